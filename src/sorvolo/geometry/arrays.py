@@ -1,0 +1,46 @@
+"""The array aliases: what shape, order and unit an array has when its annotation says so."""
+
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats: TypeAlias = NDArray[np.float64]
+"""Any float64 array; the docstring gives its shape."""
+
+PointsPx: TypeAlias = NDArray[np.float64]
+"""(N, 2) image or grid points, x right then y down, px; (0, 0) is the centre of the top-left pixel."""
+
+PointsM: TypeAlias = NDArray[np.float64]
+"""(N, 2) or (N, 3) metric points: east, north(, up) in the site frame unless the name says otherwise."""
+
+Matrix3: TypeAlias = NDArray[np.float64]
+"""(3, 3) matrix."""
+
+Vector3: TypeAlias = NDArray[np.float64]
+"""(3,) vector."""
+
+ImageRGB: TypeAlias = NDArray[np.uint8]
+"""(height, width, 3) uint8, red green blue."""
+
+ImageRGBA: TypeAlias = NDArray[np.uint8]
+"""(height, width, 4) uint8, red green blue alpha (0 = nothing known, 255 = seen)."""
+
+ImageGray: TypeAlias = NDArray[np.uint8]
+"""(height, width) uint8."""
+
+Mask: TypeAlias = NDArray[np.bool_]
+"""(height, width) bool."""
+
+TimesNs: TypeAlias = NDArray[np.int64]
+"""(N,) UTC time in nanoseconds since 1970-01-01."""
+
+Anything: TypeAlias = NDArray[Any]
+"""An array of any type."""
+
+
+def frozen(array: Any, dtype: Any = np.float64) -> Any:
+    """Copy `array` as a read-only array of `dtype`, for a record's field."""
+    copy = np.array(array, dtype=dtype)
+    copy.setflags(write=False)
+    return copy

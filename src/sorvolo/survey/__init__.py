@@ -1,0 +1,1 @@
+"""The vocabulary: frozen records that every other room speaks in; no algorithms."""

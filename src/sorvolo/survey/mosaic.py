@@ -1,0 +1,140 @@
+"""What a map is made of: features, keyframes, links between them, placed frames and tiles."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from sorvolo.errors import GeometryError
+from sorvolo.geometry.arrays import (
+    Anything,
+    Floats,
+    ImageGray,
+    ImageRGBA,
+    Matrix3,
+    PointsM,
+    PointsPx,
+    frozen,
+)
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.grid import TileIndex
+from sorvolo.geometry.pose import Pose
+from sorvolo.survey.flight import CameraPrior
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Salient points of one undistorted image: `points_px` (N, 2), `descriptors` (N, D), `kind` "orb", "sift"..."""
+
+    kind: str
+    points_px: PointsPx
+    descriptors: Anything
+
+    def __post_init__(self) -> None:
+        if len(self.points_px) != len(self.descriptors):
+            raise GeometryError(f"{len(self.points_px)} points but {len(self.descriptors)} descriptors")
+
+    def __len__(self) -> int:
+        return len(self.points_px)
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A frame that was chosen for the map, ready to be linked.
+
+    `gray` is undistorted and at registration size, which may be smaller than the frame; `camera` is the
+    distortion-free camera of that gray image. `id` counts up within a site's mapping run.
+    """
+
+    id: int
+    camera: Camera
+    gray: ImageGray
+    features: Features
+    prior: CameraPrior
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """Two keyframes see the same ground: paired undistorted points, (N, 2) each, and the map between them.
+
+    `new_from_old` is the homography that takes the old keyframe's pixels to the new one's; `sigma_px` is the
+    robust spread of the pairs about it.
+    """
+
+    new_id: int
+    old_id: int
+    new_px: PointsPx
+    old_px: PointsPx
+    new_from_old: Matrix3
+    sigma_px: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "new_px", frozen(self.new_px))
+        object.__setattr__(self, "old_px", frozen(self.old_px))
+        if self.new_px.shape != self.old_px.shape:
+            raise GeometryError("a link needs as many points on both sides")
+
+
+@dataclass(frozen=True)
+class NoLink:
+    """Two keyframes that do not fit, and why, in words."""
+
+    new_id: int
+    old_id: int
+    reason: str
+
+
+class Status(StrEnum):
+    """How a selected frame ended."""
+
+    VISION = "vision"
+    GPS_ONLY = "gps-only"
+    REJECTED = "rejected"
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedFrame:
+    """A selected frame as it ended: one feature of frames.geojson.
+
+    `outline_m` (4, 2) is the image's corners on the ground (top-left, top-right, bottom-right, bottom-left), NaN
+    when rejected. `grid_image_from_image`, the planar map of the whole undistorted image to site metres, is
+    `site_from_image` (3, 3), NaN when rejected.
+    """
+
+    name: str
+    index: int
+    time_ns: int
+    status: Status
+    reason: str
+    camera: Camera
+    site_from_camera: Pose | None  # None: the method (thesis) or the status (rejected) has no 6-DoF pose
+    site_from_image: Matrix3
+    outline_m: PointsM
+    residual_px: float
+    sigma_m: float
+    gains: Floats = field(default_factory=lambda: np.ones(3))
+    gps_residual_m: Floats = field(default_factory=lambda: np.full(3, np.nan))
+
+
+@dataclass(frozen=True, eq=False)
+class Tile:
+    """One square of the map."""
+
+    index: TileIndex
+    rgba: ImageRGBA
+
+
+@dataclass(frozen=True)
+class MosaicUpdate:
+    """What one step of a mapping mission did: the frame, how it ended for now, and the running counts."""
+
+    frame_name: str
+    status: Status
+    reason: str
+    frames_read: int
+    frames_expected: int
+    keyframes: int
+    keyframes_expected: int
+    by_vision: int
+    tiles_touched: int
+    seconds: float
