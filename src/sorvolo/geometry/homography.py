@@ -9,12 +9,15 @@ from sorvolo.geometry.pose import Pose
 
 
 def apply_homography(a_from_b: Matrix3, points_b: Floats) -> Floats:
-    """Points of plane b, shape (N, 2), in plane a; NaN where the point falls on or behind the line at infinity."""
+    """Points of plane b, shape (N, 2), in plane a; NaN where the third coordinate is not positive.
+
+    All homographies here are scaled so that it is positive for points in front of the camera.
+    """
     points = np.asarray(points_b, dtype=np.float64).reshape(-1, 2)
     mapped = points @ a_from_b[:, :2].T + a_from_b[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         result = mapped[:, :2] / mapped[:, 2:]
-    result[mapped[:, 2] * np.sign(a_from_b[2, 2] or 1.0) <= 0] = np.nan
+    result[mapped[:, 2] <= 0] = np.nan
     return result
 
 

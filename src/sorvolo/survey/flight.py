@@ -108,6 +108,16 @@ class Frame:
     image: ImageRGB
 
 
+@dataclass(frozen=True)
+class LostFrame:
+    """A picture that could not be used at all (corrupt, a duplicate, of another size), and why, in words."""
+
+    index: int
+    name: str
+    time_ns: int
+    reason: str
+
+
 @dataclass(frozen=True, eq=False)
 class CameraPrior:
     """What telemetry says of one frame's camera, in the site frame; what it does not say has an infinite sigma.
