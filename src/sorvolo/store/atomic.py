@@ -1,0 +1,110 @@
+"""Files that appear whole or not at all: written beside their place, synced, renamed; a full disk is named."""
+
+import errno
+import itertools
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from sorvolo.errors import StoreError
+
+TEMPORARY_PREFIX = ".tmp-"
+"""Whatever a killed process left behind starts with this; `remove_leftovers` deletes it."""
+
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
+_counter = itertools.count()
+
+
+@contextmanager
+def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
+    """A temporary path in the same folder, renamed to `path` when the block ends well, removed when it does not.
+
+    The name keeps `path`'s ending, for writers that choose their format by it. With `durable` the file and its
+    folder reach the disk before this returns; without, the file is still whole after a kill, but a power cut may
+    lose it. Raises StoreError when the disk is full or the folder cannot be written; other errors pass through.
+    """
+    temporary = _temporary(path)
+    with writing(path):
+        try:
+            yield temporary
+            if durable:
+                sync_file(temporary)
+            os.replace(temporary, path)
+            if durable:
+                sync_file(path.parent)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+
+
+def atomic_write_bytes(path: Path, data: bytes, *, durable: bool = True) -> None:
+    """Replace the file at `path` by `data`: a reader sees the old bytes or the new ones, never a part.
+
+    Raises StoreError when the disk is full or the folder cannot be written.
+    """
+    with atomic_path(path, durable=durable) as temporary:
+        temporary.write_bytes(data)
+
+
+@contextmanager
+def scratch_folder(parent: Path) -> Iterator[Path]:
+    """A temporary folder inside `parent`, on the same disk, gone when the block ends.
+
+    Raises StoreError when the disk is full or the folder cannot be written.
+    """
+    folder = _temporary(parent / "scratch")
+    with writing(folder):
+        folder.mkdir()
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn the operating system's refusals to write into a StoreError that says what to do."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _FULL:
+            raise StoreError(
+                f"disk full: could not write {path} ({error.strerror}); free some space and run the command again"
+            ) from error
+        if error.errno in _FORBIDDEN:
+            raise StoreError(
+                f"cannot write {path} ({error.strerror}); choose a folder that you may write to"
+            ) from error
+        raise
+
+
+def sync_file(path: Path) -> None:
+    """Wait until a file's bytes, or a folder's names, are on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def remove_leftovers(folders: Iterable[Path]) -> int:
+    """Delete what killed writers left in these folders (not below them) and say how many things it was.
+
+    Only for a folder that no other process is writing to.
+    """
+    removed = 0
+    for folder in folders:
+        for leftover in folder.glob(f"{TEMPORARY_PREFIX}*"):
+            if leftover.is_dir():
+                shutil.rmtree(leftover, ignore_errors=True)
+            else:
+                leftover.unlink(missing_ok=True)
+            removed += 1
+    return removed
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{next(_counter)}-{path.name}")
