@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all: written beside their place, synced, renamed; a full disk is named."""
+"""Files that appear whole or not at all: written beside their place, synced, then renamed."""
 
 import errno
 import itertools
@@ -20,11 +20,12 @@ _counter = itertools.count()
 
 @contextmanager
 def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
-    """A temporary path in the same folder, renamed to `path` when the block ends well, removed when it does not.
+    """A temporary path in the same folder, renamed to `path` when the block ends well, else removed.
 
-    The name keeps `path`'s ending, for writers that choose their format by it. With `durable` the file and its
-    folder reach the disk before this returns; without, the file is still whole after a kill, but a power cut may
-    lose it. Raises StoreError when the disk is full or the folder cannot be written; other errors pass through.
+    The name keeps `path`'s ending, for writers that choose their format by it. With `durable` the file and
+    its folder reach the disk before this returns; without, the file is still whole after a kill, but a power
+    cut may lose it. Raises StoreError when the disk is full or the folder cannot be written; other errors
+    pass through.
     """
     temporary = _temporary(path)
     with writing(path):
@@ -72,7 +73,7 @@ def writing(path: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno in _FULL:
             raise StoreError(
-                f"disk full: could not write {path} ({error.strerror}); free some space and run the command again"
+                f"disk full: could not write {path} ({error.strerror}); free some space and run it again"
             ) from error
         if error.errno in _FORBIDDEN:
             raise StoreError(

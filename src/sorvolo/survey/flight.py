@@ -160,6 +160,8 @@ class Site:
 
     The site's up = 0 is its ground; `origin.height_m` is the ellipsoidal height of that ground where it is known,
     else 0 (`docs/frames.md`). `is_local` marks a site without geo-reference, in a frame without metres.
+    `height_reference` says what `origin.height_m` is counted from: "ellipsoidal", "orthometric" (mean sea level),
+    "above take-off" or "above ground".
     """
 
     name: str
@@ -167,6 +169,7 @@ class Site:
     crs: str
     m_per_px: float
     is_local: bool = False
+    height_reference: str = "above ground"
 
     def __post_init__(self) -> None:
         if not self.name:

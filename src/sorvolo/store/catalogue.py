@@ -1,0 +1,529 @@
+"""The catalogue `site.db`: one SQLite file that is the truth about a site (docs/formats.md)."""
+
+import sqlite3
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sqlalchemy import (
+    JSON,
+    Boolean,
+    Column,
+    Connection,
+    Engine,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    Row,
+    String,
+    Table,
+    create_engine,
+    delete,
+    event,
+    func,
+    insert,
+    literal,
+    select,
+    update,
+)
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.pool import QueuePool
+
+from sorvolo.errors import StoreError
+from sorvolo.geometry.arrays import Floats, Matrix3
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.geodesy import Geodetic
+from sorvolo.geometry.grid import TileIndex
+from sorvolo.geometry.pose import Pose
+from sorvolo.store.atomic import atomic_path
+from sorvolo.survey.flight import Site
+from sorvolo.survey.mosaic import Status
+
+SCHEMA_VERSION = 1
+_APPLICATION_ID = 0x536F7256  # "SorV", in the file's header
+
+_metadata = MetaData()
+_site = Table(
+    "site", _metadata,
+    Column("id", Integer, primary_key=True),  # always 1
+    Column("name", String, nullable=False),
+    Column("latitude_deg", Float, nullable=False),
+    Column("longitude_deg", Float, nullable=False),
+    Column("height_m", Float, nullable=False),
+    Column("height_reference", String, nullable=False),
+    Column("crs", String, nullable=False),
+    Column("m_per_px", Float, nullable=False),
+    Column("is_local", Boolean, nullable=False),
+    Column("created_utc", String, nullable=False),
+    Column("derived_version", Integer, nullable=False),  # the version in mosaic.tif and its kin; 0: none
+)
+_flights = Table(
+    "flights", _metadata,
+    Column("id", String, primary_key=True),
+    Column("rank", Integer, nullable=False, unique=True),
+)
+_runs = Table(
+    "runs", _metadata,
+    Column("id", Integer, primary_key=True),
+    Column("flight_id", ForeignKey("flights.id"), nullable=False),
+    Column("fingerprint", String, nullable=False),
+    Column("status", String, nullable=False),  # mapping | complete
+    Column("started_utc", String, nullable=False),
+    Column("finished_utc", String, nullable=False),  # "" while mapping
+    Column("method", String, nullable=False),
+    Column("settings", JSON, nullable=False),
+    Column("frames", JSON, nullable=False),  # status -> number of frames
+    Column("notes", JSON, nullable=False),
+    Column("files_written", Boolean, nullable=False),
+    sqlite_autoincrement=True,  # a run's number names its folder: never used twice
+)
+_keyframes = Table(
+    "keyframes", _metadata,
+    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
+    Column("frame_index", Integer, primary_key=True),
+    Column("name", String, nullable=False),
+    Column("time_ns", Integer, nullable=False),
+    Column("status", String, nullable=False),
+    Column("image_path", String, nullable=False),
+    Column("camera", JSON, nullable=False),  # width_px, height_px, fx_px, fy_px, cx_px, cy_px
+    Column("site_from_image", JSON, nullable=False),  # (3, 3)
+    Column("rotation", JSON, nullable=False),  # (3, 3) site_from_camera, [] when unknown
+    Column("translation_m", JSON, nullable=False),  # (3,), [] when unknown
+    Column("gains", JSON, nullable=False),
+    Column("sigma_m", Float),  # NULL when unknown
+    Column("residual_px", Float),
+)
+_documents = Table(
+    "documents", _metadata,  # the text files of a run, verbatim, to write them again after a kill
+    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
+    Column("name", String, primary_key=True),
+    Column("content", LargeBinary, nullable=False),
+)
+_versions = Table(
+    "versions", _metadata,
+    Column("id", Integer, primary_key=True),
+    Column("parent_id", Integer, nullable=False),  # the version it was painted over; 0: none
+    Column("flight_id", ForeignKey("flights.id"), nullable=False),
+    Column("run_id", Integer, nullable=False),
+    Column("created_utc", String, nullable=False),
+    Column("complete", Boolean, nullable=False),
+    Column("export_crs", String, nullable=False),  # "" is the site's own
+    sqlite_autoincrement=True,
+)
+_version_tiles = Table(
+    "version_tiles", _metadata,
+    Column("version_id", ForeignKey("versions.id", ondelete="CASCADE"), primary_key=True),
+    Column("tile_column", Integer, primary_key=True),
+    Column("tile_row", Integer, primary_key=True),
+    Column("sha256", String, nullable=False),
+)
+Index("version_tiles_by_content", _version_tiles.c.sha256)
+
+
+@dataclass(frozen=True)
+class FlightEntry:
+    """A flight of the catalogue: its complete run, or the run that is mapping it for the first time.
+
+    `rank` counts flights in the order they were first mapped; `frames` is the number of frames by status;
+    times are ISO 8601 UTC, `finished_utc` "" while mapping.
+    """
+
+    id: str
+    rank: int
+    fingerprint: str
+    status: str
+    started_utc: str
+    finished_utc: str
+    method: str
+    frames: Mapping[str, int]
+    settings: Mapping[str, Any]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class VersionEntry:
+    """One state of the map; versions share the tiles in which they agree."""
+
+    id: int
+    parent_id: int
+    flight_id: str
+    created_utc: str
+    tiles: int
+    complete: bool
+    export_crs: str
+
+
+@dataclass(frozen=True, eq=False)
+class StoredKeyframe:
+    """A keyframe of a complete run. Its image is undistorted and may be smaller than the frame was.
+
+    `camera` and `site_from_image` (3, 3) are those of the stored image; `gains` (3,) multiply its RGB;
+    `site_from_camera` is None where the method knows no 6-DoF pose.
+    """
+
+    flight_id: str
+    index: int
+    name: str
+    time_ns: int
+    status: Status
+    image_path: str
+    camera: Camera
+    site_from_image: Matrix3
+    site_from_camera: Pose | None
+    gains: Floats
+    sigma_m: float
+    residual_px: float
+
+
+class Catalogue:
+    """The open database; `reading` and `changing` give one transaction each, the functions below use them."""
+
+    def __init__(self, path: Path, *, write: bool) -> None:
+        """Open; raises StoreError when the file is damaged, no catalogue, or of another schema version."""
+        self._path, self._write = path, write
+        self._engine = _engine(path, write)
+        try:
+            self._check()
+        except BaseException:
+            self._engine.dispose()
+            raise
+
+    @staticmethod
+    def create(path: Path) -> None:
+        """Put an empty catalogue at `path`, whole from its first moment."""
+        with atomic_path(path) as temporary:
+            connection = sqlite3.connect(temporary)
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute(f"PRAGMA application_id = {_APPLICATION_ID}")
+            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+            connection.close()
+            engine = _engine(temporary, write=True)
+            _metadata.create_all(engine)
+            engine.dispose()
+
+    def close(self) -> None:
+        """Close every connection; the last writer folds the write-ahead log into the file."""
+        self._engine.dispose()
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A transaction that sees one state of the catalogue."""
+        with self._naming_faults(), self._engine.begin() as connection:
+            yield connection
+
+    @contextmanager
+    def changing(self) -> Iterator[Connection]:
+        """A transaction that happens whole, on the disk, or not at all."""
+        with self._naming_faults(), self._engine.begin() as connection:
+            yield connection
+
+    def _check(self) -> None:
+        with self.reading() as connection:
+            application = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
+            version = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
+            if application != _APPLICATION_ID:
+                raise StoreError(f"{self._path} is not a Sorvolo catalogue; choose another site folder")
+            if version != SCHEMA_VERSION:
+                raise StoreError(
+                    f"the site {self._path.parent} has format version {version}, this Sorvolo works with "
+                    f"version {SCHEMA_VERSION}; use the Sorvolo that made it, or map into a new folder"
+                )
+            if self._write:
+                fault = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one()
+                if fault != "ok":
+                    raise StoreError(_damaged(self._path, fault))
+
+    @contextmanager
+    def _naming_faults(self) -> Iterator[None]:
+        try:
+            yield
+        except DBAPIError as error:
+            fault = str(error.orig)
+            if "full" in fault:
+                raise StoreError(
+                    f"disk full: could not write {self._path} ({fault}); free some space and run it again"
+                ) from error
+            if "readonly" in fault or "locked" in fault or "unable to open" in fault or "disk I/O" in fault:
+                raise StoreError(
+                    f"cannot use {self._path}: {fault}; check the disk and its permissions"
+                ) from error
+            raise StoreError(_damaged(self._path, fault)) from error
+
+
+def utc_now() -> str:
+    """The time, ISO 8601 UTC to the millisecond."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def load_site(connection: Connection) -> Site | None:
+    """The site, None before it was created."""
+    row = connection.execute(select(_site)).one_or_none()
+    if row is None:
+        return None
+    origin = Geodetic(row.latitude_deg, row.longitude_deg, row.height_m)
+    return Site(row.name, origin, row.crs, row.m_per_px, row.is_local, row.height_reference)
+
+
+def add_site(connection: Connection, site: Site) -> None:
+    """Write the site's one row."""
+    connection.execute(insert(_site).values(
+        id=1, name=site.name, latitude_deg=site.origin.latitude_deg, longitude_deg=site.origin.longitude_deg,
+        height_m=site.origin.height_m, height_reference=site.height_reference, crs=site.crs,
+        m_per_px=site.m_per_px, is_local=site.is_local, created_utc=utc_now(), derived_version=0,
+    ))
+
+
+def list_flights(connection: Connection) -> list[FlightEntry]:
+    """Every flight by rank; a complete run hides the run that is about to replace it."""
+    rows = connection.execute(
+        select(_flights.c.rank, _runs)
+        .join(_runs, _runs.c.flight_id == _flights.c.id)
+        .order_by(_flights.c.rank, _runs.c.status.desc())  # "mapping" before "complete": the last one stays
+    )
+    return list({
+        row.flight_id: FlightEntry(
+            row.flight_id, row.rank, row.fingerprint, row.status, row.started_utc, row.finished_utc,
+            row.method, row.frames, row.settings, tuple(row.notes),
+        )
+        for row in rows
+    }.values())
+
+
+def list_versions(connection: Connection) -> list[VersionEntry]:
+    """Every version, oldest first."""
+    tiles = func.count(_version_tiles.c.sha256)
+    rows = connection.execute(
+        select(_versions, tiles.label("tiles"))
+        .outerjoin(_version_tiles, _version_tiles.c.version_id == _versions.c.id)
+        .group_by(_versions.c.id)
+        .order_by(_versions.c.id)
+    )
+    return [
+        VersionEntry(
+            row.id, row.parent_id, row.flight_id, row.created_utc, row.tiles, row.complete, row.export_crs
+        )
+        for row in rows
+    ]
+
+
+def newest_version(connection: Connection, *, complete: bool = True) -> int:
+    """The id of the newest complete (or incomplete) version; 0 when there is none."""
+    newest = select(func.max(_versions.c.id)).where(_versions.c.complete == complete)
+    return connection.execute(newest).scalar() or 0
+
+
+def tile_hashes(connection: Connection, version_id: int) -> dict[TileIndex, str]:
+    """SHA-256 of every tile of a version; empty for a version that does not exist."""
+    rows = connection.execute(select(_version_tiles).where(_version_tiles.c.version_id == version_id))
+    return {(row.tile_column, row.tile_row): row.sha256 for row in rows}
+
+
+def used_hashes(connection: Connection, among: Collection[str] | None = None) -> set[str]:
+    """The SHA-256 of every tile that some version has, of those `among` when given."""
+    query = select(_version_tiles.c.sha256).distinct()
+    if among is None:
+        return set(connection.execute(query).scalars())
+    wanted = sorted(among)
+    return {
+        sha256
+        for start in range(0, len(wanted), 500)  # SQLite bounds the number of values in a query
+        for sha256 in connection.execute(
+            query.where(_version_tiles.c.sha256.in_(wanted[start:start + 500]))
+        ).scalars()
+    }
+
+
+def begin_run(
+    connection: Connection, flight_id: str, fingerprint: str, method: str, settings: Mapping[str, Any]
+) -> tuple[int, int]:
+    """Start a run and its incomplete version over the right earlier one; return both ids."""
+    known = connection.execute(select(_flights.c.rank).where(_flights.c.id == flight_id)).scalar()
+    if known is None:
+        last = connection.execute(select(func.max(_flights.c.rank))).scalar()
+        connection.execute(insert(_flights).values(id=flight_id, rank=0 if last is None else last + 1))
+    run_id = _inserted(connection, _runs, {
+        "flight_id": flight_id, "fingerprint": fingerprint, "status": "mapping", "started_utc": utc_now(),
+        "finished_utc": "", "method": method, "settings": dict(settings), "frames": {}, "notes": [],
+        "files_written": False,
+    })
+    newest = next((v for v in reversed(list_versions(connection)) if v.complete), None)
+    base_id = 0 if newest is None else newest.parent_id if newest.flight_id == flight_id else newest.id
+    version_id = _inserted(connection, _versions, {
+        "parent_id": base_id, "flight_id": flight_id, "run_id": run_id, "created_utc": utc_now(),
+        "complete": False, "export_crs": "",
+    })
+    base = select(
+        literal(version_id), _version_tiles.c.tile_column, _version_tiles.c.tile_row, _version_tiles.c.sha256
+    ).where(_version_tiles.c.version_id == base_id)
+    connection.execute(insert(_version_tiles).from_select(list(_version_tiles.c.keys()), base))
+    return run_id, version_id
+
+
+def change_tiles(connection: Connection, version_id: int, changed: Mapping[TileIndex, str | None]) -> None:
+    """Give tiles of a version other content; None removes one."""
+    for (column, row), sha256 in changed.items():
+        connection.execute(delete(_version_tiles).where(
+            _version_tiles.c.version_id == version_id,
+            _version_tiles.c.tile_column == column,
+            _version_tiles.c.tile_row == row,
+        ))
+        if sha256 is not None:
+            connection.execute(insert(_version_tiles).values(
+                version_id=version_id, tile_column=column, tile_row=row, sha256=sha256
+            ))
+
+
+def complete_run(
+    connection: Connection,
+    run_id: int,
+    version_id: int,
+    keyframes: Sequence[StoredKeyframe],
+    documents: Mapping[str, bytes],
+    frames: Mapping[str, int],
+    notes: Sequence[str],
+    export_crs: str,
+) -> None:
+    """Switch a flight from its former run to this one, and the map to this version."""
+    this_run = _runs.c.id == run_id
+    flight_id = connection.execute(select(_runs.c.flight_id).where(this_run)).scalar_one()
+    connection.execute(delete(_runs).where(_runs.c.flight_id == flight_id, _runs.c.id != run_id))
+    connection.execute(update(_runs).where(this_run).values(
+        status="complete", finished_utc=utc_now(), frames=dict(frames), notes=list(notes)
+    ))
+    connection.execute(update(_versions).where(_versions.c.id == version_id).values(
+        complete=True, created_utc=utc_now(), export_crs=export_crs
+    ))
+    if keyframes:
+        connection.execute(insert(_keyframes), [_row_of(keyframe, run_id) for keyframe in keyframes])
+    if documents:
+        connection.execute(insert(_documents), [
+            {"run_id": run_id, "name": name, "content": content} for name, content in documents.items()
+        ])
+
+
+def drop_unfinished(connection: Connection) -> None:
+    """Forget every run that was not committed, with its version, and flights that have no other."""
+    connection.execute(delete(_versions).where(_versions.c.complete.is_(False)))
+    connection.execute(delete(_runs).where(_runs.c.status == "mapping"))
+    connection.execute(delete(_flights).where(
+        _flights.c.id.not_in(select(_runs.c.flight_id)), _flights.c.id.not_in(select(_versions.c.flight_id))
+    ))
+
+
+def run_ids(connection: Connection) -> dict[str, set[int]]:
+    """The runs of each flight."""
+    runs: dict[str, set[int]] = {}
+    for row in connection.execute(select(_runs.c.flight_id, _runs.c.id)):
+        runs.setdefault(row.flight_id, set()).add(row.id)
+    return runs
+
+
+def load_keyframes(connection: Connection, flight_id: str | None) -> list[StoredKeyframe]:
+    """Keyframes of complete runs by flight rank and index, of one flight when its id is given."""
+    query = (
+        select(_keyframes, _runs.c.flight_id)
+        .join(_runs, _runs.c.id == _keyframes.c.run_id)
+        .join(_flights, _flights.c.id == _runs.c.flight_id)
+        .where(_runs.c.status == "complete")
+        .order_by(_flights.c.rank, _keyframes.c.frame_index)
+    )
+    if flight_id is not None:
+        query = query.where(_flights.c.id == flight_id)
+    return [_keyframe_of(row) for row in connection.execute(query)]
+
+
+def unwritten_documents(connection: Connection) -> list[tuple[str, int, dict[str, bytes]]]:
+    """Flight id, run id and documents of each complete run whose files were not all written."""
+    runs = connection.execute(
+        select(_runs.c.flight_id, _runs.c.id)
+        .where(_runs.c.status == "complete", _runs.c.files_written.is_(False))
+    ).all()
+    return [
+        (flight_id, run_id, {
+            row.name: row.content
+            for row in connection.execute(select(_documents).where(_documents.c.run_id == run_id))
+        })
+        for flight_id, run_id in runs
+    ]
+
+
+def mark_written(connection: Connection, run_ids: Sequence[int], derived_version: int) -> None:
+    """Note that these runs' files, and the map's files for this version, are on the disk."""
+    connection.execute(update(_runs).where(_runs.c.id.in_(run_ids)).values(files_written=True))
+    connection.execute(update(_site).values(derived_version=derived_version))
+
+
+def derived_version(connection: Connection) -> int:
+    """The version that the map's derived files show; 0 for none."""
+    return connection.execute(select(_site.c.derived_version)).scalar() or 0
+
+
+def _engine(path: Path, write: bool) -> Engine:
+    uri = path.resolve().as_uri() + ("?mode=rw" if write else "?mode=ro")
+
+    def connect() -> sqlite3.Connection:
+        # isolation_level None: the module must not begin transactions by itself, SQLAlchemy does it below
+        connection = sqlite3.connect(
+            uri, uri=True, timeout=30, isolation_level=None, check_same_thread=False
+        )
+        connection.execute("PRAGMA foreign_keys = ON")
+        connection.execute("PRAGMA synchronous = FULL")
+        return connection
+
+    engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool)
+
+    @event.listens_for(engine, "begin")
+    def begin(connection: Connection) -> None:
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
+
+    return engine
+
+
+def _inserted(connection: Connection, table: Table, values: Mapping[str, Any]) -> int:
+    key = connection.execute(insert(table).values(**values)).inserted_primary_key
+    assert key is not None  # SQLite gives one for each inserted row
+    return int(key[0])
+
+
+def _damaged(path: Path, fault: object) -> str:
+    return (
+        f"{path} is damaged or not a Sorvolo catalogue ({fault}); nothing was changed: "
+        "restore it from a copy, or map into a new folder"
+    )
+
+
+def _row_of(keyframe: StoredKeyframe, run_id: int) -> dict[str, Any]:
+    camera, pose = keyframe.camera, keyframe.site_from_camera
+    return {
+        "run_id": run_id, "frame_index": keyframe.index, "name": keyframe.name, "time_ns": keyframe.time_ns,
+        "status": keyframe.status.value, "image_path": keyframe.image_path,
+        "camera": {
+            "width_px": camera.width_px, "height_px": camera.height_px,
+            "fx_px": camera.fx_px, "fy_px": camera.fy_px, "cx_px": camera.cx_px, "cy_px": camera.cy_px,
+        },
+        "site_from_image": keyframe.site_from_image.tolist(),
+        "rotation": [] if pose is None else pose.rotation.tolist(),
+        "translation_m": [] if pose is None else pose.translation_m.tolist(),
+        "gains": keyframe.gains.tolist(),
+        "sigma_m": keyframe.sigma_m if np.isfinite(keyframe.sigma_m) else None,
+        "residual_px": keyframe.residual_px if np.isfinite(keyframe.residual_px) else None,
+    }
+
+
+def _keyframe_of(row: Row[Any]) -> StoredKeyframe:
+    return StoredKeyframe(
+        row.flight_id, row.frame_index, row.name, row.time_ns, Status(row.status), row.image_path,
+        Camera(**row.camera),
+        np.array(row.site_from_image),
+        Pose(row.rotation, row.translation_m) if row.rotation else None,
+        np.array(row.gains),
+        np.nan if row.sigma_m is None else row.sigma_m,
+        np.nan if row.residual_px is None else row.residual_px,
+    )

@@ -1,0 +1,72 @@
+"""Pictures as bytes and back: JPEG for keyframes, PNG for tiles and previews, RGB(A) order on our side."""
+
+from collections import OrderedDict
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from sorvolo.errors import StoreError
+from sorvolo.geometry.arrays import ImageRGB, ImageRGBA, frozen
+
+# 4:4:4 and 92: features found again on the stored keyframe sit where they sat; 4:2:0 shifts coloured edges.
+_JPEG = [
+    cv2.IMWRITE_JPEG_QUALITY, 92,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+]
+_PNG_FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+
+
+def jpeg_from_image(image: ImageRGB) -> bytes:
+    """Encode an image as JPEG, quality 92, colour at full resolution."""
+    _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), _JPEG)
+    return data.tobytes()
+
+
+def image_from_jpeg(data: bytes, name: str) -> ImageRGB:
+    """Decode a JPEG; raises StoreError, naming `name`, when it is damaged."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if image is None:
+        raise StoreError(f"{name} is damaged: no JPEG in its {len(data)} bytes; map its flight again")
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def png_from_rgba(rgba: ImageRGBA) -> bytes:
+    """Encode as PNG at zlib level 1; colours under transparent pixels are kept."""
+    _, data = cv2.imencode(".png", cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA), _PNG_FAST)
+    return data.tobytes()
+
+
+def rgba_from_png(data: bytes, name: str) -> ImageRGBA:
+    """Decode an RGBA PNG; raises StoreError, naming `name`, when it is damaged or has no alpha."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if image is None or image.ndim != 3 or image.shape[2] != 4:
+        raise StoreError(f"{name} is damaged: no RGBA PNG in its {len(data)} bytes; map its flight again")
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA), dtype=np.uint8)
+
+
+class ImageCache:
+    """The images used last, bounded in bytes; `get` loads what is not there. Images come out read-only."""
+
+    def __init__(self, load: Callable[[int], ImageRGB], limit_bytes: int) -> None:
+        self._load, self._limit_bytes = load, limit_bytes
+        self._images: OrderedDict[int, ImageRGB] = OrderedDict()
+        self._bytes = 0
+
+    def get(self, index: int) -> ImageRGB:
+        """The image at `index`, from memory if it was used lately."""
+        if index in self._images:
+            self._images.move_to_end(index)
+            return self._images[index]
+        image: ImageRGB = frozen(self._load(index), np.uint8)
+        self._images[index] = image
+        self._bytes += image.nbytes
+        while self._bytes > self._limit_bytes and len(self._images) > 1:
+            _, dropped = self._images.popitem(last=False)
+            self._bytes -= dropped.nbytes
+        return image
+
+    def forget(self, index: int) -> None:
+        """Drop the image at `index`: its file changes."""
+        dropped = self._images.pop(index, None)
+        self._bytes -= 0 if dropped is None else dropped.nbytes

@@ -1,0 +1,208 @@
+"""The map's tiles on disk: blobs named by their content, and mappings over them to read and to write."""
+
+import hashlib
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Iterator, Mapping, MutableMapping
+from pathlib import Path
+
+import numpy as np
+
+from sorvolo.errors import GeometryError, StoreError
+from sorvolo.geometry.arrays import ImageRGBA, frozen
+from sorvolo.geometry.grid import TileIndex
+from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, sync_file
+from sorvolo.store.images import png_from_rgba, rgba_from_png
+
+
+class TileBlobs:
+    """The folder `tiles/<aa>/<sha256>.png`; a blob is never overwritten, so versions of a map share it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._unsynced: set[str] = set()
+
+    def save(self, rgba: ImageRGBA) -> str:
+        """Write a tile unless its very bytes are there already, and return the SHA-256 of its PNG."""
+        data = png_from_rgba(rgba)
+        sha256 = hashlib.sha256(data).hexdigest()
+        path = self._path(sha256)
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # not synced one by one: `sync` does it for the blobs that last until the commit
+            atomic_write_bytes(path, data, durable=False)
+            self._unsynced.add(sha256)
+        return sha256
+
+    def load(self, sha256: str) -> ImageRGBA:
+        """Read a tile.
+
+        Raises FileNotFoundError when the blob is gone (a writer dropped its version) and StoreError when its
+        bytes are not the ones that were written.
+        """
+        path = self._path(sha256)
+        data = path.read_bytes()
+        if hashlib.sha256(data).hexdigest() != sha256:
+            raise StoreError(f"the tile {path} is damaged; restore it from a copy of the site, or map again")
+        return rgba_from_png(data, str(path))
+
+    def sync(self) -> None:
+        """Wait until every blob written so far is on the disk."""
+        for folder in {self._path(sha256).parent for sha256 in self._unsynced}:
+            for path in folder.iterdir():
+                if path.stem in self._unsynced:
+                    sync_file(path)
+            sync_file(folder)
+        if self._unsynced:
+            sync_file(self._folder)
+        self._unsynced.clear()
+
+    def remove(self, hashes: Collection[str]) -> None:
+        """Delete blobs that no version refers to."""
+        for sha256 in hashes:
+            self._path(sha256).unlink(missing_ok=True)
+        self._unsynced.difference_update(hashes)
+
+    def stored(self) -> set[str]:
+        """The SHA-256 of every blob in the folder."""
+        return {path.stem for path in self._folder.glob("??/*.png") if not path.name.startswith(".")}
+
+    def remove_leftovers(self) -> int:
+        """Delete the half-written blobs of killed writers and count them."""
+        return remove_leftovers(self._folder.glob("??"))
+
+    def _path(self, sha256: str) -> Path:
+        return self._folder / sha256[:2] / f"{sha256}.png"
+
+
+class TileView(Mapping[TileIndex, ImageRGBA]):
+    """The tiles of one version, read from disk one at a time when asked for.
+
+    `refresh` gives the version's hashes as they are now: a version that is still growing replaces its blobs.
+    """
+
+    def __init__(
+        self,
+        blobs: TileBlobs,
+        hashes: Mapping[TileIndex, str],
+        refresh: Callable[[], Mapping[TileIndex, str]],
+    ) -> None:
+        self._blobs, self._hashes, self._refresh = blobs, dict(hashes), refresh
+
+    def __getitem__(self, index: TileIndex) -> ImageRGBA:
+        """The tile; raises KeyError where there is none and StoreError when its version has been dropped."""
+        sha256 = self._hashes[index]
+        for _ in range(5):  # a writer that flushes between each look and each read is not seen in practice
+            try:
+                return self._blobs.load(sha256)
+            except FileNotFoundError:
+                sha256 = self._refresh().get(index, "")
+            if not sha256:
+                break
+        raise StoreError(f"tile {index} was replaced while the map was being read; read the map again")
+
+    def __iter__(self) -> Iterator[TileIndex]:
+        return iter(self._hashes)
+
+    def __len__(self) -> int:
+        return len(self._hashes)
+
+    def __contains__(self, index: object) -> bool:
+        return index in self._hashes
+
+
+class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
+    """The tiles of the version that is being made: copy-on-write over an earlier version, bounded in memory.
+
+    Tiles come out read-only; a changed one has to be set. Setting a fully transparent tile removes it. Blobs
+    are written when memory runs out and in `save`, so a tile repainted ten times a second is encoded once.
+    """
+
+    def __init__(
+        self, blobs: TileBlobs, base: Mapping[TileIndex, str], tile_px: int, limit_bytes: int
+    ) -> None:
+        self._blobs, self._tile_px, self._limit_bytes = blobs, tile_px, limit_bytes
+        self._hashes = dict(base)  # what is on disk
+        self._loaded: OrderedDict[TileIndex, ImageRGBA] = OrderedDict()
+        self._unsaved: set[TileIndex] = set()  # loaded and newer than the disk
+        self._changed: set[TileIndex] = set()  # since the last `save`
+        self._superseded: set[str] = set()
+        self._bytes = 0
+
+    def __getitem__(self, index: TileIndex) -> ImageRGBA:
+        if index in self._loaded:
+            self._loaded.move_to_end(index)
+            return self._loaded[index]
+        sha256 = self._hashes[index]
+        try:
+            tile: ImageRGBA = frozen(self._blobs.load(sha256), np.uint8)
+        except FileNotFoundError as error:
+            raise StoreError(f"{error.filename} is missing; restore it from a copy of the site") from error
+        self._keep(index, tile)
+        return tile
+
+    def __setitem__(self, index: TileIndex, rgba: ImageRGBA) -> None:
+        """Replace a tile by a copy of `rgba`; raises GeometryError unless it has the grid's tile size."""
+        if rgba.shape != (self._tile_px, self._tile_px, 4) or rgba.dtype != np.uint8:
+            raise GeometryError(
+                f"a tile here is {self._tile_px}x{self._tile_px} RGBA uint8, got {rgba.shape} {rgba.dtype}"
+            )
+        if not rgba[..., 3].any():
+            if index in self:
+                del self[index]
+            return
+        self._unsaved.add(index)
+        self._changed.add(index)
+        self._keep(index, frozen(rgba, np.uint8))
+
+    def __delitem__(self, index: TileIndex) -> None:
+        if index not in self:
+            raise KeyError(index)
+        dropped = self._loaded.pop(index, None)
+        self._bytes -= 0 if dropped is None else dropped.nbytes
+        self._unsaved.discard(index)
+        self._replace_hash(index, None)
+        self._changed.add(index)
+
+    def __iter__(self) -> Iterator[TileIndex]:
+        return iter(self._hashes.keys() | self._unsaved)
+
+    def __len__(self) -> int:
+        return len(self._hashes.keys() | self._unsaved)
+
+    def __contains__(self, index: object) -> bool:
+        return index in self._hashes or index in self._unsaved
+
+    def save(self) -> dict[TileIndex, str | None]:
+        """Write every unsaved tile; return the hashes of tiles changed since the last call, None: removed."""
+        for index in sorted(self._unsaved):
+            self._write(index)
+        changed = {index: self._hashes.get(index) for index in self._changed}
+        self._changed.clear()
+        return changed
+
+    def take_superseded(self) -> set[str]:
+        """Hashes that this version no longer uses; the caller knows whether another version does."""
+        superseded = self._superseded - set(self._hashes.values())
+        self._superseded = set()
+        return superseded
+
+    def _keep(self, index: TileIndex, tile: ImageRGBA) -> None:
+        former = self._loaded.pop(index, None)
+        self._bytes += tile.nbytes - (0 if former is None else former.nbytes)
+        self._loaded[index] = tile
+        while self._bytes > self._limit_bytes and len(self._loaded) > 1:
+            oldest = next(iter(self._loaded))
+            if oldest in self._unsaved:
+                self._write(oldest)
+            self._bytes -= self._loaded.pop(oldest).nbytes
+
+    def _write(self, index: TileIndex) -> None:
+        self._replace_hash(index, self._blobs.save(self._loaded[index]))
+        self._unsaved.discard(index)
+
+    def _replace_hash(self, index: TileIndex, sha256: str | None) -> None:
+        former = self._hashes.pop(index, None)
+        if former is not None and former != sha256:
+            self._superseded.add(former)
+        if sha256 is not None:
+            self._hashes[index] = sha256
