@@ -1,0 +1,83 @@
+"""Cameras by model name: sensor, focal length and image size of common drones, as their makers state them."""
+
+import re
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class CameraPreset:
+    """One model. `codes` are its names in EXIF; `width_px` and `height_px` its largest photo.
+
+    `focal_sigma` is the relative uncertainty of the focal length in such a photo. The lens of an
+    interchangeable or zooming camera (`changes_lens`) is the one that EXIF states, `focal_mm` only its
+    usual one.
+    """
+
+    name: str
+    codes: tuple[str, ...]
+    sensor_width_mm: float
+    sensor_height_mm: float
+    focal_mm: float
+    width_px: int
+    height_px: int
+    focal_sigma: float = 0.02
+    changes_lens: bool = False
+
+
+CAMERA_PRESETS = (
+    # 1/2.3 inch sensors with 1.55 um pixels: 4000 x 1.55 um = 6.2 mm
+    CameraPreset("Phantom 3", ("FC300X", "FC300S", "FC300C", "FC300SE"), 6.2, 4.65, 3.61, 4000, 3000),
+    CameraPreset("Zenmuse X3", ("FC350",), 6.2, 4.65, 3.61, 4000, 3000),
+    CameraPreset("Phantom 4", ("FC330",), 6.2, 4.65, 3.61, 4000, 3000),
+    CameraPreset("Mavic Pro", ("FC220",), 6.2, 4.65, 4.73, 4000, 3000),
+    CameraPreset("Mavic Air", ("FC2103",), 6.29, 4.71, 4.5, 4056, 3040, 0.03),
+    CameraPreset("Mavic Mini", ("FC7203",), 6.3, 4.73, 4.49, 4000, 3000, 0.03),
+    CameraPreset("Mini 2", ("FC7303",), 6.3, 4.73, 4.49, 4000, 3000, 0.03),
+    CameraPreset("Mavic 2 Zoom", ("FC2204",), 6.2, 4.65, 4.386, 4000, 3000, 0.03, changes_lens=True),
+    CameraPreset("Phantom 4 Multispectral", ("FC6360",), 4.87, 3.96, 5.74, 1600, 1300),
+    # 1 inch
+    CameraPreset("Phantom 4 Pro", ("FC6310", "FC6310S"), 13.2, 8.8, 8.8, 5472, 3648),
+    CameraPreset("Phantom 4 RTK", ("FC6310R",), 13.2, 8.8, 8.8, 5472, 3648),
+    CameraPreset("Zenmuse X4S", ("FC6510",), 13.2, 8.8, 8.8, 5472, 3648),
+    CameraPreset("Mavic 2 Pro", ("L1D-20c",), 13.2, 8.8, 10.26, 5472, 3648),
+    CameraPreset("Air 2S", ("FC3411",), 13.2, 8.8, 8.38, 5472, 3648, 0.03),
+    CameraPreset("senseFly S.O.D.A.", ("S.O.D.A.", "SODA"), 12.75, 8.5, 10.6, 5472, 3648),
+    # 1/2 and 1/1.3 inch
+    CameraPreset("Mavic Air 2", ("FC3170",), 6.4, 4.8, 4.5, 4000, 3000, 0.03),
+    CameraPreset("Mavic 3T", ("M3T", "M3TD"), 6.4, 4.8, 4.4, 4000, 3000, 0.03),
+    CameraPreset("Zenmuse H20", ("ZH20", "ZH20T", "ZH20N"), 6.17, 4.63, 4.5, 4056, 3040, 0.03),
+    CameraPreset("Mini 3", ("FC3682",), 9.7, 7.3, 6.72, 4000, 3000, 0.04),
+    CameraPreset("Mini 3 Pro", ("FC3582",), 9.7, 7.3, 6.72, 4032, 3024, 0.04),
+    CameraPreset("Mini 4 Pro", ("FC8482",), 9.7, 7.3, 6.72, 4032, 3024, 0.04),
+    # 4/3 inch and larger
+    CameraPreset("Mavic 3", ("L2D-20c",), 17.3, 13.0, 12.29, 5280, 3956, 0.03),
+    CameraPreset("Mavic 3E", ("M3E", "M3M"), 17.3, 13.0, 12.29, 5280, 3956, 0.03),
+    CameraPreset("Zenmuse X5", ("FC550", "FC550RAW"), 17.3, 13.0, 15.0, 4608, 3456, changes_lens=True),
+    CameraPreset("Zenmuse X5S", ("FC6520",), 17.3, 13.0, 15.0, 5280, 3956, changes_lens=True),
+    CameraPreset("Zenmuse X7", ("FC6540",), 23.5, 15.7, 24.0, 6016, 4008, changes_lens=True),
+    CameraPreset("Zenmuse P1", ("ZenmuseP1",), 35.9, 24.0, 35.0, 8192, 5460, changes_lens=True),
+    CameraPreset("senseFly Aeria X", ("AeriaX",), 23.5, 15.6, 18.5, 6000, 4000),
+    # lenses far from a pinhole: a calibration is worth much more than the preset
+    CameraPreset("Parrot ANAFI", ("Anafi", "AnafiUSA", "AnafiThermal"), 5.985, 4.498, 4.0, 5344, 4016, 0.05),
+    CameraPreset("GoPro HERO4", ("HERO4 Black", "HERO4 Silver"), 6.17, 4.63, 2.92, 4000, 3000, 0.1),
+    CameraPreset("GoPro HERO5", ("HERO5 Black", "HERO6 Black"), 6.17, 4.63, 2.92, 4000, 3000, 0.1),
+)
+
+
+def find_preset(name: str) -> CameraPreset | None:
+    """The preset with this name or EXIF code; case, blanks, hyphens and "DJI" before it do not matter."""
+    wanted = _plain(name)
+    for preset in CAMERA_PRESETS:
+        known = {_plain(preset.name), *(_plain(code) for code in preset.codes)}
+        if wanted in known or (wanted.startswith("dji") and wanted[3:] in known):
+            return preset
+    return None
+
+
+def preset_names() -> str:
+    """Every preset with its EXIF codes, for a message."""
+    return ", ".join(f"{preset.name} ({', '.join(preset.codes)})" for preset in CAMERA_PRESETS)
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())

@@ -1,0 +1,215 @@
+"""From a calibration file's named numbers to a checked camera of the frames' size; nothing is read here."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sorvolo.capture.camera_nodes import Node
+from sorvolo.errors import GeometryError, InputError
+from sorvolo.geometry.arrays import Floats, Matrix3
+from sorvolo.geometry.camera import Camera
+from sorvolo.survey.flight import CameraModel
+
+OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3")
+"""Also what `Camera.distortion` holds."""
+
+THESIS_ORDER = ("k1", "k2", "k3", "p1", "p2")
+"""How section 2.3 of the thesis lists them, and the UMCD dataset's file with it."""
+
+_MATRIX_KEYS = ("cameramatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "mtx", "k", "m1", "cm")
+_DISTORTION_KEYS = (
+    "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff", "distcoefs", "distortion",
+    "dist", "d", "d1",
+)
+_WIDTH_KEYS = ("imagewidth", "imgwidth", "framewidth", "widthpx", "width")
+_HEIGHT_KEYS = ("imageheight", "imgheight", "frameheight", "heightpx", "height")
+_SIZE_KEYS = ("imagesize", "imgsize", "framesize", "size", "resolution")
+_COMMON_WIDTHS_PX = (
+    640, 720, 800, 848, 960, 1024, 1280, 1440, 1600, 1920, 2000, 2048, 2704, 2720, 3840, 4000, 4032, 4056,
+    4096, 5280, 5472, 6016, 8000, 8192,
+)
+
+_LARGEST_TANGENTIAL = 0.02
+"""Lenses are centred well enough that |p1| and |p2| stay below this; a third coefficient above it is a k3."""
+
+_CALIBRATED_SIGMA = 0.003
+_RESIZED_SIGMA = 0.01
+"""A video mode may use a part of the sensor of the same shape, which no file tells."""
+
+
+def camera_from_nodes(
+    file_name: str, nodes: Mapping[str, Node], width_px: int, height_px: int
+) -> CameraModel:
+    """The camera for frames of this size. Raises InputError, naming the file, for what describes none.
+
+    A calibration of another size serves when the shape is the same; `origin` says so.
+    """
+    _refuse_other_lens_models(file_name, nodes)
+    matrix = _matrix(file_name, nodes)
+    distortion, order_words = _distortion(file_name, nodes)
+    words = f"calibration {file_name}, {order_words}"
+    size = _size(nodes)
+    if size is None:
+        size = _size_from_centre(file_name, matrix, width_px, height_px)
+        words += f", no image size in it, taken as {size[0]}x{size[1]} from the optical centre"
+    if abs(size[0] * height_px / (size[1] * width_px) - 1) > 0.01:
+        raise InputError(
+            f"{file_name}: made for {size[0]}x{size[1]} pictures, but these are {width_px}x{height_px}, "
+            "another "
+            "shape; calibrate in the mode that the flight used"
+        )
+    try:
+        camera = Camera(*size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], distortion)
+    except GeometryError as error:
+        raise InputError(f"{file_name}: {error}") from error
+    _check_lens(file_name, camera)
+    sigma = _sigma(nodes)
+    if size != (width_px, height_px):
+        words += f", resized from {size[0]}x{size[1]}"
+        camera, sigma = camera.resized(width_px, height_px), max(sigma, _RESIZED_SIGMA)
+    return CameraModel(camera, words, sigma)
+
+
+def _refuse_other_lens_models(file_name: str, nodes: Mapping[str, Node]) -> None:
+    model = nodes.get("distortionmodel", nodes.get("cameramodel", "pinhole"))
+    fisheye = nodes.get("fisheyemodel", nodes.get("fisheye", 0.0))
+    is_other = isinstance(model, str) and any(
+        word in model.lower() for word in ("fisheye", "equidistant", "rational", "omni", "double")
+    )
+    if is_other or fisheye not in (0.0, "false", "False", ""):
+        raise InputError(
+            f"{file_name}: a {model if is_other else 'fisheye'} lens model; the five-coefficient one (k1 "
+            "k2 p1 p2 k3) "
+            "is needed: calibrate again without the fisheye or rational option"
+        )
+
+
+def _matrix(file_name: str, nodes: Mapping[str, Node]) -> Matrix3:
+    found = _first(nodes, _MATRIX_KEYS)
+    if found is None:
+        numbers = [_first(nodes, (f"{name}px", name)) for name in ("fx", "fy", "cx", "cy")]
+        if any(not isinstance(each, float) for each in numbers):
+            raise InputError(
+                f"{file_name}: no camera matrix; a node such as camera_matrix (3 x 3), or fx, fy, cx and "
+                "cy, is needed"
+            )
+        fx, fy, cx, cy = (float(each) for each in numbers if isinstance(each, float))
+        found = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    matrix = np.asarray(found) if isinstance(found, np.ndarray) else np.zeros(0)
+    if matrix.size != 9:
+        raise InputError(f"{file_name}: the camera matrix must be 3 x 3, got shape {matrix.shape}")
+    matrix = matrix.reshape(3, 3)
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{file_name}: the camera matrix holds a value that is no number")
+    if not np.allclose(matrix[2], [0, 0, 1], atol=1e-6) or abs(matrix[1, 0]) > 1e-6:
+        raise InputError(
+            f"{file_name}: the camera matrix must be [fx 0 cx; 0 fy cy; 0 0 1], got {matrix.tolist()}; is it "
+            "transposed?"
+        )
+    if abs(matrix[0, 1]) > 1e-3 * abs(matrix[0, 0]):
+        raise InputError(f"{file_name}: the camera matrix has a skew of {matrix[0, 1]:g} px; 0 is needed")
+    return matrix
+
+
+def _distortion(file_name: str, nodes: Mapping[str, Node]) -> tuple[Floats, str]:
+    """The coefficients in OpenCV's order and, in words, the order that was read and why."""
+    named = {name: nodes[name] for name in OPENCV_ORDER if isinstance(nodes.get(name), float)}
+    if named:
+        numbers = np.array([float(named.get(name, 0.0)) for name in OPENCV_ORDER])
+        return _finite(file_name, numbers), "distortion coefficients by name"
+    found = _first(nodes, _DISTORTION_KEYS)
+    if found is None or isinstance(found, str):
+        return np.zeros(5), "without distortion coefficients"
+    numbers = _finite(file_name, np.atleast_1d(np.asarray(found, dtype=np.float64)).ravel())
+    if len(numbers) > 5 and not numbers[5:].any():
+        numbers = numbers[:5]
+    if len(numbers) not in (4, 5):
+        raise InputError(
+            f"{file_name}: {len(numbers)} distortion coefficients; 4 (k1 k2 p1 p2) or 5 (k1 k2 p1 p2 k3) "
+            "are needed: "
+            "calibrate again without the rational, thin-prism or tilted option"
+        )
+    order, why = _order(file_name, nodes, numbers)
+    by_name = dict(zip(order, numbers))
+    reordered = np.array([by_name.get(name, 0.0) for name in OPENCV_ORDER])
+    return reordered, f"distortion read as {' '.join(order)} ({why})"
+
+
+def _order(file_name: str, nodes: Mapping[str, Node], numbers: Floats) -> tuple[tuple[str, ...], str]:
+    stated = nodes.get("distortionorder")
+    if isinstance(stated, str) and stated.strip():
+        order = tuple(stated.replace(",", " ").lower().split())
+        if sorted(order) != sorted(OPENCV_ORDER[:len(numbers)]):
+            raise InputError(
+                f"{file_name}: distortion_order {stated!r} does not name its {len(numbers)} coefficients"
+            )
+        return order, "the file says so"
+    if len(numbers) == 4:
+        return OPENCV_ORDER[:4], "OpenCV's order"
+    third, _, fifth = np.abs(numbers[2:])
+    if third > _LARGEST_TANGENTIAL >= fifth:
+        return THESIS_ORDER, f"the UMCD dataset's order: a third coefficient of {numbers[2]:g} can only be k3"
+    if third > _LARGEST_TANGENTIAL:
+        return OPENCV_ORDER, "OpenCV's order, though neither order looks plausible: check the file"
+    if fifth > _LARGEST_TANGENTIAL:
+        return OPENCV_ORDER, "OpenCV's order, the only plausible one"
+    return OPENCV_ORDER, "OpenCV's order assumed; name it in a node distortion_order if it is k1 k2 k3 p1 p2"
+
+
+def _finite(file_name: str, numbers: Floats) -> Floats:
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{file_name}: a distortion coefficient is no number")
+    return numbers
+
+
+def _size(nodes: Mapping[str, Node]) -> tuple[int, int] | None:
+    width, height = _first(nodes, _WIDTH_KEYS), _first(nodes, _HEIGHT_KEYS)
+    both = _first(nodes, _SIZE_KEYS)
+    if isinstance(both, np.ndarray) and both.size == 2:
+        width, height = (float(each) for each in both.ravel())
+    if isinstance(width, float) and isinstance(height, float) and 1 <= width < 1e5 and 1 <= height < 1e5:
+        return int(width), int(height)
+    return None
+
+
+def _size_from_centre(file_name: str, matrix: Matrix3, width_px: int, height_px: int) -> tuple[int, int]:
+    """The size of a file that states none: the optical centre lies near the middle of the picture."""
+    guess = 2 * matrix[0, 2] + 1, 2 * matrix[1, 2] + 1
+    if abs(guess[0] / width_px - 1) <= 0.2 and abs(guess[1] / height_px - 1) <= 0.2:
+        return width_px, height_px
+    width = min(_COMMON_WIDTHS_PX, key=lambda each: abs(guess[0] / each - 1))
+    height = round(width * height_px / width_px)
+    if abs(guess[0] / width - 1) > 0.06 or abs(guess[1] / height - 1) > 0.1:
+        raise InputError(
+            f"{file_name}: no image size, and its optical centre ({matrix[0, 2]:.1f}, {matrix[1, 2]:.1f}) "
+            "does not "
+            f"belong to {width_px}x{height_px} pictures; add image_width and image_height"
+        )
+    return width, height
+
+
+def _check_lens(file_name: str, camera: Camera) -> None:
+    """Raise InputError if the distortion folds the picture onto itself: a pixel would have no single ray."""
+    edge_px = np.concatenate([
+        camera.corners_px, 0.5 * (camera.corners_px + np.roll(camera.corners_px, 1, axis=0)),
+    ])
+    try:
+        back_px = camera.pixels_from_points(camera.rays_from_pixels(edge_px))
+        offset_px = np.abs(back_px - edge_px).max()
+    except np.linalg.LinAlgError:
+        offset_px = np.inf
+    if not offset_px < 0.5:
+        raise InputError(
+            f"{file_name}: the distortion coefficients {camera.distortion.tolist()} (k1 k2 p1 p2 k3) fold "
+            "the picture "
+            "at its edge; calibrate again with views that reach the corners, or check the coefficients' order"
+        )
+
+
+def _sigma(nodes: Mapping[str, Node]) -> float:
+    stated = nodes.get("focalsigma")
+    return float(stated) if isinstance(stated, float) and 1e-4 < stated <= 0.5 else _CALIBRATED_SIGMA
+
+
+def _first(nodes: Mapping[str, Node], keys: tuple[str, ...]) -> Node | None:
+    return next((nodes[key] for key in keys if key in nodes), None)
