@@ -4,15 +4,11 @@ A guess is never hidden: `CameraModel.origin` tells in words where the numbers c
 """
 
 import math
-import os
-import tempfile
 from pathlib import Path
-
-import numpy as np
 
 from sorvolo.capture.camera_nodes import read_nodes
 from sorvolo.capture.camera_presets import CameraPreset, find_preset, preset_names
-from sorvolo.capture.intrinsics import camera_from_nodes
+from sorvolo.capture.intrinsics import OPENCV_ORDER, camera_from_nodes
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.camera import Camera
@@ -37,32 +33,20 @@ def read_camera(path: Path, width_px: int, height_px: int) -> CameraModel:
     return camera_from_nodes(path.name, read_nodes(path), width_px, height_px)
 
 
-def write_camera(
-    path: Path, camera: Camera, *, reprojection_error_px: float, views: int, focal_sigma: float = 0.003
-) -> None:
-    """Write an OpenCV calibration XML that `cv2.FileStorage` and `read_camera` read; whole or not at all.
-
-    Raises InputError when the folder cannot be written.
-    """
-    k1, k2, p1, p2, k3 = camera.distortion
+def camera_xml(
+    camera: Camera, *, reprojection_error_px: float, views: int, focal_sigma: float = 0.003
+) -> str:
+    """The text of an OpenCV calibration file that `cv2.FileStorage` and `read_camera` read."""
     matrix = _xml_matrix("camera_matrix", 3, 3, camera.matrix.ravel())
-    distortion = _xml_matrix("distortion_coefficients", 5, 1, np.array([k1, k2, p1, p2, k3]))
-    text = (
+    distortion = _xml_matrix("distortion_coefficients", 5, 1, camera.distortion)
+    return (
         '<?xml version="1.0"?>\n<opencv_storage>\n'
         f"<image_width>{camera.width_px}</image_width>\n<image_height>{camera.height_px}</image_height>\n"
-        f'{matrix}<distortion_order>"k1 k2 p1 p2 k3"</distortion_order>\n{distortion}'
+        f'{matrix}<distortion_order>"{" ".join(OPENCV_ORDER)}"</distortion_order>\n{distortion}'
         f"<avg_reprojection_error>{reprojection_error_px:.6g}</avg_reprojection_error>\n"
         f"<nr_of_frames>{views}</nr_of_frames>\n<focal_sigma>{focal_sigma:.6g}</focal_sigma>\n"
         "</opencv_storage>\n"
     )
-    try:
-        with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".tmp", delete=False) as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(file.name, path)
-    except OSError as error:
-        raise InputError(f"{path}: the camera file cannot be written: {error.strerror or error}") from error
 
 
 def guess_camera(

@@ -1,0 +1,259 @@
+"""Area files: GeoJSON, KML and KMZ polygons, and the thesis's list of coordinates (UAV_path, eq. 3.1).
+
+A list that closes into a polygon (its last point repeats the first, or three or more points whose outline
+does not cross itself) is that polygon. Any other list, and a line in GeoJSON or KML, is a path that was or
+will be flown: its area is everything within `CORRIDOR_M` of it.
+"""
+
+import io
+import json
+import re
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, TypeAlias
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from defusedxml import ElementTree
+from defusedxml.common import DefusedXmlException
+
+from sorvolo.errors import GeometryError, InputError
+from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.geodesy import Geodetic, LocalFrame
+from sorvolo.geometry.polygons import convex_hull
+from sorvolo.survey.area import Area
+
+CORRIDOR_M = 30.0
+"""How far to either side of a path its area reaches: about half a frame's width from 50 m, so that frames
+taken along the path are kept although GPS is off by some metres."""
+
+_MOST_BYTES = 20_000_000
+_SEPARATOR = re.compile(r"[,;\s]+")
+_LATITUDE_NAMES = ("latitude", "lat", "latitude_deg")
+_LONGITUDE_NAMES = ("longitude", "lon", "lng", "long", "longitude_deg")
+
+Rings: TypeAlias = tuple[Floats, ...]
+
+
+def read_area(path: Path) -> Area:
+    """The area of interest in a file, told apart by its content.
+
+    Raises InputError for a file that is missing, empty, of another kind, without polygon or path, or whose
+    coordinates are off the Earth, cross themselves or are not WGS84 longitude and latitude.
+    """
+    raw = _read_bytes(path)
+    if raw[:2] == b"PK":
+        raw = _kml_in_kmz(path, raw)
+    try:
+        text = raw.decode("utf-8-sig").strip()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not an area file: neither GeoJSON, KML, KMZ nor text") from error
+    if not text:
+        raise InputError(f"{path}: the area file is empty; a polygon or a list of coordinates is needed")
+    try:
+        if text.startswith("{"):
+            polygons = _from_geojson(path, text)
+        elif text.startswith("<"):
+            polygons = _from_kml(path, text)
+        else:
+            polygons = _from_text(path, text)
+        return Area(tuple(polygons), path.stem)
+    except GeometryError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            raw = file.read(_MOST_BYTES + 1)
+    except OSError as error:
+        raise InputError(f"{path}: the area file cannot be read: {error.strerror or error}") from error
+    if len(raw) > _MOST_BYTES:
+        raise InputError(f"{path}: larger than {_MOST_BYTES // 1_000_000} MB; an outline is needed")
+    return raw
+
+
+def _kml_in_kmz(path: Path, raw: bytes) -> bytes:
+    try:
+        with zipfile.ZipFile(io.BytesIO(raw)) as archive:
+            names = [name for name in archive.namelist() if name.lower().endswith(".kml")]
+            if not names:
+                raise InputError(f"{path}: the KMZ holds no .kml file")
+            with archive.open(names[0]) as file:
+                kml = file.read(_MOST_BYTES + 1)
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
+        raise InputError(f"{path}: broken KMZ: {error}") from error
+    if len(kml) > _MOST_BYTES:
+        raise InputError(f"{path}: its KML is larger than {_MOST_BYTES // 1_000_000} MB")
+    return kml
+
+
+def _from_geojson(path: Path, text: str) -> list[Rings]:
+    try:
+        tree = json.loads(text)
+        polygons, lines = [], []
+        for geometry in _geometries(tree):
+            kind, coordinates = geometry["type"], geometry["coordinates"]
+            if kind == "Polygon":
+                polygons.append(_geojson_rings(path, coordinates))
+            elif kind == "MultiPolygon":
+                polygons += [_geojson_rings(path, each) for each in coordinates]
+            elif kind == "LineString":
+                lines.append(_lonlat(path, coordinates))
+            elif kind == "MultiLineString":
+                lines += [_lonlat(path, each) for each in coordinates]
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: broken GeoJSON: {error}") from error
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: GeoJSON without the expected member: {error}") from error
+    return _polygons_or_corridors(path, polygons, lines)
+
+
+def _geometries(tree: Any) -> Iterator[Any]:
+    kind = tree["type"]
+    if kind == "FeatureCollection":
+        for feature in tree["features"]:
+            yield from _geometries(feature)
+    elif kind == "Feature":
+        if tree["geometry"] is not None:
+            yield from _geometries(tree["geometry"])
+    elif kind == "GeometryCollection":
+        for geometry in tree["geometries"]:
+            yield from _geometries(geometry)
+    else:
+        yield tree
+
+
+def _geojson_rings(path: Path, coordinates: Sequence[Any]) -> Rings:
+    return tuple(_lonlat(path, ring) for ring in coordinates)
+
+
+def _lonlat(path: Path, positions: Sequence[Any]) -> Floats:
+    """Positions with or without a height, longitude first, as (N, 2)."""
+    try:
+        lonlat = np.array([[float(position[0]), float(position[1])] for position in positions])
+    except (TypeError, ValueError, IndexError) as error:
+        raise InputError(f"{path}: a position is not a pair of numbers: {error}") from error
+    return _checked(path, lonlat.reshape(-1, 2), "GeoJSON and KML put longitude first")
+
+
+def _checked(path: Path, lonlat: Floats, order: str) -> Floats:
+    """The points if they lie on the Earth; else an InputError that says what may be the matter."""
+    bad = ~(np.isfinite(lonlat).all(axis=1) & (np.abs(lonlat[:, 0]) <= 360) & (np.abs(lonlat[:, 1]) <= 90))
+    if not bad.any():
+        return lonlat
+    longitude, latitude = lonlat[np.argmax(bad)]
+    if abs(longitude) > 360 or not np.isfinite([longitude, latitude]).all():
+        why = "are these metres of a projected system? WGS84 degrees are needed"
+    else:
+        why = f"are the two swapped? {order}"
+    raise InputError(f"{path}: latitude {latitude:g}, longitude {longitude:g} is no place on Earth; {why}")
+
+
+def _from_kml(path: Path, text: str) -> list[Rings]:
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, DefusedXmlException, ValueError) as error:
+        raise InputError(f"{path}: broken KML: {error}") from error
+    polygons, lines = [], []
+    for element in root.iter():
+        if _tag(element) == "Polygon":
+            rings: dict[str, list[Floats]] = {"outerBoundaryIs": [], "innerBoundaryIs": []}
+            for each in element.iter():
+                if _tag(each) in rings:
+                    rings[_tag(each)].append(_kml_coordinates(path, each))
+            if not rings["outerBoundaryIs"]:
+                raise InputError(f"{path}: a KML Polygon has no outerBoundaryIs")
+            polygons.append((rings["outerBoundaryIs"][0], *rings["innerBoundaryIs"]))
+        elif _tag(element) == "LineString":
+            lines.append(_kml_coordinates(path, element))
+    return _polygons_or_corridors(path, polygons, lines)
+
+
+def _kml_coordinates(path: Path, element: Element) -> Floats:
+    """The (N, 2) points of the coordinates under an element: "lon,lat[,height]" separated by blanks."""
+    texts = [each.text or "" for each in element.iter() if _tag(each) == "coordinates"]
+    return _lonlat(path, [each.split(",") for each in " ".join(texts).split()])
+
+
+def _tag(element: Element) -> str:
+    """The element's name without its namespace, which differs between KML versions and programs."""
+    return str(element.tag).rpartition("}")[2]
+
+
+def _polygons_or_corridors(path: Path, polygons: list[Rings], lines: list[Floats]) -> list[Rings]:
+    """Polygons where a file has any; a path beside them is a flight plan drawn into the same file."""
+    polygons = polygons or [capsule for line in lines for capsule in _corridor(path, line)]
+    if not polygons:
+        raise InputError(f"{path}: neither a polygon nor a path in it; draw the area as a polygon")
+    return polygons
+
+
+def _from_text(path: Path, text: str) -> list[Rings]:
+    """Lists of "latitude, longitude" lines, the thesis's order; a blank line starts another area.
+
+    What follows a # is a comment. A first line with names (lat, latitude, lon, longitude ...) says which
+    columns count.
+    """
+    lines = [line.split("#")[0].strip() for line in text.splitlines()]
+    columns = (0, 1)
+    first = next((index for index, line in enumerate(lines) if line), 0)
+    names = [name.strip('"').lower() for name in _SEPARATOR.split(lines[first])]
+    if any(name in _LATITUDE_NAMES for name in names):
+        columns = _named_columns(path, names)
+        lines = lines[first + 1:]
+    lists: list[list[tuple[float, float]]] = [[]]
+    for number, line in enumerate(lines, start=1):
+        if not line:
+            lists.append([])
+            continue
+        cells = _SEPARATOR.split(line)
+        try:
+            lists[-1].append((float(cells[columns[1]]), float(cells[columns[0]])))
+        except (ValueError, IndexError) as error:
+            raise InputError(
+                f"{path}: line {number} is {line[:60]!r}; a latitude and a longitude in degrees are needed"
+            ) from error
+    polygons: list[Rings] = []
+    for points in filter(None, lists):
+        polygons += _area_of_list(path, _checked(path, np.array(points), "lists put latitude first"))
+    if not polygons:
+        raise InputError(f"{path}: no coordinates in it")
+    return polygons
+
+
+def _named_columns(path: Path, names: list[str]) -> tuple[int, int]:
+    latitude = [names.index(name) for name in _LATITUDE_NAMES if name in names]
+    longitude = [names.index(name) for name in _LONGITUDE_NAMES if name in names]
+    if not latitude or not longitude:
+        raise InputError(f"{path}: the header {' '.join(names)[:60]!r} names no latitude and longitude")
+    return latitude[0], longitude[0]
+
+
+def _area_of_list(path: Path, lonlat: Floats) -> list[Rings]:
+    try:
+        Area(((lonlat,),))
+    except GeometryError:
+        if len(lonlat) > 2 and (lonlat[0] == lonlat[-1]).all():
+            raise
+        return _corridor(path, lonlat)
+    return [(lonlat,)]
+
+
+def _corridor(path: Path, lonlat: Floats) -> list[Rings]:
+    """One polygon a segment: everything within `CORRIDOR_M` of it, its round ends as half 16-gons."""
+    if len(lonlat) < 2:
+        raise InputError(f"{path}: a single point; an area needs a path or an outline")
+    angles = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    circle_m = CORRIDOR_M / np.cos(np.pi / 16) * np.column_stack([np.cos(angles), np.sin(angles)])
+    capsules: list[Rings] = []
+    for start, end in pairwise(lonlat):
+        frame = LocalFrame(Geodetic(float(start[1]), float((start[0] + 180) % 360 - 180)))
+        end_m = frame.site_from_wgs84(end[1], end[0], np.zeros(()))[:2]
+        outline_m = convex_hull(np.concatenate([circle_m, circle_m + end_m]))
+        latitude, longitude, _ = frame.wgs84_from_site(outline_m)
+        capsules.append((np.column_stack([longitude, latitude]),))
+    return capsules
