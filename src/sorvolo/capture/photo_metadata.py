@@ -1,0 +1,320 @@
+"""What a photo says of itself: size, camera, time, place and attitude from its EXIF and XMP."""
+
+import re
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from math import atan2, degrees, hypot, isfinite, nan
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from defusedxml import ElementTree
+from PIL import ExifTags, Image
+
+from sorvolo.errors import InputError
+from sorvolo.geometry.pose import gimbal_angles_from_rotation, site_from_body_nadir_rotation
+
+PIXEL_LIMIT = 300_000_000
+"""A larger picture is refused before it is decoded: a few kilobytes can claim gigabytes."""
+
+# Pillow's own guard stands at 89 megapixels and is a global by design; survey cameras make 150.
+Image.MAX_IMAGE_PIXELS = PIXEL_LIMIT
+
+BROKEN_PICTURE = (
+    OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError,
+    ZeroDivisionError, EOFError, RuntimeError, MemoryError, struct.error, Image.DecompressionBombError,
+)
+"""What Pillow raises, by accident or on purpose, on damaged files."""
+
+_Tags: TypeAlias = Mapping[int, Any]
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+# the EXIF FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre
+_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_M_S_PER_SPEED_UNIT = {"K": 1 / 3.6, "M": 0.44704, "N": 1852 / 3600}
+
+
+@dataclass(frozen=True)
+class PhotoMetadata:
+    """One photo's own words. Numbers are NaN, texts empty and times 0 where it says nothing.
+
+    `width_px` and `height_px` are as stored, before EXIF `orientation` (1-8) is applied. `utc_ns` is known to
+    be UTC; `local_ns` is the camera's clock, read as though it showed UTC. `full_width_px` is
+    the width that the camera wrote, to which `focal_plane_px_per_mm` belongs. `columns` are telemetry columns
+    (survey.flight.TELEMETRY_COLUMNS); `unreadable` names the parts (EXIF, XMP) that are there but damaged.
+    """
+
+    width_px: int
+    height_px: int
+    orientation: int = 1
+    make: str = ""
+    model: str = ""
+    focal_length_mm: float = nan
+    focal_length_35mm: float = nan
+    focal_plane_px_per_mm: float = nan
+    full_width_px: int = 0
+    utc_ns: int = 0
+    local_ns: int = 0
+    columns: Mapping[str, float] = field(default_factory=dict)
+    unreadable: tuple[str, ...] = ()
+
+    @property
+    def shown_size_px(self) -> tuple[int, int]:
+        """Width and height as every viewer shows the photo: after its orientation was applied."""
+        if self.orientation >= 5:
+            return self.height_px, self.width_px
+        return self.width_px, self.height_px
+
+
+def read_photo_metadata(path: Path) -> PhotoMetadata:
+    """Read a JPEG, TIFF or PNG's metadata without decoding its pixels.
+
+    Raises InputError when the file is no picture at all; damaged EXIF or XMP is named in `unreadable`.
+    """
+    try:
+        with Image.open(path) as picture:
+            (width_px, height_px), mode = picture.size, picture.mode
+            tags, unreadable = _exif_of(picture)
+            xmp = picture.info.get("xmp") or picture.info.get("XML:com.adobe.xmp") or b""
+    except BROKEN_PICTURE as error:
+        raise InputError(f"{path.name} is not a readable picture ({error}); copy it again") from error
+    if width_px * height_px > PIXEL_LIMIT:
+        raise InputError(
+            f"{path.name} claims {width_px}x{height_px} pixels; "
+            f"at most {PIXEL_LIMIT // 1_000_000} megapixels are read"
+        )
+    if mode == "F":
+        raise InputError(f"{path.name} holds floating-point numbers (an elevation map?), not a photo")
+    properties: dict[str, str] = {}
+    if xmp:
+        try:
+            properties = _xmp_properties(xmp if isinstance(xmp, bytes) else str(xmp).encode())
+        except (ElementTree.ParseError, ValueError, RecursionError):
+            unreadable = (*unreadable, "XMP")
+    main, detail, gps = tags
+    return PhotoMetadata(
+        width_px, height_px, _orientation(main), _text(main.get(ExifTags.Base.Make)),
+        _text(main.get(ExifTags.Base.Model)), _positive(detail.get(ExifTags.Base.FocalLength)),
+        _positive(detail.get(ExifTags.Base.FocalLengthIn35mmFilm)), _focal_plane_px_per_mm(detail),
+        _whole(detail.get(ExifTags.Base.ExifImageWidth)), _utc_ns(main, detail, gps, properties),
+        _camera_clock_ns(main, detail), _telemetry_columns(gps, properties), unreadable,
+    )
+
+
+def _exif_of(picture: Image.Image) -> tuple[tuple[_Tags, _Tags, _Tags], tuple[str, ...]]:
+    """The main, Exif and GPS directories as plain dicts; what is damaged comes back empty and is named."""
+    empty: _Tags = {}
+    try:
+        exif = picture.getexif()
+        main = dict(exif)
+    except BROKEN_PICTURE:
+        return (empty, empty, empty), ("EXIF",)
+    directories: list[_Tags] = []
+    damaged = False
+    for pointer in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo):
+        try:
+            directories.append(dict(exif.get_ifd(pointer)))
+        except BROKEN_PICTURE:
+            directories.append(empty)
+            damaged = True
+    return (main, directories[0], directories[1]), ("EXIF",) if damaged else ()
+
+
+def _number(value: Any) -> float:
+    """A finite float of an EXIF rational, or NaN; a zero denominator is NaN."""
+    if isinstance(value, (tuple, list)) and len(value) == 1:
+        value = value[0]
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return nan
+    return number if isfinite(number) else nan
+
+
+def _positive(value: Any) -> float:
+    number = _number(value)
+    return number if number > 0 else nan
+
+
+def _whole(value: Any) -> int:
+    number = _number(value)
+    return int(number) if 0 < number < 1e6 else 0
+
+
+def _text(value: Any) -> str:
+    """Text without the NULs and blanks that cameras pad it with."""
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", "replace")
+    return value.split("\0")[0].strip() if isinstance(value, str) else ""
+
+
+def _orientation(main: _Tags) -> int:
+    orientation = _whole(main.get(ExifTags.Base.Orientation))
+    return orientation if 1 <= orientation <= 8 else 1
+
+
+def _focal_plane_px_per_mm(detail: _Tags) -> float:
+    unit = _whole(detail.get(ExifTags.Base.FocalPlaneResolutionUnit)) or 2
+    return _positive(detail.get(ExifTags.Base.FocalPlaneXResolution)) / _MM_PER_UNIT.get(unit, nan)
+
+
+def _parse_ns(text: str, pattern: str) -> int:
+    """Nanoseconds since 1970 of a date as written, read as UTC; 0 for none and before 1990."""
+    try:
+        moment = datetime.strptime(text, pattern).replace(tzinfo=UTC)
+    except ValueError:
+        return 0
+    return (moment - _EPOCH) // timedelta(microseconds=1) * 1000 if moment.year >= 1990 else 0
+
+
+def _camera_clock_ns(main: _Tags, detail: _Tags) -> int:
+    """The camera's clock with its parts of a second, read as though it showed UTC."""
+    for tag, fraction_tag in (
+        (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal),
+        (ExifTags.Base.DateTimeDigitized, ExifTags.Base.SubsecTimeDigitized),
+        (ExifTags.Base.DateTime, ExifTags.Base.SubsecTime),
+    ):
+        text = _text(detail.get(tag) or main.get(tag)).replace("-", ":").replace("T", " ")
+        if time_ns := _parse_ns(text[:19], "%Y:%m:%d %H:%M:%S"):
+            fraction = re.match(r"\d{1,9}", _text(detail.get(fraction_tag)))
+            return time_ns + (int(fraction[0].ljust(9, "0")) if fraction else 0)
+    return 0
+
+
+def _utc_ns(main: _Tags, detail: _Tags, gps: _Tags, properties: Mapping[str, str]) -> int:
+    """UTC of the exposure: the drone's stamp, else the GPS receiver's, else a clock with its zone; else 0."""
+    written = properties.get("dji:UTCAtExposure", "").replace("-", ":").replace("T", " ").rstrip("Z")
+    if time_ns := _parse_ns(written if "." in written else f"{written}.0", "%Y:%m:%d %H:%M:%S.%f"):
+        return time_ns
+    day_ns = _parse_ns(_text(gps.get(ExifTags.GPS.GPSDateStamp)).replace("-", ":"), "%Y:%m:%d")
+    clock = gps.get(ExifTags.GPS.GPSTimeStamp)
+    if day_ns and isinstance(clock, (tuple, list)) and len(clock) == 3:
+        hours, minutes, seconds = (_number(part) for part in clock)
+        since_midnight_s = hours * 3600 + minutes * 60 + seconds
+        if 0 <= since_midnight_s <= 86_401:
+            return day_ns + round(since_midnight_s * 1000) * 1_000_000
+    offset = _text(detail.get(ExifTags.Base.OffsetTimeOriginal) or detail.get(ExifTags.Base.OffsetTime))
+    zone = re.fullmatch(r"([+-])(\d\d):?(\d\d)", offset)
+    clock_ns = _camera_clock_ns(main, detail)
+    if clock_ns and (zone or offset == "Z"):
+        minutes_east = (int(zone[2]) * 60 + int(zone[3])) * (-1 if zone[1] == "-" else 1) if zone else 0
+        return clock_ns - minutes_east * 60 * 1_000_000_000
+    return 0
+
+
+def _telemetry_columns(gps: _Tags, properties: Mapping[str, str]) -> dict[str, float]:
+    columns = {
+        "latitude_deg": _degrees(gps.get(ExifTags.GPS.GPSLatitude), gps.get(ExifTags.GPS.GPSLatitudeRef)),
+        "longitude_deg": _degrees(gps.get(ExifTags.GPS.GPSLongitude), gps.get(ExifTags.GPS.GPSLongitudeRef)),
+        "horizontal_sigma_m": _positive(gps.get(ExifTags.GPS.GPSHPositioningError)),
+        "course_deg": _number(gps.get(ExifTags.GPS.GPSTrack)),
+        "speed_m_s": _number(gps.get(ExifTags.GPS.GPSSpeed))
+        * _M_S_PER_SPEED_UNIT.get(_text(gps.get(ExifTags.GPS.GPSSpeedRef)) or "K", nan),
+        **_height_columns(gps, properties),
+    }
+    columns |= {name: value for name, value in _xmp_columns(properties).items() if isfinite(value)}
+    if not (isfinite(columns["latitude_deg"]) and isfinite(columns["longitude_deg"])):
+        columns["latitude_deg"] = _xmp_number(properties, "dji:GpsLatitude")
+        # DJI's firmware spells it "GpsLongtitude" as often as not
+        columns["longitude_deg"] = _first_number(properties, "dji:GpsLongitude", "dji:GpsLongtitude")
+    if not (abs(columns["latitude_deg"]) <= 90 and abs(columns["longitude_deg"]) <= 180):
+        columns["latitude_deg"] = columns["longitude_deg"] = nan
+    return {name: value for name, value in columns.items() if isfinite(value)}
+
+
+def _degrees(parts: Any, reference: Any) -> float:
+    """Signed degrees of degrees, minutes, seconds and N, S, E or W; NaN if any part is missing."""
+    numbers = [_number(part) for part in parts] if isinstance(parts, (tuple, list)) else [_number(parts)]
+    if not 1 <= len(numbers) <= 3:
+        return nan
+    angle_deg = sum(number / 60**power for power, number in enumerate(numbers))
+    return -angle_deg if _text(reference).upper() in ("S", "W") else angle_deg
+
+
+def _height_columns(gps: _Tags, properties: Mapping[str, str]) -> dict[str, float]:
+    """EXIF's altitude by its reference: 0 above, 1 below the sea; 2 above, 3 below the ellipsoid (EXIF 3.0).
+
+    DJI's RTK drones write ellipsoidal heights there and say so in XMP only.
+    """
+    altitude_m = _number(gps.get(ExifTags.GPS.GPSAltitude))
+    if not isfinite(altitude_m):
+        altitude_m = _xmp_number(properties, "dji:AbsoluteAltitude")
+    reference = gps.get(ExifTags.GPS.GPSAltitudeRef, 0)
+    if isinstance(reference, (bytes, str)):
+        reference = reference[0] if reference else 0
+        reference = ord(reference) if isinstance(reference, str) else reference
+    code = int(_number(reference)) if isfinite(_number(reference)) else 0
+    code = code - ord("0") if code >= ord("0") else code
+    if code in (1, 3):
+        altitude_m = -abs(altitude_m)
+    is_ellipsoidal = code in (2, 3) or properties.get("dji:AltitudeType", "").lower() == "rtkalt"
+    return {"ellipsoidal_height_m" if is_ellipsoidal else "orthometric_height_m": altitude_m}
+
+
+def _xmp_properties(xmp: bytes) -> dict[str, str]:
+    """Every DJI, Parrot and Pix4D ("Camera:") property of an XMP packet, attribute or element, by short name.
+
+    Raises ValueError or ParseError for damaged XML, and for entities, which no camera writes.
+    """
+    properties: dict[str, str] = {}
+    for element in ElementTree.fromstring(xmp.strip(b"\0 \r\n\t")).iter():
+        content = " ".join("".join(element.itertext()).split())
+        for qualified, value in [*element.attrib.items(), (element.tag, content)]:
+            space, _, name = str(qualified).lstrip("{").rpartition("}")
+            for marker, prefix in (("drone-dji", "dji"), ("dji.com", "dji"), ("parrot.com/drone", "parrot"),
+                                   ("pix4d.com/camera", "camera")):
+                if marker in space and value:
+                    properties.setdefault(f"{prefix}:{name}", str(value))
+    return properties
+
+
+def _xmp_columns(properties: Mapping[str, str]) -> dict[str, float]:
+    north_m_s = _xmp_number(properties, "dji:FlightXSpeed")
+    east_m_s = _xmp_number(properties, "dji:FlightYSpeed")
+    columns = {
+        "height_above_takeoff_m": _xmp_number(properties, "dji:RelativeAltitude"),
+        "camera_yaw_deg": _first_number(properties, "dji:GimbalYawDegree", "parrot:CameraYawDegree"),
+        "camera_pitch_deg": _first_number(properties, "dji:GimbalPitchDegree", "parrot:CameraPitchDegree"),
+        "camera_roll_deg": _first_number(properties, "dji:GimbalRollDegree", "parrot:CameraRollDegree"),
+        "body_yaw_deg": _first_number(properties, "dji:FlightYawDegree", "parrot:DroneYawDegree"),
+        "body_pitch_deg": _first_number(properties, "dji:FlightPitchDegree", "parrot:DronePitchDegree"),
+        "body_roll_deg": _first_number(properties, "dji:FlightRollDegree", "parrot:DroneRollDegree"),
+        "speed_m_s": hypot(north_m_s, east_m_s),
+        "course_deg": degrees(atan2(east_m_s, north_m_s)) % 360 if north_m_s or east_m_s else nan,
+        "horizontal_sigma_m": _xmp_number(properties, "camera:GPSXYAccuracy"),
+        "vertical_sigma_m": _xmp_number(properties, "camera:GPSZAccuracy"),
+    }
+    rtk_east_m = _xmp_number(properties, "dji:RtkStdLon")
+    rtk_north_m = _xmp_number(properties, "dji:RtkStdLat")
+    if isfinite(rtk_east_m) and isfinite(rtk_north_m):
+        columns["horizontal_sigma_m"] = hypot(rtk_east_m, rtk_north_m) / 2**0.5
+        columns["vertical_sigma_m"] = _xmp_number(properties, "dji:RtkStdHgt")
+    for name in ("horizontal_sigma_m", "vertical_sigma_m"):
+        columns[name] = columns[name] if columns[name] > 0 else nan
+    if not isfinite(columns["camera_pitch_deg"]):
+        columns |= _pix4d_angles(properties)
+    return columns
+
+
+def _pix4d_angles(properties: Mapping[str, str]) -> dict[str, float]:
+    """senseFly's and Pix4D's Camera:Yaw, Pitch, Roll, which are 0 when looking down, as a gimbal's angles."""
+    yaw_deg, pitch_deg = _xmp_number(properties, "camera:Yaw"), _xmp_number(properties, "camera:Pitch")
+    roll_deg = _xmp_number(properties, "camera:Roll")
+    if not (isfinite(yaw_deg) and isfinite(pitch_deg) and isfinite(roll_deg)):
+        return {}
+    angles = gimbal_angles_from_rotation(site_from_body_nadir_rotation(yaw_deg, pitch_deg, roll_deg))
+    return dict(zip(("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg"), angles))
+
+
+def _first_number(properties: Mapping[str, str], *names: str) -> float:
+    return next((value for name in names if isfinite(value := _xmp_number(properties, name))), nan)
+
+
+def _xmp_number(properties: Mapping[str, str], name: str) -> float:
+    """The number of texts such as "+39.80" or "3980/100"; NaN otherwise."""
+    numerator, slash, denominator = properties.get(name, "").strip().partition("/")
+    number = _number(numerator)
+    if not slash:
+        return number
+    divisor = _number(denominator)
+    return number / divisor if divisor else nan

@@ -1,0 +1,352 @@
+"""A folder of photos as a flight: put in order of time, decoded ahead of the consumer, none lost silently."""
+
+import hashlib
+import re
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+from statistics import median_low
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from sorvolo.capture.photo_metadata import BROKEN_PICTURE, PhotoMetadata, read_photo_metadata
+from sorvolo.capture.telemetry.quality import clean, notice
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry
+
+PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".png"})
+
+_LOOK_AHEAD = 2
+_STEP_NS = 1_000_000  # between photos of the same second
+_UNTIMED_STEP_NS = 1_000_000_000
+_SAME_ASPECT = 0.01
+_QUARTER_TURN = 6  # EXIF's number for clockwise
+_EDGE_BYTES = 65_536
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One photo in its flight's order. `problem` says why it cannot be used, if known without decoding."""
+
+    path: Path
+    time_ns: int
+    metadata: PhotoMetadata
+    problem: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Album:
+    """The photos of one flight in order of time, all times different, at the size that most of them have.
+
+    `typical` is the metadata of the first photo of that size; `start_ns` is 0 where no photo knows its time.
+    """
+
+    photos: tuple[Photo, ...]
+    width_px: int
+    height_px: int
+    typical: PhotoMetadata
+    telemetry: Telemetry
+    start_ns: int
+    start_origin: str
+    notices: tuple[Notice, ...]
+
+
+class PhotoSource:
+    """A flight's photos as frames; fulfils `capture.source.Source`."""
+
+    kind = "photos"
+    frame_rate_hz = float("nan")
+
+    def __init__(
+        self, name: str, fingerprint: str, album: Album, camera: CameraModel, telemetry: Telemetry,
+        notices: Sequence[Notice] = (),
+    ) -> None:
+        self.name, self.fingerprint, self.album = name, fingerprint, album
+        self.camera, self.telemetry = camera, telemetry
+        self.inputs = tuple(photo.path.name for photo in album.photos)
+        self.frame_count = len(album.photos)
+        self.start_ns, self.start_origin = album.start_ns, album.start_origin
+        self._notices = (*album.notices, *notices)
+        self._corrupt: set[int] = set()
+
+    def notices(self) -> tuple[Notice, ...]:
+        """What was found so far; complete when `frames` is exhausted."""
+        found = notice("corrupt_photo", len(self._corrupt), "{} photos are damaged and could not be decoded")
+        return (*self._notices, *found)
+
+    def frames(self, wanted: Callable[[int, int], bool]) -> Iterator[Frame | LostFrame]:
+        """Decode the wanted photos in order, up to two ahead of the consumer in a thread of their own.
+
+        `wanted(index, time_ns)` is asked before a photo is decoded, hence up to two photos ahead as well.
+        """
+        pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photos")
+        pending: deque[Future[Frame | LostFrame]] = deque()
+        try:
+            for index, photo in enumerate(self.album.photos):
+                if wanted(index, photo.time_ns):
+                    pending.append(pool.submit(self._decode, index, photo))
+                if len(pending) > _LOOK_AHEAD:
+                    yield self._counted(pending.popleft().result())
+            while pending:
+                yield self._counted(pending.popleft().result())
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+    def _counted(self, frame: Frame | LostFrame) -> Frame | LostFrame:
+        if isinstance(frame, LostFrame) and not self.album.photos[frame.index].problem:
+            self._corrupt.add(frame.index)
+        return frame
+
+    def _decode(self, index: int, photo: Photo) -> Frame | LostFrame:
+        if photo.problem:
+            return LostFrame(index, photo.path.name, photo.time_ns, photo.problem)
+        try:
+            image = decode_photo(photo.path.read_bytes(), photo.path.name)
+            fitted = _fit(image, photo.metadata.orientation, self.album.width_px, self.album.height_px)
+        except (InputError, OSError) as error:
+            return LostFrame(index, photo.path.name, photo.time_ns, f"corrupt: {error}")
+        return Frame(index, photo.path.name, photo.time_ns, fitted)
+
+
+def decode_photo(data: bytes, name: str) -> ImageRGB:
+    """Pixels of a JPEG, TIFF or PNG as stored (EXIF orientation not applied), 8 bits, RGB.
+
+    Deeper, gray, CMYK and transparent ones are converted. Raises InputError when it is damaged or cut.
+    """
+    # OpenCV needs half of Pillow's time and, since version 5, refuses cut files too; Pillow knows more TIFFs.
+    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    except cv2.error:
+        image = None
+    if image is not None and image.dtype == np.uint8:
+        return np.asarray(image)
+    try:
+        with Image.open(BytesIO(data)) as picture:
+            if picture.mode in ("I", "F", "I;16", "I;16B", "I;16L"):
+                gray = np.clip(np.asarray(picture).astype(np.float64) / 257, 0, 255).astype(np.uint8)
+                return np.repeat(gray[:, :, None], 3, axis=2)
+            return np.array(picture.convert("RGB"))
+    except BROKEN_PICTURE as error:
+        raise InputError(f"{name} is damaged or cut ({error})") from error
+
+
+def read_album(paths: Sequence[Path]) -> Album:
+    """Read every photo's metadata and put the photos in order of time; takes milliseconds a photo.
+
+    Raises InputError when none of the files is a readable picture.
+    """
+    found = [_read(path) for path in sorted(paths, key=lambda path: _natural(path.name))]
+    if all(photo.problem for photo in found):
+        raise InputError(
+            f"none of the {len(found)} pictures can be read (first: {found[0].problem}); "
+            "copy them again from the camera"
+        )
+    timed, start_origin, time_notices = _put_in_time(found)
+    distinct = _mark_duplicates(timed)
+    width_px, height_px = _usual_size(distinct)
+    photos = [_check_size(photo, width_px, height_px) for photo in distinct]
+    typical = next(
+        photo.metadata for photo in photos
+        if not photo.problem and photo.metadata.shown_size_px == (width_px, height_px)
+    )
+    telemetry, gps_notices = _telemetry_of(photos)
+    return Album(
+        tuple(photos), width_px, height_px, typical, telemetry,
+        0 if start_origin.startswith("unknown") else photos[0].time_ns, start_origin,
+        (*time_notices, *gps_notices, *_picture_notices(photos, width_px, height_px)),
+    )
+
+
+def _read(path: Path) -> Photo:
+    try:
+        return Photo(path, 0, read_photo_metadata(path))
+    except InputError as error:
+        return Photo(path, 0, PhotoMetadata(0, 0), f"corrupt: {error}")
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """A sort key under which IMG_2 comes before IMG_10."""
+    return [
+        (0, int(part), "") if part.isdecimal() else (1, 0, part)
+        for part in re.split(r"(\d+)", name.lower()) if part
+    ]
+
+
+def _put_in_time(photos: Sequence[Photo]) -> tuple[list[Photo], str, list[Notice]]:
+    """Sort photos, given by name, by strictly increasing times; and say where the times come from."""
+    times_ns, origin, notices = _best_times(photos)
+    known = [time_ns for time_ns in times_ns if time_ns]
+    if known:
+        # a photo without a time stands behind its neighbour by name
+        previous = known[0]
+        for index, time_ns in enumerate(times_ns):
+            previous = times_ns[index] = time_ns or previous
+    else:
+        times_ns = [index * _UNTIMED_STEP_NS for index in range(len(photos))]
+    ordered = sorted(zip(times_ns, range(len(photos))))
+    timed: list[Photo] = []
+    for time_ns, index in ordered:
+        earliest = timed[-1].time_ns + _STEP_NS if timed else time_ns
+        timed.append(replace(photos[index], time_ns=max(time_ns, earliest)))
+    return timed, origin, notices
+
+
+def _best_times(photos: Sequence[Photo]) -> tuple[list[int], str, list[Notice]]:
+    """Each photo's UTC, 0 where unknown.
+
+    EXIF's GPS time is that of the receiver's fix: where it stands still from photo to photo and the camera's
+    clock does not, the clock is used, set by the median of its difference to the GPS.
+    """
+    utc_ns = [photo.metadata.utc_ns for photo in photos]
+    local_ns = [photo.metadata.local_ns for photo in photos]
+    untimed = notice(
+        "photo_without_time", sum(1 for utc, local in zip(utc_ns, local_ns) if not (utc or local)),
+        "{} photos have no time and are placed by their names",
+    )
+    offsets_ns = [utc - local for utc, local in zip(utc_ns, local_ns) if utc and local]
+    if offsets_ns:
+        offset_ns = median_low(offsets_ns)
+        stands_still = any(
+            utc == next_utc != 0 and 0 != local != next_local != 0
+            for (utc, local), (next_utc, next_local) in pairwise(zip(utc_ns, local_ns))
+        )
+        times_ns = [
+            local + offset_ns if local and (stands_still or not utc) else utc
+            for utc, local in zip(utc_ns, local_ns)
+        ]
+        clock = "the camera's clock, set by the photos' GPS time"
+        return times_ns, clock if stands_still else "UTC in the photos' EXIF", untimed
+    if any(utc_ns):
+        return utc_ns, "UTC in the photos' EXIF", untimed
+    if any(local_ns):
+        origin = "EXIF time of the camera's clock, its time zone unknown and taken as UTC"
+        zone = notice(
+            "time_zone_unknown", sum(map(bool, local_ns)),
+            "{} photos give the camera's clock without a time zone; it is taken as UTC",
+        )
+        return local_ns, origin, [*zone, *untimed]
+    return utc_ns, "unknown: no photo has a time; they are taken to be one second apart, by name", untimed
+
+
+def _mark_duplicates(photos: Sequence[Photo]) -> list[Photo]:
+    """Mark photos whose bytes equal an earlier one's; only files of equal size and ends are read in full."""
+    sizes = Counter(photo.path.stat().st_size for photo in photos)
+    ends: Counter[tuple[int, bytes]] = Counter()
+    keys: dict[Path, tuple[int, bytes]] = {}
+    for photo in photos:
+        size = photo.path.stat().st_size
+        if sizes[size] > 1 and not photo.problem:
+            keys[photo.path] = (size, _digest_of_ends(photo.path, size))
+            ends[keys[photo.path]] += 1
+    first_of: dict[bytes, str] = {}
+    marked: list[Photo] = []
+    for photo in photos:
+        if ends[keys.get(photo.path, (0, b""))] > 1:
+            digest = hashlib.sha256(photo.path.read_bytes()).digest()
+            original = first_of.setdefault(digest, photo.path.name)
+            if original != photo.path.name:
+                photo = replace(photo, problem=f"duplicate of {original}")
+        marked.append(photo)
+    return marked
+
+
+def _digest_of_ends(path: Path, size: int) -> bytes:
+    with path.open("rb") as file:
+        head = file.read(_EDGE_BYTES)
+        file.seek(max(0, size - _EDGE_BYTES))
+        return hashlib.sha256(head + file.read(_EDGE_BYTES)).digest()
+
+
+def _usual_size(photos: Sequence[Photo]) -> tuple[int, int]:
+    """Width and height that most usable photos have as shown; of equally many the larger."""
+    sizes = Counter(photo.metadata.shown_size_px for photo in photos if not photo.problem)
+    return max(sizes, key=lambda size: (sizes[size], size[0] * size[1], size))
+
+
+def _check_size(photo: Photo, width_px: int, height_px: int) -> Photo:
+    own_width, own_height = photo.metadata.shown_size_px
+    if photo.problem or (own_height, own_width) == (width_px, height_px):
+        return photo
+    if abs(own_width * height_px / (own_height * width_px) - 1) <= _SAME_ASPECT:
+        return photo
+    return replace(
+        photo, problem=f"size {own_width}x{own_height} differs from the flight's {width_px}x{height_px}"
+    )
+
+
+def _fit(image: ImageRGB, orientation: int, width_px: int, height_px: int) -> ImageRGB:
+    """Apply the EXIF orientation, then turn or resample to the flight's size, which is known to fit."""
+    size_px = (width_px, height_px)
+    shown = _turn(image, orientation)
+    if shown.shape[1::-1] == (height_px, width_px) != size_px:
+        # a camera that looks straight down cannot feel what is up: its orientation tag may be wrong
+        shown = image if image.shape[1::-1] == size_px else _turn(shown, _QUARTER_TURN)
+    if shown.shape[1::-1] != size_px:
+        return np.asarray(cv2.resize(shown, size_px, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return np.ascontiguousarray(shown, dtype=np.uint8)
+
+
+def _turn(image: ImageRGB, orientation: int) -> ImageRGB:
+    """The picture as EXIF's orientation 1-8 wants it shown."""
+    if orientation >= 5:
+        image = image.transpose(1, 0, 2)
+    if orientation in (2, 3, 6, 7):
+        image = image[:, ::-1]
+    if orientation in (3, 4, 7, 8):
+        image = image[::-1]
+    return image
+
+
+def _telemetry_of(photos: Sequence[Photo]) -> tuple[Telemetry, list[Notice]]:
+    """One sample a photo that has a GPS position and is no duplicate, at exactly the photo's time."""
+    readable = [
+        photo for photo in photos if photo.metadata.width_px and not photo.problem.startswith("duplicate")
+    ]
+    placed = [photo for photo in readable if "latitude_deg" in photo.metadata.columns]
+    missing = notice("photo_without_gps", len(readable) - len(placed), "{} photos have no GPS position")
+    if not placed:
+        return no_telemetry(), missing
+    names = {name for photo in placed for name in photo.metadata.columns}
+    columns = {name: [photo.metadata.columns.get(name, np.nan) for photo in placed] for name in names}
+    cleaned = clean("exif", placed[0].path.parent.name, [photo.time_ns for photo in placed], columns)
+    located = np.isfinite(cleaned["latitude_deg"])
+    if not located.any():
+        return no_telemetry(), [*missing, *cleaned.notices]
+    telemetry = Telemetry(
+        "exif", cleaned.time_ns[located], {name: cleaned[name][located] for name in names},
+        notices=(*missing, *cleaned.notices),
+    )
+    return telemetry, []
+
+
+def _picture_notices(photos: Sequence[Photo], width_px: int, height_px: int) -> list[Notice]:
+    used = [photo.metadata for photo in photos if not photo.problem]
+    other = [metadata for metadata in used if metadata.shown_size_px != (width_px, height_px)]
+    turned = [metadata for metadata in other if metadata.shown_size_px == (height_px, width_px)]
+    cameras = {(metadata.make, metadata.model) for metadata in used}
+    focal_mm = {metadata.focal_length_mm for metadata in used if metadata.focal_length_mm > 0}
+    return [
+        *notice("duplicate_photo", sum(photo.problem.startswith("duplicate") for photo in photos),
+                "{} photos are exact copies of others and are not used twice"),
+        *notice("unreadable_photo", sum(not photo.metadata.width_px for photo in photos),
+                "{} files are named like pictures but cannot be read"),
+        *notice("other_size", sum(photo.problem.startswith("size") for photo in photos),
+                f"{{}} photos have another shape than the flight's {width_px}x{height_px} and are not used"),
+        *notice("rotated_photo", len(turned), "{} photos lay across the others and were turned by 90 deg"),
+        *notice("resized_photo", len(other) - len(turned),
+                f"{{}} photos of another size were resampled to {width_px}x{height_px}"),
+        *notice("unreadable_metadata", sum(bool(metadata.unreadable) for metadata in used),
+                "{} photos have damaged EXIF or XMP, which is not used"),
+        *notice("mixed_cameras", len(cameras) if len(cameras) > 1 else 0,
+                "the photos come from {} different cameras, but are mapped as if from one"),
+        *notice("zoom", len(focal_mm) if len(focal_mm) > 1 else 0,
+                "the photos were taken at {} different focal lengths, but are mapped as if at one"),
+    ]

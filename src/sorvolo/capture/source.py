@@ -1,0 +1,241 @@
+"""Inputs as flights: what a mission receives for each video, folder of photos or set of photos."""
+
+import hashlib
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from sorvolo.capture.calibration import camera_from_option, guess_camera
+from sorvolo.capture.photo_metadata import PhotoMetadata
+from sorvolo.capture.photos import PHOTO_SUFFIXES, PhotoSource, read_album
+from sorvolo.capture.telemetry import find_telemetry_beside, read_telemetry
+from sorvolo.capture.telemetry.quality import notice
+from sorvolo.capture.video import VIDEO_SUFFIXES, VideoInfo, VideoSource, read_video_info
+from sorvolo.errors import InputError
+from sorvolo.geometry.camera import Camera
+from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry
+
+_EDGE_BYTES = 65_536
+
+
+class Source(Protocol):
+    """One flight's frames and telemetry, wherever they come from."""
+
+    @property
+    def name(self) -> str:
+        """The flight's name, safe as a folder's."""
+
+    @property
+    def kind(self) -> str:
+        """What the frames come from: "video" or "photos"."""
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """File names, for the report."""
+
+    @property
+    def fingerprint(self) -> str:
+        """The same for the same input, another for another: names, sizes and ends of all files."""
+
+    @property
+    def camera(self) -> CameraModel:
+        """The camera of the frames as delivered."""
+
+    @property
+    def telemetry(self) -> Telemetry:
+        """The flight's telemetry; `no_telemetry()` when there is none."""
+
+    @property
+    def frame_count(self) -> int:
+        """How many frames to expect; an estimate for videos."""
+
+    @property
+    def frame_rate_hz(self) -> float:
+        """Frames a second; NaN for photos."""
+
+    @property
+    def start_ns(self) -> int:
+        """UTC of the first frame as the input says; 0 if unknown."""
+
+    @property
+    def start_origin(self) -> str:
+        """Where `start_ns` comes from, in words."""
+
+    def notices(self) -> tuple[Notice, ...]:
+        """What was found so far and survived; complete when `frames` is exhausted. Telemetry has its own."""
+
+    def frames(self, wanted: Callable[[int, int], bool]) -> Iterator[Frame | LostFrame]:
+        """The frames, in order, for which `wanted(index, time_ns)`, asked before the costly part, is true."""
+
+
+def open_sources(
+    inputs: Sequence[Path], telemetry: Path | None = None, camera: Path | str | None = None
+) -> list[Source]:
+    """Each video, each folder of photos, and all photos given one by one together, as a flight.
+
+    `telemetry` belongs to the only flight; without it, a video's is looked for beside it and photos' is in
+    them. `camera` is a calibration file or what else `--camera` takes (capture.calibration). Raises
+    InputError for what cannot be read, naming the file and what to do.
+    """
+    if not inputs:
+        raise InputError("no input; give a video file, a folder of photos, or photos")
+    videos, albums = _sort_inputs(inputs)
+    names = _distinct_names([*(path.resolve() for path in videos), *(album.place for album in albums)])
+    if telemetry is not None and len(names) > 1:
+        raise InputError(
+            f"one telemetry file for {len(names)} flights; map the flights one by one, or put each telemetry "
+            "file beside its video under the same name"
+        )
+    sources: list[Source] = [
+        _open_video(path, name, telemetry, camera) for path, name in zip(videos, names)
+    ]
+    sources += [
+        _open_photos(album, name, telemetry, camera) for album, name in zip(albums, names[len(videos):])
+    ]
+    return sources
+
+
+def safe_name(text: str) -> str:
+    """The text with all but letters, digits, dot, dash and underscore replaced, never empty nor hidden."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", text).strip("._") or "flight"
+
+
+@dataclass(frozen=True)
+class _AlbumInput:
+    """The photos of one flight; `place`, a folder or photo, names it; `others` counts its other files."""
+
+    place: Path
+    photos: Sequence[Path]
+    others: int = 0
+
+
+def _sort_inputs(inputs: Sequence[Path]) -> tuple[list[Path], list[_AlbumInput]]:
+    """The videos and the albums among the inputs."""
+    videos: list[Path] = []
+    albums: list[_AlbumInput] = []
+    single: list[Path] = []
+    for path in dict.fromkeys(inputs):
+        if not path.exists():
+            raise InputError(f"no such file or folder: {path}")
+        if not path.is_dir():
+            (single if path.suffix.lower() in PHOTO_SUFFIXES else videos).append(path)
+            continue
+        inside = [each for each in sorted(path.iterdir()) if each.is_file() and each.name[0] != "."]
+        photos = [each for each in inside if each.suffix.lower() in PHOTO_SUFFIXES]
+        films = [each for each in inside if each.suffix.lower() in VIDEO_SUFFIXES]
+        if photos:
+            albums.append(_AlbumInput(path.resolve(), photos, len(inside) - len(photos)))
+        elif films:
+            videos += films
+        else:
+            raise InputError(_nothing_in(path, len(inside)))
+    if single:
+        place = single[0].resolve() if len(single) == 1 else single[0].resolve().parent
+        albums.append(_AlbumInput(place, single))
+    return videos, albums
+
+
+def _nothing_in(folder: Path, files: int) -> str:
+    folders = sorted(each.name for each in folder.iterdir() if each.is_dir() and each.name[0] != ".")
+    hint = f"; it has folders: name the one with the pictures ({', '.join(folders[:5])})" if folders else ""
+    wanted = ", ".join(sorted(PHOTO_SUFFIXES))
+    return f"{folder} holds no pictures or videos among {files} files ({wanted} are pictures){hint}"
+
+
+def _distinct_names(places: Sequence[Path]) -> list[str]:
+    """Each flight's name; with the folder before it where two are the same: cards are numbered anew."""
+    names = [safe_name(place.name if place.is_dir() else place.stem) for place in places]
+    names = [
+        safe_name(f"{place.parent.name}_{name}") if names.count(name) > 1 else name
+        for name, place in zip(names, places)
+    ]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"two flights would be named {twice[0]}; rename one, or map them one by one")
+    return names
+
+
+def _open_video(path: Path, name: str, telemetry: Path | None, camera: Path | str | None) -> VideoSource:
+    info = read_video_info(path)
+    found, telemetry_path, notices = _video_telemetry(path, telemetry)
+    if camera is None:
+        model = _video_camera(info)
+    else:
+        model = camera_from_option(str(camera), info.width_px, info.height_px)
+    fingerprint = _fingerprint([path], telemetry_path, camera)
+    return VideoSource(name, fingerprint, info, model, found, notices)
+
+
+def _open_photos(
+    source: _AlbumInput, name: str, telemetry: Path | None, camera: Path | str | None
+) -> PhotoSource:
+    album = read_album(source.photos)
+    if camera is None:
+        model = _guess(album.width_px, album.height_px, album.typical)
+    else:
+        model = camera_from_option(str(camera), album.width_px, album.height_px)
+    found = album.telemetry if telemetry is None else read_telemetry(telemetry)
+    ignored = notice("ignored_file", source.others, "{} files in the folder are no photos and were ignored")
+    fingerprint = _fingerprint(source.photos, telemetry, camera)
+    return PhotoSource(name, fingerprint, album, model, found, ignored)
+
+
+def _video_telemetry(
+    video: Path, telemetry: Path | None
+) -> tuple[Telemetry, Path | None, list[Notice]]:
+    """The telemetry, its file, and what to tell; only a file that was asked for must be readable."""
+    if telemetry is not None:
+        return read_telemetry(telemetry), telemetry, []
+    beside = find_telemetry_beside(video)
+    if beside is None:
+        return no_telemetry(), None, []
+    try:
+        return read_telemetry(beside), beside, []
+    except InputError as error:
+        text = f"the telemetry file beside the video cannot be used: {error}"
+        return no_telemetry(), None, [Notice("unusable_telemetry", 1, text)]
+
+
+def _video_camera(info: VideoInfo) -> CameraModel:
+    # pixels that are not square: the guess is made for the picture as shown
+    shown_width_px = max(1, round(info.width_px * info.pixel_aspect))
+    words = PhotoMetadata(0, 0, make=info.make, model=info.model)
+    model = _guess(shown_width_px, info.height_px, words)
+    return CameraModel(model.camera.resized(info.width_px, info.height_px), model.origin, model.focal_sigma)
+
+
+def _guess(width_px: int, height_px: int, words: PhotoMetadata) -> CameraModel:
+    """The guess for pictures that may stand on their side: sensors lie, so it is made for the longer side."""
+    model = guess_camera(
+        max(width_px, height_px), min(width_px, height_px), make=words.make, model=words.model,
+        focal_length_mm=words.focal_length_mm, focal_length_35mm=words.focal_length_35mm,
+        focal_plane_px_per_mm=words.focal_plane_px_per_mm, full_width_px=words.full_width_px,
+    )
+    lying = model.camera
+    if width_px >= height_px:
+        return model
+    k1, k2, p1, p2, k3 = lying.distortion
+    standing = Camera(
+        width_px, height_px, lying.fy_px, lying.fx_px, lying.cy_px, lying.cx_px,
+        np.array([k1, k2, p2, p1, k3]),
+    )
+    return CameraModel(standing, model.origin, model.focal_sigma)
+
+
+def _fingerprint(inputs: Sequence[Path], telemetry: Path | None, camera: Path | str | None) -> str:
+    digest = hashlib.sha256()
+    option = Path(camera) if camera is not None else None
+    extra = [path for path in (telemetry, option) if path is not None and path.is_file()]
+    for path in [*sorted(inputs), *extra]:
+        size = path.stat().st_size
+        digest.update(f"{path.name}\0{size}\0".encode())
+        with path.open("rb") as file:
+            digest.update(file.read(_EDGE_BYTES))
+            file.seek(max(0, size - _EDGE_BYTES))
+            digest.update(file.read(_EDGE_BYTES))
+    if option is not None and not option.is_file():
+        digest.update(str(option).encode())
+    return digest.hexdigest()
