@@ -1,0 +1,427 @@
+"""The canvas: which frame shows each piece of ground, and the tiles painted from them.
+
+Every pixel is a function of the frames over it alone, not of the order in which they came. The ground is divided
+into cells of 8 x 8 grid pixels; each cell remembers the frame that shows it best. A new or moved frame changes the
+winners of some cells, and only the ground around those is rendered again, from the original images.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, MutableMapping
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.errors import GeometryError, SettingsError
+from sorvolo.geometry.arrays import Floats, ImageRGB, ImageRGBA, Mask, Matrix3, PointsPx, frozen
+from sorvolo.geometry.grid import Grid, TileIndex
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.mosaic.blending import (
+    ALIGN_PX,
+    LAYER_APRON_PX,
+    WINDOW_APRON_PX,
+    Labels,
+    Layer,
+    blend,
+    fill_invalid,
+    winners_from_shares,
+)
+from sorvolo.mosaic.exposure import corrected
+
+_CELL_PX = 8
+_CHUNK_CELLS = 64
+_NOBODY = -1
+# A changed winner is felt as far as the bands spread (62 px) and its outline is smoothed (2 cells) around it.
+_REACH_CELLS = 10
+
+
+@dataclass(frozen=True)
+class CanvasSettings:
+    """When a frame is painted again, and how much is rendered at once."""
+
+    moved_px: float = 0.5  # a smaller move of all corners cannot be seen
+    gain_step: float = 0.01  # a smaller change of gain is below one gray level in the mid-tones
+    window_px: int = 1024  # longest side of a piece rendered at once: bounds the memory
+
+    def __post_init__(self) -> None:
+        if self.moved_px < 0 or self.gain_step < 0 or self.window_px < 64:
+            raise SettingsError("canvas: moved_px and gain_step must not be negative, window_px at least 64")
+
+
+@dataclass(frozen=True, eq=False)
+class CanvasFrame:
+    """One keyframe as the canvas needs it.
+
+    `rank` is the order of its flight on the site: ground that an earlier flight covers stays that flight's.
+    `gains` (3,) multiply the undistorted image's channels; `vignette` (2,) is undone first (see
+    `exposure.corrected`). `valid` marks the undistorted image's pixels that exist, None = all.
+    Raises GeometryError when not all of the image lies in front of the camera's horizon.
+    """
+
+    id: int
+    rank: int
+    width_px: int
+    height_px: int
+    grid_from_image: Matrix3
+    gains: Floats = field(default_factory=lambda: np.ones(3))
+    vignette: Floats = field(default_factory=lambda: np.zeros(2))
+    valid: Mask | None = None
+
+    def __post_init__(self) -> None:
+        for name, shape in (("grid_from_image", (3, 3)), ("gains", (3,)), ("vignette", (2,))):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+            if getattr(self, name).shape != shape or not np.isfinite(getattr(self, name)).all():
+                raise GeometryError(f"frame {self.id}: {name} needs {shape} finite numbers")
+        if self.id < 0:
+            raise GeometryError(f"frame ids count up from 0, got {self.id}")
+        if self.valid is not None and self.valid.shape != (self.height_px, self.width_px):
+            raise GeometryError(f"frame {self.id}: valid mask {self.valid.shape} is not of the image's size")
+        if not np.isfinite(self.outline_px).all() or abs(np.linalg.det(self.grid_from_image)) < 1e-12:
+            raise GeometryError(f"frame {self.id}: a corner of the image lies at or beyond the horizon")
+
+    @property
+    def outline_px(self) -> PointsPx:
+        """(4, 2) the image's outer corners on the grid: top-left, top-right, bottom-right, bottom-left."""
+        w, h = self.width_px - 0.5, self.height_px - 0.5
+        return apply_homography(self.grid_from_image, np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]]))
+
+
+class _Chunk:
+    """The winners of 64 x 64 cells: the frame that shows each cell best, and how well."""
+
+    def __init__(self) -> None:
+        self.winner = np.full((_CHUNK_CELLS, _CHUNK_CELLS), _NOBODY, np.int64)
+        self.merit = np.full((_CHUNK_CELLS, _CHUNK_CELLS), -np.inf)
+        self.frames: set[int] = set()
+
+
+class Canvas:
+    """The mosaic while it grows. Only `paint` changes it.
+
+    `tiles` is where the picture is kept; `images(id)` gives the undistorted image of a frame and should remember
+    the last few. `painted` are the frames whose picture is in `tiles` already, for a site that is opened again.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        tiles: MutableMapping[TileIndex, ImageRGBA],
+        images: Callable[[int], ImageRGB],
+        settings: CanvasSettings = CanvasSettings(),
+        painted: Iterable[CanvasFrame] = (),
+    ) -> None:
+        self._grid, self._tiles, self._images, self._settings = grid, tiles, images, settings
+        self._frames: dict[int, CanvasFrame] = {}
+        self._chunks: dict[TileIndex, _Chunk] = {}
+        for frame in painted:
+            self._add(frame)
+
+    def paint(self, frames: Iterable[CanvasFrame], forget: Iterable[int] = ()) -> frozenset[TileIndex]:
+        """Put new or moved frames in place, drop those to forget, and return the tiles whose picture changed.
+
+        Known frames that moved by no more than `moved_px` at every corner, with the same gains, are left as they
+        are. A tile that nothing covers any more is deleted.
+        """
+        changed = {frame.id: frame for frame in frames if self._differs(frame)}
+        gone = {each for each in forget if each in self._frames} | (changed.keys() & self._frames.keys())
+        touched: set[TileIndex] = set()
+        for each in [*gone, *changed]:
+            touched |= self._chunks_of(changed[each] if each in changed else self._frames[each])
+            if each in self._frames:
+                touched |= self._chunks_of(self._frames[each])
+        before = {key: self._chunks[key].winner.copy() for key in touched if key in self._chunks}
+        self._remove(gone)
+        for frame in changed.values():
+            self._add(frame)
+        dirty = self._dirty_cells(touched, before, gone | changed.keys())
+        return self._render_around(dirty)
+
+    def covers(self, outline_px: PointsPx) -> float:
+        """The share, 0-1, of an outline on the grid, shape (N, 2), that is painted; right to about a cell of 8 px."""
+        cells = (np.asarray(outline_px, dtype=np.float64) + 0.5) / _CELL_PX - 0.5
+        low = np.floor(cells.min(axis=0)).astype(int)
+        width, height = (np.ceil(cells.max(axis=0)).astype(int) - low + 1).tolist()
+        inside = np.zeros((height, width), np.uint8)
+        cv2.fillPoly(inside, [np.rint(cells - low).astype(np.int32)], (1,))
+        winners = self._winners(int(low[0]), int(low[1]), width, height)
+        return float((winners[inside == 1] != _NOBODY).mean())
+
+    def _differs(self, frame: CanvasFrame) -> bool:
+        known = self._frames.get(frame.id)
+        if known is None or known.rank != frame.rank:
+            return True
+        if (known.width_px, known.height_px) != (frame.width_px, frame.height_px):
+            return True
+        moved_px = np.abs(frame.outline_px - known.outline_px).max()
+        brighter = np.abs(np.log(np.maximum(frame.gains, 1e-6) / np.maximum(known.gains, 1e-6))).max()
+        shaded = np.abs(frame.vignette - known.vignette).max()
+        return bool(moved_px > self._settings.moved_px or max(brighter, shaded) > self._settings.gain_step)
+
+    @staticmethod
+    def _chunks_of(frame: CanvasFrame) -> frozenset[TileIndex]:
+        return Grid((0.0, 0.0), 1.0, _CELL_PX * _CHUNK_CELLS).tiles_touched(frame.outline_px)
+
+    def _add(self, frame: CanvasFrame) -> None:
+        self._frames[frame.id] = frame
+        for key in self._chunks_of(frame):
+            self._enter(frame, key)
+
+    def _enter(self, frame: CanvasFrame, key: TileIndex) -> None:
+        chunk = self._chunks.setdefault(key, _Chunk())
+        chunk.frames.add(frame.id)
+        merit = _merit(frame, key[0] * _CHUNK_CELLS, key[1] * _CHUNK_CELLS, _CHUNK_CELLS, _CHUNK_CELLS)
+        wins = (merit > chunk.merit) | ((merit == chunk.merit) & (frame.id < chunk.winner))
+        wins &= np.isfinite(merit)
+        chunk.winner[wins] = frame.id
+        chunk.merit[wins] = merit[wins]
+
+    def _remove(self, ids: set[int]) -> None:
+        emptied: set[TileIndex] = set()
+        for each in ids:
+            emptied |= self._chunks_of(self._frames.pop(each))
+        for key in emptied:
+            staying = self._chunks.pop(key).frames - ids
+            for each in sorted(staying):
+                self._enter(self._frames[each], key)
+
+    def _dirty_cells(
+        self, touched: set[TileIndex], before: dict[TileIndex, NDArray[np.int64]], changed: set[int]
+    ) -> dict[TileIndex, Mask]:
+        """Per chunk, the cells whose winner is another, or the same one at another place."""
+        nobody = _Chunk().winner
+        dirty = {}
+        for key in touched:
+            old = before.get(key, nobody)
+            new = self._chunks[key].winner if key in self._chunks else nobody
+            cells = (old != new) | np.isin(old, list(changed)) | np.isin(new, list(changed))
+            if cells.any():
+                dirty[key] = cells
+        return dirty
+
+    def _render_around(self, dirty: dict[TileIndex, Mask]) -> frozenset[TileIndex]:
+        touched: set[TileIndex] = set()
+        for x0, y0, x1, y1 in self._windows(dirty):
+            touched |= self._store(x0, y0, self._render(x0, y0, x1, y1))
+        return frozenset(touched)
+
+    def _windows(self, dirty: dict[TileIndex, Mask]) -> Iterator[tuple[int, int, int, int]]:
+        """Aligned windows of grid pixels, ends exclusive, that hold everything a change of those cells is seen in."""
+        if not dirty:
+            return
+        low = np.array(sorted(dirty)).min(axis=0) * _CHUNK_CELLS - _REACH_CELLS
+        high = (np.array(sorted(dirty)).max(axis=0) + 1) * _CHUNK_CELLS + _REACH_CELLS
+        cells = np.zeros((high - low)[::-1], np.uint8)
+        for (column, row), mask in dirty.items():
+            x, y = column * _CHUNK_CELLS - low[0], row * _CHUNK_CELLS - low[1]
+            cells[y:y + _CHUNK_CELLS, x:x + _CHUNK_CELLS] = mask
+        cells = cv2.dilate(cells, np.ones((2 * _REACH_CELLS + 1,) * 2, np.uint8))
+        left, top, width, height = cv2.boundingRect(cells)
+        across, down = (max(1, -(-side * _CELL_PX // self._settings.window_px)) for side in (width, height))
+        xs = np.linspace(left, left + width, across + 1).astype(int)
+        ys = np.linspace(top, top + height, down + 1).astype(int)
+        for y0, y1 in zip(ys[:-1], ys[1:]):
+            for x0, x1 in zip(xs[:-1], xs[1:]):
+                x, y, w, h = cv2.boundingRect(cells[y0:y1, x0:x1])
+                if w and h:
+                    start = np.array([x0 + x, y0 + y]) + low
+                    begin = start * _CELL_PX // ALIGN_PX * ALIGN_PX
+                    end = -(-(start + [w, h]) * _CELL_PX // ALIGN_PX) * ALIGN_PX
+                    yield int(begin[0]), int(begin[1]), int(end[0]), int(end[1])
+
+    def _render(self, x0: int, y0: int, x1: int, y1: int) -> ImageRGBA:
+        """The picture of an aligned window of grid pixels, ends exclusive."""
+        x, y = x0 - WINDOW_APRON_PX, y0 - WINDOW_APRON_PX
+        width, height = x1 - x0 + 2 * WINDOW_APRON_PX, y1 - y0 + 2 * WINDOW_APRON_PX
+        pad = 2
+        winners = self._winners(
+            x // _CELL_PX - pad, y // _CELL_PX - pad, width // _CELL_PX + 2 * pad, height // _CELL_PX + 2 * pad
+        )
+        ids = [int(each) for each in np.unique(winners) if each != _NOBODY]
+        shares = (
+            (number, *_share(winners == each, self._frames[each], x, y, pad)) for number, each in enumerate(ids)
+        )
+        labels = winners_from_shares(shares, height, width)
+        picture = blend(labels, self._layers(ids, labels, x, y))
+        inner = slice(WINDOW_APRON_PX, -WINDOW_APRON_PX)
+        alpha = np.where(labels[inner, inner] >= 0, np.uint8(255), np.uint8(0))
+        rgba = np.dstack([picture[inner, inner], alpha])
+        rgba[alpha == 0] = 0
+        return rgba
+
+    def _layers(self, ids: list[int], labels: Labels, x: int, y: int) -> Iterator[Layer]:
+        for number, each in enumerate(ids):
+            left, top, width, height = cv2.boundingRect(cv2.compare(labels, float(number), cv2.CMP_EQ))
+            if not width:
+                continue
+            x0 = max(0, left - LAYER_APRON_PX) // ALIGN_PX * ALIGN_PX
+            y0 = max(0, top - LAYER_APRON_PX) // ALIGN_PX * ALIGN_PX
+            x1 = min(labels.shape[1], -(-(left + width + LAYER_APRON_PX) // ALIGN_PX) * ALIGN_PX)
+            y1 = min(labels.shape[0], -(-(top + height + LAYER_APRON_PX) // ALIGN_PX) * ALIGN_PX)
+            frame = self._frames[each]
+            yield Layer(number, x0, y0, warp(self._images(each), frame, (x + x0, y + y0, x + x1, y + y1)))
+
+    def _winners(self, column: int, row: int, width: int, height: int) -> NDArray[np.int64]:
+        """(height, width) winners of a block of cells."""
+        result = np.full((height, width), _NOBODY, np.int64)
+        for chunk_row in range(row // _CHUNK_CELLS, (row + height - 1) // _CHUNK_CELLS + 1):
+            for chunk_column in range(column // _CHUNK_CELLS, (column + width - 1) // _CHUNK_CELLS + 1):
+                chunk = self._chunks.get((chunk_column, chunk_row))
+                if chunk is None:
+                    continue
+                x, y = chunk_column * _CHUNK_CELLS - column, chunk_row * _CHUNK_CELLS - row
+                _paste(result, chunk.winner, x, y)
+        return result
+
+    def _store(self, x: int, y: int, rgba: ImageRGBA) -> set[TileIndex]:
+        """Put a rendered window into its tiles and name those that it changed."""
+        side = self._grid.tile_px
+        changed: set[TileIndex] = set()
+        for row in range(y // side, (y + rgba.shape[0] - 1) // side + 1):
+            for column in range(x // side, (x + rgba.shape[1] - 1) // side + 1):
+                index = (column, row)
+                known = self._tiles.get(index)
+                tile = np.zeros((side, side, 4), np.uint8) if known is None else known.copy()
+                _paste(tile, rgba, x - column * side, y - row * side)
+                if known is None and not tile[..., 3].any():
+                    continue
+                if known is not None and np.array_equal(tile, known):
+                    continue
+                changed.add(index)
+                if tile[..., 3].any():
+                    self._tiles[index] = tile
+                else:
+                    del self._tiles[index]
+        return changed
+
+
+def warp(image: ImageRGB, frame: CanvasFrame, window: tuple[int, int, int, int]) -> ImageRGB:
+    """A frame's image, its exposure corrected, in a window of grid pixels (x0, y0, x1, y1, ends exclusive).
+
+    Beyond its border the image is reflected. Raises GeometryError when the image is not of the frame's size.
+    """
+    if image.shape[:2] != (frame.height_px, frame.width_px):
+        raise GeometryError(
+            f"frame {frame.id}: image {image.shape[1]}x{image.shape[0]}, expected {frame.width_px}x{frame.height_px}"
+        )
+    source = image if frame.valid is None else fill_invalid(image, frame.valid)
+    window_from_image = _shift(-window[0], -window[1]) @ frame.grid_from_image
+    shrink = np.sqrt(abs(np.linalg.det(frame.grid_from_image[:2, :2])) / frame.grid_from_image[2, 2] ** 2)
+    while shrink < 0.5 and min(source.shape[:2]) > 32:
+        # a mere interpolation would skip source pixels and shimmer
+        source = cv2.pyrDown(source)  # type: ignore[assignment]
+        window_from_image = window_from_image @ np.diag([2.0, 2.0, 1.0])
+        shrink *= 2
+    return cv2.warpPerspective(  # type: ignore[return-value]
+        corrected(source, frame.gains, frame.vignette), window_from_image,
+        (window[2] - window[0], window[3] - window[1]), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT,
+    )
+
+
+def coverage(frame: CanvasFrame, window: tuple[int, int, int, int]) -> NDArray[np.uint8]:
+    """255 where a frame has pixels in a window of grid pixels (x0, y0, x1, y1, ends exclusive), else 0."""
+    size = window[2] - window[0], window[3] - window[1]
+    window_from_image = _shift(-window[0], -window[1]) @ frame.grid_from_image
+    if frame.valid is not None:
+        valid = cv2.erode(frame.valid.astype(np.uint8) * 255, np.ones((3, 3), np.uint8))
+        return cv2.warpPerspective(valid, window_from_image, size, flags=cv2.INTER_NEAREST)  # type: ignore[return-value]
+    left, right = _spans(frame.outline_px, np.arange(window[1], window[3]))
+    first = np.clip(np.ceil(left) - window[0], 0, size[0]).astype(np.int32)[:, None]
+    end = np.clip(np.floor(right) - window[0] + 1, 0, size[0]).astype(np.int32)[:, None]
+    columns = np.arange(size[0], dtype=np.int32)
+    return ((columns >= first) & (columns < end)).view(np.uint8) * np.uint8(255)
+
+
+def _spans(outline_px: PointsPx, rows: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Where each row of grid pixels enters and leaves a convex outline; entry beyond exit where it misses it.
+
+    Drawn by half planes in grid coordinates, a frame's border is the same pixels whatever window it is drawn in.
+    """
+    left, right = np.full(len(rows), -1e9), np.full(len(rows), 1e9)
+    edges = np.roll(outline_px, -1, axis=0) - outline_px
+    turn = np.sign(edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0])
+    for corner, edge in zip(outline_px, edges * turn):
+        # inside lies where edge x (point - corner) >= 0
+        if abs(edge[1]) < 1e-12:
+            left[edge[0] * (rows - corner[1]) < 0] = np.inf
+        else:
+            crossing = corner[0] + edge[0] / edge[1] * (rows - corner[1])
+            if edge[1] > 0:
+                right = np.minimum(right, crossing)
+            else:
+                left = np.maximum(left, crossing)
+    return np.minimum(left, 1e9), right
+
+
+def _merit(frame: CanvasFrame, column: int, row: int, width: int, height: int) -> Floats:
+    """(height, width) how well a frame shows each cell; -inf where it does not.
+
+    Within the image merit falls from its centre to its border and with the ground sampling distance, and is lower
+    for oblique views; the flight's rank outweighs it. Just outside, where a cell may still be partly covered, it is
+    very low, the lower the farther.
+    """
+    xs = (np.arange(column, column + width) + 0.5) * _CELL_PX - 0.5
+    ys = (np.arange(row, row + height) + 0.5) * _CELL_PX - 0.5
+    image_from_grid = np.linalg.inv(frame.grid_from_image)
+    centre = np.array([(frame.width_px - 1) / 2, (frame.height_px - 1) / 2, 1.0])
+    image_from_grid *= np.sign((frame.grid_from_image @ centre)[2])
+    u, v, z = (a * xs[None, :] + b * ys[:, None] + c for a, b, c in image_from_grid)
+    seen = z > 1e-9
+    z = np.where(seen, z, 1.0)
+    u, v = u / z, v / z
+    across = (u - centre[0]) / (frame.width_px / 2)
+    down = (v - centre[1]) / (frame.height_px / 2)
+    # grid pixels per image pixel: the smaller, the finer the image sees this ground
+    coarseness = np.sqrt(z**3 / abs(np.linalg.det(image_from_grid)))
+    inner_px = np.minimum((1 - abs(across)) * frame.width_px, (1 - abs(down)) * frame.height_px) / 2 * coarseness
+    inside = seen & (inner_px > 0)
+    if frame.valid is not None:
+        ui = np.clip(np.rint(u), 0, frame.width_px - 1).astype(int)
+        vi = np.clip(np.rint(v), 0, frame.height_px - 1).astype(int)
+        inside &= frame.valid[vi, ui]
+    quality = (1 - across**2) * (1 - down**2) * _uprightness(frame) ** 2 / coarseness
+    near = seen & (inner_px > -1.5 * _CELL_PX)
+    outside = np.where(near, np.minimum(inner_px, 0.0) - 1e6, -np.inf)
+    return np.where(inside, quality / (1 + quality) - frame.rank, outside)
+
+
+def _uprightness(frame: CanvasFrame) -> float:
+    """The cosine of the angle of view at the image's centre: a tilted camera sees the ground foreshortened."""
+    u, v = (frame.width_px - 1) / 2, (frame.height_px - 1) / 2
+    x, y, z = frame.grid_from_image @ np.array([u, v, 1.0])
+    linear = frame.grid_from_image[:2, :2] / z - np.outer([x, y], frame.grid_from_image[2, :2]) / z**2
+    small, large = sorted(np.linalg.svd(linear, compute_uv=False))
+    return float(small / large)
+
+
+def _share(
+    wins: Mask, frame: CanvasFrame, x: int, y: int, pad: int
+) -> tuple[int, int, NDArray[np.uint8]]:
+    """Where in a window (its origin x, y on the grid) a frame may show, and how strongly, from the cells it wins.
+
+    `wins` holds the window's cells and `pad` more on each side. Smoothing makes the seams curves, not stairs.
+    """
+    height, width = ((side - 2 * pad) * _CELL_PX for side in wins.shape)
+    left, top, columns, rows = cv2.boundingRect(wins.astype(np.uint8))
+    c0, c1 = max(0, left - 2), min(wins.shape[1], left + columns + 2)
+    r0, r1 = max(0, top - 2), min(wins.shape[0], top + rows + 2)
+    cells = cv2.GaussianBlur(wins[r0:r1, c0:c1].astype(np.uint8) * 255, (3, 3), 0)
+    share = cv2.resize(cells, None, fx=_CELL_PX, fy=_CELL_PX, interpolation=cv2.INTER_LINEAR)
+    # the padding cells were needed for smoothing only
+    x0, y0 = (c0 - pad) * _CELL_PX, (r0 - pad) * _CELL_PX
+    cut_x, cut_y = max(0, -x0), max(0, -y0)
+    x0, y0 = x0 + cut_x, y0 + cut_y
+    share = share[cut_y:cut_y + height - y0, cut_x:cut_x + width - x0]
+    window = x + x0, y + y0, x + x0 + share.shape[1], y + y0 + share.shape[0]
+    return x0, y0, cv2.bitwise_and(share, coverage(frame, window))
+
+
+def _paste(target: NDArray[np.generic], patch: NDArray[np.generic], x: int, y: int) -> None:
+    """Copy what of the patch falls into the target when its top-left lies at (x, y)."""
+    x0, y0 = max(0, x), max(0, y)
+    x1, y1 = min(target.shape[1], x + patch.shape[1]), min(target.shape[0], y + patch.shape[0])
+    if x0 < x1 and y0 < y1:
+        target[y0:y1, x0:x1] = patch[y0 - y:y1 - y, x0 - x:x1 - x]
+
+
+def _shift(x: float, y: float) -> Matrix3:
+    return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])

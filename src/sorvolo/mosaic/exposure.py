@@ -1,0 +1,205 @@
+"""Exposure: one gain per frame and channel and one vignette per camera, solved from points seen in two frames.
+
+A lens darkens towards its corners, V(r) = exp(a2 r^2 + a4 r^4) with r = 1 at the corner, and a frame's gain g
+undoes its exposure: what two frames a and b show of the same ground agrees when
+log I_a + log g_a - log V(r_a) = log I_b + log g_b - log V(r_b). That is linear in log g, a2 and a4.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sorvolo.errors import GeometryError, SettingsError
+from sorvolo.geometry.arrays import Floats, ImageRGB, PointsPx, frozen
+
+_SHRINK = 4
+_ITERATIONS = 8
+
+
+@dataclass(frozen=True)
+class ExposureSettings:
+    """How far gains may go; sigmas are of the logarithm (0.1 is about 10 %)."""
+
+    gain_sigma: float = 0.15  # prior about gain 1: keeps the whole map from drifting along a chain of links
+    vignette_sigma: float = 0.3  # prior about no vignette: where radii do not differ it stays at 0
+    colour_sigma: float = 0.03  # least spread of a point's colour: noise, texture and misplacement
+    points_per_link: int = 48
+    largest_gain: float = 2.0
+
+    def __post_init__(self) -> None:
+        if min(self.gain_sigma, self.vignette_sigma, self.colour_sigma, self.points_per_link) <= 0:
+            raise SettingsError("exposure: sigmas and points_per_link must be positive")
+        if self.largest_gain < 1:
+            raise SettingsError("exposure: largest_gain must be at least 1")
+
+
+@dataclass(frozen=True, eq=False)
+class ColourPairs:
+    """The same ground in two images: mean colours, (N, 3) each, and squared radii (corner = 1), (N,) each."""
+
+    colours_a: Floats
+    colours_b: Floats
+    radius2_a: Floats
+    radius2_b: Floats
+
+    def __post_init__(self) -> None:
+        for name in ("colours_a", "colours_b", "radius2_a", "radius2_b"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+        if self.colours_a.shape != self.colours_b.shape or self.colours_a.shape[1:] != (3,):
+            raise GeometryError("colour pairs need (N, 3) on both sides")
+        if not len(self.colours_a) == len(self.radius2_a) == len(self.radius2_b):
+            raise GeometryError("colour pairs need a radius for each colour")
+
+    def __len__(self) -> int:
+        return len(self.colours_a)
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """Gains (3,) that multiply each frame's channels, vignettes (a2, a4) of each camera, and the spread left.
+
+    `spread` is the robust relative difference of the colours of the same ground after correction.
+    """
+
+    gains: Mapping[int, Floats]
+    vignettes: Mapping[int, Floats]
+    spread: float
+
+
+def tie_colours(image_a: ImageRGB, points_a_px: PointsPx, image_b: ImageRGB, points_b_px: PointsPx) -> ColourPairs:
+    """The mean colours around matched points, (N, 2) each, of two undistorted images.
+
+    Means are over about 8 px, from quarter-size copies. Points that are clipped or nearly black in either image say
+    nothing of exposure and are left out.
+    """
+    colours_a, colours_b = _sample(image_a, points_a_px), _sample(image_b, points_b_px)
+    both = np.hstack([colours_a, colours_b])
+    keep = (both.min(axis=1) > 6) & (both.max(axis=1) < 247)
+    return ColourPairs(
+        colours_a[keep], colours_b[keep],
+        _radius2(points_a_px, image_a)[keep], _radius2(points_b_px, image_b)[keep],
+    )
+
+
+def solve_exposure(
+    pairs: Mapping[tuple[int, int], ColourPairs],
+    camera_of: Mapping[int, int] | None = None,
+    settings: ExposureSettings = ExposureSettings(),
+) -> Exposure:
+    """Gains of all frames named in `pairs` (frame a, frame b), by robust least squares of log colours.
+
+    `camera_of` tells frames of different cameras apart, each with its own vignette; without it there is one, 0.
+    Frames and cameras of which the pairs say little stay near gain 1 and near no vignette.
+    """
+    ids = sorted({each for link in pairs for each in link})
+    camera_of = camera_of or dict.fromkeys(ids, 0)
+    cameras = sorted({camera_of[each] for each in ids})
+    if not ids:
+        return Exposure({}, {}, 0.0)
+    column = {each: i for i, each in enumerate(ids)}
+    lens = {camera: len(ids) + 2 * i for i, camera in enumerate(cameras)}
+    rows = [_rows(link, pairs[link], column, lens, camera_of, settings) for link in sorted(pairs) if len(pairs[link])]
+    unknowns = len(ids) + 2 * len(cameras)
+    prior = np.r_[np.full(len(ids), settings.gain_sigma**-2), np.full(2 * len(cameras), settings.vignette_sigma**-2)]
+    if not rows:
+        return Exposure({e: np.ones(3) for e in ids}, {c: np.zeros(2) for c in cameras}, 0.0)
+    columns = np.concatenate([r[0] for r in rows])
+    factors = np.concatenate([r[1] for r in rows])
+    difference = np.concatenate([r[2] for r in rows])
+    solution = np.zeros((unknowns, 3))
+    spread = settings.colour_sigma
+    for _ in range(_ITERATIONS):
+        residual = difference + np.einsum("nk,nkc->nc", factors, solution[columns])
+        length = np.linalg.norm(residual, axis=1) / np.sqrt(3)
+        spread = max(settings.colour_sigma, 1.4826 * float(np.median(length)))
+        weight = 1 / (1 + (length / spread) ** 2) / spread**2
+        solution = _solve(columns, factors, difference, weight, prior, len(ids))
+    limit = np.log(settings.largest_gain)
+    gains = {e: np.exp(np.clip(solution[i], -limit, limit)) for e, i in column.items()}
+    vignettes = {c: solution[i:i + 2, 0].copy() for c, i in lens.items()}
+    return Exposure(gains, vignettes, float(np.median(length) * 1.4826))
+
+
+def corrected(image: ImageRGB, gains: Floats, vignette: Floats) -> ImageRGB:
+    """The image as it would be with gain 1 and no vignette: times gains (3,), divided by exp(a2 r^2 + a4 r^4)."""
+    if not vignette.any():
+        if (gains == 1).all():
+            return image
+        table = np.clip(np.arange(256)[:, None] * gains + 0.5, 0, 255).astype(np.uint8)
+        return cv2.LUT(image, table[None])  # type: ignore[return-value]
+    height, width = image.shape[:2]
+    # the field is smooth: a sixteenth of its size and interpolation give it to a thousandth
+    x, y = np.linspace(-1, 1, width // 16 + 2), np.linspace(-1, 1, height // 16 + 2)
+    radius2 = (x[None, :] ** 2 * width**2 + y[:, None] ** 2 * height**2) / (width**2 + height**2)
+    field = np.exp(-(vignette[0] * radius2 + vignette[1] * radius2**2)).astype(np.float32)
+    wide = cv2.warpAffine(
+        field, np.array([[(width - 1) / (len(x) - 1), 0, 0], [0, (height - 1) / (len(y) - 1), 0.0]]), (width, height),
+        flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE,
+    )
+    return cv2.merge([  # type: ignore[return-value]
+        cv2.multiply(channel, wide, scale=float(gain), dtype=cv2.CV_8U)
+        for channel, gain in zip(cv2.split(image), gains)
+    ])
+
+
+def _rows(
+    link: tuple[int, int],
+    pairs: ColourPairs,
+    column: Mapping[int, int],
+    lens: Mapping[int, int],
+    camera_of: Mapping[int, int],
+    settings: ExposureSettings,
+) -> tuple[Floats, Floats, Floats]:
+    """A link's equations: unknowns' columns (n, 6) and factors (n, 6), and log-colour differences (n, 3)."""
+    pick = np.linspace(0, len(pairs) - 1, min(len(pairs), settings.points_per_link)).astype(int)
+    a, b = link
+    lens_a, lens_b = lens[camera_of[a]], lens[camera_of[b]]
+    columns = np.tile([column[a], column[b], lens_a, lens_a + 1, lens_b, lens_b + 1], (len(pick), 1))
+    ra, rb = pairs.radius2_a[pick], pairs.radius2_b[pick]
+    one = np.ones(len(pick))
+    factors = np.column_stack([one, -one, -ra, -(ra**2), rb, rb**2])
+    difference = np.log(np.maximum(pairs.colours_a[pick], 1.0)) - np.log(np.maximum(pairs.colours_b[pick], 1.0))
+    return columns, factors, difference
+
+
+def _solve(
+    columns: Floats, factors: Floats, difference: Floats, weight: Floats, prior: Floats, frames: int
+) -> Floats:
+    """(U, 3) unknowns from weighted normal equations; the vignette is one for all channels."""
+    unknowns = len(prior)
+    normal = np.zeros((unknowns, unknowns))
+    np.add.at(
+        normal, (columns[:, :, None], columns[:, None, :]),
+        factors[:, :, None] * factors[:, None, :] * weight[:, None, None],
+    )
+    normal[np.diag_indices(unknowns)] += prior
+    right = np.zeros((unknowns, 3))
+    np.add.at(right, columns, -factors[:, :, None] * (weight[:, None] * difference)[:, None, :])
+    # gains per channel eliminated for the vignette of their mean, then put back with that vignette
+    mean = np.linalg.solve(normal, right.mean(axis=1))
+    lens = mean[frames:]
+    gains = np.linalg.solve(normal[:frames, :frames], right[:frames] - (normal[:frames, frames:] @ lens)[:, None])
+    return np.vstack([gains, np.tile(lens[:, None], (1, 3))])
+
+
+def _sample(image: ImageRGB, points_px: PointsPx) -> Floats:
+    small = cv2.resize(image, None, fx=1 / _SHRINK, fy=1 / _SHRINK, interpolation=cv2.INTER_AREA)
+    smooth = cv2.blur(small, (3, 3))
+    at = ((np.asarray(points_px, dtype=np.float64) + 0.5) / _SHRINK - 0.5).astype(np.float32)
+    # remap takes at most 32767 points in a row
+    columns = 1024
+    padded = np.zeros((-(-len(at) // columns) * columns, 2), np.float32)
+    padded[:len(at)] = at
+    grid = padded.reshape(-1, columns, 2)
+    if not len(at):
+        return np.zeros((0, 3))
+    colours = cv2.remap(smooth, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return colours.reshape(-1, 3)[:len(at)].astype(np.float64)
+
+
+def _radius2(points_px: PointsPx, image: ImageRGB) -> Floats:
+    height, width = image.shape[:2]
+    centred = np.asarray(points_px, dtype=np.float64).reshape(-1, 2) - [(width - 1) / 2, (height - 1) / 2]
+    return (centred**2).sum(axis=1) * 4 / (width**2 + height**2)
