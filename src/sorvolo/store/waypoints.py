@@ -1,0 +1,136 @@
+"""Flight plans for other programs: GeoJSON, KML and QGroundControl's .plan.
+
+Heights are above the take-off point in all three. The .plan works for PX4 and ArduPilot multicopters:
+take-off, speed, every pass with the camera triggered by distance flown, return to launch.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import simplekml
+
+from sorvolo.errors import SettingsError
+from sorvolo.geometry.geodesy import LocalFrame
+from sorvolo.geometry.planning import FlightPlan
+from sorvolo.store.atomic import atomic_write_bytes
+
+_TAKEOFF, _WAYPOINT, _RETURN, _CHANGE_SPEED, _TRIGGER_DISTANCE = 22, 16, 20, 178, 206  # MAV_CMD
+_FRAME_RELATIVE_HEIGHT, _FRAME_MISSION = 3, 2  # MAV_FRAME
+_HEIGHT_RELATIVE = 1  # QGroundControl's AltitudeMode
+_AUTOPILOT_PX4, _VEHICLE_QUADROTOR = 12, 2  # MAV_AUTOPILOT, MAV_TYPE
+
+_Item: TypeAlias = dict[str, Any]
+_LonLat: TypeAlias = list[list[float]]
+
+
+def write_waypoints(path: Path, plan: FlightPlan, frame: LocalFrame, name: str = "survey") -> None:
+    """Write the plan, whose metres are those of `frame`, in the format that the path's ending names.
+
+    Raises SettingsError for an ending other than .plan, .geojson, .json or .kml, StoreError when it cannot be
+    written.
+    """
+    writers: Mapping[str, Callable[[FlightPlan, _LonLat, str], str]] = {
+        ".plan": _qgroundcontrol, ".geojson": _geojson, ".json": _geojson, ".kml": _kml,
+    }
+    writer = writers.get(path.suffix.lower())
+    if writer is None:
+        raise SettingsError(f"{path}: a flight plan ends in {', '.join(writers)}, not in {path.suffix!r}")
+    latitude_deg, longitude_deg, _ = frame.wgs84_from_site(plan.waypoints_m)
+    lonlat = [[round(float(lon), 9), round(float(lat), 9)] for lon, lat in zip(longitude_deg, latitude_deg)]
+    atomic_write_bytes(path, writer(plan, lonlat, name).encode())
+
+
+def _geojson(plan: FlightPlan, lonlat: _LonLat, name: str) -> str:
+    """The path as a line with the plan's numbers, then every waypoint as a point."""
+    path = _feature("LineString", lonlat, {"name": name, **_summary(plan)})
+    points = [
+        _feature("Point", place, {"waypoint": index, "camera": "on" if index % 2 == 0 else "off"})
+        for index, place in enumerate(lonlat)
+    ]
+    return json.dumps({"type": "FeatureCollection", "features": [path, *points]}, indent=1)
+
+
+def _feature(kind: str, coordinates: Any, properties: _Item) -> _Item:
+    return {
+        "type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties,
+    }
+
+
+def _summary(plan: FlightPlan) -> _Item:
+    return {
+        "height_above_takeoff_m": round(plan.height_m, 3),
+        "speed_m_s": plan.speed_m_s,
+        "strip_bearing_deg": round(plan.strip_bearing_deg, 3),
+        "strip_spacing_m": round(plan.strip_spacing_m, 3),
+        "photo_spacing_m": round(plan.photo_spacing_m, 3),
+        "photo_interval_s": round(plan.photo_interval_s, 3),
+        "photos": plan.photo_count,
+        "distance_m": round(plan.distance_m, 1),
+        "duration_s": round(plan.duration_s, 1),
+    }
+
+
+def _kml(plan: FlightPlan, lonlat: _LonLat, name: str) -> str:
+    document = simplekml.Kml(name=name)
+    line = document.newlinestring(name=name, description=json.dumps(_summary(plan), indent=1))
+    line.coords = [(lon, lat, plan.height_m) for lon, lat in lonlat]
+    line.altitudemode = simplekml.AltitudeMode.relativetoground
+    line.style.linestyle.width = 3
+    line.style.linestyle.color = simplekml.Color.orange
+    for index, (lon, lat) in enumerate(lonlat):
+        point = document.newpoint(name=str(index), coords=[(lon, lat, plan.height_m)])
+        point.altitudemode = simplekml.AltitudeMode.relativetoground
+        point.style.iconstyle.scale = 0.5
+    return str(document.kml())
+
+
+def _qgroundcontrol(plan: FlightPlan, lonlat: _LonLat, _name: str) -> str:
+    """QGroundControl's plan file, version 1; a plan has no name of its own there."""
+    commands: list[tuple[int, int, list[float | None]]] = [
+        (_TAKEOFF, _FRAME_RELATIVE_HEIGHT, [0, 0, 0, None, *_place(plan, lonlat[0])]),
+        (_CHANGE_SPEED, _FRAME_MISSION, [1, plan.speed_m_s, -1, 0, 0, 0, 0]),
+    ]
+    for index, place in enumerate(lonlat):
+        starts_pass = index % 2 == 0
+        commands.append((_WAYPOINT, _FRAME_RELATIVE_HEIGHT, [0, 0, 0, None, *_place(plan, place)]))
+        spacing_m = round(plan.photo_spacing_m, 2) if starts_pass else 0
+        commands.append((_TRIGGER_DISTANCE, _FRAME_MISSION, [spacing_m, 0, int(starts_pass), 0, 0, 0, 0]))
+    commands.append((_RETURN, _FRAME_MISSION, [0, 0, 0, 0, 0, 0, 0]))
+    mission = {
+        "version": 2,
+        "firmwareType": _AUTOPILOT_PX4,
+        "vehicleType": _VEHICLE_QUADROTOR,
+        "cruiseSpeed": plan.speed_m_s,
+        "hoverSpeed": plan.speed_m_s,
+        "globalPlanAltitudeMode": _HEIGHT_RELATIVE,
+        "plannedHomePosition": [lonlat[0][1], lonlat[0][0], 0],
+        "items": [_item(plan, index, *command) for index, command in enumerate(commands, start=1)],
+    }
+    return json.dumps({
+        "fileType": "Plan",
+        "version": 1,
+        "groundStation": "QGroundControl",
+        "geoFence": {"circles": [], "polygons": [], "version": 2},
+        "rallyPoints": {"points": [], "version": 2},
+        "mission": mission,
+    }, indent=1)
+
+
+def _place(plan: FlightPlan, lonlat: list[float]) -> list[float]:
+    return [lonlat[1], lonlat[0], round(plan.height_m, 2)]
+
+
+def _item(plan: FlightPlan, jump_id: int, command: int, frame: int, params: list[float | None]) -> _Item:
+    item: _Item = {
+        "type": "SimpleItem", "autoContinue": True, "command": command, "doJumpId": jump_id, "frame": frame,
+        "params": params,
+    }
+    if frame == _FRAME_RELATIVE_HEIGHT:
+        item |= {
+            "AMSLAltAboveTerrain": None,
+            "Altitude": round(plan.height_m, 2),
+            "AltitudeMode": _HEIGHT_RELATIVE,
+        }
+    return item
