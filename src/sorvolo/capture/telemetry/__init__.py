@@ -1,0 +1,118 @@
+"""Telemetry files: which reader a file needs is told by its content, and where a video's telemetry lies."""
+
+from pathlib import Path
+from typing import Protocol
+
+from sorvolo.capture.telemetry import dji_srt, gpx, nmea, umcd
+from sorvolo.errors import InputError
+from sorvolo.survey.flight import Telemetry
+
+LARGEST_FILE_BYTES = 500_000_000
+"""A telemetry file beyond this is some other file; a day at 10 Hz with 60 columns is a tenth of it."""
+
+_HEAD_BYTES = 65_536
+_SUFFIXES = (".srt", ".csv", ".nmea", ".gpx", ".log", ".txt", ".tsv", ".gps", ".dat")
+_VIDEO_SUFFIXES = frozenset(
+    (".mp4", ".mov", ".mkv", ".avi", ".ts", ".m2ts", ".mts", ".m4v", ".webm", ".mpg", ".mpeg")
+)
+_BESIDE = ("{}_telemetry", "{}-telemetry", "{}.telemetry", "{}_gps", "{}-gps", "{}_nmea", "telemetry_{}")
+
+
+class Reader(Protocol):
+    """One telemetry format; the modules of this package are such objects."""
+
+    def recognises(self, head: bytes) -> bool:
+        """Whether a file that starts with these bytes is of this format."""
+
+    def read(self, data: bytes, name: str) -> Telemetry:
+        """The file's samples; raises InputError, which calls the file `name`, when there are none."""
+
+
+# Order matters where a file fits two: a table may hold NMEA sentences in one of its columns.
+TELEMETRY_READERS: dict[str, Reader] = {"dji_srt": dji_srt, "gpx": gpx, "umcd": umcd, "nmea": nmea}
+"""Every format that is read, by the name that `Telemetry.format` carries."""
+
+
+def read_telemetry(path: Path) -> Telemetry:
+    """The telemetry in the file, whatever its name; the first reader that recognises its content reads it.
+
+    Raises InputError for a file that is missing, a folder, empty, too large, binary, of no known format, or
+    without any usable sample.
+    """
+    data = _bytes_of(path)
+    reader = _reader_for(data[:_HEAD_BYTES])
+    if reader is None:
+        head = data[:24]
+        what = "a binary file" if _is_binary(data[:_HEAD_BYTES]) else "text of no known telemetry format"
+        raise InputError(
+            f"{path}: {what}, it starts with {head!r}; read are DJI subtitles (.SRT), GPX tracks with times, "
+            "tables with Latitude and Longitude columns (UMCD, .csv), and NMEA 0183 with GGA or RMC sentences"
+        )
+    return TELEMETRY_READERS[reader].read(data, str(path))
+
+
+def find_telemetry_beside(video: Path) -> Path | None:
+    """The telemetry file that belongs to a video or to a folder of photos; None where there is no clear one.
+
+    First a file of the video's name with another suffix (any case), then one called like
+    "<name>_telemetry", then, where the folder holds no other video, the only telemetry file in it. Only
+    files that a reader recognises count.
+    """
+    folder = video if video.is_dir() else video.parent
+    if not folder.is_dir():
+        return None
+    files = sorted(each for each in folder.iterdir() if each.is_file() and each != video)
+    candidates = sorted(
+        (each for each in files if each.suffix.lower() in _SUFFIXES),
+        key=lambda each: (_SUFFIXES.index(each.suffix.lower()), each.name),
+    )
+    stem = video.stem.lower()
+    for wanted in (stem, *(pattern.format(stem) for pattern in _BESIDE)):
+        for candidate in candidates:
+            # "path1.mp4.csv" belongs to path1.mp4 too
+            if candidate.stem.lower() in (wanted, video.name.lower()) and _is_telemetry(candidate):
+                return candidate
+    if any(each.suffix.lower() in _VIDEO_SUFFIXES for each in files):
+        return None
+    known = [candidate for candidate in candidates if _is_telemetry(candidate)]
+    named = [candidate for candidate in known if "telemetry" in candidate.stem.lower()]
+    for group in (named, known):
+        if len(group) == 1:
+            return group[0]
+    return None
+
+
+def _bytes_of(path: Path) -> bytes:
+    try:
+        if path.is_dir():
+            raise InputError(f"{path}: a folder, not a telemetry file; name the file in it")
+        size = path.stat().st_size
+        if size > LARGEST_FILE_BYTES:
+            raise InputError(
+                f"{path}: {size / 1e6:.0f} MB is too large for telemetry (at most "
+                f"{LARGEST_FILE_BYTES / 1e6:.0f} MB); is it the video?"
+            )
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such telemetry file; check the name") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+    if not data:
+        raise InputError(f"{path}: an empty file (0 bytes); copy it from the drone again")
+    return data
+
+
+def _reader_for(head: bytes) -> str | None:
+    return next((name for name, reader in TELEMETRY_READERS.items() if reader.recognises(head)), None)
+
+
+def _is_binary(head: bytes) -> bool:
+    return b"\0" in head and head[:2] not in (b"\xff\xfe", b"\xfe\xff")
+
+
+def _is_telemetry(path: Path) -> bool:
+    try:
+        with path.open("rb") as stream:
+            return _reader_for(stream.read(_HEAD_BYTES)) is not None
+    except OSError:
+        return False

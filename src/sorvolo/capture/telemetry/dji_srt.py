@@ -1,0 +1,210 @@
+"""DJI's subtitles: one cue a frame or a second, in the dialects that a dozen drones have written."""
+
+import re
+from collections import Counter
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sorvolo.capture.telemetry.quality import (
+    NO_TIME_NS,
+    SECOND_NS,
+    clean,
+    decimals_of,
+    fill_stamps,
+    notice,
+    refine_clock,
+    text_from_bytes,
+    time_ns_from_text,
+)
+from sorvolo.errors import InputError
+from sorvolo.survey.flight import Telemetry
+
+SMALLEST_SIGMA_M = 1.5
+"""Horizontal sigma of a consumer drone's GPS in hover, which no number of printed decimals improves."""
+
+_CUE = re.compile(r"(\d{1,3}):(\d{2}):(\d{2})[,.](\d{1,3})[ \t]*-->")
+_TELEMETRY = re.compile(r"\b(?:(?:GPS|HOME)\s*\(|(?:latitude|FrameCnt|SrtCnt|BAROMETER)\s*:)", re.IGNORECASE)
+# Every pattern wants something behind its last digit: the last cue of a half-written file may end within a
+# number.
+_PAIR = re.compile(r"[\[\s]([A-Za-z_]+)\s?:\s?([-+]?\d+(?:\.\d+)?)(?=[^\d.])")
+_GPS = re.compile(r"\bGPS\s*\(([^()\n]{0,80})\)")
+_COORDINATE = re.compile(r"(?:([NSEW])\s*:?\s*)?([-+]?\d+(?:\.\d*)?)\s*([mM]?)")
+_HEIGHT = re.compile(r"(?<![\w.])H\s([-+]?\d+(?:\.\d+)?)m\b")
+_SPEED = re.compile(r"\bH\.S\s([-+]?\d+(?:\.\d+)?)m/s")
+_ANGLES = re.compile(r"\b([FG])\.PRY\s*\(([^()\n]{0,60})\)")
+_NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
+_COLUMN_OF_KEY = {
+    "latitude": "latitude_deg",
+    "longitude": "longitude_deg",
+    "longtitude": "longitude_deg",  # sic, in the Mavic 2's firmware
+    "rel_alt": "height_above_takeoff_m",
+    "barometer": "height_above_takeoff_m",
+    "hb": "height_above_takeoff_m",
+    "abs_alt": "orthometric_height_m",
+    "altitude": "orthometric_height_m",
+    "gb_yaw": "camera_yaw_deg",
+    "gb_pitch": "camera_pitch_deg",
+    "gb_roll": "camera_roll_deg",
+    "drone_yaw": "body_yaw_deg",
+    "drone_pitch": "body_pitch_deg",
+    "drone_roll": "body_roll_deg",
+}
+
+
+class _Place(NamedTuple):
+    """One GPS(...) group: its first three values, and how they are ordered."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    decimals: int
+    is_latitude_first: bool
+
+
+@dataclass
+class _Cue:
+    """One subtitle: when it shows, when it says it was taken, and its numbers."""
+
+    video_time_ns: int
+    stamp_ns: int
+    values: dict[str, float]
+
+
+def recognises(head: bytes) -> bool:
+    """Whether the file's first bytes hold a subtitle's times and any of DJI's keys."""
+    text = text_from_bytes(head)
+    return _CUE.search(text) is not None and _TELEMETRY.search(text) is not None
+
+
+def read(data: bytes, name: str) -> Telemetry:
+    """The samples of a DJI subtitle file, one per cue; `video_time_ns` is the cue's start.
+
+    rel_alt, BAROMETER, Hb and H are heights above take-off; abs_alt and altitude, which DJI calls absolute,
+    are stored as orthometric. Dates name no time zone and are taken as UTC. `name` is for messages. Raises
+    InputError when no cue says where the drone was or how it stood.
+    """
+    text = text_from_bytes(data)
+    starts = list(_CUE.finditer(text))
+    if not starts:
+        raise InputError(f"{name}: no subtitle times (00:00:01,000 --> 00:00:02,000) in it")
+    ends = [match.start() for match in starts[1:]] + [len(text)]
+    counts: Counter[str] = Counter()
+    decimals = [0]
+    cues = [_cue(match, text[match.end():end], counts, decimals) for match, end in zip(starts, ends)]
+    if not cues[-1].values and any(cue.values for cue in cues):
+        counts["truncated"] = 1
+        cues.pop()
+    _forget_empty_heights(cues)
+    video_ns = np.array([cue.video_time_ns for cue in cues], dtype=np.int64)
+    stamps_ns = np.array([cue.stamp_ns for cue in cues], dtype=np.int64)
+    dated = stamps_ns != NO_TIME_NS
+    times_ns, refined = refine_clock(fill_stamps(stamps_ns, video_ns), video_ns)
+    names = sorted({key for cue in cues for key in cue.values})
+    columns = {key: np.array([cue.values.get(key, np.nan) for cue in cues]) for key in names}
+    if "latitude_deg" in columns:
+        placed = np.isfinite(columns["latitude_deg"])
+        columns["horizontal_sigma_m"] = np.where(placed, SMALLEST_SIGMA_M, np.nan)
+    return clean(
+        "dji_srt", name, times_ns, columns, video_ns,
+        notices=[
+            *notice("truncated", counts["truncated"], "the last cue is cut off"),
+            *notice(
+                "time_zone_unknown", int(dated.sum()) - counts["zoned"],
+                "{} cues print a time without its zone; it is taken as UTC and may be hours off",
+            ),
+            *notice(
+                "no_date", int((~dated).sum()),
+                "{} cues print no date; they are stamped by their place in the video"
+                + ("" if dated.any() else ", from 1970-01-01"),
+            ),
+            *notice(
+                "clock_refined", len(cues) if refined else 0,
+                "times are printed in whole seconds; the {} samples are timed by their cues instead",
+            ),
+            *notice(
+                "latitude_first", counts["latitude_first"],
+                "{} positions have a height in metres as third value: they are read as latitude, longitude",
+            ),
+        ],
+        position_decimals=max(decimals) or None,
+    )
+
+
+def _cue(match: re.Match[str], body: str, counts: Counter[str], decimals: list[int]) -> _Cue:
+    hours, minutes, seconds, fraction = match.groups()
+    start_s = int(hours) * 3600 + int(minutes) * 60 + int(seconds)
+    stamp = time_ns_from_text(body)
+    counts["zoned"] += bool(stamp and stamp[1])
+    values: dict[str, float] = {}
+    for key, number in _PAIR.findall(body):
+        column = _COLUMN_OF_KEY.get(key.lower())
+        if column is None:
+            continue
+        values[column] = float(number)
+        if column == "longitude_deg":
+            decimals[0] = max(decimals[0], decimals_of(number))
+    group = _GPS.search(body) if "GPS" in body else None
+    if group:
+        values |= _values_in_words(body)
+    if group and (place := _place(group[1])):
+        values |= {"latitude_deg": place.latitude_deg, "longitude_deg": place.longitude_deg}
+        if np.isfinite(place.height_m):
+            values.setdefault("orthometric_height_m", place.height_m)
+        decimals[0] = max(decimals[0], place.decimals)
+        counts["latitude_first"] += place.is_latitude_first
+    video_ns = start_s * SECOND_NS + int(fraction.ljust(3, "0")) * 1_000_000
+    return _Cue(video_ns, stamp[0] if stamp else NO_TIME_NS, values)
+
+
+def _values_in_words(body: str) -> dict[str, float]:
+    """What the one-line dialect says: "H 200.70m, H.S 2.1m/s, F.PRY (2.7, -7.0, 110.1), G.PRY (...)"."""
+    values = {}
+    if height := _HEIGHT.search(body):
+        values["height_above_takeoff_m"] = float(height[1])
+    if speed := _SPEED.search(body):
+        values["speed_m_s"] = float(speed[1])
+    for which, angles in _ANGLES.findall(body):
+        numbers = _NUMBER.findall(angles)
+        if len(numbers) == 3:
+            part = "body" if which == "F" else "camera"
+            for axis, number in zip(("pitch", "roll", "yaw"), numbers):
+                values[f"{part}_{axis}_deg"] = float(number)
+    return values
+
+
+def _place(group: str) -> _Place | None:
+    """The place in GPS(...); None where it says N/A.
+
+    Letters decide the order. Without them the third value does: a bare number is the count of satellites,
+    in files that put longitude first; a height with its unit ("0.0M", the Matrice 300) comes after latitude
+    and longitude. A first value beyond 90 is a longitude in any case.
+    """
+    parts = [match for match in map(_COORDINATE.fullmatch, map(str.strip, group.split(","))) if match]
+    if len(parts) < 2 or len(parts) != group.count(",") + 1:
+        return None
+    first, second = parts[0], parts[1]
+    has_unit = len(parts) > 2 and bool(parts[2][3])
+    if first[1] or second[1]:
+        is_latitude_first = first[1] in ("N", "S") or second[1] in ("E", "W")
+    else:
+        is_latitude_first = has_unit and abs(float(first[2])) <= 90
+    latitude, longitude = (first, second) if is_latitude_first else (second, first)
+    return _Place(
+        _signed(latitude), _signed(longitude),
+        height_m=float(parts[2][2]) if has_unit else float("nan"),
+        decimals=max(decimals_of(first[2]), decimals_of(second[2])),
+        is_latitude_first=is_latitude_first and not (first[1] or second[1]),
+    )
+
+
+def _signed(part: re.Match[str]) -> float:
+    return -float(part[2]) if part[1] in ("S", "W") else float(part[2])
+
+
+def _forget_empty_heights(cues: list[_Cue]) -> None:
+    # the Matrice 300 and the Mavic 2 print an absolute height of 0.0 throughout when they have none
+    if not any(cue.values.get("orthometric_height_m") for cue in cues):
+        for cue in cues:
+            cue.values.pop("orthometric_height_m", None)

@@ -1,0 +1,172 @@
+"""NMEA 0183: the GGA and RMC sentences of a GPS receiver, alone or embedded in another log."""
+
+import re
+from collections import Counter
+from dataclasses import dataclass, field
+from datetime import date, time
+from typing import Any
+
+from pynmeagps import NMEAReader, calc_checksum
+from pynmeagps.exceptions import NMEAMessageError, NMEAParseError, NMEATypeError
+
+from sorvolo.capture.telemetry.quality import (
+    DAY_NS,
+    SECOND_NS,
+    clean,
+    decimals_of,
+    notice,
+    sigma_from_hdop_m,
+)
+from sorvolo.errors import InputError
+from sorvolo.survey.flight import Telemetry
+
+_M_S_PER_KNOT = 1852 / 3600
+# talkers differ by satellite system (GP, GN, GL, GA ...); a log may write anything before the dollar
+_SENTENCE = re.compile(rb"\$([A-Z][A-Z0-9])(GGA|RMC),([^$*\r\n]*)(?:\*([0-9A-Fa-f]{2}))?")
+
+
+@dataclass
+class _Epoch:
+    """What the sentences of one moment say."""
+
+    time_ns: int
+    values: dict[str, float] = field(default_factory=dict)
+    kinds: set[str] = field(default_factory=set)
+    has_fix: bool = True
+
+
+def recognises(head: bytes) -> bool:
+    """Whether the file's first bytes hold the start of a GGA or RMC sentence."""
+    return _SENTENCE.search(head) is not None
+
+
+def read(data: bytes, name: str) -> Telemetry:
+    """The samples of a file of NMEA sentences; GGA and RMC of the same time make one sample.
+
+    Altitude in GGA is above the geoid; with the geoid's separation it also gives the ellipsoidal height.
+    HDOP becomes `horizontal_sigma_m` = max(HDOP * 1.5, 0.5). Quality 0 or status V is no fix. GGA has no
+    date: the nearest one of RMC is used, across midnight. `name` is for messages. Raises InputError when no
+    sentence is usable.
+    """
+    counts: Counter[str] = Counter()
+    messages = _messages(data, counts)
+    if not messages:
+        raise InputError(
+            f"{name}: no intact GGA or RMC sentence ({counts['bad_checksum']} with a bad checksum, "
+            f"{counts['unreadable_line'] + counts['truncated']} unreadable); "
+            "record the receiver's output again, checksums included"
+        )
+    epochs, dated = _epochs(messages)
+    names = sorted({key for epoch in epochs for key in epoch.values})
+    return clean(
+        "nmea", name,
+        [epoch.time_ns for epoch in epochs],
+        {key: [epoch.values.get(key, float("nan")) for epoch in epochs] for key in names},
+        notices=[
+            *notice("bad_checksum", counts["bad_checksum"], "{} sentences dropped: bad or missing checksum"),
+            *notice("unreadable_line", counts["unreadable_line"], "{} sentences dropped: not readable"),
+            *notice("truncated", counts["truncated"], "the last sentence is cut off"),
+            *notice(
+                "no_date", 0 if dated else len(epochs),
+                "no sentence tells the date: {} samples are stamped from 1970-01-01",
+            ),
+        ],
+        position_decimals=_position_decimals(messages),
+    )
+
+
+def _messages(data: bytes, counts: Counter[str]) -> list[Any]:
+    messages = []
+    for match in _SENTENCE.finditer(data):
+        talker, kind, body, checksum = match.groups()
+        if match.end() == len(data) and checksum is None:
+            counts["truncated"] += 1
+            continue
+        content = (talker + kind + b"," + body).decode("latin-1")
+        if checksum is None or calc_checksum(content) != checksum.decode().upper():
+            counts["bad_checksum"] += 1
+            continue
+        try:
+            message = NMEAReader.parse(f"${content}*{checksum.decode()}\r\n")
+        except (NMEAMessageError, NMEAParseError, NMEATypeError):
+            counts["unreadable_line"] += 1
+            continue
+        if isinstance(getattr(message, "time", None), time):
+            messages.append(message)
+        else:
+            counts["no_time"] += 1  # a receiver that has just been switched on; it has no position either
+    return messages
+
+
+def _epochs(messages: list[Any]) -> tuple[list[_Epoch], bool]:
+    """The sentences by moment, in the file's order, and whether any of them tells the date."""
+    dated = [message for message in messages if isinstance(getattr(message, "date", None), date)]
+    # a receiver without a fix often invents its date
+    trusted = [message for message in dated if message.status == "A"] or dated
+    days = {id(message) for message in trusted}
+    now_ns = _stamp(trusted[0]) if trusted else _time_of_day_ns(messages[0])
+    epochs: list[_Epoch] = []
+    for message in messages:
+        now_ns = _stamp(message) if id(message) in days else _nearest(_time_of_day_ns(message), now_ns)
+        if not epochs or epochs[-1].time_ns != now_ns or message.msgID in epochs[-1].kinds:
+            epochs.append(_Epoch(now_ns))
+        epochs[-1].kinds.add(message.msgID)
+        _tell(epochs[-1], message)
+    for epoch in epochs:
+        if not epoch.has_fix:
+            epoch.values = {}
+    return epochs, bool(trusted)
+
+
+def _tell(epoch: _Epoch, message: Any) -> None:
+    said = {}
+    if message.msgID == "GGA":
+        epoch.has_fix &= message.quality != 0
+        altitude_m, separation_m = _number(message, "alt"), _number(message, "sep")
+        said = {
+            "latitude_deg": _number(message, "lat"),
+            "longitude_deg": _number(message, "lon"),
+            "orthometric_height_m": altitude_m,
+            "ellipsoidal_height_m": altitude_m + separation_m,
+            "horizontal_sigma_m": sigma_from_hdop_m(_number(message, "HDOP")),
+        }
+    else:
+        epoch.has_fix &= message.status == "A"
+        said = {
+            "speed_m_s": _number(message, "spd") * _M_S_PER_KNOT,
+            "course_deg": _number(message, "cog"),
+        }
+        if "GGA" not in epoch.kinds:
+            said |= {"latitude_deg": _number(message, "lat"), "longitude_deg": _number(message, "lon")}
+    epoch.values |= said
+
+
+def _number(message: Any, attribute: str) -> float:
+    value = getattr(message, attribute, "")  # fields that are empty or not sent come as ""
+    return float(value) if isinstance(value, int | float) else float("nan")
+
+
+def _time_of_day_ns(message: Any) -> int:
+    moment: time = message.time
+    seconds = moment.hour * 3600 + moment.minute * 60 + moment.second
+    return seconds * SECOND_NS + moment.microsecond * 1000
+
+
+def _stamp(message: Any) -> int:
+    days = message.date.toordinal() - date(1970, 1, 1).toordinal()
+    return int(days * DAY_NS + _time_of_day_ns(message))
+
+
+def _nearest(time_of_day_ns: int, reference_ns: int) -> int:
+    """The moment with this time of day that lies nearest to the reference: right across midnight."""
+    ahead_ns = (time_of_day_ns - reference_ns + DAY_NS // 2) % DAY_NS - DAY_NS // 2
+    return reference_ns + ahead_ns
+
+
+def _position_decimals(messages: list[Any]) -> int | None:
+    """Decimals of a degree that the positions' minutes amount to: 4 of a minute are about 6 of a degree."""
+    printed = 0
+    for message in messages[:1000]:
+        place = 1 if message.msgID == "GGA" else 2
+        printed = max([printed, *map(decimals_of, message.payload[place: place + 1])])
+    return printed + 2 if printed else None
