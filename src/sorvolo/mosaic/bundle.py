@@ -1,0 +1,316 @@
+"""The mathematics of the pose graph: transfer residuals over level ground, their derivatives, one robust solve.
+
+A keyframe is a 6-DoF camera over the plane up = 0. A pixel of the old keyframe of a link is cast to the ground and
+projected into the new one; the miss in pixels is the residual. Residuals are in pixels, not in metres: in metres
+the whole map would gain by shrinking to a point.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.sparse import coo_matrix, csc_matrix
+from scipy.sparse.linalg import splu
+
+from sorvolo.geometry.arrays import Anything, Floats
+from sorvolo.geometry.pose import rotation_from_vector
+
+SHARED = ("log_focal", "radial", "altitude_offset_m", "east_offset_m", "north_offset_m")
+"""Unknowns that all keyframes of a flight share: focal length (log of its scale), the first radial distortion that
+the calibration left over, and the constant offsets of the altitude's zero and of GPS against the map."""
+
+
+@dataclass(frozen=True, eq=False)
+class Nodes:
+    """The unknown cameras, N of them, and what telemetry says of each (infinite sigma: nothing)."""
+
+    rotations: Floats  # (N, 3, 3) site_from_camera
+    centres_m: Floats  # (N, 3)
+    prior_centres_m: Floats  # (N, 3)
+    prior_sigma_m: Floats  # (N, 3)
+    prior_rotations: Floats  # (N, 3, 3)
+    prior_sigma_rad: Floats  # (N, 3) about the camera's own axes
+    own: Anything  # (N,) bool: of the flight being mapped; the others are the known map and never move
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Matched points of L links, K pairs each (padded; weight 0), in focal lengths from the optical centre."""
+
+    old: Anything  # (L,) node index
+    new: Anything  # (L,)
+    old_ideal: Floats  # (L, K, 2)
+    new_ideal: Floats  # (L, K, 2)
+    weight: Floats  # (L, K)
+    focal_px: Floats  # (L,) of the new keyframe
+    sigma_px: Floats  # (L,) across the parallax
+    sigma_relief_m: Floats  # (L,) height of things above the ground, from what residuals along the parallax show
+
+    def of(self, chosen: Anything) -> "Pairs":
+        """The pairs of some links only."""
+        return Pairs(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Residuals (L, K, 2) in px, derivatives by the old, the new camera (L, K, 2, 6) and the shared ones (L, K, 2, 2).
+
+    A camera's six are turn (left, rad, site axes) and shift (m). `parallax` (L, K, 2) is the px that a point moves per
+    metre of height; `seen` (L, K) is False where the geometry breaks down.
+    """
+
+    residual_px: Floats
+    by_old: Floats
+    by_new: Floats
+    by_shared: Floats
+    parallax: Floats
+    seen: Anything
+
+
+def linearise(nodes: Nodes, pairs: Pairs, shared: Floats) -> Linearised:
+    """Transfer every pair from the old to the new camera over the ground."""
+    log_focal, radial = shared[0], shared[1]
+    old_own, new_own = nodes.own[pairs.old], nodes.own[pairs.new]
+    rotation_old, rotation_new = nodes.rotations[pairs.old], nodes.rotations[pairs.new]
+    centre_old, centre_new = nodes.centres_m[pairs.old][:, None], nodes.centres_m[pairs.new][:, None]
+    focal_old = np.where(old_own, np.exp(-log_focal), 1.0)[:, None, None]
+    focal_new = np.where(new_own, np.exp(log_focal), 1.0)[:, None, None]
+    r2_old = (pairs.old_ideal**2).sum(-1, keepdims=True) * old_own[:, None, None]
+    r2_new = (pairs.new_ideal**2).sum(-1, keepdims=True) * new_own[:, None, None]
+
+    ideal_old = pairs.old_ideal * (1 + radial * r2_old) * focal_old
+    ray = ideal_old @ rotation_old[:, :, :2].transpose(0, 2, 1) + rotation_old[:, None, :, 2]
+    down = np.where(ray[..., 2] < -1e-3, ray[..., 2], -1e-3)[..., None]
+    slope = ray / down
+    height = centre_old[..., 2:]
+    ground = centre_old - height * slope
+    offset = ground - centre_new
+    local = offset @ rotation_new
+    depth = np.where(local[..., 2] > 1e-3, local[..., 2], 1e-3)[..., None]
+    image = local[..., :2] / depth
+    focal_px = pairs.focal_px[:, None, None]
+    residual = focal_px * (focal_new * image - pairs.new_ideal * (1 + radial * r2_new))
+    seen = (ray[..., 2] < -1e-3) & (local[..., 2] > 1e-3)
+
+    # px per metre of ground, (L, K, 2, 3)
+    scale = (focal_px * focal_new / depth)[..., None]
+    across = rotation_new.transpose(0, 2, 1)[:, None]
+    by_ground = scale * (across[..., :2, :] - image[..., None] * across[..., 2:, :])
+    parallax = np.einsum("lkij,lkj->lki", by_ground, slope)
+    by_centre_old = by_ground.copy()
+    by_centre_old[..., 2] -= parallax
+    by_ray = by_centre_old * (-height / down)[..., None]
+    by_old = np.concatenate([_times_cross(by_ray, -ray), by_centre_old], axis=-1)
+    by_new = np.concatenate([_times_cross(by_ground, offset), -by_ground], axis=-1)
+
+    turned = by_ray @ rotation_old[:, None, :, :2]
+    by_focal = -np.einsum("lkij,lkj->lki", turned, ideal_old) * old_own[:, None, None]
+    by_focal = by_focal + focal_px * focal_new * image * new_own[:, None, None]
+    by_radial = np.einsum("lkij,lkj->lki", turned, pairs.old_ideal * r2_old * focal_old)
+    by_radial = by_radial - focal_px * pairs.new_ideal * r2_new
+    by_shared = np.stack([by_focal, by_radial], axis=-1)
+    return Linearised(residual, by_old, by_new, by_shared, parallax, seen)
+
+
+def whiten(line: Linearised, pairs: Pairs) -> Floats:
+    """(L, K, 2, 2) matrices that turn residuals into sigmas: loose along the parallax, tight across it.
+
+    A point at height z above the ground is off by z times the parallax; with a spread of heights sigma_relief_m the
+    covariance is sigma_px^2 I + sigma_relief_m^2 parallax parallax^T. No unknown per point is needed.
+    """
+    length = np.linalg.norm(line.parallax, axis=-1)
+    along = line.parallax / np.maximum(length, 1e-9)[..., None]
+    sigma = pairs.sigma_px[:, None]
+    loose = 1 / np.sqrt(sigma**2 + (pairs.sigma_relief_m[:, None] * length) ** 2)
+    outer = along[..., :, None] * along[..., None, :]
+    return (1 / sigma)[..., None, None] * (np.eye(2) - outer) + loose[..., None, None] * outer
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Where a solve ended; `normal` and `position` let the caller ask for covariances."""
+
+    nodes: Nodes
+    shared: Floats
+    cost: float
+    normal: Anything  # sparse (6 n + 5) square information matrix
+    position: Anything  # (N,) place of each node in it, -1 for those held
+
+
+def solve(
+    nodes: Nodes, pairs: Pairs, shared: Floats, shared_sigma: Floats, free: Anything, iterations: int,
+    robust_sigmas: float = 3.0,
+) -> Solution:
+    """Levenberg-Marquardt with a Cauchy loss over the free nodes, (N,) bool, and the shared unknowns.
+
+    `shared_sigma` (5,) is each shared unknown's prior sigma about 0; 0 holds it at its present value.
+    """
+    damping = 1e-6
+    cost, normal, gradient, position = _normal_equations(nodes, pairs, shared, shared_sigma, free, robust_sigmas)
+    for _ in range(iterations):
+        step = _damped_step(normal, gradient, damping)
+        moved, moved_shared = _advance(nodes, shared, step, position)
+        trial = _normal_equations(moved, pairs, moved_shared, shared_sigma, free, robust_sigmas)
+        if trial[0] > cost * (1 + 1e-9) or not np.isfinite(trial[0]):
+            damping = max(damping * 30, 1e-4)
+            if damping > 1e3:
+                break
+            continue
+        gain = cost - trial[0]
+        nodes, shared = moved, moved_shared
+        cost, normal, gradient, position = trial
+        damping = max(damping / 10, 1e-9)
+        if gain < 1e-5 * cost + 1e-9:
+            break
+    return Solution(nodes, shared, cost, normal, position)
+
+
+def _normal_equations(
+    nodes: Nodes, pairs: Pairs, shared: Floats, shared_sigma: Floats, free: Anything, robust_sigmas: float
+) -> tuple[float, csc_matrix, Floats, Anything]:
+    position = np.full(len(free), -1)
+    position[free] = np.arange(int(free.sum()))
+    count = 6 * int(free.sum())
+    size = count + len(SHARED)
+    gradient = np.zeros(size)
+    rows, columns, values = [], [], []
+    cost = 0.0
+
+    def scatter(row_start: Anything, column_start: Anything, blocks: Floats) -> None:
+        keep = (row_start >= 0) & (column_start >= 0)
+        height, width = blocks.shape[1:]
+        r = row_start[keep, None, None] + np.arange(height)[None, :, None]
+        c = column_start[keep, None, None] + np.arange(width)[None, None, :]
+        rows.append(np.broadcast_to(r, (len(r), height, width)).ravel())
+        columns.append(np.broadcast_to(c, (len(c), height, width)).ravel())
+        values.append(blocks[keep].ravel())
+
+    def gather(start: Anything, blocks: Floats) -> None:
+        keep = start >= 0
+        np.add.at(gradient, start[keep, None] + np.arange(blocks.shape[1]), blocks[keep])
+
+    if len(pairs.old):
+        line = linearise(nodes, pairs, shared)
+        white = whiten(line, pairs)
+        residual = np.einsum("lkij,lkj->lki", white, line.residual_px)
+        weight = pairs.weight * line.seen
+        squared = (residual**2).sum(-1) / robust_sigmas**2
+        cost += float((weight * np.log1p(squared)).sum()) * robust_sigmas**2
+        root = np.sqrt(weight / (1 + squared))[..., None]
+        residual = (residual * root).reshape(len(pairs.old), -1)
+        jacobian = np.concatenate([line.by_old, line.by_new, line.by_shared], axis=-1)
+        jacobian = (white @ jacobian * root[..., None]).reshape(len(pairs.old), residual.shape[1], -1)
+        information = jacobian.transpose(0, 2, 1) @ jacobian
+        pull = -np.einsum("lri,lr->li", jacobian, residual)
+        old_at, new_at = _start(position[pairs.old]), _start(position[pairs.new])
+        shared_at = np.full(len(old_at), count)
+        places = ((old_at, slice(0, 6)), (new_at, slice(6, 12)), (shared_at, slice(12, 14)))
+        for start_a, a in places:
+            gather(start_a, pull[:, a])
+            for start_b, b in places:
+                scatter(start_a, start_b, information[:, a, b])
+
+    cost += _add_priors(nodes, shared, position, count, scatter, gather, robust_sigmas)
+
+    held = shared_sigma <= 0
+    prior = np.where(held, 1e12, 1 / np.maximum(shared_sigma, 1e-12) ** 2)
+    at = np.array([count])
+    scatter(at, at, np.diag(prior)[None])
+    gradient[count:] -= np.where(held, 0.0, prior * shared)
+    gradient[count:][held] = 0.0
+    cost += float(np.where(held, 0.0, prior * shared**2).sum())
+    normal = coo_matrix(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(size, size)
+    ).tocsc()
+    return cost, normal, gradient, position
+
+
+def _add_priors(
+    nodes: Nodes, shared: Floats, position: Anything, count: int, scatter: Anything, gather: Anything, robust: float
+) -> float:
+    index = np.flatnonzero(position >= 0)
+    start = 6 * position[index]
+    shared_start = np.full(len(index), count)
+    # place: GPS belongs to the camera, up to the offsets that the flight shares
+    root = 1 / nodes.prior_sigma_m[index]
+    miss = nodes.centres_m[index] + shared[[3, 4, 2]] - nodes.prior_centres_m[index]
+    white = miss * root
+    squared = np.column_stack([(white[:, :2] ** 2).sum(1), (white[:, :2] ** 2).sum(1), white[:, 2] ** 2]) / robust**2
+    cost = float((np.log1p(squared[:, 1]) + np.log1p(squared[:, 2])).sum()) * robust**2
+    information = root**2 / (1 + squared)
+    blocks = np.zeros((len(index), 6, 6))
+    blocks[:, [3, 4, 5], [3, 4, 5]] = information
+    coupling = np.zeros((len(index), 6, 5))
+    coupling[:, [3, 4, 5], [3, 4, 2]] = information
+    own = np.zeros((len(index), 5, 5))
+    own[:, [3, 4, 2], [3, 4, 2]] = information
+    pull = -information * miss
+    gather(start, np.concatenate([np.zeros_like(pull), pull], axis=1))
+    shared_pull = np.zeros((len(index), 5))
+    shared_pull[:, [3, 4, 2]] = pull
+    gather(shared_start, shared_pull)
+    scatter(start, shared_start, coupling)
+    scatter(shared_start, start, coupling.transpose(0, 2, 1))
+    scatter(shared_start, shared_start, own)
+    # attitude, about the camera's own axes
+    rotation = nodes.rotations[index]
+    relative = nodes.prior_rotations[index].transpose(0, 2, 1) @ rotation
+    error = _rotation_vector(relative)
+    root = 1 / nodes.prior_sigma_rad[index]
+    squared = (error * root) ** 2 / robust**2
+    cost += float(np.log1p(squared).sum()) * robust**2
+    information = root**2 / (1 + squared)
+    blocks[:, :3, :3] = (rotation * information[:, None, :]) @ rotation.transpose(0, 2, 1)
+    turn_pull = -np.einsum("nij,nj->ni", rotation, information * error)
+    gather(start, np.concatenate([turn_pull, np.zeros_like(turn_pull)], axis=1))
+    scatter(start, start, blocks)
+    return cost
+
+
+def _damped_step(normal: csc_matrix, gradient: Floats, damping: float) -> Floats:
+    diagonal = normal.diagonal()
+    damped = normal + csc_matrix(
+        (damping * diagonal + 1e-9, (np.arange(len(diagonal)), np.arange(len(diagonal)))), shape=normal.shape
+    )
+    if len(gradient) <= 700:
+        try:
+            return cho_solve(cho_factor(damped.toarray(), check_finite=False), gradient, check_finite=False)
+        except LinAlgError:
+            pass  # not positive definite by a hair: the sparse LU below copes
+    return splu(damped, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(gradient)
+
+
+def _advance(nodes: Nodes, shared: Floats, step: Floats, position: Anything) -> tuple[Nodes, Floats]:
+    index = np.flatnonzero(position >= 0)
+    steps = step[: 6 * len(index)].reshape(-1, 6)
+    rotations, centres = nodes.rotations.copy(), nodes.centres_m.copy()
+    turn = steps[:, :3]
+    size = np.linalg.norm(turn, axis=1, keepdims=True)
+    turn = turn * np.minimum(1.0, 0.3 / np.maximum(size, 1e-12))
+    rotations[index] = rotation_from_vector(turn) @ rotations[index]
+    shift = steps[:, 3:].copy()
+    limit = 0.5 * np.abs(centres[index, 2])
+    shift[:, 2] = np.clip(shift[:, 2], -limit, limit)  # a camera may not dive through the ground in one step
+    centres[index] += shift
+    return replace(nodes, rotations=rotations, centres_m=centres), shared + step[6 * len(index):]
+
+
+def _start(position: Anything) -> Anything:
+    return np.where(position >= 0, 6 * position, -1)
+
+
+def _times_cross(rows: Floats, vector: Floats) -> Floats:
+    """`rows` (..., 2, 3) times the cross-product matrix of `vector` (..., 3)."""
+    return np.cross(rows, vector[..., None, :])
+
+
+def _rotation_vector(rotation: Floats) -> Floats:
+    """(N, 3) rotation vectors of matrices, (N, 3, 3); good up to half a turn."""
+    axis = np.stack([
+        rotation[:, 2, 1] - rotation[:, 1, 2], rotation[:, 0, 2] - rotation[:, 2, 0],
+        rotation[:, 1, 0] - rotation[:, 0, 1],
+    ], axis=-1) / 2
+    sine = np.linalg.norm(axis, axis=1)
+    cosine = (np.trace(rotation, axis1=1, axis2=2) - 1) / 2
+    angle = np.arctan2(sine, cosine)
+    return axis * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 1.0)[:, None]

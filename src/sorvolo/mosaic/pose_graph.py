@@ -1,0 +1,415 @@
+"""The pose graph: keyframes come in one at a time with their links, and the ones that moved come out."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse.linalg import splu
+
+from sorvolo.geometry.arrays import Anything, Floats, Matrix3, PointsM
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.ground import footprint
+from sorvolo.geometry.homography import fit_similarity, site_from_image_homography
+from sorvolo.geometry.pose import Pose
+from sorvolo.mosaic.bundle import SHARED, Nodes, Pairs, linearise, solve
+from sorvolo.survey.flight import CameraPrior
+from sorvolo.survey.mosaic import Link
+
+_UNKNOWN_SIGMA_M = 1e6  # stands in for an infinite sigma; its weight is nothing, its arithmetic finite
+
+
+@dataclass(frozen=True)
+class PoseGraphSettings:
+    """What the graph may move and when it solves."""
+
+    pairs_per_link: int = 40
+    independent_pairs: float = 20.0  # matches of one link share lens and relief errors: they count as so many
+    sigma_px: float = 0.3  # floor of a match's noise; calibration and rolling shutter never are better
+    window: int = 6  # recent keyframes freed by each local solve
+    focal_sigma: float = 0.0  # relative; 0 holds the focal length
+    radial_sigma: float = 0.0  # prior of the left-over radial distortion; 0 holds it
+    altitude_offset_sigma_m: float = 1.0  # how well the altitude's zero is known to be the ground
+    gps_offset_sigma_m: float = 0.0  # > 0 when a known map fixes the datum instead of this flight's GPS
+
+
+@dataclass(frozen=True, eq=False)
+class GraphReport:
+    """What the flight taught about itself; sigmas are one standard deviation."""
+
+    focal_scale: float
+    focal_scale_sigma: float
+    radial: float
+    altitude_offset_m: float
+    links: int
+    links_dropped: int
+    relief_m: float
+    rms_px: float
+
+
+@dataclass(eq=False)
+class _Node:
+    camera: Camera
+    prior: CameraPrior
+    own: bool
+    reported_m: PointsM
+
+
+class PoseGraph:
+    """Cameras over a ground plane, tied by links and telemetry. `add`, `retime` and `settle` change it.
+
+    Every method that changes it returns the ids whose ground outline moved by more than half a pixel since it was
+    last returned: those, and no others, have to be painted again.
+    """
+
+    def __init__(self, settings: PoseGraphSettings = PoseGraphSettings()) -> None:  # noqa: B008 (frozen)
+        self._settings = settings
+        self._ids: dict[int, int] = {}
+        self._nodes: list[_Node] = []
+        self._rotations = np.zeros((0, 3, 3))
+        self._centres_m = np.zeros((0, 3))
+        self._links: list[Link] = []
+        self._old: list[int] = []
+        self._new: list[int] = []
+        self._padded: list[tuple[Floats, Floats, Floats]] = []
+        self._sigma_px: list[float] = []
+        self._relief_m: list[float] = []
+        self._shared = np.zeros(len(SHARED))
+        self._dropped = 0
+        self._solved_at = 0
+
+    def __contains__(self, keyframe_id: int) -> bool:
+        return keyframe_id in self._ids
+
+    def __len__(self) -> int:
+        return len(self._nodes)
+
+    def pose(self, keyframe_id: int) -> Pose:
+        """site_from_camera as it stands now."""
+        at = self._ids[keyframe_id]
+        return Pose(_orthonormal(self._rotations[at]), self._centres_m[at])
+
+    def camera(self, keyframe_id: int) -> Camera:
+        """The keyframe's registration camera with the focal length and radial distortion found so far."""
+        node = self._nodes[self._ids[keyframe_id]]
+        return self.refined(node.camera) if node.own else node.camera
+
+    def refined(self, camera: Camera) -> Camera:
+        """A camera of this flight with the focal length found so far."""
+        return camera.with_focal_px(camera.fx_px * float(np.exp(self._shared[0])))
+
+    @property
+    def radial(self) -> float:
+        """Left-over radial distortion k: ideal = seen * (1 + k r^2), r in the calibration's focal lengths."""
+        return float(self._shared[1])
+
+    def centres_m(self, keyframe_ids: Sequence[int]) -> PointsM:
+        """(N, 3) camera positions."""
+        return self._centres_m[[self._ids[each] for each in keyframe_ids]].copy()
+
+    def ids(self) -> list[int]:
+        """All keyframes in the order of their coming."""
+        return list(self._ids)
+
+    def neighbours(self, keyframe_id: int) -> list[int]:
+        """The keyframes that links tie to this one."""
+        at, names = self._ids[keyframe_id], list(self._ids)
+        return [
+            names[old if new == at else new]
+            for old, new in zip(self._old, self._new, strict=True) if at in (old, new)
+        ]
+
+    def add_known(self, keyframe_id: int, camera: Camera, site_from_camera: Pose) -> None:
+        """A keyframe of the known map: it ties others down and never moves."""
+        prior = CameraPrior(
+            site_from_camera.translation_m, np.full(3, np.inf), site_from_camera.rotation, np.full(3, np.inf)
+        )
+        self._append(keyframe_id, _Node(camera, prior, False, np.zeros((4, 2))), site_from_camera)
+
+    def add(
+        self, keyframe_id: int, camera: Camera, prior: CameraPrior, links: Sequence[Link], guess: Pose
+    ) -> frozenset[int]:
+        """Tie a new keyframe to the graph by its links (`new_id` is this one), starting from `guess`."""
+        self._append(keyframe_id, _Node(camera, prior, True, np.full((4, 2), np.inf)), guess)
+        for each in links:
+            self._append_link(each)
+        free = np.zeros(len(self._nodes), bool)
+        free[-self._settings.window:] = True
+        free[[self._ids[each.old_id] for each in links]] = True
+        free &= self._own()
+        self._solve(free, shared=False, iterations=3)
+        if self._due():
+            return self.settle(iterations=3)
+        touched = np.flatnonzero(free)
+        return self._moved(touched)
+
+    def settle(self, iterations: int = 8) -> frozenset[int]:
+        """Solve everything at once: align to GPS, weigh links by what they show, drop false ones."""
+        self._solved_at = len(self._nodes)
+        self._align()
+        self._solve(self._own(), shared=True, iterations=iterations)
+        self._weigh_links()
+        return self._moved(np.flatnonzero(self._own()))
+
+    def retime(self, priors: Mapping[int, CameraPrior]) -> frozenset[int]:
+        """Replace what telemetry says of some keyframes (another clock offset) and solve again."""
+        for keyframe_id, prior in priors.items():
+            self._nodes[self._ids[keyframe_id]].prior = prior
+        return self.settle()
+
+    def report(self) -> GraphReport:
+        """Focal length, offsets, links and residuals as they stand."""
+        solution = self._solve(self._own(), shared=True, iterations=0)
+        size = solution.normal.shape[0]
+        sigma = 0.0
+        if self._settings.focal_sigma > 0:
+            unit = np.zeros(size)
+            unit[size - len(SHARED)] = 1.0
+            sigma = float(np.sqrt(max(0.0, _solve_sparse(solution.normal, unit)[size - len(SHARED)])))
+        rms = np.array([value for value in self.residuals_px().values() if np.isfinite(value)])
+        return GraphReport(
+            float(np.exp(self._shared[0])), sigma, float(self._shared[1]), float(self._shared[2]), len(self._links),
+            self._dropped, float(np.median(self._relief_m)) if self._relief_m else 0.0,
+            float(np.sqrt(np.mean(rms**2))) if len(rms) else float("nan"),
+        )
+
+    def residuals_px(self) -> dict[int, float]:
+        """Each keyframe's median transfer residual over its links, px at registration size; NaN without links."""
+        result = dict.fromkeys(self._ids, float("nan"))
+        if not self._links:
+            return result
+        pairs = self._pairs()
+        miss = np.linalg.norm(linearise(self._state(), pairs, self._shared).residual_px, axis=-1)
+        miss[pairs.weight <= 0] = np.nan
+        names = list(self._ids)
+        gathered: dict[int, list[Floats]] = {}
+        for row, (old, new) in enumerate(zip(self._old, self._new, strict=True)):
+            gathered.setdefault(old, []).append(miss[row])
+            gathered.setdefault(new, []).append(miss[row])
+        for at, rows in gathered.items():
+            result[names[at]] = float(np.nanmedian(np.concatenate(rows)))
+        return result
+
+    def sigmas_m(self) -> dict[int, float]:
+        """Each own keyframe's one-sigma error on the ground at its image centre, per axis, from the solve's covariance."""
+        own = self._own()
+        solution = self._solve(own, shared=True, iterations=0)
+        index = np.flatnonzero(own)
+        sample = index if len(index) <= 250 else index[np.linspace(0, len(index) - 1, 250).round().astype(int)]
+        size = solution.normal.shape[0]
+        right = np.zeros((size, 2 * len(sample)))
+        blocks = []
+        for k, at in enumerate(sample):
+            block = self._ground_centre_jacobian(at)
+            start = 6 * solution.position[at]
+            right[start:start + 6, 2 * k:2 * k + 2] = block.T
+            blocks.append((start, block))
+        answer = _solve_sparse(solution.normal, right)
+        found = [
+            float(np.sqrt(max(0.0, np.trace(block @ answer[start:start + 6, 2 * k:2 * k + 2]) / 2)))
+            for k, (start, block) in enumerate(blocks)
+        ]
+        every = np.interp(index, sample, found) if len(sample) else np.zeros(0)
+        names = list(self._ids)
+        return {names[at]: float(value) for at, value in zip(index, every, strict=True)}
+
+    def gps_residuals_m(self) -> dict[int, Floats]:
+        """Own keyframes' camera position minus what telemetry said, (3,) east, north, up; NaN where it said nothing."""
+        names = list(self._ids)
+        result = {}
+        for at in np.flatnonzero(self._own()):
+            prior = self._nodes[at].prior
+            miss = self._centres_m[at] + self._shared[[3, 4, 2]] - prior.position_m
+            result[names[at]] = np.where(np.isfinite(prior.position_sigma_m), miss, np.nan)
+        return result
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _append(self, keyframe_id: int, node: _Node, pose: Pose) -> None:
+        self._ids[keyframe_id] = len(self._nodes)
+        self._nodes.append(node)
+        self._rotations = np.concatenate([self._rotations, pose.rotation[None]])
+        self._centres_m = np.concatenate([self._centres_m, pose.translation_m[None]])
+
+    def _append_link(self, each: Link) -> None:
+        count = self._settings.pairs_per_link
+        old, new = self._nodes[self._ids[each.old_id]].camera, self._nodes[self._ids[each.new_id]].camera
+        pick = np.arange(len(each.new_px))
+        if len(pick) > count:
+            pick = np.linspace(0, len(pick) - 1, count).round().astype(int)
+        ideal = np.zeros((2, count, 2))
+        ideal[0, :len(pick)] = _ideal(old, each.old_px[pick])
+        ideal[1, :len(pick)] = _ideal(new, each.new_px[pick])
+        weight = np.zeros(count)
+        weight[:len(pick)] = min(1.0, self._settings.independent_pairs / len(pick))
+        self._links.append(each)
+        self._old.append(self._ids[each.old_id])
+        self._new.append(self._ids[each.new_id])
+        self._padded.append((ideal[0], ideal[1], weight))
+        self._sigma_px.append(max(self._settings.sigma_px, each.sigma_px))
+        self._relief_m.append(float(np.median(self._relief_m)) if self._relief_m else 0.1)
+
+    def _own(self) -> Anything:
+        return np.array([node.own for node in self._nodes], bool)
+
+    def _state(self) -> Nodes:
+        sigma_m = np.array([node.prior.position_sigma_m for node in self._nodes])
+        sigma_rad = np.radians([node.prior.attitude_sigma_deg for node in self._nodes])
+        return Nodes(
+            self._rotations, self._centres_m,
+            np.array([node.prior.position_m for node in self._nodes]),
+            np.where(np.isfinite(sigma_m), np.maximum(sigma_m, 1e-3), _UNKNOWN_SIGMA_M),
+            np.array([node.prior.rotation for node in self._nodes]),
+            np.where(np.isfinite(sigma_rad), np.maximum(sigma_rad, 1e-4), _UNKNOWN_SIGMA_M),
+            self._own(),
+        )
+
+    def _pairs(self) -> Pairs:
+        if not self._links:
+            none = np.zeros(0, int)
+            return Pairs(none, none, np.zeros((0, 1, 2)), np.zeros((0, 1, 2)), np.zeros((0, 1)), none, none, none)
+        old, new, weight = (np.stack(column) for column in zip(*self._padded, strict=True))
+        focal = np.array([self._nodes[at].camera.fx_px for at in self._new])
+        return Pairs(
+            np.array(self._old), np.array(self._new), old, new, weight, focal, np.array(self._sigma_px),
+            np.array(self._relief_m),
+        )
+
+    def _solve(self, free: Anything, *, shared: bool, iterations: int) -> Anything:
+        pairs = self._pairs()
+        if len(pairs.old):
+            pairs = pairs.of(free[pairs.old] | free[pairs.new])
+        settings = self._settings
+        sigma = np.array([
+            settings.focal_sigma, settings.radial_sigma, settings.altitude_offset_sigma_m,
+            settings.gps_offset_sigma_m, settings.gps_offset_sigma_m,
+        ]) if shared else np.zeros(len(SHARED))
+        solution = solve(self._state(), pairs, self._shared, sigma, free, iterations)
+        if iterations:
+            self._rotations, self._centres_m = solution.nodes.rotations, solution.nodes.centres_m
+            self._shared = solution.shared
+        return solution
+
+    def _due(self) -> bool:
+        """Whether it is time for a global solve: often at first, then with each tenth more; loops bend the map."""
+        grown = len(self._nodes) - self._solved_at
+        return grown >= max(4, len(self._nodes) // 6)
+
+    def _align(self) -> None:
+        """Bring the whole map to its GPS fixes by a similarity where it is far off: the solve only bends a little."""
+        own = self._own()
+        sigma = np.array([node.prior.position_sigma_m[:2].max() for node in self._nodes])
+        usable = own & np.isfinite(sigma)
+        if usable.sum() < 3 or not own.all():
+            return
+        fixes = np.array([node.prior.position_m for node in self._nodes])[usable, :2]
+        places = self._centres_m[usable, :2]
+        for _ in range(3):  # trimmed: a few wild fixes must not turn the map
+            spread = float(np.sqrt(((fixes - fixes.mean(0)) ** 2).sum(1).mean()))
+            uncertainty = float(np.median(sigma[usable])) / (np.sqrt(len(fixes)) * max(spread, 1e-9))
+            if len(fixes) < 3 or uncertainty > 0.15 or np.ptp(places, axis=0).max() <= 0:
+                return
+            change = fit_similarity(fixes, places)
+            miss = np.linalg.norm(places @ change[:2, :2].T + change[:2, 2] - fixes, axis=1)
+            keep = miss <= max(3 * float(np.median(miss)), 1e-6)
+            if keep.all():
+                break
+            fixes, places = fixes[keep], places[keep]
+        scale = float(np.hypot(change[0, 0], change[1, 0]))
+        turn = float(np.arctan2(change[1, 0], change[0, 0]))
+        if abs(np.log(scale)) < max(3 * uncertainty, 0.02) and abs(turn) < max(3 * uncertainty, 0.03):
+            return
+        matrix = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]])
+        self._rotations = matrix @ self._rotations
+        self._centres_m = np.column_stack([
+            self._centres_m[:, :2] @ change[:2, :2].T + change[:2, 2], self._centres_m[:, 2] * scale
+        ])
+
+    def _weigh_links(self) -> None:
+        """Learn each link's noise across the parallax and the relief along it; drop links that cannot be true."""
+        if not self._links:
+            return
+        pairs = self._pairs()
+        line = linearise(self._state(), pairs, self._shared)
+        length = np.linalg.norm(line.parallax, axis=-1)
+        along = line.parallax / np.maximum(length, 1e-9)[..., None]
+        miss_along = np.abs((line.residual_px * along).sum(-1))
+        miss_across = np.abs(line.residual_px[..., 0] * along[..., 1] - line.residual_px[..., 1] * along[..., 0])
+        unused = pairs.weight <= 0
+        with np.errstate(all="ignore"):
+            sigma_across = 1.4826 * np.nanmedian(np.where(unused, np.nan, miss_across), axis=1)
+            sigma_along = 1.4826 * np.nanmedian(np.where(unused, np.nan, miss_along), axis=1)
+            reach = np.nanmedian(np.where(unused, np.nan, length), axis=1)
+        relief = np.sqrt(np.maximum(sigma_along**2 - sigma_across**2, 0)) / np.maximum(reach, 1e-6)
+        overall = float(np.median(relief))
+        self._relief_m = list(np.clip(np.sqrt(0.5 * (relief**2 + overall**2)), 0.0, 5.0))
+        self._sigma_px = list(np.clip(sigma_across, self._settings.sigma_px, 5.0))
+        typical = float(np.median(sigma_across))
+        false = sigma_across > max(6.0, 8 * typical)
+        if false.any():
+            self._dropped += int(false.sum())
+            for name in ("_links", "_old", "_new", "_padded", "_sigma_px", "_relief_m"):
+                setattr(self, name, [each for each, bad in zip(getattr(self, name), false, strict=True) if not bad])
+
+    def _moved(self, candidates: Iterable[int]) -> frozenset[int]:
+        names = list(self._ids)
+        moved = set()
+        for at in candidates:
+            node = self._nodes[at]
+            camera = self.refined(node.camera)
+            outline = footprint(camera, Pose(_orthonormal(self._rotations[at]), self._centres_m[at]))
+            m_per_px = max(self._centres_m[at, 2], 1e-6) / camera.fx_px
+            if not np.nanmax(np.abs(outline - node.reported_m), initial=0.0) <= 0.5 * m_per_px:
+                node.reported_m = outline
+                moved.add(names[at])
+        return frozenset(moved)
+
+    def _ground_centre_jacobian(self, at: int) -> Floats:
+        """(2, 6) how the ground point at the image's centre moves with the camera's turn and shift."""
+        ray = self._rotations[at][:, 2]
+        slope = ray / min(ray[2], -1e-3)
+        flat = np.eye(3)
+        flat[:, 2] -= slope
+        cross = np.array([[0, -ray[2], ray[1]], [ray[2], 0, -ray[0]], [-ray[1], ray[0], 0]])
+        turn = -self._centres_m[at, 2] / min(ray[2], -1e-3) * flat @ -cross
+        return np.concatenate([turn, flat], axis=1)[:2]
+
+
+def pose_from_homography(site_from_image: Matrix3, camera: Camera) -> Pose | None:
+    """The camera over level ground whose view induces this homography (closed form); None if there is none."""
+    try:
+        image_from_site = np.linalg.inv(site_from_image)
+    except np.linalg.LinAlgError:
+        return None
+    columns = np.linalg.inv(camera.matrix) @ image_from_site
+    scale = np.sqrt(np.linalg.norm(columns[:, 0]) * np.linalg.norm(columns[:, 1]))
+    if not np.isfinite(scale) or scale <= 0:
+        return None
+    columns = columns / scale
+    if columns[2, 2] < 0:
+        columns = -columns
+    u, _, vt = np.linalg.svd(np.column_stack([columns[:, 0], columns[:, 1], np.cross(columns[:, 0], columns[:, 1])]))
+    camera_from_site = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    centre_m = -camera_from_site.T @ columns[:, 2]
+    if centre_m[2] <= 0 or camera_from_site[2, 2] > -0.1:
+        return None
+    return Pose(camera_from_site.T, centre_m)
+
+
+def pose_from_link(each: Link, new: Camera, old: Camera, site_from_old: Pose) -> Pose | None:
+    """The new keyframe's pose as one link gives it."""
+    site_from_new = site_from_image_homography(old, site_from_old) @ np.linalg.inv(each.new_from_old)
+    centre = site_from_new @ np.array([new.cx_px, new.cy_px, 1.0])
+    return pose_from_homography(site_from_new * np.sign(centre[2]), new)
+
+
+def _ideal(camera: Camera, points_px: Floats) -> Floats:
+    return (points_px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
+
+
+def _orthonormal(rotation: Floats) -> Matrix3:
+    u, _, vt = np.linalg.svd(rotation)
+    return u @ vt
+
+
+def _solve_sparse(normal: Anything, right: Floats) -> Floats:
+    return splu(normal, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(right)

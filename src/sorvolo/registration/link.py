@@ -1,0 +1,214 @@
+"""Two keyframes to a Link or a NoLink: the registration room's one front door."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from sorvolo.geometry.arrays import ImageGray, Matrix3, PointsPx
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.registration.features import FeatureSettings, corners, sift_features
+from sorvolo.registration.matching import match
+from sorvolo.registration.robust import fit_homography, is_believable
+from sorvolo.survey.mosaic import Features, Keyframe, Link, NoLink
+
+
+@dataclass(frozen=True)
+class LinkSettings:
+    """When two keyframes count as linked."""
+
+    features: FeatureSettings = field(default_factory=FeatureSettings)
+    min_inliers: int = 18  # below this a wrong homography is not rare
+    threshold_px: float = 3.0  # inlier band of the first fit; trees' parallax stays inside
+    refine_window_px: int = 15
+    refine_reach_px: float = 5.0  # a refined point may leave the first fit by this much
+    max_pairs: int = 40  # pairs kept per link, spread over the overlap
+    min_correlation: float = 0.35  # of the overlaid images: the last check against a false fit
+
+
+@dataclass(frozen=True, eq=False)
+class LinkPrediction:
+    """Where the old keyframe's pixels should fall in the new one, and how far off that may be."""
+
+    new_from_old: Matrix3
+    search_px: float
+
+
+class LinkCache:
+    """Remembers what is costly to extract from a keyframe and is needed by several links."""
+
+    def __init__(self, settings: FeatureSettings, capacity: int = 64) -> None:
+        self._settings, self._capacity = settings, capacity
+        self._corners: dict[int, PointsPx] = {}
+        self._sift: dict[int, Features] = {}
+
+    def corners(self, keyframe: Keyframe) -> PointsPx:
+        """Well-textured points of the keyframe, (N, 2)."""
+        if keyframe.id not in self._corners:
+            self._corners[keyframe.id] = corners(keyframe.gray, self._settings)
+            _trim(self._corners, self._capacity)
+        return self._corners[keyframe.id]
+
+    def sift(self, keyframe: Keyframe) -> Features:
+        """The keyframe's SIFT features."""
+        if keyframe.id not in self._sift:
+            self._sift[keyframe.id] = sift_features(keyframe.gray, self._settings)
+            _trim(self._sift, self._capacity)
+        return self._sift[keyframe.id]
+
+
+def link(
+    new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache
+) -> Link | NoLink:
+    """How `new` fits `old`.
+
+    Fits are tried from cheap to dear: ORB, SIFT, then, where a prediction exists, correlation of the images laid
+    over each other as predicted. The first believable one is refined to sub-pixel pairs (Lucas-Kanade on the old
+    image warped into the new one) and must make the overlaid images correlate.
+    """
+    best = "too few matching points"
+    for homography in _candidates(new, old, prediction, settings, cache):
+        refined = _refine(new, old, homography, settings, cache)
+        if isinstance(refined, Link):
+            return refined
+        best = refined
+    return NoLink(new.id, old.id, best)
+
+
+def _candidates(
+    new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache
+) -> Iterator[Matrix3]:
+    predicted = prediction.new_from_old if prediction else None
+    search_px = prediction.search_px if prediction else 0.0
+    fitted = _fit(new.features, old.features, predicted, search_px, settings, ratio=0.85)
+    if fitted is not None:
+        yield fitted
+    fitted = _fit(cache.sift(new), cache.sift(old), predicted, search_px, settings, ratio=0.85)
+    if fitted is not None:
+        yield fitted
+    if predicted is not None:
+        shifted = _correlate(new.gray, old.gray, predicted, search_px)
+        if shifted is not None:
+            yield shifted
+
+
+def _fit(
+    new: Features, old: Features, predicted: Matrix3 | None, search_px: float, settings: LinkSettings, ratio: float
+) -> Matrix3 | None:
+    pairs = match(new, old, predicted, search_px, ratio)
+    if len(pairs) < settings.min_inliers:
+        return None
+    found = fit_homography(new.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]], settings.threshold_px)
+    if found is None or found[1].sum() < settings.min_inliers:
+        return None
+    return found[0]
+
+
+def _correlate(new: ImageGray, old: ImageGray, predicted: Matrix3, search_px: float) -> Matrix3 | None:
+    """Shift the predicted overlay to the peak of the normalised cross-correlation, at half size."""
+    half = np.diag([0.5, 0.5, 1.0])
+    size = (new.shape[1] // 2, new.shape[0] // 2)
+    small = _band_pass(cv2.resize(new, size, interpolation=cv2.INTER_AREA))
+    homography = half @ predicted @ np.linalg.inv(half)
+    warped = cv2.warpPerspective(old, homography @ half, size, flags=cv2.INTER_AREA)
+    seen = cv2.warpPerspective(np.full(old.shape, 255, np.uint8), homography @ half, size) == 255
+    seen = cv2.erode(seen.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
+    rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    if seen.mean() < 0.15:
+        return None
+    reach = int(min(search_px / 2, 0.25 * min(size)))
+    y0, y1 = max(rows[0], reach), min(rows[-1], size[1] - reach)
+    x0, x1 = max(columns[0], reach), min(columns[-1], size[0] - reach)
+    if y1 - y0 < 48 or x1 - x0 < 48 or seen[y0:y1, x0:x1].mean() < 0.8:
+        return None
+    template = _band_pass(warped)[y0:y1, x0:x1]
+    window = small[y0 - reach:y1 + reach, x0 - reach:x1 + reach]
+    score = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
+    _, peak, _, (px, py) = cv2.minMaxLoc(score)
+    blanked = score.copy()
+    blanked[max(0, py - 4):py + 5, max(0, px - 4):px + 5] = -1
+    if peak < 0.12 or peak < 1.3 * blanked.max():
+        return None
+    shift = np.eye(3)
+    shift[:2, 2] = 2.0 * (px - reach), 2.0 * (py - reach)
+    return shift @ predicted
+
+
+def _band_pass(gray: ImageGray) -> np.ndarray:  # type: ignore[type-arg]
+    image = gray.astype(np.float32)
+    return cv2.GaussianBlur(image, (0, 0), 1.0) - cv2.GaussianBlur(image, (0, 0), 8.0)
+
+
+def _refine(new: Keyframe, old: Keyframe, new_from_old: Matrix3, settings: LinkSettings, cache: LinkCache) -> Link | str:
+    """Sub-pixel pairs around a first fit, or why there are none."""
+    points = cache.corners(new)
+    old_guess = apply_homography(np.linalg.inv(new_from_old), points)
+    margin = settings.refine_window_px / 2
+    high = np.array([old.gray.shape[1], old.gray.shape[0]]) - margin
+    with np.errstate(invalid="ignore"):
+        points = points[((old_guess > margin) & (old_guess < high)).all(axis=1)]
+    if len(points) < settings.min_inliers:
+        return "the overlap is too small"
+    size = (new.gray.shape[1], new.gray.shape[0])
+    warped = cv2.warpPerspective(old.gray, new_from_old, size, flags=cv2.INTER_LINEAR)
+    start = points.astype(np.float32).reshape(-1, 1, 2)
+    window = (settings.refine_window_px, settings.refine_window_px)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
+    ahead, found, _ = cv2.calcOpticalFlowPyrLK(
+        new.gray, warped, start, start.copy(), winSize=window, maxLevel=1, criteria=stop,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-7,
+    )
+    good = (found.ravel() > 0) & (np.linalg.norm((ahead - start)[:, 0], axis=1) < settings.refine_reach_px)
+    if good.sum() < settings.min_inliers:
+        return f"only {int(good.sum())} points could be followed from one image to the other"
+    good[good] = _correlation(new.gray, warped, start[good, 0], ahead[good, 0]) > settings.min_correlation
+    if good.sum() < settings.min_inliers:
+        return f"the overlaid images agree at only {int(good.sum())} points"
+    new_px = points[good]
+    old_px = apply_homography(np.linalg.inv(new_from_old), ahead[good, 0].astype(np.float64))
+    fitted = fit_homography(new_px, old_px, 1.5)
+    if fitted is None or fitted[1].sum() < settings.min_inliers:
+        return "no single plane fits the refined points"
+    homography, inliers = fitted
+    if inliers.mean() < 0.3 or not is_believable(homography, old_px):
+        return f"only {inliers.mean():.0%} of the refined points fit one plane"
+    miss = np.linalg.norm(apply_homography(homography, old_px) - new_px, axis=1)
+    near = miss < settings.refine_reach_px
+    chosen = _spread(new_px, miss, near, settings.max_pairs)
+    sigma_px = float(1.4826 * np.median(miss[inliers]) / 1.1774)  # Rayleigh's median to a per-axis sigma
+    return Link(new.id, old.id, new_px[chosen], old_px[chosen], homography, max(sigma_px, 0.05))
+
+
+def _correlation(new: ImageGray, warped: ImageGray, at_new: np.ndarray, at_warped: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+    """(N,) normalised cross-correlation of 15 px patches around paired points."""
+    offsets = np.arange(-7, 8, dtype=np.float32)
+    dy, dx = np.meshgrid(offsets, offsets, indexing="ij")
+
+    def patches(image: ImageGray, at: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+        x = (at[:, :1] + dx.ravel()).astype(np.float32)
+        y = (at[:, 1:] + dy.ravel()).astype(np.float32)
+        values = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
+        values -= values.mean(axis=1, keepdims=True)
+        return values / (np.linalg.norm(values, axis=1, keepdims=True) + 1.0)
+
+    return (patches(new, at_new) * patches(warped, at_warped)).sum(axis=1)
+
+
+def _spread(points: PointsPx, miss: np.ndarray, usable: np.ndarray, count: int) -> np.ndarray:  # type: ignore[type-arg]
+    """Indices of at most `count` usable points, taken in turn from the cells of a 6 x 6 grid over the points."""
+    indices = np.flatnonzero(usable)
+    if len(indices) <= count:
+        return indices
+    low, high = points[indices].min(axis=0), points[indices].max(axis=0)
+    cell = np.minimum((points[indices] - low) / (high - low + 1e-9) * 6, 5).astype(int) @ np.array([1, 6])
+    order = np.lexsort((miss[indices], cell))
+    rank = np.zeros(len(indices), int)
+    starts = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    rank[order] = np.arange(len(indices)) - np.repeat(starts, np.diff(np.append(starts, len(indices))))
+    return np.sort(indices[np.lexsort((cell, rank))[:count]])
+
+
+def _trim(cache: dict, capacity: int) -> None:  # type: ignore[type-arg]
+    while len(cache) > capacity:
+        cache.pop(next(iter(cache)))
