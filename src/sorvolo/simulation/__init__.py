@@ -1,0 +1,1 @@
+"""A synthetic site and flights over it with known truth; pure, from memory."""
