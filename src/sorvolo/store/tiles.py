@@ -91,11 +91,13 @@ class TileView(Mapping[TileIndex, ImageRGBA]):
     def __getitem__(self, index: TileIndex) -> ImageRGBA:
         """The tile; raises KeyError where there is none and StoreError when its version has been dropped."""
         sha256 = self._hashes[index]
-        for _ in range(5):  # a writer that flushes between each look and each read is not seen in practice
+        for _ in range(5):  # a writer would have to flush between each look and each read
             try:
                 return self._blobs.load(sha256)
-            except FileNotFoundError:
-                sha256 = self._refresh().get(index, "")
+            except FileNotFoundError as error:
+                former, sha256 = sha256, self._refresh().get(index, "")
+                if sha256 == former:
+                    raise _missing(error) from error
             if not sha256:
                 break
         raise StoreError(f"tile {index} was replaced while the map was being read; read the map again")
@@ -136,7 +138,7 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
         try:
             tile: ImageRGBA = frozen(self._blobs.load(sha256), np.uint8)
         except FileNotFoundError as error:
-            raise StoreError(f"{error.filename} is missing; restore it from a copy of the site") from error
+            raise _missing(error) from error
         self._keep(index, tile)
         return tile
 
@@ -206,3 +208,7 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
             self._superseded.add(former)
         if sha256 is not None:
             self._hashes[index] = sha256
+
+
+def _missing(error: FileNotFoundError) -> StoreError:
+    return StoreError(f"{error.filename} is missing; restore it from a copy of the site, or map again")

@@ -1,0 +1,215 @@
+"""GeoTIFF out and in: the map as a Cloud Optimized GeoTIFF, and reference maps read back as arrays.
+
+The one place of the half-pixel shift: our pixel (0, 0) has its centre at the grid's origin, GDAL's transform
+starts at that pixel's outer corner.
+"""
+
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+import rasterio.shutil
+from rasterio.crs import CRS
+from rasterio.enums import ColorInterp, Resampling
+from rasterio.errors import CRSError, RasterioError
+from rasterio.transform import Affine
+from rasterio.warp import calculate_default_transform, reproject
+from rasterio.windows import Window
+
+from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.geometry.arrays import ImageRGBA
+from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
+from sorvolo.store.atomic import atomic_path, scratch_folder, writing
+
+_BLOCK_PX = 512
+_VERIFIED_BLOCKS = 64
+# zstd is the fastest to write and to read once; deflate is what every reader of the final file understands
+_SCRATCH = {"driver": "GTiff", "tiled": True, "compress": "zstd", "zstd_level": 1, "sparse_ok": True}
+_COG = {
+    "driver": "COG", "blocksize": _BLOCK_PX, "compress": "DEFLATE", "level": 6, "predictor": "YES",
+    "overviews": "AUTO", "overview_resampling": "AVERAGE", "bigtiff": "IF_SAFER", "num_threads": "ALL_CPUS",
+    "sparse_ok": True,
+}
+# a small cache keeps memory flat; no directory listing keeps GDAL from opening neighbours of a user's file
+_ENVIRONMENT = {"GDAL_CACHEMAX": 128, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
+
+
+@dataclass(frozen=True, eq=False)
+class Raster:
+    """A north-up map: `rgba` (H, W, 4), the centre of pixel (0, 0) at `origin_m` in `crs` ("": none)."""
+
+    rgba: ImageRGBA
+    origin_m: tuple[float, float]
+    m_per_px: float
+    crs: str
+
+
+def write_cog(
+    tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, path: Path, *, crs: str | None = None
+) -> None:
+    """Write the map as a Cloud Optimized GeoTIFF with alpha and overviews, in place of what was at `path`.
+
+    Tiles are read one at a time. `crs` reprojects (bilinear); the site's own CRS is the default, a local site
+    has none. The file is read back before it takes its place. Raises SettingsError for an unknown `crs` and
+    StoreError for an empty map, a full disk, or a file that reads back differently.
+    """
+    if not tiles:
+        raise StoreError("the map has no tiles; there is nothing to write as GeoTIFF")
+    grid = site_grid.grid
+    target = None if crs is None or crs == grid.crs else parse_crs(crs, grid)
+    with (
+        scratch_folder(path.parent) as scratch,
+        atomic_path(path) as temporary,
+        rasterio.Env(**_ENVIRONMENT),
+        _naming_faults(path),
+    ):
+        plain = scratch / "plain.tif"
+        _write_plain(tiles, grid, plain)
+        if target is not None:
+            plain = _warped(plain, target)
+        with rasterio.open(plain, driver="GTiff") as source:
+            rasterio.shutil.copy(source, temporary, **_COG)
+            _verify(temporary, source)
+
+
+def parse_crs(crs: str, grid: Grid) -> CRS:
+    """The CRS to reproject a map to; raises SettingsError when unknown or when the map is not on Earth."""
+    if not grid.crs:
+        raise SettingsError(f"this site has no geo-reference, so its map cannot be in {crs}; leave it out")
+    try:
+        return CRS.from_user_input(crs)
+    except CRSError as error:
+        raise SettingsError(f"unknown coordinate reference system {crs!r}; try one as EPSG:32633") from error
+
+
+def read_raster(path: Path, max_px: int) -> Raster:
+    """Read a north-up GeoTIFF of 8-bit grey, RGB or RGBA, thinned so that neither side exceeds `max_px`.
+
+    Only the GTiff driver opens it: a VRT renamed .tif could name any other file. Thinning averages whole
+    blocks of pixels, so that the origin and the ground sampling distance stay exact. Raises InputError.
+    """
+    if not Path(path).is_file():
+        raise InputError(f"no such file: {path}; a GeoTIFF was needed")
+    try:
+        with rasterio.Env(**_ENVIRONMENT), rasterio.open(Path(path), driver="GTiff") as source:
+            return _raster(source, path, max_px)
+    except RasterioError as error:
+        raise InputError(f"{path} is no readable GeoTIFF ({error}); export it as GeoTIFF again") from error
+
+
+def _write_plain(tiles: Mapping[TileIndex, ImageRGBA], grid: Grid, path: Path) -> None:
+    columns, rows = np.array(sorted(tiles)).T
+    left, top = columns.min() * grid.tile_px, rows.min() * grid.tile_px
+    width, height = (columns.max() + 1) * grid.tile_px - left, (rows.max() + 1) * grid.tile_px - top
+    outer_corner_m = grid.projected_from_grid(np.array([[left - 0.5, top - 0.5]]))[0]
+    profile = _SCRATCH | {
+        "width": width, "height": height, "count": 4, "dtype": "uint8", "photometric": "RGB", "alpha": "YES",
+        "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX, "bigtiff": "IF_SAFER",
+        "crs": grid.crs or None,
+        "transform": Affine(grid.m_per_px, 0, outer_corner_m[0], 0, -grid.m_per_px, outer_corner_m[1]),
+    }
+    with rasterio.open(path, "w", **profile) as sink:
+        sink.colorinterp = [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]
+        for column, row in sorted(tiles, key=lambda index: (index[1], index[0])):
+            x0, y0, _, _ = grid.tile_window((column, row))
+            window = Window(x0 - left, y0 - top, grid.tile_px, grid.tile_px)
+            sink.write(np.moveaxis(tiles[column, row], 2, 0), window=window)
+    # GDAL can lose blocks on a full disk and still close without a word
+    with rasterio.open(path, driver="GTiff") as source:
+        for index in _spread(sorted(tiles), _VERIFIED_BLOCKS):
+            x0, y0, _, _ = grid.tile_window(index)
+            read = source.read(window=Window(x0 - left, y0 - top, grid.tile_px, grid.tile_px))
+            if not np.array_equal(np.moveaxis(read, 0, 2), tiles[index]):
+                raise StoreError(_differs(path))
+
+
+def _warped(plain: Path, target: CRS) -> Path:
+    """Reproject the scratch file into another beside it; a warped VRT would be warped for each overview."""
+    warped = plain.with_name("warped.tif")
+    bands = [1, 2, 3, 4]
+    with rasterio.open(plain, driver="GTiff") as source:
+        transform, width, height = calculate_default_transform(
+            source.crs, target, source.width, source.height, *source.bounds
+        )
+        profile = source.profile | _SCRATCH | {
+            "crs": target, "transform": transform, "width": width, "height": height,
+            "photometric": "RGB", "alpha": "YES",
+        }
+        with rasterio.open(warped, "w", **profile) as sink:
+            sink.colorinterp = source.colorinterp
+            reproject(
+                rasterio.band(source, bands), rasterio.band(sink, bands),
+                resampling=Resampling.bilinear, src_alpha=4, warp_mem_limit=64,
+            )
+    return warped
+
+
+def _verify(path: Path, source: rasterio.DatasetReader) -> None:
+    with rasterio.open(path, driver="GTiff") as written:
+        if (written.width, written.height, written.count) != (source.width, source.height, 4):
+            raise StoreError(_differs(path))
+        # the last block lies last in the file: a cut file cannot give it
+        windows = [window for _, window in written.block_windows(1)]
+        for window in _spread(windows, _VERIFIED_BLOCKS):
+            if not np.array_equal(written.read(window=window), source.read(window=window)):
+                raise StoreError(_differs(path))
+
+
+def _spread(items: list, count: int) -> Iterator:  # type: ignore[type-arg]
+    """At most `count` items, evenly spread, the first and the last among them."""
+    for position in np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).astype(int)):
+        yield items[position]
+
+
+def _differs(path: Path) -> str:
+    free_mb = shutil.disk_usage(path.parent).free / 1e6
+    return (
+        f"{path} reads back differently from what was written ({free_mb:.0f} MB free on its disk); "
+        "free some space or check the disk, and run it again"
+    )
+
+
+@contextmanager
+def _naming_faults(path: Path) -> Iterator[None]:
+    try:
+        with writing(path):
+            yield
+    except RasterioError as error:
+        free_mb = shutil.disk_usage(path.parent).free / 1e6
+        raise StoreError(
+            f"could not write {path}: {error} ({free_mb:.0f} MB free on its disk); "
+            "free some space and run it again"
+        ) from error
+
+
+def _raster(source: rasterio.DatasetReader, path: Path, max_px: int) -> Raster:
+    transform = source.transform
+    if source.count == 2 or set(source.dtypes) != {"uint8"}:
+        raise InputError(
+            f"{path} has {source.count} bands of {'/'.join(sorted(set(source.dtypes)))}; "
+            "8-bit grey, RGB or RGBA was needed: convert it with gdal_translate -ot Byte -scale"
+        )
+    if transform.b or transform.d or transform.e >= 0 or not np.isclose(transform.a, -transform.e, rtol=1e-6):
+        raise InputError(f"{path} is not a north-up map with square pixels; warp it with gdalwarp first")
+    if source.crs is not None and not source.crs.is_projected:
+        raise InputError(f"{path} is in degrees ({source.crs}); warp it to a CRS in metres, as its UTM zone")
+    step = -(-max(source.width, source.height) // max_px)
+    width, height = source.width // step, source.height // step
+    if not width or not height:
+        raise InputError(f"{path} is {source.width}x{source.height} px, too narrow to thin to {max_px} px")
+    window = Window(0, 0, width * step, height * step)
+    bands = [1, 2, 3] if source.count >= 3 else [1, 1, 1]
+    rgb = source.read(bands, window=window, out_shape=(3, height, width), resampling=Resampling.average)
+    alpha = source.dataset_mask(window=window, out_shape=(height, width), resampling=Resampling.average)
+    m_per_px = transform.a * step
+    epsg = source.crs.to_epsg() if source.crs is not None else None
+    return Raster(
+        np.ascontiguousarray(np.moveaxis(np.concatenate([rgb, alpha[None]]), 0, 2)),
+        (transform.c + m_per_px / 2, transform.f - m_per_px / 2),
+        m_per_px,
+        f"EPSG:{epsg}" if epsg else source.crs.to_wkt() if source.crs is not None else "",
+    )
