@@ -62,7 +62,7 @@ def camera_from_nodes(
         camera = Camera(*size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], distortion)
     except GeometryError as error:
         raise InputError(f"{file_name}: {error}") from error
-    _check_lens(file_name, camera)
+    check_lens(file_name, camera)
     sigma = _sigma(nodes)
     if size != (width_px, height_px):
         words += f", resized from {size[0]}x{size[1]}"
@@ -188,7 +188,7 @@ def _size_from_centre(file_name: str, matrix: Matrix3, width_px: int, height_px:
     return width, height
 
 
-def _check_lens(file_name: str, camera: Camera) -> None:
+def check_lens(file_name: str, camera: Camera) -> None:
     """Raise InputError if the distortion folds the picture onto itself: a pixel would have no single ray."""
     edge_px = np.concatenate([
         camera.corners_px, 0.5 * (camera.corners_px + np.roll(camera.corners_px, 1, axis=0)),
