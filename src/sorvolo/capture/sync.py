@@ -1,0 +1,328 @@
+"""Frames and telemetry on one clock: how they are tied, what telemetry says at a frame, which offset motion shows."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Floats, PointsM, Vector3
+from sorvolo.geometry.geodesy import Geodetic, LocalFrame
+from sorvolo.geometry.homography import fit_similarity
+from sorvolo.geometry.pose import site_from_body_nadir_rotation, site_from_gimbal_rotation
+from sorvolo.survey.flight import CameraPrior, Notice, Telemetry
+
+DEFAULT_HORIZONTAL_SIGMA_M = 1.5  # the thesis's DJI Phantom 3, section 2.2
+_OTHER_FLIGHT_S = 24 * 3600.0  # clocks are set to a wrong zone by up to 14 h; a day apart is another flight
+_HEIGHTS = (
+    ("height_above_takeoff_m", "above take-off", 1.0),
+    ("orthometric_height_m", "orthometric", 3.0),
+    ("ellipsoidal_height_m", "ellipsoidal", 3.0),
+)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """How the frames' clock is tied to telemetry's: telemetry time = frame time + `offset_s` (+ the tie itself).
+
+    `sample_s` are the samples on the frames' clock (seconds since the first frame) at offset 0; `sigma_s` is how
+    far off the tie may be, which bounds the search for an offset; 0 = photos that carry their own fixes.
+    """
+
+    sample_s: Floats
+    tie: str
+    sigma_s: float
+    first_frame_utc_ns: int
+    notices: tuple[Notice, ...] = ()
+
+
+@dataclass(frozen=True)
+class OffsetEstimate:
+    """A clock offset seen in motion, with its one-sigma uncertainty, and what a fit at 0 and at it leaves over."""
+
+    offset_s: float
+    sigma_s: float
+    rms_at_zero_m: float
+    rms_m: float
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the offset is well seen and worth applying."""
+        return (
+            np.isfinite(self.sigma_s)
+            and abs(self.offset_s) > max(3 * self.sigma_s, 0.04)
+            and self.rms_m < 0.97 * self.rms_at_zero_m
+        )
+
+
+def tie_clocks(
+    telemetry: Telemetry, *, kind: str, start_ns: int, duration_s: float, offset_given: bool, strict: bool
+) -> Clock:
+    """Put telemetry's samples on the frames' clock.
+
+    Photos carry UTC themselves. A video's subtitles count from its first frame. Else UTC decides when the video
+    knows its own start and it lies in the telemetry, and the first sample is tied to the first frame when not.
+    `strict`: telemetry that the user named; raises InputError when it is plainly of another flight (more than a
+    day apart) and no `--offset` says otherwise.
+    """
+    utc_s = (telemetry.time_ns - telemetry.time_ns[:1]) / 1e9
+    first_ns = int(telemetry.time_ns[0])
+    if kind == "photos":
+        return Clock((telemetry.time_ns - start_ns) / 1e9, "each photo carries its own fix", 0.0, start_ns)
+    if (telemetry.video_time_ns >= 0).all():
+        zero_ns = int(np.median(telemetry.time_ns - telemetry.video_time_ns))
+        return Clock(telemetry.video_time_ns / 1e9, "telemetry counts from the video's first frame", 0.5, zero_ns)
+    dated = first_ns > 86_400 * 10**9 * 3650 and start_ns > 86_400 * 10**9 * 3650
+    if dated:
+        lead_s = (first_ns - start_ns) / 1e9
+        overlap_s = min(lead_s + float(utc_s[-1]), duration_s) - max(lead_s, 0.0)
+        if overlap_s > 0.3 * min(duration_s, float(utc_s[-1]) + 1.0):
+            return Clock(utc_s + lead_s, "both carry UTC", 2.0, start_ns)
+        apart_s = max(lead_s - duration_s, -lead_s - float(utc_s[-1]))
+        if apart_s > _OTHER_FLIGHT_S and strict and not offset_given:
+            raise InputError(
+                f"the telemetry is of another flight: it begins {apart_s / 86400:.1f} days from the video's own time; "
+                "give the right file with --telemetry, or --offset 0 to tie their starts all the same"
+            )
+        words = f"the video's clock and the telemetry's are {apart_s / 3600:.1f} h apart: their starts were tied"
+        return Clock(utc_s, "first sample tied to first frame", 3.0, first_ns, (Notice("clocks_apart", 1, words),))
+    return Clock(utc_s, "first sample tied to first frame", 3.0, first_ns)
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One flight's telemetry in the site frame, ready to be asked for any moment.
+
+    `up_m` is above the site's ground as telemetry has it; `altitude_offset_sigma_m` is how well the zero of that
+    height is known to be the ground (infinite: only differences count).
+    """
+
+    sample_s: Floats
+    east_north_m: PointsM
+    up_m: Floats
+    horizontal_sigma_m: Floats
+    vertical_sigma_m: float
+    altitude_offset_sigma_m: float
+    height_words: str
+    yaw_deg: Floats  # unwrapped, of the camera if known, else the body
+    pitch_deg: Floats
+    roll_deg: Floats
+    attitude: str  # "gimbal" | "body" | "none"
+    interval_s: float
+    longest_gap_s: float = field(default=3.0)
+
+    def prior(self, time_s: float, *, smooth_s: float = 0.0) -> CameraPrior:
+        """What telemetry says at `time_s` on the frames' clock (eq. 3.18: linear between fixes).
+
+        `smooth_s`: fixes within this time to both sides are averaged by a straight line, which uses every one of a
+        fast receiver's fixes. Beyond a gap or the ends by more than the receiver's interval, nothing is known.
+        """
+        place, sigma_m, velocity = self._place(time_s, smooth_s)
+        rotation, sigma_deg, words = self._attitude(time_s, velocity)
+        known = np.isfinite(place)
+        sigma = np.where(known, sigma_m, np.inf)
+        return CameraPrior(
+            np.where(known, place, 0.0), sigma, rotation, sigma_deg, np.nan_to_num(velocity),
+            f"{'GPS' if known[0] else 'no fix'}, {words}",
+        )
+
+    def _place(self, time_s: float, smooth_s: float) -> tuple[Vector3, Vector3, Vector3]:
+        unknown = np.full(3, np.nan)
+        good = np.flatnonzero(np.isfinite(self.east_north_m[:, 0]))
+        if not len(good):
+            return unknown, unknown, unknown
+        times = self.sample_s[good]
+        after = int(np.searchsorted(times, time_s))
+        before = after - 1
+        reach_s = max(1.5 * self.interval_s, 0.3)
+        if before < 0 or after >= len(good):
+            edge = max(0, min(len(good) - 1, before if after >= len(good) else after))
+            if abs(times[edge] - time_s) > reach_s:
+                return unknown, unknown, unknown
+            before, after = (edge - 1, edge) if edge > 0 else (0, min(1, len(good) - 1))
+        elif times[after] - times[before] > self.longest_gap_s and times[after] != time_s:
+            return unknown, unknown, unknown
+        chosen = np.arange(before, after + 1)
+        if smooth_s > 0:
+            near = np.flatnonzero(np.abs(times - time_s) <= smooth_s)
+            chosen = near if len(near) >= 3 else chosen
+        rows = good[chosen]
+        values = np.column_stack([self.east_north_m[rows], self.up_m[rows]])
+        place, velocity, gain = _line(times[chosen] - time_s, values)
+        sigma_h = float(np.median(self.horizontal_sigma_m[rows]))
+        # neighbouring fixes err alike, so averaging many never helps by more than a factor of two
+        shrink = max(gain, 0.5)
+        return place, np.array([sigma_h, sigma_h, self.vertical_sigma_m]) * shrink, velocity
+
+    def _attitude(self, time_s: float, velocity_m_s: Vector3) -> tuple[Floats, Floats, str]:
+        if self.attitude != "none" and self.sample_s[0] - 2 <= time_s <= self.sample_s[-1] + 2:
+            yaw, pitch, roll = (
+                float(np.interp(time_s, self.sample_s, column))
+                for column in (self.yaw_deg, self.pitch_deg, self.roll_deg)
+            )
+            if self.attitude == "gimbal":
+                return site_from_gimbal_rotation(yaw, pitch, roll), np.array([2.0, 2.0, 4.0]), "gimbal attitude"
+            words = "body attitude, camera taken as fixed straight down"
+            return site_from_body_nadir_rotation(yaw, pitch, roll), np.array([5.0, 5.0, 8.0]), words
+        course_deg = 0.0
+        words = "no attitude: camera taken as looking down"
+        if np.isfinite(velocity_m_s[:2]).all() and np.hypot(*velocity_m_s[:2]) > 0.5:
+            course_deg = float(np.degrees(np.arctan2(velocity_m_s[0], velocity_m_s[1])))
+            words += ", image top taken as the course"
+        return site_from_gimbal_rotation(course_deg, -90.0, 0.0), np.array([12.0, 12.0, np.inf]), words
+
+
+def track_from_telemetry(
+    telemetry: Telemetry, clock: Clock, frame: LocalFrame, *, ground_elevation_m: float | None = None,
+) -> tuple[Track, tuple[Notice, ...]]:
+    """Telemetry in the site frame. `ground_elevation_m` is the ground's height in telemetry's own height reference."""
+    up_m, words, vertical_sigma_m, offset_sigma_m, notices = _heights(telemetry, ground_elevation_m)
+    latitude, longitude = telemetry["latitude_deg"], telemetry["longitude_deg"]
+    known = np.isfinite(latitude) & np.isfinite(longitude)
+    east_north = np.full((len(telemetry), 2), np.nan)
+    # the plane of the site: a drone's own height moves east and north by 1 part in 100,000 only
+    east_north[known] = frame.site_from_wgs84(
+        latitude[known], longitude[known], np.full(int(known.sum()), frame.origin.height_m)
+    )[:, :2]
+    sigma = telemetry["horizontal_sigma_m"]
+    sigma = np.where(np.isfinite(sigma), sigma, DEFAULT_HORIZONTAL_SIGMA_M)
+    attitude, angles = _angles(telemetry)
+    times = clock.sample_s[known]
+    interval_s = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    changes = np.any(np.diff(east_north[known], axis=0) != 0, axis=1)
+    if clock.sigma_s and changes.any():  # a 1 Hz fix repeated at frame rate is still a 1 Hz fix
+        moments = times[1:][changes]
+        interval_s = max(interval_s, float(np.median(np.diff(moments))) if len(moments) > 1 else interval_s)
+        keep = np.flatnonzero(known)[1:][~changes]
+        if interval_s > 1.8 * float(np.median(np.diff(times))):
+            east_north[keep] = np.nan
+    gap_s = np.inf if not clock.sigma_s else max(4 * interval_s, 3.0)
+    if not clock.sigma_s:
+        interval_s = 0.0
+    track = Track(
+        clock.sample_s, east_north, up_m, sigma, vertical_sigma_m, offset_sigma_m, words, *angles, attitude,
+        interval_s, gap_s,
+    )
+    return track, notices
+
+
+def shifted(track: Track, offset_s: float) -> Track:
+    """The track with telemetry time = frame time + offset_s."""
+    return replace(track, sample_s=track.sample_s - offset_s)
+
+
+def site_origin(telemetry: Telemetry) -> Geodetic | None:
+    """The first fix of the flight, rounded to a thousandth of an arc second; None without any."""
+    known = np.flatnonzero(np.isfinite(telemetry["latitude_deg"]))
+    if not len(known):
+        return None
+    middle = known[0]
+    return Geodetic(
+        round(float(telemetry["latitude_deg"][middle]), 7), round(float(telemetry["longitude_deg"][middle]), 7), 0.0
+    )
+
+
+def estimate_offset(track: Track, times_s: Floats, seen_m: PointsM, *, reach_s: float) -> OffsetEstimate:
+    """The clock offset that makes telemetry's path fit the path seen in the pictures (N, 2), up to a similarity.
+
+    Straight flight at constant speed fits at any offset: then the uncertainty comes out infinite or large. It is
+    the curvature of the squared misfit at its minimum, with the misfit itself as the noise.
+    """
+    usable = np.isfinite(track.east_north_m[:, 0])
+    path_s, path_m = track.sample_s[usable], track.east_north_m[usable]
+    unknown = OffsetEstimate(0.0, float("inf"), float("nan"), float("nan"))
+    if len(path_s) < 4 or len(times_s) < 6 or reach_s <= 0:
+        return unknown
+
+    def misfit(offset_s: float) -> tuple[float, int]:
+        at = times_s + offset_s
+        inside = (at >= path_s[0]) & (at <= path_s[-1])
+        if inside.sum() < max(6, 0.6 * len(at)):
+            return float("inf"), 0
+        fixes = np.column_stack([np.interp(at[inside], path_s, path_m[:, k]) for k in range(2)])
+        seen = seen_m[inside]
+        if np.ptp(seen, axis=0).max() <= 0:
+            return float("inf"), 0
+        change = fit_similarity(fixes, seen)
+        miss = np.linalg.norm(seen @ change[:2, :2].T + change[:2, 2] - fixes, axis=1)
+        limit = 3 * float(np.median(miss)) + 1e-9
+        return float(np.mean(np.minimum(miss, limit) ** 2)), int(inside.sum())
+
+    step = max(0.02, reach_s / 100)
+    offsets = np.arange(-reach_s, reach_s + step / 2, step)
+    costs = np.array([misfit(each)[0] for each in offsets])
+    if not np.isfinite(costs).any():
+        return unknown
+    best = float(offsets[int(np.argmin(costs))])
+    for _ in range(3):
+        step /= 4
+        nearby = best + step * np.arange(-4, 5)
+        best = float(nearby[int(np.argmin([misfit(each)[0] for each in nearby]))])
+    lowest, count = misfit(best)
+    at_zero = misfit(0.0)[0]
+    wide = 0.25
+    bend = (misfit(best - wide)[0] + misfit(best + wide)[0] - 2 * lowest) / wide**2
+    # residuals of a 1 Hz receiver repeat over the frames between its fixes
+    independent = min(count, max(3.0, (times_s[-1] - times_s[0]) / max(track.interval_s, 1e-3)))
+    sigma = float(np.sqrt(2 * lowest / (independent * bend))) if np.isfinite(bend) and bend > 0 else float("inf")
+    if abs(best) > 0.97 * reach_s:
+        return replace(unknown, rms_at_zero_m=float(np.sqrt(at_zero)), rms_m=float(np.sqrt(lowest)))
+    return OffsetEstimate(best, sigma, float(np.sqrt(at_zero)), float(np.sqrt(lowest)))
+
+
+def _line(times_s: Floats, values: Floats) -> tuple[Floats, Floats, float]:
+    """Value and slope at time 0 of the straight line through samples, and how much it shrinks their noise."""
+    if len(times_s) == 1 or np.ptp(times_s) <= 0:
+        return values.mean(axis=0), np.full(values.shape[1], np.nan), 1.0
+    centred = times_s - times_s.mean()
+    slope = (centred[:, None] * (values - values.mean(axis=0))).sum(0) / (centred**2).sum()
+    variance = 1 / len(times_s) + times_s.mean() ** 2 / (centred**2).sum()
+    return values.mean(axis=0) - slope * times_s.mean(), slope, float(np.sqrt(variance))
+
+
+def _heights(
+    telemetry: Telemetry, ground_elevation_m: float | None
+) -> tuple[Floats, str, float, float, tuple[Notice, ...]]:
+    notices: list[Notice] = []
+    for column, words, sigma_m in _HEIGHTS:
+        values = telemetry[column]
+        known = np.isfinite(values)
+        if known.mean() < 0.5 if len(values) else True:
+            continue
+        stated = telemetry["vertical_sigma_m"]
+        sigma_m = float(np.nanmedian(stated)) if np.isfinite(stated).any() else sigma_m
+        filled = np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
+        if ground_elevation_m is not None:
+            return filled - ground_elevation_m, f"{words}, ground given", sigma_m, 0.5, tuple(notices)
+        if column == "height_above_takeoff_m":
+            if float(np.median(filled)) < 0.5:
+                text = f"height above take-off is {np.median(filled):.1f} m for most of the flight: not used"
+                notices.append(Notice("height_of_zero", int(known.sum()), text))
+                continue
+            return filled, f"{words}, ground taken to be at take-off level", sigma_m, 1.0, tuple(notices)
+        first = float(np.median(filled[: max(1, min(5, len(filled)))]))
+        if float(np.median(filled)) - first > 4.0 and first - float(filled.min()) < 2.0:
+            return filled - first, f"{words}, ground taken to be where the telemetry begins", sigma_m, 2.0, tuple(notices)
+        notices.append(Notice(
+            "ground_unknown", 1,
+            f"heights are {words} and the ground's is unknown: the height above ground is found from the pictures",
+        ))
+        typical = float(np.median(filled))
+        return filled - typical + 40.0, f"{words}, ground found from the pictures", sigma_m, np.inf, tuple(notices)
+    notices.append(Notice("height_unknown", 1, "telemetry has no height: it is found from the pictures and GPS"))
+    return np.full(len(telemetry), 40.0), "none, found from the pictures", np.inf, np.inf, tuple(notices)
+
+
+def _angles(telemetry: Telemetry) -> tuple[str, tuple[Floats, Floats, Floats]]:
+    for kind, prefix in (("gimbal", "camera"), ("body", "body")):
+        columns = [telemetry[f"{prefix}_{name}_deg"] for name in ("yaw", "pitch", "roll")]
+        known = np.isfinite(columns[0]) & np.isfinite(columns[1])
+        if len(telemetry) and known.mean() > 0.5:
+            columns[2] = np.where(np.isfinite(columns[2]), columns[2], 0.0)
+            index, where = np.arange(len(telemetry)), np.flatnonzero(known)
+            yaw = np.degrees(np.unwrap(np.radians(columns[0][known])))
+            return kind, (
+                np.interp(index, where, yaw), np.interp(index, where, columns[1][known]),
+                np.interp(index, where, columns[2][known]),
+            )
+    zeros = np.zeros(len(telemetry))
+    return "none", (zeros, zeros, zeros)

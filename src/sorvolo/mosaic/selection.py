@@ -1,0 +1,110 @@
+"""Which frames become keyframes: enough overlap by eq. 3.17, sharp enough, inside the area of interest."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sorvolo.errors import SettingsError
+from sorvolo.geometry.arrays import ImageGray, ImageRGB
+from sorvolo.geometry.camera import Camera
+from sorvolo.registration.features import gray_from_rgb, normalise_contrast, sharpness
+from sorvolo.survey.flight import LostFrame, PosedFrame
+
+_SMALL_PX = 256
+
+
+@dataclass(frozen=True)
+class SelectionSettings:
+    """When a frame is worth a place in the map."""
+
+    overlap: float = 0.7  # s of eq. 3.17: share of a frame that its successor shows again
+    least_overlap: float = 0.5  # a blurred frame is skipped only while its successors still overlap this much
+    blurred: float = 0.6  # of the usual sharpness: wait for a better one
+    useless: float = 0.35  # of the usual sharpness: reject
+
+    def __post_init__(self) -> None:
+        if not 0 < self.least_overlap <= self.overlap < 1:
+            raise SettingsError(f"overlap must lie between {self.least_overlap} and 1, got {self.overlap}")
+
+
+@dataclass(frozen=True, eq=False)
+class Selected:
+    """A selected frame; `reason` is empty, or says why it cannot be used after all."""
+
+    posed: PosedFrame
+    reason: str
+
+
+def interval_s(camera: Camera, height_m: float, speed_m_s: float, overlap: float) -> float:
+    """Longest time between frames that keeps `overlap` along the shorter side: 1 / fr_min of eq. 3.17."""
+    length_m = height_m * min(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px)
+    return float(np.clip(length_m * (1 - overlap) / max(speed_m_s, 0.1), 0.02, 10.0))
+
+
+def every(step_s: float) -> Callable[[int, int], bool]:
+    """A `wanted(index, time_ns)` that takes the first frame and then one each `step_s`."""
+    due_ns: list[int] = []
+
+    def wanted(_index: int, time_ns: int) -> bool:
+        if due_ns and time_ns < due_ns[0]:
+            return False
+        due_ns[:] = [max((due_ns[0] if due_ns else time_ns) + round(step_s * 1e9), time_ns + 1)]
+        return True
+
+    return wanted
+
+
+def select_keyframes(
+    frames: Iterable[PosedFrame | LostFrame], settings: SelectionSettings, *, keep_all: bool,
+    inside: Callable[[PosedFrame], bool],
+) -> Iterator[Selected | LostFrame]:
+    """The frames that the map needs, in order; lost ones pass through.
+
+    `inside` tells frames of the area of interest (UAV_path, eq. 3.1); the others are dropped. `keep_all`: photos,
+    each of which was meant. The shift since the last keyframe is measured in the pictures by phase correlation of
+    small copies, so it needs no telemetry; where that fails (a turn, water) each candidate is taken.
+    """
+    last: ImageGray | None = None
+    usual: list[float] = []
+    for each in frames:
+        if isinstance(each, LostFrame):
+            yield each
+            continue
+        if not inside(each):
+            continue
+        gray = small_gray(each.frame.image)
+        clarity = sharpness(gray)
+        typical = float(np.median(usual[-25:])) if usual else clarity
+        texture = normalise_contrast(gray)
+        overlap = 0.0 if last is None or keep_all else _overlap(last, texture)
+        usual.append(clarity)
+        if overlap > settings.overlap:
+            continue
+        if clarity < settings.useless * typical and len(usual) > 3:
+            yield Selected(each, f"blurred: {clarity / typical:.0%} of the usual sharpness")
+            continue
+        if clarity < settings.blurred * typical and overlap > settings.least_overlap:
+            continue
+        last = texture
+        yield Selected(each, "")
+
+
+def small_gray(image: ImageRGB) -> ImageGray:
+    """A gray copy whose longer side has 256 px."""
+    scale = _SMALL_PX / max(image.shape[:2])
+    size = (max(16, round(image.shape[1] * scale)), max(16, round(image.shape[0] * scale)))
+    return gray_from_rgb(cv2.resize(image, size, interpolation=cv2.INTER_AREA))  # type: ignore[arg-type]
+
+
+def _overlap(last: ImageGray, new: ImageGray) -> float:
+    """Share of the frame that both show; 0 where phase correlation finds no peak."""
+    if last.shape != new.shape:
+        return 0.0
+    height, width = last.shape
+    window = cv2.createHanningWindow((width, height), cv2.CV_32F)
+    (dx, dy), response = cv2.phaseCorrelate(last.astype(np.float32), new.astype(np.float32), window)
+    if response < 0.04:
+        return 0.0
+    return max(0.0, 1 - abs(dx) / width) * max(0.0, 1 - abs(dy) / height)
