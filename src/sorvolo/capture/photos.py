@@ -78,7 +78,7 @@ class PhotoSource:
 
     def notices(self) -> tuple[Notice, ...]:
         """What was found so far; complete when `frames` is exhausted."""
-        found = notice("corrupt_photo", len(self._corrupt), "{} photos are damaged and could not be decoded")
+        found = notice("corrupt_photo", len(self._corrupt), "damaged photos that could not be decoded: {}")
         return (*self._notices, *found)
 
     def frames(self, wanted: Callable[[int, int], bool]) -> Iterator[Frame | LostFrame]:
@@ -209,7 +209,7 @@ def _best_times(photos: Sequence[Photo]) -> tuple[list[int], str, list[Notice]]:
     local_ns = [photo.metadata.local_ns for photo in photos]
     untimed = notice(
         "photo_without_time", sum(1 for utc, local in zip(utc_ns, local_ns) if not (utc or local)),
-        "{} photos have no time and are placed by their names",
+        "photos without a time, placed by their names: {}",
     )
     offsets_ns = [utc - local for utc, local in zip(utc_ns, local_ns) if utc and local]
     if offsets_ns:
@@ -230,7 +230,7 @@ def _best_times(photos: Sequence[Photo]) -> tuple[list[int], str, list[Notice]]:
         origin = "EXIF time of the camera's clock, its time zone unknown and taken as UTC"
         zone = notice(
             "time_zone_unknown", sum(map(bool, local_ns)),
-            "{} photos give the camera's clock without a time zone; it is taken as UTC",
+            "photos with the camera's clock but no time zone, taken as UTC: {}",
         )
         return local_ns, origin, [*zone, *untimed]
     return utc_ns, "unknown: no photo has a time; they are taken to be one second apart, by name", untimed
@@ -311,7 +311,7 @@ def _telemetry_of(photos: Sequence[Photo]) -> tuple[Telemetry, list[Notice]]:
         photo for photo in photos if photo.metadata.width_px and not photo.problem.startswith("duplicate")
     ]
     placed = [photo for photo in readable if "latitude_deg" in photo.metadata.columns]
-    missing = notice("photo_without_gps", len(readable) - len(placed), "{} photos have no GPS position")
+    missing = notice("photo_without_gps", len(readable) - len(placed), "photos without a GPS position: {}")
     if not placed:
         return no_telemetry(), missing
     names = {name for photo in placed for name in photo.metadata.columns}
@@ -335,18 +335,18 @@ def _picture_notices(photos: Sequence[Photo], width_px: int, height_px: int) -> 
     focal_mm = {metadata.focal_length_mm for metadata in used if metadata.focal_length_mm > 0}
     return [
         *notice("duplicate_photo", sum(photo.problem.startswith("duplicate") for photo in photos),
-                "{} photos are exact copies of others and are not used twice"),
+                "photos that are exact copies of others, not used twice: {}"),
         *notice("unreadable_photo", sum(not photo.metadata.width_px for photo in photos),
-                "{} files are named like pictures but cannot be read"),
+                "files named like pictures that cannot be read: {}"),
         *notice("other_size", sum(photo.problem.startswith("size") for photo in photos),
-                f"{{}} photos have another shape than the flight's {width_px}x{height_px} and are not used"),
-        *notice("rotated_photo", len(turned), "{} photos lay across the others and were turned by 90 deg"),
+                f"photos of another shape than the flight's {width_px}x{height_px}, not used: {{}}"),
+        *notice("rotated_photo", len(turned), "photos that lay across the others, turned by 90 deg: {}"),
         *notice("resized_photo", len(other) - len(turned),
-                f"{{}} photos of another size were resampled to {width_px}x{height_px}"),
+                f"photos of another size, resampled to {width_px}x{height_px}: {{}}"),
         *notice("unreadable_metadata", sum(bool(metadata.unreadable) for metadata in used),
-                "{} photos have damaged EXIF or XMP, which is not used"),
+                "photos with damaged EXIF or XMP, which is not used: {}"),
         *notice("mixed_cameras", len(cameras) if len(cameras) > 1 else 0,
-                "the photos come from {} different cameras, but are mapped as if from one"),
+                "different cameras, mapped as if they were one: {}"),
         *notice("zoom", len(focal_mm) if len(focal_mm) > 1 else 0,
-                "the photos were taken at {} different focal lengths, but are mapped as if at one"),
+                "different focal lengths, mapped as if they were one: {}"),
     ]

@@ -178,7 +178,7 @@ def _open_photos(
     else:
         model = camera_from_option(str(camera), album.width_px, album.height_px)
     found = album.telemetry if telemetry is None else read_telemetry(telemetry)
-    ignored = notice("ignored_file", source.others, "{} files in the folder are no photos and were ignored")
+    ignored = notice("ignored_file", source.others, "files in the folder that are no photos, ignored: {}")
     fingerprint = _fingerprint(source.photos, telemetry, camera)
     return PhotoSource(name, fingerprint, album, model, found, ignored)
 

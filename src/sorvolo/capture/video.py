@@ -235,9 +235,9 @@ class _Clock:
     def notices(self) -> list[Notice]:
         longest_s = self._longest_gap_ns / _SECOND_NS
         return [
-            *notice("missing_pts", self._missing, "{} frames have no time stamp; the usual step was taken"),
-            *notice("backward_pts", self._backward, "the video's clock runs backward {} times"),
-            *notice("video_gap", self._gaps, f"{{}} gaps in the video, the longest {longest_s:.1f} s"),
+            *notice("missing_pts", self._missing, "frames without a time stamp, a usual step after the one before: {}"),
+            *notice("backward_pts", self._backward, "times that the video's clock runs backward: {}"),
+            *notice("video_gap", self._gaps, f"gaps in the video: {{}}, the longest {longest_s:.1f} s"),
         ]
 
 
@@ -252,8 +252,8 @@ class _Damage:
 
     def notices(self) -> list[Notice]:
         return [
-            *notice("decode_error", self.packets, "{} damaged places in the video were skipped"),
-            *notice("damaged_frame", self.corrupt_frames + self.unconverted, "{} frames are damaged in part"),
+            *notice("decode_error", self.packets, "damaged places in the video, skipped: {}"),
+            *notice("damaged_frame", self.corrupt_frames + self.unconverted, "frames damaged in part: {}"),
         ]
 
 

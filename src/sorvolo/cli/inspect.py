@@ -1,0 +1,113 @@
+"""`sorvolo inspect`: what is in the input, what is missing or suspicious, and what to do."""
+
+import json
+import math
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from sorvolo.missions.inspect_input import Inspection, Level, inspect_input
+
+_COLOURS = {Level.INFO: "blue", Level.WARNING: "yellow", Level.PROBLEM: "red"}
+_MOST_NAMES = 4
+
+
+def inspect(
+    inputs: Annotated[list[Path], typer.Argument(help="Videos, folders of photos, or photos.")],
+    telemetry: Annotated[Path | None, typer.Option(help="The flight's log, if not beside the video.")] = None,
+    camera: Annotated[str, typer.Option(help="Calibration file, preset name or EXIF code, or aov=DEG.")] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
+) -> None:
+    """Look at a flight before it is mapped: what is there, what is missing, and what to do about it.
+
+    Example: sorvolo inspect DJI_0042.MP4
+
+    Example: sorvolo inspect photos/ --camera phantom.xml --json
+    """
+    inspections = inspect_input(inputs, telemetry, camera or None)
+    if as_json:
+        plain = [inspection.as_json() for inspection in inspections]
+        typer.echo(json.dumps(plain, indent=2, allow_nan=False))
+        return
+    console = Console()
+    for inspection in inspections:
+        console.print(_table_of(inspection))
+        for finding in inspection.findings:
+            colour = _COLOURS[finding.level]
+            advice = f" [dim]-> {escape(finding.advice)}[/dim]" if finding.advice else ""
+            console.print(f"[{colour}]{finding.level:>8}[/{colour}]  {escape(finding.text)}{advice}")
+        if not inspection.findings:
+            console.print("[green]nothing is missing or suspicious[/green]")
+
+
+def _table_of(inspection: Inspection) -> Table:
+    table = Table(title=f"{inspection.name} ({inspection.kind})", show_header=False, title_justify="left")
+    for name, text in _rows(inspection):
+        table.add_row(name, escape(text))
+    return table
+
+
+def _rows(inspection: Inspection) -> list[tuple[str, str]]:
+    frames, camera, flight = inspection.frames, inspection.camera, inspection.flight
+    names = ", ".join(inspection.inputs[:_MOST_NAMES])
+    more = len(inspection.inputs) - _MOST_NAMES
+    size = f"{frames.width_px} x {frames.height_px} px, {frames.codec}"
+    return [
+        ("input", names + (f" and {more} more" if more > 0 else "") + f", {frames.size_bytes / 1e6:.1f} MB"),
+        ("frames", f"{frames.count}" + _with_unit(", {:.2f} a second", frames.rate_hz)
+         + _with_unit(", one in {:.1f} s", frames.interval_s)
+         + _with_unit(", {:.1f} s in all", frames.duration_s)),
+        ("pictures", size + (f" in {frames.container}" if frames.container else "")
+         + _with_unit("; sharpness {:.1f}", frames.sharpness)),
+        ("begins", f"{_utc(frames.start_ns)}{frames.start_origin}"),
+        ("camera", f"{camera.origin}; f = {camera.focal_px:.0f} px within {100 * camera.focal_sigma:.3g} %, "
+         f"sees {camera.angle_of_view_deg[0]:.1f} x {camera.angle_of_view_deg[1]:.1f} deg"),
+        *_telemetry_rows(inspection),
+        ("height", _with_unit("{:.1f} m ", flight.height_m) + flight.height_reference),
+        ("speed", (_with_unit("{:.1f} m/s", flight.speed_m_s) or "unknown")
+         + (f", {flight.distance_m:.0f} m flown" if flight.distance_m > 0 else "")),
+        ("on the ground", (_with_unit("{:.1f} cm a pixel", 100 * flight.gsd_m) or "unknown")
+         + _with_unit(", a frame is {:.0f} x ", flight.footprint_m[0])
+         + _with_unit("{:.0f} m", flight.footprint_m[1])),
+        ("overlap", _overlap(inspection)),
+        ("gimbal", _with_unit("pitch {:.0f} deg (-90 is down)", flight.camera_pitch_deg) or "unknown"),
+    ]
+
+
+def _telemetry_rows(inspection: Inspection) -> list[tuple[str, str]]:
+    facts = inspection.telemetry
+    if not facts.samples:
+        return [("telemetry", "none")]
+    first = f"{facts.format}, {facts.samples} samples, {facts.positions} with a position"
+    rate = _with_unit(", {:.3g} a second", facts.rate_hz) + f", longest gap {facts.longest_gap_s:.1f} s"
+    span = f"{_utc(facts.start_ns)}to {_utc(facts.end_ns).rstrip(' ,')}"
+    return [
+        ("telemetry", first + rate),
+        ("", span),
+        ("tied to frames", facts.tie + _with_unit(", {:.1f} s in common", facts.covered_s)),
+    ]
+
+
+def _overlap(inspection: Inspection) -> str:
+    flight = inspection.flight
+    parts = [
+        _with_unit("{:.0f} % from photo to photo", 100 * flight.forward_overlap),
+        _with_unit("70 % at one frame in {:.2f} s", flight.frame_interval_s),
+        f"{flight.strips} strips" + _with_unit(", {:.0f} % to the side", 100 * flight.side_overlap)
+        if flight.strips > 1 else "",
+    ]
+    return "; ".join(part for part in parts if part) or "unknown"
+
+
+def _with_unit(pattern: str, number: float) -> str:
+    """The number in its pattern, or nothing when it is unknown."""
+    return pattern.format(number) if math.isfinite(number) else ""
+
+
+def _utc(time_ns: int) -> str:
+    return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC, " if time_ns else ""

@@ -1,0 +1,89 @@
+"""What a track over ground tells of its flight: the speed, the length and the parallel strips."""
+
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+
+from sorvolo.geometry.arrays import Floats, PointsM
+
+_WINDOW_S = 2.0  # shorter steps measure the receiver's noise instead of the speed
+_STEPS_ACROSS = 60
+_ALONG_DEG = 25.0
+_LEAST_CONCENTRATION = 0.3
+
+
+@dataclass(frozen=True)
+class Strips:
+    """Parallel passes over an area: their bearing in [0, 180) deg and distance, NaN for one pass.
+
+    `count` is 0 where the track has no main direction.
+    """
+
+    count: int
+    bearing_deg: float
+    spacing_m: float
+
+
+def speeds_m_s(points_m: PointsM, times_s: Floats) -> Floats:
+    """Speeds of a track, points (N, 2) at times (N,), each over two seconds or one longer step."""
+    later = np.searchsorted(times_s, times_s + _WINDOW_S)
+    begin = np.flatnonzero(later < len(times_s))
+    end = later[begin]
+    distance_m = np.linalg.norm(points_m[end] - points_m[begin], axis=1)
+    return np.asarray(distance_m / (times_s[end] - times_s[begin]))
+
+
+def thinned(points_m: PointsM) -> PointsM:
+    """The track's points, (N, 2), without those nearer than a sixtieth of its extent to the one before.
+
+    What the receiver's noise adds to a slow or hovering flight goes, and every step has a bearing.
+    """
+    if not len(points_m):
+        return points_m
+    least_m = max(1.0, float(np.ptp(points_m, axis=0).max()) / _STEPS_ACROSS)
+    kept = [points_m[0]]
+    for point in points_m[1:]:
+        if np.hypot(*(point - kept[-1])) >= least_m:
+            kept.append(point)
+    return np.array(kept)
+
+
+def length_m(points_m: PointsM) -> float:
+    """The track's length over ground, points (N, 2), without its noise."""
+    return float(np.linalg.norm(np.diff(thinned(points_m), axis=0), axis=1).sum())
+
+
+def find_strips(points_m: PointsM) -> Strips:
+    """The parallel passes of a track, points (N, 2), as a lawnmower flies them.
+
+    The main direction is the mean of the steps' doubled angles, weighted by length; a pass is a run of steps
+    within 25 deg of it, all one way, at least a third as long as the longest run.
+    """
+    points = thinned(points_m)
+    steps = np.diff(points, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    if len(steps) < 2:
+        return Strips(0, np.nan, np.nan)
+    doubled = np.exp(2j * np.arctan2(steps[:, 0], steps[:, 1]))
+    mean = (lengths * doubled).sum() / lengths.sum()
+    if abs(mean) < _LEAST_CONCENTRATION:
+        return Strips(0, np.nan, np.nan)
+    bearing = 0.5 * np.angle(mean)
+    along = np.array([np.sin(bearing), np.cos(bearing)])
+    across = np.array([along[1], -along[0]])
+    cosines = steps @ along / lengths
+    ways = np.where(np.abs(cosines) >= np.cos(np.radians(_ALONG_DEG)), np.sign(cosines), 0.0)
+    passes: list[tuple[float, float]] = []  # length and place across
+    for way, group in groupby(range(len(steps)), key=lambda index: ways[index]):
+        run = list(group)
+        if way:
+            ends = points[run[0]: run[-1] + 2]
+            passes.append((float(lengths[run].sum()), float(np.mean(ends @ across))))
+    longest_m = max((length for length, _ in passes), default=0.0)
+    places = np.sort([place for length, place in passes if length >= longest_m / 3])
+    gaps = np.diff(places)
+    # the same line flown twice is one strip
+    apart = gaps[gaps > 0.2 * gaps.max(initial=0.0)]
+    spacing_m = float(np.median(apart)) if len(apart) else np.nan
+    return Strips(1 + len(apart), float(np.degrees(bearing)) % 180.0, spacing_m)
