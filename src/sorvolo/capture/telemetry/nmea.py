@@ -23,6 +23,8 @@ from sorvolo.survey.flight import Telemetry
 _M_S_PER_KNOT = 1852 / 3600
 # talkers differ by satellite system (GP, GN, GL, GA ...); a log may write anything before the dollar
 _SENTENCE = re.compile(rb"\$([A-Z][A-Z0-9])(GGA|RMC),([^$*\r\n]*)(?:\*([0-9A-Fa-f]{2}))?")
+_FINISHED = re.compile(rb"[\r\n]|\*[0-9A-Fa-f]{2}")
+_LONGEST_TAIL = 200  # a sentence has at most 82 characters
 
 
 @dataclass
@@ -77,11 +79,11 @@ def read(data: bytes, name: str) -> Telemetry:
 
 def _messages(data: bytes, counts: Counter[str]) -> list[Any]:
     messages = []
-    for match in _SENTENCE.finditer(data):
+    tail = data[data.rfind(b"$"):]
+    is_cut = tail.startswith(b"$") and len(tail) < _LONGEST_TAIL and not _FINISHED.search(tail)
+    counts["truncated"] += is_cut
+    for match in _SENTENCE.finditer(data[: len(data) - len(tail)] if is_cut else data):
         talker, kind, body, checksum = match.groups()
-        if match.end() == len(data) and checksum is None:
-            counts["truncated"] += 1
-            continue
         content = (talker + kind + b"," + body).decode("latin-1")
         if checksum is None or calc_checksum(content) != checksum.decode().upper():
             counts["bad_checksum"] += 1

@@ -204,12 +204,12 @@ def sigma_from_hdop_m(hdop: float) -> float:
 
 
 def rounding_sigma_m(decimals: int) -> float:
-    """Standard deviation (m, per axis) of a position rounded to these decimals of a degree: step / sqrt 12."""
+    """Sigma in m, per axis, of a position rounded to so many decimals of a degree: its step / sqrt 12."""
     return float(10.0**-decimals * _M_PER_DEG / np.sqrt(12))
 
 
 def notice(code: str, count: int, text: str) -> list[Notice]:
-    """The notice in a list, or an empty list when the count is 0; "{}" in the text stands for the count."""
+    """The notice in a list, or an empty list when the count is 0; "{}" in the text becomes the count."""
     return [Notice(code, count, text.replace("{}", str(count)))] if count else []
 
 

@@ -1,0 +1,273 @@
+"""The UMCD table: its 60 columns, any order, printed units, clocks, and broken rows."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sorvolo.capture.telemetry import umcd
+from sorvolo.errors import InputError
+
+# thesis, Table 2.2, columns 1 to 60
+COLUMNS = (
+    "Tick#", "offsetTime", "flightTime(msec)", "Longitude", "Latitude", "numSats", "gpsAltitude(meters)",
+    "baroAlt(meters)", "vpsHeight(M)", "relativeHeight", "accelX(M/S²)", "accelY(M/S²)", "accelZ(M/S²)",
+    "gyroX(degrees/s)", "gyroY(degrees/s)", "gyroZ(degrees/s)", "magX", "magY", "magZ", "magMod",
+    "velN(M/S)", "velE(M/S)", "velD(M/S)", "vel(M/S)", "quatW", "quatX", "quatY", "quatZ", "Roll",
+    "Pitch", "Yaw", "errorX", "errorY", "errorZ", "error", "accel(M/S²)", "gyro(degrees/s)",
+    "distancHP(M)", "distanceTravelled(M)", "directionOfTravel", "IMUTemp(C)", "batteryTemp(C)",
+    "ratedCapacity", "remaingCapacity", "batteryCycleCount", "batteryLifePercentage", "Gimbal:roll",
+    "Gimbal:pitch", "Gimbal:yaw", "Gimbal:Xroll", "Gimbal:Xpitch", "Gimbal:Yyaw", "MotorSpeed:RFront",
+    "MotorSpeed:LFront", "MotorSpeed:LBack", "MotorSpeed:RBack", "MotorLoad:RFront", "MotorLoad:LFront",
+    "MotorLoad:LBack", "MotorLoad:RBack",
+)
+SECOND_NS = 1_000_000_000
+
+
+def row(index: int) -> dict[str, float]:
+    said = {
+        "Tick#": 1000 + 60 * index, "offsetTime": 12.5 + 0.1 * index, "flightTime(msec)": 5000 + 100 * index,
+        "Longitude": 12.4964 + 1e-6 * index, "Latitude": 41.9028 + 2e-6 * index, "gpsAltitude(meters)": 85.5,
+        "baroAlt(meters)": 90.25 + index, "vpsHeight(M)": 9.0, "relativeHeight": 10.5, "velN(M/S)": 3.0,
+        "velE(M/S)": 4.0, "vel(M/S)": 5.0, "Roll": 1.0, "Pitch": -2.0, "Yaw": 30.0, "quatW": 1.0,
+        "quatX": 0.0, "quatY": 0.0, "quatZ": 0.0, "Gimbal:roll": 0.5, "Gimbal:pitch": -90.0,
+        "Gimbal:yaw": 31.0, "Gimbal:Xroll": 99.0, "Gimbal:Yyaw": 99.0, "directionOfTravel": 7.0,
+    }
+    return {name: said.get(name, 1.0) for name in COLUMNS}
+
+
+def table(columns=COLUMNS, count: int = 20, delimiter: str = ",", newline: str = "\n", changes=()) -> str:
+    rows = [row(index) for index in range(count)]
+    for index, name, value in changes:
+        rows[index][name] = value
+    lines = [delimiter.join(columns)]
+    lines += [delimiter.join(f"{each[name]}" for name in columns) for each in rows]
+    return newline.join(lines) + newline
+
+
+def codes(telemetry) -> dict[str, int]:
+    return {notice.code: notice.count for notice in telemetry.notices}
+
+
+def assert_is_the_flight(telemetry, count: int = 20) -> None:
+    assert len(telemetry) == count
+    assert telemetry["latitude_deg"] == pytest.approx([41.9028 + 2e-6 * i for i in range(count)], abs=1e-9)
+    assert telemetry["longitude_deg"] == pytest.approx([12.4964 + 1e-6 * i for i in range(count)], abs=1e-9)
+    assert telemetry["orthometric_height_m"] == pytest.approx([85.5] * count)
+    assert telemetry["height_above_takeoff_m"] == pytest.approx([10.5] * count)
+    assert np.isnan(telemetry["ellipsoidal_height_m"]).all()
+    assert telemetry["speed_m_s"] == pytest.approx([5.0] * count)
+    assert telemetry["course_deg"] == pytest.approx([math.degrees(math.atan2(4, 3))] * count)
+    assert telemetry["camera_pitch_deg"] == pytest.approx([-90.0] * count)
+    assert telemetry["camera_yaw_deg"] == pytest.approx([31.0] * count)
+    assert telemetry["camera_roll_deg"] == pytest.approx([0.5] * count)
+    assert telemetry["body_yaw_deg"] == pytest.approx([30.0] * count)
+    assert telemetry["body_pitch_deg"] == pytest.approx([-2.0] * count)
+    assert telemetry["body_roll_deg"] == pytest.approx([1.0] * count)
+    assert telemetry.time_ns == pytest.approx(np.arange(count) * SECOND_NS / 10, abs=1000)
+    assert (telemetry.video_time_ns == telemetry.time_ns).all()
+
+
+def test_the_sixty_columns_of_the_thesis():
+    assert len(COLUMNS) == 60
+    telemetry = umcd.read(table().encode(), "path1.csv")
+    assert_is_the_flight(telemetry)
+    assert codes(telemetry) == {"no_date": 20}
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    order=st.permutations(COLUMNS), delimiter=st.sampled_from(",;\t"),
+    newline=st.sampled_from(["\n", "\r\n", "\r"]), bom=st.booleans(),
+    upper=st.booleans(), spaced=st.booleans(), quoted=st.booleans(),
+)
+def test_neither_order_nor_dress_of_columns_matters(order, delimiter, newline, bom, upper, spaced, quoted):
+    text = table(tuple(order), delimiter=delimiter, newline=newline)
+    header, _, rest = text.partition(newline)
+    cells = header.upper().split(delimiter) if upper else header.split(delimiter)
+    if spaced:
+        cells = [f" {cell.replace('(', ' (').replace(':', ' : ')} " for cell in cells]
+    if quoted:
+        cells = [f'"{cell}"' for cell in cells]
+    data = (delimiter.join(cells) + newline + rest).encode("utf-8-sig" if bom else "utf-8")
+    assert umcd.recognises(data)
+    assert_is_the_flight(umcd.read(data, "a.csv"))
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
+def test_other_encodings(encoding):
+    data = table().encode(encoding)
+    assert umcd.recognises(data)
+    assert_is_the_flight(umcd.read(data, "a.csv"))
+
+
+def test_decimal_commas():
+    assert_is_the_flight(umcd.read(table(delimiter=";").replace(".", ",").encode(), "a.csv"))
+
+
+@pytest.mark.parametrize("old, new, factor, column, expected", [
+    ("relativeHeight", "relativeHeight(feet)", 1, "height_above_takeoff_m", 10.5 * 0.3048),
+    ("gpsAltitude(meters)", "gpsAltitude[ft]", 1, "orthometric_height_m", 85.5 * 0.3048),
+    ("velN(M/S)", "velN(km/h)", 3.6, "speed_m_s", 5.0),
+    ("Yaw", "Yaw(radians)", 1, "body_yaw_deg", 30.0),
+    ("offsetTime", "offsetTime(seconds)", 1, "speed_m_s", 5.0),
+])
+def test_units_of_the_header_are_converted(old, new, factor, column, expected):
+    rows = [row(index) for index in range(5)]
+    names = [new if name == old else name for name in COLUMNS]
+    if old == "Yaw":
+        rows = [{**each, "Yaw": math.radians(30.0)} for each in rows]
+    lines = [",".join(names)]
+    lines += [",".join(str(each[name] * (factor if name == old else 1)) for name in COLUMNS) for each in rows]
+    telemetry = umcd.read("\n".join(lines).encode(), "a.csv")
+    assert telemetry[column] == pytest.approx([expected] * 5)
+    assert telemetry.time_ns[1] == pytest.approx(SECOND_NS / 10, abs=1000)
+
+
+def test_an_unknown_unit_is_told_and_not_guessed():
+    telemetry = umcd.read(table().replace("relativeHeight", "relativeHeight(furlongs)").encode(), "a.csv")
+    assert "unknown_unit" in codes(telemetry)
+    assert "furlongs" in next(notice.text for notice in telemetry.notices if notice.code == "unknown_unit")
+    assert not (telemetry["height_above_takeoff_m"] == 10.5).any()
+    with pytest.raises(InputError, match="degrees or radians"):
+        umcd.read(table().replace("Latitude", "Latitude(furlongs)").encode(), "a.csv")
+
+
+@settings(max_examples=60, deadline=None)
+@given(yaw=st.floats(0, 359.9), pitch=st.floats(-89, 89), roll=st.floats(-179, 179))
+def test_the_quaternion_stands_in_for_missing_angles(yaw, pitch, roll):
+    half = [math.radians(angle) / 2 for angle in (yaw, pitch, roll)]
+    cy, sy, cp, sp, cr, sr = (function(angle) for angle in half for function in (math.cos, math.sin))
+    quaternion = {
+        "quatW": cr * cp * cy + sr * sp * sy, "quatX": sr * cp * cy - cr * sp * sy,
+        "quatY": cr * sp * cy + sr * cp * sy, "quatZ": cr * cp * sy - sr * sp * cy,
+    }
+    columns = tuple(name for name in COLUMNS if name not in ("Roll", "Pitch", "Yaw"))
+    changes = [(0, name, value) for name, value in quaternion.items()]
+    telemetry = umcd.read(table(columns, 2, changes=changes).encode(), "a.csv")
+    assert (telemetry["body_yaw_deg"][0] - yaw + 180) % 360 - 180 == pytest.approx(0, abs=1e-5)
+    assert telemetry["body_pitch_deg"][0] == pytest.approx(pitch, abs=1e-5)
+    assert telemetry["body_roll_deg"][0] == pytest.approx(roll, abs=1e-5)
+
+
+@pytest.mark.parametrize("missing, rate_is_told", [
+    ((), False), (("offsetTime",), False), (("offsetTime", "flightTime(msec)"), False),
+    (("offsetTime", "flightTime(msec)", "Tick#"), True),
+])
+def test_each_column_of_time_stands_in_for_the_next(missing, rate_is_told):
+    telemetry = umcd.read(table(tuple(name for name in COLUMNS if name not in missing)).encode(), "a.csv")
+    assert_is_the_flight(telemetry)
+    assert ("assumed_rate" in codes(telemetry)) is rate_is_told
+
+
+def test_a_gap_shows_in_ticks_too():
+    columns = tuple(name for name in COLUMNS if name not in ("offsetTime", "flightTime(msec)"))
+    lines = table(columns, 60).splitlines()
+    del lines[20:50]
+    telemetry = umcd.read("\n".join(lines).encode(), "a.csv")
+    assert codes(telemetry)["gap"] == 1
+    assert np.diff(telemetry.time_ns).max() == pytest.approx(3.1 * SECOND_NS)
+
+
+def test_a_column_of_dates_gives_utc():
+    start = int(np.datetime64("2016-05-04T10:00:00", "ns").astype(np.int64))
+    for name, texts in {
+        "GPS:dateTimeStamp": [f"2016-05-04T10:00:{i // 10:02d}Z" for i in range(30)],
+        "dateTimeUTC": [f"2016-05-04 10:00:{i // 10:02d}.{i % 10}" for i in range(30)],
+        "time": [str(start / 1e9 + i / 10) for i in range(30)],
+        "timestamp(ms)": [str(start / 1e6 + i * 100) for i in range(30)],
+    }.items():
+        lines = table(count=30).splitlines()
+        text = "\n".join([f"{lines[0]},{name}", *(f"{line},{each}" for line, each in zip(lines[1:], texts))])
+        telemetry = umcd.read(text.encode(), "a.csv")
+        assert len(telemetry) == 30, name
+        assert abs(int(telemetry.time_ns[0]) - start) < SECOND_NS, name
+        assert np.diff(telemetry.time_ns) == pytest.approx([SECOND_NS / 10] * 29, abs=1000), name
+        assert (telemetry.video_time_ns == -1).all(), name
+        assert "no_date" not in codes(telemetry) and "time_zone_unknown" not in codes(telemetry), name
+
+
+def test_a_date_without_its_zone_is_told():
+    lines = table(count=3).splitlines()
+    rows = [f"{line},2016-05-04 10:00:00.{i}" for i, line in enumerate(lines[1:])]
+    text = "\n".join([f"{lines[0]},dateTime", *rows])
+    assert codes(umcd.read(text.encode(), "a.csv"))["time_zone_unknown"] == 3
+
+
+def test_the_barometer_stands_in_for_the_relative_height_and_says_so():
+    columns = tuple(name for name in COLUMNS if name != "relativeHeight")
+    telemetry = umcd.read(table(columns, 3).encode(), "a.csv")
+    assert list(telemetry["height_above_takeoff_m"]) == [0.0, 1.0, 2.0]
+    assert codes(telemetry)["height_from_barometer"] == 3
+
+
+def test_sentences_in_a_61st_column_do_not_disturb():
+    lines = table(count=4).splitlines()
+    nmea = "$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47"
+    text = "\n".join([lines[0] + ",NMEA GGA/RMC Strings", *(f"{line},{nmea}" for line in lines[1:])])
+    assert_is_the_flight(umcd.read(text.encode(), "a.csv"), 4)
+
+
+def test_broken_rows_are_counted():
+    lines = table(count=30).splitlines()
+    lines[4] = lines[4].replace("41.9028", "41.x9")
+    lines[7] = "1,2"
+    lines[9] = '"' + lines[9]  # a stray quote
+    lines[12] = ""
+    telemetry = umcd.read(("\n".join(lines) + "\n").encode(), "a.csv")
+    said = codes(telemetry)
+    assert said["unreadable_line"] == 1
+    assert said["short_row"] == 2
+    assert len(telemetry) == 27
+
+
+def test_a_half_written_last_row_is_counted():
+    text = table(count=5)
+    telemetry = umcd.read(text[:-40].encode(), "a.csv")
+    assert codes(telemetry)["truncated"] == 1
+    assert_is_the_flight(telemetry, 4)
+    assert "truncated" not in codes(umcd.read(text.rstrip().encode(), "a.csv"))
+
+
+def test_a_flight_starts_before_the_clock_does():
+    changes = [(0, "offsetTime", -3.0), (1, "offsetTime", -2.9)]
+    telemetry = umcd.read(table(count=2, changes=changes).encode(), "a.csv")
+    assert list(telemetry.video_time_ns) == [0, SECOND_NS // 10]
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_mutated_files_raise_only_input_errors(data):
+    columns = COLUMNS[:12] + COLUMNS[20:31]
+    valid = bytearray(table(columns, 4).encode())
+    for _ in range(data.draw(st.integers(1, 8))):
+        place = data.draw(st.integers(0, len(valid) - 1))
+        if data.draw(st.booleans()):
+            valid[place] = data.draw(st.one_of(st.integers(0, 255), st.sampled_from(b"\"e-.,;\x00\n9")))
+        else:
+            del valid[place: place + data.draw(st.integers(1, 20))]
+        if not valid:
+            return
+    try:
+        telemetry = umcd.read(bytes(valid), "a.csv")
+    except InputError:
+        return
+    assert (np.diff(telemetry.time_ns) > 0).all()
+    assert all(not np.isinf(column).any() for column in telemetry.columns.values())
+
+
+@settings(max_examples=100, deadline=None)
+@given(cells=st.lists(
+    st.tuples(*[st.one_of(st.floats(allow_nan=True, allow_infinity=True).map(str), st.text(max_size=6))] * 4),
+    min_size=1, max_size=12,
+))
+def test_any_cells_raise_only_input_errors(cells):
+    text = "offsetTime,Latitude,Longitude,time\n" + "\n".join(",".join(each) for each in cells)
+    try:
+        telemetry = umcd.read(text.encode("utf-8", "surrogatepass"), "a.csv")
+    except InputError:
+        return
+    latitude = telemetry["latitude_deg"]
+    assert (np.abs(latitude[np.isfinite(latitude)]) <= 90).all()
