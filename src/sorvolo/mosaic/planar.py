@@ -1,0 +1,316 @@
+"""`--method planar`: frames to keyframes, keyframes to links, links to the pose graph, one frame at a time."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from sorvolo.errors import GeometryError
+from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Matrix3, PointsM
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.homography import apply_homography, site_from_image_homography
+from sorvolo.geometry.pose import Pose
+from sorvolo.mosaic.exposure import ColourPairs, Exposure, solve_exposure, tie_colours
+from sorvolo.mosaic.pose_graph import GraphReport, PoseGraph, PoseGraphSettings, pose_from_link
+from sorvolo.registration.features import gray_from_rgb, normalise_contrast, orb_features
+from sorvolo.registration.link import LinkCache, LinkPrediction, LinkSettings, link
+from sorvolo.survey.flight import CameraPrior
+from sorvolo.survey.mosaic import Keyframe, Link, NoLink, Status
+
+
+@dataclass(frozen=True)
+class PlanarSettings:
+    """How a keyframe is tied to others."""
+
+    registration_side_px: int = 1024  # longest side of the image that is registered
+    previous: int = 2  # keyframes before, always tried
+    spatial: int = 2  # further ones under the predicted view: they close loops between strips
+    least_overlap: float = 0.2  # of a view, for a spatial neighbour
+    recovery: int = 30  # keyframes tried for a frame that is lost and has no GPS
+    links: LinkSettings = field(default_factory=LinkSettings)
+
+
+@dataclass(frozen=True, eq=False)
+class KnownKeyframe:
+    """A keyframe of the map that exists already; `image` loads its undistorted picture, of `camera`'s size."""
+
+    id: int
+    camera: Camera
+    site_from_camera: Pose
+    image: Callable[[], ImageRGB]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """How one keyframe ended for now, and which keyframes moved on the ground since they were last named."""
+
+    status: Status
+    reason: str
+    moved: frozenset[int]
+
+
+class PlanarMapper:
+    """Everything `--method planar` knows of one flight. `add` takes a keyframe; `retime` and `settle` end it."""
+
+    def __init__(
+        self, graph: PoseGraphSettings, settings: PlanarSettings = PlanarSettings(),  # noqa: B008 (frozen)
+        known: Sequence[KnownKeyframe] = (),
+    ) -> None:
+        self._settings = settings
+        self._graph = PoseGraph(graph)
+        self._cache = LinkCache(settings.links.features)
+        self._keyframes: dict[int, Keyframe] = {}
+        self._own: list[int] = []
+        self._known = {each.id: each for each in known}
+        self._known_centres_m = np.array([each.site_from_camera.translation_m for each in known]).reshape(-1, 3)
+        self._colours: dict[tuple[int, int], ColourPairs] = {}
+        self._small: dict[int, ImageRGB] = {}
+        self._failures: dict[int, str] = {}
+
+    def add(self, keyframe_id: int, camera: Camera, image: ImageRGB, prior: CameraPrior) -> Outcome:
+        """Place an undistorted picture, (H, W, 3), of the distortion-free `camera` (at the picture's size)."""
+        keyframe = self._keyframe(keyframe_id, camera, image, prior)
+        links, guess, reason = self._tie(keyframe)
+        if guess is None:
+            self._failures[keyframe_id] = reason
+            return Outcome(Status.REJECTED, reason, frozenset())
+        self._keyframes[keyframe_id] = keyframe
+        moved = self._graph.add(keyframe_id, keyframe.camera, prior, links, guess)
+        self._own.append(keyframe_id)
+        self._small[keyframe_id] = _thumbnail(image)
+        for each in links:
+            self._tie_colours(each)
+        status = Status.VISION if links or len(self._own) == 1 else Status.GPS_ONLY
+        self._failures[keyframe_id] = "" if links else reason
+        return Outcome(status, "" if links else reason, moved)
+
+    def settle(self) -> frozenset[int]:
+        """Solve the whole flight once more; the keyframes that moved."""
+        moved = self._graph.settle()
+        return moved | self._graph.settle()
+
+    def retime(self, priors: Mapping[int, CameraPrior]) -> frozenset[int]:
+        """What telemetry says under another clock offset."""
+        return self._graph.retime({each: prior for each, prior in priors.items() if each in self._graph})
+
+    def pose(self, keyframe_id: int) -> Pose:
+        """site_from_camera as it stands."""
+        return self._graph.pose(keyframe_id)
+
+    def placed(self) -> list[int]:
+        """The flight's keyframes that have a place."""
+        return list(self._own)
+
+    def ending(self, keyframe_id: int) -> tuple[Status, str]:
+        """How the keyframe ends, in words if not by vision."""
+        if keyframe_id not in self._graph:
+            return Status.REJECTED, self._failures.get(keyframe_id, "never placed")
+        if self._graph.neighbours(keyframe_id) or len(self._own) == 1:
+            return Status.VISION, ""
+        reason = self._failures.get(keyframe_id) or "its links contradicted the rest of the map"
+        return Status.GPS_ONLY, f"no other picture fits it: {reason}"
+
+    def focal_scale(self) -> float:
+        """Focal length found over the one given."""
+        return self._graph.report().focal_scale
+
+    @property
+    def radial(self) -> float:
+        """Left-over radial distortion (see `PoseGraph.radial`)."""
+        return self._graph.radial
+
+    def report(self) -> GraphReport:
+        """What the flight taught about itself."""
+        return self._graph.report()
+
+    def residuals_px(self, full: Camera) -> dict[int, float]:
+        """Median transfer residual of each keyframe, px of the full frame's size."""
+        return {
+            each: value * full.width_px / self._keyframes[each].camera.width_px
+            for each, value in self._graph.residuals_px().items() if each in self._keyframes
+        }
+
+    def sigmas_m(self) -> dict[int, float]:
+        """One-sigma error on the ground of each keyframe, per axis."""
+        return self._graph.sigmas_m()
+
+    def gps_residuals_m(self) -> dict[int, Floats]:
+        """Camera position minus fix, (3,)."""
+        return self._graph.gps_residuals_m()
+
+    def path_m(self) -> PointsM:
+        """(N, 3) positions of the keyframes placed by vision, in the order of `placed()`; NaN for the others."""
+        centres = self._graph.centres_m(self._own)
+        tied = np.array([bool(self._graph.neighbours(each)) for each in self._own], bool)
+        centres[~tied] = np.nan
+        return centres
+
+    def exposure(self) -> Exposure:
+        """Gains and vignette from the colours that linked keyframes share."""
+        return solve_exposure(self._colours)
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _keyframe(self, keyframe_id: int, camera: Camera, image: ImageRGB, prior: CameraPrior) -> Keyframe:
+        scale = min(1.0, self._settings.registration_side_px / max(image.shape[:2]))
+        gray = gray_from_rgb(image)
+        if scale < 1.0:
+            size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
+            gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+            camera = camera.resized(*size)
+        gray = normalise_contrast(gray)
+        return Keyframe(keyframe_id, camera, gray, orb_features(gray, self._settings.links.features), prior)
+
+    def _tie(self, new: Keyframe) -> tuple[list[Link], Pose | None, str]:
+        """The links of a new keyframe, where it stands by them or by telemetry, and what failed."""
+        previous = self._own[::-1][: self._settings.previous]
+        links: list[Link] = []
+        tried: set[int] = set()
+        failures: list[str] = []
+        guess = self._guess_by_telemetry(new)
+
+        def attempt(other: int, prediction: LinkPrediction | None) -> None:
+            tried.add(other)
+            found = link(new, self._picture(other), prediction, self._settings.links, self._cache)
+            if isinstance(found, NoLink):
+                failures.append(found.reason)
+            else:
+                links.append(found)
+
+        if previous:
+            attempt(previous[0], self._loose_prediction(new, previous[0], guess))
+            guess = self._by_link(new, links) or guess
+        if guess is not None:
+            for each in self._under(new, guess, tried, previous, bool(links)):
+                before = len(links)
+                attempt(each, self._prediction(new, each, guess, tight=bool(links)))
+                if len(links) > before == 0:
+                    guess = self._by_link(new, links) or guess
+        if not links and not new.prior.knows_place:
+            for each in [*self._own[::-1][1:10], *self._own[:: max(1, len(self._own) // 20)]]:
+                if each not in tried and len(tried) < self._settings.recovery and not links:
+                    attempt(each, None)
+            guess = self._by_link(new, links)
+        if not self._own and guess is None:
+            guess = Pose(new.prior.rotation, new.prior.position_m)
+        reason = failures[0] if failures else "nothing of the map lies under it"
+        if not links and self._own and not new.prior.knows_place:
+            return [], None, f"no picture of the map fits it ({reason}) and telemetry does not say where it is"
+        return links, guess, reason
+
+    def _guess_by_telemetry(self, new: Keyframe) -> Pose | None:
+        prior = new.prior
+        if not prior.knows_place:
+            return None
+        rotation, up_m = prior.rotation, float(prior.position_m[2])
+        if self._own:
+            recent = self._graph.pose(self._own[-1])
+            if not np.isfinite(prior.position_sigma_m[2]) or up_m < 0.3 * recent.translation_m[2]:
+                up_m = float(recent.translation_m[2])
+            if not np.isfinite(prior.attitude_sigma_deg[2]):
+                rotation = recent.rotation
+        return Pose(rotation, np.array([*prior.position_m[:2], max(up_m, 0.5)]))
+
+    def _loose_prediction(self, new: Keyframe, old: int, guess: Pose | None) -> LinkPrediction | None:
+        """Where telemetry alone puts the previous keyframe; None when it knows too little to be a help."""
+        if guess is None or not np.isfinite(new.prior.attitude_sigma_deg[2]):
+            return None
+        return self._prediction(new, old, guess, tight=False)
+
+    def _prediction(self, new: Keyframe, old: int, guess: Pose, *, tight: bool) -> LinkPrediction | None:
+        """Where the old keyframe falls in the new one, off by the errors of telemetry, or of the graph if `tight`."""
+        try:
+            site_from_new = site_from_image_homography(new.camera, guess)
+        except GeometryError:
+            return None
+        new_from_old = np.linalg.inv(site_from_new) @ self._site_from_image(old)
+        side = max(new.camera.width_px, new.camera.height_px)
+        if tight:
+            search = 0.05 * side
+        else:
+            tilt = np.radians(np.nan_to_num(new.prior.attitude_sigma_deg[:2].max(), posinf=15.0))
+            place = new.prior.position_sigma_m[:2].max() / max(guess.translation_m[2], 0.5)
+            search = float(np.clip(2.5 * new.camera.fx_px * (tilt + place), 0.08 * side, 0.5 * side))
+        return LinkPrediction(new_from_old, search)
+
+    def _by_link(self, new: Keyframe, links: Sequence[Link]) -> Pose | None:
+        for each in links:
+            old = self._graph.camera(each.old_id)
+            found = pose_from_link(each, self._graph.refined(new.camera), old, self._graph.pose(each.old_id))
+            if found is not None:
+                return found
+        return None
+
+    def _under(
+        self, new: Keyframe, guess: Pose, tried: set[int], previous: Sequence[int], linked: bool
+    ) -> list[int]:
+        """The keyframes to try: those before, and the ones of other strips that lie most under the view."""
+        ids = np.array([*self._own, *self._known], dtype=int)
+        if not len(ids):
+            return []
+        centres = np.concatenate([self._graph.centres_m(self._own), self._known_centres_m])
+        axes = np.concatenate([
+            np.array([self._graph.pose(each).rotation[:, 2] for each in self._own]).reshape(-1, 3),
+            np.array([each.site_from_camera.rotation[:, 2] for each in self._known.values()]).reshape(-1, 3),
+        ])
+        centres = centres - axes * (centres[:, 2] / np.minimum(axes[:, 2], -0.1))[:, None]
+        try:
+            image_from_site = np.linalg.inv(site_from_image_homography(new.camera, guess))
+        except GeometryError:
+            return []
+        seen = apply_homography(image_from_site, centres[:, :2])
+        offset = np.abs(seen - [new.camera.cx_px, new.camera.cy_px]) / [new.camera.width_px, new.camera.height_px]
+        with np.errstate(invalid="ignore"):
+            overlap = np.nan_to_num(np.clip(1 - offset, 0, 1).prod(axis=1))
+        chosen = [each for each in previous if each not in tried and overlap[list(ids).index(each)] > 0.1]
+        order = [int(k) for k in np.argsort(-overlap, kind="stable") if overlap[k] > self._settings.least_overlap]
+        limit = len(chosen) + self._settings.spatial + (0 if linked else 3)
+        near = {*tried, *previous}
+        for k in order:
+            each = int(ids[k])
+            if len(chosen) >= limit:
+                break
+            if each in near or each in chosen:
+                continue
+            chosen.append(each)
+            near |= {each - 1, each + 1}  # neighbours along a strip say the same again
+        return chosen
+
+    def _site_from_image(self, other: int) -> Matrix3:
+        if other in self._graph:
+            return site_from_image_homography(self._graph.camera(other), self._graph.pose(other))
+        known = self._known[other]
+        return site_from_image_homography(self._picture(other).camera, known.site_from_camera)
+
+    def _picture(self, other: int) -> Keyframe:
+        """A keyframe ready to be linked; one of the known map is loaded when it is first met."""
+        if other not in self._keyframes:
+            known = self._known[other]
+            unknown = CameraPrior(
+                known.site_from_camera.translation_m, np.full(3, np.inf), known.site_from_camera.rotation,
+                np.full(3, np.inf),
+            )
+            image = known.image()
+            self._keyframes[other] = self._keyframe(other, known.camera, image, unknown)
+            self._graph.add_known(other, self._keyframes[other].camera, known.site_from_camera)
+            self._small[other] = _thumbnail(image)
+        return self._keyframes[other]
+
+    def _tie_colours(self, each: Link) -> None:
+        new, old = self._keyframes[each.new_id], self._keyframes[each.old_id]
+        small_new, small_old = self._small[each.new_id], self._small[each.old_id]
+        self._colours[each.new_id, each.old_id] = tie_colours(
+            small_new, _scaled(each.new_px, new.gray, small_new), small_old, _scaled(each.old_px, old.gray, small_old)
+        )
+
+
+def _thumbnail(image: ImageRGB) -> ImageRGB:
+    scale = min(1.0, 320 / max(image.shape[:2]))
+    size = (max(8, round(image.shape[1] * scale)), max(8, round(image.shape[0] * scale)))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
+
+
+def _scaled(points_px: Floats, gray: ImageGray, small: ImageRGB) -> Floats:
+    scale = np.array([small.shape[1] / gray.shape[1], small.shape[0] / gray.shape[0]])
+    return (points_px + 0.5) * scale - 0.5
