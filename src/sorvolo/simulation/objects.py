@@ -364,11 +364,11 @@ def _tree(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) 
     for level in range(count):
         share = (level + 0.5) / count  # 0 at the crown's foot, 1 at its top
         reach = np.sqrt(max(0.03, 1 - (1.7 * share - 0.7) ** 2))
-        leaves = fractal(rng, (side, side), texel_m, (0.09, 0.22, 0.55), (1.0, 1.0, 0.9))
+        leaves = fractal(rng, (side, side), texel_m, (0.05, 0.11, 0.24, 0.55), (0.9, 1.2, 0.9, 0.7))
         radius = np.hypot(x, y) * (1 + 0.13 * lobes)
         alpha = np.clip(4.0 * (reach * 0.93 - radius) * side * texel_m / 0.5 + 0.9 * leaves, 0, 1)
         alpha *= np.clip(1.35 + 0.55 * leaves - 0.5 * share, 0.25, 1)
-        lit = 0.5 + 0.5 * share + 0.16 * (x * sun[0] + y * sun[1]) + 0.2 * leaves + 0.1 * lobes
+        lit = 0.5 + 0.5 * share + 0.16 * (x * sun[0] + y * sun[1]) + 0.27 * leaves + 0.1 * lobes
         rgb = np.clip(green * np.clip(lit, 0.25, 1.7)[..., None], 0, 255)
         sway = np.array(thing.sway_m) * (0.3 + share) if not is_bush else np.array(thing.sway_m) * share
         sway = thing.turn[:2, :2].T @ sway

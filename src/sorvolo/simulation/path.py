@@ -11,7 +11,7 @@ from sorvolo.geometry.pose import Pose, site_from_body_nadir_rotation
 from sorvolo.simulation.noise import SmoothSeries, smooth_series
 from sorvolo.simulation.settings import LaterSettings, MotionSettings, PathSettings
 
-LEAD_S = 4.0
+LEAD_S = 5.0
 """The path is known this long before the video starts and after it ends: telemetry runs longer than video."""
 
 _STEP_M = 0.25

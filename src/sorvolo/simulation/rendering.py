@@ -10,7 +10,7 @@ from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.pose import Pose
 from sorvolo.simulation.ground import GroundRaster
 from sorvolo.simulation.objects import Body, Thing
-from sorvolo.simulation.view import View, blend, sample_patch
+from sorvolo.simulation.view import View, blend, sample_patches
 from sorvolo.simulation.world import Day
 
 Labels = NDArray[np.int32]
@@ -21,16 +21,13 @@ def render(day: Day, view: View, site_from_camera: Pose, from_middle_s: float) -
     """The picture before the camera's own faults, this long after the middle of the flight."""
     image = render_ground(day.ground, view)
     seen = _in_sight(day.things, view, site_from_camera, from_middle_s)
+    patches = [
+        day.shadows[thing.id].moved(np.eye(3), thing.place_m(from_middle_s)) for thing in seen if thing.id in day.shadows
+    ]
     for thing in seen:
-        if thing.id in day.shadows:
-            sample = sample_patch(view, day.shadows[thing.id].moved(np.eye(3), thing.place_m(from_middle_s)))
-            if sample is not None:
-                blend(image, *sample)
-    for thing in seen:
-        for patch in day.bodies[thing.id].placed(thing.turn, thing.place_m(from_middle_s), view.eye_m):
-            sample = sample_patch(view, patch)
-            if sample is not None:
-                blend(image, *sample)
+        patches += day.bodies[thing.id].placed(thing.turn, thing.place_m(from_middle_s), view.eye_m)
+    for window, sample in sample_patches(view, patches):
+        blend(image, window, sample)
     return image
 
 
@@ -63,12 +60,10 @@ def render_labels(
     totals: dict[int, int] = {}
     for thing in _in_sight(things, view, site_from_camera, from_middle_s):
         windows = []
-        for patch in bodies[thing.id].placed(thing.turn, thing.place_m(from_middle_s), view.eye_m):
-            sample = sample_patch(view, patch)
-            if sample is not None:
-                (x0, y0, x1, y1), rgba = sample
-                alone[y0:y1, x0:x1] |= rgba[..., 3] > 127
-                windows.append((x0, y0, x1, y1))
+        patches = bodies[thing.id].placed(thing.turn, thing.place_m(from_middle_s), view.eye_m)
+        for (x0, y0, x1, y1), rgba in sample_patches(view, patches):
+            alone[y0:y1, x0:x1] |= rgba[..., 3] > 127
+            windows.append((x0, y0, x1, y1))
         if not windows:
             continue
         x0, y0 = np.min(windows, axis=0)[:2]
@@ -93,10 +88,10 @@ def _in_sight(things: Sequence[Thing], view: View, site_from_camera: Pose, from_
     corner = np.abs(camera.rays_from_pixels(camera.corners_px)[:, :2]).max(axis=0)
     axis = site_from_camera.rotation[:, 2]
     middle_m = eye_m[:2] - axis[:2] / axis[2] * eye_m[2]
-    reach_m = 1.35 * float(np.hypot(*corner)) * eye_m[2] / abs(axis[2]) ** 2
+    reach_m = 1.15 * float(np.hypot(*corner)) * eye_m[2] / abs(axis[2]) ** 2
     places = np.array([thing.place_m(from_middle_s)[:2] for thing in things])
     # what is high leans outwards, into the picture too when it stands just outside
-    margin_m = np.array([thing.reach_m + 2 * thing.size_m[2] for thing in things])
+    margin_m = np.array([thing.reach_m + thing.size_m[2] for thing in things])
     near = np.hypot(*(places - middle_m).T) < reach_m + margin_m
     nearest = [
         (_distance_to_outline(thing.footprint_m(from_middle_s), eye_m[:2]), thing)

@@ -134,24 +134,27 @@ class SensorSettings:
         if self.rate_hz is not None:
             _demand("rate_hz", self.rate_hz, 0.1, 200)
         _demand("noise_m", min(self.noise_m), 0, 1000)
+        _demand("clock_offset_s", self.clock_offset_s, -3, 3)
         _demand("faults", min(self.gaps, self.jumps, self.zero_fixes, self.bad_checksums), 0, 100000)
 
 
 @dataclass(frozen=True)
 class LaterSettings:
-    """How a later flight differs from the first."""
+    """How a later flight differs from the first: what came, and how many of the first flight's targets left or moved."""
 
-    added: int = 4
+    people: int = 1
+    cars: int = 1
+    small_objects: int = 2
     removed: int = 2
     moved: int = 2
     has_clouds: bool = True
     has_other_light: bool = True
-    wind_m: float = 0.05  # how far crowns and grass have moved
+    wind_m: float = 0.03  # how far crowns and grass have moved
     height_factor: float = 1.0
     heading_change_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        _demand("changes", min(self.added, self.removed, self.moved), 0, 10000)
+        _demand("changes", min(self.people, self.cars, self.small_objects, self.removed, self.moved), 0, 10000)
         _demand("wind_m", self.wind_m, 0, 2)
         _demand("height_factor", self.height_factor, 0.3, 3)
 

@@ -61,8 +61,10 @@ def observe(
     """
     if at_s is None:
         rate_hz = settings.rate_hz or _RATES_HZ[format_name]
-        first, last = np.ceil(-1.0 * rate_hz), np.floor((path.duration_s + 1.0) * rate_hz)
-        true_s = np.arange(first, last + 1) / rate_hz
+        # a table or subtitle track begins with its video; a receiver's log runs on both sides of it
+        spare_s = 0.0 if format_name in ("csv", "srt") else 1.0
+        ticks = np.arange(np.ceil(-spare_s * rate_hz), np.floor((path.duration_s + spare_s) * rate_hz) + 1)
+        true_s = ticks / rate_hz - settings.clock_offset_s
         true_s = true_s[_outside_gaps(true_s, settings.gaps, path.duration_s, rng)]
     else:
         true_s = np.asarray(at_s, dtype=np.float64)

@@ -4,6 +4,7 @@ A view is projective: it takes site points to rays (x, y, 1), and a camera takes
 included. A drone's camera, the straight-down orthophoto and the sun (whose picture is the shadows) are all views.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -109,14 +110,23 @@ class Patch:
         return Patch(self.corners_m @ turn.T + shift_m, self.texture, turn @ self.normal)
 
 
-def sample_patch(view: View, patch: Patch) -> tuple[Window, ImageRGBA] | None:
-    """The patch as this view sees it: a window of the image and its RGBA there; None when not in sight."""
-    corners = patch.corners_m
-    if patch.normal.any() and not view.faces(corners[0], patch.normal):
-        return None
-    corners_px = view.project(corners)
+def sample_patches(view: View, patches: Sequence[Patch]) -> Iterator[tuple[Window, ImageRGBA]]:
+    """The patches in sight as this view sees them, in order: a window of the image and its RGBA there."""
+    facing = [patch for patch in patches if not patch.normal.any() or view.faces(patch.corners_m[0], patch.normal)]
+    if not facing:
+        return
+    # one projection for all corners: a picture has hundreds of patches, most of them out of sight
+    corners_px = view.project(np.concatenate([patch.corners_m for patch in facing])).reshape(-1, 4, 2)
+    for patch, corners in zip(facing, corners_px):
+        seen = _sample(view, patch, corners)
+        if seen is not None:
+            yield seen
+
+
+def _sample(view: View, patch: Patch, corners_px: PointsPx) -> tuple[Window, ImageRGBA] | None:
     if not np.isfinite(corners_px).all():
         return None
+    corners = patch.corners_m
     low, high = corners_px.min(axis=0), corners_px.max(axis=0)
     slack = 2 + 0.02 * (high - low)  # distortion bows edges outwards
     x0, y0 = np.maximum(np.floor(low - slack), 0).astype(int)

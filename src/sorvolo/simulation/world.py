@@ -11,7 +11,7 @@ from sorvolo.simulation.ground import Area, GroundKind, GroundRaster, Layout, Pa
 from sorvolo.simulation.noise import fractal
 from sorvolo.simulation.objects import SMALL_KINDS, Body, Label, Light, Thing, build_body, new_kind, new_size
 from sorvolo.simulation.settings import SceneSettings, SimulationSettings
-from sorvolo.simulation.view import Patch, blend, map_view, sample_patch
+from sorvolo.simulation.view import Patch, View, blend, map_view, sample_patches
 
 _LARGEST_GROUND_PX = 26e6
 _SHADOW_TINT = np.array([0.40, 0.44, 0.52], np.float32)  # what the blue sky alone still lights
@@ -157,9 +157,10 @@ def _next_day(first: tuple[Thing, ...], layout: Layout, waypoints_m: Floats, set
             place = _place(thing.label, thing.id, others, layout, waypoints_m, settings, rng)
             today[i] = replace(thing, east_m=place.east_m, north_m=place.north_m, yaw_deg=place.yaw_deg)
     next_id = 1000 * flight
-    labels = [Label.PERSON, Label.SMALL, Label.CAR, Label.SMALL]
-    for i in range(settings.later.added):
-        today.append(_place(labels[i % 4], next_id + i, today, layout, waypoints_m, settings, rng))
+    later = settings.later
+    came = [Label.PERSON] * later.people + [Label.CAR] * later.cars + [Label.SMALL] * later.small_objects
+    for i, label in enumerate(came):
+        today.append(_place(label, next_id + i, today, layout, waypoints_m, settings, rng))
     return tuple(
         _set_off(thing, today, rng)
         if thing.label in (Label.PERSON, Label.CAR) and rng.uniform() < settings.scene.moving_share else thing
@@ -232,7 +233,9 @@ def _blown(ground: GroundRaster, wind_m: float, rng: np.random.Generator) -> Gro
         return ground
     shape = ground.rgb.shape[:2]
     rows, columns = shape
-    weight = cv2.GaussianBlur(ground.vegetation, (0, 0), 1.5).astype(np.float32) / 255
+    # a kerb beside grass does not bend with it
+    plants = cv2.erode(ground.vegetation, np.ones((3, 3), np.uint8), iterations=max(1, round(0.06 / ground.m_per_px[0])))
+    weight = cv2.GaussianBlur(plants, (0, 0), 1.5).astype(np.float32) / 255
     moved = np.empty_like(ground.rgb)
     push = [
         weight * fractal(rng, shape, ground.m_per_px[0], (0.4, 1.2), (0.8, 0.6)) * np.float32(wind_m / ground.m_per_px[0])
@@ -253,11 +256,7 @@ def _with_shadows(ground: GroundRaster, things: list[Thing], bodies: dict[int, B
     depth = np.zeros((height, width), np.uint8)
     sun_view = map_view(ground.west_m, ground.north_m, ground.m_per_px, (width, height), light.sun)
     for thing in things:
-        for patch in bodies[thing.id].placed(thing.turn, thing.place_m(0.0), sun_view.eye_m):
-            cast = sample_patch(sun_view, Patch(patch.corners_m, patch.texture, np.zeros(3)))
-            if cast is not None:
-                (x0, y0, x1, y1), sample = cast
-                np.maximum(depth[y0:y1, x0:x1], sample[..., 3], out=depth[y0:y1, x0:x1])
+        _cast(bodies[thing.id].placed(thing.turn, thing.place_m(0.0), sun_view.eye_m), sun_view, depth)
     if not depth.any():
         return ground
     depth = cv2.GaussianBlur(depth, (0, 0), max(0.6, 0.03 / ground.m_per_px[0]))  # the sun is no point
@@ -273,13 +272,9 @@ def _own_shadow(thing: Thing, body: Body, light: Light, m_per_px: float) -> Patc
     """The shadow of something that moves, as a dark patch on the ground around its place."""
     reach_m = thing.reach_m + thing.size_m[2] * float(np.hypot(*light.sun[:2]) / light.sun[2]) + 0.3
     side = max(8, int(np.ceil(2 * reach_m / m_per_px)))
-    sun_view = map_view(-reach_m, reach_m, (2 * reach_m / side,) * 2, (side, side), light.sun)
+    sun_view = map_view(-reach_m, reach_m, (2 * reach_m / side, 2 * reach_m / side), (side, side), light.sun)
     depth: ImageGray = np.zeros((side, side), np.uint8)
-    for patch in body.placed(thing.turn, np.zeros(3), sun_view.eye_m):
-        cast = sample_patch(sun_view, Patch(patch.corners_m, patch.texture, np.zeros(3)))
-        if cast is not None:
-            (x0, y0, x1, y1), sample = cast
-            np.maximum(depth[y0:y1, x0:x1], sample[..., 3], out=depth[y0:y1, x0:x1])
+    _cast(body.placed(thing.turn, np.zeros(3), sun_view.eye_m), sun_view, depth)
     depth = cv2.GaussianBlur(depth, (0, 0), 0.7)
     texture = np.zeros((side, side, 4), np.uint8)
     texture[..., 3] = (depth * (1 - float(_SHADOW_TINT.mean()))).astype(np.uint8)
@@ -294,11 +289,17 @@ def orthophoto(day: Day) -> GroundRaster:
     view = map_view(day.ground.west_m, day.ground.north_m, day.ground.m_per_px, (width, height))
     for thing in sorted(day.things, key=lambda each: each.size_m[2]):
         if not thing.is_moving:
-            for patch in day.bodies[thing.id].placed(thing.turn, thing.place_m(0.0), view.eye_m):
-                seen = sample_patch(view, patch)
-                if seen is not None:
-                    blend(rgb, *seen)
+            patches = day.bodies[thing.id].placed(thing.turn, thing.place_m(0.0), view.eye_m)
+            for window, sample in sample_patches(view, patches):
+                blend(rgb, window, sample)
     return replace(day.ground, rgb=rgb)
+
+
+def _cast(patches: list[Patch], sun_view: View, depth: ImageGray) -> None:
+    """Darken `depth`, in place, where the patches stop the sun; a face's back stops it as its front does."""
+    two_sided = [Patch(patch.corners_m, patch.texture, np.zeros(3)) for patch in patches]
+    for (x0, y0, x1, y1), sample in sample_patches(sun_view, two_sided):
+        np.maximum(depth[y0:y1, x0:x1], sample[..., 3], out=depth[y0:y1, x0:x1])
 
 
 def _demand_cover(given: Area, needed: Area) -> None:

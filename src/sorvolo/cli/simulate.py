@@ -1,0 +1,110 @@
+"""`sorvolo simulate`: make flights over a synthetic site whose truth is known."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from sorvolo.errors import SettingsError
+from sorvolo.missions.simulate_site import SimulationProgress, simulate_site
+from sorvolo.simulation.ground import GroundKind
+from sorvolo.simulation.presets import preset, preset_names
+from sorvolo.simulation.settings import SimulationSettings
+
+
+def simulate(
+    folder: Annotated[Path, typer.Argument(help="Folder to make; an earlier simulation there is replaced.")],
+    preset_name: Annotated[str, typer.Option("--preset", help="What to simulate; --list-presets names all.")] = "demo",
+    seed: Annotated[int | None, typer.Option(help="Everything random follows from this number.")] = None,
+    ground: Annotated[str, typer.Option(help="dirt, countryside, urban, sand, or an orthophoto's file.")] = "",
+    ground_gsd: Annotated[float | None, typer.Option(help="Metres per pixel of an orthophoto without a CRS.")] = None,
+    flights: Annotated[int | None, typer.Option(help="Number of flights; later ones find changes.")] = None,
+    gps_noise: Annotated[float | None, typer.Option(help="White noise of each fix and axis, m rms.")] = None,
+    gps_rate: Annotated[float | None, typer.Option(help="Fixes a second; else the format's own.")] = None,
+    clock_offset: Annotated[float | None, typer.Option(help="Telemetry's clock minus the video's, s.")] = None,
+    telemetry: Annotated[str, typer.Option(help="csv, srt, nmea, gpx, all or none.")] = "",
+    faults: Annotated[int, typer.Option(help="So many gaps, jumps, 0/0 fixes and bad checksums each.")] = 0,
+    height: Annotated[float | None, typer.Option(help="Height above the ground, m.")] = None,
+    speed: Annotated[float | None, typer.Option(help="Ground speed, m/s.")] = None,
+    length: Annotated[float | None, typer.Option(help="Length of a strip, m.")] = None,
+    strips: Annotated[int | None, typer.Option(help="Number of strips.")] = None,
+    tilt: Annotated[float | None, typer.Option(help="Roll and pitch, deg rms.")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames a second of the video.")] = None,
+    size: Annotated[str, typer.Option(help="Picture size, such as 1280x720.")] = "",
+    photos: Annotated[bool, typer.Option("--photos", help="Write geo-tagged JPEG photos instead of a video.")] = False,
+    list_presets: Annotated[bool, typer.Option("--list-presets", help="Name the presets and stop.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object a step.")] = False,
+) -> None:
+    """Simulated flights with video or photos, telemetry, and the truth of every frame and object.
+
+    Example: sorvolo simulate demo-site --preset demo
+
+    Example: sorvolo simulate town --preset survey --ground urban --photos --gps-noise 0.5 --telemetry all
+    """
+    if list_presets:
+        typer.echo("\n".join(preset_names()))
+        return
+    settings = preset(preset_name)
+    ground_file = None if not ground or ground in list(GroundKind) else Path(ground)
+    if ground:
+        kind = ground if ground_file is None else "orthophoto"
+        settings = replace(settings, scene=replace(settings.scene, ground=kind))
+    settings = _with_options(
+        settings,
+        top={"seed": seed, "flights": flights},
+        path={"height_m": height, "speed_m_s": speed, "length_m": length, "strips": strips},
+        motion={"tilt_rms_deg": tilt},
+        imaging={"fps": fps, **_size(size)},
+        sensor={
+            "noise_m": None if gps_noise is None else (gps_noise,) * 3, "rate_hz": gps_rate,
+            "clock_offset_s": clock_offset,
+            **(dict.fromkeys(("gaps", "jumps", "zero_fixes", "bad_checksums"), faults) if faults else {}),
+        },
+        output={"telemetry": telemetry or None, "photos": photos or None},
+    )
+    steps = simulate_site(folder, settings, ground_file, ground_gsd)
+    if as_json:
+        for step in steps:
+            if step.stage != "frames" or step.frames_done == step.frames_total:
+                typer.echo(json.dumps(asdict(step)))
+    else:
+        _show(steps, folder)
+
+
+def _with_options(settings: SimulationSettings, top: dict[str, object], **parts: dict[str, object]) -> SimulationSettings:
+    """The settings with every option that was given; None was not."""
+    for name, options in parts.items():
+        given = {key: value for key, value in options.items() if value is not None}
+        settings = replace(settings, **{name: replace(getattr(settings, name), **given)})  # type: ignore[arg-type]
+    return replace(settings, **{key: value for key, value in top.items() if value is not None})  # type: ignore[arg-type]
+
+
+def _size(text: str) -> dict[str, object]:
+    if not text:
+        return {}
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise SettingsError(f"--size {text!r}: a picture size looks like 1280x720")
+    return {"width_px": int(width), "height_px": int(height)}
+
+
+def _show(steps: Iterator[SimulationProgress], folder: Path) -> None:
+    console = Console()
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+               TimeRemainingColumn())
+    last = None
+    with Progress(*columns, console=console) as progress:
+        bars: dict[str, int] = {}
+        for last in steps:
+            if last.stage == "frames":
+                if last.flight not in bars:
+                    bars[last.flight] = int(progress.add_task(last.flight, total=last.frames_total))
+                progress.update(progress.task_ids[bars[last.flight]], completed=last.frames_done)
+    if last is not None:
+        console.print(f"{last.frames_done} frames in {last.seconds:.0f} s: {folder}")
+        console.print(f"the truth is in {folder / 'truth'}; the camera in {folder / 'camera.xml'}")
