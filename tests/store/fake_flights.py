@@ -1,9 +1,16 @@
-"""Small made-up sites and flights for the store's tests; also run as a program that is killed at random moments."""
+"""Small made-up sites and flights for the store's tests; as a program, it kills itself at random moments."""
 
+import os
+import random
+import signal
 import sys
+import time
+import traceback
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import rasterio
 
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, utm_epsg
@@ -21,7 +28,7 @@ CAMERA = Camera(96, 54, 80.0, 80.0, 47.5, 26.5, np.array([-0.1, 0.02, 0.0, 0.0, 
 
 
 def tile(colour: int, opaque_columns: int = 512) -> np.ndarray:
-    """A tile with a gradient, so that no two colours give the same bytes; transparent right of some column."""
+    """A tile with a gradient, of one red; transparent right of some column."""
     rgba = np.zeros((512, 512, 4), np.uint8)
     rgba[..., 0] = colour
     rgba[..., 1] = np.arange(512)[:, None] // 2
@@ -35,7 +42,8 @@ def frame(index: int, status: Status = Status.VISION, name: str = "") -> PlacedF
     lost = status is Status.REJECTED
     pose = Pose(site_from_gimbal_rotation(30.0, -85.0, 0.0), np.array([10.0 * index, 5.0, 20.0]))
     return PlacedFrame(
-        name or str(index), index, 1_700_000_000_123_456_000 + index, status, "blurred" if lost else "", CAMERA,
+        name or str(index), index, 1_700_000_000_123_456_000 + index, status, "blurred" if lost else "",
+        CAMERA,
         None if lost else pose,
         np.full((3, 3), np.nan) if lost else site_from_image_homography(CAMERA, pose),
         np.full((4, 2), np.nan) if lost else footprint(CAMERA, pose),
@@ -50,31 +58,83 @@ def image(seed: int) -> np.ndarray:
     return np.dstack([x * 2, y * 4, np.full_like(x, (seed * 37) % 256)]).astype(np.uint8)
 
 
-def map_flight(archive: Archive, flight_id: str, colour: int, count: int = 4, flushes: bool = True) -> int:
-    """Map a fake flight of `count` tiles and frames, and commit it."""
-    with archive.begin_flight(flight_id, f"print-{flight_id}", {"method": "planar", "colour": colour}) as writer:
+def map_flight(archive: Archive, flight_id: str, colour: int, count: int = 4) -> int:
+    """Map a fake flight of `count` tiles, painted `count` deep, and as many frames, and commit it."""
+    settings = {"method": "planar", "colour": colour, "count": count}
+    with archive.begin_flight(flight_id, f"print-{flight_id}", settings) as writer:
         paths = {}
         for index in range(count):
             paths[index] = writer.save_image(index, image(index))
             for column in range(index + 1):  # repainted again and again, as a canvas does
                 writer.tiles[column - 1, 0] = tile(colour + index)
-            if flushes:
-                writer.flush()
+            writer.flush()
         placed = [frame(index) for index in range(count)] + [frame(count, Status.REJECTED)]
         return writer.commit(placed, paths, {"colour": colour}, f"<html>{colour}</html>")
 
 
-def main(folder: str, start: int) -> None:
-    """Map the same two flights in turn, for ever, telling each commit; meant to be killed."""
-    step = start
+def check_whole(folder: Path) -> None:
+    """Raise AssertionError (or the archive's own error) unless the site is whole and of one piece."""
+    if not (folder / "site.db").exists():
+        assert all(path.name.startswith((".tmp-", "site.lock")) for path in folder.glob("*"))
+        return
+    with Archive.open(folder, write=False) as archive:
+        complete = [version for version in archive.versions() if version.complete]
+        for version in complete:
+            assert len(list(archive.tiles(version.id).items())) == version.tiles
+        flights = {flight.id: flight for flight in archive.flights() if flight.status == "complete"}
+        for flight_id, flight in flights.items():
+            keyframes = archive.keyframes(flight_id)
+            assert [keyframe.index for keyframe in keyframes] == list(range(flight.settings["count"]))
+            for keyframe in keyframes:
+                assert np.abs(archive.image(keyframe).astype(int) - image(keyframe.index)).mean() < 4
+        if complete:
+            newest = flights[complete[-1].flight_id].settings
+            for column in range(newest["count"]):
+                # the last coat: every tile of the newest flight has its last frame's colour
+                expected = tile(newest["colour"] + newest["count"] - 1)
+                assert np.array_equal(archive.tiles()[column - 1, 0], expected)
+        if archive.mosaic_path.exists():
+            with rasterio.open(archive.mosaic_path) as mosaic:
+                assert mosaic.read().shape[0] == 4
+
+
+def map_for_ever(folder: Path, seed: int) -> None:
+    """Map two flights in turn, again and again."""
     while True:
-        with Archive.open(Path(folder), write=True) as archive:
+        seed += 1
+        with Archive.open(folder, write=True) as archive:
             if not archive.has_site:
                 archive.create_site(SITE)
-            map_flight(archive, f"flight-{step % 2}", 10 + step % 200, count=3)
-        print(step, flush=True)
-        step += 1
+            map_flight(archive, f"flight-{seed % 2}", 10 + seed % 200, count=2 + seed % 2)
+
+
+def _forked(task: Callable[..., None], *arguments: object) -> int:
+    """Run the task in a child and return its process id; a child that fails exits with 1 and a traceback."""
+    child = os.fork()
+    if child == 0:
+        try:
+            task(*arguments)
+            os._exit(0)
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)
+    return child
+
+
+def main(folder: Path, seed: int, rounds: int) -> None:
+    """Kill a mapping child after a random time and look whether the site is whole; exit with 1 if not."""
+    chance = random.Random(seed)
+    for number in range(rounds):
+        child = _forked(map_for_ever, folder, number)
+        time.sleep(chance.uniform(0.01, 0.9))
+        os.kill(child, signal.SIGKILL)
+        _, ending = os.waitpid(child, 0)
+        if os.WIFEXITED(ending):  # it failed by itself before it was killed
+            sys.exit(f"round {number}: the mapping child failed")
+        _, ending = os.waitpid(_forked(check_whole, folder), 0)
+        if ending:
+            sys.exit(f"round {number}: the site is not whole")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]))
+    main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))

@@ -1,5 +1,6 @@
 """The catalogue `site.db`: one SQLite file that is the truth about a site (docs/formats.md)."""
 
+import os
 import sqlite3
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -467,6 +468,8 @@ def derived_version(connection: Connection) -> int:
 
 def _engine(path: Path, write: bool) -> Engine:
     uri = path.resolve().as_uri() + ("?mode=rw" if write else "?mode=ro")
+    if not write and not os.access(path.parent, os.W_OK) and not path.with_name(path.name + "-wal").exists():
+        uri += "&immutable=1"  # SQLite cannot put its lock files beside a file on a read-only disk
 
     def connect() -> sqlite3.Connection:
         # isolation_level None: the module must not begin transactions by itself, SQLAlchemy does it below

@@ -75,10 +75,11 @@ def geojson_bytes(collection: Mapping[str, Any]) -> bytes:
     """A FeatureCollection as UTF-8 JSON text, one feature a line."""
     head = {key: value for key, value in collection.items() if key != "features"}
     opening = json.dumps(plain_json(head), ensure_ascii=False, allow_nan=False)[:-1]
-    features = ",\n".join(
-        json.dumps(plain_json(feature), ensure_ascii=False, allow_nan=False) for feature in collection["features"]
-    )
-    return f'{opening}, "features": [\n{features}\n]}}\n'.encode()
+    features = [
+        json.dumps(plain_json(feature), ensure_ascii=False, allow_nan=False)
+        for feature in collection["features"]
+    ]
+    return (opening + ', "features": [\n' + ",\n".join(features) + "\n]}\n").encode()
 
 
 def utc_text(time_ns: int) -> str:

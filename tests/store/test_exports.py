@@ -1,0 +1,217 @@
+"""Frames, pictures and KMZ lie where the site says, and say what is not known."""
+
+import json
+import zipfile
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+import pytest
+from fake_flights import LOCAL_SITE, ORIGIN, SITE, frame, tile
+
+from sorvolo.geometry.geodesy import Geodetic, Projection
+from sorvolo.geometry.grid import SiteGrid
+from sorvolo.store.exports import (
+    frames_geojson,
+    geojson_bytes,
+    picture,
+    plain_json,
+    utc_text,
+    write_kmz,
+    write_live_preview,
+    write_preview,
+)
+from sorvolo.survey.flight import Site
+from sorvolo.survey.mosaic import Status
+
+PROMISED = {
+    "frame", "time", "status", "reason", "camera_longitude_deg", "camera_latitude_deg", "camera_height_m",
+    "height_above_ground_m", "residual_px", "sigma_m",
+}
+
+
+def feature(collection: dict, number: int = 0) -> dict:
+    return json.loads(geojson_bytes(collection))["features"][number]
+
+
+def test_a_frame_is_the_ground_polygon_of_its_corners_in_order() -> None:
+    placed = frame(2)
+    made = feature(frames_geojson([placed], SITE))
+    assert set(made["properties"]) >= PROMISED
+    (ring,) = made["geometry"]["coordinates"]
+    assert made["geometry"]["type"] == "Polygon"
+    assert len(ring) == 5 and ring[0] == ring[4]
+    back_m = SITE.frame.site_from_wgs84(
+        np.array(ring)[:4, 1], np.array(ring)[:4, 0], np.full(4, ORIGIN.height_m)
+    )
+    assert np.abs(back_m[:, :2] - placed.outline_m).max() < 1e-4  # 1e-10 deg is a hundredth of a millimetre
+    assert max(len(str(number).split(".")[1]) for number in ring[0]) >= 9
+
+
+def test_a_frames_properties_say_where_its_camera_was() -> None:
+    properties = feature(frames_geojson([frame(2)], SITE))["properties"]
+    camera_m = SITE.frame.site_from_wgs84(
+        np.array([properties["camera_latitude_deg"]]), np.array([properties["camera_longitude_deg"]]),
+        np.array([properties["camera_height_m"]]),
+    )[0]
+    assert np.abs(camera_m - [20.0, 5.0, 20.0]).max() < 0.001
+    assert properties["camera_height_m"] == ORIGIN.height_m + 20
+    assert properties["height_above_ground_m"] == 20
+    assert properties["height_reference"] == "ellipsoidal"
+    assert (properties["camera_yaw_deg"], properties["camera_pitch_deg"]) == (30, -85)
+    assert properties["gps_residual_north_m"] == -0.2
+    assert properties["gps_residual_up_m"] is None
+    assert properties["time"] == "2023-11-14T22:13:20.123456002Z"
+
+
+def test_a_rejected_frame_has_a_reason_and_no_place() -> None:
+    made = feature(frames_geojson([frame(3, Status.REJECTED)], SITE))
+    assert made["geometry"] is None
+    assert (made["properties"]["status"], made["properties"]["reason"]) == ("rejected", "blurred")
+    for name in ("camera_longitude_deg", "camera_height_m", "residual_px", "sigma_m", "camera_yaw_deg"):
+        assert made["properties"][name] is None
+
+
+def test_video_frames_are_named_by_number_and_photos_by_file() -> None:
+    names = [frame(7), frame(7, name="DJI_0007.JPG"), frame(7, name="0007")]
+    features = frames_geojson(names, SITE)["features"]
+    assert [one["properties"]["frame"] for one in features] == [7, "DJI_0007.JPG", "0007"]
+
+
+def test_a_local_site_has_units_and_no_degrees() -> None:
+    placed = frame(2)
+    collection = json.loads(geojson_bytes(frames_geojson([placed], LOCAL_SITE)))
+    assert collection["crs"] is None
+    assert "crs" not in frames_geojson([placed], SITE)
+    (made,) = collection["features"]
+    assert np.abs(np.array(made["geometry"]["coordinates"][0][:4]) - placed.outline_m).max() < 1e-9
+    assert made["properties"]["camera_longitude_deg"] is None
+    assert (made["properties"]["camera_east"], made["properties"]["camera_north"]) == (20, 5)
+
+
+def test_longitudes_do_not_jump_at_the_antimeridian() -> None:
+    fiji = Site("fiji", Geodetic(-17.0, 179.99985), "EPSG:32760", 0.05)
+    longitudes = [
+        point[0]
+        for made in frames_geojson([frame(index) for index in range(6)], fiji)["features"]
+        for point in made["geometry"]["coordinates"][0]
+    ]
+    assert max(longitudes) > 180 > min(longitudes) > 179.99
+
+
+@pytest.mark.parametrize(("time_ns", "text"), [
+    (0, "1970-01-01T00:00:00.000000Z"),
+    (1_700_000_000_000_001_000, "2023-11-14T22:13:20.000001Z"),
+    (1_700_000_000_000_000_001, "2023-11-14T22:13:20.000000001Z"),
+    (-1_000, "1969-12-31T23:59:59.999999Z"),
+])
+def test_times_are_utc_and_lose_nothing(time_ns: int, text: str) -> None:
+    assert utc_text(time_ns) == text
+
+
+def test_plain_json_says_what_json_can() -> None:
+    @dataclass(frozen=True)
+    class Settings:
+        gsd_m: float
+        path: Path
+
+    class Kind(StrEnum):
+        FAST = "fast"
+
+    value = {
+        "settings": Settings(np.float64(0.5), Path("a/b")), "kind": Kind.FAST, "nan": np.nan, 3: np.arange(2),
+        "flags": (True, None, np.bool_(False)), "inf": np.float32(np.inf),
+    }
+    assert json.loads(json.dumps(plain_json(value), allow_nan=False)) == {
+        "settings": {"gsd_m": 0.5, "path": "a/b"}, "kind": "fast", "nan": None, "3": [0, 1],
+        "flags": [True, None, False], "inf": None,
+    }
+    with pytest.raises(TypeError, match="object"):
+        plain_json(object())
+
+
+def marked_tiles(pixel: tuple[int, int]) -> dict[tuple[int, int], np.ndarray]:
+    """Dark tiles of 3 x 2, the lower left one missing, with a white patch of 16 px around a grid pixel."""
+    tiles = {(column, row): tile(0) for column in (-2, -1, 0) for row in (4, 5)}
+    del tiles[-2, 5]
+    for one in tiles.values():
+        one[..., :3] = 10
+    for y in range(pixel[1] - 8, pixel[1] + 8):
+        for x in range(pixel[0] - 8, pixel[0] + 8):
+            tiles[x // 512, y // 512][y % 512, x % 512, :3] = 250
+    return tiles
+
+
+def patch_centre(rgba: np.ndarray) -> np.ndarray:
+    weight = np.clip(rgba[..., 0].astype(float) - 12, 0, None) * (rgba[..., 3] > 128)
+    rows, columns = np.indices(weight.shape)
+    return np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+
+
+@pytest.mark.parametrize("max_px", [4096, 1000, 200])
+def test_a_small_picture_knows_where_it_lies(max_px: int) -> None:
+    pixel = (-700, 2300)
+    small = picture(marked_tiles(pixel), max_px)
+    assert max(small.rgba.shape) <= max_px
+    assert small.rgba[0, 0, 3] == 255 and small.rgba[-1, 0, 3] == 0
+    place_px = (patch_centre(small.rgba) + 0.5) * small.step_px + small.corner_px
+    assert np.abs(place_px - (np.array(pixel) - 0.5)).max() < 0.01 * small.step_px
+
+
+def test_a_small_picture_is_cropped_and_keeps_the_colour_of_its_rim() -> None:
+    half = np.zeros((512, 512, 4), np.uint8)
+    half[100:, 3:203] = (200, 150, 100, 255)
+    small = picture({(0, 0): half}, 64)
+    assert small.rgba.shape == (52, 26, 4)
+    seen = small.rgba[small.rgba[..., 3] > 0]
+    assert np.abs(seen[:, :3].astype(int) - [200, 150, 100]).max() <= 1
+
+
+def test_previews_are_png_with_a_transparent_background(tmp_path: Path) -> None:
+    write_preview(marked_tiles((0, 2300)), tmp_path / "preview.png", 512)
+    image = cv2.imread(str(tmp_path / "preview.png"), cv2.IMREAD_UNCHANGED)
+    assert image.shape == (256, 384, 4)
+    assert (image[200, 60, 3], image[60, 60, 3]) == (0, 255)
+    write_live_preview({}, tmp_path / "live.png")
+    assert not (tmp_path / "live.png").exists()
+    write_live_preview({(0, 0): tile(9)}, tmp_path / "live.png")
+    assert cv2.imread(str(tmp_path / "live.png"))[0, 0].tolist() == [0, 0, 9]
+
+
+@pytest.mark.parametrize("origin", [ORIGIN, Geodetic(-17.0, 179.9999), Geodetic(78.2, 15.6)])
+def test_a_kmz_lies_on_the_map(tmp_path: Path, origin: Geodetic) -> None:
+    crs = {46.5: "EPSG:32633", -17.0: "EPSG:32701", 78.2: "EPSG:32633"}[origin.latitude_deg]
+    site_grid = SiteGrid.at(origin, 0.2, crs)
+    pixel = (-700, 2300)
+    write_kmz(marked_tiles(pixel), site_grid, "two fields", tmp_path / "mosaic.kmz")
+    latitude, longitude = Projection(crs).wgs84_from_projected(
+        site_grid.grid.projected_from_grid(np.array([pixel]) - 0.5)
+    )
+    found = 0
+    with zipfile.ZipFile(tmp_path / "mosaic.kmz") as archive:
+        document = ElementTree.fromstring(archive.read("doc.kml"))
+        overlays = [one for one in document.iter() if one.tag.endswith("GroundOverlay")]
+        for overlay in overlays:
+            text = {one.tag.split("}")[1]: one.text for one in overlay.iter()}
+            data = np.frombuffer(archive.read(text["href"]), np.uint8)
+            rgba = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+            assert max(rgba.shape) <= 1024
+            if not (rgba[..., 0] > 100).any():
+                continue
+            found += 1
+            x, y = (patch_centre(rgba) + 0.5) / rgba.shape[1::-1]
+            west, east, south, north = (float(text[side]) for side in ("west", "east", "south", "north"))
+            assert abs(north + y * (south - north) - latitude[0]) * 111_000 < 0.1
+            off_deg = (west + x * ((east - west) % 360) - longitude[0] + 180) % 360 - 180
+            assert abs(off_deg) * 111_000 * np.cos(np.radians(latitude[0])) < 0.1
+    assert found == 1 and len(overlays) >= 2
+    assert [path.name for path in tmp_path.iterdir()] == ["mosaic.kmz"]
+
+
+def test_a_site_says_what_its_height_is_counted_from() -> None:
+    above_takeoff = replace(SITE, origin=Geodetic(46.5, 13.25, 0.0), height_reference="above take-off")
+    properties = feature(frames_geojson([frame(0)], above_takeoff))["properties"]
+    assert (properties["camera_height_m"], properties["height_reference"]) == (20, "above take-off")

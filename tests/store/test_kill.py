@@ -1,0 +1,31 @@
+"""kill -9 at any moment: the site stays whole and readable, and mapping again ends whole."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import fake_flights
+import pytest
+
+from sorvolo.store.archive import Archive
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_site_survives_being_killed_at_random_moments(tmp_path: Path, seed: int) -> None:
+    folder = tmp_path / "site"
+    program = [sys.executable, fake_flights.__file__, str(folder), str(seed), "11"]
+    result = subprocess.run(program, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+
+    with Archive.open(folder, write=True) as archive:
+        if not archive.has_site:
+            archive.create_site(fake_flights.SITE)
+        version = fake_flights.map_flight(archive, "flight-0", 77)
+        assert archive.versions()[-1].id == version
+        assert all(entry.complete for entry in archive.versions())
+        named = {keyframe.image_path for keyframe in archive.keyframes()}
+    fake_flights.check_whole(folder)
+    assert {str(path.relative_to(folder)) for path in folder.glob("flights/*/keyframes/*/*")} == named
+    assert not list(folder.rglob(".tmp-*"))
+    for name in ("mosaic.tif", "preview.png", "mosaic.kmz", "flights/flight-0/report.html"):
+        assert (folder / name).is_file()

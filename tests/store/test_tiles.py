@@ -1,0 +1,97 @@
+"""The growing map behaves like a dict of tiles, whatever is evicted, written, dropped and shared meanwhile."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sorvolo.errors import StoreError
+from sorvolo.geometry.grid import TileIndex
+from sorvolo.store.images import ImageCache, image_from_jpeg, jpeg_from_image, png_from_rgba, rgba_from_png
+from sorvolo.store.tiles import GrowingTiles, TileBlobs
+
+SIDE = 16
+INDICES = st.tuples(st.integers(-1, 1), st.integers(-1, 1))
+STEPS = st.lists(
+    st.one_of(
+        st.tuples(st.just("set"), INDICES, st.integers(0, 3)),
+        st.tuples(st.just("get"), INDICES, st.just(0)),
+        st.tuples(st.just("delete"), INDICES, st.just(0)),
+        st.tuples(st.just("save"), INDICES, st.just(0)),
+    ),
+    max_size=40,
+)
+
+
+def flat(colour: int) -> np.ndarray:
+    """A tile of one colour; colour 0 is transparent."""
+    return np.full((SIDE, SIDE, 4), colour, np.uint8)
+
+
+@settings(max_examples=60, deadline=None)
+@given(steps=STEPS, limit_tiles=st.integers(0, 4))
+def test_growing_tiles_are_a_dict(steps: list[tuple[str, TileIndex, int]], limit_tiles: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        blobs = TileBlobs(Path(folder))
+        base = {(0, 0): blobs.save(flat(1)), (1, 1): blobs.save(flat(2))}
+        tiles = GrowingTiles(blobs, base, SIDE, limit_tiles * SIDE * SIDE * 4)
+        truth = {(0, 0): 1, (1, 1): 2}
+        rows: dict[TileIndex, str] = dict(base)  # what the catalogue would hold
+        for action, index, colour in steps:
+            if action == "set":
+                tiles[index] = flat(colour)
+                truth.pop(index, None)
+                truth |= {index: colour} if colour else {}
+            elif action == "get":
+                assert (int(tiles[index][0, 0, 0]) if index in tiles else 0) == truth.get(index, 0)
+            elif action == "delete" and index in truth:
+                del tiles[index], truth[index]
+            elif action == "save":
+                rows = {**rows, **tiles.save()}
+                rows = {key: sha256 for key, sha256 in rows.items() if sha256 is not None}
+                blobs.remove(tiles.take_superseded() - set(base.values()))
+                assert {key: int(blobs.load(sha256)[0, 0, 0]) for key, sha256 in rows.items()} == truth
+                assert blobs.stored() == set(rows.values()) | set(base.values())
+            assert set(tiles) == set(truth) and len(tiles) == len(truth)
+        assert {key: int(tile[0, 0, 0]) for key, tile in tiles.items()} == truth
+        blobs.sync()
+
+
+def test_png_keeps_every_value_under_transparency() -> None:
+    rgba = np.random.default_rng(3).integers(0, 256, (40, 50, 4), dtype=np.uint8)
+    assert np.array_equal(rgba_from_png(png_from_rgba(rgba), "x"), rgba)
+
+
+def test_jpeg_keeps_colour_at_full_resolution() -> None:
+    image = np.zeros((32, 32, 3), np.uint8)
+    image[:, 16:] = (255, 0, 0)
+    image[:, 17:] = (0, 0, 255)  # a red line one pixel wide between black and blue
+    read = image_from_jpeg(jpeg_from_image(image), "x")
+    assert read[16, 16, 0] > 180 and read[16, 18, 0] < 60
+
+
+@pytest.mark.parametrize("data", [b"", b"text", png_from_rgba(flat(3))[:40]])
+def test_damaged_pictures_are_named(data: bytes) -> None:
+    with pytest.raises(StoreError, match=r"tile\.png"):
+        rgba_from_png(data, "tile.png")
+    with pytest.raises(StoreError, match=r"frame\.jpg"):
+        image_from_jpeg(data[:20], "frame.jpg")
+
+
+def test_the_image_cache_is_bounded_in_bytes() -> None:
+    loaded: list[int] = []
+
+    def load(index: int) -> np.ndarray:
+        loaded.append(index)
+        return np.full((10, 10, 3), index, np.uint8)
+
+    cache = ImageCache(load, 600)
+    for index in (1, 2, 1, 3, 1, 2):  # two fit; 2 is the one used longest ago when 3 comes
+        assert cache.get(index)[0, 0, 0] == index
+    assert loaded == [1, 2, 3, 2]
+    cache.forget(1)
+    cache.get(1)
+    assert loaded == [1, 2, 3, 2, 1]
