@@ -1,4 +1,4 @@
-"""The growing map behaves like a dict of tiles, whatever is evicted, written, dropped and shared meanwhile."""
+"""The growing map behaves like a dict of tiles, whatever is evicted, written, dropped or shared."""
 
 import tempfile
 from pathlib import Path
