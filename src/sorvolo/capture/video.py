@@ -235,7 +235,7 @@ class _Clock:
     def notices(self) -> list[Notice]:
         longest_s = self._longest_gap_ns / _SECOND_NS
         return [
-            *notice("missing_pts", self._missing, "frames without a time stamp, a usual step after the one before: {}"),
+            *notice("missing_pts", self._missing, "frames without a time stamp, set by the usual step: {}"),
             *notice("backward_pts", self._backward, "times that the video's clock runs backward: {}"),
             *notice("video_gap", self._gaps, f"gaps in the video: {{}}, the longest {longest_s:.1f} s"),
         ]
@@ -267,12 +267,14 @@ def _decoded_frames(path: Path, damage: _Damage) -> Iterator[av.VideoFrame]:
                 for packet in container.demux(stream):
                     yield from _frames_of(packet, damage)
                 return
-            except av.FFmpegError:
+            except (av.FFmpegError, IndexError):
+                # PyAV's IndexError: damage made a stream appear that was not there at the start
                 damage.packets += 1
         damage.stopped = True
 
 
 def _frames_of(packet: "av.Packet[Any]", damage: _Damage) -> Iterator[av.VideoFrame]:
+    damage.packets += packet.is_corrupt
     try:
         decoded = packet.decode()
     except (av.FFmpegError, ValueError, MemoryError):
@@ -311,7 +313,7 @@ def _why_unreadable(path: Path, error: Exception) -> str:
     if "ftyp" in boxes and "moov" not in boxes:
         return (
             "moov atom not found: the file was cut before its index, which an MP4 has at its end; "
-            "copy it again from the drone, or have it repair the file; record as MKV or TS, which survive a cut"
+            "copy it again from the drone, or repair it there; record as MKV or TS, which survive a cut"
         )
     words = getattr(error, "strerror", None) or str(error)
     return f"{words}; give a video that FFmpeg reads, or a folder of photos"
@@ -324,6 +326,9 @@ def _video_stream(container: av.container.InputContainer, path: Path) -> av.Vide
     if not streams:
         kinds = ", ".join(sorted({stream.type for stream in container.streams})) or "nothing"
         raise InputError(f"{path.name} has no video in it, only {kinds}; give the drone's video file")
+    # PyAV's type does not say that an unknown codec leaves no context
+    if cast(object, streams[0].codec_context) is None:
+        raise InputError(f"{path.name}: the video's codec is unknown to FFmpeg, or its header is damaged")
     return streams[0]
 
 

@@ -168,7 +168,7 @@ def inspect_input(
 def _inspect(source: Source) -> Inspection:
     frames = _frame_facts(source)
     telemetry = _telemetry_facts(source, frames)
-    flight = _flight_facts(source.telemetry, source.camera.camera, frames)
+    flight = _flight_facts(_while_filming(source, frames), source.camera.camera, frames)
     findings = [
         *_frame_findings(frames), *_camera_findings(source.camera, flight),
         *_telemetry_findings(source, frames, telemetry),
@@ -257,6 +257,20 @@ def _tie(source: Source, frames: FrameFacts) -> tuple[str, float]:
         return "unknown: the video does not say when it began", math.nan
     both_ns = _common_ns(telemetry, source.start_ns, frames.duration_s)
     return "by UTC", both_ns / _SECOND_NS
+
+
+def _while_filming(source: Source, frames: FrameFacts) -> Telemetry:
+    """The telemetry between the first and the last frame; all of it where that cannot be told."""
+    telemetry = source.telemetry
+    duration_ns = round(frames.duration_s * _SECOND_NS) if frames.duration_s > 0 else 0
+    since_start_ns = telemetry.video_time_ns
+    if not (since_start_ns >= 0).any() and source.start_ns:
+        since_start_ns = telemetry.time_ns - source.start_ns
+    during = (since_start_ns >= 0) & (since_start_ns <= duration_ns)
+    if source.kind != "video" or not np.isfinite(telemetry["latitude_deg"][during]).any():
+        return telemetry
+    columns = {name: values[during] for name, values in telemetry.columns.items()}
+    return Telemetry(telemetry.format, telemetry.time_ns[during], columns, notices=telemetry.notices)
 
 
 def _common_ns(telemetry: Telemetry, start_ns: int, duration_s: float) -> int:
@@ -383,6 +397,12 @@ def _telemetry_findings(source: Source, frames: FrameFacts, facts: TelemetryFact
             )]
         return []
     share = facts.covered_s / frames.duration_s
+    beyond_s = float(source.telemetry.video_time_ns.max(initial=0)) / _SECOND_NS - frames.duration_s
+    if source.kind == "video" and beyond_s > max(5.0, 0.2 * frames.duration_s):
+        return [Finding(
+            Level.WARNING, f"the telemetry goes on for {beyond_s:.0f} s after the video's end",
+            "check that it belongs to this video, and that the video is whole",
+        )]
     if share > 0.98 or facts.format == "exif":
         return []
     if share > 0:
