@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 import simplekml
 
-from sorvolo.geometry.arrays import Anything, Floats, ImageRGBA
+from sorvolo.geometry.arrays import Floats, ImageRGBA
 from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.pose import gimbal_angles_from_rotation
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes, scratch_folder
-from sorvolo.store.images import png_from_rgba
+from sorvolo.store.images import png_from_rgba, shrink, unweighted, weighted
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame
 
@@ -106,7 +106,7 @@ def picture(tiles: Mapping[TileIndex, ImageRGBA], max_px: int) -> Picture:
 
     Reads one tile at a time, so that memory depends on `max_px` only.
     """
-    tile_px = next(iter(tiles.values())).shape[0]
+    tile_px = tiles[next(iter(tiles))].shape[0]
     columns, rows = np.array(sorted(tiles)).T
     left, top = int(columns.min()), int(rows.min())
     width, height = int(columns.max()) - left + 1, int(rows.max()) - top + 1
@@ -117,7 +117,7 @@ def picture(tiles: Mapping[TileIndex, ImageRGBA], max_px: int) -> Picture:
     canvas = np.zeros((height * small_px, width * small_px, 4), np.uint8)
     for column, row in sorted(tiles):
         y, x = (row - top) * small_px, (column - left) * small_px
-        canvas[y:y + small_px, x:x + small_px] = _thinned(tiles[column, row], small_px)
+        canvas[y:y + small_px, x:x + small_px] = shrink(tiles[column, row], small_px, small_px)
     seen = canvas[..., 3] > 0
     (y0, y1), (x0, x1) = (np.flatnonzero(seen.any(axis=axis))[[0, -1]] + [0, 1] for axis in (1, 0))
     corner_px = (left * tile_px + int(x0) * step - 0.5, top * tile_px + int(y0) * step - 0.5)
@@ -241,28 +241,6 @@ def _rounded(number: float, digits: int) -> float | None:
     return round(float(number), digits) if np.isfinite(number) else None
 
 
-def _thinned(rgba: ImageRGBA, size_px: int) -> ImageRGBA:
-    if rgba.shape[0] == size_px:
-        return rgba
-    size = (size_px, size_px)
-    if rgba[..., 3].min() == 255:
-        return np.asarray(cv2.resize(rgba, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    return _unweighted(cv2.resize(_weighted(rgba), size, interpolation=cv2.INTER_AREA))
-
-
-def _weighted(rgba: ImageRGBA) -> Anything:
-    """Colours times alpha: averaged like this, what is unseen does not darken the rim of what is seen."""
-    weighted = rgba.astype(np.float32)
-    weighted[..., :3] *= weighted[..., 3:] / 255
-    return weighted
-
-
-def _unweighted(weighted: Anything) -> ImageRGBA:
-    alpha = weighted[..., 3:]
-    colours = weighted[..., :3] * 255 / np.maximum(alpha, 1e-3)
-    return np.clip(np.rint(np.dstack([colours, alpha])), 0, 255).astype(np.uint8)
-
-
 def _bounds_deg(small: Picture, site_grid: SiteGrid) -> tuple[float, float, float, float]:
     """West, south, east, north of the picture, from a net of points: meridians bend in a projection."""
     net = np.stack(np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)), axis=-1).reshape(-1, 2)
@@ -296,5 +274,5 @@ def _north_up(
         return np.zeros((height, width, 4), np.uint8)
     target = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
     matrix = cv2.getPerspectiveTransform((source - [x0, y0]).astype(np.float32), target.astype(np.float32))
-    part = _weighted(small.rgba[y0:y1, x0:x1])
-    return _unweighted(cv2.warpPerspective(part, matrix, (width, height), flags=cv2.INTER_LINEAR))
+    part = weighted(small.rgba[y0:y1, x0:x1])
+    return unweighted(cv2.warpPerspective(part, matrix, (width, height), flags=cv2.INTER_LINEAR))

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from sorvolo.errors import StoreError
-from sorvolo.geometry.arrays import ImageRGB, ImageRGBA, frozen
+from sorvolo.geometry.arrays import Anything, ImageRGB, ImageRGBA, frozen
 
 # 4:4:4 and 92: features found again on the stored keyframe sit where they sat; 4:2:0 shifts coloured edges.
 _JPEG = [
@@ -43,6 +43,30 @@ def rgba_from_png(data: bytes, name: str) -> ImageRGBA:
     if image is None or image.ndim != 3 or image.shape[2] != 4:
         raise StoreError(f"{name} is damaged: no RGBA PNG in its {len(data)} bytes; map its flight again")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA), dtype=np.uint8)
+
+
+def shrink(rgba: ImageRGBA, width: int, height: int) -> ImageRGBA:
+    """The image averaged down to a smaller size; what is unseen does not darken the rim of what is seen."""
+    if rgba.shape[:2] == (height, width):
+        return rgba
+    size = (width, height)
+    if rgba[..., 3].min() == 255:
+        return np.asarray(cv2.resize(rgba, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return unweighted(cv2.resize(weighted(rgba), size, interpolation=cv2.INTER_AREA))
+
+
+def weighted(rgba: ImageRGBA) -> Anything:
+    """Float colours times alpha (and alpha as it is): in this form neighbouring pixels may be averaged."""
+    result = rgba.astype(np.float32)
+    result[..., :3] *= result[..., 3:] / 255
+    return result
+
+
+def unweighted(image: Anything) -> ImageRGBA:
+    """The inverse of `weighted`, rounded."""
+    alpha = image[..., 3:]
+    colours = image[..., :3] * 255 / np.maximum(alpha, 1e-3)
+    return np.clip(np.rint(np.dstack([colours, alpha])), 0, 255).astype(np.uint8)
 
 
 class ImageCache:
