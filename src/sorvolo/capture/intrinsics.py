@@ -189,20 +189,30 @@ def _size_from_centre(file_name: str, matrix: Matrix3, width_px: int, height_px:
 
 
 def check_lens(file_name: str, camera: Camera) -> None:
-    """Raise InputError if the distortion folds the picture onto itself: a pixel would have no single ray."""
-    edge_px = np.concatenate([
-        camera.corners_px, 0.5 * (camera.corners_px + np.roll(camera.corners_px, 1, axis=0)),
-    ])
+    """Raise InputError if the distortion folds the picture onto itself: a pixel would have no single ray.
+
+    On the way from the optical centre to any point of the border, the picture must only go outwards. A test
+    of pixel -> ray -> pixel would not do: beyond the fold another ray, far outside, may hit the same pixel.
+    """
+    corners_px = camera.corners_px
+    borders_px = np.vstack((corners_px, 0.5 * (corners_px + np.roll(corners_px, 1, axis=0))))
+    centre_px = np.array([camera.cx_px, camera.cy_px])
     try:
-        back_px = camera.pixels_from_points(camera.rays_from_pixels(edge_px))
-        offset_px = np.abs(back_px - edge_px).max()
+        ideal = camera.rays_from_pixels(borders_px)[:, None, :2] * np.linspace(0, 1, 65)[1:, None]
+        rays = np.dstack((ideal, np.ones(ideal.shape[:2]))).reshape(-1, 3)
+        way_px = camera.pixels_from_points(rays).reshape(*ideal.shape) - centre_px
+        reach_px = np.linalg.norm(way_px, axis=2)
+        wanted_px = np.linalg.norm(borders_px - centre_px, axis=1)
+        is_good = (np.diff(reach_px, axis=1) > 0).all() and (np.abs(reach_px[:, -1] - wanted_px) < 0.5).all()
     except np.linalg.LinAlgError:
-        offset_px = np.inf
-    if not offset_px < 0.5:
+        is_good = False
+    if not is_good:
         raise InputError(
             f"{file_name}: the distortion coefficients {camera.distortion.tolist()} (k1 k2 p1 p2 k3) fold "
-            "the picture "
-            "at its edge; calibrate again with views that reach the corners, or check the coefficients' order"
+            "the "
+            "picture at its edge; calibrate again with views that reach the corners, or check the "
+            "coefficients' "
+            "order"
         )
 
 
