@@ -229,3 +229,14 @@ def test_sentences_with_a_right_checksum_and_nonsense_fields(body, kind):
     telemetry = nmea.read(text.encode(), "a.log")
     assert len(telemetry) >= 2
     assert all(np.isfinite(column[~np.isnan(column)]).all() for column in telemetry.columns.values())
+
+
+def test_a_receiver_that_does_not_know_the_time_yet():
+    telemetry = nmea.read((sentence("GPGGA,,,,,,0,00,99.9,,,,,,") + flight(2)).encode(), "a.log")
+    assert len(telemetry) == 2
+    assert codes(telemetry) == {"no_time": 1}
+
+
+def test_an_intact_sentence_of_nonsense_is_counted():
+    nonsense = sentence("GPGGA,120000,48ÿ06.0,N,01130.0,E,1,08,0.9,5,M,,M,,").encode("latin-1")
+    assert codes(nmea.read(nonsense + flight(2).encode(), "a.log")) == {"unreadable_line": 1}

@@ -4,9 +4,11 @@ import re
 from collections import Counter
 from dataclasses import dataclass, field
 from datetime import date, time
+from functools import reduce
+from operator import xor
 from typing import Any
 
-from pynmeagps import NMEAReader, calc_checksum
+from pynmeagps import VALNONE, NMEAReader
 from pynmeagps.exceptions import NMEAMessageError, NMEAParseError, NMEATypeError
 
 from sorvolo.capture.telemetry.quality import (
@@ -55,7 +57,7 @@ def read(data: bytes, name: str) -> Telemetry:
     if not messages:
         raise InputError(
             f"{name}: no intact GGA or RMC sentence ({counts['bad_checksum']} with a bad checksum, "
-            f"{counts['unreadable_line'] + counts['truncated']} unreadable); "
+            f"{counts['no_time']} without a time, {counts['unreadable_line'] + counts['truncated']} unreadable); "
             "record the receiver's output again, checksums included"
         )
     epochs, dated = _epochs(messages)
@@ -68,6 +70,7 @@ def read(data: bytes, name: str) -> Telemetry:
             *notice("bad_checksum", counts["bad_checksum"], "{} sentences dropped: bad or missing checksum"),
             *notice("unreadable_line", counts["unreadable_line"], "{} sentences dropped: not readable"),
             *notice("truncated", counts["truncated"], "the last sentence is cut off"),
+            *notice("no_time", counts["no_time"], "{} sentences dropped: no readable time"),
             *notice(
                 "no_date", 0 if dated else len(epochs),
                 "no sentence tells the date: {} samples are stamped from 1970-01-01",
@@ -84,19 +87,20 @@ def _messages(data: bytes, counts: Counter[str]) -> list[Any]:
     counts["truncated"] += is_cut
     for match in _SENTENCE.finditer(data[: len(data) - len(tail)] if is_cut else data):
         talker, kind, body, checksum = match.groups()
-        content = (talker + kind + b"," + body).decode("latin-1")
-        if checksum is None or calc_checksum(content) != checksum.decode().upper():
+        content = talker + kind + b"," + body
+        if checksum is None or reduce(xor, content) != int(checksum, 16):
             counts["bad_checksum"] += 1
             continue
         try:
-            message = NMEAReader.parse(f"${content}*{checksum.decode()}\r\n")
+            message = NMEAReader.parse(b"$" + content + b"*" + checksum + b"\r\n", validate=VALNONE)
         except (NMEAMessageError, NMEAParseError, NMEATypeError):
+            message = None
+        if message is None or not body.isascii():
             counts["unreadable_line"] += 1
-            continue
-        if isinstance(getattr(message, "time", None), time):
+        elif isinstance(getattr(message, "time", None), time):
             messages.append(message)
         else:
-            counts["no_time"] += 1  # a receiver that has just been switched on; it has no position either
+            counts["no_time"] += 1  # a receiver that has just been switched on
     return messages
 
 
