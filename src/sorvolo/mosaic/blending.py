@@ -1,7 +1,7 @@
 """How overlapping frames mix: multi-band blending of the frames that win a window's pixels, without bleeding.
 
-Burt and Adelson 1983, with one economy: in the two finest bands the winner of a pixel takes all, for texture is
-sharpest unmixed; the coarser bands, which carry colour, are averaged with the winners' masks as weights.
+Burt and Adelson 1983, with one economy: in the two finest bands the winner of a pixel takes all, for texture
+is sharpest unmixed; the coarser bands, which carry colour, are averaged with the winners' masks as weights.
 """
 
 from collections.abc import Iterable
@@ -58,24 +58,24 @@ def blend(labels: Labels, layers: Iterable[Layer]) -> ImageRGB:
     for layer in layers:
         rows = slice(layer.y_px, layer.y_px + layer.image.shape[0])
         columns = slice(layer.x_px, layer.x_px + layer.image.shape[1])
-        mask = cv2.compare(labels[rows, columns], float(layer.number), cv2.CMP_EQ)
+        mask = pixels_of(labels[rows, columns], layer.number)
         gaussian: Anything = layer.image
         share: Anything = mask
         for k in range(BANDS):
             here = slice(rows.start >> k, rows.stop >> k), slice(columns.start >> k, columns.stop >> k)
-            coarser = cv2.pyrDown(gaussian) if k < BANDS - 1 else None
+            coarser = _coarser(gaussian) if k < BANDS - 1 else None
             if k < _HARD_BANDS:
                 band = _laplacian(gaussian, coarser, cv2.CV_16S)
                 winner = mask[:: 1 << k, :: 1 << k]
                 fine[k][here] = cv2.copyTo(band, np.ascontiguousarray(winner), fine[k][here])
-                share = cv2.pyrDown(share if k else mask.astype(np.float32))
+                share = _coarser(share if k else mask.astype(np.float32))
             else:
                 band = _laplacian(gaussian, coarser, cv2.CV_32F)
                 sums[k - _HARD_BANDS][here] += band * share[..., None]
                 weights[k - _HARD_BANDS][here] += share
-                share = cv2.pyrDown(share) if k < BANDS - 1 else share
-            gaussian = coarser
-    coarse = [total / weight[..., None] for total, weight in zip(sums, weights)]
+                share = _coarser(share) if k < BANDS - 1 else share
+            gaussian = gaussian if coarser is None else coarser
+    coarse: list[Anything] = [total / weight[..., None] for total, weight in zip(sums, weights)]
     picture = coarse[-1]
     for band in coarse[-2::-1]:
         picture = cv2.pyrUp(picture, dstsize=band.shape[1::-1]) + band
@@ -85,10 +85,18 @@ def blend(labels: Labels, layers: Iterable[Layer]) -> ImageRGB:
     return cv2.add(picture, fine[0], dtype=cv2.CV_8U)  # type: ignore[return-value]
 
 
-def winners_from_shares(shares: Iterable[tuple[int, int, int, NDArray[np.uint8]]], height: int, width: int) -> Labels:
+def pixels_of(labels: Labels, number: int) -> NDArray[np.uint8]:
+    """(height, width) 255 where this layer wins, else 0."""
+    return (labels == number).view(np.uint8) * np.uint8(255)
+
+
+def winners_from_shares(
+    shares: Iterable[tuple[int, int, int, NDArray[np.uint8]]], height: int, width: int
+) -> Labels:
     """(height, width) the number of the layer with the largest share at each pixel, the first of equals.
 
-    Each share is (number, x_px, y_px, values): a patch of the window where the layer may win, 0 where it must not.
+    Each share is (number, x_px, y_px, values): a patch of the window where the layer may win, 0 where it must
+    not.
     """
     best = np.zeros((height, width), np.uint8)
     labels = np.full((height, width), -1, np.int16)
@@ -101,11 +109,14 @@ def winners_from_shares(shares: Iterable[tuple[int, int, int, NDArray[np.uint8]]
 
 
 def fill_invalid(image: ImageRGB, valid: Mask) -> ImageRGB:
-    """The image with its invalid pixels continued from the valid ones around them, so that bands may cross there."""
+    """The image with its invalid pixels continued from the valid ones around them, so that bands may cross
+    there.
+    """
     if valid.all():
         return image
     known = valid.astype(np.float32)
-    colours, weights = image.astype(np.float32) * known[..., None], known
+    colours: Anything = image.astype(np.float32) * known[..., None]
+    weights: Anything = known
     levels = []
     while min(weights.shape) > 2 and weights.min() <= 0:
         levels.append((colours, weights))
@@ -117,6 +128,10 @@ def fill_invalid(image: ImageRGB, valid: Mask) -> ImageRGB:
     result = np.clip(filled, 0, 255).astype(np.uint8)
     result[valid] = image[valid]
     return result
+
+
+def _coarser(gaussian: Anything) -> Anything:
+    return cv2.pyrDown(gaussian)  # type: ignore[return-value]
 
 
 def _laplacian(gaussian: Anything, coarser: Anything | None, depth: int) -> Anything:

@@ -1,8 +1,9 @@
-"""Exposure: one gain per frame and channel and one vignette per camera, solved from points seen in two frames.
+"""Exposure: one gain per frame and channel and one vignette per camera, solved from points seen in two
+frames.
 
 A lens darkens towards its corners, V(r) = exp(a2 r^2 + a4 r^4) with r = 1 at the corner, and a frame's gain g
-undoes its exposure: what two frames a and b show of the same ground agrees when
-log I_a + log g_a - log V(r_a) = log I_b + log g_b - log V(r_b). That is linear in log g, a2 and a4.
+undoes its exposure: what two frames a and b show of the same ground agrees when log I_a + log g_a - log
+V(r_a) = log I_b + log g_b - log V(r_b). That is linear in log g, a2 and a4.
 """
 
 from collections.abc import Mapping
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from sorvolo.errors import GeometryError, SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB, PointsPx, frozen
@@ -68,11 +70,13 @@ class Exposure:
     spread: float
 
 
-def tie_colours(image_a: ImageRGB, points_a_px: PointsPx, image_b: ImageRGB, points_b_px: PointsPx) -> ColourPairs:
+def tie_colours(
+    image_a: ImageRGB, points_a_px: PointsPx, image_b: ImageRGB, points_b_px: PointsPx
+) -> ColourPairs:
     """The mean colours around matched points, (N, 2) each, of two undistorted images.
 
-    Means are over about 8 px, from quarter-size copies. Points that are clipped or nearly black in either image say
-    nothing of exposure and are left out.
+    Means are over about 8 px, from quarter-size copies. Points that are clipped or nearly black in either
+    image say nothing of exposure and are left out.
     """
     colours_a, colours_b = _sample(image_a, points_a_px), _sample(image_b, points_b_px)
     both = np.hstack([colours_a, colours_b])
@@ -90,8 +94,8 @@ def solve_exposure(
 ) -> Exposure:
     """Gains of all frames named in `pairs` (frame a, frame b), by robust least squares of log colours.
 
-    `camera_of` tells frames of different cameras apart, each with its own vignette; without it there is one, 0.
-    Frames and cameras of which the pairs say little stay near gain 1 and near no vignette.
+    `camera_of` tells frames of different cameras apart, each with its own vignette; without it there is one,
+    0. Frames and cameras of which the pairs say little stay near gain 1 and near no vignette.
     """
     ids = sorted({each for link in pairs for each in link})
     camera_of = camera_of or dict.fromkeys(ids, 0)
@@ -100,15 +104,19 @@ def solve_exposure(
         return Exposure({}, {}, 0.0)
     column = {each: i for i, each in enumerate(ids)}
     lens = {camera: len(ids) + 2 * i for i, camera in enumerate(cameras)}
-    rows = [_rows(link, pairs[link], column, lens, camera_of, settings) for link in sorted(pairs) if len(pairs[link])]
-    unknowns = len(ids) + 2 * len(cameras)
-    prior = np.r_[np.full(len(ids), settings.gain_sigma**-2), np.full(2 * len(cameras), settings.vignette_sigma**-2)]
+    rows = [
+        _rows(link, pairs[link], column, lens, camera_of, settings)
+        for link in sorted(pairs) if len(pairs[link])
+    ]
+    prior = np.repeat(
+        [settings.gain_sigma**-2, settings.vignette_sigma**-2], [len(ids), 2 * len(cameras)]
+    )
     if not rows:
         return Exposure({e: np.ones(3) for e in ids}, {c: np.zeros(2) for c in cameras}, 0.0)
     columns = np.concatenate([r[0] for r in rows])
     factors = np.concatenate([r[1] for r in rows])
     difference = np.concatenate([r[2] for r in rows])
-    solution = np.zeros((unknowns, 3))
+    solution = np.zeros((len(prior), 3))
     spread = settings.colour_sigma
     for _ in range(_ITERATIONS):
         residual = difference + np.einsum("nk,nkc->nc", factors, solution[columns])
@@ -123,7 +131,9 @@ def solve_exposure(
 
 
 def corrected(image: ImageRGB, gains: Floats, vignette: Floats) -> ImageRGB:
-    """The image as it would be with gain 1 and no vignette: times gains (3,), divided by exp(a2 r^2 + a4 r^4)."""
+    """The image as it would be with gain 1 and no vignette: times gains (3,), divided by exp(a2 r^2 + a4
+    r^4).
+    """
     if not vignette.any():
         if (gains == 1).all():
             return image
@@ -135,8 +145,8 @@ def corrected(image: ImageRGB, gains: Floats, vignette: Floats) -> ImageRGB:
     radius2 = (x[None, :] ** 2 * width**2 + y[:, None] ** 2 * height**2) / (width**2 + height**2)
     field = np.exp(-(vignette[0] * radius2 + vignette[1] * radius2**2)).astype(np.float32)
     wide = cv2.warpAffine(
-        field, np.array([[(width - 1) / (len(x) - 1), 0, 0], [0, (height - 1) / (len(y) - 1), 0.0]]), (width, height),
-        flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE,
+        field, np.array([[(width - 1) / (len(x) - 1), 0, 0], [0, (height - 1) / (len(y) - 1), 0.0]]),
+        (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE,
     )
     return cv2.merge([  # type: ignore[return-value]
         cv2.multiply(channel, wide, scale=float(gain), dtype=cv2.CV_8U)
@@ -151,7 +161,7 @@ def _rows(
     lens: Mapping[int, int],
     camera_of: Mapping[int, int],
     settings: ExposureSettings,
-) -> tuple[Floats, Floats, Floats]:
+) -> tuple[NDArray[np.int64], Floats, Floats]:
     """A link's equations: unknowns' columns (n, 6) and factors (n, 6), and log-colour differences (n, 3)."""
     pick = np.linspace(0, len(pairs) - 1, min(len(pairs), settings.points_per_link)).astype(int)
     a, b = link
@@ -160,12 +170,13 @@ def _rows(
     ra, rb = pairs.radius2_a[pick], pairs.radius2_b[pick]
     one = np.ones(len(pick))
     factors = np.column_stack([one, -one, -ra, -(ra**2), rb, rb**2])
-    difference = np.log(np.maximum(pairs.colours_a[pick], 1.0)) - np.log(np.maximum(pairs.colours_b[pick], 1.0))
-    return columns, factors, difference
+    colours_a, colours_b = np.maximum(pairs.colours_a[pick], 1.0), np.maximum(pairs.colours_b[pick], 1.0)
+    return columns, factors, np.log(colours_a) - np.log(colours_b)
 
 
 def _solve(
-    columns: Floats, factors: Floats, difference: Floats, weight: Floats, prior: Floats, frames: int
+    columns: NDArray[np.int64], factors: Floats, difference: Floats, weight: Floats, prior: Floats,
+    frames: int,
 ) -> Floats:
     """(U, 3) unknowns from weighted normal equations; the vignette is one for all channels."""
     unknowns = len(prior)
@@ -180,7 +191,8 @@ def _solve(
     # gains per channel eliminated for the vignette of their mean, then put back with that vignette
     mean = np.linalg.solve(normal, right.mean(axis=1))
     lens = mean[frames:]
-    gains = np.linalg.solve(normal[:frames, :frames], right[:frames] - (normal[:frames, frames:] @ lens)[:, None])
+    known = (normal[:frames, frames:] @ lens)[:, None]
+    gains = np.linalg.solve(normal[:frames, :frames], right[:frames] - known)
     return np.vstack([gains, np.tile(lens[:, None], (1, 3))])
 
 
@@ -195,7 +207,7 @@ def _sample(image: ImageRGB, points_px: PointsPx) -> Floats:
     grid = padded.reshape(-1, columns, 2)
     if not len(at):
         return np.zeros((0, 3))
-    colours = cv2.remap(smooth, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    colours = cv2.remap(smooth, grid, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return colours.reshape(-1, 3)[:len(at)].astype(np.float64)
 
 

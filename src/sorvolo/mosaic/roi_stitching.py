@@ -1,19 +1,31 @@
 """The thesis's own mosaicking (section 3.1.1): each frame against the mosaic's region around the last one.
 
-Kept faithful as the baseline for ever: A-KAZE on the frame and on the region, brute-force matching, a similarity by
-RANSAC, gain compensation and multi-band blending into one growing picture. What is written is never moved again.
+Kept faithful as the baseline for ever: A-KAZE on the frame and on the region, brute-force matching, a
+similarity by RANSAC, gain compensation and multi-band blending into one growing picture. What is written is
+never moved again.
 """
 
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.errors import GeometryError, SettingsError
-from sorvolo.geometry.arrays import Anything, Floats, ImageGray, ImageRGB, ImageRGBA, Matrix3, PointsM, PointsPx, frozen
+from sorvolo.geometry.arrays import (
+    Anything,
+    Floats,
+    ImageGray,
+    ImageRGB,
+    ImageRGBA,
+    Matrix3,
+    PointsM,
+    PointsPx,
+    frozen,
+)
 from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.geometry.polygons import polygon_area
 from sorvolo.mosaic.blending import fill_invalid
 
 _CHUNK_PX = 1024
@@ -27,7 +39,7 @@ class RoiStitchingSettings:
     """The choices of section 3.1.1, and those that it leaves open."""
 
     akaze_threshold: float = 8e-5  # OpenCV's 1e-3 finds next to nothing on low-contrast ground
-    max_features: int = 6000  # the strongest, in the frame and in the region each: matching costs their product
+    max_features: int = 6000  # the strongest, in frame and region each: matching costs their product
     matching: Literal["cross-check", "ratio"] = "cross-check"  # both read "only identical patterns match"
     ratio: float = 0.8
     transform: Literal["similarity", "homography"] = "similarity"  # homography: the thesis's Figure 3.12a
@@ -39,12 +51,13 @@ class RoiStitchingSettings:
 
     def __post_init__(self) -> None:
         if self.akaze_threshold <= 0 or self.ransac_px <= 0 or not 0 < self.ratio <= 1:
-            raise SettingsError("thesis method: akaze_threshold and ransac_px must be positive, ratio in (0, 1]")
+            raise SettingsError("thesis method: akaze_threshold, ransac_px must be positive, ratio in (0, 1]")
         if self.max_features < 1:
             raise SettingsError(f"thesis method: max_features must be at least 1, got {self.max_features}")
         if self.roi_frames < 1 or self.min_inliers < 4 or not 1 <= self.bands <= 10:
             raise SettingsError("thesis method: roi_frames at least 1, min_inliers at least 4, bands 1 to 10")
-        if self.matching not in ("cross-check", "ratio") or self.transform not in ("similarity", "homography"):
+        choices = ("cross-check", "ratio"), ("similarity", "homography")
+        if self.matching not in choices[0] or self.transform not in choices[1]:
             raise SettingsError(f"thesis method: unknown choice {self.matching!r} or {self.transform!r}")
 
 
@@ -52,8 +65,8 @@ class RoiStitchingSettings:
 class Stitched:
     """A frame that was placed: its pixels to the mosaic's, (3, 3), and how well they fit.
 
-    `residual_px` is the rms of the inliers; the first frame has no matches. `barycentre_px` (2,) is where its fix
-    is anchored.
+    `residual_px` is the rms of the inliers; the first frame has no matches. `barycentre_px` (2,) is where its
+    fix is anchored.
     """
 
     frame_id: int
@@ -84,7 +97,9 @@ class RoiStitcher:
         self._picture: ImageRGBA = np.zeros((0, 0, 4), np.uint8)
         self._offset: MosaicOffset = (0, 0)
         self._last: Stitched | None = None
-        self._detector = cv2.xfeatures2d.AKAZE_create(threshold=settings.akaze_threshold, max_points=settings.max_features)
+        self._detector: Any = cv2.xfeatures2d.AKAZE_create(  # type: ignore[attr-defined]
+            threshold=settings.akaze_threshold, max_points=settings.max_features
+        )
 
     def add(self, frame_id: int, image: ImageRGB) -> Stitched | NotStitched:
         """Place one undistorted frame and blend it in; the first frame defines the mosaic's pixels."""
@@ -117,7 +132,8 @@ class RoiStitcher:
         in_frame = self._features(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
         if min(len(in_mosaic[0]), len(in_frame[0])) < self._settings.min_inliers:
             return NotStitched(
-                frame_id, f"too few features: {len(in_frame[0])} in the frame, {len(in_mosaic[0])} in the mosaic"
+                frame_id,
+                f"too few features: {len(in_frame[0])} in the frame, {len(in_mosaic[0])} in the mosaic",
             )
         pairs = self._match(in_mosaic[1], in_frame[1])
         if len(pairs) < self._settings.min_inliers:
@@ -149,7 +165,7 @@ class RoiStitcher:
         keypoints, descriptors = self._detector.detectAndCompute(gray, mask)
         if descriptors is None or not len(keypoints):
             return np.zeros((0, 2)), np.zeros((0, 61), np.uint8)
-        return cv2.KeyPoint_convert(keypoints).astype(np.float64), descriptors
+        return np.array([keypoint.pt for keypoint in keypoints]), descriptors
 
     def _match(self, mosaic: Anything, frame: Anything) -> NDArray[np.int64]:
         """(N, 2) indices of mosaic and frame features that match, each at most once."""
@@ -189,7 +205,7 @@ class RoiStitcher:
         edges = np.roll(outline, -1, axis=0) - outline
         following = np.roll(edges, -1, axis=0)
         turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
-        area_px = abs(np.sum(outline[:, 0] * np.roll(outline[:, 1], -1) - np.roll(outline[:, 0], -1) * outline[:, 1])) / 2
+        area_px = polygon_area([outline])
         if not (turns > 0).all():
             return "its outline would be folded"
         if not 0.1 * frame_px <= area_px <= 10 * frame_px:
@@ -229,9 +245,11 @@ class RoiStitcher:
         size = (x1 - x0, y1 - y0)
         move = np.array([[1.0, 0, -x0 - self._offset[0]], [0, 1, -y0 - self._offset[1]], [0, 0, 1]])
         part_from_image = move @ mosaic_from_image
-        warped = cv2.warpPerspective(image, part_from_image, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        warped = cv2.warpPerspective(
+            image, part_from_image, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+        )
         full = np.full(image.shape[:2], 255, np.uint8)
-        mask = cv2.warpPerspective(full, part_from_image, size, flags=cv2.INTER_NEAREST)
+        mask: Anything = cv2.warpPerspective(full, part_from_image, size, flags=cv2.INTER_NEAREST)
         painted = np.ascontiguousarray(part[..., 3])
         known = np.ascontiguousarray(part[..., :3])
         shared = (mask > 0) & (painted > 0)
@@ -241,7 +259,7 @@ class RoiStitcher:
         if not painted.any():
             picture, both = warped, mask
         else:
-            blender = cv2.detail_MultiBandBlender(0, self._settings.bands)
+            blender = cv2.detail_MultiBandBlender(0, self._settings.bands)  # type: ignore[attr-defined]
             blender.prepare((0, 0, *size))
             beneath = fill_invalid(known, painted > 0)
             blender.feed(beneath.astype(np.int16), cv2.bitwise_and(painted, cv2.bitwise_not(mask)), (0, 0))
@@ -253,10 +271,12 @@ class RoiStitcher:
 
 
 def georeference(barycentres_mosaic_px: PointsPx, fixes_site_m: PointsM, *, robust: bool = False) -> Matrix3:
-    """site_from_mosaic (3, 3): the least-squares similarity of anchored barycentres, (N, 2) px, onto fixes, (N, 2) m.
+    """site_from_mosaic (3, 3): the least-squares similarity of anchored barycentres, (N, 2) px, onto fixes,
+    (N, 2) m.
 
-    The mosaic's y points down, so it is reflected first. `robust` drops, twice, pairs off by more than three times
-    the median; the thesis takes every fix as it is. Raises GeometryError for fewer than two different points.
+    The mosaic's y points down, so it is reflected first. `robust` drops, twice, pairs off by more than three
+    times the median; the thesis takes every fix as it is. Raises GeometryError for fewer than two different
+    points.
     """
     barycentres = np.asarray(barycentres_mosaic_px, dtype=np.float64)
     fixes_m = np.asarray(fixes_site_m, dtype=np.float64)
