@@ -149,6 +149,9 @@ class Track:
         values = np.column_stack([self.east_north_m[rows], self.up_m[rows]])
         place, velocity, gain = _line(times[chosen] - time_s, values)
         sigma_h = float(np.median(self.horizontal_sigma_m[rows]))
+        if smooth_s == 0 and times[before] < time_s < times[after] and times[after] - times[before] > 1.5:
+            # between fixes that lie far apart the path is a guess
+            sigma_h += 0.15 * float(np.linalg.norm(np.diff(values[[0, -1], :2], axis=0)))
         # neighbouring fixes err alike, so averaging many never helps by more than a factor of two
         shrink = max(gain, 0.5)
         return place, np.array([sigma_h, sigma_h, self.vertical_sigma_m]) * shrink, velocity

@@ -1,0 +1,74 @@
+"""Mode 1, first flight: sources to a map in a site folder, frame by frame."""
+
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from sorvolo.capture.areas import read_area
+from sorvolo.capture.source import Source, open_sources
+from sorvolo.missions.flight_setup import prepare
+from sorvolo.missions.map_planar import PlanarRun
+from sorvolo.missions.map_thesis import ThesisRun
+from sorvolo.missions.settings import MapSettings
+from sorvolo.mosaic.selection import Selected, SelectionSettings, every, select_keyframes
+from sorvolo.store.archive import Archive
+from sorvolo.survey.area import Area
+from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
+from sorvolo.survey.mosaic import MosaicUpdate, Status
+
+
+def map_flights(
+    inputs: Sequence[Path], site: Path, settings: MapSettings = MapSettings(), *,  # noqa: B008 (frozen)
+    telemetry: Path | None = None, camera: Path | str | None = None, area: Path | None = None,
+) -> Iterator[MosaicUpdate]:
+    """Map one or more flights into the site folder, yielding an update for each selected frame.
+
+    `inputs` are videos, folders of photos, or photos; `telemetry` a file of the only flight (else what lies beside
+    it is used); `camera` a calibration file, a preset's name, "aov=DEG" or "focal_px=PX"; `area` a polygon outside
+    of which frames are not used. Nothing of a flight is part of the site until its last update was yielded.
+    Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was.
+    """
+    wanted = None if area is None else read_area(area)
+    sources = open_sources(inputs, telemetry, camera)
+    with Archive.open(site, write=True) as archive:
+        for source in sources:
+            yield from _map_one(source, archive, settings, wanted, telemetry_named=telemetry is not None)
+
+
+def _map_one(
+    source: Source, archive: Archive, settings: MapSettings, area: Area | None, *, telemetry_named: bool
+) -> Iterator[MosaicUpdate]:
+    started_s = time.monotonic()
+    setup = prepare(source, settings, archive.site() if archive.has_site else None, telemetry_named=telemetry_named)
+    make = ThesisRun if settings.method == "thesis" else PlanarRun
+    with make(setup, archive, settings) as run:
+        read = 0
+
+        def posed() -> Iterator[PosedFrame | LostFrame]:
+            nonlocal read
+            for each in source.frames(every(setup.step_s)):
+                read = each.index + 1
+                yield PosedFrame(each, setup.prior(each, first=read == 1)) if isinstance(each, Frame) else each
+
+        selection = SelectionSettings(overlap=settings.overlap, least_overlap=min(0.5, settings.overlap))
+        selected = select_keyframes(
+            posed(), selection, keep_all=source.kind == "photos" or (settings.method == "thesis" and setup.track is not None),
+            inside=setup.inside(area),
+        )
+        for each in selected:
+            status, reason, tiles = _take(run, each)
+            name = each.posed.frame.name if isinstance(each, Selected) else each.name
+            yield MosaicUpdate(
+                name, status, reason, read, source.frame_count, run.selected,
+                max(setup.expected_keyframes, run.selected), run.by_vision, tiles, time.monotonic() - started_s,
+            )
+        run.finish(source.notices(), time.monotonic() - started_s)
+
+
+def _take(run: PlanarRun | ThesisRun, each: Selected | LostFrame) -> tuple[Status, str, int]:
+    if isinstance(each, LostFrame):
+        return run.lose(each.index, each.name, each.time_ns, each.reason)
+    if each.reason:
+        frame = each.posed.frame
+        return run.lose(frame.index, frame.name, frame.time_ns, each.reason)
+    return run.add(each.posed)

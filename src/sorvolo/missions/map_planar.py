@@ -1,0 +1,356 @@
+"""One flight by `--method planar`: keyframes into the graph, the canvas and the store."""
+
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Self
+
+import cv2
+import numpy as np
+
+from sorvolo.capture.sync import OffsetEstimate, estimate_offset, shifted
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Anything, ImageRGB, Matrix3
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.ground import footprint
+from sorvolo.geometry.grid import SiteGrid
+from sorvolo.geometry.homography import site_from_image_homography
+from sorvolo.missions.flight_report import FlightLog, Stage, build_report
+from sorvolo.missions.flight_setup import FlightSetup, new_site
+from sorvolo.missions.settings import MapSettings
+from sorvolo.mosaic.canvas import Canvas, CanvasFrame
+from sorvolo.mosaic.exposure import Exposure
+from sorvolo.mosaic.lens import Undistorter, refined_camera
+from sorvolo.mosaic.placing import canvas_frame, rejected
+from sorvolo.mosaic.planar import KnownKeyframe, PlanarMapper
+from sorvolo.mosaic.pose_graph import PoseGraphSettings, pose_from_homography
+from sorvolo.store.archive import Archive, FlightWriter
+from sorvolo.store.catalogue import StoredKeyframe
+from sorvolo.store.exports import picture, write_live_preview
+from sorvolo.store.images import ImageCache
+from sorvolo.store.report_page import report_page
+from sorvolo.survey.flight import Notice, PosedFrame
+from sorvolo.survey.mosaic import PlacedFrame, Status
+
+_WAIT_FOR_HEIGHT = 12  # keyframes held back until the height above ground is seen in them
+_PAINT_EVERY = 8  # keyframes painted together: tiles that several touch are rendered once
+_LOCAL_M_PER_PX = 1.0
+_HORIZON_MARGIN_DEG = 5.0
+
+
+class PlanarRun:
+    """A flight on its way into a site. A context manager: leaving without `finish` leaves the site as it was."""
+
+    def __init__(self, setup: FlightSetup, archive: Archive, settings: MapSettings) -> None:
+        self._setup, self._archive, self._settings = setup, archive, settings
+        model = setup.source.camera
+        self._lens = Undistorter(model.camera)
+        self._log = FlightLog()
+        self._known = _known_keyframes(archive, setup)
+        calibrated = model.focal_sigma <= 0.005
+        height_known = setup.track is not None and np.isfinite(setup.track.altitude_offset_sigma_m)
+        offset_sigma_m = setup.track.altitude_offset_sigma_m if setup.track is not None and height_known else 1e4
+        self._mapper = PlanarMapper(
+            PoseGraphSettings(
+                focal_sigma=0.0 if calibrated or not height_known else model.focal_sigma,
+                radial_sigma=0.0 if calibrated else 0.03,
+                altitude_offset_sigma_m=offset_sigma_m if setup.track is not None else 0.0,
+                gps_offset_sigma_m=5.0 if self._known else 0.0,
+            ),
+            known=[each.keyframe for each in self._known.values()],
+        )
+        self._first_id = len(self._known)
+        self._frames: dict[int, PosedFrame] = {}
+        self._images: dict[int, str] = {}
+        self._held: dict[int, ImageRGB] = {}
+        self._writer: FlightWriter | None = None
+        self._canvas: Canvas | None = None
+        self._stored: Camera = model.camera.undistorted()
+        self._dirty: set[int] = set()
+        self._painted_at = 0
+        self._shown_s = time.monotonic()
+        self._exposure = Exposure({}, {}, 0.0)
+        self._valid: Anything | None = None
+        self._known_cache = ImageCache(
+            lambda each: archive.image(self._known[each].stored), 128 * 1024 * 1024
+        )
+        self._radial = 0.0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._writer is not None:
+            self._writer.__exit__(kind, error, trace)
+
+    @property
+    def selected(self) -> int:
+        """Frames taken so far, lost ones included."""
+        return len(self._log.endings)
+
+    @property
+    def by_vision(self) -> int:
+        """Frames placed by vision so far."""
+        return self._log.count(Status.VISION)
+
+    def lose(self, index: int, name: str, time_ns: int, reason: str) -> tuple[Status, str, int]:
+        """A selected frame that cannot be used."""
+        self._log.end(index, name, time_ns, Status.REJECTED, reason)
+        return Status.REJECTED, reason, 0
+
+    def add(self, posed: PosedFrame) -> tuple[Status, str, int]:
+        """Place one frame; what became of it and how many tiles were painted meanwhile."""
+        frame = posed.frame
+        if _sees_horizon(self._setup.source.camera.camera, posed):
+            return self.lose(frame.index, frame.name, frame.time_ns, "the camera looks at the horizon")
+        with self._log.stage(Stage.UNDISTORT):
+            image = self._lens.undistort(frame.image)
+        keyframe_id = self._first_id + frame.index
+        with self._log.stage(Stage.REGISTER):
+            outcome = self._mapper.add(keyframe_id, self._lens.camera, image, posed.prior)
+        self._log.end(frame.index, frame.name, frame.time_ns, outcome.status, outcome.reason)
+        if outcome.status is Status.REJECTED:
+            return outcome.status, outcome.reason, 0
+        self._frames[keyframe_id] = posed
+        self._dirty |= outcome.moved | {keyframe_id}
+        with self._log.stage(Stage.STORE):
+            self._keep(keyframe_id, image)
+        return outcome.status, outcome.reason, self._show(force=False)
+
+    def finish(self, notices: Sequence[Notice], seconds: float) -> None:
+        """Solve once more, find the clock offset, paint what moved, and make the flight part of the site."""
+        if not self._frames:
+            raise InputError(
+                f"no frame of {self._setup.source.name} could be placed: {self._log.commonest_reason() or 'none was selected'}"
+            )
+        with self._log.stage(Stage.REGISTER):
+            self._mapper.settle()
+            offset = self._find_offset()
+            self._dirty |= set(self._frames)
+        self._begin()
+        self._exposure = self._mapper.exposure()
+        self._straighten()
+        self._show(force=True)
+        writer, site = self._writer, self._archive.site()
+        assert writer is not None
+        with self._log.stage(Stage.REPORT):
+            placed = self._placed()
+            report = build_report(
+                self._setup, self._settings, self._log, placed, site, offset, self._mapper.report(),
+                self._refined(self._setup.source.camera.camera), writer.tiles, [*self._setup.notices, *notices], seconds,
+                spread=self._exposure.spread,
+            )
+            page = report_page(report, picture(writer.tiles, 1600).rgba)
+        writer.commit(placed, self._images, report, page, crs=self._settings.crs)
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _keep(self, keyframe_id: int, image: ImageRGB) -> None:
+        if self._writer is None:
+            self._held[keyframe_id] = image
+            known = self._setup.track is None or np.isfinite(self._setup.track.altitude_offset_sigma_m)
+            enough = self._archive.has_site or (known and len(self._held) >= 2) or len(self._held) >= _WAIT_FOR_HEIGHT
+            if enough:
+                self._begin()
+        else:
+            self._save(keyframe_id, image)
+
+    def _begin(self) -> None:
+        """Make the site if there is none, and start writing the flight into it."""
+        if self._writer is not None:
+            return
+        if not self._archive.has_site:
+            offset_m = self._mapper.report().altitude_offset_m
+            m_per_px = self._settings.m_per_px or self._native_m_per_px()
+            name = self._archive.folder.resolve().name or "site"
+            self._archive.create_site(new_site(self._setup, name, m_per_px, offset_m))
+        source = self._setup.source
+        self._writer = self._archive.begin_flight(
+            source.name, source.fingerprint, {"method": self._settings.method, **vars(self._settings)}
+        )
+        site_grid = self._archive.site_grid()
+        shrink = self._native_m_per_px() / site_grid.grid.m_per_px
+        if shrink < 0.77:  # a coarse map does not need every pixel of the pictures
+            full = self._lens.camera
+            self._stored = full.resized(max(16, round(full.width_px * shrink)), max(16, round(full.height_px * shrink)))
+        self._valid = self._lens.valid(self._stored.width_px, self._stored.height_px)
+        self._canvas = Canvas(
+            site_grid.grid, self._writer.tiles, self._image,
+            painted=[each.canvas_frame(site_grid) for each in self._known.values()],
+        )
+        if self._known:
+            self._canvas.paint([], forget=[each for each, known in self._known.items() if known.is_superseded])
+        for keyframe_id, image in self._held.items():
+            self._save(keyframe_id, image)
+        self._held.clear()
+
+    def _native_m_per_px(self) -> float:
+        if self._setup.track is None:
+            return _LOCAL_M_PER_PX
+        heights = [self._mapper.pose(each).translation_m[2] for each in self._mapper.placed()]
+        focal_px = self._refined(self._lens.camera).fx_px
+        return float(f"{np.median(heights) / focal_px:.3g}")
+
+    def _save(self, keyframe_id: int, image: ImageRGB) -> None:
+        assert self._writer is not None
+        if (image.shape[1], image.shape[0]) != (self._stored.width_px, self._stored.height_px):
+            size = (self._stored.width_px, self._stored.height_px)
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+        index = keyframe_id - self._first_id
+        self._images[index] = self._writer.save_image(index, image)
+
+    def _image(self, keyframe_id: int) -> ImageRGB:
+        if keyframe_id < self._first_id:
+            return self._known_cache.get(keyframe_id)
+        assert self._writer is not None
+        return self._writer.image(keyframe_id - self._first_id)
+
+    def _refined(self, camera: Camera) -> Camera:
+        report = self._mapper.report()
+        return refined_camera(camera, report.focal_scale, report.radial)
+
+    def _straighten(self) -> None:
+        """Where the flight showed a distortion that the calibration left over, take it out of the kept pictures."""
+        assert self._writer is not None
+        radial = self._mapper.radial
+        lens = Undistorter.left_over(self._stored, radial)
+        if lens is None:
+            return
+        self._radial = radial
+        for keyframe_id in self._frames:
+            index = keyframe_id - self._first_id
+            self._images[index] = self._writer.save_image(index, lens.undistort(self._writer.image(index)))
+        self._valid = lens.valid(self._stored.width_px, self._stored.height_px)
+
+    def _site_from_stored(self, keyframe_id: int) -> Matrix3:
+        focal = self._mapper.report().focal_scale
+        camera = self._stored.with_focal_px(self._stored.fx_px * focal)
+        return site_from_image_homography(camera, self._mapper.pose(keyframe_id))
+
+    def _show(self, *, force: bool) -> int:
+        """Paint what moved and let readers see it, now and then or at once."""
+        if self._canvas is None or self._writer is None:
+            return 0
+        if not force and len(self._frames) - self._painted_at < _PAINT_EVERY:
+            return 0
+        self._painted_at = len(self._frames)
+        site_grid = self._archive.site_grid()
+        with self._log.stage(Stage.PAINT):
+            if not force:
+                self._exposure = self._mapper.exposure()
+            frames, hidden = [], []
+            for each in sorted(self._dirty):
+                painted = self._canvas_frame(each, site_grid)
+                (frames if painted is not None else hidden).append(painted or each)
+            tiles = self._canvas.paint([f for f in frames if isinstance(f, CanvasFrame)],
+                                       forget=[h for h in hidden if isinstance(h, int)])
+            self._dirty.clear()
+        if force or time.monotonic() - self._shown_s > self._settings.live_s:
+            with self._log.stage(Stage.STORE):
+                self._writer.flush()
+                write_live_preview(self._writer.tiles, self._archive.live_preview_path)
+            self._shown_s = time.monotonic()
+        return len(tiles)
+
+    def _canvas_frame(self, keyframe_id: int, site_grid: SiteGrid) -> CanvasFrame | None:
+        return canvas_frame(
+            keyframe_id, self._rank(), self._stored, self._site_from_stored(keyframe_id), site_grid,
+            self._exposure.gains.get(keyframe_id, np.ones(3)), self._exposure.vignettes.get(0, np.zeros(2)), self._valid,
+        )
+
+    def _rank(self) -> int:
+        return 1 + max((each.rank for each in self._known.values()), default=-1)
+
+    def _find_offset(self) -> OffsetEstimate | None:
+        """The clock offset that motion shows, applied when it is well seen and none was given."""
+        setup = self._setup
+        if setup.track is None or setup.clock is None or setup.clock.sigma_s == 0:
+            return None
+        estimate = None
+        track = setup.track
+        applied_s = 0.0
+        for _ in range(3):
+            ids = self._mapper.placed()
+            path = self._mapper.path_m()
+            tied = np.isfinite(path[:, 0])
+            times = np.array([setup.seconds(self._frames[each].frame) for each in ids])
+            reach_s = 4 * setup.clock.sigma_s if not applied_s else 1.0
+            found = estimate_offset(shifted(track, applied_s), times[tied], path[tied, :2], reach_s=reach_s)
+            estimate = found if estimate is None else OffsetEstimate(
+                applied_s + found.offset_s, found.sigma_s, estimate.rms_at_zero_m, found.rms_m
+            )
+            if self._settings.offset_s is not None or not found.is_significant:
+                break
+            applied_s += found.offset_s
+            moved_track = shifted(track, applied_s)
+            self._mapper.retime({
+                each: moved_track.prior(seconds, smooth_s=setup.smooth_s) for each, seconds in zip(ids, times, strict=True)
+            })
+        self._log.offset_applied_s = applied_s
+        return estimate
+
+    def _placed(self) -> list[PlacedFrame]:
+        camera = self._refined(self._setup.source.camera.camera)
+        residuals = self._mapper.residuals_px(self._lens.camera)
+        sigmas, gps = self._mapper.sigmas_m(), self._mapper.gps_residuals_m()
+        result = []
+        for ending in self._log.endings.values():
+            keyframe_id = self._first_id + ending.index
+            time_ns = self._setup.utc_ns(ending.time_ns)
+            if keyframe_id not in self._frames:
+                result.append(rejected(ending.index, ending.name, time_ns, ending.reason, camera))
+                continue
+            status, reason = self._mapper.ending(keyframe_id)
+            pose = self._mapper.pose(keyframe_id)
+            outline_m = footprint(camera, pose)
+            if not np.isfinite(outline_m).all():
+                reason = "the camera looks at the horizon"
+                self._log.end(ending.index, ending.name, ending.time_ns, Status.REJECTED, reason)
+                result.append(rejected(ending.index, ending.name, time_ns, reason, camera))
+                continue
+            self._log.end(ending.index, ending.name, ending.time_ns, status, reason)
+            result.append(PlacedFrame(
+                ending.name, ending.index, time_ns, status, reason, camera, pose, self._site_from_stored(keyframe_id),
+                outline_m, residuals.get(keyframe_id, float("nan")), sigmas[keyframe_id],
+                self._exposure.gains.get(keyframe_id, np.ones(3)), gps[keyframe_id],
+            ))
+        return result
+
+
+class _Known:
+    """A keyframe of an earlier flight on this site, as the map has it."""
+
+    def __init__(self, keyframe_id: int, stored: StoredKeyframe, rank: int, archive: Archive, superseded: bool) -> None:
+        self.id, self.stored, self.rank, self.is_superseded = keyframe_id, stored, rank, superseded
+        # the thesis's method knows a similarity only: that of a camera looking straight down
+        pose = stored.site_from_camera or pose_from_homography(stored.site_from_image, stored.camera)
+        assert pose is not None
+        self.keyframe = KnownKeyframe(keyframe_id, stored.camera, pose, lambda: archive.image(stored))
+
+    def _known_keyframes(archive: Archive, setup: FlightSetup) -> dict[int, _Known]:
+    """The site's keyframes by canvas id; those of this flight's own earlier run are marked as superseded.
+
+    When that run made the newest map its tiles are taken back anyway, and its keyframes are left out.
+    """
+    if not archive.has_site:
+        return {}
+    ranks = {flight.id: flight.rank for flight in archive.flights()}
+    newest = next((v for v in reversed(archive.versions()) if v.complete), None)
+    stored = [
+        each for each in archive.keyframes()
+        if not (newest is not None and newest.flight_id == setup.source.name == each.flight_id)
+    ]
+    return {
+        k: _Known(k, each, ranks[each.flight_id], archive, each.flight_id == setup.source.name)
+        for k, each in enumerate(stored)
+    }
+
+
+def _sees_horizon(camera: Camera, posed: PosedFrame) -> bool:
+    if posed.prior.attitude_sigma_deg[:2].max() > 4.0:
+        return False
+    rays = camera.rays_from_pixels(camera.corners_px) @ posed.prior.rotation.T
+    down = -rays[:, 2] / np.linalg.norm(rays, axis=1)
+    return bool(np.degrees(np.arcsin(down.min())) < _HORIZON_MARGIN_DEG)

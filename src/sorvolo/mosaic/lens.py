@@ -1,0 +1,86 @@
+"""Taking a lens's distortion out of pictures, and the camera that a flight found out it had."""
+
+import cv2
+import numpy as np
+
+from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, Mask
+from sorvolo.geometry.camera import Camera
+
+_VISIBLE_PX = 0.5
+
+
+class Undistorter:
+    """Makes pictures of `camera` as a perfect lens would have; its maps are made once."""
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera.undistorted()
+        self._maps: tuple[Anything, Anything] | None = None
+        if camera.is_distorted:
+            self._maps = cv2.initUndistortRectifyMap(
+                camera.matrix, camera.distortion, None, camera.matrix, (camera.width_px, camera.height_px), cv2.CV_16SC2
+            )
+
+    @classmethod
+    def left_over(cls, camera: Camera, radial: float) -> "Undistorter | None":
+        """For the distortion k that a flight found (ideal = seen (1 + k r^2)); None where it moves no pixel visibly."""
+        x, y = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
+        ideal = np.stack([(x - camera.cx_px) / camera.fx_px, (y - camera.cy_px) / camera.fy_px], axis=-1)
+        seen = _seen_from_ideal(ideal.reshape(-1, 2), radial).reshape(ideal.shape)
+        pixels = seen * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
+        if np.abs(pixels - np.stack([x, y], axis=-1)).max() < _VISIBLE_PX:
+            return None
+        made = cls(camera.undistorted())
+        made._maps = cv2.convertMaps(
+            pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32), cv2.CV_16SC2
+        )
+        return made
+
+    def undistort(self, image: ImageRGB) -> ImageRGB:
+        """The picture, (H, W, 3), of the perfect lens; black where it would see beyond the real one."""
+        if self._maps is None:
+            return image
+        return cv2.remap(image, *self._maps, cv2.INTER_LINEAR)  # type: ignore[return-value]
+
+    def valid(self, width_px: int, height_px: int) -> Mask | None:
+        """Which pixels of the perfect picture, resampled to this size, exist; None = all."""
+        if self._maps is None:
+            return None
+        white = np.full((self.camera.height_px, self.camera.width_px), 255, np.uint8)
+        seen = cv2.remap(white, *self._maps, cv2.INTER_LINEAR)
+        seen = cv2.erode(seen, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
+        mask = cv2.resize(seen, (width_px, height_px), interpolation=cv2.INTER_AREA) == 255
+        return None if mask.all() else mask
+
+
+def refined_camera(camera: Camera, focal_scale: float, radial: float) -> Camera:
+    """The camera with the focal length and the left-over radial distortion that a flight found.
+
+    The five coefficients are fitted so that every pixel's ray is the one that the flight's solution gives it.
+    """
+    result = camera.with_focal_px(camera.fx_px * focal_scale)
+    if radial == 0.0:
+        return result
+    x, y = np.meshgrid(np.linspace(-0.5, camera.width_px - 0.5, 25), np.linspace(-0.5, camera.height_px - 0.5, 25))
+    pixels = np.column_stack([x.ravel(), y.ravel()])
+    seen = camera.rays_from_pixels(pixels)[:, :2]
+    ray = seen * (1 + radial * (seen**2).sum(axis=1, keepdims=True)) / focal_scale
+    distorted = (pixels - [result.cx_px, result.cy_px]) / [result.fx_px, result.fy_px]
+    u, v = ray.T
+    r2 = u * u + v * v
+    columns_u = np.column_stack([u * r2, u * r2**2, 2 * u * v, r2 + 2 * u * u, u * r2**3])
+    columns_v = np.column_stack([v * r2, v * r2**2, r2 + 2 * v * v, 2 * u * v, v * r2**3])
+    coefficients, *_ = np.linalg.lstsq(
+        np.concatenate([columns_u, columns_v]), (distorted - ray).T.ravel(), rcond=None
+    )
+    return Camera(
+        result.width_px, result.height_px, result.fx_px, result.fy_px, result.cx_px, result.cy_px, coefficients
+    )
+
+
+def _seen_from_ideal(ideal: Floats, radial: float) -> Floats:
+    """Invert ideal = seen (1 + k r^2) by Newton's method on the radius."""
+    radius = np.linalg.norm(ideal, axis=1, keepdims=True)
+    seen = radius.copy()
+    for _ in range(10):
+        seen -= (seen + radial * seen**3 - radius) / np.maximum(1 + 3 * radial * seen**2, 0.1)
+    return ideal * np.where(radius > 1e-12, seen / np.maximum(radius, 1e-12), 1.0)
