@@ -29,6 +29,7 @@ DIALECTS = {
            "GPS({lon:.6f},{lat:.6f},17) Hb:{h:.1f} Hs:1.0\n"
            "ISO:100 TV:60 EV: 0 IR:F2.8",
     "matrice": "2021.12.25 12:27:{s:02d}\nGPS({lat:.6f},{lon:.6f},0.0M) BAROMETER:{h:.1f}M",
+    "brackets in": "2021.12.25 12:27:{s:02d}\nGPS({lon:.6f},{lat:.6f},17) BAROMETER({h:.1f})",
     "line": "F/5.6, SS 400, ISO 100, EV 0, GPS ({lon:.6f}, {lat:.6f}, 15), HOME (1.5, 2.5, -57.98m), "
             "D 698.70m, H {h:.2f}m, H.S 2.88m/s, V.S 0.00m/s, "
             "F.PRY (2.7°, -7.0°, 110.1°), G.PRY (-24.4°, 0.0°, 110.4°)",
@@ -96,7 +97,9 @@ def test_the_angles_of_each_dialect():
 @pytest.mark.parametrize("group, latitude, longitude", [
     ("-58.4563,-34.7386,19", -34.7386, -58.4563),  # satellites: longitude first
     ("36.6146,-6.1120,0.0M", 36.6146, -6.1120),  # a height with its unit: latitude first
+    ("39.9062,16.3913,69.800", 39.9062, 16.3913),  # so does one without: no count of satellites has decimals
     ("149.0251,-20.2532,12.0M", -20.2532, 149.0251),  # no latitude is 149
+    ("-41.3899,174.0177,17", -41.3899, 174.0177),
     ("N: 40.768574, W: 109.339287, 2371.76m", 40.768574, -109.339287),
     ("W: 109.339287, N: 40.768574, 2371.76m", 40.768574, -109.339287),
     ("E: 1.25, S: 43.6, 207m", -43.6, 1.25),

@@ -25,12 +25,15 @@ SMALLEST_SIGMA_M = 1.5
 """Horizontal sigma of a consumer drone's GPS in hover, which no number of printed decimals improves."""
 
 _CUE = re.compile(r"(\d{1,3}):(\d{2}):(\d{2})[,.](\d{1,3})[ \t]*-->")
-_TELEMETRY = re.compile(r"\b(?:(?:GPS|HOME)\s*\(|(?:latitude|FrameCnt|SrtCnt|BAROMETER)\s*:)", re.IGNORECASE)
+_TELEMETRY = re.compile(
+    r"\b(?:(?:GPS|HOME)\s*\(|(?:latitude|FrameCnt|SrtCnt)\s*:|BAROMETER\s*[:(])", re.IGNORECASE
+)
 # Every pattern wants something behind its last digit: the last cue of a half-written file may end within a
 # number.
 _PAIR = re.compile(r"[\[\s]([A-Za-z_]+)\s?:\s?([-+]?\d+(?:\.\d+)?)(?=[^\d.])")
 _GPS = re.compile(r"\bGPS\s*\(([^()\n]{0,80})\)")
 _COORDINATE = re.compile(r"(?:([NSEW])\s*:?\s*)?([-+]?\d+(?:\.\d*)?)\s*([mM]?)")
+_BAROMETER = re.compile(r"\bBAROMETER\s*\(\s*([-+]?\d+(?:\.\d+)?)\s*[mM]?\s*\)")
 _HEIGHT = re.compile(r"(?<![\w.])H\s([-+]?\d+(?:\.\d+)?)m\b")
 _SPEED = re.compile(r"\bH\.S\s([-+]?\d+(?:\.\d+)?)m/s")
 _ANGLES = re.compile(r"\b([FG])\.PRY\s*\(([^()\n]{0,60})\)")
@@ -125,7 +128,7 @@ def read(data: bytes, name: str) -> Telemetry:
             ),
             *notice(
                 "latitude_first", counts["latitude_first"],
-                "{} positions have a height in metres as third value: they are read as latitude, longitude",
+                "{} positions are followed by a height: such files put latitude before longitude",
             ),
         ],
         position_decimals=max(decimals) or None,
@@ -159,9 +162,9 @@ def _cue(match: re.Match[str], body: str, counts: Counter[str], decimals: list[i
 
 
 def _values_in_words(body: str) -> dict[str, float]:
-    """What the one-line dialect says: "H 200.70m, H.S 2.1m/s, F.PRY (2.7, -7.0, 110.1), G.PRY (...)"."""
+    """What stands without a colon: "BAROMETER(91.2)", "H 200.70m, H.S 2.1m/s, F.PRY (2.7, -7.0, 110.1)"."""
     values = {}
-    if height := _HEIGHT.search(body):
+    if height := _HEIGHT.search(body) or _BAROMETER.search(body):
         values["height_above_takeoff_m"] = float(height[1])
     if speed := _SPEED.search(body):
         values["speed_m_s"] = float(speed[1])
@@ -177,23 +180,25 @@ def _values_in_words(body: str) -> dict[str, float]:
 def _place(group: str) -> _Place | None:
     """The place in GPS(...); None where it says N/A.
 
-    Letters decide the order. Without them the third value does: a bare number is the count of satellites,
-    in files that put longitude first; a height with its unit ("0.0M", the Matrice 300) comes after latitude
-    and longitude. A first value beyond 90 is a longitude in any case.
+    Letters decide the order, then a value beyond 90, which is a longitude. Else the third value does: a whole
+    number is the count of satellites, in files that put longitude first; a height ("0.0M", the Matrice 300)
+    comes after latitude and longitude.
     """
     parts = [match for match in map(_COORDINATE.fullmatch, map(str.strip, group.split(","))) if match]
     if len(parts) < 2 or len(parts) != group.count(",") + 1:
         return None
     first, second = parts[0], parts[1]
-    has_unit = len(parts) > 2 and bool(parts[2][3])
+    has_height = len(parts) > 2 and bool(parts[2][3] or "." in parts[2][2])
     if first[1] or second[1]:
         is_latitude_first = first[1] in ("N", "S") or second[1] in ("E", "W")
+    elif max(abs(float(first[2])), abs(float(second[2]))) > 90:
+        is_latitude_first = abs(float(first[2])) <= 90
     else:
-        is_latitude_first = has_unit and abs(float(first[2])) <= 90
+        is_latitude_first = has_height
     latitude, longitude = (first, second) if is_latitude_first else (second, first)
     return _Place(
         _signed(latitude), _signed(longitude),
-        height_m=float(parts[2][2]) if has_unit else float("nan"),
+        height_m=float(parts[2][2]) if has_height else float("nan"),
         decimals=max(decimals_of(first[2]), decimals_of(second[2])),
         is_latitude_first=is_latitude_first and not (first[1] or second[1]),
     )

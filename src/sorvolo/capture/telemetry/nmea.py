@@ -57,7 +57,8 @@ def read(data: bytes, name: str) -> Telemetry:
     if not messages:
         raise InputError(
             f"{name}: no intact GGA or RMC sentence ({counts['bad_checksum']} with a bad checksum, "
-            f"{counts['no_time']} without a time, {counts['unreadable_line'] + counts['truncated']} unreadable); "
+            f"{counts['no_time']} without a time, "
+            f"{counts['unreadable_line'] + counts['truncated']} unreadable); "
             "record the receiver's output again, checksums included"
         )
     epochs, dated = _epochs(messages)
