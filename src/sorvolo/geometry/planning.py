@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sorvolo.errors import GeometryError, SettingsError
 from sorvolo.geometry.arrays import Floats, PointsM, frozen
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.polygons import band_spans, convex_hull, join_spans
+from sorvolo.geometry.polygons import band_spans, join_spans, narrowest_extent
 
 FRONT_CRITICAL_M = 0.75
 """Critical dimension of a person whom the camera faces (section 3.1.1)."""
@@ -213,16 +213,10 @@ def plan_strips(
 def longest_bearing_deg(points_m: PointsM) -> float:
     """The bearing, in [0, 180) deg, across which points, (N, 2), spread least: a rectangle's longer side.
 
-    Strips that way are the fewest, and so are the turns (rotating calipers over the convex hull).
+    Strips that way are the fewest, and so are the turns.
     """
-    hull = convex_hull(points_m)
-    edges = np.roll(hull, -1, axis=0) - hull
-    lengths_m = np.linalg.norm(edges, axis=1)
-    normals = np.column_stack([-edges[:, 1], edges[:, 0]]) / lengths_m[:, None]
-    spread_m = np.ptp(hull @ normals.T, axis=0)
-    # of equally narrow directions (a square) the longest edge, then the first
-    best = np.lexsort((-lengths_m, np.round(spread_m, 6)))[0]
-    return float(np.degrees(np.arctan2(edges[best, 0], edges[best, 1])) % 180)
+    _, along = narrowest_extent(points_m)
+    return float(np.degrees(np.arctan2(along[0], along[1])) % 180)
 
 
 def _strip_levels(low: float, high: float, width_m: float, spacing_m: float) -> Floats:

@@ -106,6 +106,23 @@ def convex_hull(points: PointsM) -> PointsM:
     return np.array(halves)
 
 
+def narrowest_extent(points: PointsM) -> tuple[float, Floats]:
+    """The least width of points, shape (N, 2), in any direction, and the unit vector, (2,), at right angles.
+
+    The vector runs along the points' longer way (rotating calipers over the hull). The width of points on one
+    line is zero. Of equally narrow ways, as in a square, the one along the hull's longest edge is taken.
+    """
+    hull = convex_hull(points)
+    edges = np.roll(hull, -1, axis=0) - hull
+    lengths = np.linalg.norm(edges, axis=1)
+    if lengths.max() == 0:
+        return 0.0, np.array([1.0, 0.0])
+    along = edges / lengths[:, None]
+    spread = np.ptp(hull @ np.column_stack([-along[:, 1], along[:, 0]]).T, axis=0)
+    best = np.lexsort((-lengths, np.round(spread, 6)))[0]
+    return float(spread[best]), along[best]
+
+
 def _crossings(rings: Sequence[PointsM], level: float) -> list[float]:
     found: list[float] = []
     for ring in rings:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Floats, PointsM, frozen
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame, ecef_from_wgs84, wgs84_from_ecef
-from sorvolo.geometry.polygons import first_crossing, points_inside, polygon_area
+from sorvolo.geometry.polygons import first_crossing, narrowest_extent, points_inside, polygon_area
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +105,11 @@ def _open_ring(ring: Floats) -> Floats:
 
 
 def _check_ring(ring_m: PointsM) -> None:
-    if np.ptp(ring_m, axis=0).max() > 500e3:
+    extent_m = float(np.ptp(ring_m, axis=0).max())
+    if extent_m > 500e3:
         raise GeometryError("a ring spans more than 500 km; an area of interest is local")
-    if polygon_area([ring_m]) < 1e-3:
+    # points along a parallel are on one line for the person who drew them, though not on the Earth
+    if narrowest_extent(ring_m)[0] < max(0.05, 5e-4 * extent_m):
         raise GeometryError("a ring encloses no ground: its points lie on one line")
     if crossing := first_crossing(ring_m):
         raise GeometryError(
