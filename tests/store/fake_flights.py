@@ -8,6 +8,7 @@ import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 
 import numpy as np
 import rasterio
@@ -121,7 +122,7 @@ def _forked(task: Callable[..., None], *arguments: object) -> int:
     return child
 
 
-def main(folder: Path, seed: int, rounds: int) -> None:
+def kill_at_random(folder: Path, seed: int, rounds: int) -> None:
     """Kill a mapping child after a random time and look whether the site is whole; exit with 1 if not."""
     chance = random.Random(seed)
     for number in range(rounds):
@@ -131,10 +132,56 @@ def main(folder: Path, seed: int, rounds: int) -> None:
         _, ending = os.waitpid(child, 0)
         if os.WIFEXITED(ending):  # it failed by itself before it was killed
             sys.exit(f"round {number}: the mapping child failed")
-        _, ending = os.waitpid(_forked(check_whole, folder), 0)
-        if ending:
-            sys.exit(f"round {number}: the site is not whole")
+        _expect_whole(folder, f"round {number}")
+
+
+def kill_at_steps(folder: Path, seed: int, rounds: int) -> None:
+    """Kill a mapping child at `rounds` of its steps over the whole run, and at every one around its commit.
+
+    A step is a call in the modules that order the writing.
+    """
+    steps = folder.with_name("steps")
+    os.waitpid(_forked(_map_to_step, folder, seed, 1_000_000, steps), 0)
+    count, commit = (int(word) for word in steps.read_text().split())
+    spread = np.linspace(0, 0.95 * count, rounds).astype(int)
+    for place in sorted({*spread.tolist(), *range(commit - 6, commit + 5)}):
+        seed += 2  # the same flight in another colour
+        _, ending = os.waitpid(_forked(_map_to_step, folder, seed, place, steps), 0)
+        if not os.WIFSIGNALED(ending):
+            sys.exit(f"step {place} of {count}: the mapping child was not killed")
+        _expect_whole(folder, f"step {place} of {count}")
+
+
+def _map_to_step(folder: Path, seed: int, last: int, steps: Path) -> None:
+    """Map one flight and be killed at a step; else write how many there were and which was the commit."""
+    count = commit = 0
+
+    def watch(called: FrameType, event: str, _: object) -> None:
+        nonlocal count, commit
+        ordering = ("archive.py", "catalogue.py", "atomic.py")
+        if event != "call" or not called.f_code.co_filename.endswith(ordering):
+            return
+        if count == last:
+            os.kill(os.getpid(), signal.SIGKILL)
+        count += 1
+        if called.f_code.co_name == "complete_run":
+            commit = count
+
+    with Archive.open(folder, write=True) as archive:
+        if not archive.has_site:
+            archive.create_site(SITE)
+        sys.setprofile(watch)
+        map_flight(archive, f"flight-{seed % 2}", 10 + seed % 200, count=2 + seed % 2)
+        sys.setprofile(None)
+    steps.write_text(f"{count} {commit}")
+
+
+def _expect_whole(folder: Path, when: str) -> None:
+    _, ending = os.waitpid(_forked(check_whole, folder), 0)
+    if ending:
+        sys.exit(f"{when}: the site is not whole")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))
+    kills = {"random": kill_at_random, "steps": kill_at_steps}
+    kills[sys.argv[1]](Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))

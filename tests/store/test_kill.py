@@ -10,10 +10,10 @@ import pytest
 from sorvolo.store.archive import Archive
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_site_survives_being_killed_at_random_moments(tmp_path: Path, seed: int) -> None:
+@pytest.mark.parametrize(("moments", "rounds"), [("random", 8), ("steps", 6)])
+def test_a_site_survives_being_killed(tmp_path: Path, moments: str, rounds: int) -> None:
     folder = tmp_path / "site"
-    program = [sys.executable, fake_flights.__file__, str(folder), str(seed), "11"]
+    program = [sys.executable, fake_flights.__file__, moments, str(folder), "1", str(rounds)]
     result = subprocess.run(program, capture_output=True, text=True, timeout=120)
     assert result.returncode == 0, result.stderr
 
