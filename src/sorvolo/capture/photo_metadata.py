@@ -2,6 +2,7 @@
 
 import re
 import struct
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -72,7 +73,8 @@ def read_photo_metadata(path: Path) -> PhotoMetadata:
     Raises InputError when the file is no picture at all; damaged EXIF or XMP is named in `unreadable`.
     """
     try:
-        with Image.open(path) as picture:
+        with warnings.catch_warnings(record=True) as caught, Image.open(path) as picture:
+            warnings.simplefilter("always")
             (width_px, height_px), mode = picture.size, picture.mode
             tags, unreadable = _exif_of(picture)
             xmp = picture.info.get("xmp") or picture.info.get("XML:com.adobe.xmp") or b""
@@ -85,6 +87,8 @@ def read_photo_metadata(path: Path) -> PhotoMetadata:
         )
     if mode == "F":
         raise InputError(f"{path.name} holds floating-point numbers (an elevation map?), not a photo")
+    if caught and not unreadable:  # Pillow leaves damaged tags out and warns
+        unreadable = ("EXIF",)
     properties: dict[str, str] = {}
     if xmp:
         try:
@@ -159,12 +163,12 @@ def _focal_plane_px_per_mm(detail: _Tags) -> float:
 
 
 def _parse_ns(text: str, pattern: str) -> int:
-    """Nanoseconds since 1970 of a date as written, read as UTC; 0 for none and before 1990."""
+    """Nanoseconds since 1970 of a date as written, read as UTC; 0 for none and outside 1990-2200."""
     try:
         moment = datetime.strptime(text, pattern).replace(tzinfo=UTC)
     except ValueError:
         return 0
-    return (moment - _EPOCH) // timedelta(microseconds=1) * 1000 if moment.year >= 1990 else 0
+    return (moment - _EPOCH) // timedelta(microseconds=1) * 1000 if 1990 <= moment.year <= 2200 else 0
 
 
 def _camera_clock_ns(main: _Tags, detail: _Tags) -> int:

@@ -351,7 +351,7 @@ def _start_of(metadata: dict[str, str]) -> tuple[int, str]:
         except (KeyError, ValueError):
             continue
         zoned = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-        if zoned.year >= 1990:  # cameras without a clock write 1904 or 1970
+        if 1990 <= zoned.year <= 2200:  # cameras without a clock write 1904 or 1970
             since = zoned - datetime(1970, 1, 1, tzinfo=UTC)
             origin = f"{key} in the video (some cameras write local time there)"
             return since // timedelta(microseconds=1) * 1000, origin

@@ -8,7 +8,7 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats, PointsM
 
 _WINDOW_S = 2.0  # shorter steps measure the receiver's noise instead of the speed
-_STEPS_ACROSS = 60
+_STEPS_ACROSS = 25  # the steps must be long against the receiver's noise
 _ALONG_DEG = 25.0
 _LEAST_CONCENTRATION = 0.3
 
@@ -35,7 +35,7 @@ def speeds_m_s(points_m: PointsM, times_s: Floats) -> Floats:
 
 
 def thinned(points_m: PointsM) -> PointsM:
-    """The track's points, (N, 2), without those nearer than a sixtieth of its extent to the one before.
+    """The track's points, (N, 2), without those nearer than a 25th of its extent to the one before.
 
     What the receiver's noise adds to a slow or hovering flight goes, and every step has a bearing.
     """
@@ -70,19 +70,16 @@ def find_strips(points_m: PointsM) -> Strips:
     if abs(mean) < _LEAST_CONCENTRATION:
         return Strips(0, np.nan, np.nan)
     bearing = 0.5 * np.angle(mean)
-    along = np.array([np.sin(bearing), np.cos(bearing)])
-    across = np.array([along[1], -along[0]])
-    cosines = steps @ along / lengths
+    cosines = steps @ np.array([np.sin(bearing), np.cos(bearing)]) / lengths
     ways = np.where(np.abs(cosines) >= np.cos(np.radians(_ALONG_DEG)), np.sign(cosines), 0.0)
-    passes: list[tuple[float, float]] = []  # length and place across
-    for way, group in groupby(range(len(steps)), key=lambda index: ways[index]):
-        run = list(group)
-        if way:
-            ends = points[run[0]: run[-1] + 2]
-            passes.append((float(lengths[run].sum()), float(np.mean(ends @ across))))
-    longest_m = max((length for length, _ in passes), default=0.0)
-    places = np.sort([place for length, place in passes if length >= longest_m / 3])
-    gaps = np.diff(places)
+    runs = [list(group) for way, group in groupby(range(len(steps)), key=lambda index: ways[index]) if way]
+    longest_m = max((lengths[run].sum() for run in runs), default=0.0)
+    passes = [points[run[0]: run[-1] + 2] for run in runs if lengths[run].sum() >= longest_m / 3]
+    # the turns between passes have pulled the mean; the passes' own chords have not
+    chords = np.array([each[-1] - each[0] for each in passes]).reshape(-1, 2)
+    bearing = 0.5 * np.angle(np.sum((chords[:, 1] + 1j * chords[:, 0]) ** 2)) if len(chords) else bearing
+    across = np.array([np.cos(bearing), -np.sin(bearing)])
+    gaps = np.diff(np.sort([float((each @ across).mean()) for each in passes]))
     # the same line flown twice is one strip
     apart = gaps[gaps > 0.2 * gaps.max(initial=0.0)]
     spacing_m = float(np.median(apart)) if len(apart) else np.nan

@@ -1,0 +1,402 @@
+"""Photos: EXIF and XMP of several makers, order and time, sizes, orientations, copies and damage."""
+
+import io
+import math
+import random
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image, ImageOps
+from PIL.ExifTags import GPS, IFD, Base
+from PIL.TiffImagePlugin import IFDRational
+
+from sorvolo.capture.photo_metadata import read_photo_metadata
+from sorvolo.capture.photos import PhotoSource, decode_photo, read_album
+from sorvolo.capture.source import open_sources
+from sorvolo.errors import InputError
+from sorvolo.geometry.pose import site_from_body_nadir_rotation, site_from_gimbal_rotation
+from sorvolo.survey.flight import Frame, LostFrame
+
+DJI = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description rdf:about="DJI Meta Data" xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" {attributes}>
+{elements}</rdf:Description></rdf:RDF></x:xmpmeta>"""
+SENSEFLY = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description rdf:about="" xmlns:Camera="http://pix4d.com/camera/1.0"><Camera:Yaw>{0}</Camera:Yaw>
+<Camera:Pitch>{1}</Camera:Pitch><Camera:Roll>{2}</Camera:Roll>
+<Camera:GPSXYAccuracy>1.5</Camera:GPSXYAccuracy><Camera:GPSZAccuracy>25/10</Camera:GPSZAccuracy>
+</rdf:Description></rdf:RDF></x:xmpmeta>"""
+
+
+def picture(width: int = 80, height: int = 60, seed: int = 0) -> Image.Image:
+    """Smooth random colours with a red top-left and a blue top-right corner."""
+    rough = np.random.default_rng(seed).integers(60, 180, (height // 10 + 1, width // 10 + 1, 3), np.uint8)
+    pixels = np.asarray(Image.fromarray(rough).resize((width, height), Image.Resampling.BICUBIC)).copy()
+    pixels[:20, :20], pixels[:20, -20:] = (220, 30, 30), (30, 30, 220)
+    return Image.fromarray(pixels)
+
+
+def dms(degrees: float) -> tuple[IFDRational, IFDRational, IFDRational]:
+    degrees = abs(degrees)
+    whole, minutes = int(degrees), int(degrees % 1 * 60)
+    seconds = (degrees - whole - minutes / 60) * 3600
+    return IFDRational(whole, 1), IFDRational(minutes, 1), IFDRational(round(seconds * 100_000), 100_000)
+
+
+def write_photo(
+    path: Path, place: Sequence[float] | None = (46.5, -92.25, 198.5), local: str = "", utc: str = "",
+    xmp: str = "", image: Image.Image | None = None, orientation: int = 1, seed: int = 0,
+    extra: dict[int, object] | None = None, gps_extra: dict[int, object] | None = None, zone: str = "",
+) -> Path:
+    exif = Image.Exif()
+    exif[Base.Make], exif[Base.Model] = "DJI\0\0\0\0", "FC300S\0\0"
+    exif[Base.Orientation] = orientation
+    detail = exif.get_ifd(IFD.Exif)
+    detail[Base.FocalLength] = IFDRational(361, 100)
+    if local:
+        detail[Base.DateTimeOriginal], _, fraction = local.partition(".")
+        if fraction:
+            detail[Base.SubsecTimeOriginal] = fraction
+    if zone:
+        detail[Base.OffsetTimeOriginal] = zone
+    detail.update(extra or {})
+    gps = exif.get_ifd(IFD.GPSInfo)
+    if place is not None:
+        latitude, longitude, altitude = place
+        gps[GPS.GPSLatitudeRef], gps[GPS.GPSLatitude] = "S" if latitude < 0 else "N", dms(latitude)
+        gps[GPS.GPSLongitudeRef], gps[GPS.GPSLongitude] = "W" if longitude < 0 else "E", dms(longitude)
+        gps[GPS.GPSAltitudeRef] = b"\1" if altitude < 0 else b"\0"
+        gps[GPS.GPSAltitude] = IFDRational(round(abs(altitude) * 1000), 1000)
+    if utc:
+        day, _, clock = utc.partition(" ")
+        gps[GPS.GPSDateStamp] = day
+        parts = [float(part) for part in clock.split(":")]
+        gps[GPS.GPSTimeStamp] = tuple(IFDRational(round(part * 1000), 1000) for part in parts)
+    gps.update(gps_extra or {})
+    options = {"xmp": xmp.encode()} if xmp else {}
+    (image or picture(seed=seed)).save(path, exif=exif, quality=95, **options)
+    return path
+
+
+def flight(folder: Path, count: int = 4, **options: object) -> list[Path]:
+    """Photos 2 s and about 11 m apart, flown north."""
+    return [
+        write_photo(
+            folder / f"IMG_{index + 8}.jpg", (46.5 + 1e-4 * index, -92.25, 198.5),
+            utc=f"2021:06:01 10:00:{2 * index:02d}", seed=index, **options,  # type: ignore[arg-type]
+        )
+        for index in range(count)
+    ]
+
+
+def open_photos(*paths: Path) -> PhotoSource:
+    (source,) = open_sources(paths)
+    assert isinstance(source, PhotoSource)
+    return source
+
+
+def all_frames(source: PhotoSource) -> list[Frame | LostFrame]:
+    return list(source.frames(lambda index, time_ns: True))
+
+
+def codes(source: PhotoSource) -> dict[str, int]:
+    """All notices but one: photos of these tests often share a place."""
+    notices = (*source.notices(), *source.telemetry.notices)
+    return {notice.code: notice.count for notice in notices if notice.code != "repeated_fix"}
+
+
+@given(latitude=st.floats(-89.9, 89.9), longitude=st.floats(-179.9, 179.9), altitude=st.floats(-400, 9000))
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_places_come_back(tmp_path: Path, latitude: float, longitude: float, altitude: float) -> None:
+    path = write_photo(tmp_path / "a.jpg", (latitude, longitude, altitude))
+    columns = read_photo_metadata(path).columns
+    assert columns["latitude_deg"] == pytest.approx(latitude, abs=1e-8)
+    assert columns["longitude_deg"] == pytest.approx(longitude, abs=1e-8)
+    assert columns["orthometric_height_m"] == pytest.approx(altitude, abs=1e-3)
+
+
+def test_padded_texts_and_focal_lengths(tmp_path: Path) -> None:
+    metadata = read_photo_metadata(write_photo(tmp_path / "a.jpg", extra={
+        Base.FocalPlaneXResolution: IFDRational(254_000, 10), Base.FocalPlaneResolutionUnit: 2,
+        Base.FocalLengthIn35mmFilm: 20, Base.ExifImageWidth: 4000,
+    }))
+    assert (metadata.make, metadata.model) == ("DJI", "FC300S")
+    assert metadata.focal_length_mm == pytest.approx(3.61) and metadata.focal_length_35mm == 20
+    assert metadata.focal_plane_px_per_mm == pytest.approx(1000) and metadata.full_width_px == 4000
+
+
+@pytest.mark.parametrize("broken", [
+    {GPS.GPSLatitude: (IFDRational(0, 0), IFDRational(0, 0), IFDRational(0, 0))},
+    {GPS.GPSLatitude: (IFDRational(46, 1), IFDRational(30, 0), IFDRational(1, 1))},
+    {GPS.GPSLatitude: (IFDRational(146, 1), IFDRational(0, 1), IFDRational(0, 1))},
+])
+def test_zero_denominators_and_impossible_places_are_no_place(
+    tmp_path: Path, broken: dict[int, object]
+) -> None:
+    metadata = read_photo_metadata(write_photo(tmp_path / "a.jpg", gps_extra=broken))
+    assert "latitude_deg" not in metadata.columns and "longitude_deg" not in metadata.columns
+    assert math.isnan(read_photo_metadata(write_photo(
+        tmp_path / "b.jpg", extra={Base.FocalLength: IFDRational(0, 0)}
+    )).focal_length_mm)
+
+
+@pytest.mark.parametrize("as_elements", [False, True])
+def test_dji_words_as_attributes_and_elements(tmp_path: Path, as_elements: bool) -> None:
+    words = {
+        "RelativeAltitude": "+39.80", "GimbalYawDegree": "-135.00", "GimbalPitchDegree": "-89.90",
+        "GimbalRollDegree": "+180.00", "FlightYawDegree": "+46.00", "FlightPitchDegree": "+1.80",
+        "FlightRollDegree": "-3.00", "FlightXSpeed": "+3.0", "FlightYSpeed": "-4.0",
+    }
+    attributes = "" if as_elements else " ".join(f'drone-dji:{key}="{text}"' for key, text in words.items())
+    elements = "".join(
+        f"<drone-dji:{key}>{text}</drone-dji:{key}>" for key, text in words.items()
+    ) if as_elements else ""
+    xmp = DJI.format(attributes=attributes, elements=elements)
+    columns = read_photo_metadata(write_photo(tmp_path / "a.jpg", xmp=xmp)).columns
+    assert columns["height_above_takeoff_m"] == 39.8 and columns["orthometric_height_m"] == 198.5
+    assert [columns[f"camera_{axis}_deg"] for axis in ("yaw", "pitch", "roll")] == [-135, -89.9, 180]
+    assert [columns[f"body_{axis}_deg"] for axis in ("yaw", "pitch", "roll")] == [46, 1.8, -3]
+    assert columns["speed_m_s"] == 5 and columns["course_deg"] == pytest.approx(306.87, abs=0.01)
+
+
+def test_an_rtk_height_is_ellipsoidal(tmp_path: Path) -> None:
+    xmp = DJI.format(elements="", attributes=(
+        'drone-dji:AltitudeType="RtkAlt" drone-dji:RtkStdLon="0.03" drone-dji:RtkStdLat="0.03" '
+        'drone-dji:RtkStdHgt="0.05"'
+    ))
+    columns = read_photo_metadata(write_photo(tmp_path / "a.jpg", xmp=xmp)).columns
+    assert columns["ellipsoidal_height_m"] == 198.5 and "orthometric_height_m" not in columns
+    assert columns["horizontal_sigma_m"] == pytest.approx(0.03) and columns["vertical_sigma_m"] == 0.05
+
+
+@pytest.mark.parametrize("angles", [(30.0, 5.0, -8.0), (200.0, 0.0, 0.0), (10.0, 60.0, 20.0)])
+def test_sensefly_angles_count_from_the_nadir(tmp_path: Path, angles: tuple[float, float, float]) -> None:
+    path = write_photo(tmp_path / "a.jpg", xmp=SENSEFLY.format(*angles))
+    columns = read_photo_metadata(path).columns
+    gimbal = [columns[f"camera_{axis}_deg"] for axis in ("yaw", "pitch", "roll")]
+    expected = site_from_body_nadir_rotation(*angles)
+    assert site_from_gimbal_rotation(*gimbal) == pytest.approx(expected, abs=1e-6)
+    assert columns["horizontal_sigma_m"] == 1.5 and columns["vertical_sigma_m"] == 2.5
+
+
+def test_times_are_utc_where_something_says_so(tmp_path: Path) -> None:
+    ten_ns = 1_622_541_600 * 1_000_000_000
+    gps = read_photo_metadata(write_photo(
+        tmp_path / "a.jpg", utc="2021:06:01 10:00:00.5", local="2021:06:01 03:00:00"
+    ))
+    assert gps.utc_ns == ten_ns + 500_000_000
+    zoned = read_photo_metadata(write_photo(
+        tmp_path / "b.jpg", local="2021:06:01 12:00:00.25", zone="+02:00"
+    ))
+    assert zoned.utc_ns == ten_ns + 250_000_000
+    local = read_photo_metadata(write_photo(tmp_path / "c.jpg", local="2021:06:01 12:00:00"))
+    assert local.utc_ns == 0 and local.local_ns == ten_ns + 7200 * 1_000_000_000
+    none = read_photo_metadata(write_photo(tmp_path / "d.jpg", local="0000:00:00 00:00:00"))
+    assert (none.utc_ns, none.local_ns) == (0, 0)
+
+
+def test_a_flight_is_sorted_by_time_then_by_name(tmp_path: Path) -> None:
+    for number, second in ((10, 4), (9, 4), (2, 6), (30, 2)):
+        write_photo(tmp_path / f"IMG_{number}.jpg", utc=f"2021:06:01 10:00:{second:02d}", seed=number)
+    source = open_photos(tmp_path)
+    frames = all_frames(source)
+    assert [frame.name for frame in frames] == ["IMG_30.jpg", "IMG_9.jpg", "IMG_10.jpg", "IMG_2.jpg"]
+    assert [frame.time_ns - source.start_ns for frame in frames] == [
+        0, 2_000_000_000, 2_001_000_000, 4_000_000_000
+    ]
+    assert source.telemetry.time_ns.tolist() == [frame.time_ns for frame in frames]
+    assert source.kind == "photos" and source.frame_count == 4 and math.isnan(source.frame_rate_hz)
+
+
+def test_an_unknown_zone_is_told_and_no_time_too(tmp_path: Path) -> None:
+    (tmp_path / "local").mkdir()
+    for index in range(3):
+        write_photo(tmp_path / "local" / f"{index}.jpg", local=f"2021:06:01 12:00:0{index}", seed=index)
+    assert codes(open_photos(tmp_path / "local")) == {"time_zone_unknown": 3}
+    (tmp_path / "none").mkdir()
+    for index in range(3):
+        write_photo(tmp_path / "none" / f"{index}.jpg", seed=index)
+    untimed = open_photos(tmp_path / "none")
+    assert codes(untimed) == {"photo_without_time": 3}
+    assert untimed.start_ns == 0 and "unknown" in untimed.start_origin
+
+
+def test_a_gps_clock_that_stands_still_is_replaced_by_the_cameras(tmp_path: Path) -> None:
+    for index, gps_second in enumerate((0, 2, 2, 6)):
+        write_photo(tmp_path / f"{index}.jpg", utc=f"2021:06:01 10:00:0{gps_second}",
+                    local=f"2021:06:01 05:00:0{2 * index}", seed=index)
+    source = open_photos(tmp_path)
+    assert np.diff(source.telemetry.time_ns).tolist() == [2_000_000_000] * 3
+    assert source.start_ns == 1_622_541_600 * 1_000_000_000
+
+
+def test_a_photo_without_gps_is_delivered_but_has_no_sample(tmp_path: Path) -> None:
+    flight(tmp_path)
+    write_photo(tmp_path / "IMG_7.jpg", None, utc="2021:06:01 10:00:03", seed=9)
+    source = open_photos(tmp_path)
+    frames = all_frames(source)
+    assert all(isinstance(frame, Frame) for frame in frames) and len(frames) == 5
+    assert len(source.telemetry) == 4 and frames[2].time_ns not in source.telemetry.time_ns
+    assert codes(source) == {"photo_without_gps": 1}
+
+
+def test_null_and_teleporting_fixes_are_dropped_and_counted(tmp_path: Path) -> None:
+    flight(tmp_path, 8)
+    write_photo(tmp_path / "null.jpg", (0, 0, 0), utc="2021:06:01 10:00:05", seed=20)
+    write_photo(tmp_path / "far.jpg", (47.5, -92.25, 198), utc="2021:06:01 10:00:07", seed=21)
+    source = open_photos(tmp_path)
+    found = codes(source)
+    assert found["null_fix"] == 1 and found["jump"] == 1
+    assert len(source.telemetry) == 8 and len(all_frames(source)) == 10
+
+
+def test_corrupt_duplicate_empty_and_foreign_files(tmp_path: Path) -> None:
+    good = flight(tmp_path)
+    (tmp_path / "IMG_8 copy.jpg").write_bytes(good[0].read_bytes())
+    cut = write_photo(tmp_path / "IMG_20.jpg", utc="2021:06:01 10:00:20", seed=30)
+    cut.write_bytes(cut.read_bytes()[:-400])
+    (tmp_path / "IMG_21.jpg").touch()
+    (tmp_path / "IMG_22.jpg").write_bytes(b"not a picture")
+    (tmp_path / "notes.txt").write_text("windy")
+    (tmp_path / "._IMG_8.jpg").write_bytes(b"a resource fork")
+    source = open_photos(tmp_path)
+    lost = {frame.name: frame.reason for frame in all_frames(source) if isinstance(frame, LostFrame)}
+    assert sorted(lost) == ["IMG_20.jpg", "IMG_21.jpg", "IMG_22.jpg", "IMG_8 copy.jpg"]
+    assert lost["IMG_8 copy.jpg"] == "duplicate of IMG_8.jpg"
+    assert all(reason.startswith("corrupt: ") for name, reason in lost.items() if name != "IMG_8 copy.jpg")
+    found = codes(source)
+    assert found == {"duplicate_photo": 1, "unreadable_photo": 2, "corrupt_photo": 1, "ignored_file": 1,
+                     "photo_without_time": 2, "gap": 1}
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_orientation_is_applied_as_viewers_do(tmp_path: Path, orientation: int) -> None:
+    path = write_photo(tmp_path / "a.jpg", orientation=orientation)
+    with Image.open(path) as stored:
+        expected = np.asarray(ImageOps.exif_transpose(stored).convert("RGB")).astype(int)
+    image = all_frames(open_photos(path))[0].image
+    assert image.shape == expected.shape and np.abs(image - expected).max() <= 3
+
+
+def test_a_photo_that_lies_across_is_turned_to_fit(tmp_path: Path) -> None:
+    flight(tmp_path)
+    # a tag that a camera looking down wrote by mistake, and a picture that really was turned
+    write_photo(tmp_path / "IMG_90.jpg", utc="2021:06:01 10:01:00", orientation=6, seed=5)
+    turned = picture(seed=6).transpose(Image.Transpose.ROTATE_90)
+    write_photo(tmp_path / "IMG_91.jpg", utc="2021:06:01 10:01:02", image=turned)
+    source = open_photos(tmp_path)
+    frames = all_frames(source)
+    assert {frame.image.shape for frame in frames} == {(60, 80, 3)}
+    assert codes(source) == {"rotated_photo": 2, "gap": 1}
+    for frame, seed in zip(frames[-2:], (5, 6), strict=True):
+        assert np.abs(frame.image.astype(int) - np.asarray(picture(seed=seed))).mean() < 6
+
+
+def test_other_sizes_are_resampled_or_lost(tmp_path: Path) -> None:
+    flight(tmp_path)
+    write_photo(tmp_path / "IMG_90.jpg", utc="2021:06:01 10:00:08", image=picture(160, 120))
+    write_photo(tmp_path / "IMG_91.jpg", utc="2021:06:01 10:00:10", image=picture(80, 40))
+    source = open_photos(tmp_path)
+    frames = all_frames(source)
+    assert isinstance(frames[4], Frame) and frames[4].image.shape == (60, 80, 3)
+    assert isinstance(frames[5], LostFrame)
+    assert frames[5].reason == "size 80x40 differs from the flight's 80x60"
+    assert codes(source) == {"resized_photo": 1, "other_size": 1}
+
+
+@pytest.mark.parametrize("mode", ["L", "RGBA", "CMYK", "P", "I;16", "LA"])
+@pytest.mark.parametrize("suffix", [".tif", ".png", ".jpg"])
+def test_every_pixel_type_becomes_rgb(tmp_path: Path, mode: str, suffix: str) -> None:
+    image = picture()
+    if mode == "I;16":
+        values = np.asarray(image.convert("L")).astype(np.uint16) * 257
+        converted = Image.fromarray(values)
+    else:
+        converted = image.convert(mode)
+    buffer = io.BytesIO()
+    try:
+        converted.save(buffer, {".tif": "TIFF", ".png": "PNG", ".jpg": "JPEG"}[suffix])
+    except OSError:
+        pytest.skip(f"there is no {mode} in {suffix}")
+    decoded = decode_photo(buffer.getvalue(), "a")
+    assert decoded.shape == (60, 80, 3) and decoded.dtype == np.uint8
+    reference = image.convert("L").convert("RGB") if mode in ("L", "LA", "I;16") else image
+    tolerance = 25 if mode == "P" else 12  # a palette of few colours
+    assert np.abs(decoded.astype(int) - np.asarray(reference)).mean() < tolerance
+
+
+def test_sixteen_bit_colour_keeps_its_upper_bits() -> None:
+    colours = np.random.default_rng(0).integers(0, 65_536, (30, 40, 3), np.uint16)
+    for suffix in (".tiff", ".png"):
+        data = cv2.imencode(suffix, colours[:, :, ::-1])[1].tobytes()
+        decoded = decode_photo(data, "a").astype(int)
+        assert np.abs(decoded - colours.astype(int) // 256).max() <= 1
+
+
+def test_only_wanted_photos_are_decoded(tmp_path: Path) -> None:
+    paths = flight(tmp_path)
+    source = open_photos(tmp_path)
+    paths[1].unlink()  # a photo that is not wanted is not opened any more
+    asked: list[int] = []
+
+    def wanted(index: int, time_ns: int) -> bool:
+        asked.append(index)
+        return index != 1
+
+    assert [type(frame) for frame in source.frames(wanted)] == [Frame, Frame, Frame]
+    assert asked == [0, 1, 2, 3]
+
+
+def test_a_consumer_that_stops_early_ends_the_thread(tmp_path: Path) -> None:
+    flight(tmp_path)
+    frames = open_photos(tmp_path).frames(lambda index, time_ns: True)
+    assert next(frames).index == 0
+    frames.close()  # type: ignore[attr-defined]
+    assert next(frames, None) is None
+
+
+def test_huge_and_float_pictures_are_refused_before_decoding(tmp_path: Path) -> None:
+    huge = tmp_path / "huge.png"
+    picture().save(huge)
+    data = bytearray(huge.read_bytes())
+    data[16:24] = struct.pack(">II", 20_000, 16_000)  # a header that claims more than is there
+    data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    huge.write_bytes(data)
+    with pytest.raises(InputError, match="megapixels"):
+        read_photo_metadata(huge)
+    heights = tmp_path / "dem.tif"
+    Image.fromarray(np.zeros((10, 10), np.float32)).save(heights)
+    with pytest.raises(InputError, match="floating-point"):
+        read_photo_metadata(heights)
+
+
+@settings(max_examples=150, deadline=5000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32), flips=st.integers(0, 40), keep=st.floats(0.001, 1.0),
+       suffix=st.sampled_from([".jpg", ".tif", ".png"]), in_header=st.booleans())
+def test_damaged_photos_are_lost_not_errors(
+    tmp_path: Path, seed: int, flips: int, keep: float, suffix: str, in_header: bool
+) -> None:
+    chance = random.Random(seed)
+    path = tmp_path / f"a{suffix}"
+    write_photo(path, utc="2021:06:01 10:00:00", xmp=SENSEFLY.format(1, 2, 3) if suffix == ".jpg" else "")
+    data = bytearray(path.read_bytes())
+    for _ in range(flips):
+        data[chance.randrange(min(len(data), 700) if in_header else len(data))] ^= 1 << chance.randrange(8)
+    path.write_bytes(bytes(data[: max(1, int(keep * len(data)))]))
+    try:
+        source = open_photos(path)
+    except InputError:
+        return
+    assert len(all_frames(source)) == 1
+
+
+def test_an_album_of_nothing_readable_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(b"no")
+    with pytest.raises(InputError, match="none of the 1 pictures can be read"):
+        read_album([tmp_path / "a.jpg"])
