@@ -79,10 +79,6 @@ def _kml(plan: FlightPlan, lonlat: _LonLat, name: str) -> str:
     line.altitudemode = simplekml.AltitudeMode.relativetoground
     line.style.linestyle.width = 3
     line.style.linestyle.color = simplekml.Color.orange
-    for index, (lon, lat) in enumerate(lonlat):
-        point = document.newpoint(name=str(index), coords=[(lon, lat, plan.height_m)])
-        point.altitudemode = simplekml.AltitudeMode.relativetoground
-        point.style.iconstyle.scale = 0.5
     return str(document.kml())
 
 
