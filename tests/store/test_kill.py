@@ -10,7 +10,7 @@ import pytest
 from sorvolo.store.archive import Archive
 
 
-@pytest.mark.parametrize(("moments", "rounds"), [("random", 8), ("steps", 6)])
+@pytest.mark.parametrize(("moments", "rounds"), [("random", 5), ("steps", 6)])
 def test_a_site_survives_being_killed(tmp_path: Path, moments: str, rounds: int) -> None:
     folder = tmp_path / "site"
     program = [sys.executable, fake_flights.__file__, moments, str(folder), "1", str(rounds)]
