@@ -383,7 +383,9 @@ def _resampled(raster: Raster, onto: Raster) -> tuple[ImageGray, Mask]:
         source = cv2.pyrDown(source)  # type: ignore[assignment]
         places = places / 2
         raster = Raster(source, raster.origin_m, 2 * raster.m_per_px, raster.crs)
-    moved: Anything = cv2.remap(source, places, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    moved: Anything = cv2.remap(  # type: ignore[call-overload]
+        source, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
+    )
     gray: Anything = cv2.cvtColor(np.ascontiguousarray(moved[..., :3]), cv2.COLOR_RGB2GRAY)
     return gray, moved[..., 3] > 254
 

@@ -131,7 +131,7 @@ def fill_invalid(image: ImageRGB, valid: Mask) -> ImageRGB:
 
 
 def _coarser(gaussian: Anything) -> Anything:
-    return cv2.pyrDown(gaussian)  # type: ignore[return-value]
+    return cv2.pyrDown(gaussian)
 
 
 def _laplacian(gaussian: Anything, coarser: Anything | None, depth: int) -> Anything:

@@ -370,7 +370,7 @@ def _spans(outline_px: PointsPx, rows: NDArray[np.int64]) -> tuple[Floats, Float
 def _merit(frame: CanvasFrame, column: int, row: int, width: int, height: int) -> Floats:
     """(height, width) how well a frame shows each cell; -inf where it does not.
 
-    Within the image merit falls from its centre to its border and with the ground sampling distance, and is
+    Within the image merit falls from its centre to its border and with the ground area of a pixel, and is
     lower for oblique views; the flight's rank outweighs it. Just outside, where a cell may still be partly
     covered, it is very low, the lower the farther.
     """
@@ -396,7 +396,7 @@ def _merit(frame: CanvasFrame, column: int, row: int, width: int, height: int) -
         inside &= frame.valid[vi, ui]
     small, large = _stretch(frame)
     # small / large is the cosine of the angle of view at the centre: a tilted camera foreshortens the ground
-    quality = (1 - across**2) * (1 - down**2) * (small / large) ** 2 / coarseness
+    quality = (1 - across**2) * (1 - down**2) * (small / large) ** 2 / coarseness**2
     near = seen & (inner_px > -1.5 * _CELL_PX)
     outside = np.where(near, np.minimum(inner_px, 0.0) - 1e6, -np.inf)
     return np.where(inside, quality / (1 + quality) - frame.rank, outside)

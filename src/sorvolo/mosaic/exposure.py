@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.errors import GeometryError, SettingsError
-from sorvolo.geometry.arrays import Floats, ImageRGB, PointsPx, frozen
+from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, PointsPx, frozen
 
 _SHRINK = 4
 _ITERATIONS = 8
+_SIGMA_FROM_MEDIAN = 1.126  # of the root mean square of three normal numbers
 
 
 @dataclass(frozen=True)
@@ -121,13 +122,13 @@ def solve_exposure(
     for _ in range(_ITERATIONS):
         residual = difference + np.einsum("nk,nkc->nc", factors, solution[columns])
         length = np.linalg.norm(residual, axis=1) / np.sqrt(3)
-        spread = max(settings.colour_sigma, 1.4826 * float(np.median(length)))
+        spread = max(settings.colour_sigma, _SIGMA_FROM_MEDIAN * float(np.median(length)))
         weight = 1 / (1 + (length / spread) ** 2) / spread**2
         solution = _solve(columns, factors, difference, weight, prior, len(ids))
     limit = np.log(settings.largest_gain)
     gains = {e: np.exp(np.clip(solution[i], -limit, limit)) for e, i in column.items()}
     vignettes = {c: solution[i:i + 2, 0].copy() for c, i in lens.items()}
-    return Exposure(gains, vignettes, float(np.median(length) * 1.4826))
+    return Exposure(gains, vignettes, float(np.median(length)) * _SIGMA_FROM_MEDIAN)
 
 
 def corrected(image: ImageRGB, gains: Floats, vignette: Floats) -> ImageRGB:
@@ -207,7 +208,9 @@ def _sample(image: ImageRGB, points_px: PointsPx) -> Floats:
     grid = padded.reshape(-1, columns, 2)
     if not len(at):
         return np.zeros((0, 3))
-    colours = cv2.remap(smooth, grid, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    colours: Anything = cv2.remap(  # type: ignore[call-overload]
+        smooth, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     return colours.reshape(-1, 3)[:len(at)].astype(np.float64)
 
 
