@@ -327,9 +327,12 @@ class FlightWriter:
         self._is_open = False
         self._archive._writer = None
         try:
+            # files that no reader can see go first: on a full disk, forgetting the run needs their space
+            shutil.rmtree((self._archive.folder / self._image_path(0)).parent, ignore_errors=True)
+            self._archive._remove_unused()
             self._archive._forget_unfinished()
         except StoreError:
-            # a full disk can stop this, too; the next opening does it, and the first error is the one to tell
+            # if the disk is still full, the next opening does it, and the first error is the one to tell
             if error is None:
                 raise
 

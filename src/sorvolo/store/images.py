@@ -14,7 +14,7 @@ _JPEG = [
     cv2.IMWRITE_JPEG_QUALITY, 92,
     cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
 ]
-# one filter for all rows: trying each row with all of them, as zlib level 1 alone does here, takes twice as long
+# one filter for all rows: trying all of them on each row, as level 1 alone does here, takes twice as long
 _PNG_FAST = [
     cv2.IMWRITE_PNG_COMPRESSION, 1,
     cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
