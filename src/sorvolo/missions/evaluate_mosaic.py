@@ -374,10 +374,11 @@ def _resampled(raster: Raster, onto: Raster) -> tuple[ImageGray, Mask]:
         latitude_deg, longitude_deg = Projection(onto.crs).wgs84_from_projected(points_m)
         points_m = Projection(raster.crs).projected_from_wgs84(latitude_deg, longitude_deg)
     lattice: PointsPx = (points_m - raster.origin_m) / raster.m_per_px * [1.0, -1.0]
-    places: Anything = cv2.warpAffine(
-        lattice.reshape(len(rows), len(columns), 2).astype(np.float32),
-        np.array([[step, 0.0, 0], [0, step, 0]]), (width, height), flags=cv2.INTER_LINEAR,
-    )
+    # OpenCV's own enlargements round places to 1/32 of the lattice's step, which is pixels here
+    down = np.maximum(0.0, 1 - abs(np.arange(height)[:, None] - rows) / step)
+    across = np.maximum(0.0, 1 - abs(np.arange(width)[:, None] - columns) / step)
+    places = np.einsum("hr,rcd->hcd", down, lattice.reshape(len(rows), len(columns), 2))
+    places = np.einsum("wc,hcd->hwd", across, places, optimize=True).astype(np.float32)
     source = raster.rgba
     while onto.m_per_px > 2 * raster.m_per_px and min(source.shape[:2]) > 32:
         source = cv2.pyrDown(source)  # type: ignore[assignment]
