@@ -330,6 +330,7 @@ class FlightWriter:
             # files that no reader can see go first: on a full disk, forgetting the run needs their space
             shutil.rmtree((self._archive.folder / self._image_path(0)).parent, ignore_errors=True)
             self._archive._remove_unused()
+            self._archive._catalogue.fold_log()
             self._archive._forget_unfinished()
         except StoreError:
             # if the disk is still full, the next opening does it, and the first error is the one to tell

@@ -225,6 +225,16 @@ class Catalogue:
         with self._naming_faults(), self._engine.begin() as connection:
             yield connection
 
+    def fold_log(self) -> None:
+        """Move the write-ahead log into the file and empty it: on a full disk, its space is needed again."""
+        connection = self._engine.raw_connection()
+        try:
+            connection.cursor().execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        except sqlite3.OperationalError as error:
+            raise StoreError(f"disk full: could not tidy {self._path} ({error}); free some space") from error
+        finally:
+            connection.close()
+
     def _check(self) -> None:
         with self.reading() as connection:
             application = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
