@@ -1,3 +1,91 @@
-"""Sorvolo: geo-referenced maps from small drones while they fly, and what changed on the ground since."""
+"""Sorvolo: geo-referenced maps from small drones while they fly, and what changed on the ground since.
+
+What the commands do is here under the names in `__all__` (docs/python.md shows each); a name is loaded when
+it is first used, so that `import sorvolo` alone is quick.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sorvolo.capture.areas import read_area
+    from sorvolo.errors import GeometryError, InputError, SettingsError, SorvoloError, StoreError
+    from sorvolo.missions.calibrate_camera import (
+        calibrate_camera,
+        find_views,
+        parse_board,
+        write_calibration,
+    )
+    from sorvolo.missions.evaluate_mosaic import evaluate_mosaic
+    from sorvolo.missions.inspect_input import inspect_input
+    from sorvolo.missions.map_flight import map_flights
+    from sorvolo.missions.plan_flight import (
+        PlanSettings,
+        answer_questions,
+        camera_to_plan_with,
+        plan_over,
+        write_plan,
+    )
+    from sorvolo.missions.settings import MapSettings
+    from sorvolo.missions.simulate_site import simulate_site
+    from sorvolo.simulation.presets import preset, preset_names
+    from sorvolo.simulation.settings import SimulationSettings
+    from sorvolo.store.archive import Archive
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "Archive",
+    "GeometryError",
+    "InputError",
+    "MapSettings",
+    "PlanSettings",
+    "SettingsError",
+    "SimulationSettings",
+    "SorvoloError",
+    "StoreError",
+    "__version__",
+    "answer_questions",
+    "calibrate_camera",
+    "camera_to_plan_with",
+    "evaluate_mosaic",
+    "find_views",
+    "inspect_input",
+    "map_flights",
+    "parse_board",
+    "plan_over",
+    "preset",
+    "preset_names",
+    "read_area",
+    "simulate_site",
+    "write_calibration",
+    "write_plan",
+]
+
+_HOMES = {
+    "capture.areas": ("read_area",),
+    "errors": ("GeometryError", "InputError", "SettingsError", "SorvoloError", "StoreError"),
+    "missions.calibrate_camera": ("calibrate_camera", "find_views", "parse_board", "write_calibration"),
+    "missions.evaluate_mosaic": ("evaluate_mosaic",),
+    "missions.inspect_input": ("inspect_input",),
+    "missions.map_flight": ("map_flights",),
+    "missions.plan_flight": (
+        "PlanSettings", "answer_questions", "camera_to_plan_with", "plan_over", "write_plan",
+    ),
+    "missions.settings": ("MapSettings",),
+    "missions.simulate_site": ("simulate_site",),
+    "simulation.presets": ("preset", "preset_names"),
+    "simulation.settings": ("SimulationSettings",),
+    "store.archive": ("Archive",),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{home}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,84 @@
+"""`sorvolo demo`: from nothing to a map, with two simulated flights."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+
+from sorvolo import __version__
+from sorvolo.cli.map import map_and_read_reports, show_reports
+from sorvolo.missions.evaluate_mosaic import evaluate_mosaic
+from sorvolo.missions.settings import MapSettings
+from sorvolo.missions.simulate_site import MARK, simulate_site
+from sorvolo.simulation.presets import preset
+from sorvolo.simulation.settings import SimulationSettings
+from sorvolo.store.exports import plain_json
+
+_DEFAULT_FOLDER = Path("demo-site")
+_FLIGHT = Path("flight1") / "flight1.mp4"
+_LATER_FLIGHT = Path("flight2") / "flight2.mp4"
+
+
+def demo(
+    folder: Annotated[
+        Path, typer.Argument(help="Folder to make; the demo's own files in it are replaced.")
+    ] = _DEFAULT_FOLDER,
+) -> None:
+    """Simulate two flights over a field, map the first, and measure the map against the truth.
+
+    Example: sorvolo demo
+    """
+    simulation, site = folder / "simulation", folder / "site"
+    console = Console()
+    settings = preset("demo")
+    if _is_simulated(simulation, settings):
+        console.print(f"flights of an earlier run: {simulation}", soft_wrap=True, highlight=False)
+    else:
+        console.print(f"simulating two flights: {simulation}", soft_wrap=True, highlight=False)
+        _simulate(simulation, settings)
+    console.print("mapping the first flight")
+    reports = map_and_read_reports(
+        [simulation / _FLIGHT], site, MapSettings(), camera=str(simulation / "camera.xml")
+    )
+    show_reports(reports, site, console)
+    for truth in evaluate_mosaic(site, truth=simulation).truth[:1]:
+        corners = truth.corners
+        console.print(
+            f"Against the truth, the corners of the frames lie {corners.absolute.rms_m:.2f} m off (rms), as "
+            f"GPS noise moves the map as a whole; within the map they are {corners.shape.rms_m:.3f} m off."
+        )
+    later, camera = simulation / _LATER_FLIGHT, simulation / "camera.xml"
+    console.print("Next, look at the second flight, or map one of your own:")
+    for command in (
+        f"sorvolo inspect {later} --camera {camera}",
+        f"sorvolo evaluate mosaic {site} --truth {simulation}",
+        "sorvolo map MY_VIDEO.MP4 --site my-site",
+    ):
+        console.print(f"  {command}", soft_wrap=True, highlight=False, markup=False)
+
+
+def _simulate(folder: Path, settings: SimulationSettings) -> None:
+    columns = (
+        SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=30), TimeRemainingColumn()
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("the site", total=None)
+        for step in simulate_site(folder, settings):
+            if step.stage == "frames":
+                progress.update(
+                    task, description=step.flight, completed=step.frames_done, total=step.frames_total
+                )
+
+
+def _is_simulated(folder: Path, settings: SimulationSettings) -> bool:
+    """Whether an earlier run of this version left the very flights that are wanted."""
+    try:
+        told = json.loads((folder / MARK).read_text(encoding="utf-8"))
+        same = told["settings"] == plain_json(asdict(settings)) and told["versions"]["sorvolo"] == __version__
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return bool(same) and (folder / _FLIGHT).is_file()

@@ -1,0 +1,104 @@
+"""The command `sorvolo`: its commands, and the one place where errors become exit codes."""
+
+import errno
+import os
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import typer
+
+from sorvolo import __version__
+from sorvolo.cli.calibrate import calibrate
+from sorvolo.cli.demo import demo
+from sorvolo.cli.evaluate import evaluate_app
+from sorvolo.cli.inspect import inspect
+from sorvolo.cli.map import map_command
+from sorvolo.cli.plan import plan
+from sorvolo.cli.simulate import simulate
+from sorvolo.errors import SorvoloError
+
+_COMMANDS: dict[str, Callable[..., None]] = {
+    "inspect": inspect, "plan": plan, "map": map_command, "simulate": simulate, "calibrate": calibrate,
+    "demo": demo,
+}
+_FAILED, _STOPPED = 1, 130
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+for _name, _command in _COMMANDS.items():
+    app.command(_name)(_command)
+app.add_typer(evaluate_app, name="evaluate")
+
+
+@dataclass
+class _Wishes:
+    """What the options before the command ask for."""
+
+    debug: bool
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command. The exit code: 0 well, 1 an error that was told, 2 wrong usage, 130 stopped."""
+    wishes = _Wishes(debug=os.environ.get("SORVOLO_DEBUG", "") not in ("", "0"))
+    try:
+        app(args=None if arguments is None else list(arguments), prog_name="sorvolo", obj=wishes)
+    except SystemExit as stop:
+        code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else _FAILED
+        if code == _STOPPED:
+            _tell("stopped; the site is as it was before")
+        return code
+    except Exception as error:
+        if wishes.debug:
+            traceback.print_exc()
+        _tell(f"error: {_words_of(error)}")
+        return _FAILED
+    return 0
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"sorvolo {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    context: typer.Context,
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop."),
+    ] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show where in the program an error arose.")
+    ] = False,
+) -> None:
+    """Geo-referenced maps from small drones, with an honest report.
+
+    Start with `sorvolo demo`, or with `sorvolo inspect` on a video or a folder of photos.
+    """
+    if debug:
+        context.obj.debug = True
+
+
+def _words_of(error: Exception) -> str:
+    """One line that says what happened and what to do."""
+    if isinstance(error, SorvoloError):
+        return str(error)
+    if isinstance(error, OSError) and error.errno in _FULL:
+        where = f" while writing {error.filename}" if error.filename else ""
+        return f"the disk is full{where}; free some space and run the same command again"
+    if isinstance(error, OSError) and error.strerror:
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror}; check that the path exists and may be read and written"
+    if isinstance(error, MemoryError):
+        return "out of memory; close other programs, or make a coarser map with --gsd"
+    return (
+        f"this is a bug in sorvolo {__version__}: {type(error).__name__}: {error}. Please report it with the "
+        "command and what it prints after `sorvolo --debug ...` (CONTRIBUTING.md says how)"
+    )
+
+
+def _tell(text: str) -> None:
+    typer.echo(" ".join(text.split()), err=True)

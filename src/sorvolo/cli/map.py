@@ -1,0 +1,177 @@
+"""`sorvolo map`: flights into a site folder, and in the end what became of them."""
+
+import json
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import closing
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from sorvolo.cli.progress import show_progress
+from sorvolo.errors import StoreError
+from sorvolo.missions.map_flight import map_flights
+from sorvolo.missions.settings import MapSettings
+from sorvolo.store.archive import Archive
+from sorvolo.survey.mosaic import MosaicUpdate, Status
+
+_COLOURS = {Status.VISION: "green", Status.GPS_ONLY: "yellow", Status.REJECTED: "red"}
+_MOST_REASONS = 6
+
+
+class Method(StrEnum):
+    """How frames are registered."""
+
+    PLANAR = "planar"
+    THESIS = "thesis"
+
+
+class Transform(StrEnum):
+    """What method thesis fits between a frame and the map."""
+
+    SIMILARITY = "similarity"
+    HOMOGRAPHY = "homography"
+
+
+def map_command(
+    inputs: Annotated[list[Path], typer.Argument(help="Videos, folders of photos, or photos.")],
+    site: Annotated[Path, typer.Option(help="Folder of the map; one that exists is extended.")],
+    telemetry: Annotated[
+        Path | None, typer.Option(help="The flight's log, if not beside the video.")
+    ] = None,
+    camera: Annotated[str, typer.Option(help="Calibration file, preset name or EXIF code, or aov=DEG.")] = "",
+    area: Annotated[
+        Path | None, typer.Option(help="Outline outside of which frames are not used: GeoJSON, KML, KMZ.")
+    ] = None,
+    method: Annotated[
+        Method, typer.Option(help="planar: ours. thesis: the baseline, frame against map.")
+    ] = Method.PLANAR,
+    gsd: Annotated[
+        float | None, typer.Option(help="Metres a pixel of a new map; else the frames' own.")
+    ] = None,
+    overlap: Annotated[float, typer.Option(help="Overlap of the frames selected, 0 to 1.")] = 0.7,
+    offset: Annotated[
+        float | None, typer.Option(help="Telemetry time minus video time, s; else found from motion.")
+    ] = None,
+    ground_elevation: Annotated[
+        float | None, typer.Option(help="Of the ground, m, in telemetry's own height reference.")
+    ] = None,
+    crs: Annotated[str, typer.Option(help="CRS of mosaic.tif, such as EPSG:25832; else the UTM zone.")] = "",
+    transform: Annotated[Transform, typer.Option(help="Of method thesis.")] = Transform.SIMILARITY,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Make a geo-referenced map of one or more flights, or extend the map in the site folder.
+
+    Example: sorvolo map DJI_0042.MP4 --site field
+
+    Example: sorvolo map photos/ --site field --camera phantom.xml --area field.geojson
+    """
+    settings = MapSettings(
+        method.value, gsd, overlap, offset, ground_elevation, crs or None, transform.value,
+    )
+    reports = map_and_read_reports(
+        inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area
+    )
+    if as_json:
+        plain = [{key: value for key, value in each.items() if key != "track"} for each in reports]
+        files = {name: str(path) for name, path in _map_files(site).items()}
+        typer.echo(json.dumps({"site": str(site), **files, "flights": plain}, indent=1))
+    else:
+        show_reports(reports, site, Console())
+
+
+def map_and_read_reports(
+    inputs: Sequence[Path], site: Path, settings: MapSettings, *, telemetry: Path | None = None,
+    camera: str | None = None, area: Path | None = None,
+) -> list[dict[str, Any]]:
+    """Map with a bar on stderr; the reports of the flights that were mapped, in order."""
+    before = _newest_version(site)
+    mapping = map_flights(inputs, site, settings, telemetry=telemetry, camera=camera, area=area)
+    # closed even when the bar is stopped: then the site is as it was
+    with closing(cast("Generator[MosaicUpdate]", mapping)) as updates:
+        show_progress(updates, Console(stderr=True))
+    with Archive.open(site, write=False) as archive:
+        mapped = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
+        return [_read_report(archive.flight_folder(flight_id) / "report.json") for flight_id in mapped]
+
+
+def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Console) -> None:
+    """Tell what became of the flights, what to look at first, and where the files are."""
+    for report in reports:
+        _show_report(report, console)
+    for name, path in _map_files(site).items():
+        _tell_path(name, path, console)
+    for report in reports:
+        _tell_path("report", site / "flights" / report["flight"] / "report.html", console)
+
+
+def _show_report(report: Mapping[str, Any], console: Console) -> None:
+    frames = report["frames"]
+    table = Table(title=f"Flight {escape(report['flight'])}", show_header=False, title_justify="left")
+    table.add_row("frames", f"{frames['selected']} selected of {frames['total']}")
+    for status, colour in _COLOURS.items():
+        if frames[status.value]:
+            table.add_row(f"[{colour}]{status.value}[/{colour}]", str(frames[status.value]))
+    for reason, count in list(frames["reasons"].items())[:_MOST_REASONS]:
+        table.add_row("", escape(f"{count} x {reason}"))
+    unit = "m" if report["georeferenced"] else "units"
+    for name, text in (
+        ("residual", _with_unit("{:.2f} px median", report["residual_px"]["median"])),
+        ("off GPS", _with_unit("{:.2f} " + unit + " median", report["gps_residual_m"]["median"])),
+        ("place good to", _with_unit("{:.2f} " + unit + ", one sigma", report["sigma_m"])),
+        ("map", _size(report)),
+        ("clock offset", _clock_offset(report["time_offset"])),
+        ("took", f"{report['seconds']['total']:.1f} s, {report['peak_memory_mb']:.0f} MB at most"),
+    ):
+        if text:
+            table.add_row(name, text)
+    console.print(table)
+    for notice in report["notices"]:
+        console.print(f"[blue]note[/blue]     {escape(notice['text'])}")
+    for warning in report["warnings"]:
+        console.print(f"[yellow]warning[/yellow]  {escape(warning)}")
+
+
+def _size(report: Mapping[str, Any]) -> str:
+    if not report["georeferenced"]:
+        return "in a frame of its own, without metres and north"
+    return f"{report['area_m2']:.0f} m2 at {100 * report['ground_sampling_distance_m']:.2f} cm a pixel"
+
+
+def _clock_offset(offset: Mapping[str, Any]) -> str:
+    parts = [] if offset["origin"] == "none" else [f"{offset['applied_s']:+.2f} s, {offset['origin']}"]
+    if offset["estimate_s"] is not None:
+        parts.append(f"motion shows {offset['estimate_s']:+.2f} s within {offset['sigma_s']:.2f} s")
+    return "; ".join(parts)
+
+
+def _with_unit(pattern: str, number: float | None) -> str:
+    return "" if number is None else pattern.format(number)
+
+
+def _tell_path(name: str, path: Path, console: Console) -> None:
+    # in one piece, however long: people copy it
+    console.print(f"{name:>8}  {escape(str(path))}", soft_wrap=True, highlight=False)
+
+
+def _map_files(site: Path) -> dict[str, Path]:
+    named = {"picture": "preview.png", "GeoTIFF": "mosaic.tif", "KMZ": "mosaic.kmz"}
+    return {name: site / file for name, file in named.items() if (site / file).is_file()}
+
+
+def _newest_version(site: Path) -> int:
+    if not (site / "site.db").is_file():
+        return 0
+    with Archive.open(site, write=False) as archive:
+        return max((each.id for each in archive.versions() if each.complete), default=0)
+
+
+def _read_report(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path} cannot be read ({error}); map the flight again") from error
