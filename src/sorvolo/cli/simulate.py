@@ -8,7 +8,14 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from sorvolo.errors import SettingsError
 from sorvolo.missions.simulate_site import SimulationProgress, simulate_site
@@ -19,14 +26,22 @@ from sorvolo.simulation.settings import SimulationSettings
 
 def simulate(
     folder: Annotated[Path, typer.Argument(help="Folder to make; an earlier simulation there is replaced.")],
-    preset_name: Annotated[str, typer.Option("--preset", help="What to simulate; --list-presets names all.")] = "demo",
+    preset_name: Annotated[
+        str, typer.Option("--preset", help="What to simulate; --list-presets names all.")
+    ] = "demo",
     seed: Annotated[int | None, typer.Option(help="Everything random follows from this number.")] = None,
-    ground: Annotated[str, typer.Option(help="dirt, countryside, urban, sand, or an orthophoto's file.")] = "",
-    ground_gsd: Annotated[float | None, typer.Option(help="Metres per pixel of an orthophoto without a CRS.")] = None,
+    ground: Annotated[
+        str, typer.Option(help="dirt, countryside, urban, sand, or an orthophoto's file.")
+    ] = "",
+    ground_gsd: Annotated[
+        float | None, typer.Option(help="Metres per pixel of an orthophoto without a CRS.")
+    ] = None,
     flights: Annotated[int | None, typer.Option(help="Number of flights; later ones find changes.")] = None,
     gps_noise: Annotated[float | None, typer.Option(help="White noise of each fix and axis, m rms.")] = None,
     gps_rate: Annotated[float | None, typer.Option(help="Fixes a second; else the format's own.")] = None,
-    clock_offset: Annotated[float | None, typer.Option(help="Telemetry's clock minus the video's, s.")] = None,
+    clock_offset: Annotated[
+        float | None, typer.Option(help="Telemetry's clock minus the video's, s.")
+    ] = None,
     telemetry: Annotated[str, typer.Option(help="csv, srt, nmea, gpx, all or none.")] = "",
     faults: Annotated[int, typer.Option(help="So many gaps, jumps, 0/0 fixes and bad checksums each.")] = 0,
     height: Annotated[float | None, typer.Option(help="Height above the ground, m.")] = None,
@@ -36,7 +51,9 @@ def simulate(
     tilt: Annotated[float | None, typer.Option(help="Roll and pitch, deg rms.")] = None,
     fps: Annotated[float | None, typer.Option(help="Frames a second of the video.")] = None,
     size: Annotated[str, typer.Option(help="Picture size, such as 1280x720.")] = "",
-    photos: Annotated[bool, typer.Option("--photos", help="Write geo-tagged JPEG photos instead of a video.")] = False,
+    photos: Annotated[
+        bool, typer.Option("--photos", help="Write geo-tagged JPEG photos instead of a video.")
+    ] = False,
     list_presets: Annotated[bool, typer.Option("--list-presets", help="Name the presets and stop.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object a step.")] = False,
 ) -> None:
@@ -76,11 +93,13 @@ def simulate(
         _show(steps, folder)
 
 
-def _with_options(settings: SimulationSettings, top: dict[str, object], **parts: dict[str, object]) -> SimulationSettings:
+def _with_options(
+    settings: SimulationSettings, top: dict[str, object], **parts: dict[str, object]
+) -> SimulationSettings:
     """The settings with every option that was given; None was not."""
     for name, options in parts.items():
         given = {key: value for key, value in options.items() if value is not None}
-        settings = replace(settings, **{name: replace(getattr(settings, name), **given)})  # type: ignore[arg-type]
+        settings = replace(settings, **{name: replace(getattr(settings, name), **given)})
     return replace(settings, **{key: value for key, value in top.items() if value is not None})  # type: ignore[arg-type]
 
 

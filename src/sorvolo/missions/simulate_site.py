@@ -62,17 +62,23 @@ class SimulationProgress:
 
 
 def simulate_site(
-    folder: Path, settings: SimulationSettings, ground_file: Path | None = None, ground_m_per_px: float | None = None
+    folder: Path,
+    settings: SimulationSettings,
+    ground_file: Path | None = None,
+    ground_m_per_px: float | None = None,
 ) -> Iterator[SimulationProgress]:
     """Write the flights and their truth to `folder`, which appears whole or not at all.
 
-    `ground_file` is the orthophoto of settings whose ground is "orthophoto". Raises SettingsError for a folder that
-    holds anything but an earlier simulation, InputError for an unreadable orthophoto and StoreError for a full disk.
+    `ground_file` is the orthophoto of settings whose ground is "orthophoto". Raises SettingsError for a
+    folder that holds anything but an earlier simulation, InputError for an unreadable orthophoto and
+    StoreError for a full disk.
     """
     started = time.monotonic()
     folder = folder.resolve()
     _demand_free(folder)
-    ground = None if ground_file is None else orthophoto_ground(*read_orthophoto(ground_file, ground_m_per_px))
+    ground = (
+        None if ground_file is None else orthophoto_ground(*read_orthophoto(ground_file, ground_m_per_px))
+    )
     partial = folder.with_name(f".{folder.name}.partial")
     with writing(folder):
         _remove_ours(partial)
@@ -204,7 +210,7 @@ def _demand_free(folder: Path) -> None:
         raise SettingsError(f"{folder} is a file; choose a folder for the simulation")
     if folder.is_dir() and any(folder.iterdir()) and not _is_ours(folder):
         raise SettingsError(
-            f"{folder} is not empty and holds no earlier simulation; choose another folder or empty it yourself"
+            f"{folder} is not empty and holds no earlier simulation; choose another folder, or empty it"
         )
 
 

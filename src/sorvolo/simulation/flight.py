@@ -14,14 +14,15 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
+from sorvolo.simulation.bodies import build_body
 from sorvolo.simulation.ground import PaintedGround
 from sorvolo.simulation.noise import SmoothSeries, layer, smooth_series
-from sorvolo.simulation.objects import Body, Thing, build_body
+from sorvolo.simulation.objects import Body, Thing
 from sorvolo.simulation.path import LEAD_S, FlownPath, fly, path_of_flight, planned_waypoints
 from sorvolo.simulation.rendering import render
 from sorvolo.simulation.settings import TELEMETRY_FORMATS, SimulationSettings
 from sorvolo.simulation.telemetry import Observation, observe
-from sorvolo.simulation.view import RaysF32, View, camera_view, ray_grid
+from sorvolo.simulation.view import RaysF32, View, camera_view, ray_grid, remapped
 from sorvolo.simulation.world import Day, World, build_day, build_world
 from sorvolo.survey.flight import Frame, Telemetry, no_telemetry
 
@@ -47,7 +48,8 @@ class _Imaging:
 class SimulatedFlight:
     """A flight over a world whose every pose is known; `number` counts from 1.
 
-    With `settings.output.photos` its frames are photos at the wanted overlap, else a video's at the wanted rate.
+    With `settings.output.photos` its frames are photos at the wanted overlap, else a video's at the
+    wanted rate.
     """
 
     settings: SimulationSettings
@@ -98,7 +100,8 @@ class SimulatedFlight:
 
     @property
     def from_middle_s(self) -> Floats:
-        """(N,) the frames' times since the middle of the flight: moving things are where they started there."""
+        """(N,) the frames' times since the middle of the flight: moving things are where they started
+        there."""
         return self.frame_times_s - self.path.duration_s / 2
 
     def frame_name(self, index: int) -> str:
@@ -121,7 +124,8 @@ class SimulatedFlight:
             yield self.frame(index)
 
     def telemetry(self, format_name: str | None = None) -> Telemetry:
-        """What was recorded, in the format's own columns; by default that of the photos or the primary format."""
+        """What was recorded, in the format's own columns; by default that of the photos or the primary
+        format."""
         observation = self.observation(format_name)
         return no_telemetry() if observation is None else observation.telemetry
 
@@ -143,7 +147,8 @@ class SimulatedFlight:
         today = {thing.id: thing for thing in self.day.things}
         m_per_px = self.path.height_m / self.camera.fx_px
         first = tuple(
-            today[thing.id] if not has_changed(thing, today.get(thing.id)) else thing for thing in self.world.days[0]
+            today[thing.id] if not has_changed(thing, today.get(thing.id)) else thing
+            for thing in self.world.days[0]
         )
         bodies = {
             thing.id: self.day.bodies[thing.id] if today.get(thing.id) is thing
@@ -156,16 +161,22 @@ class SimulatedFlight:
         image = self._blurred(image, index)
         time_s = float(self.frame_times_s[index])
         brightness = np.exp(float(imaging.exposure(time_s))) * self.day.gains
-        balance = np.exp([float(imaging.white_balance[0](time_s)), 0.0, float(imaging.white_balance[1](time_s))])
+        balance = np.exp(
+            [float(imaging.white_balance[0](time_s)), 0.0, float(imaging.white_balance[1](time_s))]
+        )
         shade = imaging.vignette if self.day.cloud_shade == 0 else imaging.vignette * self._cloud_light(index)
         gains = cv2.merge([shade * np.float32(gain) for gain in brightness * balance])
         exposed = cv2.multiply(image, gains, dtype=cv2.CV_32F)
         if settings.noise == 0:
-            return cv2.convertScaleAbs(np.clip(exposed, 0, 255))
+            return np.clip(np.round(exposed), 0, 255).astype(np.uint8)
         rng = np.random.default_rng([self.settings.seed, 6, self.number, index])
         height, width = image.shape[:2]
-        y, x = rng.integers(0, imaging.noise.shape[0] - height + 1), rng.integers(0, imaging.noise.shape[1] - width + 1)
-        return cv2.add(exposed, imaging.noise[y:y + height, x:x + width], dtype=cv2.CV_8U)
+        y, x = (
+            rng.integers(0, imaging.noise.shape[0] - height + 1),
+            rng.integers(0, imaging.noise.shape[1] - width + 1),
+        )
+        noisy = cv2.add(exposed, imaging.noise[y:y + height, x:x + width], dtype=cv2.CV_8U)
+        return np.asarray(noisy, np.uint8)
 
     def _blurred(self, image: ImageRGB, index: int) -> ImageRGB:
         """Motion blur about the middle of the exposure, which is the frame's time."""
@@ -177,13 +188,15 @@ class SimulatedFlight:
         ground = apply_homography(site_from_image_homography(camera, self.true_poses[index]), middle)
         point = np.column_stack([ground, [0.0]])
         start, end = (
-            camera.pixels_from_points(self.path.pose(time_s + side * exposure_s / 2).inverse().apply(point))[0]
+            camera.pixels_from_points(self.path.pose(time_s + side * exposure_s / 2).inverse().apply(point))[
+                0
+            ]
             for side in (-1, 1)
         )
         moved = end - start
         if np.hypot(*moved) < 0.3:
             return image
-        return cv2.filter2D(image, -1, _line_kernel(moved))
+        return np.asarray(cv2.filter2D(image, -1, _line_kernel(moved)), np.uint8)
 
     def _cloud_light(self, index: int) -> NDArray[np.float32]:
         """(height, width) how much light clouds leave on the ground at each pixel."""
@@ -192,10 +205,13 @@ class SimulatedFlight:
         rays = np.dstack([rays, np.ones(rays.shape[:2], np.float32)]) @ pose.rotation.T.astype(np.float32)
         ground = pose.translation_m[:2] - rays[..., :2] / rays[..., 2:] * pose.translation_m[2]
         drift = np.array([2.2, 1.1]) * float(self.from_middle_s[index])
-        cells = ((ground - drift) / _CLOUD_CELL_M + np.array(self.imaging.clouds.shape) / 2).astype(np.float32)
-        thickness = cv2.remap(self.imaging.clouds, cells, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        cells = ((ground - drift) / _CLOUD_CELL_M + np.array(self.imaging.clouds.shape) / 2).astype(
+            np.float32
+        )
+        thickness = remapped(self.imaging.clouds, cells, cv2.BORDER_WRAP)
         light = 1 - np.float32(self.day.cloud_shade) * np.clip(1.1 * thickness - 0.1, 0, 1)
-        return cv2.resize(light, (camera.width_px, camera.height_px), interpolation=cv2.INTER_LINEAR)
+        grown = cv2.resize(light, (camera.width_px, camera.height_px), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(grown, np.float32)
 
 
 def simulate_flights(
@@ -205,14 +221,18 @@ def simulate_flights(
 
     Raises SettingsError when the ground is an orthophoto that is missing or too small.
     """
-    plans = [path_of_flight(settings.path, settings.later, number) for number in range(1, settings.flights + 1)]
-    world = build_world(settings, np.concatenate([planned_waypoints(plan) for plan in plans]), orthophoto)
+    plans = [
+        path_of_flight(settings.path, settings.later, number) for number in range(1, settings.flights + 1)
+    ]
+    world = build_world(settings, [planned_waypoints(plan) for plan in plans], orthophoto)
     for number, plan in enumerate(plans, start=1):
         rng = np.random.default_rng([settings.seed, 5, number])
         path = fly(plan, settings.motion, rng)
         day = build_day(world, settings, number, plan.height_m / settings.imaging.camera.fx_px)
         imaging = _set_up(settings, path, rng)
-        yield SimulatedFlight(settings, number, world, day, path, imaging, _observe_all(settings, path, number))
+        yield SimulatedFlight(
+            settings, number, world, day, path, imaging, _observe_all(settings, path, number)
+        )
 
 
 def simulate_flight(settings: SimulationSettings, orthophoto: PaintedGround | None = None) -> SimulatedFlight:
@@ -234,7 +254,7 @@ def _frame_times_s(settings: SimulationSettings, path: FlownPath) -> Floats:
         step_s = step_m / settings.path.speed_m_s
     else:
         step_s = 1 / settings.imaging.fps
-    return np.arange(int(np.floor(path.duration_s / step_s + 1e-9)) + 1) * step_s
+    return np.arange(int(np.floor(path.duration_s / step_s + 1e-9)) + 1, dtype=np.float64) * step_s
 
 
 def _observe_all(settings: SimulationSettings, path: FlownPath, number: int) -> dict[str, Observation]:
@@ -255,7 +275,7 @@ def _set_up(settings: SimulationSettings, path: FlownPath, rng: np.random.Genera
     imaging, camera = settings.imaging, settings.imaging.camera
     span = (-LEAD_S, path.duration_s + LEAD_S)
     rays = ray_grid(camera)
-    vignette = 1 / (1 + 0.22 * (rays**2).sum(axis=2)) ** 1.0
+    vignette = 1 / (1 + 0.22 * (rays**2).sum(axis=2))
     spare = 96  # each frame takes another window of one large noise picture
     noise = rng.standard_normal((camera.height_px + spare, camera.width_px + spare, 3), dtype=np.float32)
     exposure = smooth_series(rng, *span, 6.0, imaging.exposure_drift)
@@ -264,7 +284,9 @@ def _set_up(settings: SimulationSettings, path: FlownPath, rng: np.random.Genera
         smooth_series(rng, *span, 12.0, imaging.white_balance_drift),
     )
     clouds = layer(rng, (256, 256), 4.0) + 0.35 * layer(rng, (256, 256), 1.6)
-    return _Imaging(rays, vignette.astype(np.float32), noise * np.float32(imaging.noise), exposure, balance, clouds)
+    return _Imaging(
+        rays, vignette.astype(np.float32), noise * np.float32(imaging.noise), exposure, balance, clouds
+    )
 
 
 def _line_kernel(moved_px: Floats) -> NDArray[np.float32]:

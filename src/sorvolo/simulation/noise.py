@@ -26,7 +26,9 @@ def layer(rng: np.random.Generator, shape: tuple[int, int], scale_px: float) -> 
     knots = rng.standard_normal((rows, columns), dtype=np.float32)
     # two knots are spare on every side, so that no edge of the field is stretched
     grown = cv2.resize(
-        knots, (int(np.ceil(columns * scale_px)), int(np.ceil(rows * scale_px))), interpolation=cv2.INTER_CUBIC
+        knots,
+        (int(np.ceil(columns * scale_px)), int(np.ceil(rows * scale_px))),
+        interpolation=cv2.INTER_CUBIC,
     )
     top, left = int(scale_px), int(scale_px)
     if grown.shape[0] < top + height or grown.shape[1] < left + width:
@@ -56,7 +58,8 @@ class SmoothSeries:
 
     spline: CubicSpline
 
-    def __call__(self, time_s: Anything) -> Floats:
+    def __call__(self, time_s: Anything | float) -> Floats:
+        """The number at these times, in their shape."""
         return np.asarray(self.spline(time_s), dtype=np.float64)
 
 

@@ -1,6 +1,7 @@
 """The path that a simulated drone really flew: its camera's pose at any moment."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -43,7 +44,9 @@ class FlownPath:
     def velocity_m_s(self, time_s: Floats) -> PointsM:
         """(N, 3) the camera's velocity in the site frame."""
         half_s = 0.05
-        return (self.position_m(np.asarray(time_s) + half_s) - self.position_m(np.asarray(time_s) - half_s)) / (2 * half_s)
+        return (
+            self.position_m(np.asarray(time_s) + half_s) - self.position_m(np.asarray(time_s) - half_s)
+        ) / (2 * half_s)
 
     def pose(self, time_s: float) -> Pose:
         """site_from_camera at a time."""
@@ -65,7 +68,10 @@ def planned_waypoints(settings: PathSettings) -> PointsM:
     # along the heading and to its right
     local = np.array([(along, row) for row, pair in zip(rows, ends) for along in pair])
     heading = np.radians(settings.heading_deg)
-    forward, right = np.array([np.sin(heading), np.cos(heading)]), np.array([np.cos(heading), -np.sin(heading)])
+    forward, right = (
+        np.array([np.sin(heading), np.cos(heading)]),
+        np.array([np.cos(heading), -np.sin(heading)]),
+    )
     return local[:, :1] * forward + local[:, 1:] * right
 
 
@@ -114,7 +120,7 @@ def path_of_flight(path: PathSettings, later: LaterSettings, flight: int) -> Pat
 
 def _densely(corners_m: PointsM) -> PointsM:
     pieces = []
-    for start, end in zip(corners_m[:-1], corners_m[1:]):
+    for start, end in pairwise(corners_m):
         count = max(2, int(np.ceil(np.hypot(*(end - start)) / _STEP_M)))
         pieces.append(start + (end - start) * np.linspace(0, 1, count, endpoint=False)[:, None])
     return np.concatenate([*pieces, corners_m[-1:]])

@@ -1,4 +1,5 @@
-"""Ready-made simulations: the demo, the benchmark flights, and the variety of the UMCD dataset (Tables 2.1-2.4)."""
+"""Ready-made simulations: the demo, the benchmark flights, and the variety of the UMCD dataset (Tables
+2.1-2.4)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,7 +19,8 @@ from sorvolo.simulation.settings import (
 
 @dataclass(frozen=True)
 class _Row:
-    """One video of the dataset, as its tables describe it; height, speed and size are ours where they are silent."""
+    """One video of the dataset, as its tables describe it; height, speed and size are ours where they
+    are silent."""
 
     ground: str
     length_s: float
@@ -39,13 +41,38 @@ _SD, _HD, _FULL = (720, 540), (1280, 720), (1920, 1080)
 # length s, fps, altitude m, speed m/s: Table 2.1
 _WITHOUT_TELEMETRY = {
     "dirt": (
-        (18, 25, 8, 3), (15, 25, 9, 3), (16, 25, 9, 5), (11, 25, 9, 3), (19, 25, 8, 3), (8, 25, 8, 4), (9, 25, 8, 4),
-        (12, 25, 10, 2), (9, 25, 9, 3), (13, 25, 10, 3), (12, 25, 9, 2), (8, 25, 8, 3), (13, 50, 15, 3), (16, 50, 14, 3),
-        (15, 50, 15, 2), (22, 50, 13, 2), (16, 50, 10, 2), (8, 50, 6, 4), (10, 50, 6, 3), (20, 50, 6, 2),
+        (18, 25, 8, 3),
+        (15, 25, 9, 3),
+        (16, 25, 9, 5),
+        (11, 25, 9, 3),
+        (19, 25, 8, 3),
+        (8, 25, 8, 4),
+        (9, 25, 8, 4),
+        (12, 25, 10, 2),
+        (9, 25, 9, 3),
+        (13, 25, 10, 3),
+        (12, 25, 9, 2),
+        (8, 25, 8, 3),
+        (13, 50, 15, 3),
+        (16, 50, 14, 3),
+        (15, 50, 15, 2),
+        (22, 50, 13, 2),
+        (16, 50, 10, 2),
+        (8, 50, 6, 4),
+        (10, 50, 6, 3),
+        (20, 50, 6, 2),
     ),
     "countryside": (
-        (11, 30, 12, 5), (7, 50, 12, 4), (6, 50, 11, 4), (9, 50, 10, 2), (8, 50, 10, 6), (14, 50, 10, 6), (8, 50, 8, 7),
-        (12, 50, 8, 5), (8, 50, 9, 4), (13, 25, 8, 2),
+        (11, 30, 12, 5),
+        (7, 50, 12, 4),
+        (6, 50, 11, 4),
+        (9, 50, 10, 2),
+        (8, 50, 10, 6),
+        (14, 50, 10, 6),
+        (8, 50, 8, 7),
+        (12, 50, 8, 5),
+        (8, 50, 9, 4),
+        (13, 25, 8, 2),
     ),
 }
 # Tables 2.3 and 2.4: the mosaicking flight, and the objects that the change flight found on its path
@@ -77,7 +104,9 @@ def preset(name: str) -> SimulationSettings:
         return _GENERAL[name]()
     rows = _dataset()
     if name not in rows:
-        raise SettingsError(f"unknown preset {name!r}; choose {', '.join(_GENERAL)}, or one of {', '.join(rows)}")
+        raise SettingsError(
+            f"unknown preset {name!r}; choose {', '.join(_GENERAL)}, or one of {', '.join(rows)}"
+        )
     return _from_row(name, rows[name])
 
 
@@ -86,20 +115,25 @@ def _dataset() -> dict[str, _Row]:
     for ground, table in _WITHOUT_TELEMETRY.items():
         for number, (length_s, fps, height_m, speed_m_s) in enumerate(table, start=1):
             size_px = _HD if fps == 50 else _SD
-            rows[f"umcd-{ground}-path{number:02d}"] = _Row(ground, length_s, fps, height_m, speed_m_s, size_px)
+            rows[f"umcd-{ground}-path{number:02d}"] = _Row(
+                ground, length_s, fps, height_m, speed_m_s, size_px
+            )
     return rows | {f"umcd-telemetry-{name}": row for name, row in _WITH_TELEMETRY.items()}
 
 
 def _from_row(name: str, row: _Row) -> SimulationSettings:
     return SimulationSettings(
-        preset=name, flights=row.flights,
+        preset=name,
+        flights=row.flights,
         scene=SceneSettings(row.ground, people=0, cars=0, small_objects=0),
         path=PathSettings(row.height_m, row.speed_m_s, row.length_s * row.speed_m_s, strips=1),
         motion=MotionSettings(height_rms_m=0.25, drift_rms_m=0.3),
         imaging=ImagingSettings(*row.size_px, fps=row.fps),
         # the phantom's stated accuracy: 1.5 m level, 0.5 m in height (section 2.2)
         sensor=SensorSettings(noise_m=(0.3, 0.3, 0.2), wander_m=1.0),
-        later=LaterSettings(people=row.objects[0], cars=row.objects[1], small_objects=row.objects[2], removed=0, moved=0),
+        later=LaterSettings(
+            people=row.objects[0], cars=row.objects[1], small_objects=row.objects[2], removed=0, moved=0
+        ),
         output=OutputSettings(telemetry=row.telemetry),
     )
 
@@ -108,7 +142,7 @@ def _demo() -> SimulationSettings:
     return SimulationSettings(
         preset="demo",
         scene=SceneSettings("countryside", people=4, cars=3, small_objects=5),
-        path=PathSettings(height_m=24, speed_m_s=5, length_m=60, strips=3, strip_spacing_m=12),
+        path=PathSettings(height_m=24, speed_m_s=5, length_m=50, strips=3, strip_spacing_m=12),
         imaging=ImagingSettings(fps=10),
         sensor=SensorSettings(noise_m=(0.5, 0.5, 0.5), wander_m=0.5),
     )

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.pose import Pose
-from sorvolo.simulation.ground import GroundRaster
+from sorvolo.simulation.canvas import GroundRaster
 from sorvolo.simulation.objects import Body, Thing
-from sorvolo.simulation.view import View, blend, sample_patches
+from sorvolo.simulation.view import View, blend, remapped, sample_patches
 from sorvolo.simulation.world import Day
 
 Labels = NDArray[np.int32]
@@ -22,7 +22,9 @@ def render(day: Day, view: View, site_from_camera: Pose, from_middle_s: float) -
     image = render_ground(day.ground, view)
     seen = _in_sight(day.things, view, site_from_camera, from_middle_s)
     patches = [
-        day.shadows[thing.id].moved(np.eye(3), thing.place_m(from_middle_s)) for thing in seen if thing.id in day.shadows
+        day.shadows[thing.id].moved(np.eye(3), thing.place_m(from_middle_s))
+        for thing in seen
+        if thing.id in day.shadows
     ]
     for thing in seen:
         patches += day.bodies[thing.id].placed(thing.turn, thing.place_m(from_middle_s), view.eye_m)
@@ -33,7 +35,9 @@ def render(day: Day, view: View, site_from_camera: Pose, from_middle_s: float) -
 
 def render_ground(ground: GroundRaster, view: View) -> ImageRGB:
     """The bare ground through the view's own lens."""
-    site_from_ray = np.linalg.inv(view.ray_from_plane(np.zeros(3), np.array([1.0, 0, 0]), np.array([0.0, 1, 0])))
+    site_from_ray = np.linalg.inv(
+        view.ray_from_plane(np.zeros(3), np.array([1.0, 0, 0]), np.array([0.0, 1, 0]))
+    )
     raster_from_ray = ground.raster_from_site_matrix @ site_from_ray
     width, height = view.camera.width_px, view.camera.height_px
     rays = view.rays_in((0, 0, width, height))
@@ -45,14 +49,15 @@ def render_ground(ground: GroundRaster, view: View) -> ImageRGB:
     x1, y1 = np.clip(np.ceil(reach.max(axis=0)) + 3, [x0 + 2, y0 + 2], [columns, rows]).astype(int)
     shift = np.array([[1, 0, -x0], [0, 1, -y0], [0, 0, 1.0]])
     where = cv2.perspectiveTransform(np.ascontiguousarray(rays).reshape(-1, 1, 2), shift @ raster_from_ray)
-    return cv2.remap(
-        ground.rgb[y0:y1, x0:x1], where.reshape(height, width, 2), None, cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REFLECT_101,
-    )
+    return remapped(ground.rgb[y0:y1, x0:x1], where.reshape(height, width, 2), cv2.BORDER_REPLICATE)
 
 
 def render_labels(
-    things: Sequence[Thing], bodies: Mapping[int, Body], view: View, site_from_camera: Pose, from_middle_s: float
+    things: Sequence[Thing],
+    bodies: Mapping[int, Body],
+    view: View,
+    site_from_camera: Pose,
+    from_middle_s: float,
 ) -> tuple[Labels, dict[int, int]]:
     """Which thing every pixel shows, and how many pixels each thing in sight would show if nothing hid it."""
     height, width = view.camera.height_px, view.camera.width_px
@@ -75,7 +80,9 @@ def render_labels(
     return labels, totals
 
 
-def _in_sight(things: Sequence[Thing], view: View, site_from_camera: Pose, from_middle_s: float) -> list[Thing]:
+def _in_sight(
+    things: Sequence[Thing], view: View, site_from_camera: Pose, from_middle_s: float
+) -> list[Thing]:
     """The things that may be in the picture, in painting order.
 
     Seen from above, whatever stands nearer to the point below the camera hides what stands behind it; a crown
@@ -101,5 +108,7 @@ def _in_sight(things: Sequence[Thing], view: View, site_from_camera: Pose, from_
 
 
 def _distance_to_outline(outline_m: Floats, point_m: Floats) -> float:
-    inside = cv2.pointPolygonTest(outline_m.astype(np.float32).reshape(-1, 1, 2), (float(point_m[0]), float(point_m[1])), True)
+    inside = cv2.pointPolygonTest(
+        outline_m.astype(np.float32).reshape(-1, 1, 2), (float(point_m[0]), float(point_m[1])), True
+    )
     return max(0.0, -float(inside))

@@ -13,7 +13,8 @@ TELEMETRY_FORMATS = ("csv", "srt", "nmea", "gpx")
 """The telemetry formats that can be written, in the order in which they are the primary one."""
 
 GEOID_HEIGHT_M = 48.3
-"""Height of the geoid above the ellipsoid at the default site; one constant, as a receiver's own table gives it."""
+"""Height of the geoid above the ellipsoid at the default site; one constant, as a receiver's own table
+gives it."""
 
 DEFAULT_ORIGIN = Geodetic(41.8923127, 12.6035418, 83.3)
 """A field east of Rome; the height is the ground's, above the ellipsoid."""
@@ -23,7 +24,8 @@ DEFAULT_ORIGIN = Geodetic(41.8923127, 12.6035418, 83.3)
 class SceneSettings:
     """The site: its ground and what stands on it during the first flight.
 
-    `ground` is a GroundKind's name, or "orthophoto" for a given picture. Counts are objects inside the flown area.
+    `ground` is a GroundKind's name, or "orthophoto" for a given picture. Counts are objects inside the
+    flown area.
     """
 
     ground: str = "countryside"
@@ -37,7 +39,7 @@ class SceneSettings:
     def __post_init__(self) -> None:
         if self.ground not in (*GroundKind, "orthophoto"):
             raise SettingsError(
-                f"unknown ground {self.ground!r}; choose {', '.join(GroundKind)}, or give an orthophoto's file"
+                f"unknown ground {self.ground!r}; choose {', '.join(GroundKind)}, or an orthophoto's file"
             )
         _demand("object counts", min(self.people, self.cars, self.small_objects), 0, 10000)
         _demand("moving_share", self.moving_share, 0, 1)
@@ -87,7 +89,13 @@ class ImagingSettings:
     width_px: int = 960
     height_px: int = 540
     angle_of_view_deg: float = 62.0  # horizontal, of the lens without its distortion
-    distortion: tuple[float, float, float, float, float] = (-0.08, 0.02, 0.0004, -0.0003, 0.0)  # k1 k2 p1 p2 k3
+    distortion: tuple[float, float, float, float, float] = (
+        -0.08,
+        0.02,
+        0.0004,
+        -0.0003,
+        0.0,
+    )  # k1 k2 p1 p2 k3
     fps: float = 25.0
     exposure_s: float = 1 / 1000
     exposure_drift: float = 0.06  # rms, relative
@@ -140,7 +148,8 @@ class SensorSettings:
 
 @dataclass(frozen=True)
 class LaterSettings:
-    """How a later flight differs from the first: what came, and how many of the first flight's targets left or moved."""
+    """How a later flight differs from the first: what came, and how many of the first flight's targets
+    left or moved."""
 
     people: int = 1
     cars: int = 1
@@ -154,14 +163,17 @@ class LaterSettings:
     heading_change_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        _demand("changes", min(self.people, self.cars, self.small_objects, self.removed, self.moved), 0, 10000)
+        _demand(
+            "changes", min(self.people, self.cars, self.small_objects, self.removed, self.moved), 0, 10000
+        )
         _demand("wind_m", self.wind_m, 0, 2)
         _demand("height_factor", self.height_factor, 0.3, 3)
 
 
 @dataclass(frozen=True)
 class OutputSettings:
-    """What is written to the folder; `crf` is x264's quality (lower is better), `truth_step` samples the truth."""
+    """What is written to the folder; `crf` is x264's quality (lower is better), `truth_step` samples the
+    truth."""
 
     telemetry: str = "csv"  # a format, "all" or "none"
     photos: bool = False  # JPEG photos instead of a video

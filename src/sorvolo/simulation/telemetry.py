@@ -1,4 +1,5 @@
-"""What a flight's instruments say of it: the true path, sampled, with noise, bias, a wrong clock and faults."""
+"""What a flight's instruments say of it: the true path, sampled, with noise, bias, a wrong clock and
+faults."""
 
 from dataclasses import dataclass
 
@@ -31,9 +32,9 @@ _GAP_S = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """Telemetry as it was recorded, and what is known of it: `true_s` are the moments of its samples since the
-    video's first frame, `is_sound` is False for jumps and 0/0 fixes, `corrupt` are the samples whose sentences are
-    to be written with a wrong checksum."""
+    """Telemetry as it was recorded, and what is known of it: `true_s` are the moments of its samples
+    since the video's first frame, `is_sound` is False for jumps and 0/0 fixes, `corrupt` are the samples
+    whose sentences are to be written with a wrong checksum."""
 
     telemetry: Telemetry
     true_s: Floats
@@ -41,13 +42,15 @@ class Observation:
     corrupt: frozenset[int]
 
     def fix_at(self, time_s: Floats) -> tuple[Floats, Floats]:
-        """Latitude and longitude, each (N,), interpolated between sound fixes at these times: what a perfect map
-        can know; NaN without fixes."""
+        """Latitude and longitude, each (N,), interpolated between sound fixes at these times: what a
+        perfect map can know; NaN without fixes."""
         sound = self.is_sound
         if not sound.any():
             return np.full(len(time_s), np.nan), np.full(len(time_s), np.nan)
         latitude, longitude = self.telemetry["latitude_deg"][sound], self.telemetry["longitude_deg"][sound]
-        return np.interp(time_s, self.true_s[sound], latitude), np.interp(time_s, self.true_s[sound], longitude)
+        return np.interp(time_s, self.true_s[sound], latitude), np.interp(
+            time_s, self.true_s[sound], longitude
+        )
 
 
 def observe(
@@ -56,8 +59,8 @@ def observe(
 ) -> Observation:
     """Sample the flown path as an instrument of this format does.
 
-    `at_s` (N,) samples at these moments, as a camera does for its photos; else the rate is the settings' or the
-    format's own, on the clock's whole ticks.
+    `at_s` (N,) samples at these moments, as a camera does for its photos; else the rate is the settings'
+    or the format's own, on the clock's whole ticks.
     """
     if at_s is None:
         rate_hz = settings.rate_hz or _RATES_HZ[format_name]
@@ -85,16 +88,19 @@ def observe(
     zeros = faulty[settings.jumps:]
     latitude_deg[zeros], longitude_deg[zeros] = 0.0, 0.0
     columns = {
-        "latitude_deg": latitude_deg, "longitude_deg": longitude_deg,
-        "ellipsoidal_height_m": ellipsoidal_m, "orthometric_height_m": ellipsoidal_m - GEOID_HEIGHT_M,
-        "height_above_takeoff_m": path.position_m(true_s)[:, 2] + rng.standard_normal(count) * _BAROMETER_NOISE_M,
+        "latitude_deg": latitude_deg,
+        "longitude_deg": longitude_deg,
+        "ellipsoidal_height_m": ellipsoidal_m,
+        "orthometric_height_m": ellipsoidal_m - GEOID_HEIGHT_M,
+        "height_above_takeoff_m": path.position_m(true_s)[:, 2]
+        + rng.standard_normal(count) * _BAROMETER_NOISE_M,
         **_attitudes(path, true_s, settings.attitude_noise_deg, rng),
         **_motion(path, true_s, rng),
     }
     recorded_s = true_s + settings.clock_offset_s
     telemetry = Telemetry(
         format_name, started_ns + _ns(recorded_s), {name: columns[name] for name in _COLUMNS[format_name]},
-        _ns(recorded_s) if format_name == "srt" else None,
+        _ns(recorded_s) if format_name == "srt" else np.full(count, -1),
     )
     corrupt = frozenset(int(i) for i in rng.permutation(count)[: settings.bad_checksums])
     return Observation(telemetry, true_s, is_sound, corrupt if format_name == "nmea" else frozenset())
@@ -104,14 +110,18 @@ def _ns(time_s: Floats) -> TimesNs:
     return np.round(time_s * 1e9).astype(np.int64)
 
 
-def _outside_gaps(time_s: Floats, gaps: int, duration_s: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+def _outside_gaps(
+    time_s: Floats, gaps: int, duration_s: float, rng: np.random.Generator
+) -> NDArray[np.bool_]:
     keep = np.ones(len(time_s), bool)
     for start in rng.uniform(0.1, 0.8, gaps) * duration_s:
         keep &= (time_s < start) | (time_s > start + _GAP_S)
     return keep
 
 
-def _attitudes(path: FlownPath, time_s: Floats, noise_deg: float, rng: np.random.Generator) -> dict[str, Floats]:
+def _attitudes(
+    path: FlownPath, time_s: Floats, noise_deg: float, rng: np.random.Generator
+) -> dict[str, Floats]:
     """The camera's angles as a gimbal reports them, and a body that leans into its speed."""
     turns = rotation_from_vector(np.radians(rng.standard_normal((len(time_s), 3)) * noise_deg))
     camera = np.array([

@@ -1,4 +1,5 @@
-"""The answers: where every frame lies, what stands where, and which pixels show it; plain values for files."""
+"""The answers: where every frame lies, what stands where, and which pixels show it; plain values for
+files."""
 
 from collections.abc import Iterable
 from datetime import UTC, datetime
@@ -12,8 +13,8 @@ from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.pose import gimbal_angles_from_rotation
+from sorvolo.simulation.canvas import GroundRaster
 from sorvolo.simulation.flight import SimulatedFlight, has_changed
-from sorvolo.simulation.ground import GroundRaster
 from sorvolo.simulation.objects import Label, Thing
 from sorvolo.simulation.rendering import render_labels
 from sorvolo.simulation.world import World
@@ -45,7 +46,9 @@ def frame_features(flight: SimulatedFlight) -> list[dict[str, Any]]:
             "camera_latitude_deg": round(float(latitudes[index]), _DEGREE_DECIMALS),
             "camera_height_m": round(float(heights[index]), 6),
             "height_above_ground_m": round(float(pose.translation_m[2]), 6),
-            "camera_yaw_deg": round(yaw, 6), "camera_pitch_deg": round(pitch, 6), "camera_roll_deg": round(roll, 6),
+            "camera_yaw_deg": round(yaw, 6),
+            "camera_pitch_deg": round(pitch, 6),
+            "camera_roll_deg": round(roll, 6),
             "rotation": [round(float(number), 10) for number in pose.rotation.ravel()],
             "fix_longitude_deg": _degrees_or_null(fixes[index, 1]),
             "fix_latitude_deg": _degrees_or_null(fixes[index, 0]),
@@ -86,16 +89,19 @@ def feature_collection(features: Iterable[dict[str, Any]], site: LocalFrame) -> 
     return {
         "type": "FeatureCollection",
         "site": {
-            "latitude_deg": origin.latitude_deg, "longitude_deg": origin.longitude_deg, "height_m": origin.height_m,
+            "latitude_deg": origin.latitude_deg,
+            "longitude_deg": origin.longitude_deg,
+            "height_m": origin.height_m,
         },
         "features": list(features),
     }
 
 
 def coco_boxes(flight: SimulatedFlight, frames: Iterable[int]) -> dict[str, Any]:
-    """COCO annotations of these frames. A box holds the pixels that show the object; `visibility` is the share of
-    the object that nothing hides within the picture, `area` its visible pixels."""
-    images, annotations = [], []
+    """COCO annotations of these frames. A box holds the pixels that show the object; `visibility` is the
+    share of the object that nothing hides within the picture, `area` its visible pixels."""
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
     kinds = {thing.id: thing for thing in flight.day.things if thing.label.is_target}
     for index in frames:
         images.append({
@@ -114,12 +120,18 @@ def coco_boxes(flight: SimulatedFlight, frames: Iterable[int]) -> dict[str, Any]
             if len(rows) < _FEWEST_PX:
                 continue
             left, top = int(columns.min()), int(rows.min())
-            annotations.append({
-                "id": len(annotations) + 1, "image_id": index, "category_id": CATEGORIES.index(thing.label) + 1,
-                "bbox": [left, top, int(columns.max()) - left + 1, int(rows.max()) - top + 1],
-                "area": len(rows), "iscrowd": 0, "object_id": thing.id,
-                "visibility": round(len(rows) / totals[thing.id], 4),
-            })
+            annotations.append(
+                {
+                    "id": len(annotations) + 1,
+                    "image_id": index,
+                    "category_id": CATEGORIES.index(thing.label) + 1,
+                    "bbox": [left, top, int(columns.max()) - left + 1, int(rows.max()) - top + 1],
+                    "area": len(rows),
+                    "iscrowd": 0,
+                    "object_id": thing.id,
+                    "visibility": round(len(rows) / totals[thing.id], 4),
+                }
+            )
     return {
         "info": {"description": f"simulated {flight.name}"},
         "categories": [{"id": i, "name": str(label)} for i, label in enumerate(CATEGORIES, start=1)],
@@ -128,7 +140,8 @@ def coco_boxes(flight: SimulatedFlight, frames: Iterable[int]) -> dict[str, Any]
 
 
 def change_mask(flight: SimulatedFlight, index: int) -> ImageGray:
-    """(height, width) 255 where the frame shows an object that came, or a place that one left, since flight 1.
+    """(height, width) 255 where the frame shows an object that came, or a place that one left, since
+    flight 1.
 
     What moves counts at both places. Shadows, light and plants in the wind are no changes.
     """
@@ -169,7 +182,7 @@ def map_tiles(ground: GroundRaster, site_grid: SiteGrid) -> dict[TileIndex, Imag
         )
         if picture[..., 3].any():
             picture[picture[..., 3] < 255] = 0
-            tiles[tile] = picture
+            tiles[tile] = np.asarray(picture, np.uint8)
     return tiles
 
 
@@ -193,4 +206,7 @@ def _polygon(outline_m: PointsM, site: LocalFrame) -> dict[str, Any] | None:
     latitude, longitude, _ = site.wgs84_from_site(outline_m)
     ring: Floats = np.column_stack([longitude, latitude])
     closed = np.vstack([ring, ring[:1]])
-    return {"type": "Polygon", "coordinates": [[[round(float(c), _DEGREE_DECIMALS) for c in p] for p in closed]]}
+    return {
+        "type": "Polygon",
+        "coordinates": [[[round(float(c), _DEGREE_DECIMALS) for c in p] for p in closed]],
+    }

@@ -1,19 +1,25 @@
 """Views and patches: textured plane pieces in space, drawn exactly and without jagged edges into any view.
 
-A view is projective: it takes site points to rays (x, y, 1), and a camera takes rays to pixels, lens distortion
-included. A drone's camera, the straight-down orthophoto and the sun (whose picture is the shadows) are all views.
+A view is projective: it takes site points to rays (x, y, 1), and a camera takes rays to pixels, lens
+distortion included. A drone's camera, the straight-down orthophoto and the sun (whose picture is the
+shadows) are all views.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar, cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Floats, ImageRGBA, Matrix3, PointsM, PointsPx, Vector3
+from sorvolo.geometry.arrays import Anything, Floats, ImageRGBA, Matrix3, PointsM, PointsPx, Vector3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
+
+_Scalar = TypeVar("_Scalar", np.uint8, np.float32)
+# x and y are in one map; an empty array here instead of None makes OpenCV 5 sample garbage
+_NO_SECOND_MAP = cast(Anything, None)
 
 RaysF32 = NDArray[np.float32]
 """(height, width, 2) float32: x and y of every pixel's ray with z = 1."""
@@ -31,7 +37,8 @@ def ray_grid(camera: Camera) -> RaysF32:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """How the site is seen: `ray_from_site` (3, 4) is projective; `eye_m` (4,) is homogeneous (0 = at infinity).
+    """How the site is seen: `ray_from_site` (3, 4) is projective; `eye_m` (4,) is homogeneous (0 = at
+    infinity).
 
     `rays` is `ray_grid(camera)`, or None for a camera without distortion, where it costs nothing to compute.
     """
@@ -75,11 +82,16 @@ def camera_view(camera: Camera, site_from_camera: Pose, rays: RaysF32) -> View:
 
 
 def map_view(
-    west_m: float, north_m: float, m_per_px: tuple[float, float], size_px: tuple[int, int], sun: Vector3 | None = None
+    west_m: float,
+    north_m: float,
+    m_per_px: tuple[float, float],
+    size_px: tuple[int, int],
+    sun: Vector3 | None = None,
 ) -> View:
     """The site seen straight from above on a raster whose outer top-left corner is (west_m, north_m).
 
-    With `sun`, the unit vector towards it, points slide along its light onto the ground: what is seen is shadow.
+    With `sun`, the unit vector towards it, points slide along its light onto the ground: what is seen is
+    shadow.
     """
     slide = np.zeros(2) if sun is None else sun[:2] / sun[2]
     matrix = np.array([
@@ -112,7 +124,9 @@ class Patch:
 
 def sample_patches(view: View, patches: Sequence[Patch]) -> Iterator[tuple[Window, ImageRGBA]]:
     """The patches in sight as this view sees them, in order: a window of the image and its RGBA there."""
-    facing = [patch for patch in patches if not patch.normal.any() or view.faces(patch.corners_m[0], patch.normal)]
+    facing = [
+        patch for patch in patches if not patch.normal.any() or view.faces(patch.corners_m[0], patch.normal)
+    ]
     if not facing:
         return
     # one projection for all corners: a picture has hundreds of patches, most of them out of sight
@@ -144,16 +158,22 @@ def _sample(view: View, patch: Patch, corners_px: PointsPx) -> tuple[Window, Ima
     height, width = patch.texture.shape[:2]
     texture_from_plane = cv2.getPerspectiveTransform(
         np.array([[0, 0], [1, 0], far, [0, 1]], np.float32),
-        np.array([[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]], np.float32),
+        np.array(
+            [[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]], np.float32
+        ),
     )
     texture_from_ray = texture_from_plane @ np.linalg.inv(ray_from_plane)
     rays = view.rays_in((x0, y0, x1, y1))
     where = cv2.perspectiveTransform(np.ascontiguousarray(rays).reshape(-1, 1, 2), texture_from_ray)
-    sample = cv2.remap(
-        patch.texture, where.reshape(*rays.shape), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
-        borderValue=(0, 0, 0, 0),
-    )
+    sample = remapped(patch.texture, where.reshape(*rays.shape), cv2.BORDER_CONSTANT)
     return (x0, y0, x1, y1), sample
+
+
+def remapped(picture: NDArray[_Scalar], where: Anything, border: int) -> NDArray[_Scalar]:
+    """The picture at `where`, (height, width, 2) float32 x and y, linear; a constant border is zero."""
+    coordinates = np.asarray(where, np.float32)
+    sampled = cv2.remap(picture, coordinates, _NO_SECOND_MAP, cv2.INTER_LINEAR, borderMode=border)
+    return np.asarray(sampled, picture.dtype)
 
 
 def blend(image: NDArray[np.uint8], window: Window, sample: ImageRGBA) -> None:
@@ -170,6 +190,7 @@ def opaque(rgb: NDArray[np.uint8]) -> ImageRGBA:
 
 
 def cut_out(rgb: NDArray[np.uint8], alpha: NDArray[np.float32]) -> ImageRGBA:
-    """A texture with holes: `alpha` (height, width) from 0 to 1, multiplied into the colours as patches need."""
+    """A texture with holes: `alpha` (height, width) from 0 to 1, multiplied into the colours as patches
+    need."""
     alpha = np.clip(alpha, 0, 1)
     return np.dstack([rgb * alpha[..., None], alpha * 255]).round().astype(np.uint8)

@@ -1,5 +1,6 @@
 """The simulated site: its ground, what stands on it on each day, and each day's light."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -7,9 +8,11 @@ import numpy as np
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageGray
-from sorvolo.simulation.ground import Area, GroundKind, GroundRaster, Layout, PaintedGround, paint_ground
+from sorvolo.simulation.bodies import build_body
+from sorvolo.simulation.canvas import Area, GroundRaster
+from sorvolo.simulation.ground import GroundKind, Layout, PaintedGround, paint_ground
 from sorvolo.simulation.noise import fractal
-from sorvolo.simulation.objects import SMALL_KINDS, Body, Label, Light, Thing, build_body, new_kind, new_size
+from sorvolo.simulation.objects import SMALL_KINDS, Body, Label, Light, Thing, new_kind, new_size
 from sorvolo.simulation.settings import SceneSettings, SimulationSettings
 from sorvolo.simulation.view import Patch, View, blend, map_view, sample_patches
 
@@ -38,8 +41,8 @@ class World:
 class Day:
     """The site on the day of one flight: the ground with its static shadows, and all bodies ready to be seen.
 
-    `gains` (3,) is the light's colour and strength; `cloud_shade` (0 = clear) is how dark clouds' shadows are.
-    `shadows` holds the shadow patches of what moves, by object id.
+    `gains` (3,) is the light's colour and strength; `cloud_shade` (0 = clear) is how dark clouds'
+    shadows are. `shadows` holds the shadow patches of what moves, by object id.
     """
 
     ground: GroundRaster
@@ -52,9 +55,12 @@ class Day:
 
 
 def needed_area(settings: SimulationSettings, waypoints_m: Floats, margin_m: float = 4.0) -> Area:
-    """The ground that can come into sight when flying these waypoints, all flights' height and tilt included."""
+    """The ground that can come into sight when flying these waypoints, all flights' height and tilt
+    included."""
     camera = settings.imaging.camera
-    height_m = settings.path.height_m * max(1.0, settings.later.height_factor) + 4 * settings.motion.height_rms_m
+    height_m = (
+        settings.path.height_m * max(1.0, settings.later.height_factor) + 4 * settings.motion.height_rms_m
+    )
     across = 0.5 * camera.width_px / camera.fx_px, 0.5 * camera.height_px / camera.fy_px
     # barrel distortion shows more than the pinhole's angle: its rays are the truth
     corner = np.abs(camera.rays_from_pixels(camera.corners_px)[:, :2]).max(axis=0)
@@ -67,13 +73,15 @@ def needed_area(settings: SimulationSettings, waypoints_m: Floats, margin_m: flo
 
 
 def build_world(
-    settings: SimulationSettings, waypoints_m: Floats, orthophoto: PaintedGround | None = None
+    settings: SimulationSettings, plans_m: Sequence[Floats], orthophoto: PaintedGround | None = None
 ) -> World:
     """The site that these flights need, from the settings' seed.
 
-    Raises SettingsError when a given orthophoto is too small for the flight, or missing.
+    `plans_m` are the flights' waypoints, (N, 2) each. Things are placed along the first, so that the first
+    flight is the same however many follow. Raises SettingsError when a given orthophoto is missing, or too
+    small for the flights.
     """
-    area = needed_area(settings, waypoints_m)
+    area = needed_area(settings, np.concatenate(plans_m))
     rng = np.random.default_rng([settings.seed, 1])
     if settings.scene.ground == "orthophoto":
         if orthophoto is None:
@@ -82,17 +90,22 @@ def build_world(
         _demand_cover(painted.raster.area, area)
     else:
         width_m, height_m = area.size_m
-        m_per_px = max(min(0.025, 0.6 * settings.m_per_px), float(np.sqrt(width_m * height_m / _LARGEST_GROUND_PX)))
+        m_per_px = max(
+            min(0.025, 0.72 * settings.m_per_px), float(np.sqrt(width_m * height_m / _LARGEST_GROUND_PX))
+        )
         painted = paint_ground(GroundKind(settings.scene.ground), area, m_per_px, rng)
-    first = _furnish(settings.scene, painted.layout, waypoints_m, settings, np.random.default_rng([settings.seed, 2]))
+    first = _furnish(
+        settings.scene, painted.layout, plans_m[0], settings, np.random.default_rng([settings.seed, 2])
+    )
     days = [first]
     for flight in range(2, settings.flights + 1):
-        days.append(_next_day(days[0], painted.layout, waypoints_m, settings, flight))
+        days.append(_next_day(days[0], painted.layout, plans_m[0], settings, flight))
     return World(painted.raster, tuple(days))
 
 
 def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px: float) -> Day:
-    """The site as one flight, counted from 1, finds it, fine enough for pictures of `m_per_px` on the ground."""
+    """The site as one flight, counted from 1, finds it, fine enough for pictures of `m_per_px` on the
+    ground."""
     rng = np.random.default_rng([settings.seed, 3, flight])
     is_other = flight > 1 and settings.later.has_other_light
     azimuth = np.radians(rng.uniform(0, 360) if is_other else 215.0)
@@ -114,12 +127,11 @@ def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px:
     bodies = {thing.id: build_body(thing, light, m_per_px) for thing in things}
     standing = [thing for thing in things if not thing.is_moving]
     ground = _with_shadows(ground, standing, bodies, light)
-    shadows = {thing.id: _own_shadow(thing, bodies[thing.id], light, m_per_px) for thing in things if thing.is_moving}
+    shadows = {
+        thing.id: _own_shadow(thing, bodies[thing.id], light, m_per_px) for thing in things if thing.is_moving
+    }
     cloud_shade = 0.38 if flight > 1 and settings.later.has_clouds else 0.0
     return Day(ground, things, bodies, shadows, light, gains, cloud_shade)
-
-
-# -- what stands where -----------------------------------------------------------------------------------------
 
 
 def _furnish(scene: SceneSettings, layout: Layout, waypoints_m: Floats, settings: SimulationSettings,
@@ -129,13 +141,24 @@ def _furnish(scene: SceneSettings, layout: Layout, waypoints_m: Floats, settings
     if scene.has_scenery:
         roof = "flat roof" if scene.ground == GroundKind.URBAN else "gable roof"
         for kind, label, places in (
-            (roof, Label.HOUSE, layout.houses), ("tree", Label.TREE, layout.trees), ("bush", Label.TREE, layout.bushes),
+            (roof, Label.HOUSE, layout.houses),
+            ("tree", Label.TREE, layout.trees),
+            ("bush", Label.TREE, layout.bushes),
         ):
             for east, north, yaw in places:
                 size = new_size(label, kind, rng)
-                things.append(Thing(
-                    len(things) + 1, label, kind, float(east), float(north), float(yaw), size, int(rng.integers(2**31))
-                ))
+                things.append(
+                    Thing(
+                        len(things) + 1,
+                        label,
+                        kind,
+                        float(east),
+                        float(north),
+                        float(yaw),
+                        size,
+                        int(rng.integers(2**31)),
+                    )
+                )
     wanted = [Label.PERSON] * scene.people + [Label.CAR] * scene.cars + [Label.SMALL] * scene.small_objects
     for label in wanted:
         things.append(_place(label, len(things) + 1, things, layout, waypoints_m, settings, rng))
@@ -144,12 +167,15 @@ def _furnish(scene: SceneSettings, layout: Layout, waypoints_m: Floats, settings
 
 def _next_day(first: tuple[Thing, ...], layout: Layout, waypoints_m: Floats, settings: SimulationSettings,
               flight: int) -> tuple[Thing, ...]:
-    """The things of a later flight: some targets of the first are gone, some moved, some are new, some move."""
+    """The things of a later flight: some targets of the first are gone, some moved, some are new, some
+    move."""
     rng = np.random.default_rng([settings.seed, 4, flight])
     targets = [thing for thing in first if thing.label.is_target]
     order = rng.permutation(len(targets))
     removed = {targets[i].id for i in order[:settings.later.removed]}
-    shifted = {targets[i].id for i in order[settings.later.removed:settings.later.removed + settings.later.moved]}
+    shifted = {
+        targets[i].id for i in order[settings.later.removed : settings.later.removed + settings.later.moved]
+    }
     today = [thing for thing in first if thing.id not in removed]
     for i, thing in enumerate(today):
         if thing.id in shifted:
@@ -202,16 +228,22 @@ def _is_free(thing: Thing, others: list[Thing]) -> bool:
 
 
 def _set_off(thing: Thing, others: list[Thing], rng: np.random.Generator) -> Thing:
-    """The thing on its way: a person walks anywhere, a car drives straight on, where no scenery is in the way."""
+    """The thing on its way: a person walks anywhere, a car drives straight on, where no scenery is in
+    the way."""
     is_car = thing.label is Label.CAR
     speed = rng.uniform(2.0, 4.0) if is_car else rng.uniform(0.7, 1.5)
     for _ in range(30):
         yaw = thing.yaw_deg if is_car else rng.uniform(0, 360)
         direction = np.array([np.cos(np.radians(yaw)), np.sin(np.radians(yaw))])
-        ahead = np.array([[thing.east_m, thing.north_m]]) + direction * np.linspace(-12, 12, 13)[:, None] * speed / 1.5
+        ahead = (
+            np.array([[thing.east_m, thing.north_m]])
+            + direction * np.linspace(-12, 12, 13)[:, None] * speed / 1.5
+        )
         if all(
-            np.hypot(ahead[:, 0] - other.east_m, ahead[:, 1] - other.north_m).min() > thing.reach_m + other.reach_m
-            for other in others if not other.label.is_target
+            np.hypot(ahead[:, 0] - other.east_m, ahead[:, 1] - other.north_m).min()
+            > thing.reach_m + other.reach_m
+            for other in others
+            if not other.label.is_target
         ):
             velocity = (float(direction[0] * speed), float(direction[1] * speed))
             return replace(thing, yaw_deg=float(yaw), velocity_m_s=velocity)
@@ -224,9 +256,6 @@ def _distance_to_path(point_m: Floats, waypoints_m: Floats) -> float:
     return float(np.hypot(*(start + share[:, None] * along - point_m).T).min())
 
 
-# -- the day's ground ------------------------------------------------------------------------------------------
-
-
 def _blown(ground: GroundRaster, wind_m: float, rng: np.random.Generator) -> GroundRaster:
     """The ground after its plants have moved by about `wind_m`, each tuft its own way."""
     if not ground.vegetation.any():
@@ -234,11 +263,15 @@ def _blown(ground: GroundRaster, wind_m: float, rng: np.random.Generator) -> Gro
     shape = ground.rgb.shape[:2]
     rows, columns = shape
     # a kerb beside grass does not bend with it
-    plants = cv2.erode(ground.vegetation, np.ones((3, 3), np.uint8), iterations=max(1, round(0.06 / ground.m_per_px[0])))
+    plants = cv2.erode(
+        ground.vegetation, np.ones((3, 3), np.uint8), iterations=max(1, round(0.06 / ground.m_per_px[0]))
+    )
     weight = cv2.GaussianBlur(plants, (0, 0), 1.5).astype(np.float32) / 255
     moved = np.empty_like(ground.rgb)
     push = [
-        weight * fractal(rng, shape, ground.m_per_px[0], (0.4, 1.2), (0.8, 0.6)) * np.float32(wind_m / ground.m_per_px[0])
+        weight
+        * fractal(rng, shape, ground.m_per_px[0], (0.4, 1.2), (0.8, 0.6))
+        * np.float32(wind_m / ground.m_per_px[0])
         for _ in range(2)
     ]
     x = np.arange(columns, dtype=np.float32)[None, :]
@@ -246,12 +279,18 @@ def _blown(ground: GroundRaster, wind_m: float, rng: np.random.Generator) -> Gro
         end = min(top + 512, rows)
         y = np.arange(top, end, dtype=np.float32)[:, None]
         moved[top:end] = cv2.remap(
-            ground.rgb, x + push[0][top:end], y + push[1][top:end], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            ground.rgb,
+            x + push[0][top:end],
+            y + push[1][top:end],
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
         )
     return replace(ground, rgb=moved)
 
 
-def _with_shadows(ground: GroundRaster, things: list[Thing], bodies: dict[int, Body], light: Light) -> GroundRaster:
+def _with_shadows(
+    ground: GroundRaster, things: list[Thing], bodies: dict[int, Body], light: Light
+) -> GroundRaster:
     height, width = ground.rgb.shape[:2]
     depth = np.zeros((height, width), np.uint8)
     sun_view = map_view(ground.west_m, ground.north_m, ground.m_per_px, (width, height), light.sun)
@@ -259,7 +298,7 @@ def _with_shadows(ground: GroundRaster, things: list[Thing], bodies: dict[int, B
         _cast(bodies[thing.id].placed(thing.turn, thing.place_m(0.0), sun_view.eye_m), sun_view, depth)
     if not depth.any():
         return ground
-    depth = cv2.GaussianBlur(depth, (0, 0), max(0.6, 0.03 / ground.m_per_px[0]))  # the sun is no point
+    depth[:] = cv2.GaussianBlur(depth, (0, 0), max(0.6, 0.03 / ground.m_per_px[0]))  # the sun is no point
     rgb = ground.rgb.copy()
     for top in range(0, height, 512):
         part = slice(top, top + 512)
@@ -275,7 +314,7 @@ def _own_shadow(thing: Thing, body: Body, light: Light, m_per_px: float) -> Patc
     sun_view = map_view(-reach_m, reach_m, (2 * reach_m / side, 2 * reach_m / side), (side, side), light.sun)
     depth: ImageGray = np.zeros((side, side), np.uint8)
     _cast(body.placed(thing.turn, np.zeros(3), sun_view.eye_m), sun_view, depth)
-    depth = cv2.GaussianBlur(depth, (0, 0), 0.7)
+    depth[:] = cv2.GaussianBlur(depth, (0, 0), 0.7)
     texture = np.zeros((side, side, 4), np.uint8)
     texture[..., 3] = (depth * (1 - float(_SHADOW_TINT.mean()))).astype(np.uint8)
     corners = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) * reach_m
@@ -307,6 +346,7 @@ def _demand_cover(given: Area, needed: Area) -> None:
             or given.east_m < needed.east_m or given.north_m < needed.north_m):
         have, need = given.size_m, needed.size_m
         raise SettingsError(
-            f"the orthophoto covers {have[0]:.0f} x {have[1]:.0f} m, but the flight sees up to {need[0]:.0f} x {need[1]:.0f} m;"
+            f"the orthophoto covers {have[0]:.0f} x {have[1]:.0f} m, but the flight sees up to"
+            f" {need[0]:.0f} x {need[1]:.0f} m;"
             " fly lower or a shorter path, or give a larger orthophoto"
         )

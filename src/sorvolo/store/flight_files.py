@@ -1,4 +1,5 @@
-"""Flights as files that drones leave behind: video, photos, telemetry, camera and truth; the same bytes each time."""
+"""Flights as files that drones leave behind: video, photos, telemetry, camera and truth; the same bytes
+each time."""
 
 import csv
 import io
@@ -25,15 +26,66 @@ from sorvolo.store.atomic import atomic_path, atomic_write_bytes
 from sorvolo.survey.flight import Frame, Telemetry
 
 UMCD_COLUMNS = (
-    "Tick#", "offsetTime", "flightTime(msec)", "Longitude", "Latitude", "numSats", "gpsAltitude(meters)",
-    "baroAlt(meters)", "vpsHeight(M)", "relativeHeight", "accelX(M/S2)", "accelY(M/S2)", "accelZ(M/S2)",
-    "gyroX(degrees/s)", "gyroY(degrees/s)", "gyroZ(degrees/s)", "magX", "magY", "magZ", "magMod", "velN(M/S)",
-    "velE(M/S)", "velD(M/S)", "vel(M/S)", "quatW", "quatX", "quatY", "quatZ", "Roll", "Pitch", "Yaw", "errorX",
-    "errorY", "errorZ", "error", "accel(M/S2)", "gyro(degrees/s)", "distancHP(M)", "distanceTravelled(M)",
-    "directionOfTravel", "IMUTemp(C)", "batteryTemp(C)", "ratedCapacity", "remaingCapacity", "batteryCycleCount",
-    "batteryLifePercentage", "Gimbal:roll", "Gimbal:pitch", "Gimbal:yaw", "Gimbal:Xroll", "Gimbal:Xpitch",
-    "Gimbal:Yyaw", "MotorSpeed:RFront", "MotorSpeed:LFront", "MotorSpeed:LBack", "MotorSpeed:RBack",
-    "MotorLoad:RFront", "MotorLoad:LFront", "MotorLoad:LBack", "MotorLoad:RBack",
+    "Tick#",
+    "offsetTime",
+    "flightTime(msec)",
+    "Longitude",
+    "Latitude",
+    "numSats",
+    "gpsAltitude(meters)",
+    "baroAlt(meters)",
+    "vpsHeight(M)",
+    "relativeHeight",
+    "accelX(M/S2)",
+    "accelY(M/S2)",
+    "accelZ(M/S2)",
+    "gyroX(degrees/s)",
+    "gyroY(degrees/s)",
+    "gyroZ(degrees/s)",
+    "magX",
+    "magY",
+    "magZ",
+    "magMod",
+    "velN(M/S)",
+    "velE(M/S)",
+    "velD(M/S)",
+    "vel(M/S)",
+    "quatW",
+    "quatX",
+    "quatY",
+    "quatZ",
+    "Roll",
+    "Pitch",
+    "Yaw",
+    "errorX",
+    "errorY",
+    "errorZ",
+    "error",
+    "accel(M/S2)",
+    "gyro(degrees/s)",
+    "distancHP(M)",
+    "distanceTravelled(M)",
+    "directionOfTravel",
+    "IMUTemp(C)",
+    "batteryTemp(C)",
+    "ratedCapacity",
+    "remaingCapacity",
+    "batteryCycleCount",
+    "batteryLifePercentage",
+    "Gimbal:roll",
+    "Gimbal:pitch",
+    "Gimbal:yaw",
+    "Gimbal:Xroll",
+    "Gimbal:Xpitch",
+    "Gimbal:Yyaw",
+    "MotorSpeed:RFront",
+    "MotorSpeed:LFront",
+    "MotorSpeed:LBack",
+    "MotorSpeed:RBack",
+    "MotorLoad:RFront",
+    "MotorLoad:LFront",
+    "MotorLoad:LBack",
+    "MotorLoad:RBack",
 )
 """The sixty columns of the thesis's Table 2.2, spelled as there."""
 
@@ -76,10 +128,11 @@ def video_writer(
 
 
 def write_photo(path: Path, frame: Frame, camera: Camera, row: Mapping[str, float]) -> None:
-    """Write a JPEG with what telemetry's row says of it in EXIF GPS and DJI's XMP; an empty row writes neither.
+    """Write a JPEG with what telemetry's row says of it in EXIF GPS and DJI's XMP; an empty row writes
+    neither.
 
-    EXIF tells the focal length as a length and as its 35 mm equivalent, rounded as cameras do. Raises StoreError
-    as `video_writer`.
+    EXIF tells the focal length as a length and as its 35 mm equivalent, rounded as cameras do. Raises
+    StoreError as `video_writer`.
     """
     moment = _moment(frame.time_ns)
     exif = Image.Exif()
@@ -89,7 +142,9 @@ def write_photo(path: Path, frame: Frame, camera: Camera, row: Mapping[str, floa
     detail[Base.DateTimeOriginal] = exif[Base.DateTime]
     detail[Base.SubsecTimeOriginal] = f"{moment.microsecond // 1000:03d}"
     detail[Base.OffsetTimeOriginal] = "+00:00"
-    detail[Base.FocalLength] = IFDRational(round(camera.fx_px / camera.width_px * _SENSOR_WIDTH_MM * 1000), 1000)
+    detail[Base.FocalLength] = IFDRational(
+        round(camera.fx_px / camera.width_px * _SENSOR_WIDTH_MM * 1000), 1000
+    )
     detail[Base.FocalLengthIn35mmFilm] = round(camera.fx_px / camera.width_px * 36)
     detail[Base.ExifImageWidth], detail[Base.ExifImageHeight] = camera.width_px, camera.height_px
     xmp = b""
@@ -161,19 +216,20 @@ def read_orthophoto(path: Path, m_per_px: float | None = None) -> tuple[ImageRGB
         with rasterio.open(path) as source:
             if source.count < 3 or source.dtypes[0] != "uint8":
                 raise InputError(
-                    f"{path}: {source.count} band(s) of {source.dtypes[0]}; an orthophoto needs red, green and blue"
-                    " in 8 bits each"
+                    f"{path}: {source.count} band(s) of {source.dtypes[0]}; an orthophoto needs red, green"
+                    " and blue in 8 bits each"
                 )
             own = abs(source.transform.a) if source.crs is not None and source.crs.is_projected else None
             size_m = m_per_px or own
             if not size_m:
-                raise InputError(f"{path}: has no metric coordinate system; say its pixel size with --ground-gsd")
+                raise InputError(
+                    f"{path}: has no metric coordinate system; say its pixel size with --ground-gsd"
+                )
             return np.ascontiguousarray(np.moveaxis(source.read([1, 2, 3]), 0, -1)), float(size_m)
     except rasterio.errors.RasterioIOError as error:
-        raise InputError(f"{path}: cannot be read as a picture: {error}; give a GeoTIFF, PNG or JPEG") from error
-
-
-# -- the telemetry formats -------------------------------------------------------------------------------------
+        raise InputError(
+            f"{path}: cannot be read as a picture: {error}; give a GeoTIFF, PNG or JPEG"
+        ) from error
 
 
 def _moment(time_ns: int) -> datetime:
@@ -192,22 +248,64 @@ def _umcd(telemetry: Telemetry) -> str:
     times_s = _since_first_s(telemetry)
     course = np.radians(telemetry["course_deg"])
     speed = telemetry["speed_m_s"]
-    travelled_m = np.concatenate([[0.0], np.cumsum(speed[1:] * np.diff(times_s))]) if len(times_s) else times_s
+    travelled_m = (
+        np.concatenate([[0.0], np.cumsum(speed[1:] * np.diff(times_s))]) if len(times_s) else times_s
+    )
     for i, time_s in enumerate(times_s):
         yaw, pitch, roll = (telemetry[f"body_{axis}_deg"][i] for axis in ("yaw", "pitch", "roll"))
         height_m, relative_m = telemetry["orthometric_height_m"][i], telemetry["height_above_takeoff_m"][i]
         gimbal = [f"{telemetry[f'camera_{axis}_deg'][i]:.4f}" for axis in ("roll", "pitch", "yaw")]
-        writer.writerow([
-            round(time_s * 4_500_000), f"{time_s:.3f}", round(time_s * 1000),
-            f"{telemetry['longitude_deg'][i]:.10f}", f"{telemetry['latitude_deg'][i]:.10f}", 14,
-            f"{height_m:.3f}", f"{height_m:.3f}", "0.0", f"{relative_m:.3f}", "0.0", "0.0", "-9.81", "0.0", "0.0",
-            "0.0", "0", "0", "0", "0", f"{speed[i] * np.cos(course[i]):.3f}", f"{speed[i] * np.sin(course[i]):.3f}",
-            "0.0", f"{speed[i]:.3f}", *(f"{q:.6f}" for q in _quaternion(yaw, pitch, roll)), f"{roll:.3f}",
-            f"{pitch:.3f}", f"{yaw:.3f}", "0.0", "0.0", "0.0", "0.0", "9.81", "0.0", f"{travelled_m[i]:.2f}",
-            f"{travelled_m[i]:.2f}", f"{telemetry['course_deg'][i]:.2f}", "42.0", "31.0", "4480",
-            f"{4480 - time_s:.0f}", "12", f"{max(5.0, 98 - time_s / 12):.0f}", *gimbal, *gimbal,
-            *["5200"] * 4, *["38"] * 4,
-        ])
+        writer.writerow(
+            [
+                round(time_s * 4_500_000),
+                f"{time_s:.3f}",
+                round(time_s * 1000),
+                f"{telemetry['longitude_deg'][i]:.10f}",
+                f"{telemetry['latitude_deg'][i]:.10f}",
+                14,
+                f"{height_m:.3f}",
+                f"{height_m:.3f}",
+                "0.0",
+                f"{relative_m:.3f}",
+                "0.0",
+                "0.0",
+                "-9.81",
+                "0.0",
+                "0.0",
+                "0.0",
+                "0",
+                "0",
+                "0",
+                "0",
+                f"{speed[i] * np.cos(course[i]):.3f}",
+                f"{speed[i] * np.sin(course[i]):.3f}",
+                "0.0",
+                f"{speed[i]:.3f}",
+                *(f"{q:.6f}" for q in _quaternion(yaw, pitch, roll)),
+                f"{roll:.3f}",
+                f"{pitch:.3f}",
+                f"{yaw:.3f}",
+                "0.0",
+                "0.0",
+                "0.0",
+                "0.0",
+                "9.81",
+                "0.0",
+                f"{travelled_m[i]:.2f}",
+                f"{travelled_m[i]:.2f}",
+                f"{telemetry['course_deg'][i]:.2f}",
+                "42.0",
+                "31.0",
+                "4480",
+                f"{4480 - time_s:.0f}",
+                "12",
+                f"{max(5.0, 98 - time_s / 12):.0f}",
+                *gimbal,
+                *gimbal,
+                *["5200"] * 4,
+                *["38"] * 4,
+            ]
+        )
     return text.getvalue()
 
 
@@ -243,7 +341,8 @@ def _srt(telemetry: Telemetry) -> str:
             f'<font size="28">FrameCnt: {i + 1}, DiffTime: 40ms\n'
             f"{moment:%Y-%m-%d %H:%M:%S}.{moment.microsecond // 1000:03d}\n"
             "[iso: 100] [shutter: 1/1000.0] [fnum: 2.8] [ev: 0] [color_md: default] [focal_len: 24.00] "
-            f"[latitude: {telemetry['latitude_deg'][i]:.7f}] [longitude: {telemetry['longitude_deg'][i]:.7f}] "
+            f"[latitude: {telemetry['latitude_deg'][i]:.7f}] "
+            f"[longitude: {telemetry['longitude_deg'][i]:.7f}] "
             f"[rel_alt: {telemetry['height_above_takeoff_m'][i]:.3f} "
             f"abs_alt: {telemetry['orthometric_height_m'][i]:.3f}] "
             f"[gb_yaw: {yaw:.3f} gb_pitch: {telemetry['camera_pitch_deg'][i]:.3f} "
@@ -253,14 +352,16 @@ def _srt(telemetry: Telemetry) -> str:
 
 
 def _srt_gps(telemetry: Telemetry) -> str:
-    """DJI's older subtitles: GPS(longitude, latitude, satellites) and the barometer's height above take-off."""
+    """DJI's older subtitles: GPS(longitude, latitude, satellites) and the barometer's height above
+    take-off."""
     blocks = []
     for i, (start, end) in enumerate(_srt_times(telemetry)):
         moment = _moment(int(telemetry.time_ns[i]))
         latitude, longitude = telemetry["latitude_deg"][i], telemetry["longitude_deg"][i]
+        home = f"HOME({telemetry['longitude_deg'][0]:.6f},{telemetry['latitude_deg'][0]:.6f})"
         blocks.append(
             f"{i + 1}\n{start} --> {end}\n"
-            f"HOME({telemetry['longitude_deg'][0]:.6f},{telemetry['latitude_deg'][0]:.6f}) {moment:%Y.%m.%d %H:%M:%S}\n"
+            f"{home} {moment:%Y.%m.%d %H:%M:%S}\n"
             f"GPS({longitude:.6f},{latitude:.6f},14) BAROMETER:{telemetry['height_above_takeoff_m'][i]:.1f}\n"
             "ISO:100 Shutter:1000 EV: Fnum:F2.8\n"
         )
@@ -272,10 +373,11 @@ def _nmea(telemetry: Telemetry, corrupt: Set[int], geoid_height_m: float) -> str
     lines = []
     for i, time_ns in enumerate(telemetry.time_ns):
         moment = _moment(int(time_ns))
+        latitude, longitude = telemetry["latitude_deg"][i], telemetry["longitude_deg"][i]
         clock = f"{moment:%H%M%S}.{moment.microsecond // 10000:02d}"
         place = (
-            f"{_degrees_minutes(telemetry['latitude_deg'][i], 2)},{'N' if telemetry['latitude_deg'][i] >= 0 else 'S'},"
-            f"{_degrees_minutes(telemetry['longitude_deg'][i], 3)},{'E' if telemetry['longitude_deg'][i] >= 0 else 'W'}"
+            f"{_degrees_minutes(latitude, 2)},{'N' if latitude >= 0 else 'S'},"
+            f"{_degrees_minutes(longitude, 3)},{'E' if longitude >= 0 else 'W'}"
         )
         height_m = telemetry["orthometric_height_m"][i]
         knots = telemetry["speed_m_s"][i] * _KNOTS_PER_M_S
@@ -300,7 +402,7 @@ def _gpx(telemetry: Telemetry) -> str:
     points = "".join(
         f'<trkpt lat="{telemetry["latitude_deg"][i]:.9f}" lon="{telemetry["longitude_deg"][i]:.9f}">'
         f"<ele>{telemetry['orthometric_height_m'][i]:.3f}</ele>"
-        f"<time>{_moment(int(time_ns)):%Y-%m-%dT%H:%M:%S}.{_moment(int(time_ns)).microsecond // 1000:03d}Z</time></trkpt>\n"
+        f"<time>{_moment(int(time_ns)).isoformat(timespec='milliseconds')[:-6]}Z</time></trkpt>\n"
         for i, time_ns in enumerate(telemetry.time_ns)
     )
     return (
@@ -336,11 +438,13 @@ def _degrees_minutes_seconds(angle_deg: float) -> tuple[IFDRational, IFDRational
 def _xmp(row: Mapping[str, float], moment: datetime) -> bytes:
     values = {
         "UTCAtExposure": f"{moment:%Y-%m-%dT%H:%M:%S}.{moment.microsecond:06d}",
-        "GpsLatitude": f"{row['latitude_deg']:.9f}", "GpsLongitude": f"{row['longitude_deg']:.9f}",
+        "GpsLatitude": f"{row['latitude_deg']:.9f}",
+        "GpsLongitude": f"{row['longitude_deg']:.9f}",
         "AbsoluteAltitude": f"{row['orthometric_height_m']:+.3f}",
         "RelativeAltitude": f"{row['height_above_takeoff_m']:+.3f}",
         "GimbalYawDegree": f"{(row['camera_yaw_deg'] + 180) % 360 - 180:+.3f}",
-        "GimbalPitchDegree": f"{row['camera_pitch_deg']:+.3f}", "GimbalRollDegree": f"{row['camera_roll_deg']:+.3f}",
+        "GimbalPitchDegree": f"{row['camera_pitch_deg']:+.3f}",
+        "GimbalRollDegree": f"{row['camera_roll_deg']:+.3f}",
     }
     attributes = " ".join(f'drone-dji:{name}="{value}"' for name, value in values.items())
     return (
