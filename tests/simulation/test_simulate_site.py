@@ -145,7 +145,7 @@ def test_the_ground_picture_agrees_with_the_frames(site):
     with rasterio.open(site / "truth/ground.tif") as source:
         assert source.crs.to_epsg() == 32633
         places = Projection("EPSG:32633").projected_from_wgs84(latitude, longitude)
-        columns, rows = ~source.transform * places.T
+        columns, rows = ~source.transform @ places.T
         picture = source.read([1, 2, 3]).mean(axis=0).astype(np.float32)
     columns, rows = (np.float32(each).reshape(x.shape) - 0.5 for each in (columns, rows))
     on_map = cv2.remap(picture, columns, rows, cv2.INTER_LINEAR)

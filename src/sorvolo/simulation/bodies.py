@@ -48,7 +48,7 @@ def _as_texture(rgb: Floats, shade: float) -> ImageRGBA:
 
 
 def _quad(a: Floats, b: Floats, c: Floats, d: Floats, texture: ImageRGBA, normal: Floats) -> Patch:
-    return Patch(np.array([a, b, c, d], np.float64), texture, np.asarray(normal, np.float64))
+    return Patch.spanned(np.array([a, b, c, d], np.float64), texture, np.asarray(normal, np.float64))
 
 
 def _level(centre_m: tuple[float, float, float], size_m: tuple[float, float], texture: ImageRGBA) -> Patch:
@@ -56,7 +56,7 @@ def _level(centre_m: tuple[float, float, float], size_m: tuple[float, float], te
     x, y, z = centre_m
     a, b = size_m[0] / 2, size_m[1] / 2
     corners = np.array([[x - a, y + b, z], [x + a, y + b, z], [x + a, y - b, z], [x - a, y - b, z]])
-    return Patch(corners, texture, _BOTH_SIDES)
+    return Patch.spanned(corners, texture, _BOTH_SIDES)
 
 
 def _disc(size_m: tuple[float, float], texel_m: float, colour: Floats, shade: float) -> ImageRGBA:
@@ -216,7 +216,8 @@ def _tree(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) 
     is_bush = thing.kind == "bush"
     green = np.array([[66.0, 88, 42], [82, 98, 48], [54, 78, 44], [98, 104, 56]])[rng.integers(4)]
     low = 0.05 * height if is_bush else 0.3 * height
-    count = 4 if is_bush else 9
+    # a crown that is few pixels wide needs few layers
+    count = int(np.clip(width / texel_m / 14, 3, 4 if is_bush else 9))
     parts: list[Patch | Standing] = []
     if not is_bush:
         bark = np.full(

@@ -111,7 +111,8 @@ class Standing:
         half = side * self.size_m[0] / 2
         foot = place_m + _UP * self.foot_m
         top = foot + _UP * self.size_m[1]
-        return Patch(np.array([top - half, top + half, foot + half, foot - half]), self.texture, _BOTH_SIDES)
+        corners = np.array([top - half, top + half, foot + half, foot - half])
+        return Patch.spanned(corners, self.texture, _BOTH_SIDES)
 
 
 @dataclass(frozen=True, eq=False)

@@ -90,16 +90,16 @@ def _in_sight(
     """
     if not things:
         return []
-    eye_m = site_from_camera.translation_m
-    camera = view.camera
-    corner = np.abs(camera.rays_from_pixels(camera.corners_px)[:, :2]).max(axis=0)
-    axis = site_from_camera.rotation[:, 2]
-    middle_m = eye_m[:2] - axis[:2] / axis[2] * eye_m[2]
-    reach_m = 1.15 * float(np.hypot(*corner)) * eye_m[2] / abs(axis[2]) ** 2
-    places = np.array([thing.place_m(from_middle_s)[:2] for thing in things])
-    # what is high leans outwards, into the picture too when it stands just outside
-    margin_m = np.array([thing.reach_m + thing.size_m[2] for thing in things])
-    near = np.hypot(*(places - middle_m).T) < reach_m + margin_m
+    eye_m, camera = site_from_camera.translation_m, view.camera
+    places = np.array([thing.place_m(from_middle_s) for thing in things])
+    half_heights = np.array([0.0, 0.0, 0.5]) * np.array([[thing.size_m[2]] for thing in things])
+    reach_m = np.array([thing.reach_m + thing.size_m[2] / 2 for thing in things])
+    middles_px = view.project(places + half_heights)
+    # the ball around a thing, at the distance of its nearest point, and a little for the lens
+    nearest_m = np.maximum(np.linalg.norm(places + half_heights - eye_m, axis=1) - reach_m, 0.5)
+    reach_px = (1.3 * camera.fx_px * reach_m / nearest_m + 8)[:, None]
+    size = np.array([camera.width_px, camera.height_px])
+    near = ((middles_px > -reach_px) & (middles_px < size + reach_px)).all(axis=1)
     nearest = [
         (_distance_to_outline(thing.footprint_m(from_middle_s), eye_m[:2]), thing)
         for thing, keep in zip(things, near) if keep

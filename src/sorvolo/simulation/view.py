@@ -6,7 +6,7 @@ shadows) are all views.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar, cast
 
 import cv2
@@ -111,15 +111,34 @@ class Patch:
     top-left, top-right, bottom-right, bottom-left; `texture` is RGBA with the colours multiplied by alpha.
 
     `normal` (3,) points out of a closed body, whose back is never seen; zeros for a leaf that has two sides.
+    `texture_from_plane` (3, 3) takes plane coordinates (a, b), the point corner 0 + a (corner 1 - corner 0) +
+    b (corner 3 - corner 0), to the texture's pixels; moving the patch does not change it.
     """
 
     corners_m: PointsM
     texture: ImageRGBA
     normal: Vector3
+    texture_from_plane: Matrix3
+
+    @classmethod
+    def spanned(cls, corners_m: PointsM, texture: ImageRGBA, normal: Vector3) -> "Patch":
+        """The patch of a texture between four corners in one plane; keystoned if no parallelogram."""
+        height, width = texture.shape[:2]
+        u, v = corners_m[1] - corners_m[0], corners_m[3] - corners_m[0]
+        if np.allclose(corners_m[2] - corners_m[0], u + v, atol=1e-9):
+            matrix = np.array([[width, 0.0, -0.5], [0.0, height, -0.5], [0.0, 0.0, 1.0]])
+        else:
+            far = np.linalg.lstsq(np.column_stack([u, v]), corners_m[2] - corners_m[0], rcond=None)[0]
+            right, bottom = width - 0.5, height - 0.5
+            matrix = cv2.getPerspectiveTransform(
+                np.array([[0, 0], [1, 0], far, [0, 1]], np.float32),
+                np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]], np.float32),
+            )
+        return cls(corners_m, texture, normal, np.asarray(matrix, np.float64))
 
     def moved(self, turn: Matrix3, shift_m: Vector3) -> "Patch":
         """The same patch turned about the origin and then shifted."""
-        return Patch(self.corners_m @ turn.T + shift_m, self.texture, turn @ self.normal)
+        return replace(self, corners_m=self.corners_m @ turn.T + shift_m, normal=turn @ self.normal)
 
 
 def sample_patches(view: View, patches: Sequence[Patch]) -> Iterator[tuple[Window, ImageRGBA]]:
@@ -129,44 +148,31 @@ def sample_patches(view: View, patches: Sequence[Patch]) -> Iterator[tuple[Windo
     ]
     if not facing:
         return
-    # one projection for all corners: a picture has hundreds of patches, most of them out of sight
+    # one projection for all corners: a picture has hundreds of patches, many of them out of sight
     corners_px = view.project(np.concatenate([patch.corners_m for patch in facing])).reshape(-1, 4, 2)
-    for patch, corners in zip(facing, corners_px):
-        seen = _sample(view, patch, corners)
-        if seen is not None:
-            yield seen
-
-
-def _sample(view: View, patch: Patch, corners_px: PointsPx) -> tuple[Window, ImageRGBA] | None:
-    if not np.isfinite(corners_px).all():
-        return None
-    corners = patch.corners_m
-    low, high = corners_px.min(axis=0), corners_px.max(axis=0)
+    low, high = corners_px.min(axis=1), corners_px.max(axis=1)
     slack = 2 + 0.02 * (high - low)  # distortion bows edges outwards
-    x0, y0 = np.maximum(np.floor(low - slack), 0).astype(int)
-    x1 = min(int(np.ceil(high[0] + slack[0])) + 1, view.camera.width_px)
-    y1 = min(int(np.ceil(high[1] + slack[1])) + 1, view.camera.height_px)
-    if x1 <= x0 or y1 <= y0:
+    size = np.array([view.camera.width_px, view.camera.height_px])
+    with np.errstate(invalid="ignore"):
+        is_seen = ((high + slack > 0) & (low - slack < size)).all(axis=1)  # a corner behind the camera is NaN
+    starts = np.maximum(np.floor(low[is_seen] - slack[is_seen]), 0).astype(int)
+    ends = np.minimum(np.ceil(high[is_seen] + slack[is_seen]).astype(int) + 1, size)
+    for index, (x0, y0), (x1, y1) in zip(np.flatnonzero(is_seen), starts.tolist(), ends.tolist()):
+        sample = _sample(view, facing[index], (x0, y0, x1, y1))
+        if sample is not None:
+            yield (x0, y0, x1, y1), sample
+
+
+def _sample(view: View, patch: Patch, window: Window) -> ImageRGBA | None:
+    """The patch within a window; None when it is seen edge-on."""
+    corners = patch.corners_m
+    ray_from_plane = view.ray_from_plane(corners[0], corners[1] - corners[0], corners[3] - corners[0])
+    if abs(np.linalg.det(ray_from_plane / np.abs(ray_from_plane).max())) < 1e-9:
         return None
-    origin, u, v = corners[0], corners[1] - corners[0], corners[3] - corners[0]
-    ray_from_plane = view.ray_from_plane(origin, u, v)
-    scale = np.abs(ray_from_plane).max()
-    if abs(np.linalg.det(ray_from_plane / scale)) < 1e-9:  # edge-on
-        return None
-    # the fourth corner in units of u and v: (1, 1) for a parallelogram, else the texture is keystoned
-    far = np.linalg.lstsq(np.column_stack([u, v]), corners[2] - origin, rcond=None)[0]
-    height, width = patch.texture.shape[:2]
-    texture_from_plane = cv2.getPerspectiveTransform(
-        np.array([[0, 0], [1, 0], far, [0, 1]], np.float32),
-        np.array(
-            [[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]], np.float32
-        ),
-    )
-    texture_from_ray = texture_from_plane @ np.linalg.inv(ray_from_plane)
-    rays = view.rays_in((x0, y0, x1, y1))
+    texture_from_ray = patch.texture_from_plane @ np.linalg.inv(ray_from_plane)
+    rays = view.rays_in(window)
     where = cv2.perspectiveTransform(np.ascontiguousarray(rays).reshape(-1, 1, 2), texture_from_ray)
-    sample = remapped(patch.texture, where.reshape(*rays.shape), cv2.BORDER_CONSTANT)
-    return (x0, y0, x1, y1), sample
+    return remapped(patch.texture, where.reshape(*rays.shape), cv2.BORDER_CONSTANT)
 
 
 def remapped(picture: NDArray[_Scalar], where: Anything, border: int) -> NDArray[_Scalar]:

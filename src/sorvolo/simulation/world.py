@@ -318,7 +318,7 @@ def _own_shadow(thing: Thing, body: Body, light: Light, m_per_px: float) -> Patc
     texture = np.zeros((side, side, 4), np.uint8)
     texture[..., 3] = (depth * (1 - float(_SHADOW_TINT.mean()))).astype(np.uint8)
     corners = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) * reach_m
-    return Patch(corners, texture, np.zeros(3))
+    return Patch.spanned(corners, texture, np.zeros(3))
 
 
 def orthophoto(day: Day) -> GroundRaster:
@@ -336,7 +336,7 @@ def orthophoto(day: Day) -> GroundRaster:
 
 def _cast(patches: list[Patch], sun_view: View, depth: ImageGray) -> None:
     """Darken `depth`, in place, where the patches stop the sun; a face's back stops it as its front does."""
-    two_sided = [Patch(patch.corners_m, patch.texture, np.zeros(3)) for patch in patches]
+    two_sided = [replace(patch, normal=np.zeros(3)) for patch in patches]
     for (x0, y0, x1, y1), sample in sample_patches(sun_view, two_sided):
         np.maximum(depth[y0:y1, x0:x1], sample[..., 3], out=depth[y0:y1, x0:x1])
 
