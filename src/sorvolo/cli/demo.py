@@ -47,6 +47,8 @@ def demo(
     show_reports(reports, site, console)
     for truth in evaluate_mosaic(site, truth=simulation).truth[:1]:
         corners = truth.corners
+        if not corners.absolute.count:  # without frames by vision there is nothing to say
+            continue
         console.print(
             f"Against the truth, the corners of the frames lie {corners.absolute.rms_m:.2f} m off (rms), as "
             f"GPS noise moves the map as a whole; within the map they are {corners.shape.rms_m:.3f} m off."

@@ -78,7 +78,7 @@ def map_command(
     )
     if as_json:
         plain = [{key: value for key, value in each.items() if key != "track"} for each in reports]
-        files = {name: str(path) for name, path in _map_files(site).items()}
+        files = {path.name.replace(".", "_"): str(path) for path in _map_files(site).values()}
         typer.echo(json.dumps({"site": str(site), **files, "flights": plain}, indent=1))
     else:
         show_reports(reports, site, Console())

@@ -375,7 +375,7 @@ def _with_unit(pattern: str, value: Any) -> str | None:
 
 
 def _within(sigma: float | None) -> str | None:
-    return None if sigma is None else f"\u00b1 {100 * sigma:.2g} %"
+    return None if sigma is None else f"\u00b1 {100 * sigma:.2g} %" if sigma else "(kept as given)"
 
 
 def _join(*parts: str | None) -> str:

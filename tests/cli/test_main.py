@@ -1,0 +1,159 @@
+"""The command as people meet it: exit codes, one line for an error, pure JSON, help with an example."""
+
+import errno
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import sorvolo
+from sorvolo.cli import main as cli
+from sorvolo.errors import InputError
+from sorvolo.missions.map_flight import map_flights
+
+_COMMANDS = ("inspect", "plan", "map", "simulate", "evaluate", "calibrate", "demo")
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"sorvolo {sorvolo.__version__}\n"
+
+
+def test_module_is_the_command() -> None:
+    command = [sys.executable, "-m", "sorvolo", "--version"]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (run.returncode, run.stdout, run.stderr) == (0, f"sorvolo {sorvolo.__version__}\n", "")
+
+
+@pytest.mark.parametrize("command", [*_COMMANDS[:4], "evaluate mosaic", *_COMMANDS[5:]])
+def test_help_has_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*command.split(), "--help"]) == 0
+    example = capsys.readouterr().out.split("Example", 1)[1]
+    assert f"sorvolo {command}" in " ".join(example.replace("│", " ").split())
+
+
+def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--help"]) == 0
+    words = capsys.readouterr().out.split()
+    assert all(command in words for command in _COMMANDS)
+
+
+@pytest.mark.parametrize(
+    "arguments", [["nonsense"], ["map"], ["map", "x.mp4"], ["map", "x", "--site", "y", "--gsd", "z"]]
+)
+def test_wrong_usage_is_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(arguments) == 2
+    told = capsys.readouterr()
+    assert told.out == "" and "Usage" in told.err
+
+
+def test_an_error_is_one_line_on_stderr(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missing = tmp_path / "gone.mp4"
+    assert cli.main(["inspect", str(missing)]) == 1
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("error: ") and str(missing) in told.err
+    assert told.err.count("\n") == 1 and "Traceback" not in told.err
+
+
+def test_nothing_is_left_of_a_map_that_could_not_begin(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["map", str(tmp_path / "gone.mp4"), "--site", str(tmp_path / "site")]) == 1
+    assert "error: " in capsys.readouterr().err
+    assert not (tmp_path / "site").exists()
+
+
+@pytest.mark.parametrize("options", [["--overlap", "1.5"], ["--gsd", "-1"], ["--offset", "1e12"]])
+def test_settings_out_of_range_are_errors(
+    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["map", str(tmp_path), "--site", str(tmp_path / "site"), *options]) == 1
+    assert "error: " in capsys.readouterr().err
+
+
+def test_json_is_pure(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["plan", "--camera", "aov=62", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["height_m"] > 0
+
+
+class TestFailures:
+    """A command that fails on purpose, through the one catcher."""
+
+    @pytest.fixture(autouse=True)
+    def _command(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.delenv("SORVOLO_DEBUG", raising=False)
+        failing = cli.typer.Typer(pretty_exceptions_enable=False)
+        failing.callback()(cli.options)
+        failing.command("fail")(self._fail)
+        failing.command("other")(self._fail)
+        monkeypatch.setattr(cli, "app", failing)
+
+    error: BaseException = RuntimeError("boom")
+
+    @classmethod
+    def _fail(cls) -> None:
+        raise cls.error
+
+    def _told(
+        self, error: BaseException, capsys: pytest.CaptureFixture[str], *options: str
+    ) -> tuple[int, str]:
+        type(self).error = error
+        code = cli.main([*options, "fail"])
+        told = capsys.readouterr()
+        assert told.out == ""
+        return code, told.err
+
+    def test_ours(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert self._told(InputError("no\nsuch  thing"), capsys) == (1, "error: no such thing\n")
+
+    def test_full_disk(self, capsys: pytest.CaptureFixture[str]) -> None:
+        code, told = self._told(OSError(errno.ENOSPC, "No space left", "/full/tile.png"), capsys)
+        assert code == 1 and "disk is full" in told and "/full/tile.png" in told and told.count("\n") == 1
+
+    def test_forbidden(self, capsys: pytest.CaptureFixture[str]) -> None:
+        code, told = self._told(PermissionError(errno.EACCES, "Permission denied", "/locked"), capsys)
+        assert code == 1 and told.startswith("error: /locked: Permission denied")
+
+    def test_out_of_memory(self, capsys: pytest.CaptureFixture[str]) -> None:
+        code, told = self._told(MemoryError(), capsys)
+        assert code == 1 and "memory" in told and "bug" not in told
+
+    def test_bug(self, capsys: pytest.CaptureFixture[str]) -> None:
+        code, told = self._told(KeyError("oops"), capsys)
+        assert code == 1 and "bug" in told and "KeyError" in told and "--debug" in told
+        assert told.count("\n") == 1
+
+    def test_debug_shows_where(self, capsys: pytest.CaptureFixture[str]) -> None:
+        code, told = self._told(KeyError("oops"), capsys, "--debug")
+        assert code == 1 and "Traceback" in told and "_fail" in told
+
+    def test_debug_by_environment(
+        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        monkeypatch.setenv("SORVOLO_DEBUG", "1")
+        assert "Traceback" in self._told(InputError("x"), capsys)[1]
+
+    def test_stopped(self, capsys: pytest.CaptureFixture[str]) -> None:
+        code, told = self._told(KeyboardInterrupt(), capsys)
+        assert code == 130 and told == "stopped; the site is as it was before\n"
+
+
+def test_import_is_quick_and_lazy() -> None:
+    heavy = ("numpy", "cv2", "scipy", "rasterio")
+    code = f"import sys, sorvolo; sys.exit(any(name in sys.modules for name in {heavy}))"
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0
+
+
+@pytest.mark.parametrize("name", sorted(sorvolo.__all__))
+def test_public_names_are_there(name: str) -> None:
+    assert getattr(sorvolo, name) is not None
+
+
+def test_public_names_are_the_missions() -> None:
+    assert sorvolo.map_flights is map_flights
+    assert set(sorvolo.__all__) <= set(dir(sorvolo))
+    with pytest.raises(AttributeError, match="no_such"):
+        _ = sorvolo.no_such

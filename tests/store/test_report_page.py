@@ -1,0 +1,242 @@
+"""The report page: whole, self-contained, escaped, honest, and the same whatever is unknown."""
+
+import base64
+import math
+import re
+from html.parser import HTMLParser
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from fake_reports import fake_picture, fake_report
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sorvolo.store.exports import plain_json
+from sorvolo.store.report_page import report_page
+from sorvolo.store.report_plots import Scale, round_length
+
+_VOID = {"meta", "img", "br", "path", "line", "circle", "rect", "polyline"}
+
+
+class _Checker(HTMLParser):
+    """Collects text, addresses and elements; fails on elements that are not closed in order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text: list[str] = []
+        self.addresses: list[str] = []
+        self.names: list[str] = []
+        self.classes: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.names.append(tag)
+        self.classes += [value or "" for name, value in attrs if name == "class"]
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data")]
+        assert not [name for name, _ in attrs if name.startswith("on")]
+        if tag not in _VOID or tag in ("circle", "rect", "path"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.names.append(tag)
+        self.classes += [value or "" for name, value in attrs if name == "class"]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open and self.open[-1] == tag, f"</{tag}> closes {self.open[-1:]}"
+        self.open.pop()
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+def _checked(page: str) -> _Checker:
+    checker = _Checker()
+    checker.feed(page)
+    checker.close()
+    assert checker.open == []
+    return checker
+
+
+def _words(page: str) -> str:
+    return " ".join(" ".join(_checked(page).text).split())
+
+
+def test_page_needs_nothing_else() -> None:
+    page = report_page(fake_report(), fake_picture())
+    checker = _checked(page)
+    assert "script" not in checker.names and "link" not in checker.names
+    assert len(checker.addresses) == 1 and checker.addresses[0].startswith("data:image/jpeg;base64,")
+    assert "http" not in page and "url(" not in page and "@import" not in page
+
+
+def test_picture_is_the_map_on_grey() -> None:
+    picture = fake_picture(noise=0.0)
+    page = report_page(fake_report(), picture)
+    data = base64.b64decode(re.search(r"base64,([^\"]+)", page)[1])  # type: ignore[index]
+    shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    assert shown.shape == picture[..., :3].shape
+    seen = cv2.erode(picture[..., 3], np.ones((17, 17))) > 0
+    unseen = cv2.dilate(picture[..., 3], np.ones((17, 17))) == 0
+    assert np.abs(shown[seen].astype(int) - picture[..., :3][seen]).mean() < 3
+    assert np.abs(shown[unseen].astype(int) - 236).max() < 8
+
+
+def test_large_pictures_are_made_to_fit() -> None:
+    rng = np.random.default_rng(1)
+    noise = np.dstack([rng.integers(0, 256, (1600, 1600, 3)), np.full((1600, 1600), 255)]).astype(np.uint8)
+    assert len(report_page(fake_report(), noise)) < 2_200_000
+
+
+def test_nothing_seen_is_no_picture() -> None:
+    page = report_page(fake_report(), np.zeros((4, 4, 4), np.uint8))
+    assert "img" not in _checked(page).names
+
+
+def test_everything_from_outside_is_escaped() -> None:
+    evil = '<script>alert("1")</script>&\'"><img src=x>'
+    report = _with_every_text(fake_report(), evil)
+    page = report_page(report, fake_picture(60, 40))
+    checker = _checked(page)
+    assert "script" not in checker.names and checker.names.count("img") == 1
+    assert "<script" not in page and "alert(&quot;1&quot;)" in page
+
+
+def _with_every_text(value: Any, text: str) -> Any:
+    """The report with every text that a file or a person gave replaced; keys of reasons and settings, too."""
+    if isinstance(value, dict):
+        changed = {
+            key: each if key == "status" else _with_every_text(each, text) for key, each in value.items()
+        }
+        if "reasons" in changed:
+            changed["reasons"] = {text: 1}
+        return changed
+    if isinstance(value, list):
+        return [_with_every_text(each, text) for each in value]
+    return text if isinstance(value, str) else value
+
+
+def test_marks_are_one_for_each_frame() -> None:
+    report = fake_report(40)
+    residuals = report_page(report, fake_picture(60, 40)).split("<h2>")
+    plot = next(each for each in residuals if each.startswith("How well"))
+    classes = _classes_of_marks(plot)
+    frames = report["frames"]
+    assert (classes.count("vision"), classes.count("gps-only"), classes.count("rejected")) == (
+        frames["vision"], frames["gps-only"], frames["rejected"]
+    )
+    plan = next(each for each in residuals if each.startswith("The track"))
+    assert _classes_of_marks(plan).count("rejected") == 0
+    assert plan.count('class="fix"') == frames["vision"] + frames["gps-only"]
+
+
+def _classes_of_marks(part: str) -> list[str]:
+    return re.findall(r'<(?:circle|rect|path) class="(vision|gps-only|rejected)"', part)
+
+
+def test_fix_lies_at_camera_less_residual() -> None:
+    report = fake_report(8)
+    report["track"] = [
+        {"frame": "a", "status": "vision", "east_m": 0.0, "north_m": 0.0, "up_m": 1.0, "residual_px": 1.0,
+         "sigma_m": 1.0, "gps_east_m": -10.0, "gps_north_m": 0.0, "gps_up_m": 0.0},
+        {"frame": "b", "status": "vision", "east_m": 0.0, "north_m": 10.0, "up_m": 1.0, "residual_px": 1.0,
+         "sigma_m": 1.0, "gps_east_m": 0.0, "gps_north_m": 0.0, "gps_up_m": 0.0},
+    ]
+    page = report_page(report, fake_picture(60, 40))
+    plan = next(each for each in page.split("<h2>") if each.startswith("The track"))
+    fixes, cameras = (
+        [(float(x), float(y)) for x, y in re.findall(rf'class="{name}" cx="([\d.]+)" cy="([\d.]+)"', plan)]
+        for name in ("fix", "vision")
+    )
+    assert fixes[0][0] > cameras[0][0] and fixes[0][1] == cameras[0][1]  # 10 m to the east
+    assert fixes[1] == cameras[1] and cameras[1][1] < cameras[0][1]  # north is up
+    assert fixes[0][0] - cameras[0][0] == pytest.approx(cameras[0][1] - cameras[1][1], abs=0.2)
+
+
+@pytest.mark.parametrize(("counts", "words"), [
+    ((60, 0, 0), "All 60 selected frames fit together"),
+    ((55, 3, 2), "58 of 60 selected frames make a map of 3\u202f412 m\u00b2 at 3 cm a pixel: 55 by what they "
+                 "show, 3 by GPS alone; 2 could not be placed."),
+    ((0, 0, 60), "there is no map"),
+])
+def test_headline_is_honest(counts: tuple[int, int, int], words: str) -> None:
+    report = fake_report()
+    report["frames"] |= dict(zip(("vision", "gps-only", "rejected"), counts))
+    page = report_page(report, fake_picture(60, 40))
+    headline = re.search("<h1>(.*?)</h1>", page)[1]  # type: ignore[index]
+    assert words in headline
+
+
+def test_local_map_promises_no_metres() -> None:
+    page = report_page(fake_report(georeferenced=False), fake_picture(60, 40))
+    headline = _words(page).split("What became")[0]
+    assert "without metres and without north" in headline
+    assert " m\u00b2" not in headline and "cm" not in headline and 'class="scale"' not in page
+
+
+def test_scale_bar_is_as_long_as_it_says() -> None:
+    report, picture = fake_report(), fake_picture(400, 200)
+    report["area_m2"] = np.count_nonzero(picture[..., 3]) * 0.25**2  # 0.25 m a pixel: 100 m wide
+    share, length = re.search(
+        r'class="scale" style="width:([\d.]+)%">([\d.]+) m', report_page(report, picture)
+    ).groups()  # type: ignore[union-attr]
+    assert float(length) / (float(share) / 100) == pytest.approx(100.0, rel=1e-3)
+
+
+def test_unknown_numbers_are_said_or_left_out() -> None:
+    report = _without_numbers(plain_json(fake_report()))
+    words = _words(report_page(report, fake_picture(60, 40)))
+    assert "None" not in words and "nan" not in words.lower().split()
+    assert "Look at this first" in words
+
+
+def _without_numbers(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_numbers(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_without_numbers(each) for each in value]
+    return None if isinstance(value, float) else value
+
+
+@pytest.mark.parametrize("key", list(fake_report()))
+def test_any_part_may_be_missing(key: str) -> None:
+    report = fake_report(5)
+    report[key] = None
+    _checked(report_page(report, fake_picture(60, 40)))
+    del report[key]
+    _checked(report_page(report, fake_picture(60, 40)))
+
+
+@given(st.lists(
+    st.tuples(
+        st.sampled_from(["vision", "gps-only", "rejected"]),
+        st.lists(st.one_of(st.none(), st.floats(-1e7, 1e7), st.just(math.nan), st.just(math.inf)), min_size=8,
+                 max_size=8),
+    ), max_size=12,
+))
+def test_any_track_can_be_drawn(rows: list[tuple[str, list[float | None]]]) -> None:
+    names = ("east_m", "north_m", "up_m", "residual_px", "sigma_m", "gps_east_m", "gps_north_m", "gps_up_m")
+    report = fake_report(8)
+    report["track"] = [{"frame": str(k), "status": status, **dict(zip(names, numbers))}
+                       for k, (status, numbers) in enumerate(rows)]
+    page = report_page(report, np.zeros((2, 2, 4), np.uint8))
+    _checked(page)
+    drawn = "".join(re.findall("<svg.*?</svg>", page, re.DOTALL))
+    assert not re.search(r"[\"\s,MLHV](nan|inf)", drawn)
+
+
+@given(st.floats(1e-6, 1e9))
+def test_round_lengths(about: float) -> None:
+    length = round_length(about)
+    assert 0.39 * about <= length <= about * (1 + 1e-6)
+    digit = length / 10 ** math.floor(math.log10(length) + 1e-9)
+    assert min(abs(digit - each) for each in (1, 2, 5, 10)) < 1e-6
+
+
+@given(st.floats(-1e4, 1e4), st.floats(1e-2, 1e4))
+def test_ticks_lie_on_the_scale(low: float, span: float) -> None:
+    scale = Scale(low, low + span, 0.0, 100.0)
+    ticks = list(scale.ticks(5))
+    assert 4 <= len(ticks) <= 14
+    assert all(-1e-4 <= scale(tick) <= 100.0001 for tick in ticks)
