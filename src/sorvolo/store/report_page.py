@@ -104,7 +104,10 @@ def _second_sentence(report: Mapping[str, Any]) -> str:
     sigma, gps = _number(report, "sigma_m"), _number(report, "gps_residual_m", "median")
     parts = []
     if sigma is not None:
-        parts.append(f"A frame's place is estimated to be good to {_length(sigma)} (one sigma).")
+        parts.append(
+            f"By the scatter of its GPS fixes the map lies in its place to {_length(sigma)} (one sigma); what all "
+            "fixes err in common, often a metre or more, comes on top and cannot be seen from the flight alone."
+        )
     if gps is not None:
         parts.append(f"The cameras lie {_length(gps)} from their GPS fixes (median).")
     return " ".join(parts)
@@ -166,7 +169,7 @@ def _key_figures(report: Mapping[str, Any]) -> str:
          "median distance of cameras and fixes, level; rms "
          + (_length(_number(report, "gps_residual_m", "rms")) or "unknown")),
         ("in its place to", _length(_number(report, "sigma_m")) if unit == "m" else None,
-         "one sigma of a frame's place, estimated, median"),
+         "one sigma, besides what all GPS fixes err in common"),
         ("flown at",
          _with_unit("{:.1f} m", _number(report, "height_above_ground_m")) if unit == "m" else None,
          "above the ground, median"),
