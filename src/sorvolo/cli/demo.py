@@ -50,9 +50,9 @@ def demo(
         if not corners.absolute.count:  # without frames by vision there is nothing to say
             continue
         console.print(
-            f"Against the truth, the corners of the frames lie {corners.absolute.rms_m:.2f} m off (rms), where "
-            f"the GPS noise alone costs {corners.floor.rms_m:.2f} m; within the map, which GPS moves as a whole, "
-            f"they are {corners.shape.rms_m:.3f} m off."
+            f"Against the truth, the corners of the frames lie {corners.absolute.rms_m:.2f} m off (rms), "
+            f"where GPS noise alone costs {corners.floor.rms_m:.2f} m; within the map, which GPS moves as a "
+            f"whole, they are {corners.shape.rms_m:.3f} m off."
         )
     later, camera = simulation / _LATER_FLIGHT, simulation / "camera.xml"
     console.print("Next, look at the second flight, or map one of your own:")
