@@ -53,6 +53,7 @@ def main() -> None:
     parser.add_argument("--length", type=float, help="length of a strip, m, for a shorter flight")
     parser.add_argument("--repeats", type=int, default=1, help="runs of each method on each flight")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
+    parser.add_argument("--limit", type=float, default=1800.0, help="longest time of a run, s")
     parser.add_argument("--output", type=Path, default=RESULTS)
     parser.add_argument("--run", nargs=3, metavar=("METHOD", "SIMULATION", "SITE"), help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -68,7 +69,7 @@ def main() -> None:
                 for method in options.methods:
                     site = Path(folder) / f"{method}-{repeat}"
                     print(f"seed {seed}, run {repeat + 1}: {method}", file=sys.stderr, flush=True)
-                    measured = run_apart(method, simulation, site)
+                    measured = run_apart(method, simulation, site, options.limit)
                     measured |= accuracy(method, simulation, site)
                     runs.append({"seed": seed, "method": method, **measured})
     summary = summarise(runs, options.methods)
@@ -79,6 +80,9 @@ def main() -> None:
         "summary": summary, "runs": runs,
     }, indent=1) + "\n")
     show(summary)
+    for run in runs:
+        if "failure" in run:
+            print(f"{run['method']}, seed {run['seed']}: {run['failure']}")
 
 
 def simulate(folder: Path, name: str, seed: int, length_m: float | None) -> None:
@@ -96,10 +100,13 @@ def photos_of(simulation: Path) -> Path:
     return next(simulation.glob("*/photos"))
 
 
-def run_apart(method: str, simulation: Path, site: Path) -> dict[str, float | str]:
+def run_apart(method: str, simulation: Path, site: Path, limit_s: float) -> dict[str, float | str]:
     """Run one method in a process of its own; what it cost, or how it failed."""
     command = [sys.executable, __file__, "--run", method, str(simulation), str(site)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit_s)
+    except subprocess.TimeoutExpired:
+        return {"failure": f"not done after {limit_s:.0f} s"}
     if done.returncode:
         last = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
         return {"failure": last[0]}
@@ -134,14 +141,21 @@ def stitch_with_opencv(photos: Path, site: Path) -> None:
         raise SystemExit(f"OpenCV's Stitcher ended with status {status}")
     site.mkdir()
     cv2.imwrite(str(site / "mosaic.png"), picture)
-    # SCANS keeps each image's affine map, at registration scale, in its camera's rotation
     scale = stitcher.workScale()
     at_scale = np.diag([scale, scale, 1.0])
     placed = {
-        files[index].name: (np.asarray(camera.R, dtype=np.float64) @ at_scale).tolist()
+        files[index].name: (picture_from_image(np.asarray(camera.R, dtype=np.float64)) @ at_scale).tolist()
         for index, camera in zip(np.ravel(stitcher.component()).tolist(), stitcher.cameras(), strict=True)
     }
     (site / "placed.json").write_text(json.dumps(placed))
+
+
+def picture_from_image(rotation: np.ndarray) -> np.ndarray:
+    """SCANS keeps an image's map [A t] in its camera's rotation and draws its pixels p at A^T (p - t)."""
+    result = np.eye(3)
+    result[:2, :2] = rotation[:2, :2].T
+    result[:2, 2] = -rotation[:2, :2].T @ rotation[:2, 2]
+    return result
 
 
 def accuracy(method: str, simulation: Path, site: Path) -> dict[str, float]:
