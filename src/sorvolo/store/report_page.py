@@ -105,8 +105,8 @@ def _second_sentence(report: Mapping[str, Any]) -> str:
     parts = []
     if sigma is not None:
         parts.append(
-            f"By the scatter of its GPS fixes the map lies in its place to {_length(sigma)} (one sigma); what "
-            "all fixes err in common, often a metre or more, comes on top and cannot be seen from the flight."
+            f"By the scatter of its GPS fixes the map lies in its place to {_length(sigma)} (one sigma); "
+            "what all fixes err in common, often a metre or more, comes on top and does not show here."
         )
     if gps is not None:
         parts.append(f"The cameras lie {_length(gps)} from their GPS fixes (median).")
