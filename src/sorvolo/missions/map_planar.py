@@ -329,7 +329,16 @@ class _Known:
         assert pose is not None
         self.keyframe = KnownKeyframe(keyframe_id, stored.camera, pose, lambda: archive.image(stored))
 
-    def _known_keyframes(archive: Archive, setup: FlightSetup) -> dict[int, _Known]:
+    def canvas_frame(self, site_grid: SiteGrid) -> CanvasFrame:
+        found = canvas_frame(
+            self.id, self.rank, self.stored.camera, self.stored.site_from_image, site_grid, self.stored.gains,
+            np.zeros(2), None,
+        )
+        assert found is not None  # it was painted before
+        return found
+
+
+def _known_keyframes(archive: Archive, setup: FlightSetup) -> dict[int, _Known]:
     """The site's keyframes by canvas id; those of this flight's own earlier run are marked as superseded.
 
     When that run made the newest map its tiles are taken back anyway, and its keyframes are left out.

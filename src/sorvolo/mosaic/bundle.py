@@ -15,9 +15,13 @@ from scipy.sparse.linalg import splu
 from sorvolo.geometry.arrays import Anything, Floats
 from sorvolo.geometry.pose import rotation_from_vector
 
-SHARED = ("log_focal", "radial", "altitude_offset_m", "east_offset_m", "north_offset_m")
+SHARED = (
+    "log_focal", "radial", "altitude_offset_m", "east_offset_m", "north_offset_m",
+    "boresight_x_rad", "boresight_y_rad", "boresight_z_rad",
+)
 """Unknowns that all keyframes of a flight share: focal length (log of its scale), the first radial distortion that
-the calibration left over, and the constant offsets of the altitude's zero and of GPS against the map."""
+the calibration left over, the constant offsets of the altitude's zero and of GPS against the map, and the constant
+turn of the camera, about its own axes, against the attitude that telemetry states (mounting, gimbal, compass)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +137,7 @@ class Solution:
     nodes: Nodes
     shared: Floats
     cost: float
-    normal: Anything  # sparse (6 n + 5) square information matrix
+    normal: Anything  # sparse (6 n + 8) square information matrix
     position: Anything  # (N,) place of each node in it, -1 for those held
 
 
@@ -143,7 +147,7 @@ def solve(
 ) -> Solution:
     """Levenberg-Marquardt with a Cauchy loss over the free nodes, (N,) bool, and the shared unknowns.
 
-    `shared_sigma` (5,) is each shared unknown's prior sigma about 0; 0 holds it at its present value.
+    `shared_sigma` (8,) is each shared unknown's prior sigma about 0; 0 holds it at its present value.
     """
     damping = 1e-6
     cost, normal, gradient, position = _normal_equations(nodes, pairs, shared, shared_sigma, free, robust_sigmas)
@@ -240,22 +244,18 @@ def _add_priors(
     information = root**2 / (1 + squared)
     blocks = np.zeros((len(index), 6, 6))
     blocks[:, [3, 4, 5], [3, 4, 5]] = information
-    coupling = np.zeros((len(index), 6, 5))
+    coupling = np.zeros((len(index), 6, 8))
     coupling[:, [3, 4, 5], [3, 4, 2]] = information
-    own = np.zeros((len(index), 5, 5))
+    own = np.zeros((len(index), 8, 8))
     own[:, [3, 4, 2], [3, 4, 2]] = information
     pull = -information * miss
     gather(start, np.concatenate([np.zeros_like(pull), pull], axis=1))
-    shared_pull = np.zeros((len(index), 5))
+    shared_pull = np.zeros((len(index), 8))
     shared_pull[:, [3, 4, 2]] = pull
-    gather(shared_start, shared_pull)
-    scatter(start, shared_start, coupling)
-    scatter(shared_start, start, coupling.transpose(0, 2, 1))
-    scatter(shared_start, shared_start, own)
     # attitude, about the camera's own axes
     rotation = nodes.rotations[index]
     relative = nodes.prior_rotations[index].transpose(0, 2, 1) @ rotation
-    error = _rotation_vector(relative)
+    error = rotation_vector(relative) - shared[5:]
     root = 1 / nodes.prior_sigma_rad[index]
     squared = (error * root) ** 2 / robust**2
     cost += float(np.log1p(squared).sum()) * robust**2
@@ -263,6 +263,13 @@ def _add_priors(
     blocks[:, :3, :3] = (rotation * information[:, None, :]) @ rotation.transpose(0, 2, 1)
     turn_pull = -np.einsum("nij,nj->ni", rotation, information * error)
     gather(start, np.concatenate([turn_pull, np.zeros_like(turn_pull)], axis=1))
+    coupling[:, :3, 5:] = -rotation * information[:, None, :]
+    own[:, [5, 6, 7], [5, 6, 7]] = information
+    shared_pull[:, 5:] = information * error
+    gather(shared_start, shared_pull)
+    scatter(start, shared_start, coupling)
+    scatter(shared_start, start, coupling.transpose(0, 2, 1))
+    scatter(shared_start, shared_start, own)
     scatter(start, start, blocks)
     return cost
 
@@ -304,7 +311,7 @@ def _times_cross(rows: Floats, vector: Floats) -> Floats:
     return np.cross(rows, vector[..., None, :])
 
 
-def _rotation_vector(rotation: Floats) -> Floats:
+def rotation_vector(rotation: Floats) -> Floats:
     """(N, 3) rotation vectors of matrices, (N, 3, 3); good up to half a turn."""
     axis = np.stack([
         rotation[:, 2, 1] - rotation[:, 1, 2], rotation[:, 0, 2] - rotation[:, 2, 0],

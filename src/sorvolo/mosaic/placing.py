@@ -10,15 +10,6 @@ from sorvolo.mosaic.canvas import CanvasFrame
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
 
-def canvas_frame(self, site_grid: SiteGrid) -> CanvasFrame:
-        found = canvas_frame(
-            self.id, self.rank, self.stored.camera, self.stored.site_from_image, site_grid, self.stored.gains,
-            np.zeros(2), None,
-        )
-        assert found is not None  # it was painted before
-        return found
-
-
 def canvas_frame(
     keyframe_id: int, rank: int, stored: Camera, site_from_image: Matrix3, site_grid: SiteGrid, gains: Floats,
     vignette: Floats, valid: Mask | None,

@@ -88,7 +88,7 @@ class PlanarMapper:
     def settle(self) -> frozenset[int]:
         """Solve the whole flight once more; the keyframes that moved."""
         moved = self._graph.settle()
-        return moved | self._graph.settle()
+        return moved | self._graph.settle()  # what the first solve taught about links and telemetry counts in the second
 
     def retime(self, priors: Mapping[int, CameraPrior]) -> frozenset[int]:
         """What telemetry says under another clock offset."""
@@ -172,7 +172,11 @@ class PlanarMapper:
 
         def attempt(other: int, prediction: LinkPrediction | None) -> None:
             tried.add(other)
-            found = link(new, self._picture(other), prediction, self._settings.links, self._cache)
+            old = self._picture(other)
+            found = link(new, old, prediction, self._settings.links, self._cache)
+            if isinstance(found, NoLink) and prediction is not None and not links:
+                # telemetry may be plainly wrong (pictures turned by half a turn, a compass that hangs): ask them alone
+                found = link(new, old, None, self._settings.links, self._cache)
             if isinstance(found, NoLink):
                 failures.append(found.reason)
             else:

@@ -1,7 +1,7 @@
 """The pose graph: keyframes come in one at a time with their links, and the ones that moved come out."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.sparse.linalg import splu
@@ -11,10 +11,11 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import fit_similarity, site_from_image_homography
 from sorvolo.geometry.pose import Pose
-from sorvolo.mosaic.bundle import SHARED, Nodes, Pairs, linearise, solve
+from sorvolo.mosaic.bundle import SHARED, Nodes, Pairs, linearise, rotation_vector, solve
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
 
+_ENOUGH = 8  # frames from which telemetry's own errors are learnt
 _UNKNOWN_SIGMA_M = 1e6  # stands in for an infinite sigma; its weight is nothing, its arithmetic finite
 
 
@@ -30,6 +31,8 @@ class PoseGraphSettings:
     radial_sigma: float = 0.0  # prior of the left-over radial distortion; 0 holds it
     altitude_offset_sigma_m: float = 1.0  # how well the altitude's zero is known to be the ground
     gps_offset_sigma_m: float = 0.0  # > 0 when a known map fixes the datum instead of this flight's GPS
+    tilt_offset_sigma_deg: float = 0.0  # of gimbal or mount against the vertical, the same all flight
+    heading_offset_sigma_deg: float = 0.0  # of the compass, the same all flight
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +47,16 @@ class GraphReport:
     links_dropped: int
     relief_m: float
     rms_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Trust:
+    """Factors on telemetry's stated sigmas, (3,) each, and the nodes whose angles are plainly wrong."""
+
+    place: Floats = field(default_factory=lambda: np.ones(3))
+    attitude: Floats = field(default_factory=lambda: np.ones(3))
+    contradicted: Anything = field(default_factory=lambda: np.zeros(0, int))
+    heading_offset_rad: float = np.inf  # how far the compass may be off all flight, as far as it shows
 
 
 @dataclass(eq=False)
@@ -76,6 +89,7 @@ class PoseGraph:
         self._shared = np.zeros(len(SHARED))
         self._dropped = 0
         self._solved_at = 0
+        self._trust = _Trust()
 
     def __contains__(self, keyframe_id: int) -> bool:
         return keyframe_id in self._ids
@@ -148,6 +162,7 @@ class PoseGraph:
         self._align()
         self._solve(self._own(), shared=True, iterations=iterations)
         self._weigh_links()
+        self._weigh_telemetry()
         return self._moved(np.flatnonzero(self._own()))
 
     def retime(self, priors: Mapping[int, CameraPrior]) -> frozenset[int]:
@@ -252,8 +267,11 @@ class PoseGraph:
         return np.array([node.own for node in self._nodes], bool)
 
     def _state(self) -> Nodes:
-        sigma_m = np.array([node.prior.position_sigma_m for node in self._nodes])
-        sigma_rad = np.radians([node.prior.attitude_sigma_deg for node in self._nodes])
+        sigma_m, sigma_rad = self._stated_sigmas()
+        sigma_m = sigma_m * self._trust.place
+        sigma_rad = sigma_rad * self._trust.attitude
+        if len(self._trust.contradicted):
+            sigma_rad[self._trust.contradicted] = np.inf
         return Nodes(
             self._rotations, self._centres_m,
             np.array([node.prior.position_m for node in self._nodes]),
@@ -262,6 +280,11 @@ class PoseGraph:
             np.where(np.isfinite(sigma_rad), np.maximum(sigma_rad, 1e-4), _UNKNOWN_SIGMA_M),
             self._own(),
         )
+
+    def _stated_sigmas(self) -> tuple[Floats, Floats]:
+        """(N, 3) m and (N, 3) rad as telemetry states them."""
+        sigma_m = np.array([node.prior.position_sigma_m for node in self._nodes])
+        return sigma_m, np.radians([node.prior.attitude_sigma_deg for node in self._nodes])
 
     def _pairs(self) -> Pairs:
         if not self._links:
@@ -281,13 +304,18 @@ class PoseGraph:
         settings = self._settings
         sigma = np.array([
             settings.focal_sigma, settings.radial_sigma, settings.altitude_offset_sigma_m,
-            settings.gps_offset_sigma_m, settings.gps_offset_sigma_m,
+            settings.gps_offset_sigma_m, settings.gps_offset_sigma_m, *self._boresight_sigma_rad(),
         ]) if shared else np.zeros(len(SHARED))
         solution = solve(self._state(), pairs, self._shared, sigma, free, iterations)
         if iterations:
             self._rotations, self._centres_m = solution.nodes.rotations, solution.nodes.centres_m
             self._shared = solution.shared
         return solution
+
+    def _boresight_sigma_rad(self) -> list[float]:
+        settings = self._settings
+        tilt, heading = np.radians([settings.tilt_offset_sigma_deg, settings.heading_offset_sigma_deg])
+        return [tilt, tilt, min(heading, self._trust.heading_offset_rad)]
 
     def _due(self) -> bool:
         """Whether it is time for a global solve: often at first, then with each tenth more; loops bend the map."""
@@ -349,6 +377,54 @@ class PoseGraph:
             self._dropped += int(false.sum())
             for name in ("_links", "_old", "_new", "_padded", "_sigma_px", "_relief_m"):
                 setattr(self, name, [each for each, bad in zip(getattr(self, name), false, strict=True) if not bad])
+
+    def _weigh_telemetry(self) -> None:
+        """Learn how good telemetry really is from how it departs from the pictures, once there are enough of them.
+
+        Fixes and angles scatter more or less than they claim, and both are scaled to what they show. Angles that
+        are plainly wrong are left out one by one.
+        """
+        tied = np.zeros(len(self._nodes), bool)
+        tied[[*self._old, *self._new]] = True
+        tied &= self._own()
+        stated_m, stated_rad = self._stated_sigmas()
+        prior_rotations = np.array([node.prior.rotation for node in self._nodes])
+        error_rad = rotation_vector(prior_rotations.transpose(0, 2, 1) @ self._rotations)
+        size = np.linalg.norm(error_rad, axis=1)
+        angled = np.isfinite(stated_rad[:, 2])
+        contradicted = np.flatnonzero(tied & angled & (size > np.maximum(5 * stated_rad.max(axis=1), np.radians(15))))
+        place, attitude, heading_offset = np.ones(3), np.ones(3), np.inf
+        miss_m = self._centres_m + self._shared[[3, 4, 2]] - np.array([n.prior.position_m for n in self._nodes])
+        fixed = tied & np.isfinite(stated_m[:, 0])
+        if fixed.sum() >= _ENOUGH:
+            ratio = np.linalg.norm(miss_m[fixed, :2], axis=1) / stated_m[fixed, 0] / 1.1774
+            place[:2] = np.clip(np.median(ratio), 0.5, 20.0)
+        high = tied & np.isfinite(stated_m[:, 2])
+        if high.sum() >= _ENOUGH:
+            place[2] = np.clip(1.4826 * np.median(np.abs(miss_m[high, 2]) / stated_m[high, 2]), 0.5, 20.0)
+        used = tied & angled
+        used[contradicted] = False
+        if used.sum() >= _ENOUGH:
+            scatter = error_rad[used] - np.median(error_rad[used], axis=0)
+            spread = 1.4826 * np.median(np.abs(scatter), axis=0)
+            # pictures see heading well, tilt hardly: a small scatter of tilt only says that it was believed
+            attitude = np.clip(spread / np.median(stated_rad[used], axis=0), [1.0, 1.0, 0.25], 5.0)
+            reach_m = float(np.sqrt(self._centres_m[used, :2].var(axis=0).sum()))
+            turn_by_gps = float(np.median(stated_m[used, 0]) * place[0]) / (np.sqrt(used.sum()) * max(reach_m, 1e-6))
+            doubt = float(np.hypot(1.25 * spread[2] / np.sqrt(used.sum()), turn_by_gps))
+            # what GPS alone makes of the compass: a turn of the map turns cameras the other way about their own axis
+            offset = float(np.median(error_rad[used, 2])) - self._turn_to_gps(fixed)
+            # one without a visible offset is taken at its word, one with an offset is free to have it
+            heading_offset = float(np.sqrt(max(0.0, offset**2 - doubt**2))) + np.radians(0.15)
+        self._trust = _Trust(place, attitude, contradicted, heading_offset)
+
+    def _turn_to_gps(self, fixed: Anything) -> float:
+        """The turn (rad, left) that would fit the solved positions best to the fixes."""
+        if fixed.sum() < 3:
+            return 0.0
+        fixes = np.array([node.prior.position_m for node in self._nodes])[fixed, :2]
+        change = fit_similarity(fixes, self._centres_m[fixed, :2])
+        return float(np.arctan2(change[1, 0], change[0, 0]))
 
     def _moved(self, candidates: Iterable[int]) -> frozenset[int]:
         names = list(self._ids)

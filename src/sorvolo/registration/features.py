@@ -13,9 +13,9 @@ from sorvolo.survey.mosaic import Features
 class FeatureSettings:
     """How many points are looked for, and on what."""
 
-    detection_side_px: int = 640  # longest side for detection: pairs are refined at full size, so coarse is enough
+    detection_side_px: int = 640  # longest side for ORB: pairs are refined at full size, so coarse is enough
     orb_count: int = 900
-    sift_count: int = 1200
+    sift_count: int = 2500
     corner_count: int = 150  # points that a link is refined on
     corner_cells: int = 12  # a corner quota per cell of this many columns keeps them spread
 
@@ -51,11 +51,10 @@ def orb_features(gray: ImageGray, settings: FeatureSettings) -> Features:
 def sift_features(gray: ImageGray, settings: FeatureSettings) -> Features:
     """SIFT (Lowe 2004), as RootSIFT (Arandjelovic 2012), of a contrast-normalised image: slow, for weak links."""
     sift = cv2.SIFT_create(nfeatures=settings.sift_count, contrastThreshold=0.015)
-    small, scale = _detection_image(gray, settings)
-    keypoints, descriptors = sift.detectAndCompute(small, None)
+    keypoints, descriptors = sift.detectAndCompute(gray, None)
     if descriptors is not None and len(descriptors):
         descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6))
-    return _features("sift", keypoints, descriptors, scale)
+    return _features("sift", keypoints, descriptors, 1.0)
 
 
 def _detection_image(gray: ImageGray, settings: FeatureSettings) -> tuple[ImageGray, float]:

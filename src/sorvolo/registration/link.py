@@ -67,42 +67,63 @@ def link(
     over each other as predicted. The first believable one is refined to sub-pixel pairs (Lucas-Kanade on the old
     image warped into the new one) and must make the overlaid images correlate.
     """
-    best = "too few matching points"
-    for homography in _candidates(new, old, prediction, settings, cache):
-        refined = _refine(new, old, homography, settings, cache)
+    reason = "too few matching points"
+    for found in _candidates(new, old, prediction, settings, cache):
+        refined = _refine(new, old, found.new_from_old, settings, cache)
         if isinstance(refined, Link):
             return refined
-        best = refined
-    return NoLink(new.id, old.id, best)
+        if found.is_sub_pixel:
+            return _as_link(new, old, found, settings)
+        reason = refined
+    return NoLink(new.id, old.id, reason)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A first fit: the map and the pairs, (N, 2) each, that agree with it."""
+
+    new_from_old: Matrix3
+    new_px: PointsPx
+    old_px: PointsPx
+    is_sub_pixel: bool = False
 
 
 def _candidates(
     new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache
-) -> Iterator[Matrix3]:
-    predicted = prediction.new_from_old if prediction else None
-    search_px = prediction.search_px if prediction else 0.0
-    fitted = _fit(new.features, old.features, predicted, search_px, settings, ratio=0.85)
+) -> Iterator[_Fit]:
+    fitted = _fit(new.features, old.features, prediction, settings)
     if fitted is not None:
         yield fitted
-    fitted = _fit(cache.sift(new), cache.sift(old), predicted, search_px, settings, ratio=0.85)
+    fitted = _fit(cache.sift(new), cache.sift(old), prediction, settings)
     if fitted is not None:
         yield fitted
-    if predicted is not None:
-        shifted = _correlate(new.gray, old.gray, predicted, search_px)
+    if prediction is not None:
+        shifted = _correlate(new.gray, old.gray, prediction.new_from_old, prediction.search_px)
         if shifted is not None:
-            yield shifted
+            yield _Fit(shifted, np.zeros((0, 2)), np.zeros((0, 2)))
 
 
 def _fit(
-    new: Features, old: Features, predicted: Matrix3 | None, search_px: float, settings: LinkSettings, ratio: float
-) -> Matrix3 | None:
-    pairs = match(new, old, predicted, search_px, ratio)
+    new: Features, old: Features, prediction: LinkPrediction | None, settings: LinkSettings
+) -> _Fit | None:
+    predicted = prediction.new_from_old if prediction else None
+    pairs = match(new, old, predicted, prediction.search_px if prediction else 0.0)
     if len(pairs) < settings.min_inliers:
         return None
-    found = fit_homography(new.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]], settings.threshold_px)
+    new_px, old_px = new.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]]
+    found = fit_homography(new_px, old_px, settings.threshold_px)
     if found is None or found[1].sum() < settings.min_inliers:
         return None
-    return found[0]
+    agree = found[1]
+    return _Fit(found[0], new_px[agree], old_px[agree], is_sub_pixel=new.kind == "sift" and agree.mean() > 0.25)
+
+
+def _as_link(new: Keyframe, old: Keyframe, found: _Fit, settings: LinkSettings) -> Link:
+    """The pairs of a sub-pixel detector as they are: trees and roofs leave little that one plane could refine."""
+    miss = np.linalg.norm(apply_homography(found.new_from_old, found.old_px) - found.new_px, axis=1)
+    chosen = _spread(found.new_px, miss, np.isfinite(miss), settings.max_pairs)
+    sigma_px = max(0.3, float(np.median(miss) / 1.1774))
+    return Link(new.id, old.id, found.new_px[chosen], found.old_px[chosen], found.new_from_old, sigma_px)
 
 
 def _correlate(new: ImageGray, old: ImageGray, predicted: Matrix3, search_px: float) -> Matrix3 | None:
@@ -167,7 +188,7 @@ def _refine(new: Keyframe, old: Keyframe, new_from_old: Matrix3, settings: LinkS
         return f"the overlaid images agree at only {int(good.sum())} points"
     new_px = points[good]
     old_px = apply_homography(np.linalg.inv(new_from_old), ahead[good, 0].astype(np.float64))
-    fitted = fit_homography(new_px, old_px, 1.5)
+    fitted = fit_homography(new_px, old_px, 2.0)
     if fitted is None or fitted[1].sum() < settings.min_inliers:
         return "no single plane fits the refined points"
     homography, inliers = fitted

@@ -42,8 +42,8 @@ class Features:
 class Keyframe:
     """A frame that was chosen for the map, ready to be linked.
 
-    `gray` is undistorted and at registration size, which may be smaller than the frame; `camera` is the
-    distortion-free camera of that gray image. `id` counts up within a site's mapping run.
+    `gray` is undistorted, contrast-normalised and at registration size, which may be smaller than the frame;
+    `camera` is the distortion-free camera of that gray image. `id` counts up within a site's mapping run.
     """
 
     id: int
