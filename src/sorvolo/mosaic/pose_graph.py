@@ -409,14 +409,19 @@ class PoseGraph:
             spread = 1.4826 * np.median(np.abs(scatter), axis=0)
             # pictures see heading well, tilt hardly: a small scatter of tilt only says that it was believed
             attitude = np.clip(spread / np.median(stated_rad[used], axis=0), [1.0, 1.0, 0.25], 5.0)
-            reach_m = float(np.sqrt(self._centres_m[used, :2].var(axis=0).sum()))
-            turn_by_gps = float(np.median(stated_m[used, 0]) * place[0]) / (np.sqrt(used.sum()) * max(reach_m, 1e-6))
-            doubt = float(np.hypot(1.25 * spread[2] / np.sqrt(used.sum()), turn_by_gps))
+            doubt = float(np.hypot(1.25 * spread[2] / np.sqrt(used.sum()), self._doubt_of_turn(stated_m, fixed) * place[0]))
             # what GPS alone makes of the compass: a turn of the map turns cameras the other way about their own axis
             offset = float(np.median(error_rad[used, 2])) - self._turn_to_gps(fixed)
             # one without a visible offset is taken at its word, one with an offset is free to have it
             heading_offset = float(np.sqrt(max(0.0, offset**2 - doubt**2))) + np.radians(0.15)
         self._trust = _Trust(place, attitude, contradicted, heading_offset)
+
+    def _doubt_of_turn(self, stated_m: Floats, fixed: Anything) -> float:
+        """One sigma (rad) of the map's turn as the fixes alone tell it."""
+        if fixed.sum() < 3:
+            return 1.0
+        reach_m = float(np.sqrt(self._centres_m[fixed, :2].var(axis=0).sum()))
+        return float(np.median(stated_m[fixed, 0]) / (np.sqrt(fixed.sum()) * max(reach_m, 1e-6)))
 
     def _turn_to_gps(self, fixed: Anything) -> float:
         """The turn (rad, left) that would fit the solved positions best to the fixes."""
