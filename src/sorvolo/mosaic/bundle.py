@@ -294,7 +294,8 @@ def _advance(nodes: Nodes, shared: Floats, step: Floats, position: Anything) -> 
     turn = steps[:, :3]
     size = np.linalg.norm(turn, axis=1, keepdims=True)
     turn = turn * np.minimum(1.0, 0.3 / np.maximum(size, 1e-12))
-    rotations[index] = rotation_from_vector(turn) @ rotations[index]
+    u, _, vt = np.linalg.svd(rotation_from_vector(turn) @ rotations[index])
+    rotations[index] = u @ vt  # rounding would add up over thousands of steps
     shift = steps[:, 3:].copy()
     limit = 0.5 * np.abs(centres[index, 2])
     shift[:, 2] = np.clip(shift[:, 2], -limit, limit)  # a camera may not dive through the ground in one step

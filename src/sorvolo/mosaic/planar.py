@@ -236,7 +236,7 @@ class PlanarMapper:
             tilt = np.radians(np.nan_to_num(new.prior.attitude_sigma_deg[:2].max(), posinf=15.0))
             place = new.prior.position_sigma_m[:2].max() / max(guess.translation_m[2], 0.5)
             search = float(np.clip(2.5 * new.camera.fx_px * (tilt + place), 0.08 * side, 0.5 * side))
-        return LinkPrediction(new_from_old, search)
+        return LinkPrediction(new_from_old, search, is_tight=tight)
 
     def _by_link(self, new: Keyframe, links: Sequence[Link]) -> Pose | None:
         for each in links:
@@ -255,7 +255,7 @@ class PlanarMapper:
             return []
         centres = np.concatenate([self._graph.centres_m(self._own), self._known_centres_m])
         axes = np.concatenate([
-            np.array([self._graph.pose(each).rotation[:, 2] for each in self._own]).reshape(-1, 3),
+            self._graph.axes(self._own),
             np.array([each.site_from_camera.rotation[:, 2] for each in self._known.values()]).reshape(-1, 3),
         ])
         centres = centres - axes * (centres[:, 2] / np.minimum(axes[:, 2], -0.1))[:, None]

@@ -100,7 +100,7 @@ class PoseGraph:
     def pose(self, keyframe_id: int) -> Pose:
         """site_from_camera as it stands now."""
         at = self._ids[keyframe_id]
-        return Pose(_orthonormal(self._rotations[at]), self._centres_m[at])
+        return Pose(self._rotations[at], self._centres_m[at])
 
     def camera(self, keyframe_id: int) -> Camera:
         """The keyframe's registration camera with the focal length and radial distortion found so far."""
@@ -118,7 +118,11 @@ class PoseGraph:
 
     def centres_m(self, keyframe_ids: Sequence[int]) -> PointsM:
         """(N, 3) camera positions."""
-        return self._centres_m[[self._ids[each] for each in keyframe_ids]].copy()
+        return self._centres_m[[self._ids[each] for each in keyframe_ids]].reshape(-1, 3)
+
+    def axes(self, keyframe_ids: Sequence[int]) -> PointsM:
+        """(N, 3) unit vectors that the cameras look along."""
+        return self._rotations[[self._ids[each] for each in keyframe_ids], :, 2].reshape(-1, 3)
 
     def ids(self) -> list[int]:
         """All keyframes in the order of their coming."""
@@ -150,7 +154,7 @@ class PoseGraph:
         free[-self._settings.window:] = True
         free[[self._ids[each.old_id] for each in links]] = True
         free &= self._own()
-        self._solve(free, shared=False, iterations=3)
+        self._solve(free, shared=False, iterations=2)
         if self._due():
             return self.settle(iterations=3)
         touched = np.flatnonzero(free)
@@ -437,7 +441,7 @@ class PoseGraph:
         for at in candidates:
             node = self._nodes[at]
             camera = self.refined(node.camera)
-            outline = footprint(camera, Pose(_orthonormal(self._rotations[at]), self._centres_m[at]))
+            outline = footprint(camera, Pose(self._rotations[at], self._centres_m[at]))
             m_per_px = max(self._centres_m[at, 2], 1e-6) / camera.fx_px
             if not np.nanmax(np.abs(outline - node.reported_m), initial=0.0) <= 0.5 * m_per_px:
                 node.reported_m = outline
@@ -485,11 +489,6 @@ def pose_from_link(each: Link, new: Camera, old: Camera, site_from_old: Pose) ->
 
 def _ideal(camera: Camera, points_px: Floats) -> Floats:
     return (points_px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
-
-
-def _orthonormal(rotation: Floats) -> Matrix3:
-    u, _, vt = np.linalg.svd(rotation)
-    return u @ vt
 
 
 def _solve_sparse(normal: Anything, right: Floats) -> Floats:

@@ -14,7 +14,7 @@ class FeatureSettings:
     """How many points are looked for, and on what."""
 
     detection_side_px: int = 640  # longest side for ORB: pairs are refined at full size, so coarse is enough
-    orb_count: int = 900
+    orb_count: int = 700
     sift_count: int = 2500
     corner_count: int = 150  # points that a link is refined on
     corner_cells: int = 12  # a corner quota per cell of this many columns keeps them spread

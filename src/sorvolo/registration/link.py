@@ -22,17 +22,21 @@ class LinkSettings:
     min_inliers: int = 18  # below this a wrong homography is not rare
     threshold_px: float = 3.0  # inlier band of the first fit; trees' parallax stays inside
     refine_window_px: int = 15
-    refine_reach_px: float = 5.0  # a refined point may leave the first fit by this much
+    refine_reach_px: float = 8.0  # a refined point may leave the first fit by this much
     max_pairs: int = 40  # pairs kept per link, spread over the overlap
     min_correlation: float = 0.35  # of the overlaid images: the last check against a false fit
 
 
 @dataclass(frozen=True, eq=False)
 class LinkPrediction:
-    """Where the old keyframe's pixels should fall in the new one, and how far off that may be."""
+    """Where the old keyframe's pixels should fall in the new one, and how far off that may be.
+
+    `is_tight`: known to a few pixels, from links that hold already, so that refinement may begin at once.
+    """
 
     new_from_old: Matrix3
     search_px: float
+    is_tight: bool = False
 
 
 class LinkCache:
@@ -63,7 +67,7 @@ def link(
 ) -> Link | NoLink:
     """How `new` fits `old`.
 
-    Fits are tried from cheap to dear: ORB, SIFT, then, where a prediction exists, correlation of the images laid
+    Fits are tried from cheap to dear: a tight prediction as it is, ORB, SIFT, then, where a prediction exists, correlation of the images laid
     over each other as predicted. The first believable one is refined to sub-pixel pairs (Lucas-Kanade on the old
     image warped into the new one) and must make the overlaid images correlate.
     """
@@ -91,6 +95,9 @@ class _Fit:
 def _candidates(
     new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache
 ) -> Iterator[_Fit]:
+    nothing = np.zeros((0, 2))
+    if prediction is not None and prediction.is_tight:
+        yield _Fit(prediction.new_from_old, nothing, nothing)
     fitted = _fit(new.features, old.features, prediction, settings)
     if fitted is not None:
         yield fitted
@@ -100,7 +107,7 @@ def _candidates(
     if prediction is not None:
         shifted = _correlate(new.gray, old.gray, prediction.new_from_old, prediction.search_px)
         if shifted is not None:
-            yield _Fit(shifted, np.zeros((0, 2)), np.zeros((0, 2)))
+            yield _Fit(shifted, nothing, nothing)
 
 
 def _fit(
