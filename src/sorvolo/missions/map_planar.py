@@ -68,6 +68,7 @@ class PlanarRun:
         self._stored: Camera = model.camera.undistorted()
         self._dirty: set[int] = set()
         self._painted_at = 0
+        self._paint_again_s = 0.0
         self._shown_s = time.monotonic()
         self._exposure = Exposure({}, {}, 0.0)
         self._valid: Anything | None = None
@@ -233,7 +234,8 @@ class PlanarRun:
         """Paint what moved and let readers see it, now and then or at once."""
         if self._canvas is None or self._writer is None:
             return 0
-        if not force and len(self._frames) - self._painted_at < _PAINT_EVERY:
+        started_s = time.monotonic()
+        if not force and (len(self._frames) - self._painted_at < _PAINT_EVERY or started_s < self._paint_again_s):
             return 0
         self._painted_at = len(self._frames)
         site_grid = self._archive.site_grid()
@@ -247,6 +249,8 @@ class PlanarRun:
             tiles = self._canvas.paint([f for f in frames if isinstance(f, CanvasFrame)],
                                        forget=[h for h in hidden if isinstance(h, int)])
             self._dirty.clear()
+        # showing a map that still moves must not hold up the flight: at most a fifth of the time goes into it
+        self._paint_again_s = time.monotonic() + 4 * (time.monotonic() - started_s)
         if force or time.monotonic() - self._shown_s > self._settings.live_s:
             with self._log.stage(Stage.STORE):
                 self._writer.flush()
