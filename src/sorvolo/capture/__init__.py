@@ -1,0 +1,1 @@
+"""Frames and telemetry from files: videos, photos, cameras, areas, and the clock that ties them together."""

@@ -304,7 +304,8 @@ def _heights(
             return filled, f"{words}, ground taken to be at take-off level", sigma_m, 1.0, tuple(notices)
         first = float(np.median(filled[: max(1, min(5, len(filled)))]))
         if float(np.median(filled)) - first > 4.0 and first - float(filled.min()) < 2.0:
-            return filled - first, f"{words}, ground taken to be where the telemetry begins", sigma_m, 2.0, tuple(notices)
+            words = f"{words}, ground taken to be where the telemetry begins"
+            return filled - first, words, sigma_m, 2.0, tuple(notices)
         notices.append(Notice(
             "ground_unknown", 1,
             f"heights are {words} and the ground's is unknown: the height above ground is found from the pictures",

@@ -1,6 +1,9 @@
 """Plane-to-plane maps: apply, compose, fit, and the one that level ground induces between image and site."""
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Floats, Matrix3, PointsM
@@ -8,8 +11,8 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
 
 
-def apply_homography(a_from_b: Matrix3, points_b: Floats) -> Floats:
-    """Points of plane b, shape (N, 2), in plane a; NaN where the third coordinate is not positive.
+def apply_homography(a_from_b: NDArray[np.floating[Any]], points_b: Floats) -> Floats:
+    """Points of plane b, shape (N, 2), in plane a by a (3, 3) matrix; NaN where the third coordinate is not positive.
 
     All homographies here are scaled so that it is positive for points in front of the camera.
     """
@@ -34,7 +37,7 @@ def site_from_image_homography(camera: Camera, site_from_camera: Pose, ground_he
         site_from_camera.rotation.T[:, :2],
         site_from_camera.rotation.T @ (np.array([0.0, 0.0, ground_height_m]) - site_from_camera.translation_m),
     ])
-    inverse = np.linalg.inv(camera.matrix @ image_from_site)
+    inverse = np.asarray(np.linalg.inv(camera.matrix @ image_from_site), dtype=np.float64)
     # depth > 0 in front of the camera: the inverse's third row gives 1 / depth
     centre_depth = inverse[2] @ np.array([camera.cx_px, camera.cy_px, 1.0])
     return inverse / (abs(centre_depth) or 1.0) if centre_depth > 0 else inverse

@@ -1,0 +1,1 @@
+"""The use cases, where capture, the pure core and the store meet."""

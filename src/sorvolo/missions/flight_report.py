@@ -51,8 +51,8 @@ class FlightLog:
 
     def __init__(self) -> None:
         self.endings: dict[int, Ending] = {}
-        self.wall_s: Counter[str] = Counter()
-        self.cpu_s: Counter[str] = Counter()
+        self.wall_s: dict[str, float] = {}
+        self.cpu_s: dict[str, float] = {}
         self.offset_applied_s = 0.0
         self._started_cpu_s = time.process_time()
 
@@ -76,8 +76,8 @@ class FlightLog:
         try:
             yield
         finally:
-            self.wall_s[stage.value] += time.monotonic() - wall_s
-            self.cpu_s[stage.value] += time.process_time() - cpu_s
+            self.wall_s[stage.value] = self.wall_s.get(stage.value, 0.0) + time.monotonic() - wall_s
+            self.cpu_s[stage.value] = self.cpu_s.get(stage.value, 0.0) + time.process_time() - cpu_s
 
     def total_cpu_s(self) -> float:
         """CPU seconds of the process since the flight began."""
@@ -99,7 +99,7 @@ def build_report(
     model = source.camera
     area_m2 = _area_m2(tiles, site.m_per_px)
     selected = max(1, len(placed))
-    registering_s = log.cpu_s[Stage.REGISTER.value] + log.cpu_s[Stage.UNDISTORT.value]
+    registering_s = sum(log.cpu_s.get(stage.value, 0.0) for stage in (Stage.REGISTER, Stage.UNDISTORT))
     all_notices = [*telemetry.notices, *notices]
     return {
         "sorvolo": sorvolo.__version__,
@@ -176,7 +176,8 @@ def _offset(settings: MapSettings, log: FlightLog, offset: OffsetEstimate | None
 
 
 def _warnings(
-    placed: Sequence[PlacedFrame], residuals: Floats, horizontal_m: Floats, seen: Sequence[PlacedFrame], setup: FlightSetup
+    placed: Sequence[PlacedFrame], residuals: Floats, horizontal_m: Floats, seen: Sequence[PlacedFrame],
+    setup: FlightSetup,
 ) -> list[str]:
     warnings = []
     lost = len(placed) - len(seen)

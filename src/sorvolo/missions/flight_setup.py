@@ -8,6 +8,7 @@ import numpy as np
 from sorvolo.capture.source import Source
 from sorvolo.capture.sync import Clock, Track, shifted, site_origin, tie_clocks, track_from_telemetry
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame, utm_epsg
 from sorvolo.missions.settings import MapSettings
@@ -74,8 +75,8 @@ def prepare(source: Source, settings: MapSettings, site: Site | None, *, telemet
     if not telemetry.has_fixes:
         if site is not None and not site.is_local:
             raise InputError(
-                f"the site is geo-referenced, but the flight {source.name} has no GPS: give --telemetry, or map it into "
-                "a site folder of its own"
+                f"the site is geo-referenced, but the flight {source.name} has no GPS: give --telemetry, or map it "
+                "into a site folder of its own"
             )
         if settings.offset_s is not None:
             raise SettingsError("--offset was given, but the flight has no telemetry with fixes")
@@ -88,7 +89,8 @@ def prepare(source: Source, settings: MapSettings, site: Site | None, *, telemet
         )
     if site is not None and site.is_local:
         raise InputError(
-            f"the site {site.name} has no geo-reference, but the flight {source.name} has GPS: map it into a new site folder"
+            f"the site {site.name} has no geo-reference, but the flight {source.name} has GPS: map it into a new site "
+            "folder"
         )
     clock = tie_clocks(
         telemetry, kind=source.kind, start_ns=source.start_ns, duration_s=duration_s,
@@ -137,10 +139,10 @@ def new_site(setup: FlightSetup, name: str, m_per_px: float, ground_up_m: float)
     if setup.track is None:
         return Site(name, Geodetic(0.0, 0.0), "", m_per_px, is_local=True)
     telemetry = setup.source.telemetry
-    for column, reference in (("ellipsoidal_height_m", "ellipsoidal"), ("orthometric_height_m", "orthometric")):
+    for column, stated in (("ellipsoidal_height_m", "ellipsoidal"), ("orthometric_height_m", "orthometric")):
         heights = telemetry[column]
         if np.isfinite(heights).mean() > 0.5:
-            ground_m = float(np.nanmedian(heights - setup.track.up_m)) + ground_up_m
+            ground_m, reference = float(np.nanmedian(heights - setup.track.up_m)) + ground_up_m, stated
             break
     else:
         ground_m, reference = 0.0, "above ground"
@@ -159,7 +161,7 @@ def _check_place(site: Site, track: Track, name: str) -> None:
         )
 
 
-def _speed_m_s(path_s: np.ndarray, path_m: np.ndarray) -> float:  # type: ignore[type-arg]
+def _speed_m_s(path_s: Floats, path_m: PointsM) -> float:
     """The speed that three quarters of the flight stay below, over steps of a second or more."""
     if len(path_s) < 2:
         return 1.0

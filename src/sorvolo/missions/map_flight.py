@@ -52,7 +52,8 @@ def _map_one(
 
         selection = SelectionSettings(overlap=settings.overlap, least_overlap=min(0.5, settings.overlap))
         selected = select_keyframes(
-            posed(), selection, keep_all=source.kind == "photos" or (settings.method == "thesis" and setup.track is not None),
+            posed(), selection,
+            keep_all=source.kind == "photos" or (settings.method == "thesis" and setup.track is not None),
             inside=setup.inside(area),
         )
         for each in selected:

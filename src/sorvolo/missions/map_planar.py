@@ -12,8 +12,8 @@ from sorvolo.capture.sync import OffsetEstimate, estimate_offset, shifted
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Anything, ImageRGB, Matrix3
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.missions.flight_report import FlightLog, Stage, build_report
 from sorvolo.missions.flight_setup import FlightSetup, new_site
@@ -124,7 +124,8 @@ class PlanarRun:
         """Solve once more, find the clock offset, paint what moved, and make the flight part of the site."""
         if not self._frames:
             raise InputError(
-                f"no frame of {self._setup.source.name} could be placed: {self._log.commonest_reason() or 'none was selected'}"
+                f"no frame of {self._setup.source.name} could be placed: "
+                f"{self._log.commonest_reason() or 'none was selected'}"
             )
         with self._log.stage(Stage.REGISTER):
             self._mapper.settle()
@@ -140,8 +141,8 @@ class PlanarRun:
             placed = self._placed()
             report = build_report(
                 self._setup, self._settings, self._log, placed, site, offset, self._mapper.report(),
-                self._refined(self._setup.source.camera.camera), writer.tiles, [*self._setup.notices, *notices], seconds,
-                spread=self._exposure.spread,
+                self._refined(self._setup.source.camera.camera), writer.tiles, [*self._setup.notices, *notices],
+                seconds, spread=self._exposure.spread,
             )
             page = report_page(report, picture(writer.tiles, 1600).rgba)
         writer.commit(placed, self._images, report, page, crs=self._settings.crs)
@@ -242,12 +243,11 @@ class PlanarRun:
         with self._log.stage(Stage.PAINT):
             if not force:
                 self._exposure = self._mapper.exposure()
-            frames, hidden = [], []
-            for each in sorted(self._dirty):
-                painted = self._canvas_frame(each, site_grid)
-                (frames if painted is not None else hidden).append(painted or each)
-            tiles = self._canvas.paint([f for f in frames if isinstance(f, CanvasFrame)],
-                                       forget=[h for h in hidden if isinstance(h, int)])
+            painted = {each: self._canvas_frame(each, site_grid) for each in sorted(self._dirty)}
+            tiles = self._canvas.paint(
+                [frame for frame in painted.values() if frame is not None],
+                forget=[each for each, frame in painted.items() if frame is None],
+            )
             self._dirty.clear()
         # showing a map that still moves must not hold up the flight: at most a fifth of the time goes into it
         self._paint_again_s = time.monotonic() + 4 * (time.monotonic() - started_s)
@@ -261,7 +261,8 @@ class PlanarRun:
     def _canvas_frame(self, keyframe_id: int, site_grid: SiteGrid) -> CanvasFrame | None:
         return canvas_frame(
             keyframe_id, self._rank(), self._stored, self._site_from_stored(keyframe_id), site_grid,
-            self._exposure.gains.get(keyframe_id, np.ones(3)), self._exposure.vignettes.get(0, np.zeros(2)), self._valid,
+            self._exposure.gains.get(keyframe_id, np.ones(3)), self._exposure.vignettes.get(0, np.zeros(2)),
+            self._valid,
         )
 
     def _rank(self) -> int:
@@ -290,7 +291,8 @@ class PlanarRun:
             applied_s += found.offset_s
             moved_track = shifted(track, applied_s)
             self._mapper.retime({
-                each: moved_track.prior(seconds, smooth_s=setup.smooth_s) for each, seconds in zip(ids, times, strict=True)
+                each: moved_track.prior(seconds, smooth_s=setup.smooth_s)
+                for each, seconds in zip(ids, times, strict=True)
             })
         self._log.offset_applied_s = applied_s
         return estimate

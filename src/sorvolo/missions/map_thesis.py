@@ -94,7 +94,8 @@ class ThesisRun:
         """Anchor the mosaic to its fixes, cut it into tiles, and make the flight part of the site."""
         if not self._stitched:
             raise InputError(
-                f"no frame of {self._setup.source.name} could be placed: {self._log.commonest_reason() or 'none was selected'}"
+                f"no frame of {self._setup.source.name} could be placed: "
+                f"{self._log.commonest_reason() or 'none was selected'}"
             )
         site_from_mosaic = self._georeference()
         if not self._archive.has_site:
@@ -132,8 +133,8 @@ class ThesisRun:
             return georeference(barycentres, fixes_m)
         except GeometryError as error:
             raise InputError(
-                f"{len(anchored)} stitched frames of {self._setup.source.name} have a GPS fix, which is too few to place "
-                "the mosaic; --method planar places each frame by its own fix"
+                f"{len(anchored)} stitched frames of {self._setup.source.name} have a GPS fix, which is too few to "
+                "place the mosaic; --method planar places each frame by its own fix"
             ) from error
 
     def _paint(self, site_from_mosaic: Matrix3, site_grid: SiteGrid, writer: FlightWriter) -> None:
@@ -160,7 +161,8 @@ class ThesisRun:
 
     def _placed(self, site_from_mosaic: Matrix3) -> list[PlacedFrame]:
         camera = self._setup.source.camera.camera
-        corners = self._lens.camera.corners_px if not camera.is_distorted else camera.undistort_points(camera.corners_px)
+        distorted = camera.is_distorted
+        corners = camera.undistort_points(camera.corners_px) if distorted else self._lens.camera.corners_px
         small = np.diag([self._camera.width_px / camera.width_px, self._camera.height_px / camera.height_px, 1.0])
         small[:2, 2] = 0.5 * np.diag(small)[:2] - 0.5  # pixel centres stay on pixel centres
         result = []
@@ -177,11 +179,13 @@ class ThesisRun:
             site_from_image = last if stitched is not None else self._moved(last, posed.prior.position_m[:2])
             outline_m = apply_homography(site_from_image @ small, corners)
             centre_m = apply_homography(site_from_image, self._barycentre()[None])[0]
-            gps = np.append(centre_m - posed.prior.position_m[:2], np.nan) if posed.prior.knows_place else np.full(3, np.nan)
+            gps = np.full(3, np.nan)
+            if posed.prior.knows_place:
+                gps[:2] = centre_m - posed.prior.position_m[:2]
             sigma_m = float(np.hypot(*posed.prior.position_sigma_m[:2])) if stitched is None else float("nan")
             result.append(PlacedFrame(
-                ending.name, ending.index, time_ns, ending.status, ending.reason, camera, None, site_from_image, outline_m,
-                stitched.residual_px if stitched else float("nan"), sigma_m, gps_residual_m=gps,
+                ending.name, ending.index, time_ns, ending.status, ending.reason, camera, None, site_from_image,
+                outline_m, stitched.residual_px if stitched else float("nan"), sigma_m, gps_residual_m=gps,
             ))
         return result
 

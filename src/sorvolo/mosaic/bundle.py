@@ -5,7 +5,9 @@ projected into the new one; the miss in pixels is the residual. Residuals are in
 the whole map would gain by shrinking to a point.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
@@ -22,6 +24,10 @@ SHARED = (
 """Unknowns that all keyframes of a flight share: focal length (log of its scale), the first radial distortion that
 the calibration left over, the constant offsets of the altitude's zero and of GPS against the map, and the constant
 turn of the camera, about its own axes, against the attitude that telemetry states (mounting, gimbal, compass)."""
+
+
+_Scatter: TypeAlias = Callable[[Anything, Anything, Floats], None]  # rows, columns (n,); blocks (n, h, w)
+_Gather: TypeAlias = Callable[[Anything, Floats], None]  # rows (n,); blocks (n, h)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +143,7 @@ class Solution:
     nodes: Nodes
     shared: Floats
     cost: float
-    normal: Anything  # sparse (6 n + 8) square information matrix
+    normal: csc_matrix  # sparse (6 n + 8) square information matrix
     position: Anything  # (N,) place of each node in it, -1 for those held
 
 
@@ -230,7 +236,7 @@ def _normal_equations(
 
 
 def _add_priors(
-    nodes: Nodes, shared: Floats, position: Anything, count: int, scatter: Anything, gather: Anything, robust: float
+    nodes: Nodes, shared: Floats, position: Anything, count: int, scatter: _Scatter, gather: _Gather, robust: float
 ) -> float:
     index = np.flatnonzero(position >= 0)
     start = 6 * position[index]

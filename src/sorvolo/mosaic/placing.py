@@ -21,7 +21,8 @@ def canvas_frame(
     grid_from_site = site_grid.grid_from_site_affine(centre[:2] / centre[2], min(reach_m, 1000.0))
     try:
         return CanvasFrame(
-            keyframe_id, rank, stored.width_px, stored.height_px, grid_from_site @ site_from_image, gains, vignette, valid
+            keyframe_id, rank, stored.width_px, stored.height_px, grid_from_site @ site_from_image, gains, vignette,
+            valid,
         )
     except GeometryError:
         return None

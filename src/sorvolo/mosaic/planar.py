@@ -54,7 +54,7 @@ class PlanarMapper:
     """Everything `--method planar` knows of one flight. `add` takes a keyframe; `retime` and `settle` end it."""
 
     def __init__(
-        self, graph: PoseGraphSettings, settings: PlanarSettings = PlanarSettings(),  # noqa: B008 (frozen)
+        self, graph: PoseGraphSettings, settings: PlanarSettings = PlanarSettings(),
         known: Sequence[KnownKeyframe] = (),
     ) -> None:
         self._settings = settings
@@ -88,7 +88,8 @@ class PlanarMapper:
     def settle(self) -> frozenset[int]:
         """Solve the whole flight once more; the keyframes that moved."""
         moved = self._graph.settle()
-        return moved | self._graph.settle()  # what the first solve taught about links and telemetry counts in the second
+        # what the first solve taught about links and telemetry counts in the second
+        return moved | self._graph.settle()
 
     def retime(self, priors: Mapping[int, CameraPrior]) -> frozenset[int]:
         """What telemetry says under another clock offset."""

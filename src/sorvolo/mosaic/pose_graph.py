@@ -11,7 +11,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import fit_similarity, site_from_image_homography
 from sorvolo.geometry.pose import Pose
-from sorvolo.mosaic.bundle import SHARED, Nodes, Pairs, linearise, rotation_vector, solve
+from sorvolo.mosaic.bundle import SHARED, Nodes, Pairs, Solution, linearise, rotation_vector, solve
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
 
@@ -74,7 +74,7 @@ class PoseGraph:
     last returned: those, and no others, have to be painted again.
     """
 
-    def __init__(self, settings: PoseGraphSettings = PoseGraphSettings()) -> None:  # noqa: B008 (frozen)
+    def __init__(self, settings: PoseGraphSettings = PoseGraphSettings()) -> None:
         self._settings = settings
         self._ids: dict[int, int] = {}
         self._nodes: list[_Node] = []
@@ -209,7 +209,7 @@ class PoseGraph:
         return result
 
     def sigmas_m(self) -> dict[int, float]:
-        """Each own keyframe's one-sigma error on the ground at its image centre, per axis, from the solve's covariance."""
+        """Each own keyframe's one-sigma error on the ground at its image centre, per axis, by the covariance."""
         own = self._own()
         solution = self._solve(own, shared=True, iterations=0)
         index = np.flatnonzero(own)
@@ -301,7 +301,7 @@ class PoseGraph:
             np.array(self._relief_m),
         )
 
-    def _solve(self, free: Anything, *, shared: bool, iterations: int) -> Anything:
+    def _solve(self, free: Anything, *, shared: bool, iterations: int) -> Solution:
         pairs = self._pairs()
         if len(pairs.old):
             pairs = pairs.of(free[pairs.old] | free[pairs.new])
@@ -413,7 +413,8 @@ class PoseGraph:
             spread = 1.4826 * np.median(np.abs(scatter), axis=0)
             # pictures see heading well, tilt hardly: a small scatter of tilt only says that it was believed
             attitude = np.clip(spread / np.median(stated_rad[used], axis=0), [1.0, 1.0, 0.25], 5.0)
-            doubt = float(np.hypot(1.25 * spread[2] / np.sqrt(used.sum()), self._doubt_of_turn(stated_m, fixed) * place[0]))
+            doubt_of_turn = self._doubt_of_turn(stated_m, fixed) * place[0]
+            doubt = float(np.hypot(1.25 * spread[2] / np.sqrt(used.sum()), doubt_of_turn))
             # what GPS alone makes of the compass: a turn of the map turns cameras the other way about their own axis
             offset = float(np.median(error_rad[used, 2])) - self._turn_to_gps(fixed)
             # one without a visible offset is taken at its word, one with an offset is free to have it

@@ -1,6 +1,8 @@
 """Image to Features: contrast-normalised ORB for speed, SIFT where the ground is nearly bare."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -30,7 +32,8 @@ def normalise_contrast(gray: ImageGray) -> ImageGray:
 
     Bare sand spans three gray levels; without this its texture lies below every detector's threshold, and
     Lucas-Kanade, which takes brightness as constant, would follow the camera's exposure instead of the ground
-    (0.22 px instead of 0.03 px on a flight whose exposure wanders by 15 %). The window is 31 px; contrast of about one gray level is noise and is hardly lifted.
+    (0.22 px instead of 0.03 px on a flight whose exposure wanders by 15 %). The window is 31 px; contrast of about
+    one gray level is noise and is hardly lifted.
     """
     smooth = cv2.GaussianBlur(gray, (0, 0), 0.8).astype(np.float32)
     smooth -= cv2.boxFilter(smooth, -1, (31, 31))
@@ -41,16 +44,17 @@ def normalise_contrast(gray: ImageGray) -> ImageGray:
 
 def orb_features(gray: ImageGray, settings: FeatureSettings) -> Features:
     """ORB (Rublee 2011) of a contrast-normalised image."""
-    orb = cv2.ORB_create(
+    orb = cv2.ORB.create(
         nfeatures=settings.orb_count, scaleFactor=1.35, nlevels=4, edgeThreshold=17, patchSize=31, fastThreshold=20
     )
     small, scale = _detection_image(gray, settings)
-    return _features("orb", *orb.detectAndCompute(small, None), scale)
+    keypoints, descriptors = orb.detectAndCompute(small, None)
+    return _features("orb", keypoints, descriptors, scale)
 
 
 def sift_features(gray: ImageGray, settings: FeatureSettings) -> Features:
     """SIFT (Lowe 2004), as RootSIFT (Arandjelovic 2012), of a contrast-normalised image: slow, for weak links."""
-    sift = cv2.SIFT_create(nfeatures=settings.sift_count, contrastThreshold=0.015)
+    sift = cv2.SIFT.create(nfeatures=settings.sift_count, contrastThreshold=0.015)
     keypoints, descriptors = sift.detectAndCompute(gray, None)
     if descriptors is not None and len(descriptors):
         descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6))
@@ -78,8 +82,8 @@ def corners(gray: ImageGray, settings: FeatureSettings) -> PointsPx:
     xs = np.linspace(margin, small.shape[1] - margin, columns + 1).astype(int)
     ys = np.linspace(margin, small.shape[0] - margin, rows + 1).astype(int)
     found = []
-    for y0, y1 in zip(ys[:-1], ys[1:], strict=True):
-        for x0, x1 in zip(xs[:-1], xs[1:], strict=True):
+    for y0, y1 in pairwise(ys):
+        for x0, x1 in pairwise(xs):
             cell = response[y0:y1, x0:x1].ravel()
             best = np.argpartition(-cell, per_cell)[:per_cell] if cell.size > per_cell else np.arange(cell.size)
             best = best[cell[best] > 0]
@@ -94,8 +98,8 @@ def sharpness(gray: ImageGray) -> float:
     return float(fine.std() / (coarse.std() + 0.05))
 
 
-def _features(kind: str, keypoints: Anything, descriptors: Anything | None, scale: float) -> Features:
+def _features(kind: str, keypoints: Sequence[cv2.KeyPoint], descriptors: Anything | None, scale: float) -> Features:
     if descriptors is None or len(keypoints) == 0:
         return Features(kind, np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
-    points = cv2.KeyPoint_convert(keypoints).astype(np.float64)
+    points = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64)
     return Features(kind, (points + 0.5) / scale - 0.5, descriptors)

@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import ImageGray, Matrix3, PointsPx
+from sorvolo.geometry.arrays import Anything, Floats, ImageGray, Matrix3, PointsPx
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.registration.features import FeatureSettings, corners, sift_features
 from sorvolo.registration.matching import match
@@ -67,9 +69,9 @@ def link(
 ) -> Link | NoLink:
     """How `new` fits `old`.
 
-    Fits are tried from cheap to dear: a tight prediction as it is, ORB, SIFT, then, where a prediction exists, correlation of the images laid
-    over each other as predicted. The first believable one is refined to sub-pixel pairs (Lucas-Kanade on the old
-    image warped into the new one) and must make the overlaid images correlate.
+    Fits are tried from cheap to dear: a tight prediction as it is, ORB, SIFT, then, where a prediction exists,
+    correlation of the images laid over each other as predicted. The first believable one is refined to sub-pixel
+    pairs (Lucas-Kanade on the old image warped into the new one) and must make the overlaid images correlate.
     """
     reason = "too few matching points"
     for found in _candidates(new, old, prediction, settings, cache):
@@ -163,12 +165,14 @@ def _correlate(new: ImageGray, old: ImageGray, predicted: Matrix3, search_px: fl
     return shift @ predicted
 
 
-def _band_pass(gray: ImageGray) -> np.ndarray:  # type: ignore[type-arg]
+def _band_pass(gray: Anything) -> Anything:
     image = gray.astype(np.float32)
     return cv2.GaussianBlur(image, (0, 0), 1.0) - cv2.GaussianBlur(image, (0, 0), 8.0)
 
 
-def _refine(new: Keyframe, old: Keyframe, new_from_old: Matrix3, settings: LinkSettings, cache: LinkCache) -> Link | str:
+def _refine(
+    new: Keyframe, old: Keyframe, new_from_old: Matrix3, settings: LinkSettings, cache: LinkCache
+) -> Link | str:
     """Sub-pixel pairs around a first fit, or why there are none."""
     points = cache.corners(new)
     old_guess = apply_homography(np.linalg.inv(new_from_old), points)
@@ -208,12 +212,12 @@ def _refine(new: Keyframe, old: Keyframe, new_from_old: Matrix3, settings: LinkS
     return Link(new.id, old.id, new_px[chosen], old_px[chosen], homography, max(sigma_px, 0.05))
 
 
-def _correlation(new: ImageGray, warped: ImageGray, at_new: np.ndarray, at_warped: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+def _correlation(new: ImageGray, warped: Anything, at_new: Anything, at_warped: Anything) -> Anything:
     """(N,) normalised cross-correlation of 15 px patches around paired points."""
     offsets = np.arange(-7, 8, dtype=np.float32)
     dy, dx = np.meshgrid(offsets, offsets, indexing="ij")
 
-    def patches(image: ImageGray, at: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+    def patches(image: Anything, at: Anything) -> Anything:
         x = (at[:, :1] + dx.ravel()).astype(np.float32)
         y = (at[:, 1:] + dy.ravel()).astype(np.float32)
         values = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
@@ -223,7 +227,7 @@ def _correlation(new: ImageGray, warped: ImageGray, at_new: np.ndarray, at_warpe
     return (patches(new, at_new) * patches(warped, at_warped)).sum(axis=1)
 
 
-def _spread(points: PointsPx, miss: np.ndarray, usable: np.ndarray, count: int) -> np.ndarray:  # type: ignore[type-arg]
+def _spread(points: PointsPx, miss: Floats, usable: Anything, count: int) -> NDArray[np.intp]:
     """Indices of at most `count` usable points, taken in turn from the cells of a 6 x 6 grid over the points."""
     indices = np.flatnonzero(usable)
     if len(indices) <= count:
@@ -237,6 +241,6 @@ def _spread(points: PointsPx, miss: np.ndarray, usable: np.ndarray, count: int) 
     return np.sort(indices[np.lexsort((cell, rank))[:count]])
 
 
-def _trim(cache: dict, capacity: int) -> None:  # type: ignore[type-arg]
+def _trim(cache: dict[int, Any], capacity: int) -> None:
     while len(cache) > capacity:
         cache.pop(next(iter(cache)))

@@ -2,8 +2,9 @@
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Matrix3
+from sorvolo.geometry.arrays import Matrix3, PointsPx
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.mosaic import Features
 
@@ -12,7 +13,7 @@ _EMPTY = np.zeros((0, 2), np.int64)
 
 def match(
     new: Features, old: Features, new_from_old: Matrix3 | None, search_px: float, ratio: float = 0.85
-) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+) -> NDArray[np.int64]:
     """(N, 2) index pairs (new, old), nearest neighbours that pass Lowe's ratio test and are mutual.
 
     With a predicted homography only old points that fall into the new image (within `search_px`), and new points
@@ -43,7 +44,7 @@ def match(
     return indices
 
 
-def _inside(mapped: np.ndarray, other: Features, margin_px: float) -> np.ndarray:  # type: ignore[type-arg]
+def _inside(mapped: PointsPx, other: Features, margin_px: float) -> NDArray[np.int64]:
     low, high = other.points_px.min(axis=0) - margin_px, other.points_px.max(axis=0) + margin_px
     with np.errstate(invalid="ignore"):
         return np.flatnonzero(((mapped >= low) & (mapped <= high)).all(axis=1))
