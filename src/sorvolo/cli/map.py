@@ -123,7 +123,7 @@ def _show_report(report: Mapping[str, Any], console: Console) -> None:
         ("residual", _with_unit("{:.2f} px median", report["residual_px"]["median"])),
         ("off GPS", _with_unit("{:.2f} " + unit + " median", report["gps_residual_m"]["median"])),
         ("place good to", _with_unit(
-            "{:.2f} " + unit + ", one sigma, besides what all fixes err in common", report["sigma_m"]
+            "{:.2f} " + unit + ", one sigma, what all fixes err in common included", report["sigma_m"]
         )),
         ("map", _size(report)),
         ("clock offset", _clock_offset(report["time_offset"])),

@@ -333,7 +333,9 @@ class _Known:
         # the thesis's method knows a similarity only: that of a camera looking straight down
         pose = stored.site_from_camera or pose_from_homography(stored.site_from_image, stored.camera)
         assert pose is not None
-        self.keyframe = KnownKeyframe(keyframe_id, stored.camera, pose, lambda: archive.image(stored))
+        self.keyframe = KnownKeyframe(
+            keyframe_id, stored.camera, pose, stored.sigma_m, lambda: archive.image(stored)
+        )
 
     def canvas_frame(self, site_grid: SiteGrid) -> CanvasFrame:
         found = canvas_frame(

@@ -33,11 +33,15 @@ class PlanarSettings:
 
 @dataclass(frozen=True, eq=False)
 class KnownKeyframe:
-    """A keyframe of the map that exists already; `image` loads its undistorted picture, of `camera`'s size."""
+    """A keyframe of the map that exists already; `image` loads its undistorted picture, of `camera`'s size.
+
+    `sigma_m` is its own error on the ground: what is tied to it errs at least as much.
+    """
 
     id: int
     camera: Camera
     site_from_camera: Pose
+    sigma_m: float
     image: Callable[[], ImageRGB]
 
 
@@ -133,8 +137,13 @@ class PlanarMapper:
         }
 
     def sigmas_m(self) -> dict[int, float]:
-        """One-sigma error on the ground of each keyframe, per axis."""
-        return self._graph.sigmas_m()
+        """One-sigma error on the ground of each keyframe, per axis: its own and what all of the flight err in common.
+
+        What a flight errs in common is its receiver's, or that of the known map it is tied to.
+        """
+        tied_to = [self._known[each].sigma_m for each in self._known if each in self._graph]
+        common_m = float(np.nanmedian(tied_to)) if np.isfinite(tied_to).any() else self._graph.common_sigma_m()
+        return {each: float(np.hypot(sigma_m, common_m)) for each, sigma_m in self._graph.sigmas_m().items()}
 
     def gps_residuals_m(self) -> dict[int, Floats]:
         """Camera position minus fix, (3,)."""

@@ -231,6 +231,17 @@ class PoseGraph:
         names = list(self._ids)
         return {names[at]: float(value) for at, value in zip(index, every, strict=True)}
 
+    def common_sigma_m(self) -> float:
+        """What all fixes of the flight err in common, per axis, m; 0 without fixes.
+
+        A receiver's errors repeat for minutes, so a map made from a hundred fixes is hardly better placed than one
+        fix: seven tenths of a fix's sigma, or of the scatter that the pictures found if that is larger.
+        """
+        stated_m = self._stated_sigmas()[0][self._own(), 0]
+        stated_m = stated_m[np.isfinite(stated_m)]
+        fixes = self._own().any() and len(stated_m) >= 2
+        return float(0.7 * np.median(stated_m) * max(1.0, self._trust.place[0])) if fixes else 0.0
+
     def gps_residuals_m(self) -> dict[int, Floats]:
         """Own keyframes' camera position minus what telemetry said, (3,) east, north, up; NaN where it said nothing."""
         names = list(self._ids)

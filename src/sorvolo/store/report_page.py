@@ -105,8 +105,8 @@ def _second_sentence(report: Mapping[str, Any]) -> str:
     parts = []
     if sigma is not None:
         parts.append(
-            f"By the scatter of its GPS fixes the map lies in its place to {_length(sigma)} (one sigma); "
-            "what all fixes err in common, often a metre or more, comes on top and does not show here."
+            f"The map lies in its place to {_length(sigma)} (one sigma), what all its GPS fixes may err in common "
+            "included."
         )
     if gps is not None:
         parts.append(f"The cameras lie {_length(gps)} from their GPS fixes (median).")
@@ -169,7 +169,7 @@ def _key_figures(report: Mapping[str, Any]) -> str:
          "median distance of cameras and fixes, level; rms "
          + (_length(_number(report, "gps_residual_m", "rms")) or "unknown")),
         ("in its place to", _length(_number(report, "sigma_m")) if unit == "m" else None,
-         "one sigma, besides what all GPS fixes err in common"),
+         "one sigma, what all GPS fixes may err in common included"),
         ("flown at",
          _with_unit("{:.1f} m", _number(report, "height_above_ground_m")) if unit == "m" else None,
          "above the ground, median"),
