@@ -14,7 +14,9 @@ FOCAL_PX = 600.0
 HELD = np.zeros(len(SHARED))
 
 
-def staged(seed: int = 0, count: int = 6, pairs_per_link: int = 25, own: list[int] | None = None) -> tuple[Nodes, Pairs]:
+def staged(
+    seed: int = 0, count: int = 6, pairs_per_link: int = 25, own: list[int] | None = None
+) -> tuple[Nodes, Pairs]:
     """Cameras on a winding path 20 m up and exact pairs between each and the two before it."""
     rng = np.random.default_rng(seed)
     along = np.arange(count)

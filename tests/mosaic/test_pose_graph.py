@@ -12,7 +12,7 @@ from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
 
 CAMERA = Camera.from_angle_of_view(960, 540, 62)
-M_PER_PX = 20 / CAMERA.fx_px
+DEFAULTS = PoseGraphSettings()
 KNOWN_ATTITUDE = np.array([2.0, 2.0, 4.0])
 UNKNOWN_ATTITUDE = np.array([12.0, 12.0, np.inf])
 
@@ -31,7 +31,9 @@ def flown(seed: int, strips: int = 2, per_strip: int = 10) -> list[Pose]:
     return poses
 
 
-def tied(new_id: int, old_id: int, new: Pose, old: Pose, rng: np.random.Generator, noise_px: float = 0.2) -> Link | None:
+def tied(
+    new_id: int, old_id: int, new: Pose, old: Pose, rng: np.random.Generator, noise_px: float = 0.2
+) -> Link | None:
     """The link of two true poses, from points spread over both pictures; None where they share too little ground."""
     x, y = np.meshgrid(np.linspace(20, 940, 14), np.linspace(20, 520, 9))
     old_px = np.column_stack([x.ravel(), y.ravel()])
@@ -66,7 +68,7 @@ def prior_of(
 
 def build(
     poses: list[Pose], priors: list[CameraPrior], rng: np.random.Generator,
-    settings: PoseGraphSettings = PoseGraphSettings(), noise_px: float = 0.2,
+    settings: PoseGraphSettings = DEFAULTS, noise_px: float = 0.2,
 ) -> PoseGraph:
     graph = PoseGraph(settings)
     for number, prior in enumerate(priors):
@@ -251,7 +253,7 @@ def test_a_false_link_is_dropped():
         if k == 15:
             # two places that look alike: 90 px off, to the side and ahead
             true = links[-1]
-            links[-1] = Link(15, true.old_id, true.new_px + [90.0, 70.0], true.old_px, true.new_from_old, 0.3)
+            links[-1] = Link(15, true.old_id, true.new_px + np.array([90.0, 70.0]), true.old_px, true.new_from_old, 0.3)
         graph.add(k, CAMERA, prior, links, by_link or Pose(prior.rotation, prior.position_m))
     graph.settle()
     graph.settle()
