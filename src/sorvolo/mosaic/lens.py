@@ -58,7 +58,7 @@ def refined_camera(camera: Camera, focal_scale: float, radial: float) -> Camera:
     The five coefficients are fitted so that every pixel's ray is the one that the flight's solution gives it.
     """
     result = camera.with_focal_px(camera.fx_px * focal_scale)
-    if radial == 0.0:
+    if radial == 0.0 and (focal_scale == 1.0 or not camera.is_distorted):
         return result
     x, y = np.meshgrid(np.linspace(-0.5, camera.width_px - 0.5, 25), np.linspace(-0.5, camera.height_px - 0.5, 25))
     pixels = np.column_stack([x.ravel(), y.ravel()])
