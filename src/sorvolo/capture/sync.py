@@ -227,8 +227,9 @@ def site_origin(telemetry: Telemetry) -> Geodetic | None:
 def estimate_offset(track: Track, times_s: Floats, seen_m: PointsM, *, reach_s: float) -> OffsetEstimate:
     """The clock offset that makes telemetry's path fit the path seen in the pictures (N, 2), up to a similarity.
 
-    Straight flight at constant speed fits at any offset: then the uncertainty comes out infinite or large. It is
-    the curvature of the squared misfit at its minimum, with the misfit itself as the noise.
+    Straight flight at constant speed fits at any offset: then the uncertainty comes out infinite or large. It comes
+    from the motion that the pictures show, with the misfit as the noise: the fixes' own noise bends a path as well,
+    and would pass for motion.
     """
     usable = np.isfinite(track.east_north_m[:, 0])
     path_s, path_m = track.sample_s[usable], track.east_north_m[usable]
@@ -262,14 +263,29 @@ def estimate_offset(track: Track, times_s: Floats, seen_m: PointsM, *, reach_s: 
         best = float(nearby[int(np.argmin([misfit(each)[0] for each in nearby]))])
     lowest, count = misfit(best)
     at_zero = misfit(0.0)[0]
-    wide = 0.25
-    bend = (misfit(best - wide)[0] + misfit(best + wide)[0] - 2 * lowest) / wide**2
+    inside = (times_s + best >= path_s[0]) & (times_s + best <= path_s[-1])
+    fixes = np.column_stack([np.interp(times_s[inside] + best, path_s, path_m[:, k]) for k in range(2)])
+    change = fit_similarity(fixes, seen_m[inside])
+    motion = _telling_motion(times_s[inside], seen_m[inside] @ change[:2, :2].T + change[:2, 2])
     # residuals of a 1 Hz receiver repeat over the frames between its fixes
     independent = min(count, max(3.0, (times_s[-1] - times_s[0]) / max(track.interval_s, 1e-3)))
-    sigma = float(np.sqrt(2 * lowest / (independent * bend))) if np.isfinite(bend) and bend > 0 else float("inf")
+    sigma = float(np.sqrt(lowest / (independent * motion))) if motion > 1e-9 else float("inf")
     if abs(best) > 0.97 * reach_s:
         return replace(unknown, rms_at_zero_m=float(np.sqrt(at_zero)), rms_m=float(np.sqrt(lowest)))
     return OffsetEstimate(best, sigma, float(np.sqrt(at_zero)), float(np.sqrt(lowest)))
+
+
+def _telling_motion(times_s: Floats, path_m: PointsM) -> float:
+    """Mean square (m2/s2) of the velocity along a path, (N, 2), that no similarity of the path can stand in for."""
+    velocity = np.gradient(path_m, times_s, axis=0).T.ravel()
+    east, north = (path_m - path_m.mean(axis=0)).T
+    one, zero = np.ones(len(times_s)), np.zeros(len(times_s))
+    similar = np.column_stack([
+        np.concatenate([one, zero]), np.concatenate([zero, one]), np.concatenate([east, north]),
+        np.concatenate([-north, east]),
+    ])
+    taken_up, *_ = np.linalg.lstsq(similar, velocity, rcond=None)
+    return float(((velocity - similar @ taken_up) ** 2).sum() / len(times_s))
 
 
 def _line(times_s: Floats, values: Floats) -> tuple[Floats, Floats, float]:

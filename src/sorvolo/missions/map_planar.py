@@ -164,7 +164,7 @@ class PlanarRun:
         if self._writer is not None:
             return
         if not self._archive.has_site:
-            offset_m = self._mapper.report().altitude_offset_m
+            offset_m = self._mapper.altitude_offset_m
             m_per_px = self._settings.m_per_px or self._native_m_per_px()
             name = self._archive.folder.resolve().name or "site"
             self._archive.create_site(new_site(self._setup, name, m_per_px, offset_m))
@@ -210,8 +210,7 @@ class PlanarRun:
         return self._writer.image(keyframe_id - self._first_id)
 
     def _refined(self, camera: Camera) -> Camera:
-        report = self._mapper.report()
-        return refined_camera(camera, report.focal_scale, report.radial)
+        return refined_camera(camera, self._mapper.focal_scale, self._mapper.radial)
 
     def _straighten(self) -> None:
         """Where the flight showed a distortion that the calibration left over, take it out of the kept pictures."""
@@ -227,8 +226,7 @@ class PlanarRun:
         self._valid = lens.valid(self._stored.width_px, self._stored.height_px)
 
     def _site_from_stored(self, keyframe_id: int) -> Matrix3:
-        focal = self._mapper.report().focal_scale
-        camera = self._stored.with_focal_px(self._stored.fx_px * focal)
+        camera = self._stored.with_focal_px(self._stored.fx_px * self._mapper.focal_scale)
         return site_from_image_homography(camera, self._mapper.pose(keyframe_id))
 
     def _show(self, *, force: bool) -> int:

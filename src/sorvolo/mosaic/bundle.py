@@ -285,7 +285,7 @@ def _damped_step(normal: csc_matrix, gradient: Floats, damping: float) -> Floats
     damped = normal + csc_matrix(
         (damping * diagonal + 1e-9, (np.arange(len(diagonal)), np.arange(len(diagonal)))), shape=normal.shape
     )
-    if len(gradient) <= 700:
+    if len(gradient) <= 120:
         try:
             return cho_solve(cho_factor(damped.toarray(), check_finite=False), gradient, check_finite=False)
         except LinAlgError:

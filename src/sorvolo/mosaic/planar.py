@@ -87,7 +87,7 @@ class PlanarMapper:
             self._tie_colours(each)
         status = Status.VISION if links or len(self._own) == 1 else Status.GPS_ONLY
         self._failures[keyframe_id] = "" if links else reason
-        return Outcome(status, "" if links else reason, moved)
+        return Outcome(status, reason if status is Status.GPS_ONLY else "", moved)
 
     def settle(self) -> frozenset[int]:
         """Solve the whole flight once more; the keyframes that moved."""
@@ -116,9 +116,15 @@ class PlanarMapper:
         reason = self._failures.get(keyframe_id) or "its links contradicted the rest of the map"
         return Status.GPS_ONLY, f"no other picture fits it: {reason}"
 
+    @property
     def focal_scale(self) -> float:
         """Focal length found over the one given."""
-        return self._graph.report().focal_scale
+        return self._graph.focal_scale
+
+    @property
+    def altitude_offset_m(self) -> float:
+        """See `PoseGraph.altitude_offset_m`."""
+        return self._graph.altitude_offset_m
 
     @property
     def radial(self) -> float:

@@ -109,7 +109,17 @@ class PoseGraph:
 
     def refined(self, camera: Camera) -> Camera:
         """A camera of this flight with the focal length found so far."""
-        return camera.with_focal_px(camera.fx_px * float(np.exp(self._shared[0])))
+        return camera.with_focal_px(camera.fx_px * self.focal_scale)
+
+    @property
+    def focal_scale(self) -> float:
+        """Focal length found over the one given."""
+        return float(np.exp(self._shared[0]))
+
+    @property
+    def altitude_offset_m(self) -> float:
+        """Height of the ground above telemetry's zero, negated: stated height = height above ground + this."""
+        return float(self._shared[2])
 
     @property
     def radial(self) -> float:

@@ -45,7 +45,7 @@ def normalise_contrast(gray: ImageGray) -> ImageGray:
 def orb_features(gray: ImageGray, settings: FeatureSettings) -> Features:
     """ORB (Rublee 2011) of a contrast-normalised image."""
     orb = cv2.ORB.create(
-        nfeatures=settings.orb_count, scaleFactor=1.35, nlevels=4, edgeThreshold=17, patchSize=31, fastThreshold=20
+        nfeatures=settings.orb_count, scaleFactor=1.35, nlevels=4, edgeThreshold=17, patchSize=31, fastThreshold=35
     )
     small, scale = _detection_image(gray, settings)
     keypoints, descriptors = orb.detectAndCompute(small, None)
