@@ -1,0 +1,288 @@
+"""Clocks and tracks: interpolation by eq. 3.18, what lies outside is unknown, and offsets that motion shows."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sorvolo.capture.sync import (
+    Clock,
+    estimate_offset,
+    shifted,
+    site_origin,
+    tie_clocks,
+    track_from_telemetry,
+)
+from sorvolo.errors import InputError
+from sorvolo.geometry.geodesy import Geodetic, LocalFrame
+from sorvolo.geometry.pose import gimbal_angles_from_rotation
+from sorvolo.survey.flight import Telemetry
+
+FRAME = LocalFrame(Geodetic(41.9, 12.6, 0.0))
+START_NS = 1_778_576_400 * 10**9
+
+
+def telemetry(times_s, east_north_m, *, start_ns=START_NS, video=False, **columns) -> Telemetry:
+    times_s = np.asarray(times_s, float)
+    points = np.asarray(east_north_m, float)
+    latitude, longitude, _ = FRAME.wgs84_from_site(points)
+    time_ns = start_ns + np.round(times_s * 1e9).astype(np.int64)
+    made = {"latitude_deg": latitude, "longitude_deg": longitude, **columns}
+    video_time_ns = np.round(times_s * 1e9).astype(np.int64) if video else None
+    return Telemetry("test", time_ns, {name: np.broadcast_to(each, len(times_s)) for name, each in made.items()},
+                     video_time_ns)
+
+
+def straight(times_s, **columns) -> Telemetry:
+    """4 m/s east, 1 m/s north."""
+    return telemetry(times_s, np.column_stack([4.0 * np.asarray(times_s), 1.0 * np.asarray(times_s)]), **columns)
+
+
+def clock_of(times_s, sigma_s=2.0) -> Clock:
+    return Clock(np.asarray(times_s, float), "test", sigma_s, START_NS)
+
+
+def track_of(samples: Telemetry, *, sigma_s=2.0, **options):
+    times_s = (samples.time_ns - START_NS) / 1e9
+    return track_from_telemetry(samples, clock_of(times_s, sigma_s), FRAME, **options)
+
+
+ONE_HZ = np.arange(0, 21.0)
+
+
+@given(st.floats(0, 20))
+def test_linear_motion_is_interpolated_exactly(time_s):
+    track, _ = track_of(straight(ONE_HZ, height_above_takeoff_m=np.linspace(10, 30, 21)))
+    prior = track.prior(time_s)
+    assert np.allclose(prior.position_m, [4 * time_s, time_s, 10 + time_s], atol=1e-3)
+    assert np.allclose(prior.velocity_m_s, [4, 1, 1], atol=1e-3)
+    assert np.isfinite(prior.position_sigma_m).all()
+
+
+@given(st.floats(0, 10))
+def test_smoothing_keeps_linear_motion_and_uses_every_fix(time_s):
+    times_s = np.arange(0, 10.05, 0.1)
+    track, _ = track_of(straight(times_s))
+    plain, smooth = track.prior(time_s), track.prior(time_s, smooth_s=0.5)
+    assert np.allclose(smooth.position_m[:2], [4 * time_s, time_s], atol=1e-3)
+    assert smooth.position_sigma_m[0] <= plain.position_sigma_m[0] + 1e-9
+
+
+def test_a_fix_between_others_far_apart_is_less_sure():
+    times_s = np.arange(0, 21.0, 2.0)
+    track, _ = track_of(straight(times_s, horizontal_sigma_m=1.0))
+    assert track.prior(5.0).position_sigma_m[0] > track.prior(4.0).position_sigma_m[0]
+
+
+def test_beyond_the_ends_nothing_is_known():
+    track, _ = track_of(straight(ONE_HZ, height_above_takeoff_m=20.0))
+    assert track.prior(-1.0).knows_place and track.prior(21.0).knows_place
+    for time_s in (-2.0, 22.0, 500.0):
+        prior = track.prior(time_s)
+        assert not prior.knows_place
+        assert "no fix" in prior.source
+
+
+def test_in_a_gap_nothing_is_known():
+    times_s = np.concatenate([np.arange(0, 8.0), np.arange(15, 21.0)])
+    track, _ = track_of(straight(times_s))
+    assert track.prior(7.0).knows_place and track.prior(15.0).knows_place
+    assert not track.prior(11.0).knows_place
+    # a shorter one is bridged
+    short, _ = track_of(straight(np.delete(ONE_HZ, [8, 9])))
+    assert np.allclose(short.prior(8.5).position_m[:2], [34, 8.5], atol=1e-3)
+
+
+def test_a_sample_without_a_fix_is_no_fix():
+    samples = straight(ONE_HZ)
+    latitude = samples["latitude_deg"].copy()
+    latitude[5] = np.nan
+    holed = Telemetry("test", samples.time_ns, {**samples.columns, "latitude_deg": latitude})
+    track, _ = track_of(holed)
+    assert np.allclose(track.prior(5.0).position_m[:2], [20, 5], atol=1e-3)
+    assert site_origin(holed) is not None
+    assert site_origin(Telemetry("test", samples.time_ns, {})) is None
+
+
+def test_photos_carry_their_own_fixes():
+    times_s = np.array([0.0, 4.0, 60.0, 300.0])
+    track, _ = track_of(straight(times_s), sigma_s=0.0)
+    for time_s in times_s:
+        assert np.allclose(track.prior(time_s).position_m[:2], [4 * time_s, time_s], atol=1e-3)
+    assert tie_clocks(
+        straight(times_s), kind="photos", start_ns=START_NS, duration_s=300, offset_given=False, strict=True
+    ).sigma_s == 0
+
+
+def test_a_slow_fix_repeated_at_frame_rate_is_a_slow_fix():
+    times_s = np.arange(0, 20, 0.04)
+    held_s = np.floor(times_s)
+    track, _ = track_of(telemetry(times_s, np.column_stack([4 * held_s, held_s])))
+    assert track.interval_s == pytest.approx(1.0, abs=0.05)
+    assert np.allclose(track.prior(10.5).position_m[:2], [42, 10.5], atol=0.1)
+
+
+# ---- clocks ---------------------------------------------------------------------------------------------------
+
+
+def tied(samples: Telemetry, start_ns: int, *, strict=True, offset_given=False) -> Clock:
+    return tie_clocks(
+        samples, kind="video", start_ns=start_ns, duration_s=20.0, offset_given=offset_given, strict=strict
+    )
+
+
+def test_utc_decides_where_both_have_it():
+    clock = tied(straight(ONE_HZ), START_NS + 3 * 10**9)
+    assert clock.sample_s[0] == pytest.approx(-3.0)
+    assert clock.tie == "both carry UTC"
+    assert clock.first_frame_utc_ns == START_NS + 3 * 10**9
+
+
+def test_subtitles_count_from_the_first_frame():
+    clock = tied(straight(ONE_HZ, video=True), START_NS + 7 * 3600 * 10**9)
+    assert (clock.sample_s == ONE_HZ).all()
+    assert clock.first_frame_utc_ns == START_NS
+
+
+@pytest.mark.parametrize("hours", [1, 2, -9, 14])
+def test_clocks_some_hours_apart_are_tied_by_their_starts_and_told(hours):
+    clock = tied(straight(ONE_HZ), START_NS + hours * 3600 * 10**9)
+    assert clock.sample_s[0] == 0.0
+    assert [each.code for each in clock.notices] == ["clocks_apart"]
+    assert f"{abs(hours)}.0 h" in clock.notices[0].text
+    assert clock.first_frame_utc_ns == START_NS
+
+
+def test_a_video_that_does_not_know_its_time_is_tied_by_starts():
+    clock = tied(straight(ONE_HZ), 0)
+    assert clock.sample_s[0] == 0.0 and clock.notices == ()
+
+
+@pytest.mark.parametrize("days", [3, -40])
+def test_telemetry_of_another_day_is_an_error(days):
+    start_ns = START_NS + days * 86400 * 10**9
+    with pytest.raises(InputError, match=r"another flight.*days.*--offset"):
+        tied(straight(ONE_HZ), start_ns)
+    # found beside the video rather than named, or with a word from the user, it is taken
+    assert tied(straight(ONE_HZ), start_ns, strict=False).sample_s[0] == 0.0
+    assert tied(straight(ONE_HZ), start_ns, offset_given=True).sample_s[0] == 0.0
+
+
+# ---- the offset that motion shows -----------------------------------------------------------------------------
+
+
+def curved(times_s) -> np.ndarray:
+    times_s = np.asarray(times_s)
+    return np.column_stack([40 * np.sin(times_s / 6), 25 * np.sin(times_s / 4) + 1.5 * times_s])
+
+
+def seen_path(path, times_s) -> np.ndarray:
+    """The path in a map of its own: turned, scaled and shifted."""
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    return 1.7 * path(times_s) @ turn.T + [300, -20]
+
+
+@pytest.mark.parametrize("offset_s", [0.7, -1.1, 0.0])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_an_offset_is_seen_on_a_curved_path(offset_s, seed):
+    rng = np.random.default_rng(seed)
+    sample_s = np.arange(0, 60.0, 0.5)
+    samples = telemetry(sample_s, curved(sample_s) + rng.normal(0, 0.7, (120, 2)))
+    track, _ = track_of(samples)
+    frames_s = np.arange(5, 54, 0.8)
+    # what a frame at t shows is what telemetry says at t + offset
+    found = estimate_offset(track, frames_s, seen_path(curved, frames_s + offset_s), reach_s=4.0)
+    assert abs(found.offset_s - offset_s) < 3 * found.sigma_s
+    assert 0.005 < found.sigma_s < 0.2
+    assert found.is_significant == (offset_s != 0)
+    corrected = shifted(track, found.offset_s)
+    again = estimate_offset(corrected, frames_s, seen_path(curved, frames_s + offset_s), reach_s=4.0)
+    assert abs(again.offset_s) < 0.05
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_straight_flight_shows_no_offset(seed):
+    rng = np.random.default_rng(seed)
+    line = lambda t: np.column_stack([4 * np.asarray(t), np.asarray(t)])  # noqa: E731
+    samples = telemetry(ONE_HZ, line(ONE_HZ) + rng.normal(0, 0.7, (21, 2)))
+    track, _ = track_of(samples)
+    frames_s = np.arange(4, 16, 0.8)
+    found = estimate_offset(track, frames_s, seen_path(line, frames_s + 0.7), reach_s=3.0)
+    assert not found.is_significant
+
+
+def test_too_little_shows_nothing():
+    track, _ = track_of(straight(ONE_HZ))
+    few = np.arange(4.0)
+    assert np.isinf(estimate_offset(track, few, curved(few), reach_s=3.0).sigma_s)
+    many = np.arange(0, 20, 0.5)
+    assert np.isinf(estimate_offset(track, many, curved(many), reach_s=0.0).sigma_s)
+    assert not estimate_offset(track, many, np.zeros((40, 2)), reach_s=2.0).is_significant
+
+
+# ---- heights --------------------------------------------------------------------------------------------------
+
+
+def test_height_above_take_off_is_taken_as_height_above_ground():
+    track, notices = track_of(straight(ONE_HZ, height_above_takeoff_m=25.0, ellipsoidal_height_m=110.0))
+    assert (track.up_m == 25.0).all() and notices == ()
+    assert "take-off" in track.height_words and np.isfinite(track.altitude_offset_sigma_m)
+
+
+@pytest.mark.parametrize("column", ["orthometric_height_m", "ellipsoidal_height_m"])
+def test_absolute_heights_alone_leave_the_ground_unknown(column):
+    track, notices = track_of(straight(ONE_HZ, **{column: 110 + np.linspace(0, 1, 21)}))
+    assert [each.code for each in notices] == ["ground_unknown"]
+    assert np.isinf(track.altitude_offset_sigma_m)
+    assert np.allclose(np.diff(track.up_m), 0.05)
+
+
+@pytest.mark.parametrize("column", ["orthometric_height_m", "ellipsoidal_height_m"])
+def test_a_given_ground_makes_them_heights_above_it(column):
+    track, notices = track_of(straight(ONE_HZ, **{column: 110.0}), ground_elevation_m=85.0)
+    assert (track.up_m == 25.0).all() and notices == ()
+    assert np.isfinite(track.altitude_offset_sigma_m)
+
+
+def test_a_take_off_in_the_telemetry_shows_the_ground():
+    heights = np.concatenate([np.full(5, 80.0), np.linspace(80, 105, 6), np.full(10, 105.0)])
+    track, notices = track_of(straight(ONE_HZ, orthometric_height_m=heights))
+    assert track.up_m[0] == pytest.approx(0.0) and track.up_m[-1] == pytest.approx(25.0)
+    assert notices == () and "begins" in track.height_words
+
+
+def test_a_height_of_zero_is_not_believed():
+    track, notices = track_of(straight(ONE_HZ, height_above_takeoff_m=0.0))
+    assert [each.code for each in notices] == ["height_of_zero", "height_unknown"]
+    assert np.isinf(track.vertical_sigma_m)
+    assert np.isinf(track.prior(5.0).position_sigma_m[2]) and track.prior(5.0).knows_place
+
+
+# ---- attitude -------------------------------------------------------------------------------------------------
+
+
+def test_yaw_turns_across_north_the_short_way():
+    yaw = np.array([350.0, 10.0, 30.0])
+    track, _ = track_of(straight([0.0, 1, 2], camera_yaw_deg=yaw, camera_pitch_deg=-89.0, camera_roll_deg=0.0))
+    for time_s, expected in ((0.25, 355.0), (0.5, 0.0), (1.5, 20.0)):
+        found = gimbal_angles_from_rotation(track.prior(time_s).rotation)[0]
+        assert abs((found - expected + 180) % 360 - 180) < 1e-6
+
+
+def test_a_gimbal_is_asked_before_the_body():
+    angles = {"body_yaw_deg": 10.0, "body_pitch_deg": 5.0, "body_roll_deg": 0.0}
+    body, _ = track_of(straight(ONE_HZ, **angles))
+    gimbal, _ = track_of(straight(ONE_HZ, **angles, camera_yaw_deg=50.0, camera_pitch_deg=-90.0, camera_roll_deg=0.0))
+    assert (body.attitude, gimbal.attitude) == ("body", "gimbal")
+    # nose up by 5 deg tilts a camera fixed below the body 5 deg forward of the vertical
+    looks = body.prior(3.0).rotation[:, 2]
+    assert np.degrees(np.arccos(-looks[2])) == pytest.approx(5.0)
+    assert np.all(gimbal.prior(3.0).attitude_sigma_deg < body.prior(3.0).attitude_sigma_deg)
+
+
+def test_without_angles_the_course_turns_the_picture_but_is_not_trusted():
+    track, _ = track_of(straight(ONE_HZ))
+    prior = track.prior(5.0)
+    forward = prior.rotation @ np.array([0.0, -1.0, 0.0])
+    assert np.allclose(forward[:2], np.array([4, 1]) / np.hypot(4, 1), atol=1e-3)
+    assert np.isinf(prior.attitude_sigma_deg[2])
