@@ -138,7 +138,7 @@ class TestFailures:
 
     def test_stopped(self, capsys: pytest.CaptureFixture[str]) -> None:
         code, told = self._told(KeyboardInterrupt(), capsys)
-        assert code == 130 and told == "stopped; the site is as it was before\n"
+        assert code == 130 and told == "stopped; what was not finished is left out, what was before is as it was\n"
 
 
 def test_import_is_quick_and_lazy() -> None:

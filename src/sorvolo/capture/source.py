@@ -141,9 +141,11 @@ def _sort_inputs(inputs: Sequence[Path]) -> tuple[list[Path], list[_AlbumInput]]
 
 def _nothing_in(folder: Path, files: int) -> str:
     folders = sorted(each.name for each in folder.iterdir() if each.is_dir() and each.name[0] != ".")
-    hint = f"; it has folders: name the one with the pictures ({', '.join(folders[:5])})" if folders else ""
+    hint = f"it has folders: name the one with the pictures ({', '.join(folders[:5])})" if folders else (
+        "name the folder that has them, or a video file"
+    )
     wanted = ", ".join(sorted(PHOTO_SUFFIXES))
-    return f"{folder} holds no pictures or videos among {files} files ({wanted} are pictures){hint}"
+    return f"{folder} holds no pictures or videos among {files} files ({wanted} are pictures); {hint}"
 
 
 def _distinct_names(places: Sequence[Path]) -> list[str]:

@@ -13,6 +13,7 @@ from sorvolo.survey.flight import CameraPrior, Notice, Telemetry
 
 DEFAULT_HORIZONTAL_SIGMA_M = 1.5  # the thesis's DJI Phantom 3, section 2.2
 _OTHER_FLIGHT_S = 24 * 3600.0  # clocks are set to a wrong zone by up to 14 h; a day apart is another flight
+_DATED_NS = 3650 * 86_400 * 10**9  # ten years after 1970: an earlier clock was never set
 _HEIGHTS = (
     ("height_above_takeoff_m", "above take-off", 1.0),
     ("orthometric_height_m", "orthometric", 3.0),
@@ -71,7 +72,7 @@ def tie_clocks(
     if (telemetry.video_time_ns >= 0).all():
         zero_ns = int(np.median(telemetry.time_ns - telemetry.video_time_ns))
         return Clock(telemetry.video_time_ns / 1e9, "telemetry counts from the video's first frame", 0.5, zero_ns)
-    dated = first_ns > 86_400 * 10**9 * 3650 and start_ns > 86_400 * 10**9 * 3650
+    dated = min(first_ns, start_ns) > _DATED_NS
     if dated:
         lead_s = (first_ns - start_ns) / 1e9
         overlap_s = min(lead_s + float(utc_s[-1]), duration_s) - max(lead_s, 0.0)
@@ -85,7 +86,8 @@ def tie_clocks(
             )
         words = f"the video's clock and the telemetry's are {apart_s / 3600:.1f} h apart: their starts were tied"
         return Clock(utc_s, "first sample tied to first frame", 3.0, first_ns, (Notice("clocks_apart", 1, words),))
-    return Clock(utc_s, "first sample tied to first frame", 3.0, first_ns)
+    # a log without a date is stamped from 1970: then the video's own start tells when it was
+    return Clock(utc_s, "first sample tied to first frame", 3.0, start_ns if first_ns < _DATED_NS else first_ns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,8 +152,8 @@ class Track:
         place, velocity, gain = _line(times[chosen] - time_s, values)
         sigma_h = float(np.median(self.horizontal_sigma_m[rows]))
         if smooth_s == 0 and times[before] < time_s < times[after] and times[after] - times[before] > 1.5:
-            # between fixes that lie far apart the path is a guess
-            sigma_h += 0.15 * float(np.linalg.norm(np.diff(values[[0, -1], :2], axis=0)))
+            # between fixes that lie far apart the path is a guess, and between photos there may be a turn
+            sigma_h += (0.15 if self.interval_s else 0.4) * float(np.linalg.norm(np.diff(values[[0, -1], :2], axis=0)))
         # neighbouring fixes err alike, so averaging many never helps by more than a factor of two
         shrink = max(gain, 0.5)
         return place, np.array([sigma_h, sigma_h, self.vertical_sigma_m]) * shrink, velocity

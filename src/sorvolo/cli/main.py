@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else _FAILED
         if code == _STOPPED:
-            _tell("stopped; the site is as it was before")
+            _tell("stopped; what was not finished is left out, what was before is as it was")
         return code
     except Exception as error:
         if wishes.debug:

@@ -1,11 +1,11 @@
 """`sorvolo map`: flights into a site folder, and in the end what became of them."""
 
 import json
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -17,7 +17,7 @@ from sorvolo.errors import StoreError
 from sorvolo.missions.map_flight import map_flights
 from sorvolo.missions.settings import MapSettings
 from sorvolo.store.archive import Archive
-from sorvolo.survey.mosaic import MosaicUpdate, Status
+from sorvolo.survey.mosaic import Status
 
 _COLOURS = {Status.VISION: "green", Status.GPS_ONLY: "yellow", Status.REJECTED: "red"}
 _MOST_REASONS = 6
@@ -92,7 +92,7 @@ def map_and_read_reports(
     before = _newest_version(site)
     mapping = map_flights(inputs, site, settings, telemetry=telemetry, camera=camera, area=area)
     # closed even when the bar is stopped: then the site is as it was
-    with closing(cast("Generator[MosaicUpdate]", mapping)) as updates:
+    with closing(mapping) as updates:
         show_progress(updates, Console(stderr=True))
     with Archive.open(site, write=False) as archive:
         mapped = [each.flight_id for each in archive.versions() if each.complete and each.id > before]

@@ -107,6 +107,16 @@ def utm_epsg(latitude_deg: float, longitude_deg: float) -> int:
     return (32600 if latitude_deg >= 0 else 32700) + zone
 
 
+def check_map_crs(crs: str) -> None:
+    """Raise SettingsError unless a map can be written in this CRS: a projected one, or latitude and longitude."""
+    try:
+        parsed = CRS.from_user_input(crs)
+    except CRSError as error:
+        raise SettingsError(f"unknown coordinate reference system {crs!r}; try one as EPSG:32633") from error
+    if not (parsed.is_projected or parsed.is_geographic):
+        raise SettingsError(f"{crs} ({parsed.name}) is no CRS of a map; choose a projected one as EPSG:32633")
+
+
 @dataclass(frozen=True)
 class Projection:
     """A projected metric CRS and its way to and from WGS84; `crs` is anything PROJ reads, e.g. "EPSG:32633"."""

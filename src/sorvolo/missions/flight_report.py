@@ -15,6 +15,7 @@ import numpy as np
 
 import sorvolo
 from sorvolo.capture.sync import OffsetEstimate
+from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGBA
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import TileIndex
@@ -82,6 +83,14 @@ class FlightLog:
     def total_cpu_s(self) -> float:
         """CPU seconds of the process since the flight began."""
         return time.process_time() - self._started_cpu_s
+
+
+def nothing_placed(name: str, log: FlightLog) -> InputError:
+    """The error for a flight none of whose frames has a place on the ground."""
+    reason = log.commonest_reason() or "none was selected"
+    return InputError(
+        f"no frame of {name} could be placed: {reason}; `sorvolo inspect` tells what the flight holds and what to do"
+    )
 
 
 def build_report(

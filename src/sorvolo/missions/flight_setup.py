@@ -80,8 +80,14 @@ def prepare(source: Source, settings: MapSettings, site: Site | None, *, telemet
             )
         if settings.offset_s is not None:
             raise SettingsError("--offset was given, but the flight has no telemetry with fixes")
+        if settings.crs is not None:
+            raise SettingsError(
+                f"--crs {settings.crs} was given, but {source.name} has no GPS, so its map has no place on Earth; give "
+                "--telemetry, or leave --crs out"
+            )
         step_s = _UNTIMED_STEP_S if source.kind == "video" else 0.0
-        text = "no telemetry: the map is in a local frame of its own, without metres and north"
+        lack = "telemetry without a single fix" if len(telemetry) else "no telemetry"
+        text = f"{lack}: the map is in a local frame of its own, without metres and north"
         return FlightSetup(
             source, LocalFrame(Geodetic(0.0, 0.0)), None, None, step_s, step_s, 0.0,
             source.frame_count if source.kind == "photos" else max(2, round(duration_s)), site,

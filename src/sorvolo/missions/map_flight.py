@@ -1,7 +1,7 @@
 """Mode 1, first flight: sources to a map in a site folder, frame by frame."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 
 from sorvolo.capture.areas import read_area
@@ -20,13 +20,14 @@ from sorvolo.survey.mosaic import MosaicUpdate, Status
 def map_flights(
     inputs: Sequence[Path], site: Path, settings: MapSettings = MapSettings(), *,  # noqa: B008 (frozen)
     telemetry: Path | None = None, camera: Path | str | None = None, area: Path | None = None,
-) -> Iterator[MosaicUpdate]:
+) -> Generator[MosaicUpdate]:
     """Map one or more flights into the site folder, yielding an update for each selected frame.
 
     `inputs` are videos, folders of photos, or photos; `telemetry` a file of the only flight (else what lies beside
     it is used); `camera` a calibration file, a preset's name, "aov=DEG" or "focal_px=PX"; `area` a polygon outside
     of which frames are not used. Nothing of a flight is part of the site until its last update was yielded.
-    Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was.
+    Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
+    to stop early: the flight that is being mapped is left out, those before it are in.
     """
     wanted = None if area is None else read_area(area)
     sources = open_sources(inputs, telemetry, camera)
@@ -37,7 +38,7 @@ def map_flights(
 
 def _map_one(
     source: Source, archive: Archive, settings: MapSettings, area: Area | None, *, telemetry_named: bool
-) -> Iterator[MosaicUpdate]:
+) -> Generator[MosaicUpdate]:
     started_s = time.monotonic()
     setup = prepare(source, settings, archive.site() if archive.has_site else None, telemetry_named=telemetry_named)
     make = ThesisRun if settings.method == "thesis" else PlanarRun
@@ -63,7 +64,7 @@ def _map_one(
                 name, status, reason, read, source.frame_count, run.selected,
                 max(setup.expected_keyframes, run.selected), run.by_vision, tiles, time.monotonic() - started_s,
             )
-        run.finish(source.notices(), time.monotonic() - started_s)
+        run.finish(source.notices(), started_s)
 
 
 def _take(run: PlanarRun | ThesisRun, each: Selected | LostFrame) -> tuple[Status, str, int]:

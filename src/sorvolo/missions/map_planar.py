@@ -15,7 +15,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import site_from_image_homography
-from sorvolo.missions.flight_report import FlightLog, Stage, build_report
+from sorvolo.missions.flight_report import FlightLog, Stage, build_report, nothing_placed
 from sorvolo.missions.flight_setup import FlightSetup, new_site
 from sorvolo.missions.settings import MapSettings
 from sorvolo.mosaic.canvas import Canvas, CanvasFrame
@@ -120,13 +120,13 @@ class PlanarRun:
             self._keep(keyframe_id, image)
         return outcome.status, outcome.reason, self._show(force=False)
 
-    def finish(self, notices: Sequence[Notice], seconds: float) -> None:
-        """Solve once more, find the clock offset, paint what moved, and make the flight part of the site."""
+    def finish(self, notices: Sequence[Notice], started_s: float) -> None:
+        """Solve once more, find the clock offset, paint what moved, and make the flight part of the site.
+
+        `started_s` is when the flight's mapping began, by the monotonic clock.
+        """
         if not self._frames:
-            raise InputError(
-                f"no frame of {self._setup.source.name} could be placed: "
-                f"{self._log.commonest_reason() or 'none was selected'}"
-            )
+            raise self._nothing_placed()
         with self._log.stage(Stage.REGISTER):
             self._mapper.settle()
             offset = self._find_offset()
@@ -139,15 +139,20 @@ class PlanarRun:
         assert writer is not None
         with self._log.stage(Stage.REPORT):
             placed = self._placed()
-            report = build_report(
-                self._setup, self._settings, self._log, placed, site, offset, self._mapper.report(),
-                self._refined(self._setup.source.camera.camera), writer.tiles, [*self._setup.notices, *notices],
-                seconds, spread=self._exposure.spread,
-            )
-            page = report_page(report, picture(writer.tiles, 1600).rgba)
-        writer.commit(placed, self._images, report, page, crs=self._settings.crs)
+            if all(each.status is Status.REJECTED for each in placed):
+                raise self._nothing_placed()
+            shown = picture(writer.tiles, 1600).rgba
+        report = build_report(
+            self._setup, self._settings, self._log, placed, site, offset, self._mapper.report(),
+            self._refined(self._setup.source.camera.camera), writer.tiles, [*self._setup.notices, *notices],
+            time.monotonic() - started_s, spread=self._exposure.spread,
+        )
+        writer.commit(placed, self._images, report, report_page(report, shown), crs=self._settings.crs)
 
     # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _nothing_placed(self) -> InputError:
+        return nothing_placed(self._setup.source.name, self._log)
 
     def _keep(self, keyframe_id: int, image: ImageRGB) -> None:
         if self._writer is None:
@@ -225,9 +230,10 @@ class PlanarRun:
             self._images[index] = self._writer.save_image(index, lens.undistort(self._writer.image(index)))
         self._valid = lens.valid(self._stored.width_px, self._stored.height_px)
 
-    def _site_from_stored(self, keyframe_id: int) -> Matrix3:
-        camera = self._stored.with_focal_px(self._stored.fx_px * self._mapper.focal_scale)
-        return site_from_image_homography(camera, self._mapper.pose(keyframe_id))
+    def _site_from_image(self, keyframe_id: int, camera: Camera) -> Matrix3:
+        """Of an undistorted image of the size that `camera` has: the stored one's or the frame's own."""
+        refined = camera.with_focal_px(camera.fx_px * self._mapper.focal_scale)
+        return site_from_image_homography(refined, self._mapper.pose(keyframe_id))
 
     def _show(self, *, force: bool) -> int:
         """Paint what moved and let readers see it, now and then or at once."""
@@ -258,7 +264,7 @@ class PlanarRun:
 
     def _canvas_frame(self, keyframe_id: int, site_grid: SiteGrid) -> CanvasFrame | None:
         return canvas_frame(
-            keyframe_id, self._rank(), self._stored, self._site_from_stored(keyframe_id), site_grid,
+            keyframe_id, self._rank(), self._stored, self._site_from_image(keyframe_id, self._stored), site_grid,
             self._exposure.gains.get(keyframe_id, np.ones(3)), self._exposure.vignettes.get(0, np.zeros(2)),
             self._valid,
         )
@@ -316,8 +322,9 @@ class PlanarRun:
                 continue
             self._log.end(ending.index, ending.name, ending.time_ns, status, reason)
             result.append(PlacedFrame(
-                ending.name, ending.index, time_ns, status, reason, camera, pose, self._site_from_stored(keyframe_id),
-                outline_m, residuals.get(keyframe_id, float("nan")), sigmas[keyframe_id],
+                ending.name, ending.index, time_ns, status, reason, camera, pose,
+                self._site_from_image(keyframe_id, self._lens.camera), outline_m,
+                residuals.get(keyframe_id, float("nan")), sigmas[keyframe_id],
                 self._exposure.gains.get(keyframe_id, np.ones(3)), gps[keyframe_id],
             ))
         return result

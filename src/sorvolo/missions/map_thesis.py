@@ -1,5 +1,6 @@
 """One flight by `--method thesis`: section 3.1.1 from the selected frames to the site's tiles."""
 
+import time
 from collections.abc import Sequence
 from types import TracebackType
 from typing import Self
@@ -12,7 +13,7 @@ from sorvolo.geometry.arrays import Floats, ImageRGB, ImageRGBA, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.missions.flight_report import FlightLog, Stage, build_report
+from sorvolo.missions.flight_report import FlightLog, Stage, build_report, nothing_placed
 from sorvolo.missions.flight_setup import FlightSetup, new_site
 from sorvolo.missions.settings import MapSettings
 from sorvolo.mosaic.lens import Undistorter
@@ -90,13 +91,13 @@ class ThesisRun:
         self._pictures[frame.index] = image
         return status, reason, 0
 
-    def finish(self, notices: Sequence[Notice], seconds: float) -> None:
-        """Anchor the mosaic to its fixes, cut it into tiles, and make the flight part of the site."""
+    def finish(self, notices: Sequence[Notice], started_s: float) -> None:
+        """Anchor the mosaic to its fixes, cut it into tiles, and make the flight part of the site.
+
+        `started_s` is when the flight's mapping began, by the monotonic clock.
+        """
         if not self._stitched:
-            raise InputError(
-                f"no frame of {self._setup.source.name} could be placed: "
-                f"{self._log.commonest_reason() or 'none was selected'}"
-            )
+            raise nothing_placed(self._setup.source.name, self._log)
         site_from_mosaic = self._georeference()
         if not self._archive.has_site:
             metres = float(np.sqrt(abs(np.linalg.det(site_from_mosaic[:2, :2]))))
@@ -113,12 +114,12 @@ class ThesisRun:
             self._paint(site_from_mosaic, self._archive.site_grid(), writer)
         with self._log.stage(Stage.REPORT):
             placed = self._placed(site_from_mosaic)
-            report = build_report(
-                self._setup, self._settings, self._log, placed, site, None, None, self._setup.source.camera.camera,
-                writer.tiles, [*self._setup.notices, *notices], seconds, spread=float("nan"),
-            )
-            page = report_page(report, picture(writer.tiles, 1600).rgba)
-        writer.commit(placed, paths, report, page, crs=self._settings.crs)
+            shown = picture(writer.tiles, 1600).rgba
+        report = build_report(
+            self._setup, self._settings, self._log, placed, site, None, None, self._setup.source.camera.camera,
+            writer.tiles, [*self._setup.notices, *notices], time.monotonic() - started_s, spread=float("nan"),
+        )
+        writer.commit(placed, paths, report, report_page(report, shown), crs=self._settings.crs)
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
@@ -184,8 +185,9 @@ class ThesisRun:
                 gps[:2] = centre_m - posed.prior.position_m[:2]
             sigma_m = float(np.hypot(*posed.prior.position_sigma_m[:2])) if stitched is None else float("nan")
             result.append(PlacedFrame(
-                ending.name, ending.index, time_ns, ending.status, ending.reason, camera, None, site_from_image,
-                outline_m, stitched.residual_px if stitched else float("nan"), sigma_m, gps_residual_m=gps,
+                ending.name, ending.index, time_ns, ending.status, ending.reason, camera, None,
+                site_from_image @ small, outline_m,
+                stitched.residual_px if stitched else float("nan"), sigma_m, gps_residual_m=gps,
             ))
         return result
 

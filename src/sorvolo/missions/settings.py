@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sorvolo.errors import SettingsError
+from sorvolo.geometry.geodesy import check_map_crs
 
 
 @dataclass(frozen=True)
@@ -26,5 +27,7 @@ class MapSettings:
             raise SettingsError(f"the ground sampling distance must lie in 0.0001 to 100 m, got {self.m_per_px}")
         if not 0 < self.overlap < 1:
             raise SettingsError(f"overlap must lie between 0 and 1, got {self.overlap}")
+        if self.crs is not None:
+            check_map_crs(self.crs)
         if self.offset_s is not None and not abs(self.offset_s) <= 86_400 * 365:
             raise SettingsError(f"the clock offset must be a number of seconds, got {self.offset_s}")

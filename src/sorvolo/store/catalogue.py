@@ -420,9 +420,15 @@ def complete_run(
 
 
 def drop_unfinished(connection: Connection) -> None:
-    """Forget every run that was not committed, with its version, and flights that have no other."""
+    """Forget every run that was not committed, with its version, and flights that have no other.
+
+    A site that such a run made is forgotten as well when nothing was ever committed: its place, its ground sampling
+    distance and its height are that run's, and need not suit the next one.
+    """
     connection.execute(delete(_versions).where(_versions.c.complete.is_(False)))
-    connection.execute(delete(_runs).where(_runs.c.status == "mapping"))
+    dropped = connection.execute(delete(_runs).where(_runs.c.status == "mapping")).rowcount
+    if dropped and newest_version(connection) == 0:
+        connection.execute(delete(_site))
     connection.execute(delete(_flights).where(
         _flights.c.id.not_in(select(_runs.c.flight_id)), _flights.c.id.not_in(select(_versions.c.flight_id))
     ))

@@ -97,8 +97,8 @@ class PlacedFrame:
     """A selected frame as it ended: one feature of frames.geojson.
 
     `outline_m` (4, 2) is the image's corners on the ground (top-left, top-right, bottom-right, bottom-left), NaN
-    when rejected. `grid_image_from_image`, the planar map of the whole undistorted image to site metres, is
-    `site_from_image` (3, 3), NaN when rejected.
+    when rejected. `site_from_image` (3, 3) takes the pixels of the undistorted image, as large as `camera` however
+    small it is stored, to site metres on the ground; NaN when rejected.
     """
 
     name: str
