@@ -148,8 +148,9 @@ def test_the_gradient_is_that_of_the_cost(attitude_sigma_rad):
             expected.append(-(cost(at, step) - cost(at, -step)) / 2e-6 / 2)
     assert list(position) == [-1, 0, 1, 2]
     assert normal.shape == (26, 26)
-    scale = np.repeat([np.abs(expected[:18]).max(), np.abs(expected[18:]).max()], [18, 8])
-    assert (np.abs(gradient - expected) < 1e-3 * scale).all()
+    # each kind of unknown against its own size: cameras, lens, offsets, boresight
+    for kind in (slice(0, 18), slice(18, 20), slice(20, 23), slice(23, 26)):
+        assert np.abs(gradient[kind] - expected[kind]).max() < 5e-3 * np.abs(expected[kind]).max()
 
 
 def test_a_held_unknown_stays_where_it_is():
