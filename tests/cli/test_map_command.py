@@ -74,7 +74,8 @@ def test_a_stop_leaves_the_site_as_it_was(simulated: Path, tmp_path: Path) -> No
         os.kill(running.pid, signal.SIGINT)
         out, err = running.communicate(timeout=60)
     assert running.returncode == 130, err
-    assert out == "" and err.splitlines()[-1] == "stopped; what was not finished is left out, what was before is as it was"
+    assert out == ""
+    assert err.splitlines()[-1] == "stopped; what was not finished is left out, what was before is as it was"
     with Archive.open(site, write=False) as archive:
         assert not [flight for flight in archive.flights() if flight.status == "complete"]
 
