@@ -308,7 +308,7 @@ def _turn(image: ImageRGB, orientation: int) -> ImageRGB:
 
 
 def _telemetry_of(photos: Sequence[Photo]) -> tuple[Telemetry, list[Notice]]:
-    """One sample a photo that has a GPS position and is no duplicate, at exactly the photo's time."""
+    """One sample a photo that says where it is or how it looked, and is no duplicate, at exactly the photo's time."""
     readable = [
         photo for photo in photos if photo.metadata.width_px and not photo.problem.startswith("duplicate")
     ]
@@ -316,17 +316,13 @@ def _telemetry_of(photos: Sequence[Photo]) -> tuple[Telemetry, list[Notice]]:
     missing = notice("photo_without_gps", len(readable) - len(placed), "photos without a GPS position: {}")
     if not placed:
         return no_telemetry(), missing
-    names = {name for photo in placed for name in photo.metadata.columns}
-    columns = {name: [photo.metadata.columns.get(name, np.nan) for photo in placed] for name in names}
-    cleaned = clean("exif", placed[0].path.parent.name, [photo.time_ns for photo in placed], columns)
-    located = np.isfinite(cleaned["latitude_deg"])
-    if not located.any():
+    telling = [photo for photo in readable if photo.metadata.columns]
+    names = {name for photo in telling for name in photo.metadata.columns}
+    columns = {name: [photo.metadata.columns.get(name, np.nan) for photo in telling] for name in names}
+    cleaned = clean("exif", telling[0].path.parent.name, [photo.time_ns for photo in telling], columns)
+    if not cleaned.has_fixes:
         return no_telemetry(), [*missing, *cleaned.notices]
-    telemetry = Telemetry(
-        "exif", cleaned.time_ns[located], {name: cleaned[name][located] for name in names},
-        notices=(*missing, *cleaned.notices),
-    )
-    return telemetry, []
+    return replace(cleaned, notices=(*missing, *cleaned.notices)), []
 
 
 def _picture_notices(photos: Sequence[Photo], width_px: int, height_px: int) -> list[Notice]:

@@ -123,7 +123,7 @@ class Track:
         known = np.isfinite(place)
         sigma = np.where(known, sigma_m, np.inf)
         return CameraPrior(
-            np.where(known, place, 0.0), sigma, rotation, sigma_deg, np.nan_to_num(velocity),
+            np.where(known, place, self._nearest(time_s)), sigma, rotation, sigma_deg, np.nan_to_num(velocity),
             f"{'GPS' if known[0] else 'no fix'}, {words}",
         )
 
@@ -157,6 +157,14 @@ class Track:
         # neighbouring fixes err alike, so averaging many never helps by more than a factor of two
         shrink = max(gain, 0.5)
         return place, np.array([sigma_h, sigma_h, self.vertical_sigma_m]) * shrink, velocity
+
+    def _nearest(self, time_s: float) -> Vector3:
+        """The fix nearest in time: where to begin the search for a frame of unknown place."""
+        good = np.flatnonzero(np.isfinite(self.east_north_m[:, 0]))
+        if not len(good):
+            return np.array([0.0, 0.0, 40.0])
+        row = good[int(np.argmin(np.abs(self.sample_s[good] - time_s)))]
+        return np.array([*self.east_north_m[row], max(self.up_m[row], 1.0)])
 
     def _attitude(self, time_s: float, velocity_m_s: Vector3) -> tuple[Floats, Floats, str]:
         if self.attitude != "none" and self.sample_s[0] - 2 <= time_s <= self.sample_s[-1] + 2:

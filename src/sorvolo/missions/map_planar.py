@@ -35,6 +35,8 @@ from sorvolo.survey.mosaic import PlacedFrame, Status
 _WAIT_FOR_HEIGHT = 12  # keyframes held back until the height above ground is seen in them
 _PAINT_EVERY = 8  # keyframes painted together: tiles that several touch are rendered once
 _LOCAL_M_PER_PX = 1.0
+_TILT_OFFSET_DEG = 2.0  # a gimbal's zero, or a camera's mount
+_HEADING_OFFSET_DEG = 5.0  # a drone's compass beside its motors
 _HORIZON_MARGIN_DEG = 5.0
 
 
@@ -56,6 +58,8 @@ class PlanarRun:
                 radial_sigma=0.0 if calibrated else 0.03,
                 altitude_offset_sigma_m=offset_sigma_m if setup.track is not None else 0.0,
                 gps_offset_sigma_m=5.0 if self._known else 0.0,
+                tilt_offset_sigma_deg=_TILT_OFFSET_DEG if setup.track is not None else 0.0,
+                heading_offset_sigma_deg=_HEADING_OFFSET_DEG if setup.track is not None else 0.0,
             ),
             known=[each.keyframe for each in self._known.values()],
         )

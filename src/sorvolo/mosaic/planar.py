@@ -242,9 +242,9 @@ class PlanarMapper:
         """Where the old keyframe falls in the new one, off by the errors of telemetry, or of the graph if `tight`."""
         try:
             site_from_new = site_from_image_homography(new.camera, guess)
+            new_from_old = np.linalg.inv(site_from_new) @ self._site_from_image(old)
         except GeometryError:
             return None
-        new_from_old = np.linalg.inv(site_from_new) @ self._site_from_image(old)
         side = max(new.camera.width_px, new.camera.height_px)
         if tight:
             search = 0.05 * side

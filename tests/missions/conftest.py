@@ -1,0 +1,42 @@
+"""Small simulated flights, made once, that the tests of mapping share; their fixes are good to some centimetres."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from sorvolo.missions.simulate_site import simulate_site
+from sorvolo.simulation.settings import (
+    ImagingSettings,
+    OutputSettings,
+    PathSettings,
+    SceneSettings,
+    SensorSettings,
+    SimulationSettings,
+)
+
+_SMALL = SimulationSettings(
+    seed=31, flights=1,
+    scene=SceneSettings(people=1, cars=1, small_objects=2, has_scenery=False),
+    path=PathSettings(height_m=20, speed_m_s=5, length_m=30, strips=2, strip_spacing_m=6),
+    imaging=ImagingSettings(width_px=480, height_px=270, fps=6),
+    sensor=SensorSettings(noise_m=(0.05, 0.05, 0.05)),
+)
+
+
+@pytest.fixture(scope="session")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A video of two strips with telemetry in every format, `camera.xml` and the truth."""
+    folder = tmp_path_factory.mktemp("flights") / "filmed"
+    for _ in simulate_site(folder, replace(_SMALL, output=OutputSettings(telemetry="all"))):
+        pass
+    return folder
+
+
+@pytest.fixture(scope="session")
+def photographed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same flight as geo-tagged photos with the gimbal's angles, and the truth."""
+    folder = tmp_path_factory.mktemp("flights") / "photographed"
+    for _ in simulate_site(folder, replace(_SMALL, output=OutputSettings(photos=True))):
+        pass
+    return folder

@@ -1,0 +1,304 @@
+"""`sorvolo map` from end to end on small simulated flights, against their truth."""
+
+import json
+import shutil
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+from pyproj import Transformer
+
+from sorvolo.cli import main as cli
+from sorvolo.geometry.geodesy import Geodetic, LocalFrame
+from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.store.archive import Archive
+
+_M_PER_PX = 0.05  # of the simulated pictures
+_PROPERTIES = {
+    "frame", "time", "status", "reason", "camera_longitude_deg", "camera_latitude_deg", "camera_height_m",
+    "height_above_ground_m", "residual_px", "sigma_m",
+}
+
+
+def run_map(site: Path, *arguments: str | Path) -> None:
+    assert cli.main(["map", *map(str, arguments), "--site", str(site)]) == 0
+
+
+def report_of(site: Path, flight: str) -> dict[str, Any]:
+    return json.loads((site / "flights" / flight / "report.json").read_text())
+
+
+def frames_of(site: Path, flight: str) -> dict[str, Any]:
+    return json.loads((site / "flights" / flight / "frames.geojson").read_text())
+
+
+def corner_errors_m(site: Path, flight: str, truth: Path) -> tuple[float, float]:
+    """Root mean square corner error: absolute, and of the shape, after the best similarity onto the truth."""
+    true = json.loads((truth / "frames.geojson").read_text())
+    frame = LocalFrame(Geodetic(**true["site"]))
+    expected = {each["properties"]["frame"]: _corners_m(each, frame) for each in true["features"]}
+    pairs = [
+        (_corners_m(each, frame), expected[each["properties"]["frame"]])
+        for each in frames_of(site, flight)["features"] if each["geometry"] is not None
+    ]
+    found_m, true_m = (np.concatenate([pair[k] for pair in pairs]) for k in (0, 1))
+    moved_m = apply_homography(fit_similarity(true_m, found_m), found_m)
+    return _rms_m(found_m - true_m), _rms_m(moved_m - true_m)
+
+
+def _corners_m(feature: dict[str, Any], frame: LocalFrame) -> np.ndarray:
+    lonlat = np.array(feature["geometry"]["coordinates"][0])[:4]
+    return frame.site_from_wgs84(lonlat[:, 1], lonlat[:, 0], np.full(4, frame.origin.height_m))[:, :2]
+
+
+def _rms_m(errors_m: np.ndarray) -> float:
+    return float(np.sqrt((errors_m**2).sum(axis=1).mean()))
+
+
+def _film(filmed: Path) -> Path:
+    return filmed / "flight1" / "flight1.mp4"
+
+
+def _telemetry(filmed: Path, name: str) -> Path:
+    return filmed / "flight1" / (name if name.endswith("csv") else f"other/{name}")
+
+
+def _some_photos(photographed: Path, folder: Path, start: int, end: int) -> Path:
+    folder.mkdir()
+    for photo in sorted((photographed / "flight1" / "photos").glob("*.jpg"))[start:end]:
+        shutil.copy(photo, folder)
+    return folder
+
+
+# The telemetry's height decides the map's scale where only it does; seen in pixels of the pictures' 5 cm.
+@pytest.mark.parametrize("name", ["flight1.csv", "flight1.nmea", "flight1.srt", "flight1.gpx"])
+def test_a_video_with_telemetry_of_each_format(filmed: Path, tmp_path: Path, name: str) -> None:
+    site = tmp_path / "site"
+    run_map(site, _film(filmed), "--telemetry", _telemetry(filmed, name), "--camera", filmed / "camera.xml")
+    report = report_of(site, "flight1")
+    assert report["georeferenced"] and report["frames"]["vision"] == report["frames"]["selected"] > 8
+    absolute_m, shape_m = corner_errors_m(site, "flight1", filmed / "truth")
+    assert shape_m < _M_PER_PX
+    assert absolute_m < 0.6  # 1 Hz formats interpolate a fix from two that are 5 m apart, turns included
+
+
+def test_the_report_counts_every_second_up_to_itself(filmed: Path, tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    run_map(site, _film(filmed), "--camera", filmed / "camera.xml")
+    seconds = report_of(site, "flight1")["seconds"]
+    assert set(seconds) == {"total", "undistort", "register", "paint", "store", "report"}
+    assert seconds["total"] >= sum(value for name, value in seconds.items() if name != "total")
+
+
+def test_a_clock_offset_is_found_from_motion_or_taken_as_given(filmed: Path, tmp_path: Path) -> None:
+    lines = _telemetry(filmed, "flight1.csv").read_text().splitlines()
+    late = tmp_path / "late.csv"
+    late.write_text("\n".join([lines[0], *lines[9:]]))  # at 10 Hz: what is tied to the first frame is 0.8 s late
+    common = (_film(filmed), "--telemetry", late, "--camera", filmed / "camera.xml")
+    run_map(tmp_path / "found", *common)
+    found = report_of(tmp_path / "found", "flight1")["time_offset"]
+    assert found["origin"] == "estimated" and found["applied_s"] == pytest.approx(-0.8, abs=0.12)
+    run_map(tmp_path / "given", *common, "--offset", "-0.8")
+    given = report_of(tmp_path / "given", "flight1")["time_offset"]
+    assert given["origin"] == "given" and given["applied_s"] == -0.8
+    for site in ("found", "given"):
+        assert corner_errors_m(tmp_path / site, "flight1", filmed / "truth")[0] < 0.5
+
+
+def test_a_video_without_telemetry_is_mapped_in_a_frame_of_its_own(filmed: Path, tmp_path: Path) -> None:
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    shutil.copy(_film(filmed), alone)
+    site = tmp_path / "site"
+    run_map(site, alone / "flight1.mp4")
+    report, frames = report_of(site, "flight1"), frames_of(site, "flight1")
+    assert not report["georeferenced"] and frames["crs"] is None
+    assert "no_telemetry" in {each["code"] for each in report["notices"]}
+    assert report["frames"]["vision"] >= 0.9 * report["frames"]["selected"]
+    with rasterio.open(site / "mosaic.tif") as mosaic:
+        assert mosaic.crs is None
+    assert not (site / "mosaic.kmz").exists()
+
+
+def test_telemetry_that_ends_before_the_video(filmed: Path, tmp_path: Path) -> None:
+    lines = _telemetry(filmed, "flight1.csv").read_text().splitlines()
+    short = tmp_path / "short.csv"
+    short.write_text("\n".join(lines[:1 + len(lines) // 2]))
+    site = tmp_path / "site"
+    run_map(site, _film(filmed), "--telemetry", short, "--camera", filmed / "camera.xml")
+    frames = report_of(site, "flight1")["frames"]
+    assert frames["vision"] == frames["selected"] > 8  # found again by what they show
+    assert corner_errors_m(site, "flight1", filmed / "truth")[1] < 2 * _M_PER_PX
+
+
+def test_photos_and_what_frames_geojson_says_of_them(photographed: Path, tmp_path: Path) -> None:
+    site, photos = tmp_path / "site", photographed / "flight1" / "photos"
+    run_map(site, photos, "--camera", photographed / "camera.xml")
+    absolute_m, shape_m = corner_errors_m(site, "photos", photographed / "truth")
+    assert absolute_m < 2 * _M_PER_PX and shape_m < _M_PER_PX
+    frames = frames_of(site, "photos")
+    names = [each["properties"]["frame"] for each in frames["features"]]
+    assert sorted(names) == sorted(path.name for path in photos.iterdir())
+    text = (site / "flights" / "photos" / "frames.geojson").read_text()
+    true = json.loads((photographed / "truth" / "frames.geojson").read_text())
+    expected = {each["properties"]["frame"]: each["geometry"]["coordinates"][0] for each in true["features"]}
+    for feature in frames["features"]:
+        assert set(feature["properties"]) >= _PROPERTIES
+        assert feature["properties"]["status"] == "vision" and feature["properties"]["reason"] == ""
+        (ring,) = feature["geometry"]["coordinates"]
+        assert len(ring) == 5 and ring[0] == ring[4]
+        # top-left, top-right, bottom-right, bottom-left: each is nearest to the truth's corner of that name
+        distances = np.linalg.norm(
+            np.array(ring[:4])[:, None] - np.array(expected[feature["properties"]["frame"]][:4])[None], axis=2
+        )
+        assert list(distances.argmin(axis=1)) == [0, 1, 2, 3]
+        assert sum(len(f"{x!r}".partition(".")[2]) >= 9 for point in ring for x in point) >= 8
+    assert "NaN" not in text and "Infinity" not in text
+
+
+def test_mosaic_tif_opens_in_its_place(photographed: Path, tmp_path: Path) -> None:
+    site, photos = tmp_path / "site", photographed / "flight1" / "photos"
+    run_map(site, photos, "--camera", photographed / "camera.xml", "--gsd", "0.1")
+    truth = rasterio.open(photographed / "truth" / "ground.tif")
+    with rasterio.open(site / "mosaic.tif") as mosaic, truth:
+        assert mosaic.crs.to_epsg() == truth.crs.to_epsg() == 32633
+        assert mosaic.count == 4 and mosaic.colorinterp[3].name == "alpha"
+        assert mosaic.overviews(1) and mosaic.profile["tiled"]
+        assert mosaic.res == pytest.approx((0.1, 0.1))
+        rgba = mosaic.read()
+        rows, columns = np.nonzero(rgba[3] == 255)
+        east_m, north_m = mosaic.transform @ (columns + 0.5, rows + 0.5)
+        found = rgba[:3, rows, columns].mean(axis=0)
+        ground = truth.read([1, 2, 3]).mean(axis=0)
+        scores = {}
+        for shift in [(x, y) for x in (-0.2, -0.1, 0, 0.1, 0.2) for y in (-0.2, -0.1, 0, 0.1, 0.2)]:
+            x, y = ~truth.transform @ (east_m + shift[0], north_m + shift[1])
+            at = np.floor(y).astype(int), np.floor(x).astype(int)
+            scores[shift] = np.corrcoef(found, ground[at])[0, 1]
+    best = max(scores, key=lambda shift: scores[shift])
+    assert np.hypot(*best) <= 0.1 and scores[best] > 0.6  # metres: one pixel of the map
+
+
+@pytest.mark.parametrize(("crs", "epsg"), [("EPSG:3857", 3857), ("EPSG:32632", 32632)])
+def test_another_crs_for_the_map(photographed: Path, tmp_path: Path, crs: str, epsg: int) -> None:
+    photos = _some_photos(photographed, tmp_path / "few", 0, 6)
+    site = tmp_path / "site"
+    run_map(site, photos, "--camera", photographed / "camera.xml", "--crs", crs)
+    place = frames_of(site, "few")["features"][2]["properties"]
+    with rasterio.open(site / "mosaic.tif") as mosaic:
+        assert mosaic.crs.to_epsg() == epsg
+        x, y = Transformer.from_crs(4326, epsg, always_xy=True).transform(
+            place["camera_longitude_deg"], place["camera_latitude_deg"]
+        )
+        assert next(mosaic.sample([(x, y)]))[3] == 255
+
+
+def test_frames_outside_the_area_are_not_used(photographed: Path, tmp_path: Path) -> None:
+    true = json.loads((photographed / "truth" / "frames.geojson").read_text())
+    longitude = {each["properties"]["frame"]: each["properties"]["camera_longitude_deg"] for each in true["features"]}
+    latitude = [each["properties"]["camera_latitude_deg"] for each in true["features"]]
+    middle, low, high = float(np.median(list(longitude.values()))), min(latitude) - 1e-3, max(latitude) + 1e-3
+    ring = [[middle, low], [middle + 1e-2, low], [middle + 1e-2, high], [middle, high], [middle, low]]
+    area = tmp_path / "area.geojson"
+    area.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    site = tmp_path / "site"
+    run_map(site, photographed / "flight1" / "photos", "--camera", photographed / "camera.xml", "--area", area)
+    used = {
+        each["properties"]["frame"] for each in frames_of(site, "photos")["features"]
+        if each["properties"]["status"] != "rejected"
+    }
+    well_inside = {name for name, where in longitude.items() if where > middle + 5e-6}
+    well_outside = {name for name, where in longitude.items() if where < middle - 5e-6}
+    assert well_inside <= used and not well_outside & used and well_inside and well_outside
+
+
+@pytest.mark.parametrize("transform", ["similarity", "homography"])
+def test_the_thesis_method(photographed: Path, tmp_path: Path, transform: str) -> None:
+    photos = _some_photos(photographed, tmp_path / "few", 0, 7)
+    site = tmp_path / "site"
+    run_map(
+        site, photos, "--camera", photographed / "camera.xml", "--method", "thesis", "--transform", transform
+    )
+    report = report_of(site, "few")
+    assert report["method"] == "thesis" and report["settings"]["transform"] == transform
+    assert report["frames"]["vision"] == 7
+    assert corner_errors_m(site, "few", photographed / "truth")[1] < 1.0  # metres: its own ceiling
+
+
+def test_stored_frames_of_a_coarse_map_lie_where_the_frames_do(photographed: Path, tmp_path: Path) -> None:
+    photos = _some_photos(photographed, tmp_path / "few", 0, 6)
+    site = tmp_path / "site"
+    run_map(site, photos, "--camera", photographed / "camera.xml", "--gsd", "0.2")
+    with Archive.open(site, write=False) as archive:
+        frame = archive.site().frame
+        outlines = {
+            each["properties"]["frame"]: _corners_m(each, frame) for each in frames_of(site, "few")["features"]
+        }
+        for keyframe in archive.keyframes():
+            assert archive.image(keyframe).shape[1] == keyframe.camera.width_px < 240
+            centre_m = apply_homography(keyframe.site_from_image, keyframe.camera.corners_px).mean(axis=0)
+            assert np.linalg.norm(centre_m - outlines[keyframe.name].mean(axis=0)) < 0.2  # metres: one pixel
+
+
+def test_a_second_flight_extends_the_map_and_changes_nothing_of_the_first(
+    photographed: Path, tmp_path: Path
+) -> None:
+    first = _some_photos(photographed, tmp_path / "first", 0, 9)
+    second = _some_photos(photographed, tmp_path / "second", 5, 16)
+    site = tmp_path / "site"
+    run_map(site, first, "--camera", photographed / "camera.xml")
+    before = (site / "flights" / "first" / "frames.geojson").read_bytes()
+    with Archive.open(site, write=False) as archive:
+        tiles = dict(archive.tiles().items())
+    run_map(site, second, "--camera", photographed / "camera.xml")
+    assert (site / "flights" / "first" / "frames.geojson").read_bytes() == before
+    with Archive.open(site, write=False) as archive:
+        extended = dict(archive.tiles().items())
+        assert [flight.id for flight in archive.flights()] == ["first", "second"]
+    assert sum(int((tile[..., 3] > 0).sum()) for tile in extended.values()) > 1.1 * sum(
+        int((tile[..., 3] > 0).sum()) for tile in tiles.values()
+    )
+    for index, tile in tiles.items():
+        # away from the first flight's rim, where the new ground is joined to the old, not a byte has changed
+        inner = _eroded(tile[..., 3] == 255, 48)
+        assert np.array_equal(extended[index][inner], tile[inner])
+    assert corner_errors_m(site, "second", photographed / "truth")[0] < 3 * _M_PER_PX
+
+
+def test_the_same_flight_again_doubles_nothing(photographed: Path, tmp_path: Path) -> None:
+    photos = _some_photos(photographed, tmp_path / "few", 0, 8)
+    site = tmp_path / "site"
+    run_map(site, photos, "--camera", photographed / "camera.xml")
+    frames = frames_of(site, "few")["features"]
+    run_map(site, photos, "--camera", photographed / "camera.xml")
+    again = frames_of(site, "few")["features"]
+    assert [each["properties"]["frame"] for each in again] == [each["properties"]["frame"] for each in frames]
+    for one, other in zip(frames, again, strict=True):
+        moved_deg = np.subtract(one["geometry"]["coordinates"], other["geometry"]["coordinates"])
+        assert np.abs(moved_deg).max() < 1e-8  # a millimetre
+    with Archive.open(site, write=False) as archive:
+        assert len(archive.flights()) == 1 and len(archive.keyframes()) == 8
+
+
+def test_every_selected_frame_ends_once_with_a_reason_unless_by_vision(filmed: Path, tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    run_map(site, _film(filmed), "--camera", filmed / "camera.xml", "--overlap", "0.5")
+    frames, counted = frames_of(site, "flight1")["features"], report_of(site, "flight1")["frames"]
+    assert max(Counter(each["properties"]["frame"] for each in frames).values()) == 1
+    assert len(frames) == counted["selected"]
+    for each in frames:
+        assert (each["properties"]["status"] == "vision") or each["properties"]["reason"]
+        assert (each["geometry"] is None) == (each["properties"]["status"] == "rejected")
+
+
+def _eroded(mask: np.ndarray, by_px: int) -> np.ndarray:
+    """The mask without its rim of `by_px`; ground beyond the tile's own edge counts as outside."""
+    padded = np.pad(np.cumsum(np.cumsum(mask.astype(np.int64), 0), 1), ((1, 0), (1, 0)))
+    side = 2 * by_px + 1
+    sums = padded[side:, side:] - padded[:-side, side:] - padded[side:, :-side] + padded[:-side, :-side]
+    result = np.zeros_like(mask)
+    result[by_px:-by_px, by_px:-by_px] = sums == side**2
+    return result
