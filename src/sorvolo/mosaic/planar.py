@@ -91,9 +91,7 @@ class PlanarMapper:
 
     def settle(self) -> frozenset[int]:
         """Solve the whole flight once more; the keyframes that moved."""
-        moved = self._graph.settle()
-        # what the first solve taught about links and telemetry counts in the second
-        return moved | self._graph.settle()
+        return self._graph.conclude()
 
     def retime(self, priors: Mapping[int, CameraPrior]) -> frozenset[int]:
         """What telemetry says under another clock offset."""

@@ -16,6 +16,9 @@ from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
 
 _ENOUGH = 8  # frames from which telemetry's own errors are learnt
+_OFFSET_GROUPS = ((2,), (5, 6), (7,))  # of SHARED: altitude's zero, tilt, heading; judged together
+_OFFSETS = tuple(k for group in _OFFSET_GROUPS for k in group)
+_AT_WORD = np.array([np.inf, np.inf, 0.1, np.inf, np.inf, 0.002, 0.002, 0.003])  # sigma of an offset not believed in
 _UNKNOWN_SIGMA_M = 1e6  # stands in for an infinite sigma; its weight is nothing, its arithmetic finite
 
 
@@ -56,7 +59,6 @@ class _Trust:
     place: Floats = field(default_factory=lambda: np.ones(3))
     attitude: Floats = field(default_factory=lambda: np.ones(3))
     contradicted: Anything = field(default_factory=lambda: np.zeros(0, int))
-    heading_offset_rad: float = np.inf  # how far the compass may be off all flight, as far as it shows
 
 
 @dataclass(eq=False)
@@ -68,7 +70,7 @@ class _Node:
 
 
 class PoseGraph:
-    """Cameras over a ground plane, tied by links and telemetry. `add`, `retime` and `settle` change it.
+    """Cameras over a ground plane, tied by links and telemetry. `add`, `retime`, `settle` and `conclude` change it.
 
     Every method that changes it returns the ids whose ground outline moved by more than half a pixel since it was
     last returned: those, and no others, have to be painted again.
@@ -90,6 +92,7 @@ class PoseGraph:
         self._dropped = 0
         self._solved_at = 0
         self._trust = _Trust()
+        self._at_word = np.zeros(len(SHARED), bool)
 
     def __contains__(self, keyframe_id: int) -> bool:
         return keyframe_id in self._ids
@@ -183,7 +186,14 @@ class PoseGraph:
         """Replace what telemetry says of some keyframes (another clock offset) and solve again."""
         for keyframe_id, prior in priors.items():
             self._nodes[self._ids[keyframe_id]].prior = prior
-        return self.settle()
+        return self.conclude()
+
+    def conclude(self) -> frozenset[int]:
+        """The flight is over: settle with every offset free, judge which are real, and settle again."""
+        self._at_word[:] = False
+        moved = self.settle()
+        self._judge_offsets()
+        return moved | self.settle()
 
     def report(self) -> GraphReport:
         """Focal length, offsets, links and residuals as they stand."""
@@ -326,21 +336,47 @@ class PoseGraph:
         pairs = self._pairs()
         if len(pairs.old):
             pairs = pairs.of(free[pairs.old] | free[pairs.new])
-        settings = self._settings
-        sigma = np.array([
-            settings.focal_sigma, settings.radial_sigma, settings.altitude_offset_sigma_m,
-            settings.gps_offset_sigma_m, settings.gps_offset_sigma_m, *self._boresight_sigma_rad(),
-        ]) if shared else np.zeros(len(SHARED))
+        sigma = self._shared_sigma() if shared else np.zeros(len(SHARED))
         solution = solve(self._state(), pairs, self._shared, sigma, free, iterations)
         if iterations:
             self._rotations, self._centres_m = solution.nodes.rotations, solution.nodes.centres_m
             self._shared = solution.shared
         return solution
 
-    def _boresight_sigma_rad(self) -> list[float]:
+    def _shared_sigma(self) -> Floats:
+        """(8,) prior sigma of each shared unknown; those taken at telemetry's word are held close to zero."""
         settings = self._settings
         tilt, heading = np.radians([settings.tilt_offset_sigma_deg, settings.heading_offset_sigma_deg])
-        return [tilt, tilt, min(heading, self._trust.heading_offset_rad)]
+        sigma = np.array([
+            settings.focal_sigma, settings.radial_sigma, settings.altitude_offset_sigma_m,
+            settings.gps_offset_sigma_m, settings.gps_offset_sigma_m, tilt, tilt, heading,
+        ])
+        return np.where(self._at_word, np.minimum(sigma, _AT_WORD), sigma)
+
+    def _judge_offsets(self) -> None:
+        """Take telemetry at its word where this flight does not speak against it.
+
+        An offset that all frames share (altitude's zero, gimbal, compass) and that the rest of the flight sees at
+        less than two of its own sigmas is noise: left free, it would only turn, tilt or scale the whole map.
+        """
+        sigma = self._shared_sigma()
+        solution = self._solve(self._own(), shared=True, iterations=0)
+        size = solution.normal.shape[0]
+        first = size - len(SHARED)
+        silent = set()
+        for k in _OFFSETS:
+            if not 0 < sigma[k] < 100.0:
+                continue
+            unit = np.zeros(size)
+            unit[first + k] = 1.0
+            variance = max(float(_solve_sparse(solution.normal, unit)[first + k]), 1e-30)
+            told = 1 / variance - 1 / sigma[k] ** 2  # what the flight, without the prior, knows of it
+            estimate = self._shared[k] / variance / told if told > 0 else 0.0
+            if estimate**2 * max(told, 0.0) <= 4.0:
+                silent.add(k)
+        for group in _OFFSET_GROUPS:
+            if silent.issuperset(group):
+                self._at_word[list(group)] = True
 
     def _due(self) -> bool:
         """Whether it is time for a global solve: often at first, then with each tenth more; loops bend the map."""
@@ -418,7 +454,7 @@ class PoseGraph:
         size = np.linalg.norm(error_rad, axis=1)
         angled = np.isfinite(stated_rad[:, 2])
         contradicted = np.flatnonzero(tied & angled & (size > np.maximum(5 * stated_rad.max(axis=1), np.radians(15))))
-        place, attitude, heading_offset = np.ones(3), np.ones(3), np.inf
+        place, attitude = np.ones(3), np.ones(3)
         miss_m = self._centres_m + self._shared[[3, 4, 2]] - np.array([n.prior.position_m for n in self._nodes])
         fixed = tied & np.isfinite(stated_m[:, 0])
         if fixed.sum() >= _ENOUGH:
@@ -434,28 +470,7 @@ class PoseGraph:
             spread = 1.4826 * np.median(np.abs(scatter), axis=0)
             # pictures see heading well, tilt hardly: a small scatter of tilt only says that it was believed
             attitude = np.clip(spread / np.median(stated_rad[used], axis=0), [1.0, 1.0, 0.25], 5.0)
-            doubt_of_turn = self._doubt_of_turn(stated_m, fixed) * place[0]
-            doubt = float(np.hypot(1.25 * spread[2] / np.sqrt(used.sum()), doubt_of_turn))
-            # what GPS alone makes of the compass: a turn of the map turns cameras the other way about their own axis
-            offset = float(np.median(error_rad[used, 2])) - self._turn_to_gps(fixed)
-            # one without a visible offset is taken at its word, one with an offset is free to have it
-            heading_offset = float(np.sqrt(max(0.0, offset**2 - doubt**2))) + np.radians(0.15)
-        self._trust = _Trust(place, attitude, contradicted, heading_offset)
-
-    def _doubt_of_turn(self, stated_m: Floats, fixed: Anything) -> float:
-        """One sigma (rad) of the map's turn as the fixes alone tell it."""
-        if fixed.sum() < 3:
-            return 1.0
-        reach_m = float(np.sqrt(self._centres_m[fixed, :2].var(axis=0).sum()))
-        return float(np.median(stated_m[fixed, 0]) / (np.sqrt(fixed.sum()) * max(reach_m, 1e-6)))
-
-    def _turn_to_gps(self, fixed: Anything) -> float:
-        """The turn (rad, left) that would fit the solved positions best to the fixes."""
-        if fixed.sum() < 3:
-            return 0.0
-        fixes = np.array([node.prior.position_m for node in self._nodes])[fixed, :2]
-        change = fit_similarity(fixes, self._centres_m[fixed, :2])
-        return float(np.arctan2(change[1, 0], change[0, 0]))
+        self._trust = _Trust(place, attitude, contradicted)
 
     def _moved(self, candidates: Iterable[int]) -> frozenset[int]:
         names = list(self._ids)
