@@ -330,6 +330,7 @@ class PlanarRun:
                 self._site_from_image(keyframe_id, self._lens.camera), outline_m,
                 residuals.get(keyframe_id, float("nan")), sigmas[keyframe_id],
                 self._exposure.gains.get(keyframe_id, np.ones(3)), gps[keyframe_id],
+                self._exposure.vignettes.get(0, np.zeros(2)),
             ))
         return result
 
@@ -349,7 +350,7 @@ class _Known:
     def canvas_frame(self, site_grid: SiteGrid) -> CanvasFrame:
         found = canvas_frame(
             self.id, self.rank, self.stored.camera, self.stored.site_from_image, site_grid, self.stored.gains,
-            np.zeros(2), None,
+            self.stored.vignette, None,
         )
         assert found is not None  # it was painted before
         return found

@@ -36,10 +36,10 @@ class Undistorter:
         return made
 
     def undistort(self, image: ImageRGB) -> ImageRGB:
-        """The picture, (H, W, 3), of the perfect lens; black where it would see beyond the real one."""
+        """The picture, (H, W, 3), of the perfect lens; its edge repeated where it would see beyond the real one."""
         if self._maps is None:
             return image
-        return cv2.remap(image, *self._maps, cv2.INTER_LINEAR)  # type: ignore[return-value]
+        return cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[return-value]
 
     def valid(self, width_px: int, height_px: int) -> Mask | None:
         """Which pixels of the perfect picture, resampled to this size, exist; None = all."""

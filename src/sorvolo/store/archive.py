@@ -434,6 +434,7 @@ class FlightWriter:
             self._flight_id, frame.index, frame.name, frame.time_ns, frame.status, image_path,
             camera.resized(width_px, height_px), frame.site_from_image @ frame_from_stored,
             frame.site_from_camera, np.asarray(frame.gains), frame.sigma_m, frame.residual_px,
+            np.asarray(frame.vignette),
         )
 
 

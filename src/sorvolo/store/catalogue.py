@@ -4,7 +4,7 @@ import os
 import sqlite3
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -98,6 +98,7 @@ _keyframes = Table(
     Column("rotation", JSON, nullable=False),  # (3, 3) site_from_camera, [] when unknown
     Column("translation_m", JSON, nullable=False),  # (3,), [] when unknown
     Column("gains", JSON, nullable=False),
+    Column("vignette", JSON, nullable=False),
     Column("sigma_m", Float),  # NULL when unknown
     Column("residual_px", Float),
 )
@@ -165,7 +166,8 @@ class VersionEntry:
 class StoredKeyframe:
     """A keyframe of a complete run. Its image is undistorted and may be smaller than the frame was.
 
-    `camera` and `site_from_image` (3, 3) are those of the stored image; `gains` (3,) multiply its RGB;
+    `camera` and `site_from_image` (3, 3) are those of the stored image; `gains` (3,) multiply its RGB
+    once the lens's `vignette` (2,) is undone (mosaic.exposure);
     `site_from_camera` is None where the method knows no 6-DoF pose.
     """
 
@@ -181,6 +183,7 @@ class StoredKeyframe:
     gains: Floats
     sigma_m: float
     residual_px: float
+    vignette: Floats = field(default_factory=lambda: np.zeros(2))
 
 
 class Catalogue:
@@ -531,6 +534,7 @@ def _row_of(keyframe: StoredKeyframe, run_id: int) -> dict[str, Any]:
         "rotation": [] if pose is None else pose.rotation.tolist(),
         "translation_m": [] if pose is None else pose.translation_m.tolist(),
         "gains": keyframe.gains.tolist(),
+        "vignette": keyframe.vignette.tolist(),
         "sigma_m": keyframe.sigma_m if np.isfinite(keyframe.sigma_m) else None,
         "residual_px": keyframe.residual_px if np.isfinite(keyframe.residual_px) else None,
     }
@@ -545,4 +549,5 @@ def _keyframe_of(row: Row[Any]) -> StoredKeyframe:
         np.array(row.gains),
         np.nan if row.sigma_m is None else row.sigma_m,
         np.nan if row.residual_px is None else row.residual_px,
+        np.array(row.vignette),
     )

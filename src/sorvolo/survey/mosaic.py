@@ -114,6 +114,7 @@ class PlacedFrame:
     sigma_m: float
     gains: Floats = field(default_factory=lambda: np.ones(3))
     gps_residual_m: Floats = field(default_factory=lambda: np.full(3, np.nan))
+    vignette: Floats = field(default_factory=lambda: np.zeros(2))
 
 
 @dataclass(frozen=True, eq=False)
