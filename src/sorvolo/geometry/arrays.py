@@ -32,6 +32,9 @@ ImageGray: TypeAlias = NDArray[np.uint8]
 Mask: TypeAlias = NDArray[np.bool_]
 """(height, width) bool."""
 
+Boxes: TypeAlias = NDArray[np.int64]
+"""(N, 4) whole-pixel boxes: x and y of the top-left pixel, width, height."""
+
 TimesNs: TypeAlias = NDArray[np.int64]
 """(N,) UTC time in nanoseconds since 1970-01-01."""
 

@@ -1,0 +1,1 @@
+"""Two flights over one site: what changed on the ground."""

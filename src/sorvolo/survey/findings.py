@@ -1,0 +1,155 @@
+"""What a later flight finds: views laid over the known map, and the changes of the ground that they show."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from sorvolo.errors import GeometryError
+from sorvolo.geometry.arrays import (
+    Boxes,
+    Floats,
+    ImageGray,
+    ImageRGB,
+    ImageRGBA,
+    Mask,
+    Matrix3,
+    PointsM,
+    Vector3,
+    frozen,
+)
+
+
+class ViewStatus(StrEnum):
+    """How one frame's comparison with the map ended."""
+
+    COMPARED = "compared"
+    NOT_ALIGNED = "not-aligned"
+    OUTSIDE = "outside"  # of the known map: the frame extends it
+    LOST = "lost"  # the frame itself cannot be used
+
+
+class ChangeKind(StrEnum):
+    """What happened to a piece of ground between the map and the flight."""
+
+    APPEARED = "appeared"
+    DISAPPEARED = "disappeared"
+    REPLACED = "replaced"
+    MOVING = "moving"  # someone or something that moves while it is seen: no change of the ground
+
+
+class Verdict(StrEnum):
+    """What a person said of a change."""
+
+    CONFIRMED = "confirmed"
+    REJECTED = "rejected"
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedView:
+    """One frame laid over the map and compared with it; all its pictures have the same pixels.
+
+    `image` is the undistorted frame, perhaps made smaller; `reference` the map resampled to the same pixels;
+    `valid` where both are known (elsewhere the answer is *unknown*); `changed` 0 or 255, 0 where not valid.
+    `boxes` (N, 4) are x, y, width, height of the connected changes and `scores` (N,) how sure each is, 0 to 1.
+    `site_from_image` (3, 3) takes pixels to the ground; `camera_m` (3,) is where the camera was, up being its height
+    above the ground. `residual_px` is what is left between the image and the map after alignment.
+    """
+
+    index: int
+    name: str
+    time_ns: int
+    site_from_image: Matrix3
+    camera_m: Vector3
+    image: ImageRGB
+    reference: ImageRGB
+    valid: Mask
+    changed: ImageGray
+    boxes: Boxes
+    scores: Floats
+    residual_px: float
+
+    def __post_init__(self) -> None:
+        size = self.image.shape[:2]
+        if not size == self.reference.shape[:2] == self.valid.shape == self.changed.shape:
+            raise GeometryError(f"view {self.name}: image, reference, valid and changed differ in size")
+        if len(self.boxes) != len(self.scores):
+            raise GeometryError(f"view {self.name}: {len(self.boxes)} boxes but {len(self.scores)} scores")
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """A piece of ground on both dates, north up: pixel (column, row) is centred at east = `west_m` +
+    (column + 1/2) `m_per_px`, north = `north_m` - (row + 1/2) `m_per_px`, in the site frame.
+
+    `before` comes from the map, `after` from the flight's best view; alpha 0 where nothing is known. `changed` marks
+    the change itself; the patch shows some of its surroundings, too.
+    """
+
+    west_m: float
+    north_m: float
+    m_per_px: float
+    before: ImageRGBA
+    after: ImageRGBA
+    changed: Mask
+
+    def __post_init__(self) -> None:
+        if not self.before.shape[:2] == self.after.shape[:2] == self.changed.shape:
+            raise GeometryError("a patch's pictures differ in size")
+
+    @property
+    def site_from_patch(self) -> Matrix3:
+        """(3, 3) affine map from the patch's pixels to site metres."""
+        s = self.m_per_px
+        return np.array([[s, 0.0, self.west_m + s / 2], [0.0, -s, self.north_m - s / 2], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """One thing that happened to the ground, however many frames saw it.
+
+    `id` is the flight's name and a number, the same whenever the flight is compared again. `outline_m` (N, 2), N >= 3,
+    is its outline on the ground in site metres, not closed. `length_m` is the longer side of the smallest rectangle
+    around it. `sigma_m` is the one-sigma error of its place, per axis. `views` counts the frames that showed it.
+    `velocity_m_s` (2,) east, north: zero unless it moves. Classes are "" where nobody looked.
+    """
+
+    id: str
+    kind: ChangeKind
+    score: float
+    outline_m: PointsM
+    first_seen_ns: int
+    last_seen_ns: int
+    views: int
+    area_m2: float
+    length_m: float
+    sigma_m: float
+    patch: Patch
+    velocity_m_s: Floats = field(default_factory=lambda: np.zeros(2))
+    class_before: str = ""
+    class_after: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "outline_m", frozen(self.outline_m))
+        object.__setattr__(self, "velocity_m_s", frozen(self.velocity_m_s))
+        if self.outline_m.ndim != 2 or self.outline_m.shape[1] != 2 or len(self.outline_m) < 3:
+            raise GeometryError(f"change {self.id}: an outline needs (N, 2) points, N >= 3, got {self.outline_m.shape}")
+        if not 0 <= self.score <= 1:
+            raise GeometryError(f"change {self.id}: a score lies in 0 to 1, got {self.score}")
+
+
+@dataclass(frozen=True)
+class CompareUpdate:
+    """What one step of a comparison did: the frame, how it ended, the changes announced just now, running counts."""
+
+    frame_name: str
+    time_ns: int
+    status: ViewStatus
+    reason: str
+    residual_px: float  # NaN unless compared or not aligned
+    announced: tuple[Change, ...]
+    frames_read: int
+    frames_expected: int
+    views: int
+    compared: int
+    seconds: float
