@@ -7,7 +7,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.ground import footprint, ground_from_pixels
 from sorvolo.geometry.homography import apply_homography, fit_similarity, site_from_image_homography
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
-from sorvolo.mosaic.pose_graph import PoseGraph, PoseGraphSettings, pose_from_homography, pose_from_link
+from sorvolo.mosaic.pose_graph import PoseGraph, PoseGraphSettings, pose_from_link
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
 

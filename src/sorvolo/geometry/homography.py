@@ -63,3 +63,24 @@ def fit_similarity(points_a: PointsM, points_b: PointsM) -> Matrix3:
     result[:2, :2] = linear
     result[:2, 2] = centre_a - linear @ centre_b
     return result
+
+
+def pose_from_homography(site_from_image: Matrix3, camera: Camera) -> Pose | None:
+    """The camera over level ground whose view induces this homography (closed form); None if there is none."""
+    try:
+        image_from_site = np.linalg.inv(site_from_image)
+    except np.linalg.LinAlgError:
+        return None
+    columns = np.linalg.inv(camera.matrix) @ image_from_site
+    scale = np.sqrt(np.linalg.norm(columns[:, 0]) * np.linalg.norm(columns[:, 1]))
+    if not np.isfinite(scale) or scale <= 0:
+        return None
+    columns = columns / scale
+    if columns[2, 2] < 0:
+        columns = -columns
+    u, _, vt = np.linalg.svd(np.column_stack([columns[:, 0], columns[:, 1], np.cross(columns[:, 0], columns[:, 1])]))
+    camera_from_site = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    centre_m = -camera_from_site.T @ columns[:, 2]
+    if centre_m[2] <= 0 or camera_from_site[2, 2] > -0.1:
+        return None
+    return Pose(camera_from_site.T, centre_m)

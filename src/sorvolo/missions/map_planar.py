@@ -14,7 +14,7 @@ from sorvolo.geometry.arrays import Anything, ImageRGB, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.ground import footprint
-from sorvolo.geometry.homography import site_from_image_homography
+from sorvolo.geometry.homography import pose_from_homography, site_from_image_homography
 from sorvolo.missions.flight_report import FlightLog, Stage, build_report, nothing_placed
 from sorvolo.missions.flight_setup import FlightSetup, new_site
 from sorvolo.missions.settings import MapSettings
@@ -23,7 +23,7 @@ from sorvolo.mosaic.exposure import Exposure
 from sorvolo.mosaic.lens import Undistorter, refined_camera
 from sorvolo.mosaic.placing import canvas_frame, rejected
 from sorvolo.mosaic.planar import KnownKeyframe, PlanarMapper
-from sorvolo.mosaic.pose_graph import PoseGraphSettings, pose_from_homography
+from sorvolo.mosaic.pose_graph import PoseGraphSettings
 from sorvolo.store.archive import Archive, FlightWriter
 from sorvolo.store.catalogue import StoredKeyframe
 from sorvolo.store.exports import picture, write_live_preview

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.sparse.linalg import splu
 
-from sorvolo.geometry.arrays import Anything, Floats, Matrix3, PointsM
+from sorvolo.geometry.arrays import Anything, Floats, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.ground import footprint
-from sorvolo.geometry.homography import fit_similarity, site_from_image_homography
+from sorvolo.geometry.homography import fit_similarity, pose_from_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
 from sorvolo.mosaic.bundle import SHARED, Nodes, Pairs, Solution, linearise, rotation_vector, solve
 from sorvolo.survey.flight import CameraPrior
@@ -494,27 +494,6 @@ class PoseGraph:
         cross = np.array([[0, -ray[2], ray[1]], [ray[2], 0, -ray[0]], [-ray[1], ray[0], 0]])
         turn = -self._centres_m[at, 2] / min(ray[2], -1e-3) * flat @ -cross
         return np.concatenate([turn, flat], axis=1)[:2]
-
-
-def pose_from_homography(site_from_image: Matrix3, camera: Camera) -> Pose | None:
-    """The camera over level ground whose view induces this homography (closed form); None if there is none."""
-    try:
-        image_from_site = np.linalg.inv(site_from_image)
-    except np.linalg.LinAlgError:
-        return None
-    columns = np.linalg.inv(camera.matrix) @ image_from_site
-    scale = np.sqrt(np.linalg.norm(columns[:, 0]) * np.linalg.norm(columns[:, 1]))
-    if not np.isfinite(scale) or scale <= 0:
-        return None
-    columns = columns / scale
-    if columns[2, 2] < 0:
-        columns = -columns
-    u, _, vt = np.linalg.svd(np.column_stack([columns[:, 0], columns[:, 1], np.cross(columns[:, 0], columns[:, 1])]))
-    camera_from_site = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    centre_m = -camera_from_site.T @ columns[:, 2]
-    if centre_m[2] <= 0 or camera_from_site[2, 2] > -0.1:
-        return None
-    return Pose(camera_from_site.T, centre_m)
 
 
 def pose_from_link(each: Link, new: Camera, old: Camera, site_from_old: Pose) -> Pose | None:

@@ -75,7 +75,7 @@ def link(
     """
     reason = "too few matching points"
     for found in _candidates(new, old, prediction, settings, cache):
-        refined = _refine(new, old, found.new_from_old, settings, cache)
+        refined = refine(new, old, found.new_from_old, settings, cache)
         if isinstance(refined, Link):
             return refined
         if found.is_sub_pixel:
@@ -170,10 +170,10 @@ def _band_pass(gray: Anything) -> Anything:
     return cv2.GaussianBlur(image, (0, 0), 1.0) - cv2.GaussianBlur(image, (0, 0), 8.0)
 
 
-def _refine(
+def refine(
     new: Keyframe, old: Keyframe, new_from_old: Matrix3, settings: LinkSettings, cache: LinkCache
 ) -> Link | str:
-    """Sub-pixel pairs around a first fit, or why there are none."""
+    """Sub-pixel pairs around a first fit that is right to `refine_reach_px`, or in words why there are none."""
     points = cache.corners(new)
     old_guess = apply_homography(np.linalg.inv(new_from_old), points)
     margin = settings.refine_window_px / 2
