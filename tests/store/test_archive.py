@@ -15,7 +15,7 @@ from fake_flights import CAMERA, LOCAL_SITE, SITE, frame, image, map_flight, til
 from sorvolo.errors import GeometryError, SettingsError, StoreError
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.store.archive import Archive
-from sorvolo.store.catalogue import SCHEMA_VERSION
+from sorvolo.store.schema import SCHEMA_VERSION
 from sorvolo.survey.mosaic import Status
 
 

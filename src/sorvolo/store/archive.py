@@ -1,43 +1,31 @@
 """The site folder: the only path layout, who may write, and how a flight enters whole or not at all."""
 
-import fcntl
 import os
 import shutil
-from collections.abc import Mapping, MutableMapping, Sequence
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
-import numpy as np
-
-from sorvolo.errors import SettingsError, StoreError
+from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB, ImageRGBA
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.store import catalogue as records
-from sorvolo.store.atomic import (
-    TEMPORARY_PREFIX,
-    atomic_write_bytes,
-    remove_leftovers,
-    sync_file,
-    writing,
-)
-from sorvolo.store.catalogue import Catalogue, FlightEntry, StoredKeyframe, VersionEntry
-from sorvolo.store.exports import (
-    frames_geojson,
-    geojson_bytes,
-    json_bytes,
-    plain_json,
-    write_kmz,
-    write_preview,
-)
-from sorvolo.store.geotiff import parse_crs, write_cog
-from sorvolo.store.images import ImageCache, image_from_jpeg, jpeg_from_image
+from sorvolo.store import change_records
+from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
+from sorvolo.store.catalogue import Catalogue, FlightEntry, StoredKeyframe, TileDifference, VersionEntry
+from sorvolo.store.change_records import StoredChange, StoredReview
+from sorvolo.store.derived import STAGED, map_is_there, take_staged, write_change_files, write_map_files
+from sorvolo.store.exports import plain_json
+from sorvolo.store.flight_writer import FlightWriter
+from sorvolo.store.images import read_keyframe
+from sorvolo.store.site_folder import CATALOGUE, lock_site_folder, make_site_folder
 from sorvolo.store.tiles import GrowingTiles, TileBlobs, TileView
+from sorvolo.survey.findings import Verdict
 from sorvolo.survey.flight import Site
-from sorvolo.survey.mosaic import PlacedFrame, Status
 
-_CATALOGUE = "site.db"
-_LOCK = "site.lock"
+__all__ = ["Archive", "FlightWriter"]
+
 _MEGABYTE = 1_000_000
 
 
@@ -62,13 +50,13 @@ class Archive:
         damaged, or has another format version; then nothing in it was changed.
         """
         folder = Path(folder)
-        path = folder / _CATALOGUE
+        path = folder / CATALOGUE
         if not write:
             if not path.is_file():
                 raise StoreError(f"no site at {folder}; make one with: sorvolo map INPUT --site {folder}")
             return cls(folder, Catalogue(path, write=False), None)
-        _make_site_folder(folder)
-        lock = _exclusive_lock(folder)
+        make_site_folder(folder)
+        lock = lock_site_folder(folder)
         try:
             if not path.exists():
                 Catalogue.create(path)
@@ -123,7 +111,7 @@ class Archive:
         return self._folder / "live.png"
 
     def flight_folder(self, flight_id: str) -> Path:
-        """Where a flight's frames.geojson, report.json, report.html and keyframes lie."""
+        """Where a flight's frames.geojson, report.json, report.html, keyframes and changes lie."""
         return self._folder / "flights" / flight_id
 
     @property
@@ -163,6 +151,58 @@ class Archive:
         with self._catalogue.reading() as connection:
             return records.list_versions(connection)
 
+    def version_at(self, moment: datetime) -> VersionEntry:
+        """The newest version that was complete at a moment, taken as UTC when it names no time zone.
+
+        Raises InputError when there was no map yet.
+        """
+        utc = moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
+        complete = [entry for entry in self.versions() if entry.complete]
+        known = [entry for entry in complete if datetime.fromisoformat(entry.created_utc) <= utc]
+        if not known:
+            first = f"; its first version is of {complete[0].created_utc}" if complete else ", and has none now"
+            raise InputError(f"{self._folder} had no map at {utc.isoformat(timespec='seconds')}{first}")
+        return known[-1]
+
+    def tile_difference(self, version: VersionEntry) -> TileDifference:
+        """What a version's map has that the one it was painted over has not."""
+        with self._catalogue.reading() as connection:
+            changed, removed = records.tile_changes(connection, version)
+        return TileDifference(len(changed), removed, self._blobs.size_bytes(changed))
+
+    def comparisons(self) -> dict[int, Mapping[str, int]]:
+        """The versions that comparisons made: how many changes of each kind each found."""
+        with self._catalogue.reading() as connection:
+            return change_records.compared_versions(connection)
+
+    def changes(self, flight_id: str | None = None) -> list[StoredChange]:
+        """The changes that complete runs found, by flight rank and number, with their verdicts; of one flight."""
+        with self._catalogue.reading() as connection:
+            return change_records.load_changes(connection, flight_id)
+
+    def reviews(self) -> list[StoredReview]:
+        """Everything that was said of changes, in the order of saying, also of those that were replaced since."""
+        with self._catalogue.reading() as connection:
+            return change_records.load_reviews(connection)
+
+    def review(self, change_ids: str | Iterable[str], verdict: Verdict, note: str = "") -> None:
+        """Say of one change, or of several, that it is real or not; the flights' change files follow.
+
+        A later word replaces an earlier one. Raises InputError, and says nothing, when an id is unknown.
+        """
+        self._require_writable()
+        wanted = {change_ids} if isinstance(change_ids, str) else set(change_ids)
+        with self._catalogue.changing() as connection:
+            found = [each for each in change_records.load_changes(connection) if each.id in wanted]
+            unknown = sorted(wanted - {each.id for each in found})
+            if unknown:
+                raise InputError(
+                    f"{self._folder} has no change {', '.join(unknown)}; `sorvolo review {self._folder}` lists them"
+                )
+            change_records.put_reviews(connection, found, verdict, note)
+            records.owe_documents(connection, {each.flight_id for each in found})
+        self.repair()
+
     def keyframes(self, flight_id: str | None = None) -> list[StoredKeyframe]:
         """Keyframes of complete runs, by flight rank and index; of one flight when its id is given."""
         with self._catalogue.reading() as connection:
@@ -170,7 +210,7 @@ class Archive:
 
     def image(self, keyframe: StoredKeyframe) -> ImageRGB:
         """A keyframe's undistorted image; raises StoreError when its flight was mapped again meanwhile."""
-        return _read_image(self._folder / keyframe.image_path)
+        return read_keyframe(self._folder / keyframe.image_path)
 
     def tiles(self, version: int | None = None) -> Mapping[TileIndex, ImageRGBA]:
         """The tiles of a version, of the newest complete one by default, read when asked for; {} if none.
@@ -228,32 +268,29 @@ class Archive:
             owed = records.unwritten_documents(connection)
             shown = records.derived_version(connection)
             newest = next((v for v in reversed(records.list_versions(connection)) if v.complete), None)
-        for flight_id, _, documents in owed:
-            with writing(self.flight_folder(flight_id)):
-                self.flight_folder(flight_id).mkdir(parents=True, exist_ok=True)
-            for name, content in documents.items():
-                atomic_write_bytes(self.flight_folder(flight_id) / name, content)
+        for flight_id, run_id, documents in owed:
+            self._write_flight_files(flight_id, run_id, documents)
         if newest is None:
             return
-        if newest.id != shown or (newest.tiles and not self._map_is_there()):
-            self._write_map(newest)
+        if newest.id != shown or (newest.tiles and not map_is_there(self)):
+            write_map_files(self, newest)
         with self._catalogue.changing() as connection:
             records.mark_written(connection, [run_id for _, run_id, _ in owed], newest.id)
 
-    def _write_map(self, version: VersionEntry) -> None:
-        tiles = self._view(version.id)
-        if not tiles:
-            for path in (self.preview_path, self.mosaic_path, self.kmz_path):
-                path.unlink(missing_ok=True)
-            return
-        write_preview(tiles, self.preview_path)
-        write_cog(tiles, self.site_grid(), self.mosaic_path, crs=version.export_crs or None)
-        if not self.site().is_local:
-            write_kmz(tiles, self.site_grid(), self.site().name, self.kmz_path)
-
-    def _map_is_there(self) -> bool:
-        paths = [self.preview_path, self.mosaic_path] + ([] if self.site().is_local else [self.kmz_path])
-        return all(path.is_file() for path in paths)
+    def _write_flight_files(self, flight_id: str, run_id: int, documents: Mapping[str, bytes]) -> None:
+        folder = self.flight_folder(flight_id)
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        for name, content in documents.items():
+            if content:
+                atomic_write_bytes(folder / name, content)
+            else:
+                (folder / name).unlink(missing_ok=True)
+        take_staged(folder, run_id)
+        with self._catalogue.reading() as connection:
+            is_compared = change_records.is_compared(connection, run_id)
+        version = next((each for each in self.versions() if each.run_id == run_id and is_compared), None)
+        write_change_files(self, flight_id, version, documents.get("report.json", b""))
 
     def _view(self, version_id: int) -> TileView:
         def hashes() -> Mapping[TileIndex, str]:
@@ -282,194 +319,12 @@ class Archive:
         self.live_preview_path.unlink(missing_ok=True)
         for flight in flights:
             known = {str(run_id) for run_id in runs.get(flight.name, set())}
-            for images in (flight / "keyframes").glob("*"):
+            for images in (*(flight / "keyframes").glob("*"), *(flight / STAGED).glob("*")):
                 if images.name.isdigit() and images.name not in known:
                     shutil.rmtree(images, ignore_errors=True)
             if not known:
-                for emptied in (flight / "keyframes", flight):
+                for emptied in (flight / "keyframes", flight / STAGED, flight):
                     if emptied.is_dir() and not any(emptied.iterdir()):
                         emptied.rmdir()
 
 
-class FlightWriter:
-    """A flight on its way into the site; a context manager. Without `commit` the site stays as it was.
-
-    Made by `Archive.begin_flight`. `tiles` is the map as it grows, over the newest complete version (over
-    that one's parent when this very flight made it). Not for several threads at once.
-    """
-
-    def __init__(
-        self,
-        archive: Archive,
-        flight_id: str,
-        run_id: int,
-        version_id: int,
-        tiles: GrowingTiles,
-        cache_bytes: int,
-    ) -> None:
-        self.tiles: MutableMapping[TileIndex, ImageRGBA] = tiles
-        self._archive, self._growing = archive, tiles
-        self._flight_id, self._run_id, self._version_id = flight_id, run_id, version_id
-        self._sizes: dict[str, tuple[int, int]] = {}  # path of each saved image: width, height
-        self._cache = ImageCache(
-            lambda index: _read_image(archive.folder / self._image_path(index)), cache_bytes
-        )
-        self._is_open = True
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if not self._is_open:
-            return
-        self._is_open = False
-        self._archive._writer = None
-        try:
-            # files that no reader can see go first: on a full disk, forgetting the run needs their space
-            shutil.rmtree((self._archive.folder / self._image_path(0)).parent, ignore_errors=True)
-            self._archive._remove_unused()
-            self._archive._catalogue.fold_log()
-            self._archive._forget_unfinished()
-        except StoreError:
-            # if the disk is still full, the next opening does it, and the first error is the one to tell
-            if error is None:
-                raise
-
-    def save_image(self, index: int, image: ImageRGB) -> str:
-        """Store an undistorted keyframe, (H, W, 3), as JPEG and return its path relative to the site folder.
-
-        Raises StoreError on a full disk.
-        """
-        relative = self._image_path(index)
-        path = self._archive.folder / relative
-        with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-        atomic_write_bytes(path, jpeg_from_image(image), durable=False)
-        self._cache.forget(index)
-        self._sizes[relative] = (image.shape[1], image.shape[0])
-        return relative
-
-    def image(self, index: int) -> ImageRGB:
-        """A keyframe saved earlier, as it will be read later; read-only. StoreError if there is none."""
-        return self._cache.get(index)
-
-    def flush(self) -> None:
-        """Let readers see the map as it is now."""
-        changed = self._growing.save()
-        catalogue = self._archive._catalogue
-        with catalogue.changing() as connection:
-            records.change_tiles(connection, self._version_id, changed)
-            dropped = self._growing.take_superseded()
-            dropped -= records.used_hashes(connection, dropped)
-        self._archive._blobs.remove(dropped)
-
-    def commit(
-        self,
-        placed: Sequence[PlacedFrame],
-        image_paths: Mapping[int, str],
-        report: Mapping[str, Any],
-        report_html: str,
-        *,
-        crs: str | None = None,
-        notes: Sequence[str] = (),
-    ) -> int:
-        """Make the flight and its map part of the site in one transaction; return the map's version.
-
-        `image_paths` are what `save_image` returned, by frame index. Then the derived files are written,
-        `crs` being that of mosaic.tif (the site's own by default); a kill or a full disk in between is made
-        good by the next opening. Raises SettingsError for a bad `crs`, StoreError on a full disk or an
-        unknown image path.
-        """
-        archive = self._archive
-        if crs is not None:
-            parse_crs(crs, archive.site_grid().grid)
-        keyframes = [
-            self._keyframe(frame, image_paths[frame.index])
-            for frame in placed
-            if frame.index in image_paths and frame.status is not Status.REJECTED
-        ]
-        documents = {
-            "frames.geojson": geojson_bytes(frames_geojson(placed, archive.site())),
-            "report.json": json_bytes(report),
-            "report.html": report_html.encode(),
-        }
-        frames = {status.value: sum(frame.status is status for frame in placed) for status in Status}
-        self.flush()
-        self._sync()
-        with archive._catalogue.changing() as connection:
-            records.complete_run(
-                connection, self._run_id, self._version_id, keyframes, documents, frames, notes, crs or ""
-            )
-        self._is_open = False
-        archive._writer = None
-        archive.repair()
-        archive._remove_unused()
-        return self._version_id
-
-    def _sync(self) -> None:
-        """What the transaction names must reach the disk before it does."""
-        self._archive._blobs.sync()
-        for relative in self._sizes:
-            sync_file(self._archive.folder / relative)
-        if self._sizes:
-            images = (self._archive.folder / next(iter(self._sizes))).parent
-            for folder in (images, images.parent, images.parent.parent, images.parent.parent.parent):
-                sync_file(folder)
-        sync_file(self._archive.folder)
-
-    def _image_path(self, index: int) -> str:
-        return f"flights/{self._flight_id}/keyframes/{self._run_id}/{index:06d}.jpg"
-
-    def _keyframe(self, frame: PlacedFrame, image_path: str) -> StoredKeyframe:
-        if image_path not in self._sizes:
-            raise StoreError(f"the image {image_path} of frame {frame.name} was never saved; save it first")
-        width_px, height_px = self._sizes[image_path]
-        camera = frame.camera.undistorted()
-        sx, sy = camera.width_px / width_px, camera.height_px / height_px
-        # centres of pixels lie half a pixel inside: frame = (stored + 1/2) s - 1/2
-        frame_from_stored = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
-        return StoredKeyframe(
-            self._flight_id, frame.index, frame.name, frame.time_ns, frame.status, image_path,
-            camera.resized(width_px, height_px), frame.site_from_image @ frame_from_stored,
-            frame.site_from_camera, np.asarray(frame.gains), frame.sigma_m, frame.residual_px,
-            np.asarray(frame.vignette),
-        )
-
-
-def _make_site_folder(folder: Path) -> None:
-    """Create the folder; refuse one that holds anything but a site (or what a killed creation left)."""
-    try:
-        with writing(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise StoreError(f"{folder} is a file, a folder was needed; choose another name") from error
-    if (folder / _CATALOGUE).exists():
-        return
-    names = (path.name for path in folder.iterdir())
-    foreign = sorted(name for name in names if name != _LOCK and not name.startswith(TEMPORARY_PREFIX))
-    if foreign:
-        raise StoreError(
-            f"{folder} is no site: it holds {foreign[0]!r} and no {_CATALOGUE}; choose a new or empty folder"
-        )
-
-
-def _exclusive_lock(folder: Path) -> int:
-    with writing(folder / _LOCK):
-        lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(lock)
-        raise StoreError(f"another process is mapping into {folder}; wait until it has finished") from error
-    return lock
-
-
-def _read_image(path: Path) -> ImageRGB:
-    try:
-        return image_from_jpeg(path.read_bytes(), str(path))
-    except FileNotFoundError as error:
-        raise StoreError(
-            f"the keyframe {path} is gone; if its flight was mapped again meanwhile, list the keyframes anew"
-        ) from error

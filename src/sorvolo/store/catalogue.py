@@ -1,6 +1,5 @@
 """The catalogue `site.db`: one SQLite file that is the truth about a site (docs/formats.md)."""
 
-import os
 import sqlite3
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -10,32 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sqlalchemy import (
-    JSON,
-    Boolean,
-    Column,
-    Connection,
-    Engine,
-    Float,
-    ForeignKey,
-    Index,
-    Integer,
-    LargeBinary,
-    MetaData,
-    Row,
-    String,
-    Table,
-    create_engine,
-    delete,
-    event,
-    func,
-    insert,
-    literal,
-    select,
-    update,
-)
+from sqlalchemy import Connection, Row, Table, delete, func, insert, literal, select, update
 from sqlalchemy.exc import DBAPIError
-from sqlalchemy.pool import QueuePool
 
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import Floats, Matrix3
@@ -43,90 +18,11 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.geometry.pose import Pose
+from sorvolo.store import schema
 from sorvolo.store.atomic import atomic_path
+from sorvolo.store.schema import SCHEMA_VERSION
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
-
-SCHEMA_VERSION = 1
-_APPLICATION_ID = 0x536F7256  # "SorV", in the file's header
-
-_metadata = MetaData()
-_site = Table(
-    "site", _metadata,
-    Column("id", Integer, primary_key=True),  # always 1
-    Column("name", String, nullable=False),
-    Column("latitude_deg", Float, nullable=False),
-    Column("longitude_deg", Float, nullable=False),
-    Column("height_m", Float, nullable=False),
-    Column("height_reference", String, nullable=False),
-    Column("crs", String, nullable=False),
-    Column("m_per_px", Float, nullable=False),
-    Column("is_local", Boolean, nullable=False),
-    Column("created_utc", String, nullable=False),
-    Column("derived_version", Integer, nullable=False),  # the version in mosaic.tif and its kin; 0: none
-)
-_flights = Table(
-    "flights", _metadata,
-    Column("id", String, primary_key=True),
-    Column("rank", Integer, nullable=False, unique=True),
-)
-_runs = Table(
-    "runs", _metadata,
-    Column("id", Integer, primary_key=True),
-    Column("flight_id", ForeignKey("flights.id"), nullable=False),
-    Column("fingerprint", String, nullable=False),
-    Column("status", String, nullable=False),  # mapping | complete
-    Column("started_utc", String, nullable=False),
-    Column("finished_utc", String, nullable=False),  # "" while mapping
-    Column("method", String, nullable=False),
-    Column("settings", JSON, nullable=False),
-    Column("frames", JSON, nullable=False),  # status -> number of frames
-    Column("notes", JSON, nullable=False),
-    Column("files_written", Boolean, nullable=False),
-    sqlite_autoincrement=True,  # a run's number names its folder: never used twice
-)
-_keyframes = Table(
-    "keyframes", _metadata,
-    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
-    Column("frame_index", Integer, primary_key=True),
-    Column("name", String, nullable=False),
-    Column("time_ns", Integer, nullable=False),
-    Column("status", String, nullable=False),
-    Column("image_path", String, nullable=False),
-    Column("camera", JSON, nullable=False),  # width_px, height_px, fx_px, fy_px, cx_px, cy_px
-    Column("site_from_image", JSON, nullable=False),  # (3, 3)
-    Column("rotation", JSON, nullable=False),  # (3, 3) site_from_camera, [] when unknown
-    Column("translation_m", JSON, nullable=False),  # (3,), [] when unknown
-    Column("gains", JSON, nullable=False),
-    Column("vignette", JSON, nullable=False),
-    Column("sigma_m", Float),  # NULL when unknown
-    Column("residual_px", Float),
-)
-_documents = Table(
-    "documents", _metadata,  # the text files of a run, verbatim, to write them again after a kill
-    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
-    Column("name", String, primary_key=True),
-    Column("content", LargeBinary, nullable=False),
-)
-_versions = Table(
-    "versions", _metadata,
-    Column("id", Integer, primary_key=True),
-    Column("parent_id", Integer, nullable=False),  # the version it was painted over; 0: none
-    Column("flight_id", ForeignKey("flights.id"), nullable=False),
-    Column("run_id", Integer, nullable=False),
-    Column("created_utc", String, nullable=False),
-    Column("complete", Boolean, nullable=False),
-    Column("export_crs", String, nullable=False),  # "" is the site's own
-    sqlite_autoincrement=True,
-)
-_version_tiles = Table(
-    "version_tiles", _metadata,
-    Column("version_id", ForeignKey("versions.id", ondelete="CASCADE"), primary_key=True),
-    Column("tile_column", Integer, primary_key=True),
-    Column("tile_row", Integer, primary_key=True),
-    Column("sha256", String, nullable=False),
-)
-Index("version_tiles_by_content", _version_tiles.c.sha256)
 
 
 @dataclass(frozen=True)
@@ -160,6 +56,16 @@ class VersionEntry:
     tiles: int
     complete: bool
     export_crs: str
+    run_id: int
+
+
+@dataclass(frozen=True)
+class TileDifference:
+    """How a version's tiles differ from those it was painted over: new or other ones, their bytes, ones taken away."""
+
+    changed: int
+    removed: int
+    changed_bytes: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,9 +96,12 @@ class Catalogue:
     """The open database; `reading` and `changing` give one transaction each, the functions below use them."""
 
     def __init__(self, path: Path, *, write: bool) -> None:
-        """Open; raises StoreError when the file is damaged, no catalogue, or of another schema version."""
+        """Open, and bring an older format up to date if it is to be written.
+
+        Raises StoreError when the file is damaged, no catalogue, or of a format that is not known.
+        """
         self._path, self._write = path, write
-        self._engine = _engine(path, write)
+        self._engine = schema.open_engine(path, write=write)
         try:
             self._check()
         except BaseException:
@@ -203,14 +112,7 @@ class Catalogue:
     def create(path: Path) -> None:
         """Put an empty catalogue at `path`, whole from its first moment."""
         with atomic_path(path) as temporary:
-            connection = sqlite3.connect(temporary)
-            connection.execute("PRAGMA journal_mode = WAL")
-            connection.execute(f"PRAGMA application_id = {_APPLICATION_ID}")
-            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-            connection.close()
-            engine = _engine(temporary, write=True)
-            _metadata.create_all(engine)
-            engine.dispose()
+            schema.create_tables(temporary)
 
     def close(self) -> None:
         """Close every connection; the last writer folds the write-ahead log into the file."""
@@ -242,9 +144,9 @@ class Catalogue:
         with self.reading() as connection:
             application = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
             version = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
-            if application != _APPLICATION_ID:
+            if application != schema.APPLICATION_ID:
                 raise StoreError(f"{self._path} is not a Sorvolo catalogue; choose another site folder")
-            if version != SCHEMA_VERSION:
+            if not schema.OLDEST_VERSION <= version <= SCHEMA_VERSION:
                 raise StoreError(
                     f"the site {self._path.parent} has format version {version}, this Sorvolo works with "
                     f"version {SCHEMA_VERSION}; use the Sorvolo that made it, or map into a new folder"
@@ -253,6 +155,9 @@ class Catalogue:
                 fault = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one()
                 if fault != "ok":
                     raise StoreError(_damaged(self._path, fault))
+        if self._write and version < SCHEMA_VERSION:
+            with self.changing() as connection:
+                schema.upgrade(connection, version)
 
     @contextmanager
     def _naming_faults(self) -> Iterator[None]:
@@ -278,7 +183,7 @@ def utc_now() -> str:
 
 def load_site(connection: Connection) -> Site | None:
     """The site, None before it was created."""
-    row = connection.execute(select(_site)).one_or_none()
+    row = connection.execute(select(schema.site)).one_or_none()
     if row is None:
         return None
     origin = Geodetic(row.latitude_deg, row.longitude_deg, row.height_m)
@@ -287,7 +192,7 @@ def load_site(connection: Connection) -> Site | None:
 
 def add_site(connection: Connection, site: Site) -> None:
     """Write the site's one row."""
-    connection.execute(insert(_site).values(
+    connection.execute(insert(schema.site).values(
         id=1, name=site.name, latitude_deg=site.origin.latitude_deg, longitude_deg=site.origin.longitude_deg,
         height_m=site.origin.height_m, height_reference=site.height_reference, crs=site.crs,
         m_per_px=site.m_per_px, is_local=site.is_local, created_utc=utc_now(), derived_version=0,
@@ -297,9 +202,10 @@ def add_site(connection: Connection, site: Site) -> None:
 def list_flights(connection: Connection) -> list[FlightEntry]:
     """Every flight by rank; a complete run hides the run that is about to replace it."""
     rows = connection.execute(
-        select(_flights.c.rank, _runs)
-        .join(_runs, _runs.c.flight_id == _flights.c.id)
-        .order_by(_flights.c.rank, _runs.c.status.desc())  # "mapping" before "complete": the last one stays
+        select(schema.flights.c.rank, schema.runs)
+        .join(schema.runs, schema.runs.c.flight_id == schema.flights.c.id)
+        # "mapping" before "complete": the last one stays
+        .order_by(schema.flights.c.rank, schema.runs.c.status.desc())
     )
     return list({
         row.flight_id: FlightEntry(
@@ -312,16 +218,16 @@ def list_flights(connection: Connection) -> list[FlightEntry]:
 
 def list_versions(connection: Connection) -> list[VersionEntry]:
     """Every version, oldest first."""
-    tiles = func.count(_version_tiles.c.sha256)
+    tiles = func.count(schema.version_tiles.c.sha256)
     rows = connection.execute(
-        select(_versions, tiles.label("tiles"))
-        .outerjoin(_version_tiles, _version_tiles.c.version_id == _versions.c.id)
-        .group_by(_versions.c.id)
-        .order_by(_versions.c.id)
+        select(schema.versions, tiles.label("tiles"))
+        .outerjoin(schema.version_tiles, schema.version_tiles.c.version_id == schema.versions.c.id)
+        .group_by(schema.versions.c.id)
+        .order_by(schema.versions.c.id)
     )
     return [
         VersionEntry(
-            row.id, row.parent_id, row.flight_id, row.created_utc, row.tiles, row.complete, row.export_crs
+            row.id, row.parent_id, row.flight_id, row.created_utc, row.tiles, row.complete, row.export_crs, row.run_id
         )
         for row in rows
     ]
@@ -329,19 +235,25 @@ def list_versions(connection: Connection) -> list[VersionEntry]:
 
 def newest_version(connection: Connection, *, complete: bool = True) -> int:
     """The id of the newest complete (or incomplete) version; 0 when there is none."""
-    newest = select(func.max(_versions.c.id)).where(_versions.c.complete == complete)
+    newest = select(func.max(schema.versions.c.id)).where(schema.versions.c.complete == complete)
     return connection.execute(newest).scalar() or 0
 
 
 def tile_hashes(connection: Connection, version_id: int) -> dict[TileIndex, str]:
     """SHA-256 of every tile of a version; empty for a version that does not exist."""
-    rows = connection.execute(select(_version_tiles).where(_version_tiles.c.version_id == version_id))
+    rows = connection.execute(select(schema.version_tiles).where(schema.version_tiles.c.version_id == version_id))
     return {(row.tile_column, row.tile_row): row.sha256 for row in rows}
+
+
+def tile_changes(connection: Connection, version: VersionEntry) -> tuple[list[str], int]:
+    """SHA-256 of each tile that differs from the parent's at its place, and the number that only the parent has."""
+    now, then = tile_hashes(connection, version.id), tile_hashes(connection, version.parent_id)
+    return [sha256 for index, sha256 in now.items() if then.get(index) != sha256], len(then.keys() - now.keys())
 
 
 def used_hashes(connection: Connection, among: Collection[str] | None = None) -> set[str]:
     """The SHA-256 of every tile that some version has, of those `among` when given."""
-    query = select(_version_tiles.c.sha256).distinct()
+    query = select(schema.version_tiles.c.sha256).distinct()
     if among is None:
         return set(connection.execute(query).scalars())
     wanted = sorted(among)
@@ -349,7 +261,7 @@ def used_hashes(connection: Connection, among: Collection[str] | None = None) ->
         sha256
         for start in range(0, len(wanted), 500)  # SQLite bounds the number of values in a query
         for sha256 in connection.execute(
-            query.where(_version_tiles.c.sha256.in_(wanted[start:start + 500]))
+            query.where(schema.version_tiles.c.sha256.in_(wanted[start:start + 500]))
         ).scalars()
     }
 
@@ -358,38 +270,38 @@ def begin_run(
     connection: Connection, flight_id: str, fingerprint: str, method: str, settings: Mapping[str, Any]
 ) -> tuple[int, int]:
     """Start a run and its incomplete version over the right earlier one; return both ids."""
-    known = connection.execute(select(_flights.c.rank).where(_flights.c.id == flight_id)).scalar()
+    known = connection.execute(select(schema.flights.c.rank).where(schema.flights.c.id == flight_id)).scalar()
     if known is None:
-        last = connection.execute(select(func.max(_flights.c.rank))).scalar()
-        connection.execute(insert(_flights).values(id=flight_id, rank=0 if last is None else last + 1))
-    run_id = _inserted(connection, _runs, {
+        last = connection.execute(select(func.max(schema.flights.c.rank))).scalar()
+        connection.execute(insert(schema.flights).values(id=flight_id, rank=0 if last is None else last + 1))
+    run_id = _inserted(connection, schema.runs, {
         "flight_id": flight_id, "fingerprint": fingerprint, "status": "mapping", "started_utc": utc_now(),
         "finished_utc": "", "method": method, "settings": dict(settings), "frames": {}, "notes": [],
         "files_written": False,
     })
     newest = next((v for v in reversed(list_versions(connection)) if v.complete), None)
     base_id = 0 if newest is None else newest.parent_id if newest.flight_id == flight_id else newest.id
-    version_id = _inserted(connection, _versions, {
+    version_id = _inserted(connection, schema.versions, {
         "parent_id": base_id, "flight_id": flight_id, "run_id": run_id, "created_utc": utc_now(),
         "complete": False, "export_crs": "",
     })
-    base = select(
-        literal(version_id), _version_tiles.c.tile_column, _version_tiles.c.tile_row, _version_tiles.c.sha256
-    ).where(_version_tiles.c.version_id == base_id)
-    connection.execute(insert(_version_tiles).from_select(list(_version_tiles.c.keys()), base))
+    tiles = schema.version_tiles
+    base = select(literal(version_id), tiles.c.tile_column, tiles.c.tile_row, tiles.c.sha256)
+    columns = list(tiles.c.keys())
+    connection.execute(insert(tiles).from_select(columns, base.where(tiles.c.version_id == base_id)))
     return run_id, version_id
 
 
 def change_tiles(connection: Connection, version_id: int, changed: Mapping[TileIndex, str | None]) -> None:
     """Give tiles of a version other content; None removes one."""
     for (column, row), sha256 in changed.items():
-        connection.execute(delete(_version_tiles).where(
-            _version_tiles.c.version_id == version_id,
-            _version_tiles.c.tile_column == column,
-            _version_tiles.c.tile_row == row,
+        connection.execute(delete(schema.version_tiles).where(
+            schema.version_tiles.c.version_id == version_id,
+            schema.version_tiles.c.tile_column == column,
+            schema.version_tiles.c.tile_row == row,
         ))
         if sha256 is not None:
-            connection.execute(insert(_version_tiles).values(
+            connection.execute(insert(schema.version_tiles).values(
                 version_id=version_id, tile_column=column, tile_row=row, sha256=sha256
             ))
 
@@ -404,20 +316,28 @@ def complete_run(
     notes: Sequence[str],
     export_crs: str,
 ) -> None:
-    """Switch a flight from its former run to this one, and the map to this version."""
-    this_run = _runs.c.id == run_id
-    flight_id = connection.execute(select(_runs.c.flight_id).where(this_run)).scalar_one()
-    connection.execute(delete(_runs).where(_runs.c.flight_id == flight_id, _runs.c.id != run_id))
-    connection.execute(update(_runs).where(this_run).values(
+    """Switch a flight from its former run to this one, and the map to this version.
+
+    A document of the former run that this one does not have stays as an empty one: its file is to be removed.
+    """
+    this_run = schema.runs.c.id == run_id
+    flight_id = connection.execute(select(schema.runs.c.flight_id).where(this_run)).scalar_one()
+    former = (schema.runs.c.flight_id == flight_id, schema.runs.c.id != run_id)
+    names = connection.execute(
+        select(schema.documents.c.name).join(schema.runs, schema.runs.c.id == schema.documents.c.run_id).where(*former)
+    ).scalars()
+    documents = {**dict.fromkeys(names, b""), **documents}
+    connection.execute(delete(schema.runs).where(*former))
+    connection.execute(update(schema.runs).where(this_run).values(
         status="complete", finished_utc=utc_now(), frames=dict(frames), notes=list(notes)
     ))
-    connection.execute(update(_versions).where(_versions.c.id == version_id).values(
+    connection.execute(update(schema.versions).where(schema.versions.c.id == version_id).values(
         complete=True, created_utc=utc_now(), export_crs=export_crs
     ))
     if keyframes:
-        connection.execute(insert(_keyframes), [_row_of(keyframe, run_id) for keyframe in keyframes])
+        connection.execute(insert(schema.keyframes), [_row_of(keyframe, run_id) for keyframe in keyframes])
     if documents:
-        connection.execute(insert(_documents), [
+        connection.execute(insert(schema.documents), [
             {"run_id": run_id, "name": name, "content": content} for name, content in documents.items()
         ])
 
@@ -428,19 +348,37 @@ def drop_unfinished(connection: Connection) -> None:
     A site that such a run made is forgotten as well when nothing was ever committed: its place, its ground sampling
     distance and its height are that run's, and need not suit the next one.
     """
-    connection.execute(delete(_versions).where(_versions.c.complete.is_(False)))
-    dropped = connection.execute(delete(_runs).where(_runs.c.status == "mapping")).rowcount
+    connection.execute(delete(schema.versions).where(schema.versions.c.complete.is_(False)))
+    dropped = connection.execute(delete(schema.runs).where(schema.runs.c.status == "mapping")).rowcount
     if dropped and newest_version(connection) == 0:
-        connection.execute(delete(_site))
-    connection.execute(delete(_flights).where(
-        _flights.c.id.not_in(select(_runs.c.flight_id)), _flights.c.id.not_in(select(_versions.c.flight_id))
+        connection.execute(delete(schema.site))
+    connection.execute(delete(schema.flights).where(
+        schema.flights.c.id.not_in(select(schema.runs.c.flight_id)),
+        schema.flights.c.id.not_in(select(schema.versions.c.flight_id)),
     ))
+
+
+def owe_documents(connection: Connection, flight_ids: Collection[str]) -> None:
+    """Let the next repair write the files of these flights again."""
+    connection.execute(
+        update(schema.runs).where(schema.runs.c.flight_id.in_(list(flight_ids))).values(files_written=False)
+    )
+
+
+def document(connection: Connection, flight_id: str, name: str) -> bytes:
+    """A document of a flight's complete run; b"" when it has none of that name."""
+    return connection.execute(
+        select(schema.documents.c.content)
+        .join(schema.runs, schema.runs.c.id == schema.documents.c.run_id)
+        .where(schema.runs.c.flight_id == flight_id, schema.runs.c.status == "complete")
+        .where(schema.documents.c.name == name)
+    ).scalar() or b""
 
 
 def run_ids(connection: Connection) -> dict[str, set[int]]:
     """The runs of each flight."""
     runs: dict[str, set[int]] = {}
-    for row in connection.execute(select(_runs.c.flight_id, _runs.c.id)):
+    for row in connection.execute(select(schema.runs.c.flight_id, schema.runs.c.id)):
         runs.setdefault(row.flight_id, set()).add(row.id)
     return runs
 
@@ -448,27 +386,27 @@ def run_ids(connection: Connection) -> dict[str, set[int]]:
 def load_keyframes(connection: Connection, flight_id: str | None) -> list[StoredKeyframe]:
     """Keyframes of complete runs by flight rank and index, of one flight when its id is given."""
     query = (
-        select(_keyframes, _runs.c.flight_id)
-        .join(_runs, _runs.c.id == _keyframes.c.run_id)
-        .join(_flights, _flights.c.id == _runs.c.flight_id)
-        .where(_runs.c.status == "complete")
-        .order_by(_flights.c.rank, _keyframes.c.frame_index)
+        select(schema.keyframes, schema.runs.c.flight_id)
+        .join(schema.runs, schema.runs.c.id == schema.keyframes.c.run_id)
+        .join(schema.flights, schema.flights.c.id == schema.runs.c.flight_id)
+        .where(schema.runs.c.status == "complete")
+        .order_by(schema.flights.c.rank, schema.keyframes.c.frame_index)
     )
     if flight_id is not None:
-        query = query.where(_flights.c.id == flight_id)
+        query = query.where(schema.flights.c.id == flight_id)
     return [_keyframe_of(row) for row in connection.execute(query)]
 
 
 def unwritten_documents(connection: Connection) -> list[tuple[str, int, dict[str, bytes]]]:
     """Flight id, run id and documents of each complete run whose files were not all written."""
     runs = connection.execute(
-        select(_runs.c.flight_id, _runs.c.id)
-        .where(_runs.c.status == "complete", _runs.c.files_written.is_(False))
+        select(schema.runs.c.flight_id, schema.runs.c.id)
+        .where(schema.runs.c.status == "complete", schema.runs.c.files_written.is_(False))
     ).all()
     return [
         (flight_id, run_id, {
             row.name: row.content
-            for row in connection.execute(select(_documents).where(_documents.c.run_id == run_id))
+            for row in connection.execute(select(schema.documents).where(schema.documents.c.run_id == run_id))
         })
         for flight_id, run_id in runs
     ]
@@ -476,36 +414,13 @@ def unwritten_documents(connection: Connection) -> list[tuple[str, int, dict[str
 
 def mark_written(connection: Connection, run_ids: Sequence[int], derived_version: int) -> None:
     """Note that these runs' files, and the map's files for this version, are on the disk."""
-    connection.execute(update(_runs).where(_runs.c.id.in_(run_ids)).values(files_written=True))
-    connection.execute(update(_site).values(derived_version=derived_version))
+    connection.execute(update(schema.runs).where(schema.runs.c.id.in_(run_ids)).values(files_written=True))
+    connection.execute(update(schema.site).values(derived_version=derived_version))
 
 
 def derived_version(connection: Connection) -> int:
     """The version that the map's derived files show; 0 for none."""
-    return connection.execute(select(_site.c.derived_version)).scalar() or 0
-
-
-def _engine(path: Path, write: bool) -> Engine:
-    uri = path.resolve().as_uri() + ("?mode=rw" if write else "?mode=ro")
-    if not write and not os.access(path.parent, os.W_OK) and not path.with_name(path.name + "-wal").exists():
-        uri += "&immutable=1"  # SQLite cannot put its lock files beside a file on a read-only disk
-
-    def connect() -> sqlite3.Connection:
-        # isolation_level None: the module must not begin transactions by itself, SQLAlchemy does it below
-        connection = sqlite3.connect(
-            uri, uri=True, timeout=30, isolation_level=None, check_same_thread=False
-        )
-        connection.execute("PRAGMA foreign_keys = ON")
-        connection.execute("PRAGMA synchronous = FULL")
-        return connection
-
-    engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool)
-
-    @event.listens_for(engine, "begin")
-    def begin(connection: Connection) -> None:
-        connection.exec_driver_sql("BEGIN")
-
-    return engine
+    return connection.execute(select(schema.site.c.derived_version)).scalar() or 0
 
 
 def _inserted(connection: Connection, table: Table, values: Mapping[str, Any]) -> int:

@@ -106,22 +106,30 @@ def picture(tiles: Mapping[TileIndex, ImageRGBA], max_px: int) -> Picture:
 
     Reads one tile at a time, so that memory depends on `max_px` only.
     """
-    tile_px = tiles[next(iter(tiles))].shape[0]
-    columns, rows = np.array(sorted(tiles)).T
+    return pictures([tiles], max_px)[0]
+
+
+def pictures(maps: Sequence[Mapping[TileIndex, ImageRGBA]], max_px: int) -> list[Picture]:
+    """Several maps of one site as `picture` shows one, all of the same size and the same ground; one is not empty."""
+    indexes = sorted(set().union(*maps))
+    tile_px = next(tiles[index].shape[0] for index in indexes[:1] for tiles in maps if index in tiles)
+    columns, rows = np.array(indexes).T
     left, top = int(columns.min()), int(rows.min())
     width, height = int(columns.max()) - left + 1, int(rows.max()) - top + 1
     step = 1
     while tile_px % (2 * step) == 0 and max(width, height) * tile_px > step * max_px:
         step *= 2
     small_px = tile_px // step
-    canvas = np.zeros((height * small_px, width * small_px, 4), np.uint8)
-    for column, row in sorted(tiles):
-        y, x = (row - top) * small_px, (column - left) * small_px
-        canvas[y:y + small_px, x:x + small_px] = shrink(tiles[column, row], small_px, small_px)
-    seen = canvas[..., 3] > 0
+    canvases = [np.zeros((height * small_px, width * small_px, 4), np.uint8) for _ in maps]
+    seen = np.zeros((height * small_px, width * small_px), bool)
+    for canvas, tiles in zip(canvases, maps):
+        for column, row in sorted(tiles):
+            y, x = (row - top) * small_px, (column - left) * small_px
+            canvas[y:y + small_px, x:x + small_px] = shrink(tiles[column, row], small_px, small_px)
+        seen |= canvas[..., 3] > 0
     (y0, y1), (x0, x1) = (np.flatnonzero(seen.any(axis=axis))[[0, -1]] + [0, 1] for axis in (1, 0))
     corner_px = (left * tile_px + int(x0) * step - 0.5, top * tile_px + int(y0) * step - 0.5)
-    return Picture(np.ascontiguousarray(canvas[y0:y1, x0:x1]), corner_px, step)
+    return [Picture(np.ascontiguousarray(canvas[y0:y1, x0:x1]), corner_px, step) for canvas in canvases]
 
 
 def write_preview(tiles: Mapping[TileIndex, ImageRGBA], path: Path, max_px: int = PREVIEW_PX) -> None:
@@ -179,11 +187,11 @@ def _feature(frame: PlacedFrame, site: Site) -> dict[str, Any]:
         "status": frame.status.value,
         "reason": frame.reason,
         **_camera_place(frame, site),
-        "residual_px": _rounded(frame.residual_px, 4),
-        "sigma_m": _rounded(frame.sigma_m, 4),
-        "gps_residual_east_m": _rounded(frame.gps_residual_m[0], 4),
-        "gps_residual_north_m": _rounded(frame.gps_residual_m[1], 4),
-        "gps_residual_up_m": _rounded(frame.gps_residual_m[2], 4),
+        "residual_px": rounded(frame.residual_px, 4),
+        "sigma_m": rounded(frame.sigma_m, 4),
+        "gps_residual_east_m": rounded(frame.gps_residual_m[0], 4),
+        "gps_residual_north_m": rounded(frame.gps_residual_m[1], 4),
+        "gps_residual_up_m": rounded(frame.gps_residual_m[2], 4),
     }
     return {"type": "Feature", "geometry": _outline(frame, site), "properties": properties}
 
@@ -193,7 +201,7 @@ def _outline(frame: PlacedFrame, site: Site) -> dict[str, Any] | None:
         return None
     corners = frame.outline_m
     if not site.is_local:
-        corners = np.column_stack(_longitude_latitude(frame.outline_m, site))
+        corners = np.column_stack(longitude_latitude(frame.outline_m, site))
     ring = [[round(float(x), 10), round(float(y), 10)] for x, y in [*corners, corners[0]]]
     return {"type": "Polygon", "coordinates": [ring]}
 
@@ -206,24 +214,25 @@ def _camera_place(frame: PlacedFrame, site: Site) -> dict[str, Any]:
         height_m = site.origin.height_m + up_m
         yaw_deg, pitch_deg, roll_deg = gimbal_angles_from_rotation(frame.site_from_camera.rotation)
         if site.is_local:
-            local = {"camera_east": _rounded(east_m, 6), "camera_north": _rounded(north_m, 6)}
+            local = {"camera_east": rounded(east_m, 6), "camera_north": rounded(north_m, 6)}
         else:
-            longitudes, latitudes = _longitude_latitude(frame.site_from_camera.translation_m[None], site)
+            longitudes, latitudes = longitude_latitude(frame.site_from_camera.translation_m[None], site)
             longitude_deg, latitude_deg = longitudes[0], latitudes[0]
     return {
-        "camera_longitude_deg": _rounded(longitude_deg, 10),
-        "camera_latitude_deg": _rounded(latitude_deg, 10),
+        "camera_longitude_deg": rounded(longitude_deg, 10),
+        "camera_latitude_deg": rounded(latitude_deg, 10),
         **local,
-        "camera_height_m": _rounded(height_m, 4),
-        "height_above_ground_m": _rounded(up_m, 4),
+        "camera_height_m": rounded(height_m, 4),
+        "height_above_ground_m": rounded(up_m, 4),
         "height_reference": site.height_reference,
-        "camera_yaw_deg": _rounded(yaw_deg, 5),
-        "camera_pitch_deg": _rounded(pitch_deg, 5),
-        "camera_roll_deg": _rounded(roll_deg, 5),
+        "camera_yaw_deg": rounded(yaw_deg, 5),
+        "camera_pitch_deg": rounded(pitch_deg, 5),
+        "camera_roll_deg": rounded(roll_deg, 5),
     }
 
 
-def _longitude_latitude(points_m: Floats, site: Site) -> tuple[Floats, Floats]:
+def longitude_latitude(points_m: Floats, site: Site) -> tuple[Floats, Floats]:
+    """WGS84 degrees of site points, (N, 2) or (N, 3), (N,) each; longitudes run on where the site meets +-180."""
     latitudes, longitudes, _ = site.frame.wgs84_from_site(points_m)
     return _near(longitudes, site.origin.longitude_deg), latitudes
 
@@ -237,7 +246,8 @@ def _wrapped_deg(longitude_deg: float) -> float:
     return (longitude_deg + 180) % 360 - 180
 
 
-def _rounded(number: float, digits: int) -> float | None:
+def rounded(number: float, digits: int) -> float | None:
+    """The number for JSON; None when it is not finite."""
     return round(float(number), digits) if np.isfinite(number) else None
 
 

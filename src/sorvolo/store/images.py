@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -34,6 +35,16 @@ def image_from_jpeg(data: bytes, name: str) -> ImageRGB:
     if image is None:
         raise StoreError(f"{name} is damaged: no JPEG in its {len(data)} bytes; map its flight again")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def read_keyframe(path: Path) -> ImageRGB:
+    """Read a stored keyframe; raises StoreError when it is gone or damaged."""
+    try:
+        return image_from_jpeg(path.read_bytes(), str(path))
+    except FileNotFoundError as error:
+        raise StoreError(
+            f"the keyframe {path} is gone; if its flight was mapped again meanwhile, list the keyframes anew"
+        ) from error
 
 
 def png_from_rgba(rgba: ImageRGBA) -> bytes:

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, MutableMapping
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +65,11 @@ class TileBlobs:
     def stored(self) -> set[str]:
         """The SHA-256 of every blob in the folder."""
         return {path.stem for path in self._folder.glob("??/*.png") if not path.name.startswith(".")}
+
+    def size_bytes(self, hashes: Iterable[str]) -> int:
+        """How much room blobs take, each counted once."""
+        paths = [self._path(sha256) for sha256 in set(hashes)]
+        return sum(path.stat().st_size for path in paths if path.is_file())
 
     def remove_leftovers(self) -> int:
         """Delete the half-written blobs of killed writers and count them."""

@@ -1,0 +1,112 @@
+"""The files of a comparison: changes as GeoJSON, their crops before and after, and the views' masks."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path, PurePath
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
+from sorvolo.geometry.polygons import signed_area
+from sorvolo.store.atomic import atomic_write_bytes
+from sorvolo.store.change_records import StoredChange
+from sorvolo.store.exports import longitude_latitude, rounded, utc_text
+from sorvolo.store.images import png_from_rgba
+from sorvolo.survey.findings import Change
+from sorvolo.survey.flight import Site
+
+CHANGED, UNCHANGED, UNKNOWN = 255, 0, 128
+"""What a pixel of a view's mask says."""
+
+BOXES_FILE = "boxes.json"
+_PICTURE_ENDINGS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".dng", ".bmp"}
+
+
+def changes_geojson(changes: Iterable[StoredChange], site: Site) -> dict[str, Any]:
+    """The changes of a flight as a GeoJSON FeatureCollection, one polygon each (docs/formats.md).
+
+    Rings turn counter-clockwise, ten decimals. Longitudes run on beyond 180 degrees where a site meets the
+    antimeridian. For a local site the coordinates are the site's own units and "crs" is null.
+    """
+    collection: dict[str, Any] = {"type": "FeatureCollection", "name": "changes"}
+    if site.is_local:
+        collection["crs"] = None
+    collection["features"] = [_feature(change, site) for change in changes]
+    return collection
+
+
+def crop_files(changes: Sequence[Change]) -> dict[str, bytes]:
+    """The PNG pictures of the changes before and after, by file name."""
+    return {
+        name: png_from_rgba(rgba)
+        for each in changes
+        for name, rgba in zip(crop_names(each.id), (each.patch.before, each.patch.after))
+    }
+
+
+def crop_names(change_id: str) -> tuple[str, str]:
+    """The file names of a change's pictures before and after."""
+    return f"{change_id}-before.png", f"{change_id}-after.png"
+
+
+def write_view_masks(folder: Path, name: str, changed: ImageGray, valid: Mask) -> Path:
+    """Write one view's mask `<name>.png` into the folder: 255 changed, 0 unchanged, 128 unknown; return its path.
+
+    `changed` and `valid` are (H, W), as in `survey.findings.ComparedView`. Raises StoreError on a full disk.
+    """
+    mask: ImageGray = np.where(valid, np.where(changed > 0, CHANGED, UNCHANGED), UNKNOWN).astype(np.uint8)
+    path = folder / f"{name}.png"
+    _, data = cv2.imencode(".png", mask)
+    atomic_write_bytes(path, data.tobytes(), durable=False)
+    return path
+
+
+def mask_name(frame_name: str, taken: Iterable[str] = ()) -> str:
+    """The name of a frame's mask without its ending: a photo's name without its own, unless that is `taken`."""
+    path = PurePath(frame_name)
+    short = path.stem if path.suffix.lower() in _PICTURE_ENDINGS else path.name
+    return path.name if short in set(taken) else short
+
+
+def boxes_json(boxes: Boxes) -> list[list[int]]:
+    """(N, 4) boxes as lists of x, y, width, height."""
+    return [[int(number) for number in box] for box in np.asarray(boxes).reshape(-1, 4)]
+
+
+def _feature(change: StoredChange, site: Site) -> dict[str, Any]:
+    east_m, north_m = change.centre_m
+    is_still = not np.any(change.velocity_m_s)
+    properties = {
+        "id": change.id,
+        "number": change.number,
+        "kind": change.kind.value,
+        "score": rounded(change.score, 4),
+        "first_seen": utc_text(change.first_seen_ns),
+        "last_seen": utc_text(change.last_seen_ns),
+        "views": change.views,
+        "area_m2": rounded(change.area_m2, 4),
+        "length_m": rounded(change.length_m, 4),
+        "sigma_m": rounded(change.sigma_m, 4),
+        "class_before": change.class_before or None,
+        "class_after": change.class_after or None,
+        "east_m": rounded(east_m, 4),
+        "north_m": rounded(north_m, 4),
+        "velocity_m_s": None if is_still else [rounded(each, 3) for each in change.velocity_m_s],
+        "review": None if change.verdict is None else change.verdict.value,
+        "note": change.note or None,
+    }
+    return {
+        "type": "Feature",
+        "id": change.id,
+        "geometry": {"type": "Polygon", "coordinates": [_ring(change.outline_m, site)]},
+        "properties": properties,
+        "outline_m": [[rounded(east, 4), rounded(north, 4)] for east, north in change.outline_m],
+    }
+
+
+def _ring(outline_m: Floats, site: Site) -> list[list[float]]:
+    corners = outline_m if signed_area(outline_m) >= 0 else outline_m[::-1]
+    if not site.is_local:
+        corners = np.column_stack(longitude_latitude(corners, site))
+    return [[round(float(x), 10), round(float(y), 10)] for x, y in [*corners, corners[0]]]

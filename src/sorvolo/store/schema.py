@@ -1,0 +1,176 @@
+"""The tables of the catalogue `site.db`, how it is opened, and how an older one is brought up to date."""
+
+import os
+import sqlite3
+from pathlib import Path
+
+from sqlalchemy import (
+    JSON,
+    Boolean,
+    Column,
+    Connection,
+    Engine,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    create_engine,
+    event,
+)
+from sqlalchemy.pool import QueuePool
+
+SCHEMA_VERSION = 2
+OLDEST_VERSION = 1
+"""The oldest format that is still read, and brought up to date when it is opened to be written."""
+APPLICATION_ID = 0x536F7256  # "SorV", in the file's header
+
+metadata = MetaData()
+site = Table(
+    "site", metadata,
+    Column("id", Integer, primary_key=True),  # always 1
+    Column("name", String, nullable=False),
+    Column("latitude_deg", Float, nullable=False),
+    Column("longitude_deg", Float, nullable=False),
+    Column("height_m", Float, nullable=False),
+    Column("height_reference", String, nullable=False),
+    Column("crs", String, nullable=False),
+    Column("m_per_px", Float, nullable=False),
+    Column("is_local", Boolean, nullable=False),
+    Column("created_utc", String, nullable=False),
+    Column("derived_version", Integer, nullable=False),  # the version in mosaic.tif and its kin; 0: none
+)
+flights = Table(
+    "flights", metadata,
+    Column("id", String, primary_key=True),
+    Column("rank", Integer, nullable=False, unique=True),
+)
+runs = Table(
+    "runs", metadata,
+    Column("id", Integer, primary_key=True),
+    Column("flight_id", ForeignKey("flights.id"), nullable=False),
+    Column("fingerprint", String, nullable=False),
+    Column("status", String, nullable=False),  # mapping | complete
+    Column("started_utc", String, nullable=False),
+    Column("finished_utc", String, nullable=False),  # "" while mapping
+    Column("method", String, nullable=False),
+    Column("settings", JSON, nullable=False),
+    Column("frames", JSON, nullable=False),  # status -> number of frames
+    Column("notes", JSON, nullable=False),
+    Column("files_written", Boolean, nullable=False),
+    sqlite_autoincrement=True,  # a run's number names its folder: never used twice
+)
+keyframes = Table(
+    "keyframes", metadata,
+    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
+    Column("frame_index", Integer, primary_key=True),
+    Column("name", String, nullable=False),
+    Column("time_ns", Integer, nullable=False),
+    Column("status", String, nullable=False),
+    Column("image_path", String, nullable=False),
+    Column("camera", JSON, nullable=False),  # width_px, height_px, fx_px, fy_px, cx_px, cy_px
+    Column("site_from_image", JSON, nullable=False),  # (3, 3)
+    Column("rotation", JSON, nullable=False),  # (3, 3) site_from_camera, [] when unknown
+    Column("translation_m", JSON, nullable=False),  # (3,), [] when unknown
+    Column("gains", JSON, nullable=False),
+    Column("vignette", JSON, nullable=False),
+    Column("sigma_m", Float),  # NULL when unknown
+    Column("residual_px", Float),
+)
+documents = Table(
+    "documents", metadata,  # the text files of a run, verbatim, to write them again after a kill
+    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
+    Column("name", String, primary_key=True),
+    Column("content", LargeBinary, nullable=False),
+)
+versions = Table(
+    "versions", metadata,
+    Column("id", Integer, primary_key=True),
+    Column("parent_id", Integer, nullable=False),  # the version it was painted over; 0: none
+    Column("flight_id", ForeignKey("flights.id"), nullable=False),
+    Column("run_id", Integer, nullable=False),
+    Column("created_utc", String, nullable=False),
+    Column("complete", Boolean, nullable=False),
+    Column("export_crs", String, nullable=False),  # "" is the site's own
+    sqlite_autoincrement=True,
+)
+version_tiles = Table(
+    "version_tiles", metadata,
+    Column("version_id", ForeignKey("versions.id", ondelete="CASCADE"), primary_key=True),
+    Column("tile_column", Integer, primary_key=True),
+    Column("tile_row", Integer, primary_key=True),
+    Column("sha256", String, nullable=False),
+)
+Index("version_tiles_by_content", version_tiles.c.sha256)
+comparisons = Table(
+    "comparisons", metadata,  # a version that a comparison made; kept when its run is replaced
+    Column("version_id", ForeignKey("versions.id", ondelete="CASCADE"), primary_key=True),
+    Column("run_id", Integer, nullable=False),
+    Column("kinds", JSON, nullable=False),  # kind -> number of changes
+)
+changes = Table(
+    "changes", metadata,
+    Column("id", String, primary_key=True),
+    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), nullable=False),
+    Column("number", Integer, nullable=False),
+    Column("kind", String, nullable=False),
+    Column("properties", JSON, nullable=False),
+)
+Index("changes_by_run", changes.c.run_id)
+reviews = Table(
+    "reviews", metadata,  # no foreign keys: a verdict outlives the run whose change was looked at
+    Column("change_id", String, primary_key=True),
+    Column("flight_id", String, nullable=False),
+    Column("verdict", String, nullable=False),
+    Column("at_utc", String, nullable=False),
+    Column("note", String, nullable=False),
+    Column("kind", String, nullable=False),
+    Column("outline_m", JSON, nullable=False),
+)
+_NEW_IN_2 = [comparisons, changes, reviews]
+
+
+def create_tables(path: Path) -> None:
+    """Make an empty catalogue of the newest format in a file that does not exist yet."""
+    connection = sqlite3.connect(path)
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+    connection.close()
+    engine = open_engine(path, write=True)
+    metadata.create_all(engine)
+    engine.dispose()
+
+
+def upgrade(connection: Connection, version: int) -> None:
+    """Bring a catalogue of an older format up to date, inside the caller's transaction."""
+    if version < 2:
+        metadata.create_all(connection, tables=_NEW_IN_2)
+    connection.exec_driver_sql(f"PRAGMA user_version = {SCHEMA_VERSION}")
+
+
+def open_engine(path: Path, *, write: bool) -> Engine:
+    """Connections to the file; a reader's cannot write."""
+    uri = path.resolve().as_uri() + ("?mode=rw" if write else "?mode=ro")
+    if not write and not os.access(path.parent, os.W_OK) and not path.with_name(path.name + "-wal").exists():
+        uri += "&immutable=1"  # SQLite cannot put its lock files beside a file on a read-only disk
+
+    def connect() -> sqlite3.Connection:
+        # isolation_level None: the module must not begin transactions by itself, SQLAlchemy does it below
+        connection = sqlite3.connect(
+            uri, uri=True, timeout=30, isolation_level=None, check_same_thread=False
+        )
+        connection.execute("PRAGMA foreign_keys = ON")
+        connection.execute("PRAGMA synchronous = FULL")
+        return connection
+
+    engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool)
+
+    @event.listens_for(engine, "begin")
+    def begin(connection: Connection) -> None:
+        connection.exec_driver_sql("BEGIN")
+
+    return engine
