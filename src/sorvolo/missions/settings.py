@@ -31,3 +31,38 @@ class MapSettings:
             check_map_crs(self.crs)
         if self.offset_s is not None and not abs(self.offset_s) <= 86_400 * 365:
             raise SettingsError(f"the clock offset must be a number of seconds, got {self.offset_s}")
+
+
+@dataclass(frozen=True)
+class CompareSettings:
+    """How a later flight is compared with the map (`sorvolo compare`)."""
+
+    method: Literal["robust", "thesis"] = "robust"
+    views_per_second: float = 5.0  # of flight: neighbouring frames of a video show the same again
+    votes: int = 3  # k: views of a piece of ground that must show a change ...
+    voters: int = 5  # n: ... among the last so many that saw it
+    offset_s: float | None = None  # telemetry time = video time + this
+    ground_elevation_m: float | None = None  # of the ground, in the telemetry's own height reference
+    side_px: int = 1280  # longest side at which frames are compared
+    updates_map: bool = True  # make a new version of the map where the ground changed or is new
+    writes_masks: bool = False
+
+    def __post_init__(self) -> None:
+        if self.method not in ("robust", "thesis"):
+            raise SettingsError(f"method must be robust or thesis, got {self.method!r}")
+        if not 0.05 <= self.views_per_second <= 240:
+            raise SettingsError(f"views per second must lie in 0.05 to 240, got {self.views_per_second}")
+        if not 1 <= self.votes <= self.voters <= 16:
+            raise SettingsError(
+                f"a change needs {self.votes} of the last {self.voters} views: the first must not exceed the second, "
+                "and both lie in 1 to 16"
+            )
+        if not 256 <= self.side_px <= 8192:
+            raise SettingsError(f"frames are compared at 256 to 8192 px, got {self.side_px}")
+        if self.offset_s is not None and not abs(self.offset_s) <= 86_400 * 365:
+            raise SettingsError(f"the clock offset must be a number of seconds, got {self.offset_s}")
+
+    @property
+    def mapping(self) -> MapSettings:
+        """How frames that show new ground are mapped."""
+        return MapSettings(offset_s=self.offset_s, ground_elevation_m=self.ground_elevation_m)

@@ -26,6 +26,7 @@ class ViewStatus(StrEnum):
     COMPARED = "compared"
     NOT_ALIGNED = "not-aligned"
     OUTSIDE = "outside"  # of the known map: the frame extends it
+    ALL_CHANGED = "all-changed"  # snow, a flood, another place: no list of changes could be trusted
     LOST = "lost"  # the frame itself cannot be used
 
 

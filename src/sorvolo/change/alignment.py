@@ -1,0 +1,283 @@
+"""A frame laid over the known map: by telemetry and the frames before, then by features, then to a part of a pixel."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from sorvolo.change.reference import ReferenceMap, normalised
+from sorvolo.errors import GeometryError
+from sorvolo.geometry.arrays import Anything, ImageGray, ImageRGB, Mask, Matrix3, PointsPx, Vector3
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.grid import SiteGrid
+from sorvolo.geometry.homography import apply_homography, pose_from_homography, site_from_image_homography
+from sorvolo.geometry.pose import Pose
+from sorvolo.registration.features import FeatureSettings, gray_from_rgb, normalise_contrast, orb_features
+from sorvolo.registration.link import LinkCache, LinkSettings, refine
+from sorvolo.registration.matching import match
+from sorvolo.registration.robust import fit_homography
+from sorvolo.survey.flight import CameraPrior
+from sorvolo.survey.mosaic import Features, Keyframe, Link
+
+_UNKNOWN = CameraPrior(np.zeros(3), np.full(3, np.inf), np.eye(3), np.full(3, np.inf))
+_NO_FEATURES = Features("orb", np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
+_TRACKED_S = 2.0  # a fit older than this foretells nothing
+
+
+@dataclass(frozen=True)
+class AlignmentSettings:
+    """How a frame is laid over the map, and when that counts."""
+
+    side_px: int = 640  # longest side at which frames are aligned
+    least_known: float = 0.1  # share of the frame that must lie on known ground
+    most_residual_px: float = 1.6  # of the registered image: worse, and what differs is the fit, not the ground
+    most_features: int = 60_000  # of the whole map, to look for a frame whose place is not known at all
+    links: LinkSettings = field(default_factory=lambda: LinkSettings(FeatureSettings(orb_count=900), min_inliers=20))
+
+
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """A frame that fits the map. `site_from_image` (3, 3) takes its undistorted pixels to site metres on the ground.
+
+    `residual_px` is the median distance that paired points keep, in the frame's own pixels. `followed`: the last fit
+    foretold this one, no features were needed.
+    """
+
+    site_from_image: Matrix3
+    camera_m: Vector3
+    residual_px: float
+    followed: bool
+
+
+@dataclass(frozen=True)
+class NotAligned:
+    """A frame that fits the map nowhere, why, and the residual of the best try (NaN without any).
+
+    `is_outside`: it lies beyond the known ground, as far as anyone can tell.
+    """
+
+    reason: str
+    residual_px: float
+    is_outside: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    time_ns: int
+    pose: Pose
+    rotation_told: Matrix3  # by telemetry at that time
+    seen_from_ideal: Matrix3  # what the fit has beyond a perfect camera at that pose
+    site_from_image: Matrix3
+
+
+class Aligner:
+    """Lays the frames of one flight over a map, in order of time. Only `align` changes it."""
+
+    def __init__(
+        self, reference: ReferenceMap, site_grid: SiteGrid, settings: AlignmentSettings = AlignmentSettings()
+    ) -> None:
+        self._reference, self._site_grid, self._settings = reference, site_grid, settings
+        self._fits: list[_Fit] = []
+        self._count = 0
+
+    def align(self, image: ImageRGB, camera: Camera, prior: CameraPrior, time_ns: int) -> Aligned | NotAligned:
+        """Where an undistorted frame, (H, W, 3), of the distortion-free `camera` lies on the map."""
+        scale = min(1.0, self._settings.side_px / max(image.shape[:2]))
+        size = max(16, round(image.shape[1] * scale)), max(16, round(image.shape[0] * scale))
+        small_camera = camera.resized(*size)
+        gray = gray_from_rgb(image)
+        new = self._keyframe(
+            small_camera, normalise_contrast(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))  # type: ignore[arg-type]
+        )
+        told = self._told(small_camera, prior)
+        known = self._share_known(told, small_camera)
+        is_outside = told is not None and known < self._settings.least_known
+        worst = NotAligned("its features are found nowhere in the map where it could be", np.nan)
+        for guess, followed in self._guesses(new, small_camera, prior, time_ns, None if is_outside else told):
+            found = self._fit(new, guess)
+            if isinstance(found, NotAligned):
+                worst = found
+                continue
+            site_from_small, residual_px = found
+            pose = pose_from_homography(site_from_small, small_camera)
+            if pose is None:
+                worst = NotAligned("the fit is none that a camera above the ground could have", np.nan)
+                continue
+            self._remember(time_ns, pose, prior, site_from_small, small_camera)
+            # centres of pixels lie half a pixel inside: small = (full + 1/2) s - 1/2
+            sx, sy = size[0] / image.shape[1], size[1] / image.shape[0]
+            small_from_full = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
+            return Aligned(site_from_small @ small_from_full, pose.translation_m, residual_px / scale, followed)
+        reason = f"only {known:.0%} of it lies on the map" if is_outside else worst.reason
+        return NotAligned(reason, worst.residual_px / scale, is_outside)
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _keyframe(self, camera: Camera, gray: ImageGray) -> Keyframe:
+        self._count += 1
+        return Keyframe(self._count, camera, gray, _NO_FEATURES, _UNKNOWN)
+
+    def _told(self, camera: Camera, prior: CameraPrior) -> Matrix3 | None:
+        """site_from_image as telemetry alone gives it."""
+        if not prior.knows_place:
+            return None
+        up_m = float(prior.position_m[2])
+        if self._fits:
+            last_up_m = float(self._fits[-1].pose.translation_m[2])
+            if not np.isfinite(prior.position_sigma_m[2]) or up_m < 0.3 * last_up_m:
+                up_m = last_up_m
+        try:
+            pose = Pose(prior.rotation, np.array([*prior.position_m[:2], max(up_m, 0.5)]))
+            return site_from_image_homography(camera, pose)
+        except GeometryError:
+            return None
+
+    def _guesses(
+        self, new: Keyframe, camera: Camera, prior: CameraPrior, time_ns: int, told: Matrix3 | None
+    ) -> Iterator[tuple[Matrix3, bool]]:
+        """site_from_image good to a few pixels, the cheapest first."""
+        foretold = self._foretold(camera, prior, time_ns)
+        if foretold is not None:
+            yield self._shifted(new, foretold), True
+        near = foretold if foretold is not None else told
+        features = orb_features(new.gray, self._settings.links.features)
+        for base in (near, told if foretold is not None else None):
+            if base is not None:
+                found = self._by_features(new, features, base, prior)
+                if found is not None:
+                    yield found, False
+        found = self._anywhere(new, features) if told is not None or not prior.knows_place else None
+        if found is not None:
+            yield found, False
+
+    def _foretold(self, camera: Camera, prior: CameraPrior, time_ns: int) -> Matrix3 | None:
+        """The last fit moved on at the flight's velocity, turned as telemetry says the camera turned."""
+        if not self._fits or not 0 <= time_ns - self._fits[-1].time_ns <= _TRACKED_S * 1e9:
+            return None
+        last = self._fits[-1]
+        since_s = (time_ns - last.time_ns) / 1e9
+        if len(self._fits) > 1 and last.time_ns - self._fits[-2].time_ns <= _TRACKED_S * 1e9:
+            before = self._fits[-2]
+            moved_m = last.pose.translation_m - before.pose.translation_m
+            velocity_m_s = moved_m / ((last.time_ns - before.time_ns) / 1e9)
+        else:
+            velocity_m_s = prior.velocity_m_s
+        rotation = last.pose.rotation
+        if prior.attitude_sigma_deg.max() <= 2.0:
+            rotation = prior.rotation @ last.rotation_told.T @ rotation
+        place_m = last.pose.translation_m + velocity_m_s * since_s
+        try:
+            ideal = site_from_image_homography(camera, Pose(rotation, np.array([*place_m[:2], max(place_m[2], 0.5)])))
+        except GeometryError:
+            return None
+        return ideal @ np.linalg.inv(last.seen_from_ideal)
+
+    def _remember(self, time_ns: int, pose: Pose, prior: CameraPrior, site_from_image: Matrix3, camera: Camera) -> None:
+        # ideal @ inv(seen_from_ideal) gives the fit back
+        ideal = site_from_image_homography(camera, pose)
+        seen_from_ideal = np.linalg.inv(site_from_image) @ ideal
+        fit = _Fit(time_ns, pose, prior.rotation, seen_from_ideal / seen_from_ideal[2, 2], site_from_image)
+        self._fits = [*self._fits[-1:], fit]
+
+    def _on_grid(self, site_from_image: Matrix3, camera: Camera) -> Matrix3 | None:
+        """grid_from_image of a guess; None when the image's centre sees no ground."""
+        centre = site_from_image @ np.array([camera.cx_px, camera.cy_px, 1.0])
+        if centre[2] <= 0:
+            return None
+        return self._site_grid.grid_from_site_affine(centre[:2] / centre[2], 50.0) @ site_from_image
+
+    def _seen(self, site_from_image: Matrix3, camera: Camera) -> tuple[ImageRGB, Mask] | None:
+        grid_from_image = self._on_grid(site_from_image, camera)
+        if grid_from_image is None:
+            return None
+        return self._reference.seen_from(grid_from_image, camera.width_px, camera.height_px)
+
+    def _shifted(self, new: Keyframe, site_from_image: Matrix3) -> Matrix3:
+        """The guess moved to where phase correlation of small copies puts it: refinement reaches a few pixels only."""
+        seen = self._seen(site_from_image, new.camera)
+        if seen is None or seen[1].mean() < self._settings.least_known:
+            return site_from_image
+        size = new.camera.width_px // 4, new.camera.height_px // 4
+        old = cv2.resize(normalised(*seen), size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        fresh = cv2.resize(new.gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        window = cv2.createHanningWindow(size, cv2.CV_32F)
+        (dx, dy), response = cv2.phaseCorrelate(old, fresh, window)
+        if response < 0.05 or abs(dx) > 0.4 * size[0] or abs(dy) > 0.4 * size[1]:
+            return site_from_image
+        return site_from_image @ np.array([[1.0, 0.0, -4 * dx], [0.0, 1.0, -4 * dy], [0.0, 0.0, 1.0]])
+
+    def _by_features(
+        self, new: Keyframe, features: Features, site_from_image: Matrix3, prior: CameraPrior
+    ) -> Matrix3 | None:
+        grid_from_image = self._on_grid(site_from_image, new.camera)
+        if grid_from_image is None:
+            return None
+        sigma_m = float(np.nan_to_num(prior.position_sigma_m[:2].max(), posinf=10.0))
+        metres_per_px = abs(np.linalg.det(site_from_image[:2, :2] / site_from_image[2, 2])) ** 0.5
+        search_px = min(0.25 * max(new.gray.shape) + 3 * sigma_m / max(metres_per_px, 1e-6), 1.5 * max(new.gray.shape))
+        old = self._reference.features_under(
+            grid_from_image, new.camera.width_px, new.camera.height_px, search_px / max(new.gray.shape)
+        )
+        return self._matched(features, old, grid_from_image, search_px, site_from_image)
+
+    def _anywhere(self, new: Keyframe, features: Features) -> Matrix3 | None:
+        """A frame of unknown place, looked for in the whole map at the frame's own scale and those beside it."""
+        if self._fits and self._count % 5:
+            return None  # the search is dear, and the next frame may be found by its telemetry again
+        for level in range(3):
+            old = self._reference.all_features(level, self._settings.most_features)
+            if not len(old):
+                continue
+            centre_px = old.points_px.mean(axis=0)
+            scale = float(1 << level)
+            grid_from_image = np.array([[scale, 0.0, centre_px[0]], [0.0, scale, centre_px[1]], [0.0, 0.0, 1.0]])
+            site_from_grid = self._site_from_grid(centre_px)
+            found = self._matched(features, old, grid_from_image, 0.0, site_from_grid @ grid_from_image)
+            if found is not None:
+                return found
+        return None
+
+    def _site_from_grid(self, centre_px: PointsPx) -> Matrix3:
+        grid_from_site = self._site_grid.grid_from_site_affine(np.zeros(2), 50.0)
+        near_m = apply_homography(np.linalg.inv(grid_from_site), centre_px[None])[0]
+        return np.asarray(np.linalg.inv(self._site_grid.grid_from_site_affine(near_m, 50.0)))
+
+    def _matched(
+        self, features: Features, old: Features, grid_from_image: Matrix3, search_px: float, site_from_image: Matrix3
+    ) -> Matrix3 | None:
+        """The guess corrected by matched features; `search_px` 0: wherever they lie."""
+        image_from_grid = np.linalg.inv(grid_from_image)
+        pairs = match(features, old, image_from_grid if search_px else None, search_px)
+        if len(pairs) < self._settings.links.min_inliers // 2:
+            return None
+        guessed = apply_homography(image_from_grid, old.points_px[pairs[:, 1]])
+        ahead = np.isfinite(guessed).all(axis=1)
+        fitted = fit_homography(features.points_px[pairs[ahead, 0]], guessed[ahead], self._settings.links.threshold_px)
+        if fitted is None or fitted[1].sum() < self._settings.links.min_inliers // 2:
+            return None
+        return site_from_image @ np.linalg.inv(fitted[0])
+
+    def _share_known(self, site_from_image: Matrix3 | None, camera: Camera) -> float:
+        seen = None if site_from_image is None else self._seen(site_from_image, camera)
+        return 0.0 if seen is None else float(seen[1].mean())
+
+    def _fit(self, new: Keyframe, guess: Matrix3) -> tuple[Matrix3, float] | NotAligned:
+        """site_from_image to a part of a pixel with its residual, or why not."""
+        seen = self._seen(guess, new.camera)
+        if seen is None:
+            return NotAligned("it would look at the horizon", np.nan)
+        share = float(seen[1].mean())
+        if share < self._settings.least_known:
+            return NotAligned(f"only {share:.0%} of it lies on the map", np.nan)
+        old = self._keyframe(new.camera, normalised(*seen))
+        links = self._settings.links
+        found = refine(new, old, np.eye(3), links, LinkCache(links.features, 2))
+        if not isinstance(found, Link):
+            return NotAligned(f"it does not fit the map: {found}", np.nan)
+        residual_px = float(found.sigma_px * 1.1774)  # a Rayleigh distribution's median
+        if residual_px > self._settings.most_residual_px:
+            return NotAligned("its points fit the map badly", residual_px)
+        fit: Anything = guess @ np.linalg.inv(found.new_from_old)
+        return fit, residual_px
+

@@ -1,0 +1,199 @@
+"""The known map as a later flight reads it: any view of it, and its features, made once."""
+
+from collections import OrderedDict
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from sorvolo.geometry.arrays import Anything, ImageGray, ImageRGB, ImageRGBA, Mask, Matrix3, PointsPx
+from sorvolo.geometry.grid import Grid, TileIndex
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.registration.features import FeatureSettings, gray_from_rgb, normalise_contrast, orb_features
+from sorvolo.survey.mosaic import Features
+
+_BLOCK_PX = 512  # features are found in blocks of this side
+_APRON_PX = 40  # what contrast and descriptors look at beyond a block
+_MOST_PX = 48_000_000  # of the map in one view: more is a view towards the horizon
+_FEATURES = FeatureSettings(detection_side_px=_BLOCK_PX + 2 * _APRON_PX, orb_count=1100)
+_NOTHING = Features("orb", np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
+
+
+class ReferenceMap:
+    """A version of the map, read a tile at a time; remembers the last tiles, the last window and all features.
+
+    `tiles` is any mapping from tile to RGBA; level n of the map has pixels of 2^n grid pixels.
+    """
+
+    def __init__(self, tiles: Mapping[TileIndex, ImageRGBA], grid: Grid, cache_bytes: int = 192 * 2**20) -> None:
+        self._tiles, self._grid = tiles, grid
+        self._cache: OrderedDict[tuple[int, TileIndex], ImageRGBA | None] = OrderedDict()
+        self._cache_tiles = max(8, cache_bytes // (4 * grid.tile_px**2))
+        self._window: tuple[int, int, int, ImageRGBA] = (-1, 0, 0, np.zeros((0, 0, 4), np.uint8))
+        self._features: dict[tuple[int, TileIndex], Features] = {}
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether the map shows nothing at all."""
+        return len(self._tiles) == 0
+
+    def seen_from(self, grid_from_image: Matrix3, width_px: int, height_px: int) -> tuple[ImageRGB, Mask]:
+        """The map resampled to an image's pixels, and where it is known; nothing is known of views to the horizon."""
+        nothing = np.zeros((height_px, width_px, 3), np.uint8), np.zeros((height_px, width_px), bool)
+        outline = outline_on_grid(grid_from_image, width_px, height_px)
+        if outline is None:
+            return nothing
+        level = level_for(grid_from_image, width_px, height_px)
+        level_from_image = _level_from_grid(level) @ grid_from_image
+        outline = apply_homography(_level_from_grid(level), outline)
+        low, high = np.floor(outline.min(axis=0)).astype(int) - 2, np.ceil(outline.max(axis=0)).astype(int) + 3
+        if np.prod((high - low).astype(float)) > _MOST_PX:
+            return nothing
+        x, y, window = self._window_around(level, (int(low[0]), int(low[1]), int(high[0]), int(high[1])))
+        window_from_image = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, 1.0]]) @ level_from_image
+        seen = cv2.warpPerspective(
+            window, window_from_image, (width_px, height_px), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        )
+        return cv2.cvtColor(seen, cv2.COLOR_RGBA2RGB), seen[..., 3] == 255  # type: ignore[return-value]
+
+    def features_under(self, grid_from_image: Matrix3, width_px: int, height_px: int, margin: float) -> Features:
+        """ORB features of the map under an image and `margin` of its size around it, `points_px` on the grid."""
+        outline = outline_on_grid(grid_from_image, width_px, height_px)
+        if outline is None:
+            return _NOTHING
+        level = level_for(grid_from_image, width_px, height_px)
+        centre = outline.mean(axis=0)
+        outline = apply_homography(_level_from_grid(level), centre + (outline - centre) * (1 + 2 * margin))
+        blocks = Grid((0.0, 0.0), 1.0, _BLOCK_PX).tiles_touched(outline)
+        if len(blocks) > 400:
+            return _NOTHING
+        return _joined([self._block(level, each) for each in sorted(blocks)])
+
+    def all_features(self, level: int, most: int) -> Features:
+        """The features of the whole map at a level, or of nothing when they are more than `most`."""
+        side = self._grid.tile_px << level
+        blocks: set[TileIndex] = set()
+        per_block = _BLOCK_PX << level
+        for column, row in {(c * self._grid.tile_px // side, r * self._grid.tile_px // side) for c, r in self._tiles}:
+            first = column * side // per_block, row * side // per_block
+            last = ((column + 1) * side - 1) // per_block, ((row + 1) * side - 1) // per_block
+            blocks |= {(c, r) for c in range(first[0], last[0] + 1) for r in range(first[1], last[1] + 1)}
+        if len(blocks) * _FEATURES.orb_count > most:
+            return _NOTHING
+        return _joined([self._block(level, each) for each in sorted(blocks)])
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _window_around(self, level: int, box: tuple[int, int, int, int]) -> tuple[int, int, ImageRGBA]:
+        known_level, x, y, window = self._window
+        height, width = window.shape[:2]
+        if known_level == level and x <= box[0] and y <= box[1] and box[2] <= x + width and box[3] <= y + height:
+            return x, y, window
+        spare = max(box[2] - box[0], box[3] - box[1]) // 4  # the next views lie beside this one
+        x, y = box[0] - spare, box[1] - spare
+        window = self._assembled(level, x, y, box[2] + spare - x, box[3] + spare - y)
+        self._window = level, x, y, window
+        return x, y, window
+
+    def _assembled(self, level: int, x: int, y: int, width: int, height: int) -> ImageRGBA:
+        side = self._grid.tile_px
+        result = np.zeros((height, width, 4), np.uint8)
+        for row in range(y // side, (y + height - 1) // side + 1):
+            for column in range(x // side, (x + width - 1) // side + 1):
+                tile = self._tile(level, (column, row))
+                if tile is None:
+                    continue
+                x0, y0 = max(x, column * side), max(y, row * side)
+                x1, y1 = min(x + width, (column + 1) * side), min(y + height, (row + 1) * side)
+                result[y0 - y:y1 - y, x0 - x:x1 - x] = tile[
+                    y0 - row * side:y1 - row * side, x0 - column * side:x1 - column * side
+                ]
+        return result
+
+    def _tile(self, level: int, index: TileIndex) -> ImageRGBA | None:
+        key = level, index
+        if key not in self._cache:
+            self._cache[key] = self._made(level, index)
+            while len(self._cache) > self._cache_tiles:
+                self._cache.popitem(last=False)
+        self._cache.move_to_end(key)
+        return self._cache[key]
+
+    def _made(self, level: int, index: TileIndex) -> ImageRGBA | None:
+        if level == 0:
+            return self._tiles.get(index)
+        side = self._grid.tile_px
+        children = {
+            (dx, dy): self._tile(level - 1, (2 * index[0] + dx, 2 * index[1] + dy)) for dx in (0, 1) for dy in (0, 1)
+        }
+        if all(each is None for each in children.values()):
+            return None
+        large = np.zeros((2 * side, 2 * side, 4), np.uint8)
+        for (dx, dy), child in children.items():
+            if child is not None:
+                large[dy * side:(dy + 1) * side, dx * side:(dx + 1) * side] = child
+        small: Anything = cv2.resize(large, (side, side), interpolation=cv2.INTER_AREA)
+        small[small[..., 3] < 255] = 0  # half-known pixels are darkened by the unknown half
+        return small  # type: ignore[no-any-return]
+
+    def _block(self, level: int, index: TileIndex) -> Features:
+        if (level, index) not in self._features:
+            self._features[level, index] = self._found(level, index)
+        return self._features[level, index]
+
+    def _found(self, level: int, index: TileIndex) -> Features:
+        x, y = index[0] * _BLOCK_PX - _APRON_PX, index[1] * _BLOCK_PX - _APRON_PX
+        side = _BLOCK_PX + 2 * _APRON_PX
+        rgba = self._assembled(level, x, y, side, side)
+        known = rgba[..., 3] == 255
+        if not known.any():
+            return _NOTHING
+        found = orb_features(normalised(cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB), known), _FEATURES)  # type: ignore[arg-type]
+        near = np.rint(found.points_px).astype(int).clip(0, side - 1)
+        inner = ((found.points_px >= _APRON_PX - 0.5) & (found.points_px < side - _APRON_PX - 0.5)).all(axis=1)
+        safe: Anything = cv2.erode(known.view(np.uint8), np.ones((31, 31), np.uint8))  # no corners of the map's rim
+        keep = inner & (safe[near[:, 1], near[:, 0]] > 0)
+        grid_px = apply_homography(np.linalg.inv(_level_from_grid(level)), found.points_px[keep] + [x, y])
+        return Features(found.kind, grid_px, found.descriptors[keep])
+
+
+def normalised(rgb: ImageRGB, known: Mask) -> ImageGray:
+    """Contrast-normalised gray of a picture with holes; the holes are even gray and throw no edges."""
+    gray = gray_from_rgb(rgb)
+    if known.all():
+        return normalise_contrast(gray)
+    gray = gray.copy()
+    gray[~known] = np.uint8(gray[known].mean()) if known.any() else 128
+    result = normalise_contrast(gray)
+    result[~known] = 128
+    return result
+
+
+def outline_on_grid(grid_from_image: Matrix3, width_px: int, height_px: int) -> PointsPx | None:
+    """(4, 2) the image's corners on the grid; None where one lies at or beyond the horizon."""
+    w, h = width_px - 0.5, height_px - 0.5
+    outline = apply_homography(grid_from_image, np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]]))
+    return outline if np.isfinite(outline).all() and np.abs(outline).max() < 1e9 else None
+
+
+def level_for(grid_from_image: Matrix3, width_px: int, height_px: int) -> int:
+    """The level of the map whose pixels are about as large on the ground as the image's, at its centre."""
+    centre = np.array([(width_px - 1) / 2, (height_px - 1) / 2, 1.0])
+    x, y, z = grid_from_image @ centre
+    linear = grid_from_image[:2, :2] / z - np.outer([x, y], grid_from_image[2, :2]) / z**2
+    return int(np.clip(np.rint(0.5 * np.log2(max(abs(np.linalg.det(linear)), 1e-12))), 0, 8))
+
+
+def _level_from_grid(level: int) -> Matrix3:
+    scale = 0.5**level
+    return np.array([[scale, 0.0, 0.5 * scale - 0.5], [0.0, scale, 0.5 * scale - 0.5], [0.0, 0.0, 1.0]])
+
+
+def _joined(parts: list[Features]) -> Features:
+    parts = [each for each in parts if len(each)]
+    if not parts:
+        return _NOTHING
+    return Features(
+        parts[0].kind, np.concatenate([each.points_px for each in parts]),
+        np.concatenate([each.descriptors for each in parts]),
+    )

@@ -1,0 +1,168 @@
+"""Frames laid over a map: from telemetry that errs, from the frames before, from nothing at all."""
+
+import cv2
+import numpy as np
+import pytest
+
+from sorvolo.change.alignment import Aligned, Aligner, NotAligned
+from sorvolo.change.reference import ReferenceMap, level_for
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.geodesy import Geodetic
+from sorvolo.geometry.grid import SiteGrid
+from sorvolo.geometry.homography import apply_homography, site_from_image_homography
+from sorvolo.geometry.pose import Pose
+from sorvolo.survey.flight import CameraPrior
+
+M_PER_PX = 0.05
+TILE_PX = 256
+CAMERA = Camera.from_angle_of_view(640, 360, 62.0)
+DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+def textured(side: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    total = np.zeros((side, side, 3), np.float32)
+    for octave in (3, 9, 27, 81):
+        small = rng.normal(0, 1, (side // octave + 2, side // octave + 2, 3)).astype(np.float32)
+        total += cv2.resize(small, (side, side), interpolation=cv2.INTER_CUBIC)
+    return np.clip(120 + 20 * total, 0, 255).astype(np.uint8)
+
+
+GROUND = textured(8 * TILE_PX, 5)  # 102 m square around the site's origin
+SITE_GRID = SiteGrid.at(Geodetic(0.0, 0.0), M_PER_PX, "", TILE_PX)
+
+
+@pytest.fixture
+def tiles() -> dict:
+    """The ground as a map; its north-east tile is a hole."""
+    found = {}
+    for row in range(8):
+        for column in range(8):
+            rgb = GROUND[row * TILE_PX:(row + 1) * TILE_PX, column * TILE_PX:(column + 1) * TILE_PX]
+            found[column - 4, row - 4] = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
+    del found[3, -4]
+    return found
+
+
+def site_from_ground() -> np.ndarray:
+    """GROUND's pixels to site metres."""
+    grid_from_ground = np.array([[1.0, 0, -4 * TILE_PX], [0, 1, -4 * TILE_PX], [0, 0, 1]])
+    return np.linalg.inv(SITE_GRID.grid_from_site_affine(np.zeros(2), 50.0)) @ grid_from_ground
+
+
+def turned(yaw_deg: float, tilt_deg: float = 0.0) -> np.ndarray:
+    a, b = np.radians([yaw_deg, tilt_deg])
+    yaw = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+    return yaw @ DOWN @ np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
+
+
+def photographed(pose: Pose, ground: np.ndarray = GROUND, gain: float = 1.0) -> np.ndarray:
+    image_from_ground = np.linalg.inv(site_from_image_homography(CAMERA, pose)) @ site_from_ground()
+    image = cv2.warpPerspective(
+        ground, image_from_ground, (CAMERA.width_px, CAMERA.height_px), flags=cv2.INTER_AREA,
+        borderMode=cv2.BORDER_REFLECT,
+    )
+    return np.clip(image * gain + np.random.default_rng(0).normal(0, 2, image.shape), 0, 255).astype(np.uint8)
+
+
+def prior_at(pose: Pose, off_m=(0.0, 0.0, 0.0), sigma_m: float = 2.0, attitude_deg: float = 1.0) -> CameraPrior:
+    return CameraPrior(
+        pose.translation_m + np.array(off_m), np.full(3, sigma_m), pose.rotation, np.full(3, attitude_deg)
+    )
+
+
+def error_px(found: Aligned, pose: Pose) -> float:
+    truth = site_from_image_homography(CAMERA, pose)
+    corners = CAMERA.corners_px
+    miss_m = apply_homography(found.site_from_image, corners) - apply_homography(truth, corners)
+    return float(np.linalg.norm(miss_m, axis=1).max() / (pose.translation_m[2] / CAMERA.fx_px))
+
+
+def aligner(tiles) -> Aligner:
+    return Aligner(ReferenceMap(tiles, SITE_GRID.grid), SITE_GRID)
+
+
+@pytest.mark.parametrize("off_m", [(0, 0, 0), (6, -5, 2), (-9, 9, -3)])
+@pytest.mark.parametrize("yaw_deg", [0, 90, 200])
+def test_telemetry_may_be_metres_off(tiles, off_m, yaw_deg):
+    pose = Pose(turned(yaw_deg, 3.0), np.array([4.0, -7.0, 30.0]))
+    found = aligner(tiles).align(photographed(pose, gain=0.7), CAMERA, prior_at(pose, off_m, 4.0), 0)
+    assert isinstance(found, Aligned)
+    assert not found.followed
+    assert error_px(found, pose) < 1.0
+    assert np.linalg.norm(found.camera_m - pose.translation_m) < 0.3
+    assert found.residual_px < 0.7
+
+
+def test_each_fit_foretells_the_next_although_fixes_jump(tiles):
+    along = aligner(tiles)
+    rng = np.random.default_rng(1)
+    followed = []
+    for k in range(8):
+        pose = Pose(turned(80.0 + 0.3 * k, rng.normal(0, 0.3)), np.array([-15.0 + 1.5 * k, 2.0, 30.0]))
+        found = along.align(photographed(pose), CAMERA, prior_at(pose, rng.normal(0, 3, 3), 3.0), k * 200_000_000)
+        assert isinstance(found, Aligned)
+        assert error_px(found, pose) < 1.0
+        followed.append(found.followed)
+    assert sum(followed) >= 6
+
+
+def test_another_height_and_flight_direction_fit(tiles):
+    pose = Pose(turned(300.0), np.array([0.0, 0.0, 55.0]))
+    found = aligner(tiles).align(photographed(pose), CAMERA, prior_at(pose, (2, 1, 0)), 0)
+    assert isinstance(found, Aligned)
+    assert error_px(found, pose) < 1.0
+
+
+def test_a_frame_without_telemetry_is_found_in_the_whole_map(tiles):
+    pose = Pose(turned(25.0), np.array([12.0, 9.0, 30.0]))
+    unknown = CameraPrior(np.zeros(3), np.full(3, np.inf), DOWN, np.full(3, np.inf))
+    found = aligner(tiles).align(photographed(pose), CAMERA, unknown, 0)
+    assert isinstance(found, Aligned)
+    assert error_px(found, pose) < 1.0
+
+
+def test_other_ground_does_not_fit_and_says_so(tiles):
+    pose = Pose(turned(0.0), np.array([0.0, 0.0, 30.0]))
+    found = aligner(tiles).align(photographed(pose, textured(8 * TILE_PX, 77)), CAMERA, prior_at(pose), 0)
+    assert isinstance(found, NotAligned)
+    assert not found.is_outside
+    assert found.reason
+
+
+def test_beyond_the_map_is_outside(tiles):
+    pose = Pose(turned(0.0), np.array([200.0, 0.0, 30.0]))
+    found = aligner(tiles).align(photographed(pose), CAMERA, prior_at(pose), 0)
+    assert isinstance(found, NotAligned)
+    assert found.is_outside
+
+
+def test_the_map_is_seen_as_the_camera_saw_it_and_holes_are_unknown(tiles):
+    reference = ReferenceMap(tiles, SITE_GRID.grid)
+    pose = Pose(turned(10.0), np.array([38.0, 38.0, 30.0]))
+    grid_from_image = SITE_GRID.grid_from_site_affine(np.zeros(2), 50.0) @ site_from_image_homography(CAMERA, pose)
+    seen, known = reference.seen_from(grid_from_image, CAMERA.width_px, CAMERA.height_px)
+    corner = apply_homography(grid_from_image, np.array([[0.0, 0.0], [320.0, 180.0]]))
+    assert 0.05 < known.mean() < 0.95
+    assert not seen[~known].any() or (seen[~known] <= 255).all()
+    inside = (corner[1] >= -4 * TILE_PX).all()
+    assert inside
+    image = photographed(pose)
+    difference = np.abs(seen.astype(int) - image)[cv2.erode(known.view(np.uint8), np.ones((5, 5))) > 0]
+    assert difference.mean() < 6
+
+
+@pytest.mark.parametrize(("scale", "level"), [(0.6, 0), (1.0, 0), (2.0, 1), (3.9, 2)])
+def test_a_coarse_view_reads_a_coarse_level(scale, level):
+    assert level_for(np.diag([scale, scale, 1.0]), 640, 360) == level
+
+
+def test_levels_lie_over_each_other(tiles):
+    reference = ReferenceMap(tiles, SITE_GRID.grid)
+    fine = np.array([[1.0, 0, -200], [0, 1, -152], [0, 0, 1]])
+    coarse = np.array([[4.0, 0, -200 + 1.5], [0, 4, -152 + 1.5], [0, 0, 1]])
+    large, _ = reference.seen_from(fine, 400, 320)
+    small, known = reference.seen_from(coarse, 100, 80)
+    assert known.all()
+    expected = cv2.resize(large, (100, 80), interpolation=cv2.INTER_AREA).astype(int)
+    assert np.abs(small.astype(int) - expected).mean() < 1.5
