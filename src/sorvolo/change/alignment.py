@@ -247,7 +247,7 @@ class Aligner:
         self, features: Features, old: Features, grid_from_image: Matrix3, search_px: float, site_from_image: Matrix3
     ) -> Matrix3 | None:
         """The guess corrected by matched features; `search_px` 0: wherever they lie."""
-        image_from_grid = np.linalg.inv(grid_from_image)
+        image_from_grid: Matrix3 = np.linalg.inv(grid_from_image).astype(np.float64)
         pairs = match(features, old, image_from_grid if search_px else None, search_px)
         if len(pairs) < self._settings.links.min_inliers // 2:
             return None

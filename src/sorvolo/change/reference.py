@@ -134,7 +134,7 @@ class ReferenceMap:
                 large[dy * side:(dy + 1) * side, dx * side:(dx + 1) * side] = child
         small: Anything = cv2.resize(large, (side, side), interpolation=cv2.INTER_AREA)
         small[small[..., 3] < 255] = 0  # half-known pixels are darkened by the unknown half
-        return small  # type: ignore[no-any-return]
+        return small
 
     def _block(self, level: int, index: TileIndex) -> Features:
         if (level, index) not in self._features:
