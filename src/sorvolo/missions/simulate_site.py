@@ -19,6 +19,7 @@ from sorvolo import __version__
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import utm_epsg
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.simulation.events import event_features
 from sorvolo.simulation.flight import SimulatedFlight, simulate_flights
 from sorvolo.simulation.ground import orthophoto_ground
 from sorvolo.simulation.settings import GEOID_HEIGHT_M, SimulationSettings
@@ -92,6 +93,8 @@ def simulate_site(
         yield SimulationProgress("truth", flight.name, len(flight), len(flight), time.monotonic() - started)
         features += frame_features(flight)
         _write_truth(flight, partial / "truth")
+        if flight.settings.imaging != settings.imaging:
+            write_camera(partial / flight.name / "camera.xml", flight.camera)
         if flight.number == 1:
             write_camera(partial / "camera.xml", flight.camera)
             _write_ground(flight, partial / "truth" / "ground.tif")
@@ -170,6 +173,8 @@ def _write_truth(flight: SimulatedFlight, folder: Path) -> None:
         (folder / flight.name).mkdir(parents=True)
     write_json(folder / flight.name / "boxes.json", coco_boxes(flight, sampled))
     if flight.number > 1:
+        events = feature_collection(event_features(flight), flight.site)
+        write_json(folder / flight.name / "events.geojson", events)
         changes = folder / flight.name / "changes"
         with writing(folder):
             changes.mkdir()

@@ -46,7 +46,7 @@ class _Imaging:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedFlight:
-    """A flight over a world whose every pose is known; `number` counts from 1.
+    """A flight over a world whose every pose is known; `number` counts from 1, `settings` have its own camera.
 
     With `settings.output.photos` its frames are photos at the wanted overlap, else a video's at the
     wanted rate.
@@ -226,13 +226,12 @@ def simulate_flights(
     ]
     world = build_world(settings, [planned_waypoints(plan) for plan in plans], orthophoto)
     for number, plan in enumerate(plans, start=1):
+        own = settings.of_flight(number)
         rng = np.random.default_rng([settings.seed, 5, number])
         path = fly(plan, settings.motion, rng)
-        day = build_day(world, settings, number, plan.height_m / settings.imaging.camera.fx_px)
-        imaging = _set_up(settings, path, rng)
-        yield SimulatedFlight(
-            settings, number, world, day, path, imaging, _observe_all(settings, path, number)
-        )
+        day = build_day(world, settings, number, plan.height_m / own.imaging.camera.fx_px)
+        imaging = _set_up(own, path, rng)
+        yield SimulatedFlight(own, number, world, day, path, imaging, _observe_all(own, path, number))
 
 
 def simulate_flight(settings: SimulationSettings, orthophoto: PaintedGround | None = None) -> SimulatedFlight:

@@ -113,8 +113,8 @@ def path_of_flight(path: PathSettings, later: LaterSettings, flight: int) -> Pat
     if flight == 1:
         return path
     return replace(
-        path, height_m=path.height_m * later.height_factor,
-        heading_deg=(path.heading_deg + later.heading_change_deg) % 360.0,
+        path, height_m=path.height_m * later.revisit.height_factor,
+        heading_deg=(path.heading_deg + later.revisit.heading_change_deg) % 360.0,
     )
 
 

@@ -2,7 +2,7 @@
 2.1-2.4)."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sorvolo.errors import SettingsError
 from sorvolo.simulation.settings import (
@@ -11,9 +11,11 @@ from sorvolo.simulation.settings import (
     MotionSettings,
     OutputSettings,
     PathSettings,
+    RevisitSettings,
     SceneSettings,
     SensorSettings,
     SimulationSettings,
+    WeatherSettings,
 )
 
 
@@ -90,6 +92,10 @@ _WITH_TELEMETRY = {
 }
 
 
+_COMPARE_LATER = LaterSettings(people=2, cars=1, small_objects=3, removed=3, moved=3)
+_WEATHER, _REVISIT = WeatherSettings(), RevisitSettings()
+
+
 def preset_names() -> tuple[str, ...]:
     """All presets, the general ones first."""
     return (*_GENERAL, *_dataset())
@@ -159,10 +165,62 @@ def _survey(ground: str, name: str) -> SimulationSettings:
     )
 
 
+def _compare(name: str, ground: str = "countryside", later: LaterSettings | None = None) -> SimulationSettings:
+    """Two short video flights over the same path: things added, taken away, moved and moving, in other weather."""
+    return SimulationSettings(
+        preset=name,
+        scene=SceneSettings(ground, people=3, cars=2, small_objects=5),
+        # 24 m and 62 degrees give 0.022 m a pixel: a person is some 20 pixels wide
+        path=PathSettings(height_m=24, speed_m_s=5, length_m=45, strips=2, strip_spacing_m=12),
+        imaging=ImagingSettings(*_HD, fps=30),
+        sensor=SensorSettings(noise_m=(0.5, 0.5, 0.5)),
+        later=later or _COMPARE_LATER,
+        # views are taken about five times a second: every sixth frame
+        output=OutputSettings(truth_step=3),
+    )
+
+
+def _compare_photos(name: str, ground: str = "countryside") -> SimulationSettings:
+    """Two survey flights by photos, each place of the ground in four or more of them."""
+    return SimulationSettings(
+        preset=name,
+        scene=SceneSettings(ground, people=4, cars=3, small_objects=6),
+        path=PathSettings(height_m=36, speed_m_s=6, length_m=70, strips=3, strip_spacing_m=17),
+        imaging=ImagingSettings(1600, 1200, fps=5),
+        sensor=SensorSettings(noise_m=(0.5, 0.5, 0.5)),
+        later=replace(_COMPARE_LATER, people=3, small_objects=4),
+        output=OutputSettings(photos=True, photo_overlap=0.75),
+    )
+
+
+def _compare_unlike(
+    name: str, weather: WeatherSettings = _WEATHER, revisit: RevisitSettings = _REVISIT
+) -> SimulationSettings:
+    """The flights of `compare`, shorter, the second one in a way that makes comparing hard or impossible."""
+    settings = _compare(name, later=replace(_COMPARE_LATER, weather=weather, revisit=revisit))
+    return replace(
+        settings, path=replace(settings.path, length_m=25), imaging=replace(settings.imaging, fps=10),
+        output=replace(settings.output, truth_step=2),
+    )
+
+
 _GENERAL: Mapping[str, Callable[[], SimulationSettings]] = {
     "demo": _demo,
     "survey": lambda: _survey("countryside", "survey"),
     "survey-urban": lambda: _survey("urban", "survey-urban"),
     "survey-dirt": lambda: _survey("dirt", "survey-dirt"),
     "sand": lambda: _survey("sand", "sand"),
+    "compare": lambda: _compare("compare"),
+    "compare-urban": lambda: _compare("compare-urban", "urban"),
+    "compare-dirt": lambda: _compare("compare-dirt", "dirt"),
+    "compare-photos": lambda: _compare_photos("compare-photos"),
+    "compare-higher": lambda: _compare_unlike("compare-higher", revisit=RevisitSettings(height_factor=1.5)),
+    "compare-across": lambda: _compare_unlike("compare-across", revisit=RevisitSettings(heading_change_deg=90)),
+    "compare-back": lambda: _compare_unlike("compare-back", revisit=RevisitSettings(heading_change_deg=180)),
+    "compare-camera": lambda: _compare_unlike(
+        "compare-camera",
+        revisit=RevisitSettings(imaging=ImagingSettings(1920, 1080, 74.0, (-0.02, 0.01, 0.0, 0.0, 0.0), fps=10)),
+    ),
+    "compare-night": lambda: _compare_unlike("compare-night", WeatherSettings(has_clouds=False, brightness=0.06)),
+    "compare-snow": lambda: _compare_unlike("compare-snow", WeatherSettings(has_clouds=False, snow=1.0)),
 }

@@ -1,6 +1,6 @@
 """What a simulation can be asked for: one small record per part, each checked at birth."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -147,27 +147,50 @@ class SensorSettings:
 
 
 @dataclass(frozen=True)
+class WeatherSettings:
+    """The day of a later flight: its light and what the weather did to the ground."""
+
+    has_other_light: bool = True  # another sun, another colour and strength of the light
+    has_clouds: bool = True
+    wind_m: float = 0.03  # how far crowns and grass have moved
+    brightness: float = 1.0  # of all light; a night under street lamps has about 0.06
+    snow: float = 0.0  # share of the ground that lies under snow
+
+    def __post_init__(self) -> None:
+        _demand("wind_m", self.wind_m, 0, 2)
+        _demand("brightness", self.brightness, 0, 3)
+        _demand("snow", self.snow, 0, 1)
+
+
+@dataclass(frozen=True)
+class RevisitSettings:
+    """How a later flight is flown other than the first: higher, in another direction, by another camera."""
+
+    height_factor: float = 1.0
+    heading_change_deg: float = 0.0
+    imaging: ImagingSettings | None = None  # None: the first flight's own camera
+
+    def __post_init__(self) -> None:
+        _demand("height_factor", self.height_factor, 0.3, 3)
+        _demand("heading_change_deg", self.heading_change_deg, -360, 360)
+
+
+@dataclass(frozen=True)
 class LaterSettings:
-    """How a later flight differs from the first: what came, and how many of the first flight's targets
-    left or moved."""
+    """How a later flight differs from the first: what came, how many of the first flight's targets left or moved."""
 
     people: int = 1
     cars: int = 1
     small_objects: int = 2
     removed: int = 2
     moved: int = 2
-    has_clouds: bool = True
-    has_other_light: bool = True
-    wind_m: float = 0.03  # how far crowns and grass have moved
-    height_factor: float = 1.0
-    heading_change_deg: float = 0.0
+    weather: WeatherSettings = field(default_factory=WeatherSettings)
+    revisit: RevisitSettings = field(default_factory=RevisitSettings)
 
     def __post_init__(self) -> None:
         _demand(
             "changes", min(self.people, self.cars, self.small_objects, self.removed, self.moved), 0, 10000
         )
-        _demand("wind_m", self.wind_m, 0, 2)
-        _demand("height_factor", self.height_factor, 0.3, 3)
 
 
 @dataclass(frozen=True)
@@ -221,6 +244,11 @@ class SimulationSettings:
     def m_per_px(self) -> float:
         """Ground sampling distance of the planned first flight."""
         return self.path.height_m / self.imaging.camera.fx_px
+
+    def of_flight(self, flight: int) -> "SimulationSettings":
+        """These settings with the camera of one flight, counted from 1."""
+        other = self.later.revisit.imaging
+        return self if flight == 1 or other is None else replace(self, imaging=other)
 
 
 def _demand(name: str, value: float, low: float, high: float) -> None:

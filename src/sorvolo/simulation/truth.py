@@ -22,7 +22,9 @@ from sorvolo.simulation.world import World
 CATEGORIES = (Label.PERSON, Label.CAR, Label.SMALL)
 """The COCO categories; their ids count from 1."""
 
-_DEGREE_DECIMALS = 11  # a micrometre
+DEGREE_DECIMALS = 11
+"""Of longitudes and latitudes in truth files: a micrometre."""
+
 _FEWEST_PX = 4  # less of an object is no answer to anything
 
 
@@ -42,8 +44,8 @@ def frame_features(flight: SimulatedFlight) -> list[dict[str, Any]]:
             "flight": flight.name,
             "frame": flight.frame_name(index) if flight.settings.output.photos else index,
             "time": iso_time(int(flight.frame_times_ns[index])),
-            "camera_longitude_deg": round(float(longitudes[index]), _DEGREE_DECIMALS),
-            "camera_latitude_deg": round(float(latitudes[index]), _DEGREE_DECIMALS),
+            "camera_longitude_deg": round(float(longitudes[index]), DEGREE_DECIMALS),
+            "camera_latitude_deg": round(float(latitudes[index]), DEGREE_DECIMALS),
             "camera_height_m": round(float(heights[index]), 6),
             "height_above_ground_m": round(float(pose.translation_m[2]), 6),
             "camera_yaw_deg": round(yaw, 6),
@@ -55,7 +57,7 @@ def frame_features(flight: SimulatedFlight) -> list[dict[str, Any]]:
         }
         outline = footprint(flight.camera, pose)
         features.append({
-            "type": "Feature", "geometry": _polygon(outline, flight.site), "properties": properties,
+            "type": "Feature", "geometry": polygon_geometry(outline, flight.site), "properties": properties,
         })
     return features
 
@@ -71,7 +73,7 @@ def object_features(world: World, site: LocalFrame) -> list[dict[str, Any]]:
     for thing, flights in first_seen.values():
         features.append({
             "type": "Feature",
-            "geometry": _polygon(thing.footprint_m(), site),
+            "geometry": polygon_geometry(thing.footprint_m(), site),
             "properties": {
                 "id": thing.id, "class": str(thing.label), "subtype": thing.kind,
                 "height_m": round(thing.size_m[2], 4), "length_m": round(thing.size_m[0], 4),
@@ -197,10 +199,11 @@ def _picture_name(flight: SimulatedFlight, index: int) -> str:
 
 
 def _degrees_or_null(value: float) -> float | None:
-    return round(float(value), _DEGREE_DECIMALS) if np.isfinite(value) else None
+    return round(float(value), DEGREE_DECIMALS) if np.isfinite(value) else None
 
 
-def _polygon(outline_m: PointsM, site: LocalFrame) -> dict[str, Any] | None:
+def polygon_geometry(outline_m: PointsM, site: LocalFrame) -> dict[str, Any] | None:
+    """A ring of ground points, (N, 2), as a GeoJSON polygon in WGS84; None where a point is not known."""
     if not np.isfinite(outline_m).all():
         return None
     latitude, longitude, _ = site.wgs84_from_site(outline_m)
@@ -208,5 +211,5 @@ def _polygon(outline_m: PointsM, site: LocalFrame) -> dict[str, Any] | None:
     closed = np.vstack([ring, ring[:1]])
     return {
         "type": "Polygon",
-        "coordinates": [[[round(float(c), _DEGREE_DECIMALS) for c in p] for p in closed]],
+        "coordinates": [[[round(float(c), DEGREE_DECIMALS) for c in p] for p in closed]],
     }

@@ -13,7 +13,7 @@ from sorvolo.simulation.canvas import Area, GroundRaster
 from sorvolo.simulation.ground import GroundKind, Layout, PaintedGround, paint_ground
 from sorvolo.simulation.noise import fractal
 from sorvolo.simulation.objects import SMALL_KINDS, Body, Label, Light, Thing, new_kind, new_size
-from sorvolo.simulation.settings import SceneSettings, SimulationSettings
+from sorvolo.simulation.settings import SceneSettings, SimulationSettings, WeatherSettings
 from sorvolo.simulation.view import Patch, View, blend, map_view, sample_patches
 
 _LARGEST_GROUND_PX = 26e6
@@ -57,19 +57,23 @@ class Day:
 def needed_area(settings: SimulationSettings, waypoints_m: Floats, margin_m: float = 4.0) -> Area:
     """The ground that can come into sight when flying these waypoints, all flights' height and tilt
     included."""
+    margin_m += 4 * settings.motion.drift_rms_m
+    reach_m = margin_m + max(_reach_m(settings.of_flight(flight), flight) for flight in (1, 2))
+    low, high = waypoints_m.min(axis=0) - reach_m, waypoints_m.max(axis=0) + reach_m
+    return Area(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+
+
+def _reach_m(settings: SimulationSettings, flight: int) -> float:
+    """How far from the point below it the camera of a flight may see the ground."""
     camera = settings.imaging.camera
-    height_m = (
-        settings.path.height_m * max(1.0, settings.later.height_factor) + 4 * settings.motion.height_rms_m
-    )
+    height_factor = 1.0 if flight == 1 else settings.later.revisit.height_factor
+    height_m = settings.path.height_m * height_factor + 4 * settings.motion.height_rms_m
     across = 0.5 * camera.width_px / camera.fx_px, 0.5 * camera.height_px / camera.fy_px
     # barrel distortion shows more than the pinhole's angle: its rays are the truth
     corner = np.abs(camera.rays_from_pixels(camera.corners_px)[:, :2]).max(axis=0)
     half_angle = np.arctan(float(np.hypot(max(across[0], corner[0]), max(across[1], corner[1]))))
     tilt = np.radians(4.5 * settings.motion.tilt_rms_deg + settings.motion.camera_pitch_deg + 90)
-    reach_m = height_m * float(np.tan(min(half_angle + tilt, np.radians(80))))
-    reach_m += 4 * settings.motion.drift_rms_m + margin_m
-    low, high = waypoints_m.min(axis=0) - reach_m, waypoints_m.max(axis=0) + reach_m
-    return Area(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    return height_m * float(np.tan(min(half_angle + tilt, np.radians(80))))
 
 
 def build_world(
@@ -107,7 +111,8 @@ def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px:
     """The site as one flight, counted from 1, finds it, fine enough for pictures of `m_per_px` on the
     ground."""
     rng = np.random.default_rng([settings.seed, 3, flight])
-    is_other = flight > 1 and settings.later.has_other_light
+    weather = settings.later.weather if flight > 1 else WeatherSettings(False, False, 0.0)
+    is_other = weather.has_other_light
     azimuth = np.radians(rng.uniform(0, 360) if is_other else 215.0)
     elevation = np.radians(rng.uniform(28, 62) if is_other else 48.0)
     light = Light(np.array([
@@ -115,9 +120,12 @@ def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px:
     ]))
     warmth = rng.uniform(-0.06, 0.06) if is_other else 0.0
     gains = np.array([1 + warmth, 1.0, 1 - warmth]) * (rng.uniform(0.82, 1.12) if is_other else 1.0)
+    gains = gains * weather.brightness
     things = world.days[flight - 1]
     ground = world.ground.resampled(0.72 * m_per_px)
-    wind_m = settings.later.wind_m if flight > 1 else 0.0
+    if weather.snow:
+        ground = _snowed_in(ground, weather.snow, np.random.default_rng([settings.seed, 9, flight]))
+    wind_m = weather.wind_m
     if wind_m:
         ground = _blown(ground, wind_m, rng)
         things = tuple(
@@ -130,7 +138,7 @@ def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px:
     shadows = {
         thing.id: _own_shadow(thing, bodies[thing.id], light, m_per_px) for thing in things if thing.is_moving
     }
-    cloud_shade = 0.38 if flight > 1 and settings.later.has_clouds else 0.0
+    cloud_shade = 0.38 if weather.has_clouds else 0.0
     return Day(ground, things, bodies, shadows, light, gains, cloud_shade)
 
 
@@ -286,6 +294,17 @@ def _blown(ground: GroundRaster, wind_m: float, rng: np.random.Generator) -> Gro
             borderMode=cv2.BORDER_REPLICATE,
         )
     return replace(ground, rgb=moved)
+
+
+def _snowed_in(ground: GroundRaster, share: float, rng: np.random.Generator) -> GroundRaster:
+    """The ground with snow on about this share of it, almost without texture; what stands on it stays bare."""
+    shape = ground.rgb.shape[:2]
+    drifts = fractal(rng, shape, ground.m_per_px[0], (0.5, 2.0, 6.0), (0.4, 0.8, 1.0))
+    depth = np.clip(0.5 + 2.0 * (drifts - np.float32(np.quantile(drifts, 1 - share))), 0, 1) if share < 1 else 1.0
+    white = 226 + 5 * fractal(rng, shape, ground.m_per_px[0], (0.05, 0.3, 1.5), (0.6, 0.8, 1.0))
+    cover = np.broadcast_to(np.float32(depth), shape)[..., None]
+    rgb = ground.rgb * (1 - cover) + white[..., None] * cover
+    return replace(ground, rgb=np.clip(rgb, 0, 255).astype(np.uint8))
 
 
 def _with_shadows(
