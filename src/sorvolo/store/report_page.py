@@ -1,16 +1,27 @@
 """The flight report as one page of HTML that needs no other file, no network and no script."""
 
-import base64
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from html import escape
+from collections.abc import Mapping
 from typing import Any
 
-import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, ImageRGBA
-from sorvolo.store.images import shrink
+from sorvolo.geometry.arrays import ImageRGBA
+from sorvolo.store.page_parts import (
+    area_words,
+    at,
+    bullet_list,
+    escaped,
+    finite_or_none,
+    join_words,
+    length_words,
+    number_at,
+    page_of,
+    picture_uri,
+    seconds_words,
+    table_of,
+    with_unit,
+)
 from sorvolo.store.report_plots import (
     TrackColumns,
     gps_along,
@@ -22,8 +33,6 @@ from sorvolo.store.report_plots import (
 from sorvolo.store.report_style import STYLE
 from sorvolo.survey.mosaic import Status
 
-_MOST_PICTURE_BYTES = 1_450_000  # base64 makes four bytes of three: below 2 MB in the page
-_BACKGROUND = 236.0  # of what was never seen, a light grey
 _TRACK_NUMBERS = (
     "east_m", "north_m", "up_m", "residual_px", "sigma_m", "gps_east_m", "gps_north_m", "gps_up_m",
 )
@@ -59,33 +68,27 @@ def report_page(report: Mapping[str, Any], picture: ImageRGBA) -> str:
         _effort(report),
         _settings(report),
     ]
-    title = f"{_text(report.get('flight'))} - flight report"
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{title}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<main>\n"
-        + "\n".join(part for part in body if part)
-        + "\n</main>\n</body>\n</html>\n"
-    )
+    title = f"{escaped(report.get('flight'))} - flight report"
+    return page_of(title, STYLE, body)
 
 
 def _header(report: Mapping[str, Any]) -> str:
-    inputs = [_text(each) for each in _at(report, "inputs") or []]
+    inputs = [escaped(each) for each in at(report, "inputs") or []]
     named = ", ".join(inputs[:3]) + (f" and {len(inputs) - 3} more" if len(inputs) > 3 else "")
     return (
-        f'<header><p class="over">Flight <b>{_text(report.get("flight"))}</b> on the site '
-        f'<b>{_text(report.get("site"))}</b>{": " + named if named else ""}</p>'
+        f'<header><p class="over">Flight <b>{escaped(report.get("flight"))}</b> on the site '
+        f'<b>{escaped(report.get("site"))}</b>{": " + named if named else ""}</p>'
         f"<h1>{_headline(report)}</h1><p>{_second_sentence(report)}</p></header>"
     )
 
 
 def _headline(report: Mapping[str, Any]) -> str:
     vision, blind, rejected = (_count(report, status) for status in Status)
-    selected = int(_at(report, "frames", "selected") or 0)
+    selected = int(at(report, "frames", "selected") or 0)
     place = ""
     if report.get("georeferenced"):
-        area, gsd = _area(_number(report, "area_m2")), _number(report, "ground_sampling_distance_m")
-        place = f" of {area}" + (f" at {_length(gsd)} a pixel" if gsd is not None else "")
+        area, gsd = area_words(number_at(report, "area_m2")), number_at(report, "ground_sampling_distance_m")
+        place = f" of {area}" + (f" at {length_words(gsd)} a pixel" if gsd is not None else "")
     if not vision + blind:
         return f"None of {selected} selected frames could be placed: there is no map of this flight."
     if vision == selected:
@@ -101,23 +104,23 @@ def _second_sentence(report: Mapping[str, Any]) -> str:
             "The flight has no GPS: the map lies in a frame of its own, without metres and without north, "
             "and cannot be laid over other maps."
         )
-    sigma, gps = _number(report, "sigma_m"), _number(report, "gps_residual_m", "median")
+    sigma, gps = number_at(report, "sigma_m"), number_at(report, "gps_residual_m", "median")
     parts = []
     if sigma is not None:
         parts.append(
-            f"The map lies in its place to {_length(sigma)} (one sigma), what all its GPS fixes may err in common "
+            f"The map lies in its place to {length_words(sigma)} (one sigma), what all its GPS fixes may err in common "
             "included."
         )
     if gps is not None:
-        parts.append(f"The cameras lie {_length(gps)} from their GPS fixes (median).")
+        parts.append(f"The cameras lie {length_words(gps)} from their GPS fixes (median).")
     return " ".join(parts)
 
 
 def _warnings(report: Mapping[str, Any]) -> str:
-    warnings = _at(report, "warnings") or []
+    warnings = at(report, "warnings") or []
     if not warnings:
         return ""
-    items = _list(_text(each) for each in warnings)
+    items = bullet_list(escaped(each) for each in warnings)
     return f'<section class="warn"><h2>Look at this first</h2>{items}</section>'
 
 
@@ -126,7 +129,7 @@ def _picture(report: Mapping[str, Any], picture: ImageRGBA) -> str:
         return ""
     height_px, width_px = picture.shape[:2]
     bar, caption = "", "The map. Grey was never seen."
-    area_m2 = _number(report, "area_m2")
+    area_m2 = number_at(report, "area_m2")
     if report.get("georeferenced") and area_m2:
         caption = "The map, north up. Grey was never seen."
         # the report does not say how much the picture was shrunk, but what area its seen pixels cover
@@ -134,57 +137,44 @@ def _picture(report: Mapping[str, Any], picture: ImageRGBA) -> str:
         length_m = round_length(width_m / 4)
         bar = f'<div class="scale" style="width:{100 * length_m / width_m:.2f}%">{length_m:g} m</div>'
     return (
-        f'<figure class="map"><div class="frame"><img src="{_picture_uri(picture)}" width="{width_px}" '
+        f'<figure class="map"><div class="frame"><img src="{picture_uri(picture)}" width="{width_px}" '
         f'height="{height_px}" alt="The map">{bar}</div><figcaption>{caption}</figcaption></figure>'
     )
 
 
-def _picture_uri(picture: ImageRGBA) -> str:
-    """The picture as a JPEG on grey inside an address, below the size that a page can carry."""
-    small = picture
-    while True:
-        alpha = small[..., 3:].astype(np.float32) / 255
-        flat: Anything = np.round(small[..., 2::-1] * alpha + _BACKGROUND * (1 - alpha)).astype(np.uint8)
-        for quality in (88, 75):
-            _, data = cv2.imencode(".jpg", flat, [cv2.IMWRITE_JPEG_QUALITY, quality])
-            if len(data) <= _MOST_PICTURE_BYTES:
-                return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
-        small = shrink(small, max(1, small.shape[1] // 2), max(1, small.shape[0] // 2))
-
-
 def _key_figures(report: Mapping[str, Any]) -> str:
     unit = _unit(report)
-    cpu_s = _number(report, "registration_cpu_s_per_keyframe")
+    cpu_s = number_at(report, "registration_cpu_s_per_keyframe")
     figures = [
-        ("by vision", f"{_count(report, Status.VISION)} of {_at(report, 'frames', 'selected') or 0}",
-         f"frames selected from {_at(report, 'frames', 'total') or 'an unknown number'}"),
-        ("area", _area(_number(report, "area_m2")) if unit == "m" else None, "seen by at least one frame"),
-        ("a pixel", _length(_number(report, "ground_sampling_distance_m")) if unit == "m" else None,
+        ("by vision", f"{_count(report, Status.VISION)} of {at(report, 'frames', 'selected') or 0}",
+         f"frames selected from {at(report, 'frames', 'total') or 'an unknown number'}"),
+        ("area", area_words(number_at(report, "area_m2")) if unit == "m" else None, "seen by at least one frame"),
+        ("a pixel", length_words(number_at(report, "ground_sampling_distance_m")) if unit == "m" else None,
          "of the map on the ground; pictures: "
-         + (_length(_number(report, "native_ground_sampling_distance_m")) or "unknown")),
-        ("residual", _with_unit("{:.2f} px", _number(report, "residual_px", "median")),
+         + (length_words(number_at(report, "native_ground_sampling_distance_m")) or "unknown")),
+        ("residual", with_unit("{:.2f} px", number_at(report, "residual_px", "median")),
          "median misfit of a frame to its neighbours; 95 % below "
-         + (_with_unit("{:.2f} px", _number(report, "residual_px", "p95")) or "unknown")),
-        ("GPS", _length(_number(report, "gps_residual_m", "median")) if unit == "m" else None,
+         + (with_unit("{:.2f} px", number_at(report, "residual_px", "p95")) or "unknown")),
+        ("GPS", length_words(number_at(report, "gps_residual_m", "median")) if unit == "m" else None,
          "median distance of cameras and fixes, level; rms "
-         + (_length(_number(report, "gps_residual_m", "rms")) or "unknown")),
-        ("in its place to", _length(_number(report, "sigma_m")) if unit == "m" else None,
+         + (length_words(number_at(report, "gps_residual_m", "rms")) or "unknown")),
+        ("in its place to", length_words(number_at(report, "sigma_m")) if unit == "m" else None,
          "one sigma, what all GPS fixes may err in common included"),
         ("flown at",
-         _with_unit("{:.1f} m", _number(report, "height_above_ground_m")) if unit == "m" else None,
+         with_unit("{:.1f} m", number_at(report, "height_above_ground_m")) if unit == "m" else None,
          "above the ground, median"),
-        ("took", _seconds(_number(report, "seconds", "total")),
+        ("took", seconds_words(number_at(report, "seconds", "total")),
          (f"{1000 * cpu_s:.0f} ms CPU a frame to find its place" if cpu_s is not None else "in all")),
     ]
     tiles = "".join(
-        f'<div><dt>{name}</dt><dd>{_text(value)}</dd><p>{_text(words)}</p></div>'
+        f'<div><dt>{name}</dt><dd>{escaped(value)}</dd><p>{escaped(words)}</p></div>'
         for name, value, words in figures if value
     )
     return f'<dl class="figures">{tiles}</dl>'
 
 
 def _frames(report: Mapping[str, Any]) -> str:
-    selected = max(1, int(_at(report, "frames", "selected") or 0))
+    selected = max(1, int(at(report, "frames", "selected") or 0))
     bar = "".join(
         f'<span class="{status}" style="width:{100 * _count(report, status) / selected:.2f}%"></span>'
         for status in Status
@@ -193,14 +183,14 @@ def _frames(report: Mapping[str, Any]) -> str:
         (f'<i class="key {status}"></i>{status}', str(_count(report, status)), words)
         for status, words in _STATUS_WORDS.items()
     ]
-    reasons = _at(report, "frames", "reasons") or {}
+    reasons = at(report, "frames", "reasons") or {}
     why = ""
     if reasons:
-        table = _table([(str(count), _text(reason)) for reason, count in reasons.items()], ("frames", "why"))
+        table = table_of([(str(count), escaped(reason)) for reason, count in reasons.items()], ("frames", "why"))
         why = f"<h3>Reasons and remarks</h3>{table}"
     return (
         f'<section><h2>What became of the frames</h2><div class="shares">{bar}</div>'
-        f'{_table(rows, ("status", "frames", "meaning"))}{why}</section>'
+        f'{table_of(rows, ("status", "frames", "meaning"))}{why}</section>'
     )
 
 
@@ -235,107 +225,107 @@ def _plots(report: Mapping[str, Any], track: TrackColumns) -> str:
 
 
 def _camera_and_telemetry(report: Mapping[str, Any]) -> str:
-    camera, telemetry = _at(report, "camera") or {}, _at(report, "telemetry") or {}
+    camera, telemetry = at(report, "camera") or {}, at(report, "telemetry") or {}
     unit = _unit(report)
-    found_sigma = _number(report, "camera", "focal_found_sigma_relative")
-    distortion = _at(report, "camera", "distortion_k1_k2_p1_p2_k3") or []
+    found_sigma = number_at(report, "camera", "focal_found_sigma_relative")
+    distortion = at(report, "camera", "distortion_k1_k2_p1_p2_k3") or []
     rows = [
         ("camera", camera.get("origin")),
         ("picture", f"{camera.get('width_px')} x {camera.get('height_px')} px"),
-        ("focal length", _join(
-            _with_unit("{:.1f} px", _number(report, "camera", "focal_px")),
-            _within(_number(report, "camera", "focal_sigma_relative")),
+        ("focal length", join_words(
+            with_unit("{:.1f} px", number_at(report, "camera", "focal_px")),
+            _within(number_at(report, "camera", "focal_sigma_relative")),
         )),
-        ("focal length found", _join(
-            _with_unit("{:.1f} px", _number(report, "camera", "focal_found_px")), _within(found_sigma)
+        ("focal length found", join_words(
+            with_unit("{:.1f} px", number_at(report, "camera", "focal_found_px")), _within(found_sigma)
         )),
         ("distortion k1 k2 p1 p2 k3", "  ".join(f"{each:.4g}" for each in distortion if each is not None)),
         ("distortion found besides",
-         _with_unit("{:+.4f} (radial)", _number(report, "camera", "radial_found"))),
+         with_unit("{:+.4f} (radial)", number_at(report, "camera", "radial_found"))),
         ("telemetry",
-         _join(telemetry.get("format"), _with_unit("with {:.0f} samples", telemetry.get("samples")))),
+         join_words(telemetry.get("format"), with_unit("with {:.0f} samples", telemetry.get("samples")))),
         ("tied to the frames by", telemetry.get("tie")),
         ("height from", telemetry.get("height")),
         ("attitude from", telemetry.get("attitude")),
         ("clock offset", _clock_offset(report)),
-        ("altitude offset found", _with_unit("{:+.2f} " + unit, _number(report, "altitude_offset_m"))),
-        ("relief seen", _with_unit("{:.2f} " + unit, _number(report, "relief_m"))),
-        ("links between frames", _join(
-            _with_unit("{:.0f} kept,", _number(report, "links", "kept")),
-            _with_unit("{:.0f} dropped as false", _number(report, "links", "dropped_as_false")),
+        ("altitude offset found", with_unit("{:+.2f} " + unit, number_at(report, "altitude_offset_m"))),
+        ("relief seen", with_unit("{:.2f} " + unit, number_at(report, "relief_m"))),
+        ("links between frames", join_words(
+            with_unit("{:.0f} kept,", number_at(report, "links", "kept")),
+            with_unit("{:.0f} dropped as false", number_at(report, "links", "dropped_as_false")),
         )),
-        ("brightness differences left", _with_unit("{:.1%}", _number(report, "colour_spread"))),
+        ("brightness differences left", with_unit("{:.1%}", number_at(report, "colour_spread"))),
     ]
-    known = [(name, _text(value)) for name, value in rows if value not in (None, "", "none")]
-    return f"<section><h2>Camera, telemetry and clocks</h2>{_table(known)}</section>"
+    known = [(name, escaped(value)) for name, value in rows if value not in (None, "", "none")]
+    return f"<section><h2>Camera, telemetry and clocks</h2>{table_of(known)}</section>"
 
 
 def _clock_offset(report: Mapping[str, Any]) -> str:
-    origin, applied = _at(report, "time_offset", "origin"), _number(report, "time_offset", "applied_s")
-    estimate, sigma = _number(report, "time_offset", "estimate_s"), _number(report, "time_offset", "sigma_s")
+    origin, applied = at(report, "time_offset", "origin"), number_at(report, "time_offset", "applied_s")
+    estimate, sigma = number_at(report, "time_offset", "estimate_s"), number_at(report, "time_offset", "sigma_s")
     nothing = origin in (None, "none") or applied is None
     words = "none applied" if nothing else f"{applied:+.3f} s applied, {origin}"
     if estimate is not None:
         words += f"; motion shows {estimate:+.3f} s" + (f" \u00b1 {sigma:.3f} s" if sigma is not None else "")
-    before, after = _number(report, "time_offset", "rms_at_zero_m"), _number(report, "time_offset", "rms_m")
+    before, after = number_at(report, "time_offset", "rms_at_zero_m"), number_at(report, "time_offset", "rms_m")
     if before is not None and after is not None:
         words += f" (path against GPS: {before:.2f} m rms without it, {after:.2f} m with it)"
     return words
 
 
 def _notices(report: Mapping[str, Any]) -> str:
-    notices = _at(report, "notices") or []
+    notices = at(report, "notices") or []
     if not notices:
         return ""
-    rows = [(_text(each.get("count")), _text(each.get("text")), f"<code>{_text(each.get('code'))}</code>")
+    rows = [(escaped(each.get("count")), escaped(each.get("text")), f"<code>{escaped(each.get('code'))}</code>")
             for each in notices]
     return (
         "<section><h2>Found, counted and survived</h2>"
-        + _table(rows, ("times", "what", "code")) + "</section>"
+        + table_of(rows, ("times", "what", "code")) + "</section>"
     )
 
 
 def _effort(report: Mapping[str, Any]) -> str:
-    wall, cpu = _at(report, "seconds") or {}, _at(report, "cpu_s") or {}
-    stages = {name: _float(value) for name, value in wall.items() if name != "total"}
-    total = _float(wall.get("total")) or 0.0
+    wall, cpu = at(report, "seconds") or {}, at(report, "cpu_s") or {}
+    stages = {name: finite_or_none(value) for name, value in wall.items() if name != "total"}
+    total = finite_or_none(wall.get("total")) or 0.0
     spent = sum(each or 0.0 for each in stages.values())
     longest = max([total - spent, *(each or 0.0 for each in stages.values()), 1e-9])
-    rows = [(_STAGE_WORDS.get(name, name), each, _float(cpu.get(name))) for name, each in stages.items()]
+    rows = [(_STAGE_WORDS.get(name, name), each, finite_or_none(cpu.get(name))) for name, each in stages.items()]
     if total > spent:
         rows.append(("reading frames, and the rest", total - spent, None))
-    table = _table(
+    table = table_of(
         [
-            (_text(name), f'<div class="bar" style="width:{100 * (each or 0) / longest:.1f}%"></div>',
-             _seconds(each), _seconds(cpu_s) if cpu_s is not None else "")
+            (escaped(name), f'<div class="bar" style="width:{100 * (each or 0) / longest:.1f}%"></div>',
+             seconds_words(each), seconds_words(cpu_s) if cpu_s is not None else "")
             for name, each, cpu_s in rows
         ],
         ("stage", "", "time", "CPU"),
     )
     sums = ", ".join(part for part in (
-        f"{_seconds(total)} in all",
-        _join(_seconds(_float(cpu.get("total"))), "of CPU") if cpu.get("total") is not None else "",
-        _with_unit("at most {:.0f} MB of memory", _number(report, "peak_memory_mb")) or "",
+        f"{seconds_words(total)} in all",
+        join_words(seconds_words(finite_or_none(cpu.get("total"))), "of CPU") if cpu.get("total") is not None else "",
+        with_unit("at most {:.0f} MB of memory", number_at(report, "peak_memory_mb")) or "",
     ) if part)
-    return f"<section><h2>Time and memory</h2>{table}<p class='note'>{_text(sums)}</p></section>"
+    return f"<section><h2>Time and memory</h2>{table}<p class='note'>{escaped(sums)}</p></section>"
 
 
 def _settings(report: Mapping[str, Any]) -> str:
-    chosen = [(_text(name), _text("as the flight gives it" if value is None else value))
-              for name, value in (_at(report, "settings") or {}).items()]
-    versions = {"sorvolo": report.get("sorvolo"), **(_at(report, "versions") or {})}
-    made = [(_text(name), _text(value)) for name, value in versions.items()]
+    chosen = [(escaped(name), escaped("as the flight gives it" if value is None else value))
+              for name, value in (at(report, "settings") or {}).items()]
+    versions = {"sorvolo": report.get("sorvolo"), **(at(report, "versions") or {})}
+    made = [(escaped(name), escaped(value)) for name, value in versions.items()]
     return (
         '<section><h2>Settings and versions</h2><div class="pair">'
-        f'{_table(chosen, ("setting", "value"))}{_table(made, ("software", "version"))}</div></section>'
+        f'{table_of(chosen, ("setting", "value"))}{table_of(made, ("software", "version"))}</div></section>'
     )
 
 
 def _track(report: Mapping[str, Any]) -> TrackColumns:
-    rows = _at(report, "track") or []
+    rows = at(report, "track") or []
     unknown = float("nan")
     columns = {
-        name: np.array([unknown if (number := _float(row.get(name))) is None else number for row in rows])
+        name: np.array([unknown if (number := finite_or_none(row.get(name))) is None else number for row in rows])
         for name in _TRACK_NUMBERS
     }
     return TrackColumns(
@@ -343,74 +333,13 @@ def _track(report: Mapping[str, Any]) -> TrackColumns:
     )
 
 
-def _at(report: Mapping[str, Any], *keys: str) -> Any:
-    """What lies at the path of keys; None where any part of it is missing."""
-    value: Any = report
-    for key in keys:
-        value = value.get(key) if isinstance(value, Mapping) else None
-    return value
-
-
-def _number(report: Mapping[str, Any], *keys: str) -> float | None:
-    return _float(_at(report, *keys))
-
-
-def _float(value: Any) -> float | None:
-    """The value as a finite number, else None."""
-    return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
-
-
 def _count(report: Mapping[str, Any], status: Status) -> int:
-    return int(_at(report, "frames", status.value) or 0)
+    return int(at(report, "frames", status.value) or 0)
 
 
 def _unit(report: Mapping[str, Any]) -> str:
     return "m" if report.get("georeferenced") else "units"
 
 
-def _text(value: Any) -> str:
-    return "unknown" if value is None else escape(str(value))
-
-
-def _with_unit(pattern: str, value: Any) -> str | None:
-    number = _float(value)
-    return None if number is None else pattern.format(number)
-
-
 def _within(sigma: float | None) -> str | None:
     return None if sigma is None else f"\u00b1 {100 * sigma:.2g} %" if sigma else "(kept as given)"
-
-
-def _join(*parts: str | None) -> str:
-    return " ".join(part for part in parts if part)
-
-
-def _length(value_m: float | None) -> str | None:
-    if value_m is None:
-        return None
-    return f"{100 * value_m:.3g} cm" if value_m < 0.995 else f"{value_m:.3g} m"
-
-
-def _area(value_m2: float | None) -> str:
-    if value_m2 is None:
-        return "unknown area"
-    if value_m2 < 10_000:
-        return f"{value_m2:,.0f} m\u00b2".replace(",", "\u202f")
-    return f"{value_m2 / 1e4:.3g} ha" if value_m2 < 1e6 else f"{value_m2 / 1e6:.3g} km\u00b2"
-
-
-def _seconds(value: float | None) -> str:
-    if value is None:
-        return "unknown"
-    return f"{value:.2g} s" if value < 10 else f"{value:.0f} s" if value < 180 else f"{value / 60:.1f} min"
-
-
-def _list(items: Iterable[str]) -> str:
-    return f"<ul>{''.join(f'<li>{each}</li>' for each in items)}</ul>"
-
-
-def _table(rows: Sequence[Sequence[str]], names: Sequence[str] = ()) -> str:
-    """A table of cells that are HTML already."""
-    head = f"<tr>{''.join(f'<th>{each}</th>' for each in names)}</tr>" if names else ""
-    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
-    return f'<div class="wide"><table>{head}{body}</table></div>'
