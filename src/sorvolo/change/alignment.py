@@ -1,6 +1,6 @@
 """A frame laid over the known map: by telemetry and the frames before, then by features, then to a part of a pixel."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import cv2
@@ -13,7 +13,13 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import apply_homography, pose_from_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
-from sorvolo.registration.features import FeatureSettings, gray_from_rgb, normalise_contrast, orb_features
+from sorvolo.registration.features import (
+    FeatureSettings,
+    gray_from_rgb,
+    normalise_contrast,
+    orb_features,
+    sift_features,
+)
 from sorvolo.registration.link import LinkCache, LinkSettings, refine
 from sorvolo.registration.matching import match
 from sorvolo.registration.robust import fit_homography
@@ -31,7 +37,8 @@ class AlignmentSettings:
 
     side_px: int = 640  # longest side at which frames are aligned
     least_known: float = 0.1  # share of the frame that must lie on known ground
-    most_residual_px: float = 1.6  # of the registered image: worse, and what differs is the fit, not the ground
+    most_residual_px: float = 2.2  # of the registered image: worse, and what differs is the fit, not the ground
+    doubtful_px: float = 1.5  # a foretold fit that leaves more is checked against the features
     most_features: int = 60_000  # of the whole map, to look for a frame whose place is not known at all
     links: LinkSettings = field(default_factory=lambda: LinkSettings(FeatureSettings(orb_count=900), min_inliers=20))
 
@@ -80,6 +87,7 @@ class Aligner:
         self._reference, self._site_grid, self._settings = reference, site_grid, settings
         self._fits: list[_Fit] = []
         self._count = 0
+        self._misses = 0  # frames since the last fit
 
     def align(self, image: ImageRGB, camera: Camera, prior: CameraPrior, time_ns: int) -> Aligned | NotAligned:
         """Where an undistorted frame, (H, W, 3), of the distortion-free `camera` lies on the map."""
@@ -95,7 +103,7 @@ class Aligner:
         is_outside = told is not None and known < self._settings.least_known
         worst = NotAligned("its features are found nowhere in the map where it could be", np.nan)
         for guess, followed in self._guesses(new, small_camera, prior, time_ns, None if is_outside else told):
-            found = self._fit(new, guess)
+            found = self._fit(new, guess, self._settings.doubtful_px if followed else self._settings.most_residual_px)
             if isinstance(found, NotAligned):
                 worst = found
                 continue
@@ -105,6 +113,7 @@ class Aligner:
                 worst = NotAligned("the fit is none that a camera above the ground could have", np.nan)
                 continue
             self._remember(time_ns, pose, prior, site_from_small, small_camera)
+            self._misses = 0
             # centres of pixels lie half a pixel inside: small = (full + 1/2) s - 1/2
             sx, sy = size[0] / image.shape[1], size[1] / image.shape[0]
             small_from_full = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
@@ -142,14 +151,25 @@ class Aligner:
             yield self._shifted(new, foretold), True
         near = foretold if foretold is not None else told
         features = orb_features(new.gray, self._settings.links.features)
-        for base in (near, told if foretold is not None else None):
-            if base is not None:
-                found = self._by_features(new, features, base, prior)
-                if found is not None:
-                    yield found, False
-        found = self._anywhere(new, features) if told is not None or not prior.knows_place else None
-        if found is not None:
-            yield found, False
+        tries: list[Callable[[], Matrix3 | None]] = []
+        if near is not None:
+            tries.append(lambda: self._by_features(new, features, near, prior, is_free=False))
+        if told is not None:
+            if foretold is not None:
+                tries.append(lambda: self._by_features(new, features, told, prior, is_free=False))
+            # a compass may be off by any angle
+            tries.append(lambda: self._by_features(new, features, told, prior, is_free=True))
+        self._misses += 1
+        if self._misses % 5 == 1:
+            # dear searches; the next frame of a video may be found by its telemetry again
+            if told is not None:
+                tries.append(lambda: self._by_sift(new, told))
+            if told is not None or not prior.knows_place:
+                tries.append(lambda: self._anywhere(features))
+        for attempt in tries:
+            found = attempt()
+            if found is not None:
+                yield found, False
 
     def _foretold(self, camera: Camera, prior: CameraPrior, time_ns: int) -> Matrix3 | None:
         """The last fit moved on at the flight's velocity, turned as telemetry says the camera turned."""
@@ -208,8 +228,9 @@ class Aligner:
         return site_from_image @ np.array([[1.0, 0.0, -4 * dx], [0.0, 1.0, -4 * dy], [0.0, 0.0, 1.0]])
 
     def _by_features(
-        self, new: Keyframe, features: Features, site_from_image: Matrix3, prior: CameraPrior
+        self, new: Keyframe, features: Features, site_from_image: Matrix3, prior: CameraPrior, *, is_free: bool
     ) -> Matrix3 | None:
+        """The guess corrected by the map's features around it; `is_free`: turned and shifted as they tell."""
         grid_from_image = self._on_grid(site_from_image, new.camera)
         if grid_from_image is None:
             return None
@@ -219,12 +240,20 @@ class Aligner:
         old = self._reference.features_under(
             grid_from_image, new.camera.width_px, new.camera.height_px, search_px / max(new.gray.shape)
         )
-        return self._matched(features, old, grid_from_image, search_px, site_from_image)
+        return self._matched(features, old, grid_from_image, 0.0 if is_free else search_px, site_from_image)
 
-    def _anywhere(self, new: Keyframe, features: Features) -> Matrix3 | None:
+    def _by_sift(self, new: Keyframe, site_from_image: Matrix3) -> Matrix3 | None:
+        """The guess corrected by SIFT on the view that it foresees: slow, for ground that ORB is lost on."""
+        seen = self._seen(site_from_image, new.camera)
+        if seen is None:
+            return None
+        settings = self._settings.links.features
+        old, found = sift_features(normalised(*seen), settings), sift_features(new.gray, settings)
+        pairs = match(found, old, None, 0.0)
+        return self._corrected(found.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]], site_from_image)
+
+    def _anywhere(self, features: Features) -> Matrix3 | None:
         """A frame of unknown place, looked for in the whole map at the frame's own scale and those beside it."""
-        if self._fits and self._count % 5:
-            return None  # the search is dear, and the next frame may be found by its telemetry again
         for level in range(3):
             old = self._reference.all_features(level, self._settings.most_features)
             if not len(old):
@@ -249,11 +278,15 @@ class Aligner:
         """The guess corrected by matched features; `search_px` 0: wherever they lie."""
         image_from_grid: Matrix3 = np.linalg.inv(grid_from_image).astype(np.float64)
         pairs = match(features, old, image_from_grid if search_px else None, search_px)
-        if len(pairs) < self._settings.links.min_inliers // 2:
-            return None
         guessed = apply_homography(image_from_grid, old.points_px[pairs[:, 1]])
         ahead = np.isfinite(guessed).all(axis=1)
-        fitted = fit_homography(features.points_px[pairs[ahead, 0]], guessed[ahead], self._settings.links.threshold_px)
+        return self._corrected(features.points_px[pairs[ahead, 0]], guessed[ahead], site_from_image)
+
+    def _corrected(self, new_px: PointsPx, guessed_px: PointsPx, site_from_image: Matrix3) -> Matrix3 | None:
+        """The guess corrected by points where they are and where it put them; None where no plane fits them."""
+        if len(new_px) < self._settings.links.min_inliers // 2:
+            return None
+        fitted = fit_homography(new_px, guessed_px, self._settings.links.threshold_px)
         if fitted is None or fitted[1].sum() < self._settings.links.min_inliers // 2:
             return None
         return site_from_image @ np.linalg.inv(fitted[0])
@@ -262,7 +295,7 @@ class Aligner:
         seen = None if site_from_image is None else self._seen(site_from_image, camera)
         return 0.0 if seen is None else float(seen[1].mean())
 
-    def _fit(self, new: Keyframe, guess: Matrix3) -> tuple[Matrix3, float] | NotAligned:
+    def _fit(self, new: Keyframe, guess: Matrix3, most_residual_px: float) -> tuple[Matrix3, float] | NotAligned:
         """site_from_image to a part of a pixel with its residual, or why not."""
         seen = self._seen(guess, new.camera)
         if seen is None:
@@ -276,7 +309,7 @@ class Aligner:
         if not isinstance(found, Link):
             return NotAligned(f"it does not fit the map: {found}", np.nan)
         residual_px = float(found.sigma_px * 1.1774)  # a Rayleigh distribution's median
-        if residual_px > self._settings.most_residual_px:
+        if residual_px > most_residual_px:
             return NotAligned("its points fit the map badly", residual_px)
         fit: Anything = guess @ np.linalg.inv(found.new_from_old)
         return fit, residual_px
