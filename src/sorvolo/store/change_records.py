@@ -80,26 +80,22 @@ class StoredReview:
 
 
 def stored_changes(flight_id: str, changes: Sequence[Change]) -> list[StoredChange]:
-    """The changes as they are stored, by number: the number that ends the id, else the place in the list.
+    """The changes as they are stored, by number: the one that ends the id, or all by their places in the list.
 
     Raises StoreError when two have the same id, or an id cannot name a file.
     """
-    result: dict[str, StoredChange] = {}
-    for place, each in enumerate(changes, 1):
-        if each.id in result:
-            raise StoreError(f"two changes have the id {each.id!r}; each needs its own")
-        if not each.id or each.id.startswith(".") or not set(each.id).isdisjoint(_FORBIDDEN):
-            raise StoreError(f"{each.id!r} cannot name a change's pictures; choose letters, digits and dashes")
-        ending = re.search(r"[0-9]{1,9}$", each.id)
-        patch = each.patch
-        height_px, width_px = patch.changed.shape
-        result[each.id] = StoredChange(
-            each.id, flight_id, int(ending.group()) if ending else place, each.kind, each.score, each.outline_m,
-            each.first_seen_ns, each.last_seen_ns, each.views, each.area_m2, each.length_m, each.sigma_m,
-            each.velocity_m_s, each.class_before, each.class_after,
-            CropPlace(patch.west_m, patch.north_m, patch.m_per_px, width_px, height_px),
-        )
-    return sorted(result.values(), key=lambda change: change.number)
+    ids = [each.id for each in changes]
+    for change_id in ids:
+        if ids.count(change_id) > 1:
+            raise StoreError(f"two changes have the id {change_id!r}; each needs its own")
+        if not change_id or change_id.startswith(".") or not set(change_id).isdisjoint(_FORBIDDEN):
+            raise StoreError(f"{change_id!r} cannot name a change's pictures; choose letters, digits and dashes")
+    endings = [re.search(r"[0-9]{1,9}$", change_id) for change_id in ids]
+    numbers = [int(ending.group()) for ending in endings if ending is not None]
+    if len(set(numbers)) < len(ids):
+        numbers = list(range(1, len(ids) + 1))
+    result = [_stored(flight_id, number, each) for number, each in zip(numbers, changes)]
+    return sorted(result, key=lambda change: change.number)
 
 
 def add_comparison(
@@ -202,6 +198,17 @@ def _is_older(connection: Connection) -> bool:
 
 def _centre(outline_m: PointsM) -> PointsM:
     return (outline_m.min(axis=0) + outline_m.max(axis=0)) / 2
+
+
+def _stored(flight_id: str, number: int, change: Change) -> StoredChange:
+    patch = change.patch
+    height_px, width_px = patch.changed.shape
+    return StoredChange(
+        change.id, flight_id, number, change.kind, change.score, change.outline_m, change.first_seen_ns,
+        change.last_seen_ns, change.views, change.area_m2, change.length_m, change.sigma_m, change.velocity_m_s,
+        change.class_before, change.class_after,
+        CropPlace(patch.west_m, patch.north_m, patch.m_per_px, width_px, height_px),
+    )
 
 
 def _row_of(change: StoredChange, run_id: int) -> dict[str, Any]:

@@ -81,8 +81,18 @@ def write_change_files(archive: "Archive", flight_id: str, version: VersionEntry
     crops = {each.id: _crops(folder / "changes", each.id) for each in changes}
     maps = [archive.tiles(version.parent_id) if version.parent_id else {}, archive.tiles(version.id)]
     before, after = pictures(maps, _PICTURE_PX) if any(maps) else (None, None)
-    page = changes_page(json.loads(report_json or b"{}"), changes, before, after, site, crops)
+    made = {each.id: each for each in archive.versions()}
+    page = changes_page(
+        json.loads(report_json or b"{}"), changes, before, after, site, crops,
+        before_words=_words_of(made.get(version.parent_id)), after_words=_words_of(version),
+    )
     atomic_write_bytes(folder / "changes.html", page.encode())
+
+
+def _words_of(version: VersionEntry | None) -> str:
+    if version is None:
+        return "no map yet"
+    return f"version {version.id}: flight {version.flight_id}, {version.created_utc[:10]}"
 
 
 def _crops(folder: Path, change_id: str) -> tuple[ImageRGBA | None, ImageRGBA | None]:
