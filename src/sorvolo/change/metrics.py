@@ -1,0 +1,354 @@
+"""How good change detection is: the thesis's counts (Tables 4.3 to 4.5) per pixel and frame, and events found."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import Floats, Mask, PointsM, TimesNs
+from sorvolo.geometry.polygons import points_inside, signed_area
+from sorvolo.survey.findings import ChangeKind
+
+
+@dataclass(frozen=True)
+class Counts:
+    """True and false positives and negatives (Table 4.3) of pixels or of frames; `unknown` ones are not judged.
+
+    Rates are as in section 4.2.1. A rate whose denominator is zero is NaN: precision where nothing was found, recall
+    where nothing was there, F1 where neither.
+    """
+
+    tp: int = 0
+    fp: int = 0
+    fn: int = 0
+    tn: int = 0
+    unknown: int = 0
+
+    def __add__(self, other: "Counts") -> "Counts":
+        return Counts(
+            self.tp + other.tp, self.fp + other.fp, self.fn + other.fn, self.tn + other.tn,
+            self.unknown + other.unknown,
+        )
+
+    @property
+    def precision(self) -> float:
+        """Share of what was found that was there."""
+        return _ratio(self.tp, self.tp + self.fp)
+
+    @property
+    def recall(self) -> float:
+        """Share of what was there that was found."""
+        return _ratio(self.tp, self.tp + self.fn)
+
+    @property
+    def accuracy(self) -> float:
+        """Share of right answers."""
+        return _ratio(self.tp + self.tn, self.tp + self.tn + self.fp + self.fn)
+
+    @property
+    def f1(self) -> float:
+        """Harmonic mean of precision and recall."""
+        return _ratio(2 * self.tp, 2 * self.tp + self.fp + self.fn)
+
+
+def pixel_counts(found: Mask, truth: Mask, unknown: Mask | None = None) -> Counts:
+    """The pixels of one frame, all (height, width) bool; `unknown` ones are counted apart.
+
+    Raises InputError when the masks differ in size.
+    """
+    found, truth, known = _checked(found, truth, unknown)
+    judged = int(np.count_nonzero(known))
+    tp = int(np.count_nonzero(found & truth & known))
+    positives, there = int(np.count_nonzero(found & known)), int(np.count_nonzero(truth & known))
+    return Counts(tp, positives - tp, there - tp, judged - positives - there + tp, found.size - judged)
+
+
+def frame_counts(found: Mask, truth: Mask, unknown: Mask | None = None, least_px: int = 1) -> Counts:
+    """One frame as a whole: positive when at least `least_px` of its known pixels are changed.
+
+    A frame whose true change has some pixels, but fewer than `least_px`, and a frame of which nothing is known, are
+    `unknown`. The thesis counts any pixel: `least_px` 1. Raises InputError when the masks differ in size, SettingsError
+    for `least_px` under 1.
+    """
+    if least_px < 1:
+        raise SettingsError(f"a changed frame has at least 1 changed pixel, got a least of {least_px}")
+    found, truth, known = _checked(found, truth, unknown)
+    there = int(np.count_nonzero(truth & known))
+    if 0 < there < least_px or not known.any():
+        return Counts(unknown=1)
+    says = int(np.count_nonzero(found & known)) >= least_px
+    if there:
+        return Counts(tp=1) if says else Counts(fn=1)
+    return Counts(fp=1) if says else Counts(tn=1)
+
+
+@dataclass(frozen=True, eq=False)
+class FoundEvent:
+    """A change as it was reported: outline (N, 2) in metres; NaN and None where the report is silent."""
+
+    id: str
+    kind: ChangeKind
+    outline_m: PointsM
+    sigma_m: float = math.nan
+    announced_ns: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class TrueEvent:
+    """What really happened: the thing's outline on the ground, (N, 2) metres, and `length_m`, its longer side.
+
+    `clear_ns` (V,) are the times of the views that show it well, `path_m` (V, 2) where it was then, if it moves. An
+    event that need not be found (`must_find` False) is neither missed nor false.
+    """
+
+    id: str
+    kind: ChangeKind
+    outline_m: PointsM
+    length_m: float
+    clear_ns: TimesNs
+    path_m: PointsM = field(default_factory=lambda: np.zeros((0, 2)))
+    must_find: bool = True
+
+
+@dataclass(frozen=True)
+class EventSettings:
+    """When a reported event is a true one, and when it came late."""
+
+    tolerance_m: float = 0.5  # between centres, or half the thing's length where that is more
+    views: int = 3  # clear views after which an event can be announced: k of the evidence
+    late_s: float = 1.0  # later than this after that view is late
+
+    def __post_init__(self) -> None:
+        if self.tolerance_m < 0 or self.late_s < 0 or self.views < 1:
+            raise SettingsError(f"tolerances are not negative and views at least 1, got {self}")
+
+
+@dataclass(frozen=True, eq=False)
+class EventPair:
+    """A true event and the report of it: `offset_m` (2,) is the report's centre less the true one, east and north.
+
+    `delay_s` is from the view after which it could be announced to when it was; NaN where that is not known.
+    """
+
+    true: TrueEvent
+    found: FoundEvent
+    offset_m: Floats
+    delay_s: float
+
+    @property
+    def error_m(self) -> float:
+        """Distance of the two centres."""
+        return float(np.hypot(*self.offset_m))
+
+
+@dataclass(frozen=True, eq=False)
+class EventMatch:
+    """Every event, true or found, in exactly one place.
+
+    `pairs` were found; `missed` had to be and were not; `skipped` need not have been. Of the other reports, `twice`
+    lie on a true event that was found already, `false` on none, `optional` on one that need not be found.
+    """
+
+    pairs: tuple[EventPair, ...]
+    missed: tuple[TrueEvent, ...]
+    skipped: tuple[TrueEvent, ...]
+    twice: tuple[FoundEvent, ...]
+    false: tuple[FoundEvent, ...]
+    optional: tuple[FoundEvent, ...]
+
+
+@dataclass(frozen=True)
+class KindScore:
+    """The events of one true kind; `false` and `twice` count reports of that kind."""
+
+    must_find: int
+    found: int
+    named_right: int
+    late: int
+    twice: int
+    false: int
+
+
+@dataclass(frozen=True)
+class EventScores:
+    """What a list of reported events is worth.
+
+    `late` of `judged_late` found events were announced late. Errors are of things that stand still; `within_two_sigma`
+    is the share of their single-axis errors that are under twice the stated sigma (0.954 if it is honest and errors
+    are normal). Rates without a denominator are NaN.
+    """
+
+    must_find: int
+    found: int
+    judged_late: int
+    late: int
+    twice: int
+    false: int
+    optional: int
+    named_right: int
+    compared_m2: float
+    error_median_m: float
+    error_p95_m: float
+    sigma_median_m: float
+    within_two_sigma: float
+    by_kind: dict[str, KindScore]
+
+    @property
+    def found_share(self) -> float:
+        """Share of the events that had to be found."""
+        return _ratio(self.found, self.must_find)
+
+    @property
+    def false_per_hectare(self) -> float:
+        """False events per hectare of compared ground."""
+        return _ratio(self.false, self.compared_m2 / 1e4)
+
+
+def match_events(
+    found: Sequence[FoundEvent], true: Sequence[TrueEvent], settings: EventSettings = EventSettings()
+) -> EventMatch:
+    """Pair reports with true events, each used once: those of the same kind first, then the nearest.
+
+    A report is of a true event when their outlines touch or their centres are within max(`tolerance_m`, half the
+    thing's length); of something that moves, when it is that near to its path or one of its places lies within the
+    report's outline.
+    """
+    offsets = [[_offset_m(each, truth) for truth in true] for each in found]
+    near = np.array([
+        [_is_near(each, truth, offsets[i][j], settings) for j, truth in enumerate(true)] for i, each in enumerate(found)
+    ], bool).reshape(len(found), len(true))
+    wishes = sorted(
+        (found[i].kind != true[j].kind, float(np.hypot(*offsets[i][j])), i, j) for i, j in np.argwhere(near).tolist()
+    )
+    of_found: dict[int, int] = {}
+    for _, _, i, j in wishes:
+        if i not in of_found and j not in of_found.values():
+            of_found[i] = j
+    matched = set(of_found.values())
+    pairs = tuple(
+        EventPair(true[j], found[i], offsets[i][j], _delay_s(found[i], true[j], settings.views))
+        for i, j in sorted(of_found.items()) if true[j].must_find
+    )
+    others = [i for i in range(len(found)) if i not in of_found]
+    must_find = np.array([truth.must_find for truth in true], bool)
+    twice = {i for i in others if (near[i] & must_find).any()}
+    optional = ({i for i in others if near[i].any()} - twice) | {i for i, j in of_found.items() if not must_find[j]}
+    return EventMatch(
+        pairs,
+        tuple(truth for j, truth in enumerate(true) if truth.must_find and j not in matched),
+        tuple(truth for j, truth in enumerate(true) if not truth.must_find),
+        tuple(found[i] for i in sorted(twice)),
+        tuple(found[i] for i in others if not near[i].any()),
+        tuple(found[i] for i in sorted(optional)),
+    )
+
+
+def score_events(
+    match: EventMatch, compared_m2: float, settings: EventSettings = EventSettings()
+) -> EventScores:
+    """The numbers of a match; `compared_m2` is the ground that was compared with the map."""
+    still = [pair for pair in match.pairs if pair.true.kind != ChangeKind.MOVING]
+    errors_m = np.array([pair.error_m for pair in still])
+    stated = [pair for pair in still if math.isfinite(pair.found.sigma_m)]
+    within = np.array([np.abs(pair.offset_m) <= 2 * pair.found.sigma_m for pair in stated])
+    delays_s = np.array([pair.delay_s for pair in match.pairs])
+    return EventScores(
+        must_find=len(match.pairs) + len(match.missed), found=len(match.pairs),
+        judged_late=int(np.isfinite(delays_s).sum()), late=_late(match.pairs, settings),
+        twice=len(match.twice), false=len(match.false), optional=len(match.optional),
+        named_right=sum(pair.true.kind == pair.found.kind for pair in match.pairs), compared_m2=compared_m2,
+        error_median_m=float(np.median(errors_m)) if len(still) else math.nan,
+        error_p95_m=float(np.percentile(errors_m, 95)) if len(still) else math.nan,
+        sigma_median_m=float(np.median([pair.found.sigma_m for pair in stated])) if stated else math.nan,
+        within_two_sigma=float(within.mean()) if stated else math.nan,
+        by_kind={str(kind): _kind_score(match, kind, settings) for kind in ChangeKind},
+    )
+
+
+def _kind_score(match: EventMatch, kind: ChangeKind, settings: EventSettings) -> KindScore:
+    pairs = [pair for pair in match.pairs if pair.true.kind == kind]
+    return KindScore(
+        len(pairs) + sum(truth.kind == kind for truth in match.missed), len(pairs),
+        sum(pair.found.kind == kind for pair in pairs), _late(pairs, settings),
+        sum(each.kind == kind for each in match.twice), sum(each.kind == kind for each in match.false),
+    )
+
+
+def _late(pairs: Sequence[EventPair], settings: EventSettings) -> int:
+    return sum(pair.delay_s > settings.late_s for pair in pairs)
+
+
+def _delay_s(found: FoundEvent, truth: TrueEvent, views: int) -> float:
+    if found.announced_ns is None or len(truth.clear_ns) < views:
+        return math.nan
+    return (found.announced_ns - int(truth.clear_ns[views - 1])) / 1e9
+
+
+def _offset_m(found: FoundEvent, truth: TrueEvent) -> Floats:
+    """(2,) from the true place to the report's centre; for something that moves, from the nearest point of its path."""
+    centre = _centroid(found.outline_m)
+    if not len(truth.path_m):
+        return centre - _centroid(truth.outline_m)
+    start = truth.path_m
+    along = np.roll(start, -1, axis=0) - start
+    along[-1] = 0.0
+    squares = np.maximum((along**2).sum(axis=1), 1e-12)
+    share = np.clip(((centre - start) * along).sum(axis=1) / squares, 0, 1)
+    offsets = centre - (start + share[:, None] * along)
+    return np.asarray(offsets[np.argmin((offsets**2).sum(axis=1))])
+
+
+def _is_near(found: FoundEvent, truth: TrueEvent, offset_m: Floats, settings: EventSettings) -> bool:
+    if np.hypot(*offset_m) <= max(settings.tolerance_m, truth.length_m / 2):
+        return True
+    if len(truth.path_m):
+        return bool(points_inside([found.outline_m], truth.path_m).any())
+    return _rings_touch(found.outline_m, truth.outline_m)
+
+
+def _rings_touch(a: PointsM, b: PointsM) -> bool:
+    """Whether the areas of two rings, (N, 2) and (M, 2), overlap."""
+    if (a.max(axis=0) < b.min(axis=0)).any() or (b.max(axis=0) < a.min(axis=0)).any():
+        return False
+    if points_inside([a], b).any() or points_inside([b], a).any():
+        return True
+    a0, b0 = a[:, None], b[None]
+    a1, b1 = np.roll(a, -1, axis=0)[:, None], np.roll(b, -1, axis=0)[None]
+    across_a = _side(a0, a1, b0) * _side(a0, a1, b1) < 0
+    across_b = _side(b0, b1, a0) * _side(b0, b1, a1) < 0
+    return bool((across_a & across_b).any())
+
+
+def _side(start: Floats, end: Floats, points: Floats) -> Floats:
+    along, to = end - start, points - start
+    return along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]
+
+
+def _centroid(ring: PointsM) -> Floats:
+    """(2,) the centre of a ring's area; of its corners where it has none."""
+    middle = ring.mean(axis=0)
+    area = signed_area(ring)
+    if abs(area) < 1e-12:
+        return np.asarray(middle)
+    here, there = ring - middle, np.roll(ring, -1, axis=0) - middle
+    cross = here[:, 0] * there[:, 1] - there[:, 0] * here[:, 1]
+    return np.asarray(middle + ((here + there) * cross[:, None]).sum(axis=0) / (6 * area))
+
+
+def _checked(
+    found: Mask, truth: Mask, unknown: Mask | None
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    if found.shape != truth.shape or (unknown is not None and unknown.shape != truth.shape):
+        sizes = " and ".join(
+            "x".join(str(side) for side in mask.shape[::-1]) for mask in (found, truth, unknown) if mask is not None
+        )
+        raise InputError(f"masks of one frame have one size, got {sizes} pixels; compare masks of the same pictures")
+    known = np.ones(truth.shape, bool) if unknown is None else ~unknown.astype(bool)
+    return found.astype(bool), truth.astype(bool), known
+
+
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if whole else math.nan
