@@ -8,7 +8,7 @@ import numpy as np
 
 from sorvolo.change.reference import ReferenceMap, normalised
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Anything, ImageGray, ImageRGB, Mask, Matrix3, PointsPx, Vector3
+from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, Matrix3, PointsM, PointsPx, Vector3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import apply_homography, pose_from_homography, site_from_image_homography
@@ -40,7 +40,9 @@ class AlignmentSettings:
     most_residual_px: float = 2.2  # of the registered image: worse, and what differs is the fit, not the ground
     doubtful_px: float = 1.5  # a foretold fit that leaves more is checked against the features
     most_features: int = 60_000  # of the whole map, to look for a frame whose place is not known at all
-    links: LinkSettings = field(default_factory=lambda: LinkSettings(FeatureSettings(orb_count=900), min_inliers=20))
+    links: LinkSettings = field(
+        default_factory=lambda: LinkSettings(FeatureSettings(orb_count=900), min_inliers=20, max_pairs=150)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,6 +313,41 @@ class Aligner:
         residual_px = float(found.sigma_px * 1.1774)  # a Rayleigh distribution's median
         if residual_px > most_residual_px:
             return NotAligned("its points fit the map badly", residual_px)
-        fit: Anything = guess @ np.linalg.inv(found.new_from_old)
-        return fit, residual_px
+        fit: Matrix3 = guess @ np.linalg.inv(found.new_from_old)
+        return _stiffened(fit, found, guess, new.camera), residual_px
 
+
+def _stiffened(site_from_image: Matrix3, link: Link, site_from_old: Matrix3, camera: Camera) -> Matrix3:
+    """The fit as a camera over level ground sees it, six degrees of freedom, where that explains the pairs as well.
+
+    A free homography has two more, and swings at the corners where pairs lie in one part of the image only.
+    """
+    start = pose_from_homography(site_from_image, camera)
+    if start is None:
+        return site_from_image
+    ground_m = apply_homography(site_from_old, link.old_px)
+    free_miss = _miss_px(site_from_image, ground_m, link.new_px)
+    near = free_miss < 3 * max(1.0, float(np.median(free_miss)))
+    if near.sum() < 6:
+        return site_from_image
+    middle_m = np.append(ground_m[near].mean(axis=0), 0.0)
+    points = np.column_stack([ground_m[near], np.zeros(near.sum())]) - middle_m
+    rotation, _ = cv2.Rodrigues(start.rotation.T)
+    offset = -start.rotation.T @ (start.translation_m - middle_m)
+    rotation, offset = cv2.solvePnPRefineLM(
+        points, link.new_px[near], camera.matrix, np.zeros(5), rotation, offset.reshape(3, 1)
+    )
+    camera_from_site: Matrix3 = np.asarray(cv2.Rodrigues(rotation)[0], np.float64)
+    place_m = middle_m - camera_from_site.T @ offset.ravel()
+    try:
+        stiff = site_from_image_homography(camera, Pose(camera_from_site.T, place_m))
+    except GeometryError:
+        return site_from_image
+    stiff_miss = _miss_px(stiff, ground_m, link.new_px)
+    worse = float(np.median(stiff_miss[near])) > 1.15 * float(np.median(free_miss[near])) + 0.1
+    return site_from_image if worse else stiff
+
+
+def _miss_px(site_from_image: Matrix3, ground_m: PointsM, image_px: PointsPx) -> Floats:
+    miss = apply_homography(np.linalg.inv(site_from_image), ground_m) - image_px
+    return np.nan_to_num(np.linalg.norm(miss, axis=1), nan=1e9)
