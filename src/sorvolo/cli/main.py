@@ -13,15 +13,17 @@ from sorvolo import __version__
 from sorvolo.cli.calibrate import calibrate
 from sorvolo.cli.demo import demo
 from sorvolo.cli.evaluate import evaluate_app
+from sorvolo.cli.history import history
 from sorvolo.cli.inspect import inspect
 from sorvolo.cli.map import map_command
 from sorvolo.cli.plan import plan
+from sorvolo.cli.review import review
 from sorvolo.cli.simulate import simulate
 from sorvolo.errors import SorvoloError
 
 _COMMANDS: dict[str, Callable[..., None]] = {
     "inspect": inspect, "plan": plan, "map": map_command, "simulate": simulate, "calibrate": calibrate,
-    "demo": demo,
+    "demo": demo, "history": history, "review": review,
 }
 _FAILED, _STOPPED = 1, 130
 _FULL = (errno.ENOSPC, errno.EDQUOT)

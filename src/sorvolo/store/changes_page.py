@@ -204,8 +204,8 @@ def _overview(changes: Sequence[StoredChange], site: Site) -> str:
     if not changes:
         return ""
     unit = "" if site.is_local else " m"
-    names = ("", "kind", "verdict", "score", f"size{unit}", f"area{unit}{'²' if unit else ''}", f"within{unit}", "views", "seen",
-             "place", "id")
+    area = "" if site.is_local else " m²"
+    names = ("", "kind", "verdict", "score", f"size{unit}", f"area{area}", f"within{unit}", "views", "seen", "place", "id")
     rows = "".join(
         f'<tr class="{_classes(each)}" data-kind="{each.kind.value}">' + "".join(f"<td>{cell}</td>" for cell in (
             f'<a href="#change-{each.number}">{each.number}</a>', _kind(each), _verdict(each),
@@ -217,7 +217,8 @@ def _overview(changes: Sequence[StoredChange], site: Site) -> str:
     long = " long" if len(changes) > _MANY else ""
     head = "".join(f"<th>{name}</th>" for name in names)
     return (
-        f'<section><h2>All changes</h2><div class="wide{long}"><table class="overview"><tr>{head}</tr>{rows}</table></div>'
+        f'<section><h2>All changes</h2><div class="wide{long}"><table class="overview"><tr>{head}</tr>{rows}</table>'
+        "</div>"
         '<p class="note">Size: the longer side. Within: one sigma of the place, per axis. Seen: the first time, UTC. '
         "Files for other programs: changes.geojson, and the pictures in the folder changes.</p></section>"
     )
@@ -256,7 +257,8 @@ def _pair(
     listed = "".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in facts)
     return (
         f'<article class="change {_classes(change)}" id="change-{change.number}" data-kind="{change.kind.value}">'
-        f'<div class="crops">{pictures}</div><div><h3><a href="#map" title="to the map">{change.number}</a> {_kind(change)}{_verdict(change)}</h3>'
+        f'<div class="crops">{pictures}</div><div><h3><a href="#map" title="to the map">{change.number}</a> '
+        f'{_kind(change)}{_verdict(change)}</h3>'
         f'<dl class="facts">{listed}</dl></div></article>'
     )
 

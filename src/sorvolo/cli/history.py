@@ -1,0 +1,66 @@
+"""`sorvolo history`: the versions of a map, and the map as it was."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from sorvolo.errors import SettingsError
+from sorvolo.missions.site_history import HistoryEntry, export_version, site_history
+from sorvolo.store.exports import plain_json
+
+
+def history(
+    site: Annotated[Path, typer.Argument(help="The site folder.")],
+    at: Annotated[
+        str | None, typer.Option(help="Version number, or date (UTC): the newest version complete by then.")
+    ] = None,
+    export: Annotated[Path | None, typer.Option(help="Write the map as it was: FILE.tif, .png or .kmz.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """List the versions of a map, or write the map as it was at one of them.
+
+    Example: sorvolo history field
+
+    Example: sorvolo history field --at 2026-05-31 --export may.tif
+    """
+    if at is not None and export is None:
+        raise SettingsError("--at says which map to write; give --export FILE.tif, FILE.png or FILE.kmz as well")
+    entries = site_history(site)
+    if export is None:
+        if as_json:
+            typer.echo(json.dumps({"site": str(site), "versions": plain_json(entries)}, indent=1))
+        else:
+            _show(entries, Console())
+        return
+    version = export_version(site, at, export)
+    if as_json:
+        entry = next(each for each in entries if each.version == version.id)
+        typer.echo(json.dumps({"site": str(site), "file": str(export), "version": plain_json(entry)}, indent=1))
+    else:
+        typer.echo(f"{export}: version {version.id}, flight {version.flight_id}, {version.created_utc}")
+
+
+def _show(entries: Sequence[HistoryEntry], console: Console) -> None:
+    if not entries:
+        console.print("no map yet")
+        return
+    table = Table("version", "date (UTC)", "flight", "by", "tiles", "changed", "new MB", "changes", "reviewed")
+    for each in entries:
+        removed = f" (-{each.tiles_removed})" if each.tiles_removed else ""
+        changes = ", ".join(f"{count} {kind}" for kind, count in each.changes.items())
+        reviewed = ", ".join(
+            f"{count} {word}" for word, count in (("confirmed", each.confirmed), ("rejected", each.rejected)) if count
+        )
+        again = " (again since)" if each.is_replaced else ""
+        table.add_row(
+            str(each.version), each.date_utc[:19].replace("T", " "), escape(each.flight) + again, each.kind,
+            str(each.tiles), f"{each.tiles_changed}{removed}", f"{each.bytes_changed / 1e6:.1f}",
+            changes or ("none" if each.kind == "compare" else ""), reviewed,
+        )
+    console.print(table)

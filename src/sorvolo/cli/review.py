@@ -1,0 +1,83 @@
+"""`sorvolo review`: the changes that flights found, and what a person says of them."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from sorvolo.errors import SettingsError
+from sorvolo.missions.review_changes import list_changes, review_changes
+from sorvolo.store.change_records import StoredChange
+from sorvolo.store.exports import utc_text
+from sorvolo.survey.findings import Verdict
+
+_COLOURS = {Verdict.CONFIRMED: "green", Verdict.REJECTED: "red"}
+
+
+def review(
+    site: Annotated[Path, typer.Argument(help="The site folder.")],
+    ids: Annotated[
+        list[str] | None, typer.Argument(help="Changes: ids, or numbers with --flight; none: list them.")
+    ] = None,
+    confirm: Annotated[bool, typer.Option("--confirm", help="They are real.")] = False,
+    reject: Annotated[
+        bool, typer.Option("--reject", help="They are not; they do not come back in later flights.")
+    ] = False,
+    note: Annotated[str, typer.Option(help="Why, in words.")] = "",
+    flight: Annotated[str | None, typer.Option(help="Of this flight only.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """List the changes that flights found, or confirm or reject some.
+
+    Example: sorvolo review field
+
+    Example: sorvolo review field DJI_0043-3 DJI_0043-7 --reject --note "shadows"
+    """
+    if confirm and reject:
+        raise SettingsError("--confirm and --reject contradict each other; give one of them")
+    if ids and not (confirm or reject):
+        raise SettingsError("what is to be said of them? give --confirm or --reject")
+    if not ids and (confirm or reject or note):
+        raise SettingsError("of which changes? give the ids that `sorvolo review SITE` lists")
+    if ids:
+        verdict = Verdict.CONFIRMED if confirm else Verdict.REJECTED
+        changes = review_changes(site, ids, verdict, note, flight=flight)
+    else:
+        changes = list_changes(site, flight)
+    if as_json:
+        typer.echo(json.dumps({"site": str(site), "changes": [_plain(each) for each in changes]}, indent=1))
+    else:
+        _show(changes, Console())
+
+
+def _show(changes: Sequence[StoredChange], console: Console) -> None:
+    if not changes:
+        console.print("no changes were found, or no flight was compared yet")
+        return
+    table = Table("id", "flight", "kind", "score", "size m", "views", "first seen UTC", "east m", "north m", "verdict")
+    for each in changes:
+        east_m, north_m = each.centre_m
+        verdict = ""
+        if each.verdict is not None:
+            colour = _COLOURS[each.verdict]
+            verdict = f"[{colour}]{each.verdict.value}[/{colour}]" + (f": {escape(each.note)}" if each.note else "")
+        table.add_row(
+            escape(each.id), escape(each.flight_id), each.kind.value, f"{each.score:.2f}", f"{each.length_m:.2f}",
+            str(each.views), utc_text(each.first_seen_ns)[:19].replace("T", " "), f"{east_m:.1f}", f"{north_m:.1f}",
+            verdict,
+        )
+    console.print(table)
+
+
+def _plain(change: StoredChange) -> dict[str, Any]:
+    return {
+        "id": change.id, "flight": change.flight_id, "number": change.number, "kind": change.kind.value,
+        "score": change.score, "first_seen": utc_text(change.first_seen_ns), "last_seen": utc_text(change.last_seen_ns),
+        "views": change.views, "east_m": float(change.centre_m[0]), "north_m": float(change.centre_m[1]),
+        "review": None if change.verdict is None else change.verdict.value, "note": change.note,
+    }
