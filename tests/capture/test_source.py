@@ -109,13 +109,23 @@ def test_the_fingerprint_follows_the_input(tmp_path: Path) -> None:
     video = write_video(tmp_path / "a.mp4")
     first = open_sources([video])[0].fingerprint
     assert open_sources([video])[0].fingerprint == first
-    assert open_sources([video], camera="aov=60")[0].fingerprint != first
+    assert open_sources([video], camera="aov=60")[0].fingerprint == first
     (tmp_path / "a.SRT").write_text(SRT)
-    with_telemetry = open_sources([video])[0].fingerprint
-    assert with_telemetry != first
-    (tmp_path / "a.SRT").unlink()
+    assert open_sources([video])[0].fingerprint == first
     write_video(tmp_path / "a.mp4", seed=9)
     assert open_sources([video])[0].fingerprint != first
+
+
+def test_another_flight_of_a_known_name_gets_its_own(tmp_path: Path) -> None:
+    """Drones begin to count anew on each card: Friday's DJI_0001 is not Monday's."""
+    video = write_video(tmp_path / "DJI_0001.mp4")
+    monday = open_sources([video])[0]
+    again = open_sources([video], known={"DJI_0001": monday.fingerprint})[0]
+    assert again.name == "DJI_0001"
+    friday = open_sources([video], known={"DJI_0001": "another", "DJI_0001-2": "and another"})[0]
+    assert friday.name == "DJI_0001-3"
+    once_more = open_sources([video], known={"DJI_0001": "another", "DJI_0001-2": monday.fingerprint})[0]
+    assert once_more.name == "DJI_0001-2"
 
 
 def test_the_camera_fits_the_frames_as_delivered(tmp_path: Path) -> None:

@@ -2,9 +2,10 @@
 
 import hashlib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +20,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry
 
-_EDGE_BYTES = 65_536
+_HEAD_BYTES = 262_144
 
 
 class Source(Protocol):
@@ -39,7 +40,7 @@ class Source(Protocol):
 
     @property
     def fingerprint(self) -> str:
-        """The same for the same input, another for another: names, sizes and ends of all files."""
+        """The same for the same flight, though it grows or its telemetry is mended; another for another of its name."""
 
     @property
     def camera(self) -> CameraModel:
@@ -73,13 +74,15 @@ class Source(Protocol):
 
 
 def open_sources(
-    inputs: Sequence[Path], telemetry: Path | None = None, camera: Path | str | None = None
+    inputs: Sequence[Path], telemetry: Path | None = None, camera: Path | str | None = None,
+    known: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Source]:
     """Each video, each folder of photos, and all photos given one by one together, as a flight.
 
     `telemetry` belongs to the only flight; without it, a video's is looked for beside it and photos' is in
-    them. `camera` is a calibration file or what else `--camera` takes (capture.calibration). Raises
-    InputError for what cannot be read, naming the file and what to do.
+    them. `camera` is a calibration file or what else `--camera` takes (capture.calibration). `known` are the site's
+    flights, name to fingerprint: another flight of the same name (cards are numbered anew) gets a name of its own.
+    Raises InputError for what cannot be read, naming the file and what to do.
     """
     if not inputs:
         raise InputError("no input; give a video file, a folder of photos, or photos")
@@ -90,13 +93,17 @@ def open_sources(
             f"one telemetry file for {len(names)} flights; map the flights one by one, or put each telemetry "
             "file beside its video under the same name"
         )
-    sources: list[Source] = [
+    sources: list[VideoSource | PhotoSource] = [
         _open_video(path, name, telemetry, camera) for path, name in zip(videos, names)
     ]
     sources += [
         _open_photos(album, name, telemetry, camera) for album, name in zip(albums, names[len(videos):])
     ]
-    return sources
+    taken = dict(known)
+    for each in sources:
+        each.name = _free_name(each.name, each.fingerprint, taken)
+        taken[each.name] = each.fingerprint
+    return list(sources)
 
 
 def safe_name(text: str) -> str:
@@ -160,14 +167,20 @@ def _distinct_names(places: Sequence[Path]) -> list[str]:
     return names
 
 
+def _free_name(name: str, fingerprint: str, taken: Mapping[str, str]) -> str:
+    """The name, or the name and a number where another flight has it."""
+    candidates = [name, *(f"{name}-{number}" for number in range(2, len(taken) + 3))]
+    return next(each for each in candidates if taken.get(each, fingerprint) == fingerprint)
+
+
 def _open_video(path: Path, name: str, telemetry: Path | None, camera: Path | str | None) -> VideoSource:
     info = read_video_info(path)
-    found, telemetry_path, notices = _video_telemetry(path, telemetry)
+    found, notices = _video_telemetry(path, telemetry)
     if camera is None:
         model = _video_camera(info)
     else:
         model = camera_from_option(str(camera), info.width_px, info.height_px)
-    fingerprint = _fingerprint([path], telemetry_path, camera)
+    fingerprint = _fingerprint(path)
     return VideoSource(name, fingerprint, info, model, found, notices)
 
 
@@ -181,24 +194,24 @@ def _open_photos(
         model = camera_from_option(str(camera), album.width_px, album.height_px)
     found = album.telemetry if telemetry is None else read_telemetry(telemetry)
     ignored = notice("ignored_file", source.others, "files in the folder that are no photos, ignored: {}")
-    fingerprint = _fingerprint(source.photos, telemetry, camera)
+    fingerprint = _fingerprint(sorted(source.photos)[0])
     return PhotoSource(name, fingerprint, album, model, found, ignored)
 
 
 def _video_telemetry(
     video: Path, telemetry: Path | None
-) -> tuple[Telemetry, Path | None, list[Notice]]:
-    """The telemetry, its file, and what to tell; only a file that was asked for must be readable."""
+) -> tuple[Telemetry, list[Notice]]:
+    """The telemetry and what to tell; only a file that was asked for must be readable."""
     if telemetry is not None:
-        return read_telemetry(telemetry), telemetry, []
+        return read_telemetry(telemetry), []
     beside = find_telemetry_beside(video)
     if beside is None:
-        return no_telemetry(), None, []
+        return no_telemetry(), []
     try:
-        return read_telemetry(beside), beside, []
+        return read_telemetry(beside), []
     except InputError as error:
         text = f"the telemetry file beside the video cannot be used: {error}"
-        return no_telemetry(), None, [Notice("unusable_telemetry", 1, text)]
+        return no_telemetry(), [Notice("unusable_telemetry", 1, text)]
 
 
 def _video_camera(info: VideoInfo) -> CameraModel:
@@ -227,17 +240,7 @@ def _guess(width_px: int, height_px: int, words: PhotoMetadata) -> CameraModel:
     return CameraModel(standing, model.origin, model.focal_sigma)
 
 
-def _fingerprint(inputs: Sequence[Path], telemetry: Path | None, camera: Path | str | None) -> str:
-    digest = hashlib.sha256()
-    option = Path(camera) if camera is not None else None
-    extra = [path for path in (telemetry, option) if path is not None and path.is_file()]
-    for path in [*sorted(inputs), *extra]:
-        size = path.stat().st_size
-        digest.update(f"{path.name}\0{size}\0".encode())
-        with path.open("rb") as file:
-            digest.update(file.read(_EDGE_BYTES))
-            file.seek(max(0, size - _EDGE_BYTES))
-            digest.update(file.read(_EDGE_BYTES))
-    if option is not None and not option.is_file():
-        digest.update(str(option).encode())
-    return digest.hexdigest()
+def _fingerprint(first: Path) -> str:
+    """How the flight's first file begins: pictures that differ, or the times in a video's header."""
+    with first.open("rb") as file:
+        return hashlib.sha256(file.read(_HEAD_BYTES)).hexdigest()

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame, utm_epsg
 from sorvolo.missions.settings import MapSettings
 from sorvolo.mosaic.selection import interval_s
+from sorvolo.store.archive import Archive
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import CameraPrior, Frame, Notice, PosedFrame, Site
 
@@ -135,6 +137,14 @@ def prepare(source: Source, settings: MapSettings, site: Site | None, *, telemet
     return FlightSetup(
         source, frame, clock, track, step_s, keyframe_s, smooth_s, expected, site, (*clock.notices, *notices)
     )
+
+
+def known_flights(site: Path) -> dict[str, str]:
+    """The fingerprint of each flight that the site folder has, by name; none where there is no site yet."""
+    if not (site / "site.db").is_file():
+        return {}
+    with Archive.open(site, write=False) as archive:
+        return {each.id: each.fingerprint for each in archive.flights()}
 
 
 def new_site(setup: FlightSetup, name: str, m_per_px: float, ground_up_m: float) -> Site:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from sorvolo.capture.areas import read_area
 from sorvolo.capture.source import Source, open_sources
-from sorvolo.missions.flight_setup import prepare
+from sorvolo.missions.flight_run import FlightRun
+from sorvolo.missions.flight_setup import known_flights, prepare
 from sorvolo.missions.map_planar import PlanarRun
 from sorvolo.missions.map_thesis import ThesisRun
 from sorvolo.missions.settings import MapSettings
@@ -30,7 +31,7 @@ def map_flights(
     to stop early: the flight that is being mapped is left out, those before it are in.
     """
     wanted = None if area is None else read_area(area)
-    sources = open_sources(inputs, telemetry, camera)
+    sources = open_sources(inputs, telemetry, camera, known_flights(site))
     with Archive.open(site, write=True) as archive:
         for source in sources:
             yield from _map_one(source, archive, settings, wanted, telemetry_named=telemetry is not None)
@@ -67,7 +68,7 @@ def _map_one(
         run.finish(source.notices(), started_s)
 
 
-def _take(run: PlanarRun | ThesisRun, each: Selected | LostFrame) -> tuple[Status, str, int]:
+def _take(run: FlightRun, each: Selected | LostFrame) -> tuple[Status, str, int]:
     if isinstance(each, LostFrame):
         return run.lose(each.index, each.name, each.time_ns, each.reason)
     if each.reason:
