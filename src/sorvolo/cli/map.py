@@ -89,14 +89,14 @@ def map_and_read_reports(
     camera: str | None = None, area: Path | None = None,
 ) -> list[dict[str, Any]]:
     """Map with a bar on stderr; the reports of the flights that were mapped, in order."""
-    before = _newest_version(site)
+    before = newest_version(site)
     mapping = map_flights(inputs, site, settings, telemetry=telemetry, camera=camera, area=area)
     # closed even when the bar is stopped: then the site is as it was
     with closing(mapping) as updates:
         show_progress(updates, Console(stderr=True))
     with Archive.open(site, write=False) as archive:
         mapped = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
-        return [_read_report(archive.flight_folder(flight_id) / "report.json") for flight_id in mapped]
+        return [read_json(archive.flight_folder(flight_id) / "report.json") for flight_id in mapped]
 
 
 def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Console) -> None:
@@ -104,9 +104,9 @@ def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Cons
     for report in reports:
         _show_report(report, console)
     for name, path in _map_files(site).items():
-        _tell_path(name, path, console)
+        tell_path(name, path, console)
     for report in reports:
-        _tell_path("report", site / "flights" / report["flight"] / "report.html", console)
+        tell_path("report", site / "flights" / report["flight"] / "report.html", console)
 
 
 def _show_report(report: Mapping[str, Any], console: Console) -> None:
@@ -155,7 +155,8 @@ def _with_unit(pattern: str, number: float | None) -> str:
     return "" if number is None else pattern.format(number)
 
 
-def _tell_path(name: str, path: Path, console: Console) -> None:
+def tell_path(name: str, path: Path, console: Console) -> None:
+    """Print where a file is."""
     # in one piece, however long: people copy it
     console.print(f"{name:>8}  {escape(str(path))}", soft_wrap=True, highlight=False)
 
@@ -165,14 +166,16 @@ def _map_files(site: Path) -> dict[str, Path]:
     return {name: site / file for name, file in named.items() if (site / file).is_file()}
 
 
-def _newest_version(site: Path) -> int:
+def newest_version(site: Path) -> int:
+    """The id of the site's newest version; 0 where there is no site yet."""
     if not (site / "site.db").is_file():
         return 0
     with Archive.open(site, write=False) as archive:
         return max((each.id for each in archive.versions() if each.complete), default=0)
 
 
-def _read_report(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
+    """A document of a flight; raises StoreError when it cannot be read."""
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:

@@ -67,13 +67,23 @@ class FlightSetup:
         return check
 
 
-def prepare(source: Source, settings: MapSettings, site: Site | None, *, telemetry_named: bool) -> FlightSetup:
+def prepare(
+    source: Source, settings: MapSettings, site: Site | None, *, telemetry_named: bool, finds_itself: bool = False
+) -> FlightSetup:
     """Tie clocks, lay the flight into the site frame and foresee its keyframes.
 
-    Raises InputError when the flight belongs to another place than the site, or the telemetry to another flight.
+    `finds_itself`: the flight's frames are looked for in the site's map, so that they need no GPS. Raises InputError
+    when the flight belongs to another place than the site, or the telemetry to another flight.
     """
     telemetry = source.telemetry
     duration_s = source.frame_count / source.frame_rate_hz if source.frame_rate_hz > 0 else 0.0
+    if finds_itself and site is not None and (site.is_local or not telemetry.has_fixes):
+        lack = "the site has no geo-reference" if site.is_local else "the flight has no telemetry with fixes"
+        notice = Notice("no_telemetry", 1, f"{lack}: the frames are looked for in the whole map, by their looks alone")
+        step_s = _UNTIMED_STEP_S if source.kind == "video" else 0.0
+        return FlightSetup(
+            source, site.frame, None, None, step_s, step_s, 0.0, max(2, source.frame_count), site, (notice,)
+        )
     if not telemetry.has_fixes:
         if site is not None and not site.is_local:
             raise InputError(

@@ -52,10 +52,10 @@ class CompareSettings:
             raise SettingsError(f"method must be robust or thesis, got {self.method!r}")
         if not 0.05 <= self.views_per_second <= 240:
             raise SettingsError(f"views per second must lie in 0.05 to 240, got {self.views_per_second}")
-        if not 1 <= self.votes <= self.voters <= 16:
+        if not 1 <= self.votes <= self.voters <= 8:
             raise SettingsError(
                 f"a change needs {self.votes} of the last {self.voters} views: the first must not exceed the second, "
-                "and both lie in 1 to 16"
+                "and both lie in 1 to 8"
             )
         if not 256 <= self.side_px <= 8192:
             raise SettingsError(f"frames are compared at 256 to 8192 px, got {self.side_px}")
