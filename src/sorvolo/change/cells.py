@@ -1,0 +1,256 @@
+"""The ground as small square cells: which of them the last views found changed, and how often they were seen at all."""
+
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.geometry.arrays import Anything, ImageGray, Mask, Matrix3, PointsM
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.survey.findings import ComparedView
+
+_CHUNK = 64
+_FAR_HEIGHTS = 5.0  # ground further away than this many flying heights shows nothing that a cell could hold
+_MOST_CELLS = 2_000_000
+_VOTES: NDArray[np.uint8] = np.array([bin(bits).count("1") for bits in range(256)], np.uint8)
+
+
+@dataclass(frozen=True)
+class CellWindow:
+    """Cells x0 <= column < x1, y0 <= row < y1. Columns count east, rows south; both may be negative."""
+
+    x0: int
+    y0: int
+    x1: int
+    y1: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows, columns."""
+        return max(self.y1 - self.y0, 0), max(self.x1 - self.x0, 0)
+
+    def joined(self, other: "CellWindow") -> "CellWindow":
+        """The smallest window that holds both."""
+        return CellWindow(
+            min(self.x0, other.x0), min(self.y0, other.y0), max(self.x1, other.x1), max(self.y1, other.y1)
+        )
+
+    def site_from_cell(self, cell_m: float) -> Matrix3:
+        """(3, 3) affine map from a raster of this window, (0, 0) the centre of its first cell, to site metres."""
+        return np.array([
+            [cell_m, 0.0, (self.x0 + 0.5) * cell_m], [0.0, -cell_m, -(self.y0 + 0.5) * cell_m], [0.0, 0.0, 1.0]
+        ])
+
+
+def window_around(points_m: PointsM, cell_m: float) -> CellWindow:
+    """The cells of the box around points, shape (N, 2), in site metres."""
+    columns, rows = points_m[:, 0] / cell_m, -points_m[:, 1] / cell_m
+    return CellWindow(
+        int(np.floor(columns.min())), int(np.floor(rows.min())),
+        int(np.ceil(columns.max())), int(np.ceil(rows.max())),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class LaidView:
+    """One view as cells of a window: `flagged` where it shows a change, `seen` where it can tell at all.
+
+    `score` is 255 times the sureness of the change there; `held` marks cells under things that seem to move.
+    """
+
+    window: CellWindow
+    flagged: Mask
+    seen: Mask
+    score: ImageGray
+    held: Mask
+
+
+def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask) -> LaidView:
+    """The view's answer for every cell of ground that it shows.
+
+    `ignored` and `held`, (number of boxes,), choose boxes: what lies in ignored ones is taken for unknown ground. A
+    cell is flagged where most of it is changed, and seen where the map and the frame know all of it.
+    """
+    height, width = view.changed.shape
+    m_per_px = scale_m_per_px(view)
+    shrink = int(np.clip(cell_m / m_per_px, 1, min(height, width)))
+    rows, columns = height // shrink, width // shrink
+
+    def small(image: ImageGray) -> ImageGray:
+        if shrink == 1:
+            return image
+        cut = image[: rows * shrink, : columns * shrink]
+        return np.asarray(cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)
+
+    changed = small(view.changed)
+    valid = small(view.valid.view(np.uint8) * np.uint8(255))
+    score, keep_out = np.zeros((rows, columns), np.uint8), np.zeros((rows, columns), np.uint8)
+    for index in np.argsort(view.scores, kind="stable"):
+        x, y, w, h = view.boxes[index]
+        part = np.s_[y // shrink : -(-(y + h) // shrink), x // shrink : -(-(x + w) // shrink)]
+        score[part] = round(255 * float(np.clip(view.scores[index], 0, 1)))
+        if ignored[index]:
+            valid = valid if valid.flags.writeable else valid.copy()
+            valid[part][changed[part] > 0] = 0
+        if held[index]:
+            keep_out[part] = 255
+    window = _window_of(view, cell_m)
+    image_from_small = np.array([
+        [shrink, 0, (shrink - 1) / 2], [0, shrink, (shrink - 1) / 2], [0, 0, 1.0]
+    ])
+    cell_from_small = np.linalg.inv(window.site_from_cell(cell_m)) @ view.site_from_image @ image_from_small
+    size = window.shape[::-1]
+
+    def laid(image: ImageGray, how: int) -> Anything:
+        return cv2.warpPerspective(image, cell_from_small, size, flags=how)
+
+    seen = laid(valid, cv2.INTER_LINEAR) >= 250
+    _clear_behind(seen, cell_from_small)
+    flagged = (laid(changed, cv2.INTER_LINEAR) >= 128) & seen
+    keeps_out = laid(keep_out, cv2.INTER_NEAREST) > 0 if held.any() else np.zeros_like(seen)
+    return LaidView(window, flagged, seen, np.where(flagged, laid(score, cv2.INTER_NEAREST), 0), keeps_out)
+
+
+def scale_m_per_px(view: ComparedView) -> float:
+    """Ground metres of a pixel in the middle of the view's picture."""
+    height, width = view.changed.shape
+    middle = np.array([[width / 2, height / 2], [width / 2 + 1, height / 2], [width / 2, height / 2 + 1]])
+    a, b, c = apply_homography(view.site_from_image, middle)
+    across = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+    return float(np.sqrt(abs(across))) or 1.0
+
+
+def _window_of(view: ComparedView, cell_m: float) -> CellWindow:
+    height, width = view.changed.shape
+    x, y = np.meshgrid(np.linspace(-0.5, width - 0.5, 5), np.linspace(-0.5, height - 0.5, 5))
+    ground_m = apply_homography(view.site_from_image, np.column_stack([x.ravel(), y.ravel()]))
+    reach_m = max(_FAR_HEIGHTS * float(view.camera_m[2]), 1.0)
+    reach_m = min(reach_m, 0.5 * cell_m * np.sqrt(_MOST_CELLS))
+    low, high = view.camera_m[:2] - reach_m, view.camera_m[:2] + reach_m
+    near = np.isfinite(ground_m).all(axis=1)
+    if not near.any():
+        return CellWindow(0, 0, 1, 1)
+    if not near.all():
+        ground_m = np.vstack([ground_m[near], low, high])  # part of the view lies beyond the horizon
+    return window_around(np.clip(ground_m, low, high), cell_m)
+
+
+def _clear_behind(seen: Mask, cell_from_image: Matrix3) -> None:
+    # the warp would show ground behind the camera, too; there the third coordinate is not positive
+    row = np.linalg.inv(cell_from_image)[2]
+    height, width = seen.shape
+    corners = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1.0]])
+    if (corners @ row > 0).all():
+        return
+    y, x = np.mgrid[:height, :width]
+    seen[x * row[0] + y * row[1] + row[2] <= 0] = False
+
+
+@dataclass(frozen=True, eq=False)
+class CellEvidence:
+    """What the cells of a window hold: `votes` of the last n views that saw each cell, how many views ever `seen` it
+    and found it `changed`, and the number of the change that owns it, 0 = none."""
+
+    votes: NDArray[np.uint8]
+    seen: NDArray[np.uint16]
+    changed: NDArray[np.uint16]
+    owner: NDArray[np.int32]
+
+
+class _Chunk:
+    def __init__(self, seen: int) -> None:
+        self.history = np.zeros((_CHUNK, _CHUNK), np.uint8)
+        self.seen = np.full((_CHUNK, _CHUNK), seen, np.uint16)
+        self.changed = np.zeros((_CHUNK, _CHUNK), np.uint16)
+        self.owner = np.zeros((_CHUNK, _CHUNK), np.int32)
+
+
+class CellGrid:
+    """Histories of the cells, kept only where something changed. `record` and `own` change it.
+
+    At most `most_chunks` pieces of 64 x 64 cells are kept; the one not looked at for the longest time goes first.
+    """
+
+    def __init__(self, n: int, most_chunks: int = 4096) -> None:
+        self._kept_bits = np.uint8((1 << n) - 1)
+        self._most_chunks = most_chunks
+        self._chunks: OrderedDict[tuple[int, int], _Chunk] = OrderedDict()
+        self._quiet: dict[tuple[int, int], int] = {}  # views of chunks in which nothing ever changed
+
+    def record(self, laid: LaidView, counts: bool) -> CellEvidence:
+        """Shift one view into the cells' histories; `counts` says whether the lifelong counts take it, too."""
+        found = _no_evidence(laid.window)
+        for key, inside, part in _pieces(laid.window):
+            flagged, seen = laid.flagged[part], laid.seen[part]
+            chunk = self._chunks.get(key)
+            if chunk is None:
+                if not flagged.any():
+                    if counts and flagged.size == _CHUNK * _CHUNK and seen.all():
+                        self._quiet[key] = self._quiet.get(key, 0) + 1
+                    continue
+                chunk = self._new_chunk(key)
+            self._chunks.move_to_end(key)
+            history = chunk.history[inside]
+            shifted = ((history << np.uint8(1)) | flagged.view(np.uint8)) & self._kept_bits
+            np.copyto(history, shifted, where=seen)
+            if counts:
+                ever = chunk.seen[inside]
+                np.minimum(ever + seen, 60_000, out=ever)
+                often = chunk.changed[inside]
+                np.minimum(often + flagged, 60_000, out=often)
+            found.votes[part] = _VOTES[history]
+            found.seen[part], found.changed[part] = chunk.seen[inside], chunk.changed[inside]
+            found.owner[part] = chunk.owner[inside]
+        return found
+
+    def read(self, window: CellWindow) -> CellEvidence:
+        """What the cells of a window hold now."""
+        found = _no_evidence(window)
+        for key, inside, part in _pieces(window):
+            chunk = self._chunks.get(key)
+            if chunk is not None:
+                found.votes[part] = _VOTES[chunk.history[inside]]
+                found.seen[part], found.changed[part] = chunk.seen[inside], chunk.changed[inside]
+                found.owner[part] = chunk.owner[inside]
+        return found
+
+    def own(self, window: CellWindow, cells: Mask, number: int) -> None:
+        """Give cells of a window to a change."""
+        for key, inside, part in _pieces(window):
+            chunk = self._chunks.get(key)
+            if chunk is not None:
+                chunk.owner[inside][cells[part]] = number
+
+    @property
+    def chunks(self) -> int:
+        """How many pieces of ground are kept."""
+        return len(self._chunks)
+
+    def _new_chunk(self, key: tuple[int, int]) -> _Chunk:
+        if len(self._chunks) >= self._most_chunks:
+            self._chunks.popitem(last=False)
+        chunk = self._chunks[key] = _Chunk(min(self._quiet.pop(key, 0), 60_000))
+        return chunk
+
+
+def _no_evidence(window: CellWindow) -> CellEvidence:
+    shape = window.shape
+    return CellEvidence(
+        np.zeros(shape, np.uint8), np.zeros(shape, np.uint16), np.zeros(shape, np.uint16), np.zeros(shape, np.int32)
+    )
+
+
+def _pieces(
+    window: CellWindow,
+) -> Iterator[tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]]:
+    """Chunk, its part inside the window, and where that part lies in a raster of the window."""
+    for row in range(window.y0 // _CHUNK, -(-window.y1 // _CHUNK)):
+        y0, y1 = max(window.y0, row * _CHUNK), min(window.y1, (row + 1) * _CHUNK)
+        rows, rows_here = slice(y0 - row * _CHUNK, y1 - row * _CHUNK), slice(y0 - window.y0, y1 - window.y0)
+        for column in range(window.x0 // _CHUNK, -(-window.x1 // _CHUNK)):
+            x0, x1 = max(window.x0, column * _CHUNK), min(window.x1, (column + 1) * _CHUNK)
+            inside = (rows, slice(x0 - column * _CHUNK, x1 - column * _CHUNK))
+            yield (column, row), inside, (rows_here, slice(x0 - window.x0, x1 - window.x0))

@@ -1,0 +1,441 @@
+"""Changes of the ground collected over views: what persists at one place on the ground is told, once.
+
+The ground is divided into small cells; each keeps what the last n views that saw it said. A ghost of something tall
+lies elsewhere on the ground from each place of the camera, moving leaves flicker, noise does not come back: none of
+them gathers k votes out of n in the same cell. Unknown ground says nothing, neither for nor against.
+"""
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.change.cells import CellEvidence, CellGrid, CellWindow, LaidView, lay, scale_m_per_px
+from sorvolo.change.gathering import GatheredChange
+from sorvolo.change.moving import BlobTracker, MovingSettings, Track
+from sorvolo.change.outlines import KnownPlace, is_known, measures, outline_of
+from sorvolo.change.patches import PatchWindow, cut, patch_of
+from sorvolo.errors import SettingsError
+from sorvolo.geometry.arrays import Floats, ImageGray, Mask, Matrix3, PointsM
+from sorvolo.survey.findings import Change, ChangeKind, ComparedView
+
+_CELL_PX = 3
+_LEAST_CELL_M = 0.05
+_SHOWS = 0.3  # share of a change's cells that a view must flag to count as showing it
+_PICTURES_A_VIEW = 6  # cut anew at most, which bounds the time a view takes
+_MOST_SEEDS = 256
+_MOVED_HEIGHTS = 0.01  # the camera's way, in flying heights, after which a view is a new witness
+_ALL_CHANGED = 0.5  # share of the frame beyond which nothing in it can be followed
+
+
+@dataclass(frozen=True)
+class EvidenceSettings:
+    """When a change is told."""
+
+    k: int = 3  # views that must show it ...
+    n: int = 5  # ... of the last ones that saw its ground
+    least_views: int = 2  # where fewer than n ever see it
+    least_views_apart_s: float = 0.1  # frames nearer in time see the same thing and say nothing new
+    least_share: float = 0.3  # of all views of its ground must show it, or it was nothing lasting
+    least_area_m2: float = 0.02
+    join_m: float = 0.3  # a smaller gap does not make two things of one
+    single_view_score: float = 0.9  # a single view's change this sure is told at the end; above 1: never
+    moving: MovingSettings = field(default_factory=MovingSettings)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.k <= self.n <= 8:
+            raise SettingsError(f"evidence needs 1 <= k <= n <= 8 views, got k = {self.k}, n = {self.n}")
+        if not 1 <= self.least_views <= self.k:
+            raise SettingsError(f"least_views must lie in 1 to k = {self.k}, got {self.least_views}")
+        if not 0 <= self.least_share <= 1:
+            raise SettingsError(f"least_share must lie in 0 to 1, got {self.least_share}")
+        if min(self.least_views_apart_s, self.least_area_m2, self.join_m) < 0:
+            raise SettingsError("times, areas and gaps of the evidence must not be negative")
+
+
+@dataclass(frozen=True, eq=False)
+class _Witness:
+    """What is kept of one of the last views."""
+
+    time_ns: int
+    laid: LaidView
+    camera_m: Floats
+    site_from_image: Matrix3
+    changed: ImageGray
+    valid: Mask
+    counts: bool
+
+
+class EvidenceMap:
+    """The changes of one flight while its views come in. `add` changes it; `conclude` says the last word.
+
+    `site_m_per_px` is the map's pixel, `id_prefix` begins every change's id: the flight's name. `rejected` are the
+    places where a person said no on an earlier flight: a change of the same kind there is not told but counted in
+    `suppressed`. Views must come in order of time; the same views give the same changes and ids.
+    """
+
+    def __init__(
+        self, site_m_per_px: float, settings: EvidenceSettings, id_prefix: str, rejected: Sequence[KnownPlace] = ()
+    ) -> None:
+        self.suppressed = 0
+        self._settings, self._prefix, self._rejected = settings, id_prefix, tuple(rejected)
+        self._site_m_per_px = site_m_per_px
+        self._cell_m = max(_LEAST_CELL_M, _CELL_PX * site_m_per_px)
+        self._join_m = max(settings.join_m, 3 * self._cell_m) if settings.join_m else 0.0
+        self._grid = CellGrid(settings.n)
+        self._tracker = BlobTracker(settings.moving)
+        self._found: dict[int, GatheredChange] = {}  # by number, in order
+        self._merged: dict[int, int] = {}
+        self._movers: dict[int, Change] = {}  # by the tracker's number
+        self._seeds: list[GatheredChange] = []
+        self._recent: deque[_Witness] = deque(maxlen=settings.n)
+        self._number = 0
+        self._last_ns: int | None = None
+        self._tallied_at_m: Floats | None = None
+
+    def add(self, view: ComparedView) -> tuple[Change, ...]:
+        """Take in one view; the changes that it makes certain enough to be told, each once in a flight."""
+        if self._last_ns is not None and (view.time_ns - self._last_ns) * 1e-9 < self._settings.least_views_apart_s:
+            return ()
+        self._last_ns = view.time_ns
+        known = int(np.count_nonzero(view.valid))
+        may_follow = np.count_nonzero(view.changed) < _ALL_CHANGED * known
+        followed = self._tracker.follow(view if may_follow else replace(
+            view, boxes=view.boxes[:0], scores=view.scores[:0]
+        ))
+        nothing = np.zeros(len(view.boxes), bool)
+        moving, held = (followed.is_moving, followed.may_move) if may_follow else (nothing, nothing)
+        laid = lay(view, self._cell_m, moving, held)
+        counts = self._is_new_place(view)
+        evidence = self._grid.record(laid, counts)
+        witness = _Witness(
+            view.time_ns, laid, view.camera_m, view.site_from_image, view.changed, view.valid, counts
+        )
+        earlier = list(self._recent)
+        self._recent.append(witness)
+        budget = [_PICTURES_A_VIEW]
+        new = self._gather(view, witness, earlier, evidence, budget)
+        self._update(view, witness, evidence.owner, {each.number for each in new}, budget)
+        announced = [self._change(each) for each in new]
+        announced += self._tell_movers(view, followed.movers)
+        self._keep_seeds(view, laid, evidence, budget)
+        return tuple(each for each in announced if each is not None)
+
+    def changes(self) -> tuple[Change, ...]:
+        """All changes told so far as they are known now, in the order of their numbers."""
+        found = [self._change(each) for each in self._found.values() if not each.is_hidden]
+        return tuple(sorted([each for each in found if each is not None] + list(self._movers.values()), key=_number_of))
+
+    def conclude(self) -> tuple[Change, ...]:
+        """The last word, after the last view: all changes, with those that fewer than n views could see.
+
+        A change that too small a share of all views of its ground showed is taken back. A change that only one view
+        saw, and no other could, is told if that view was very sure, with half the score.
+        """
+        for change in self._found.values():
+            change.is_hidden = change.is_hidden or change.share < self._settings.least_share
+        for seed in self._seeds:
+            self._grow_late(seed)
+        self._seeds = []
+        return self.changes()
+
+    def _is_new_place(self, view: ComparedView) -> bool:
+        last = self._tallied_at_m
+        if last is None or np.linalg.norm(view.camera_m - last) >= _MOVED_HEIGHTS * float(view.camera_m[2]):
+            self._tallied_at_m = np.array(view.camera_m)
+            return True
+        return False
+
+    def _next_number(self) -> int:
+        self._number += 1
+        return self._number
+
+    def _gather(
+        self, view: ComparedView, witness: _Witness, earlier: Sequence[_Witness], evidence: CellEvidence,
+        budget: list[int],
+    ) -> list[GatheredChange]:
+        """Give the cells that are certain to the changes that they belong to; the changes that begin with this."""
+        laid, settings = witness.laid, self._settings
+        lasting = evidence.changed >= settings.least_share * evidence.seen
+        sure = (evidence.votes >= settings.k) & lasting & laid.flagged
+        if not (sure & (evidence.owner == 0)).any():
+            return []
+        new = []
+        least_cells = max(2, settings.least_area_m2 / self._cell_m**2)
+        for piece, part in self._pieces(sure | (evidence.owner > 0)):
+            cells = sure[part] & piece
+            owner = evidence.owner[part]
+            owners = sorted({self._current(int(each)) for each in np.unique(owner[piece & (owner > 0)])})
+            if not (cells & (owner == 0)).any():
+                continue
+            if not owners:
+                if np.count_nonzero(cells) < least_cells or np.mean(laid.held[part][cells]) > 0.5:
+                    continue
+                known = self._known_at(laid.window, part, cells)
+                change = self._found[known] if known else self._begin(view, earlier, witness, part, cells, budget)
+                if not known:
+                    new.append(change)
+            else:
+                change = self._found[owners[0]]
+                for younger in owners[1:]:
+                    self._merge(change, self._found[younger])
+            window = _sub_window(laid.window, part)
+            change.cells = window if change.cells is None else change.cells.joined(window)
+            self._grid.own(window, cells, change.number)
+            owner[cells] = change.number
+        return [each for each in new if self._current(each.number) == each.number and self._is_told(each)]
+
+    def _begin(
+        self, view: ComparedView, earlier: Sequence[_Witness], witness: _Witness, part: tuple[slice, slice],
+        cells: Mask, budget: list[int],
+    ) -> GatheredChange:
+        change = GatheredChange(self._next_number(), view.time_ns)
+        change.cells = _sub_window(witness.laid.window, part)
+        self._found[change.number] = change
+        box = _box_m(change.cells, self._cell_m)
+        change.show(view, *box, self._site_m_per_px)
+        budget[0] -= 1
+        for each in earlier:
+            seen, flagged, score, place_m = self._answer(each.laid, change.cells, cells)
+            if seen >= 0.5 and flagged >= _SHOWS * seen:
+                change.see(each.time_ns, score, place_m, None, each.counts)
+                change.from_camera(each.camera_m)
+                change.vote(each.site_from_image, each.changed, each.valid)
+            elif seen >= 0.5:
+                change.miss(each.counts)
+        return change
+
+    def _is_told(self, change: GatheredChange) -> bool:
+        record = self._change(change)
+        if record is None or is_known(record.outline_m, record.kind, self._rejected):
+            change.is_hidden = True
+            self.suppressed += record is not None
+        return not change.is_hidden
+
+    def _answer(self, laid: LaidView, window: CellWindow, cells: Mask) -> tuple[float, float, float, Floats]:
+        """What a view says of some cells: the shares of them it saw and flagged, how sure, where the flagged lie."""
+        inner = CellWindow(
+            max(window.x0, laid.window.x0), max(window.y0, laid.window.y0),
+            min(window.x1, laid.window.x1), min(window.y1, laid.window.y1),
+        )
+        if 0 in inner.shape:
+            return 0.0, 0.0, 0.0, np.zeros(2)
+        here, there = _slices(inner, window), _slices(inner, laid.window)
+        mine, total = cells[here], max(int(np.count_nonzero(cells)), 1)
+        flagged = mine & laid.flagged[there]
+        seen = np.count_nonzero(mine & laid.seen[there]) / total
+        if not flagged.any():
+            return seen, 0.0, 0.0, np.zeros(2)
+        rows, columns = np.nonzero(flagged)
+        middle = np.array([columns.mean() + inner.x0 + 0.5, -(rows.mean() + inner.y0 + 0.5)]) * self._cell_m
+        return seen, len(rows) / total, float(laid.score[there][flagged].max()) / 255, middle
+
+    def _update(
+        self, view: ComparedView, witness: _Witness, owner: NDArray[np.int32], new: set[int], budget: list[int]
+    ) -> None:
+        """Tell the known changes what this view says of them."""
+        if not owner.any():
+            return
+        laid = witness.laid
+        wishes = []
+        for number in sorted({self._current(int(each)) for each in np.unique(owner[owner > 0])}):
+            change = self._found[number]
+            if change.cells is None:
+                continue
+            cells = self._cells_of(change)
+            seen, flagged, score, place_m = self._answer(laid, change.cells, cells)
+            is_large = max(change.cells.shape) * self._cell_m > 0.5 * max(laid.window.shape) * self._cell_m
+            if seen < 0.5 and not (is_large and flagged > 0):
+                continue
+            if flagged < _SHOWS * seen:
+                change.miss(witness.counts)
+                continue
+            change.see(view.time_ns, score, place_m if seen > 0.99 else None, view, witness.counts)
+            change.from_camera(view.camera_m)
+            if change.still_votes and number not in new:
+                change.vote(view.site_from_image, view.changed, view.valid)
+            wishes.append((change.wants(*_box_m(change.cells, self._cell_m), view), -number))
+        for gain, minus_number in sorted(wishes, reverse=True):
+            if gain <= 1.15 or budget[0] <= 0:
+                break
+            change = self._found[-minus_number]
+            if change.cells is not None:
+                change.show(view, *_box_m(change.cells, self._cell_m), self._site_m_per_px)
+                budget[0] -= 1
+        for number in new:
+            change = self._found[number]
+            change.vote(view.site_from_image, view.changed, view.valid)
+
+    def _merge(self, older: GatheredChange, younger: GatheredChange) -> None:
+        if younger.cells is not None:
+            self._grid.own(younger.cells, self._cells_of(younger), older.number)
+        older.take_over(younger)
+        self._merged[younger.number] = older.number
+        del self._found[younger.number]
+
+    def _current(self, number: int) -> int:
+        while number in self._merged:
+            number = self._merged[number]
+        return number
+
+    def _known_at(self, window: CellWindow, part: tuple[slice, slice], cells: Mask) -> int:
+        """The change already told here whose cells were forgotten since; 0 if there is none."""
+        here = _sub_window(window, part)
+        rows, columns = np.nonzero(cells)
+        x, y = int(columns.mean()) + here.x0, int(rows.mean()) + here.y0
+        for number, change in self._found.items():
+            box = change.cells
+            if box and box.x0 <= x < box.x1 and box.y0 <= y < box.y1 and not self._cells_of(change).any():
+                return number
+        return 0
+
+    def _cells_of(self, change: GatheredChange) -> Mask:
+        if change.cells is None:
+            return np.zeros((1, 1), bool)
+        return self._grid.read(change.cells).owner == change.number
+
+    def _pieces(self, cells: Mask) -> Iterator[tuple[Mask, tuple[slice, slice]]]:
+        """The connected pieces of cells, small gaps closed: each with the window, as slices, that holds it."""
+        gap = int(np.ceil(self._join_m / self._cell_m))
+        kernel = np.ones((gap + 1, gap + 1), np.uint8)
+        closed = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_CLOSE, kernel)
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+        for label in range(1, count):
+            x, y, w, h = (int(each) for each in stats[label, :4])
+            part = (slice(y, y + h), slice(x, x + w))
+            yield labels[part] == label, part
+
+    def _change(self, change: GatheredChange) -> Change | None:
+        cells = self._cells_of(change)
+        outline_m = change.outline_m(cells, self._cell_m, self._join_m)
+        return None if outline_m is None else change.change(self._prefix, outline_m, self._cell_m)
+
+    def _keep_seeds(self, view: ComparedView, laid: LaidView, evidence: CellEvidence, budget: list[int]) -> None:
+        """Keep pictures of what is not certain yet: it may never be seen often enough for k of n."""
+        weak = laid.flagged & (evidence.owner == 0)
+        kept = []
+        for seed in self._seeds:
+            if seed.cells is None:
+                continue
+            here = _slices(seed.cells, laid.window)
+            votes, owner = evidence.votes[here], evidence.owner[here]
+            if not votes.size:
+                kept.append(seed)
+            elif (votes > 0).any() and not (owner > 0).any():
+                kept.append(seed)
+                weak[_slices(seed.cells, laid.window)] = False
+        self._seeds = kept
+        if budget[0] <= 0 or not weak.any():
+            return
+        least_cells = max(2, self._settings.least_area_m2 / self._cell_m**2)
+        pieces = [
+            (float(laid.score[part][piece & weak[part]].max(initial=0)) / 255, _sub_window(laid.window, part))
+            for piece, part in self._pieces(weak)
+            if np.count_nonzero(piece & weak[part]) >= least_cells
+        ]
+        for score, window in sorted(pieces, key=lambda each: -each[0])[: budget[0]]:
+            seed = GatheredChange(0, view.time_ns)
+            seed.cells = window
+            seed.show(view, *_box_m(window, self._cell_m), self._site_m_per_px)
+            seed.see(view.time_ns, score, None, view, True)
+            seed.from_camera(view.camera_m)
+            seed.vote(view.site_from_image, view.changed, view.valid)
+            self._seeds.append(seed)
+        del self._seeds[:-_MOST_SEEDS]
+
+    def _grow_late(self, seed: GatheredChange) -> None:
+        """Tell what fewer than n views could see: the same share of them must show it as k of n."""
+        settings = self._settings
+        if seed.cells is None:
+            return
+        evidence = self._grid.read(seed.cells)
+        seen, changed = evidence.seen.astype(float), evidence.changed
+        needed = np.maximum(settings.least_views, np.ceil(settings.k * np.minimum(seen, settings.n) / settings.n))
+        free = evidence.owner == 0
+        late = free & (changed >= needed) & (seen < settings.n)
+        single = free & (changed == 1) & (seen == 1)
+        least_cells = max(2, settings.least_area_m2 / self._cell_m**2)
+        if np.count_nonzero(late) >= least_cells:
+            cells, views, asked = late, int(changed[late].max()), int(seen[late].max())
+        elif np.count_nonzero(single) >= least_cells and seed.score * 1.5 >= settings.single_view_score:
+            cells, views, asked, seed.weakness = single, 1, 1, 0.5
+        else:
+            return
+        seed.number = self._next_number()
+        for _ in range(views - seed.views):
+            seed.see(seed.last_seen_ns, seed.score, None, None, True)
+        for _ in range(asked - seed.asked):
+            seed.miss(True)
+        self._grid.own(seed.cells, cells, seed.number)
+        self._found[seed.number] = seed
+        self._is_told(seed)
+
+    def _tell_movers(self, view: ComparedView, movers: Sequence[Track]) -> list[Change]:
+        """Bring the moving things up to date; those told for the first time."""
+        told = []
+        for track in movers:
+            known = self._movers.get(track.mover)
+            number = _number_of(known) if known else self._next_number()
+            change = self._moving(view, track, f"{self._prefix}-{number}")
+            if known:
+                change = replace(
+                    change, first_seen_ns=known.first_seen_ns, views=max(change.views, known.views + 1)
+                )
+            elif is_known(change.outline_m, change.kind, self._rejected):
+                self.suppressed += 1
+                continue
+            else:
+                told.append(change)
+            self._movers[track.mover] = change
+        return told
+
+    def _moving(self, view: ComparedView, track: Track, change_id: str) -> Change:
+        """A moving thing as this view shows it."""
+        x, y, w, h = (int(each) for each in view.boxes[track.last.blob.box])
+        part = view.changed[y : y + h, x : x + w] > 0
+        site_from_part = view.site_from_image @ np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
+        m_per_px = scale_m_per_px(view)
+        outline_m = outline_of(part, site_from_part, 0.5 * self._cell_m / m_per_px, self._join_m / m_per_px)
+        if outline_m is None:
+            outline_m = _square(track.last.blob.place_m, self._cell_m)
+        window = PatchWindow.around(outline_m.min(axis=0), outline_m.max(axis=0), self._site_m_per_px, 512)
+        size = measures(outline_m)
+        residual_m = view.residual_px * m_per_px if np.isfinite(view.residual_px) else 0.0
+        score = track.score_sum / track.count * (track.count + 1) / (track.count + 2)
+        return Change(
+            change_id, ChangeKind.MOVING, float(np.clip(score, 0, 1)), outline_m, track.first.time_ns,
+            track.last.time_ns, track.count, size.area_m2, size.length_m,
+            float(np.hypot(residual_m, self._cell_m / np.sqrt(12))), patch_of(window, cut(view, window), outline_m),
+            track.velocity_m_s(),
+        )
+
+
+def _number_of(change: Change) -> int:
+    return int(change.id.rsplit("-", 1)[1])
+
+
+def _square(place_m: Floats, side_m: float) -> PointsM:
+    return place_m + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side_m / 2
+
+
+def _sub_window(window: CellWindow, part: tuple[slice, slice]) -> CellWindow:
+    rows, columns = part
+    return CellWindow(
+        window.x0 + columns.start, window.y0 + rows.start, window.x0 + columns.stop, window.y0 + rows.stop
+    )
+
+
+def _slices(inner: CellWindow, outer: CellWindow) -> tuple[slice, slice]:
+    """Where a window lies in the raster of another; what sticks out is cut off."""
+    return (
+        slice(max(inner.y0 - outer.y0, 0), max(inner.y1 - outer.y0, 0)),
+        slice(max(inner.x0 - outer.x0, 0), max(inner.x1 - outer.x0, 0)),
+    )
+
+
+def _box_m(window: CellWindow, cell_m: float) -> tuple[Floats, Floats]:
+    """South-west and north-east corner, (2,) each, in site metres."""
+    return np.array([window.x0, -window.y1]) * cell_m, np.array([window.x1, -window.y0]) * cell_m

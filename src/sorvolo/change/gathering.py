@@ -1,0 +1,191 @@
+"""One change while views of it come in: its pictures, its outline by majority, and how sure it is by now."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.change.cells import CellWindow, scale_m_per_px
+from sorvolo.change.kinds import kind_of
+from sorvolo.change.outlines import measures, outline_of
+from sorvolo.change.patches import Cut, PatchWindow, cut, moved, patch_of
+from sorvolo.errors import GeometryError
+from sorvolo.geometry.arrays import Floats, Mask, Matrix3, PointsM
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.survey.findings import Change, ChangeKind, ComparedView
+
+_MOST_PX = 512
+_VOTING_VIEWS = 12  # more of them hardly move the outline
+_BETTER = 1.15  # a view's pictures replace the older ones when it is so much better
+_ONE_PLACE = 0.05  # of the flying height: seen from no wider apart, a ghost of something tall looks the same
+
+
+class GatheredChange:
+    """All that views told of one change. `see`, `vote`, `show` and `take_over` change it."""
+
+    def __init__(self, number: int, first_seen_ns: int) -> None:
+        self.number = number
+        self.is_hidden = False  # a person said no to it, or it turned out to be nothing
+        self.first_seen_ns = self.last_seen_ns = first_seen_ns
+        self.views = self.asked = 0
+        self.tallied_views = self.tallied_asked = 0
+        self.weakness = 1.0  # factor of the score, for what too few views say
+        self.cells: CellWindow | None = None
+        self._score_sum = 0.0
+        self._residual_m_sum = 0.0
+        self._places: list[Floats] = []
+        self._camera_low = np.full(3, np.inf)
+        self._camera_high = np.full(3, -np.inf)
+        self._window: PatchWindow | None = None
+        self._pictures: Cut | None = None
+        self._quality = 0.0
+        self._votes = 0
+        self._yes: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
+        self._asked_px: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
+        self._kind: ChangeKind | None = None
+        self._kind_outline: PointsM | None = None
+
+    def see(
+        self, time_ns: int, score: float, place_m: Floats | None, view: ComparedView | None, counts: bool
+    ) -> None:
+        """One more view flagged it; `view` is None for one of those before it was found, whose pictures are gone."""
+        self.views += 1
+        self.asked += 1
+        self.tallied_views += counts
+        self.tallied_asked += counts
+        self._score_sum += score
+        self.first_seen_ns, self.last_seen_ns = min(self.first_seen_ns, time_ns), max(self.last_seen_ns, time_ns)
+        if place_m is not None and len(self._places) < 64:
+            self._places.append(place_m)
+        if view is not None:
+            self._residual_m_sum += view.residual_px * scale_m_per_px(view) if np.isfinite(view.residual_px) else 0.0
+
+    def from_camera(self, camera_m: Floats) -> None:
+        """The camera's place (3,) in a view that flagged it."""
+        self._camera_low = np.minimum(self._camera_low, camera_m)
+        self._camera_high = np.maximum(self._camera_high, camera_m)
+
+    def miss(self, counts: bool) -> None:
+        """One more view that could have shown it does not."""
+        self.asked += 1
+        self.tallied_asked += counts
+
+    @property
+    def share(self) -> float:
+        """The share of the views from different places that show it, of those that could."""
+        return self.tallied_views / self.tallied_asked if self.tallied_asked else 1.0
+
+    @property
+    def score(self) -> float:
+        """0 to 1: mean sureness of its boxes x (views that show it + 1) / (views that could + 2), which is the mean of
+        a share under Bayes; halved if all of them looked from one place."""
+        if not self.views:
+            return 0.0
+        score = self._score_sum / self.views * (self.views + 1) / (self.asked + 2) * self.weakness
+        apart_m = float(np.hypot(*(self._camera_high - self._camera_low)[:2]))
+        is_one_place = self.views > 1 and apart_m < _ONE_PLACE * float(self._camera_high[2])
+        return float(np.clip(score * (0.5 if is_one_place else 1.0), 0, 1))
+
+    def wants(self, low_m: Floats, high_m: Floats, view: ComparedView) -> float:
+        """How much better, as a factor, the view's pictures are than those it has; infinite if it has to grow."""
+        if self._window is None or not self._window.holds(low_m, high_m) or self._pictures is None:
+            return np.inf
+        return quality(view, low_m, high_m) / max(self._quality, 1e-9)
+
+    @property
+    def still_votes(self) -> bool:
+        """Whether more masks would make the outline better."""
+        return self._votes < _VOTING_VIEWS
+
+    def show(self, view: ComparedView, low_m: Floats, high_m: Floats, site_m_per_px: float) -> None:
+        """Take the view's pictures of the box of ground if they are better, or wherever there were none."""
+        old = self._window
+        if old is None or not old.holds(low_m, high_m):
+            self._window = PatchWindow.around(low_m, high_m, site_m_per_px, _MOST_PX)
+            if old is not None and self._pictures is not None:
+                self._yes = moved(self._yes, self._window, old)
+                self._asked_px = moved(self._asked_px, self._window, old)
+                self._pictures = Cut(
+                    moved(self._pictures.before, self._window, old), moved(self._pictures.after, self._window, old)
+                )
+        window = self._window
+        if window is None:
+            raise GeometryError(f"change {self.number}: no ground to show")
+        if not self._yes.size:
+            self._yes = np.zeros((window.height_px, window.width_px), np.uint8)
+            self._asked_px = np.zeros_like(self._yes)
+        new, good = cut(view, window), quality(view, low_m, high_m)
+        if self._pictures is None:
+            self._pictures, self._quality = new, good
+        elif good > _BETTER * self._quality:
+            self._pictures, self._quality = new.over(self._pictures), good
+        else:
+            self._pictures = self._pictures.over(new)
+
+    def vote(self, site_from_image: Matrix3, changed: NDArray[np.uint8], valid: Mask) -> None:
+        """Count one view's mask, pixel by pixel, towards the outline."""
+        if self._window is None or self._votes >= 250:
+            return
+        self._votes += 1
+        patch_from_image = np.linalg.inv(self._window.site_from_patch) @ site_from_image
+        size = self._window.size_px
+        self._yes += cv2.warpPerspective(changed, patch_from_image, size, flags=cv2.INTER_LINEAR) >= 128
+        self._asked_px += cv2.warpPerspective(valid.view(np.uint8), patch_from_image, size, flags=cv2.INTER_NEAREST) > 0
+
+    def take_over(self, younger: "GatheredChange") -> None:
+        """Become one with a younger change; its pictures are forgotten."""
+        self.first_seen_ns = min(self.first_seen_ns, younger.first_seen_ns)
+        self.last_seen_ns = max(self.last_seen_ns, younger.last_seen_ns)
+        self.is_hidden = self.is_hidden and younger.is_hidden
+        if self.cells is not None and younger.cells is not None:
+            self.cells = self.cells.joined(younger.cells)
+
+    def outline_m(self, cells: Mask, cell_m: float, join_m: float) -> PointsM | None:
+        """(N, 2) its outline: what most masks call changed, on or beside its cells; by its cells alone if that is
+        nothing. `cells` is the raster of its own cells in its window."""
+        if self.cells is None:
+            return None
+        site_from_cells = self.cells.site_from_cell(cell_m)
+        if self._window is not None and self._votes:
+            window = self._window
+            grown = cv2.dilate(cells.view(np.uint8), np.ones((3, 3), np.uint8))
+            patch_from_cells = np.linalg.inv(window.site_from_patch) @ site_from_cells
+            near = cv2.warpAffine(grown, patch_from_cells[:2], window.size_px, flags=cv2.INTER_NEAREST) > 0
+            majority = (2 * self._yes.astype(np.int16) > self._asked_px) & near
+            if np.count_nonzero(majority) * window.m_per_px**2 >= 0.3 * np.count_nonzero(cells) * cell_m**2:
+                tolerance_px = max(0.5 * cell_m / window.m_per_px, 0.5)
+                return outline_of(majority, window.site_from_patch, tolerance_px, join_m / window.m_per_px)
+        return outline_of(cells, site_from_cells, 0.5, join_m / cell_m)
+
+    def change(self, id_prefix: str, outline_m: PointsM, cell_m: float) -> Change:
+        """The record of what is known of it.
+
+        `sigma_m` is the root of the sum of squares of: the mean alignment residual on the ground; a cell's rounding,
+        its side / sqrt(12); and the spread of its middle over the views, per axis, / sqrt(views).
+        """
+        if self._window is None or self._pictures is None:
+            raise GeometryError(f"change {self.number}: nothing was seen of it")
+        patch = patch_of(self._window, self._pictures, outline_m)
+        if self._kind is None or self._kind_outline is None or self._kind_outline is not outline_m:
+            self._kind, self._kind_outline = kind_of(patch), outline_m
+        size = measures(outline_m)
+        residual_m = self._residual_m_sum / max(self.views, 1)
+        spread_m = float(np.sqrt(np.mean(np.var(self._places, axis=0)))) if len(self._places) > 1 else 0.0
+        sigma_m = np.sqrt(residual_m**2 + cell_m**2 / 12 + spread_m**2 / max(len(self._places), 1))
+        return Change(
+            f"{id_prefix}-{self.number}", self._kind, self.score, outline_m, self.first_seen_ns, self.last_seen_ns,
+            self.views, size.area_m2, size.length_m, float(sigma_m), patch,
+        )
+
+
+def quality(view: ComparedView, low_m: Floats, high_m: Floats) -> float:
+    """How well a view shows a box of ground: the more central and the less oblique the better, half if cut off."""
+    height, width = view.changed.shape
+    corners = np.array([[low_m[0], low_m[1]], [high_m[0], low_m[1]], [high_m[0], high_m[1]], [low_m[0], high_m[1]]])
+    pixels = apply_homography(np.linalg.inv(view.site_from_image), corners)
+    if not np.isfinite(pixels).all():
+        return 1e-3
+    off = np.abs(pixels.mean(axis=0) / [width, height] - 0.5).max()
+    is_whole = (pixels >= 0).all() and (pixels < [width, height]).all()
+    to_camera = view.camera_m - np.append(corners.mean(axis=0), 0.0)
+    upright = float(to_camera[2] / max(np.linalg.norm(to_camera), 1e-9))
+    return float(max(1 - 1.4 * off, 0.05) * max(upright, 0.05) * (1.0 if is_whole else 0.5))

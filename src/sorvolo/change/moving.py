@@ -1,0 +1,289 @@
+"""What moves while it is seen: changed blobs followed over views in ground metres, and which of them really move.
+
+A thing of height h stands in the picture where its top hides the ground: seen from a camera at height H that flies with
+v, its blob moves over the ground with -v h / (H - h). So what a blob moves against the camera's own way proves nothing
+as long as some h below 0.6 H explains it; only the rest of its motion counts.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.change.cells import scale_m_per_px
+from sorvolo.errors import SettingsError
+from sorvolo.geometry.arrays import Floats, Mask
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.survey.findings import ComparedView
+
+_MOST_PARALLAX = 0.6 / (1 - 0.6)  # h / (H - h) of a thing 0.6 times as high as the camera flies
+_UNLIKELY_PARALLAX = 0.5  # no thing that came is a third as high as the camera flies
+_POINTS = 12  # of a track, that its velocity is fitted to
+_MOST_BOXES = 64
+_RIM_PX = 2
+_LOST_FOR_S = 10.0  # a thing that moves steadily is known again after so long
+
+
+@dataclass(frozen=True)
+class MovingSettings:
+    """When something counts as moving."""
+
+    least_views: int = 3
+    least_move_m: float = 1.0  # beyond what alignment and a swaying crown do
+    least_lengths: float = 1.2  # of its own: then its places do not overlap, and nothing that grew explains it
+    most_speed_m_s: float = 15.0
+    most_step_m: float = 6.0  # between two views: further away anything could be it
+    forget_s: float = 2.5  # a track without a blob for so long has ended
+
+    def __post_init__(self) -> None:
+        if self.least_views < 3:
+            raise SettingsError(f"moving needs at least 3 views to see a steady velocity, got {self.least_views}")
+        if min(self.least_move_m, self.least_lengths, self.most_speed_m_s, self.most_step_m, self.forget_s) <= 0:
+            raise SettingsError("moving: distances, speeds and times must be above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Blob:
+    """One changed piece of a view: its middle on the ground (2,), its size, and its mean colour (3,) in the frame."""
+
+    box: int  # row of the view's boxes
+    place_m: Floats
+    length_m: float
+    area_m2: float
+    colour: Floats
+    score: float
+
+
+@dataclass(frozen=True, eq=False)
+class TrackPoint:
+    """A blob at a time, with the camera's place (2,) then."""
+
+    time_ns: int
+    blob: Blob
+    camera_m: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How a track moves: `velocity_m_s` (2,) as fitted, `own_m_s` (2,) what no parallax explains.
+
+    `path_m` is how far its own motion took it, `error_m` the rms distance of its points from steady motion.
+    """
+
+    velocity_m_s: Floats
+    own_m_s: Floats
+    path_m: float
+    error_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One blob over time: its first point, its last few, how many, and the sum of their scores.
+
+    `mover` is the number of the moving thing that it is, 0 = not known to move.
+    """
+
+    first: TrackPoint
+    points: tuple[TrackPoint, ...]
+    count: int
+    score_sum: float
+    mover: int = 0
+
+    @property
+    def last(self) -> TrackPoint:
+        """Where it was seen last."""
+        return self.points[-1]
+
+    def with_point(self, point: TrackPoint) -> "Track":
+        """The track, one view longer."""
+        points = (*self.points, point)[-_POINTS:]
+        return replace(self, points=points, count=self.count + 1, score_sum=self.score_sum + point.blob.score)
+
+    def velocity_m_s(self) -> Floats:
+        """(2,) over its last points; zeros while there is but one."""
+        return motion(self.points).velocity_m_s if len(self.points) > 1 else np.zeros(2)
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """What one view says about motion. For each box of the view: whether it shows something that moves, and whether
+    it may (so that nobody should call it a change of the ground yet). `movers` are the tracks that moved in this view.
+    """
+
+    is_moving: NDArray[np.bool_]
+    may_move: NDArray[np.bool_]
+    movers: tuple[Track, ...]
+
+
+def motion(points: Sequence[TrackPoint]) -> Motion:
+    """The steady motion that fits a track's points best (least squares), N >= 2, less what parallax explains."""
+    times = np.array([each.time_ns - points[0].time_ns for each in points]) * 1e-9
+    spread = times - times.mean()
+    weight = spread / max(float(spread @ spread), 1e-12)
+    places = np.array([each.blob.place_m for each in points])
+    velocity = weight @ places
+    error_m = float(np.sqrt(np.mean(np.sum((places - places.mean(axis=0) - np.outer(spread, velocity)) ** 2, axis=1))))
+    camera = weight @ np.array([each.camera_m for each in points])
+    speed2 = float(camera @ camera)
+    parallax = float(np.clip(-(velocity @ camera) / speed2, 0, _MOST_PARALLAX)) if speed2 > 1e-4 else 0.0
+    own = velocity + parallax * camera
+    return Motion(velocity, own, float(np.hypot(*own) * times[-1]), error_m)
+
+
+class BlobTracker:
+    """The blobs of a flight's views while they come. Only `follow` changes it."""
+
+    def __init__(self, settings: MovingSettings = MovingSettings()) -> None:
+        self._settings = settings
+        self._tracks: list[Track] = []
+        self._lost: list[Track] = []
+        self._movers = 0
+
+    def follow(self, view: ComparedView) -> Followed:
+        """Take the next view's blobs; views come in order of time."""
+        now_ns, settings = view.time_ns, self._settings
+        gone = [each for each in self._tracks if (now_ns - each.last.time_ns) * 1e-9 > settings.forget_s]
+        self._lost += [each for each in gone if each.mover]
+        self._lost = [each for each in self._lost if (now_ns - each.last.time_ns) * 1e-9 <= _LOST_FOR_S]
+        tracks = [each for each in self._tracks if each not in gone]
+        blobs = _blobs(view)
+        is_moving, may_move = np.zeros(len(view.boxes), bool), np.zeros(len(view.boxes), bool)
+        movers: list[Track] = []
+        pairs = _pairs(tracks, blobs, now_ns, settings)
+        taken = {blob for _, blob in pairs}
+        for index, blob_index in pairs:
+            blob = blobs[blob_index]
+            track = tracks[index].with_point(TrackPoint(now_ns, blob, np.array(view.camera_m[:2])))
+            move = motion(track.points)
+            if not track.mover and self._moves(track, move, view):
+                track = replace(track, mover=self._number_of(track, move))
+            if track.mover:
+                movers.append(track)
+            # a thing that stopped is a change of the ground, whatever it was before
+            recent = motion(track.points[-5:])
+            may_move[blob.box] = _may_move(track, recent)
+            is_moving[blob.box] = bool(track.mover) and may_move[blob.box]
+            tracks[index] = track
+        camera_m = np.array(view.camera_m[:2])
+        for blob_index, blob in enumerate(blobs):
+            if blob_index not in taken:
+                point = TrackPoint(now_ns, blob, camera_m)
+                tracks.append(Track(point, (point,), 1, blob.score))
+        self._tracks = tracks
+        return Followed(is_moving, may_move, tuple(movers))
+
+    def _moves(self, track: Track, move: Motion, view: ComparedView) -> bool:
+        settings = self._settings
+        lengths = [each.blob.length_m for each in track.points]
+        needed_m = max(settings.least_move_m, settings.least_lengths * float(np.median(lengths)))
+        return (
+            track.count >= settings.least_views
+            and move.path_m > needed_m
+            and np.hypot(*move.own_m_s) > 0.35 * np.hypot(*move.velocity_m_s)
+            and move.error_m < 0.1 + 0.08 * move.path_m
+            and not _is_still_there(track.points[0], view)
+        )
+
+    def _number_of(self, track: Track, move: Motion) -> int:
+        start = track.points[0]
+        for lost in self._lost:
+            gap_s = (start.time_ns - lost.last.time_ns) * 1e-9
+            expected_m = lost.last.blob.place_m + gap_s * lost.velocity_m_s()
+            reach_m = 1.0 + 0.4 * gap_s * float(np.hypot(*move.velocity_m_s))
+            is_near = float(np.hypot(*(start.blob.place_m - expected_m))) < reach_m
+            if gap_s > 0 and is_near and _alike(lost.last.blob, start.blob):
+                self._lost.remove(lost)
+                return lost.mover
+        self._movers += 1
+        return self._movers
+
+
+def _may_move(track: Track, move: Motion) -> bool:
+    if track.count < 3:
+        return bool(track.mover)
+    recent = track.points[-5:]
+    camera_m = recent[-1].camera_m - recent[0].camera_m
+    way_m = move.velocity_m_s * (recent[-1].time_ns - recent[0].time_ns) * 1e-9
+    camera_way_m = float(np.hypot(*camera_m))
+    against_m = -float(way_m @ camera_m) / camera_way_m if camera_way_m > 0.1 else 0.0
+    is_ghost = against_m > max(_UNLIKELY_PARALLAX * camera_way_m, 0.5 * track.last.blob.length_m)
+    return bool(move.path_m > max(0.25, 2 * move.error_m) or is_ghost)
+
+
+def _is_still_there(first: TrackPoint, view: ComparedView) -> bool:
+    """Whether the view still shows a change where the track began; not if it cannot tell."""
+    pixel = apply_homography(np.linalg.inv(view.site_from_image), first.blob.place_m[None])[0]
+    height, width = view.changed.shape
+    if not np.isfinite(pixel).all() or not (0 <= pixel[0] < width - 1 and 0 <= pixel[1] < height - 1):
+        return False
+    return bool(view.changed[round(pixel[1]), round(pixel[0])])
+
+
+def _alike(a: Blob, b: Blob) -> bool:
+    sizes = sorted([a.area_m2, b.area_m2])
+    return sizes[1] < 3 * sizes[0] + 0.1 and float(np.abs(a.colour - b.colour).max()) < 70
+
+
+def _pairs(
+    tracks: Sequence[Track], blobs: Sequence[Blob], now_ns: int, settings: MovingSettings
+) -> list[tuple[int, int]]:
+    """Track and blob that go together: the best pair first, each used once."""
+    if not tracks or not blobs:
+        return []
+    places = np.array([each.place_m for each in blobs])
+    areas = np.array([each.area_m2 for each in blobs])
+    colours = np.array([each.colour for each in blobs])
+    costs = np.full((len(tracks), len(blobs)), np.inf)
+    for row, track in enumerate(tracks):
+        ahead_s = (now_ns - track.last.time_ns) * 1e-9
+        velocity = track.velocity_m_s()
+        if len(track.points) == 1:
+            gate_m = 0.3 + min(settings.most_speed_m_s * ahead_s, settings.most_step_m)
+        else:
+            gate_m = 0.4 + 0.35 * float(np.hypot(*velocity)) * ahead_s
+        distance = np.hypot(*(places - track.last.blob.place_m - velocity * ahead_s).T)
+        growth = np.abs(np.log((areas + 0.02) / (track.last.blob.area_m2 + 0.02)))
+        tint = np.abs(colours - track.last.blob.colour).max(axis=1)
+        fits = (distance < gate_m) & (growth < np.log(3)) & (tint < 80)
+        costs[row] = np.where(fits, distance + 0.3 * growth + tint / 100, np.inf)
+    found = []
+    for flat in np.argsort(costs, axis=None, kind="stable"):
+        row, column = divmod(int(flat), len(blobs))
+        if np.isfinite(costs[row, column]):
+            found.append((row, column))
+            costs[row], costs[:, column] = np.inf, np.inf
+    return found
+
+
+def _blobs(view: ComparedView) -> list[Blob]:
+    """The blobs that lie whole inside the view; one cut by its rim would seem to move with the camera."""
+    height, width = view.changed.shape
+    m_per_px = scale_m_per_px(view)
+    blobs, centres = [], []
+    for index in np.argsort(-view.scores, kind="stable")[:_MOST_BOXES]:
+        x, y, w, h = (int(each) for each in view.boxes[index])
+        if x < _RIM_PX or y < _RIM_PX or x + w > width - _RIM_PX or y + h > height - _RIM_PX:
+            continue
+        if w * h > 0.15 * width * height or not _is_known_around(view.valid, x, y, w, h):
+            continue
+        part = view.changed[y : y + h, x : x + w]
+        moments = cv2.moments(part, binaryImage=True)
+        if moments["m00"] <= 0:
+            continue
+        centres.append([x + moments["m10"] / moments["m00"], y + moments["m01"] / moments["m00"]])
+        colour = np.array(cv2.mean(view.image[y : y + h, x : x + w], part)[:3])
+        area_m2 = moments["m00"] * m_per_px**2
+        blobs.append(Blob(int(index), np.zeros(2), max(w, h) * m_per_px, area_m2, colour, float(view.scores[index])))
+    if not blobs:
+        return []
+    places = apply_homography(view.site_from_image, np.array(centres))
+    return [replace(blob, place_m=place) for blob, place in zip(blobs, places) if np.isfinite(place).all()]
+
+
+def _is_known_around(valid: Mask, x: int, y: int, w: int, h: int) -> bool:
+    rim = 2 * (w + h)
+    part = valid[max(y - 1, 0) : y + h + 1, max(x - 1, 0) : x + w + 1]
+    unknown = part.size - int(np.count_nonzero(part))
+    return unknown < 0.1 * rim
