@@ -1,22 +1,21 @@
 """One flight by `--method planar`: keyframes into the graph, the canvas and the store."""
 
 import time
-from collections.abc import Sequence
-from types import TracebackType
-from typing import Self
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
 
 from sorvolo.capture.sync import OffsetEstimate, estimate_offset, shifted
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Anything, ImageRGB, Matrix3
+from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import pose_from_homography, site_from_image_homography
-from sorvolo.missions.flight_report import FlightLog, Stage, build_report, nothing_placed
-from sorvolo.missions.flight_setup import FlightSetup, new_site
+from sorvolo.missions.flight_report import Stage, build_report, nothing_placed
+from sorvolo.missions.flight_run import FlightRun
+from sorvolo.missions.flight_setup import FlightSetup
 from sorvolo.missions.settings import MapSettings
 from sorvolo.mosaic.canvas import Canvas, CanvasFrame
 from sorvolo.mosaic.exposure import Exposure
@@ -40,14 +39,15 @@ _HEADING_OFFSET_DEG = 5.0  # a drone's compass beside its motors
 _HORIZON_MARGIN_DEG = 5.0
 
 
-class PlanarRun:
-    """A flight on its way into a site. A context manager: leaving without `finish` leaves the site as it was."""
+class PlanarRun(FlightRun):
+    """A flight placed keyframe by keyframe and painted as it goes; ground that the map shows already stays as it is."""
 
-    def __init__(self, setup: FlightSetup, archive: Archive, settings: MapSettings) -> None:
-        self._setup, self._archive, self._settings = setup, archive, settings
+    def __init__(
+        self, setup: FlightSetup, archive: Archive, settings: MapSettings, writer: FlightWriter | None = None
+    ) -> None:
+        super().__init__(setup, archive, settings, writer)
         model = setup.source.camera
         self._lens = Undistorter(model.camera)
-        self._log = FlightLog()
         self._known = _known_keyframes(archive, setup)
         calibrated = model.focal_sigma <= 0.005
         height_known = setup.track is not None and np.isfinite(setup.track.altitude_offset_sigma_m)
@@ -67,7 +67,6 @@ class PlanarRun:
         self._frames: dict[int, PosedFrame] = {}
         self._images: dict[int, str] = {}
         self._held: dict[int, ImageRGB] = {}
-        self._writer: FlightWriter | None = None
         self._canvas: Canvas | None = None
         self._stored: Camera = model.camera.undistorted()
         self._dirty: set[int] = set()
@@ -79,31 +78,23 @@ class PlanarRun:
         self._known_cache = ImageCache(
             lambda each: archive.image(self._known[each].stored), 128 * 1024 * 1024
         )
-        self._radial = 0.0
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._writer is not None:
-            self._writer.__exit__(kind, error, trace)
+        self._offset: OffsetEstimate | None = None
 
     @property
-    def selected(self) -> int:
-        """Frames taken so far, lost ones included."""
-        return len(self._log.endings)
+    def images(self) -> Mapping[int, str]:
+        """Where each frame's picture is stored, by frame index: what `FlightWriter.commit` wants."""
+        return self._images
 
-    @property
-    def by_vision(self) -> int:
-        """Frames placed by vision so far."""
-        return self._log.count(Status.VISION)
+    def begin(self) -> FlightWriter:
+        """Start to write the flight into the site, if that has not begun; where there is no site yet it is made.
 
-    def lose(self, index: int, name: str, time_ns: int, reason: str) -> tuple[Status, str, int]:
-        """A selected frame that cannot be used."""
-        self._log.end(index, name, time_ns, Status.REJECTED, reason)
-        return Status.REJECTED, reason, 0
+        Raises InputError when a site has to be made and no frame has a place that tells its scale.
+        """
+        if not self._archive.has_site:
+            if not self._frames:
+                raise self._nothing_placed()
+            self._make_site(self._settings.m_per_px or self._native_m_per_px(), self._mapper.altitude_offset_m)
+        return self._begin_flight()
 
     def add(self, posed: PosedFrame) -> tuple[Status, str, int]:
         """Place one frame; what became of it and how many tiles were painted meanwhile."""
@@ -124,30 +115,32 @@ class PlanarRun:
             self._keep(keyframe_id, image)
         return outcome.status, outcome.reason, self._show(force=False)
 
-    def finish(self, notices: Sequence[Notice], started_s: float) -> None:
-        """Solve once more, find the clock offset, paint what moved, and make the flight part of the site.
+    def complete(self) -> list[PlacedFrame]:
+        """Solve once more, find the clock offset, paint what moved: every selected frame as it ends, in their order.
 
-        `started_s` is when the flight's mapping began, by the monotonic clock.
+        Nothing is committed. Frames that came to nothing are rejected; without any other nothing is painted.
         """
-        if not self._frames:
+        if self._frames:
+            with self._log.stage(Stage.REGISTER):
+                self._mapper.settle()
+                self._offset = self._find_offset()
+                self._dirty |= set(self._frames)
+            self._start_painting()
+            self._exposure = self._mapper.exposure()
+            self._straighten()
+            self._show(force=True)
+        return self._placed()
+
+    def finish(self, notices: Sequence[Notice], started_s: float) -> None:
+        """See `FlightRun.finish`."""
+        placed = self.complete()
+        if all(each.status is Status.REJECTED for each in placed):
             raise self._nothing_placed()
-        with self._log.stage(Stage.REGISTER):
-            self._mapper.settle()
-            offset = self._find_offset()
-            self._dirty |= set(self._frames)
-        self._begin()
-        self._exposure = self._mapper.exposure()
-        self._straighten()
-        self._show(force=True)
-        writer, site = self._writer, self._archive.site()
-        assert writer is not None
+        writer = self.begin()
         with self._log.stage(Stage.REPORT):
-            placed = self._placed()
-            if all(each.status is Status.REJECTED for each in placed):
-                raise self._nothing_placed()
             shown = picture(writer.tiles, 1600).rgba
         report = build_report(
-            self._setup, self._settings, self._log, placed, site, offset, self._mapper.report(),
+            self._setup, self._settings, self._log, placed, self._archive.site(), self._offset, self._mapper.report(),
             self._refined(self._setup.source.camera.camera), writer.tiles, [*self._setup.notices, *notices],
             time.monotonic() - started_s, spread=self._exposure.spread,
         )
@@ -159,28 +152,19 @@ class PlanarRun:
         return nothing_placed(self._setup.source.name, self._log)
 
     def _keep(self, keyframe_id: int, image: ImageRGB) -> None:
-        if self._writer is None:
-            self._held[keyframe_id] = image
-            known = self._setup.track is None or np.isfinite(self._setup.track.altitude_offset_sigma_m)
-            enough = self._archive.has_site or (known and len(self._held) >= 2) or len(self._held) >= _WAIT_FOR_HEIGHT
-            if enough:
-                self._begin()
-        else:
+        if self._canvas is not None:
             self._save(keyframe_id, image)
-
-    def _begin(self) -> None:
-        """Make the site if there is none, and start writing the flight into it."""
-        if self._writer is not None:
             return
-        if not self._archive.has_site:
-            offset_m = self._mapper.altitude_offset_m
-            m_per_px = self._settings.m_per_px or self._native_m_per_px()
-            name = self._archive.folder.resolve().name or "site"
-            self._archive.create_site(new_site(self._setup, name, m_per_px, offset_m))
-        source = self._setup.source
-        self._writer = self._archive.begin_flight(
-            source.name, source.fingerprint, {"method": self._settings.method, **vars(self._settings)}
-        )
+        self._held[keyframe_id] = image
+        known = self._setup.track is None or np.isfinite(self._setup.track.altitude_offset_sigma_m)
+        if self._archive.has_site or (known and len(self._held) >= 2) or len(self._held) >= _WAIT_FOR_HEIGHT:
+            self._start_painting()
+
+    def _start_painting(self) -> None:
+        """Lay the canvas over the site's map, now that the frames tell how large their pictures are on it."""
+        if self._canvas is not None:
+            return
+        writer = self.begin()
         site_grid = self._archive.site_grid()
         shrink = self._native_m_per_px() / site_grid.grid.m_per_px
         if shrink < 0.77:  # a coarse map does not need every pixel of the pictures
@@ -188,8 +172,8 @@ class PlanarRun:
             self._stored = full.resized(max(16, round(full.width_px * shrink)), max(16, round(full.height_px * shrink)))
         self._valid = self._lens.valid(self._stored.width_px, self._stored.height_px)
         self._canvas = Canvas(
-            site_grid.grid, self._writer.tiles, self._image,
-            painted=[each.canvas_frame(site_grid) for each in self._known.values()],
+            site_grid.grid, writer.tiles, self._image,
+            painted=[each.canvas_frame(site_grid) for each in self._known.values()], keeps_known_ground=True,
         )
         if self._known:
             self._canvas.paint([], forget=[each for each, known in self._known.items() if known.is_superseded])
@@ -228,7 +212,6 @@ class PlanarRun:
         lens = Undistorter.left_over(self._stored, radial)
         if lens is None:
             return
-        self._radial = radial
         for keyframe_id in self._frames:
             index = keyframe_id - self._first_id
             self._images[index] = self._writer.save_image(index, lens.undistort(self._writer.image(index)))
@@ -307,9 +290,13 @@ class PlanarRun:
 
     def _placed(self) -> list[PlacedFrame]:
         camera = self._refined(self._setup.source.camera.camera)
-        residuals = self._mapper.residuals_px(self._lens.camera)
-        sigmas, gps = self._mapper.sigmas_m(), self._mapper.gps_residuals_m()
         result = []
+        residuals: dict[int, float] = {}
+        sigmas: dict[int, float] = {}
+        gps: dict[int, Floats] = {}
+        if self._frames:
+            residuals = self._mapper.residuals_px(self._lens.camera)
+            sigmas, gps = self._mapper.sigmas_m(), self._mapper.gps_residuals_m()
         for ending in self._log.endings.values():
             keyframe_id = self._first_id + ending.index
             time_ns = self._setup.utc_ns(ending.time_ns)

@@ -2,8 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from types import TracebackType
-from typing import Self
 
 import cv2
 import numpy as np
@@ -13,8 +11,9 @@ from sorvolo.geometry.arrays import Floats, ImageRGB, ImageRGBA, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.missions.flight_report import FlightLog, Stage, build_report, nothing_placed
-from sorvolo.missions.flight_setup import FlightSetup, new_site
+from sorvolo.missions.flight_report import Stage, build_report, nothing_placed
+from sorvolo.missions.flight_run import FlightRun
+from sorvolo.missions.flight_setup import FlightSetup
 from sorvolo.missions.settings import MapSettings
 from sorvolo.mosaic.lens import Undistorter
 from sorvolo.mosaic.placing import rejected
@@ -29,45 +28,19 @@ _SIDE_PX = 1024  # the thesis stitches at half HD (section 4.1.2): larger pictur
 _MIRROR_Y = np.diag([1.0, -1.0, 1.0])
 
 
-class ThesisRun:
-    """A flight on its way into a site. A context manager: leaving without `finish` leaves the site as it was."""
+class ThesisRun(FlightRun):
+    """A flight mapped as the thesis does: all of it stitched first, then anchored to its fixes."""
 
     def __init__(self, setup: FlightSetup, archive: Archive, settings: MapSettings) -> None:
-        self._setup, self._archive, self._settings = setup, archive, settings
+        super().__init__(setup, archive, settings)
         self._lens = Undistorter(setup.source.camera.camera)
         full = self._lens.camera
         scale = min(1.0, _SIDE_PX / max(full.width_px, full.height_px))
         self._camera: Camera = full.resized(round(full.width_px * scale), round(full.height_px * scale))
         self._stitcher = RoiStitcher(RoiStitchingSettings(transform=settings.transform))
-        self._log = FlightLog()
         self._frames: dict[int, PosedFrame] = {}
         self._stitched: dict[int, Stitched] = {}
         self._pictures: dict[int, ImageRGB] = {}
-        self._writer: FlightWriter | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._writer is not None:
-            self._writer.__exit__(kind, error, trace)
-
-    @property
-    def selected(self) -> int:
-        """Frames taken so far, lost ones included."""
-        return len(self._log.endings)
-
-    @property
-    def by_vision(self) -> int:
-        """Frames placed by vision so far."""
-        return self._log.count(Status.VISION)
-
-    def lose(self, index: int, name: str, time_ns: int, reason: str) -> tuple[Status, str, int]:
-        """A selected frame that cannot be used."""
-        self._log.end(index, name, time_ns, Status.REJECTED, reason)
-        return Status.REJECTED, reason, 0
 
     def add(self, posed: PosedFrame) -> tuple[Status, str, int]:
         """Stitch one frame; what became of it. The site's tiles are painted at the end, when GPS anchors the mosaic."""
@@ -99,15 +72,9 @@ class ThesisRun:
         if not self._stitched:
             raise nothing_placed(self._setup.source.name, self._log)
         site_from_mosaic = self._georeference()
-        if not self._archive.has_site:
-            metres = float(np.sqrt(abs(np.linalg.det(site_from_mosaic[:2, :2]))))
-            name = self._archive.folder.resolve().name or "site"
-            m_per_px = self._settings.m_per_px or float(f"{metres:.3g}")
-            self._archive.create_site(new_site(self._setup, name, m_per_px, 0.0))
-        source, site = self._setup.source, self._archive.site()
-        self._writer = writer = self._archive.begin_flight(
-            source.name, source.fingerprint, {"method": self._settings.method, **vars(self._settings)}
-        )
+        metres = float(np.sqrt(abs(np.linalg.det(site_from_mosaic[:2, :2]))))
+        self._make_site(self._settings.m_per_px or float(f"{metres:.3g}"), 0.0)
+        site, writer = self._archive.site(), self._begin_flight()
         with self._log.stage(Stage.STORE):
             paths = {index: writer.save_image(index, image) for index, image in self._pictures.items()}
         with self._log.stage(Stage.PAINT):

@@ -30,6 +30,7 @@ from sorvolo.mosaic.blending import (
     winners_from_shares,
 )
 from sorvolo.mosaic.exposure import corrected
+from sorvolo.mosaic.known_ground import KnownGround
 
 _CELL_PX = 8
 _CHUNK_CELLS = 64
@@ -103,7 +104,9 @@ class Canvas:
 
     `tiles` is where the picture is kept; `images(id)` gives the undistorted image of a frame and should
     remember the last few. `painted` are the frames whose picture is in `tiles` already, for a site that is
-    opened again.
+    opened again. With `keeps_known_ground` every pixel that `tiles` shows now stays byte for byte, whoever painted
+    it, but for the ground of a painted frame that is moved or forgotten; and painted frames, of which it may not be
+    known any more which of their pixels exist, show no ground but that.
     """
 
     def __init__(
@@ -113,12 +116,18 @@ class Canvas:
         images: Callable[[int], ImageRGB],
         settings: CanvasSettings = CanvasSettings(),
         painted: Iterable[CanvasFrame] = (),
+        *,
+        keeps_known_ground: bool = False,
     ) -> None:
         self._grid, self._tiles, self._images, self._settings = grid, tiles, images, settings
         self._frames: dict[int, CanvasFrame] = {}
         self._chunks: dict[TileIndex, _Chunk] = {}
+        self._known = KnownGround(grid, tiles) if keeps_known_ground else None
+        self._painted_before: set[int] = set()
+        self._bounded: set[TileIndex] = set()  # chunks where painted frames win what the map showed, no more
         for frame in painted:
             self._add(frame)
+            self._painted_before.add(frame.id)
 
     def paint(self, frames: Iterable[CanvasFrame], forget: Iterable[int] = ()) -> frozenset[TileIndex]:
         """Put new or moved frames in place, drop those to forget, and return the tiles whose picture changed.
@@ -133,6 +142,11 @@ class Canvas:
             touched |= self._chunks_of(changed[each] if each in changed else self._frames[each])
             if each in self._frames:
                 touched |= self._chunks_of(self._frames[each])
+        if self._known is not None:
+            for key in touched:
+                self._bound(key, self._known)
+                self._release(key, gone & self._painted_before, self._known)
+            self._painted_before -= gone
         before = {key: self._chunks[key].winner.copy() for key in touched if key in self._chunks}
         self._remove(gone)
         for frame in changed.values():
@@ -178,8 +192,31 @@ class Canvas:
         merit = _merit(frame, key[0] * _CHUNK_CELLS, key[1] * _CHUNK_CELLS, _CHUNK_CELLS, _CHUNK_CELLS)
         wins = (merit > chunk.merit) | ((merit == chunk.merit) & (frame.id < chunk.winner))
         wins &= np.isfinite(merit)
+        if self._known is not None and key in self._bounded and frame.id in self._painted_before:
+            wins &= _shown_cells(self._known, key)
         chunk.winner[wins] = frame.id
         chunk.merit[wins] = merit[wins]
+
+    def _bound(self, key: TileIndex, known: KnownGround) -> None:
+        """Take from painted frames the cells in which the map showed nothing: seen for the first time in this chunk."""
+        if key in self._bounded:
+            return
+        self._bounded.add(key)
+        if key in self._chunks:
+            empty = ~_shown_cells(known, key)
+            self._chunks[key].winner[empty] = _NOBODY
+            self._chunks[key].merit[empty] = -np.inf
+
+    def _release(self, key: TileIndex, ids: set[int], known: KnownGround) -> None:
+        """Let ground that these frames showed be painted anew, with the cell around it into which seams may swing."""
+        if not ids:
+            return
+        column, row = key[0] * _CHUNK_CELLS, key[1] * _CHUNK_CELLS
+        theirs = np.isin(self._winners(column - 1, row - 1, _CHUNK_CELLS + 2, _CHUNK_CELLS + 2), list(ids))
+        if theirs.any():
+            cells = cv2.dilate(theirs.astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
+            ground = np.repeat(np.repeat(cells, _CELL_PX, axis=0), _CELL_PX, axis=1)
+            known.release(column * _CELL_PX, row * _CELL_PX, ground)
 
     def _remove(self, ids: set[int]) -> None:
         emptied: set[TileIndex] = set()
@@ -244,11 +281,15 @@ class Canvas:
         columns, rows = width // _CELL_PX + 2 * pad, height // _CELL_PX + 2 * pad
         winners = self._winners(x // _CELL_PX - pad, y // _CELL_PX - pad, columns, rows)
         ids = [int(each) for each in np.unique(winners) if each != _NOBODY]
-        shares = (
-            (number, *_share(winners == each, self._frames[each], x, y, pad))
-            for number, each in enumerate(ids)
-        )
-        labels = winners_from_shares(shares, height, width)
+        shown = None if self._known is None else self._known.opaque(x, y, x + width, y + height)
+
+        def share_of(each: int) -> tuple[int, int, NDArray[np.uint8]]:
+            left, top, share = _share(winners == each, self._frames[each], x, y, pad)
+            if shown is not None and each in self._painted_before:
+                share = share * shown[top:top + share.shape[0], left:left + share.shape[1]]
+            return left, top, share
+
+        labels = winners_from_shares(((number, *share_of(each)) for number, each in enumerate(ids)), height, width)
         picture = blend(labels, self._layers(ids, labels, x, y))
         inner = slice(WINDOW_APRON_PX, -WINDOW_APRON_PX)
         alpha = (labels[inner, inner] >= 0).view(np.uint8) * np.uint8(255)
@@ -286,9 +327,12 @@ class Canvas:
         for row in range(y // side, (y + rgba.shape[0] - 1) // side + 1):
             for column in range(x // side, (x + rgba.shape[1] - 1) // side + 1):
                 index = (column, row)
+                lasting = None if self._known is None else self._known.lasting(*self._grid.tile_window(index))
                 known = self._tiles.get(index)
                 tile = np.zeros((side, side, 4), np.uint8) if known is None else known.copy()
                 _paste(tile, rgba, x - column * side, y - row * side)
+                if lasting is not None and known is not None:
+                    tile[lasting] = known[lasting]
                 if known is None and not tile[..., 3].any():
                     continue
                 if known is not None and np.array_equal(tile, known):
@@ -434,6 +478,14 @@ def _share(
     share = share[cut_y:cut_y + height - y0, cut_x:cut_x + width - x0]
     window = x + x0, y + y0, x + x0 + share.shape[1], y + y0 + share.shape[0]
     return x0, y0, share & coverage(frame, window)
+
+
+def _shown_cells(known: KnownGround, key: TileIndex) -> Mask:
+    """(64, 64) the cells of a chunk in which the map showed any pixel."""
+    side = _CHUNK_CELLS * _CELL_PX
+    shown = known.opaque(key[0] * side, key[1] * side, (key[0] + 1) * side, (key[1] + 1) * side)
+    blocks: Mask = shown.reshape(_CHUNK_CELLS, _CELL_PX, _CHUNK_CELLS, _CELL_PX).any(axis=(1, 3))  # type: ignore[assignment]
+    return blocks
 
 
 def _paste(target: NDArray[np.generic], patch: NDArray[np.generic], x: int, y: int) -> None:

@@ -1,0 +1,78 @@
+"""The ground that a map showed before a flight was painted into it, pixel by pixel."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.geometry.arrays import ImageRGBA, Mask
+from sorvolo.geometry.grid import Grid, TileIndex
+
+
+class KnownGround:
+    """Which pixels of `tiles` were opaque when first asked for, and which of those must stay as they are.
+
+    Ask for a tile's pixels before changing the tile; only `release` changes the answers. Masks are kept as bits.
+    """
+
+    def __init__(self, grid: Grid, tiles: Mapping[TileIndex, ImageRGBA]) -> None:
+        self._grid, self._tiles = grid, tiles
+        self._opaque: dict[TileIndex, NDArray[np.uint8] | None] = {}
+        self._lasting: dict[TileIndex, NDArray[np.uint8]] = {}  # where it is not all that is opaque
+
+    def opaque(self, x0: int, y0: int, x1: int, y1: int) -> Mask:
+        """(y1 - y0, x1 - x0) what the map showed within a window of grid pixels, ends exclusive."""
+        return self._gather((x0, y0, x1, y1), lasting=False)
+
+    def lasting(self, x0: int, y0: int, x1: int, y1: int) -> Mask:
+        """(y1 - y0, x1 - x0) what of that must stay as it is."""
+        return self._gather((x0, y0, x1, y1), lasting=True)
+
+    def release(self, x0: int, y0: int, ground: Mask) -> None:
+        """Let the pixels of `ground`, (height, width) from the grid pixel (x0, y0) on, be painted anew."""
+        window = x0, y0, x0 + ground.shape[1], y0 + ground.shape[0]
+        for index in self._tiles_of(window):
+            bits = self._bits(index, lasting=True)
+            if bits is None:
+                continue
+            mask = self._unpacked(bits)
+            here, there = self._meeting(index, window)
+            mask[here] &= ~ground[there]
+            self._lasting[index] = np.packbits(mask)
+
+    def _gather(self, window: tuple[int, int, int, int], *, lasting: bool) -> Mask:
+        result = np.zeros((window[3] - window[1], window[2] - window[0]), bool)
+        for index in self._tiles_of(window):
+            bits = self._bits(index, lasting=lasting)
+            if bits is not None:
+                here, there = self._meeting(index, window)
+                result[there] = self._unpacked(bits)[here]
+        return result
+
+    def _bits(self, index: TileIndex, *, lasting: bool) -> NDArray[np.uint8] | None:
+        if index not in self._opaque:
+            tile = self._tiles.get(index)
+            self._opaque[index] = None if tile is None else np.packbits(tile[..., 3] == 255)
+        return self._lasting.get(index, self._opaque[index]) if lasting else self._opaque[index]
+
+    def _unpacked(self, bits: NDArray[np.uint8]) -> Mask:
+        side = self._grid.tile_px
+        return np.unpackbits(bits, count=side * side).reshape(side, side).view(bool)
+
+    def _tiles_of(self, window: tuple[int, int, int, int]) -> list[TileIndex]:
+        side = self._grid.tile_px
+        columns = range(window[0] // side, (window[2] - 1) // side + 1)
+        rows = range(window[1] // side, (window[3] - 1) // side + 1)
+        return [(column, row) for row in rows for column in columns]
+
+    def _meeting(
+        self, index: TileIndex, window: tuple[int, int, int, int]
+    ) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+        """Where a tile and a window meet: in the tile and in the window, rows and columns."""
+        tile = self._grid.tile_window(index)
+        x0, y0 = max(tile[0], window[0]), max(tile[1], window[1])
+        x1, y1 = min(tile[2], window[2]), min(tile[3], window[3])
+        return (
+            (slice(y0 - tile[1], y1 - tile[1]), slice(x0 - tile[0], x1 - tile[0])),
+            (slice(y0 - window[1], y1 - window[1]), slice(x0 - window[0], x1 - window[0])),
+        )
