@@ -272,10 +272,19 @@ class Archive:
             self._write_flight_files(flight_id, run_id, documents)
         if newest is None:
             return
-        if newest.id != shown or (newest.tiles and not map_is_there(self)):
+        if not self._looks_like(newest, shown) or (newest.tiles and not map_is_there(self)):
             write_map_files(self, newest)
         with self._catalogue.changing() as connection:
             records.mark_written(connection, [run_id for _, run_id, _ in owed], newest.id)
+
+    def _looks_like(self, version: VersionEntry, shown: int) -> bool:
+        """Whether the map's files, which show another version, would be the same for this one."""
+        if version.id == shown:
+            return True
+        crs = {each.id: each.export_crs for each in self.versions()}.get(shown)
+        with self._catalogue.reading() as connection:
+            same = records.tile_hashes(connection, version.id) == records.tile_hashes(connection, shown)
+        return same and crs == version.export_crs
 
     def _write_flight_files(self, flight_id: str, run_id: int, documents: Mapping[str, bytes]) -> None:
         folder = self.flight_folder(flight_id)
@@ -322,9 +331,8 @@ class Archive:
             for images in (*(flight / "keyframes").glob("*"), *(flight / STAGED).glob("*")):
                 if images.name.isdigit() and images.name not in known:
                     shutil.rmtree(images, ignore_errors=True)
-            if not known:
-                for emptied in (flight / "keyframes", flight / STAGED, flight):
-                    if emptied.is_dir() and not any(emptied.iterdir()):
-                        emptied.rmdir()
+            for emptied in (flight / STAGED, *(() if known else (flight / "keyframes", flight))):
+                if emptied.is_dir() and not any(emptied.iterdir()):
+                    emptied.rmdir()
 
 

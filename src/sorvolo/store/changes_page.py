@@ -205,7 +205,8 @@ def _overview(changes: Sequence[StoredChange], site: Site) -> str:
         return ""
     unit = "" if site.is_local else " m"
     area = "" if site.is_local else " m²"
-    names = ("", "kind", "verdict", "score", f"size{unit}", f"area{area}", f"within{unit}", "views", "seen", "place", "id")
+    measured = (f"size{unit}", f"area{area}", f"within{unit}")
+    names = ("", "kind", "verdict", "score", *measured, "views", "seen", "place", "id")
     rows = "".join(
         f'<tr class="{_classes(each)}" data-kind="{each.kind.value}">' + "".join(f"<td>{cell}</td>" for cell in (
             f'<a href="#change-{each.number}">{each.number}</a>', _kind(each), _verdict(each),

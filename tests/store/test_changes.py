@@ -1,0 +1,325 @@
+"""Changes enter the site with their flight, appear as files, are replaced whole, and keep what people said of them."""
+
+import json
+import sqlite3
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from fake_changes import SEEN_NS, fake_change, fake_comparison
+from fake_flights import LOCAL_SITE, SITE, frame, map_flight, tile
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sorvolo.errors import InputError, StoreError
+from sorvolo.geometry.polygons import signed_area
+from sorvolo.store import schema
+from sorvolo.store.archive import Archive
+from sorvolo.store.change_records import StoredChange, stored_changes
+from sorvolo.store.changes import changes_geojson, mask_name, write_view_masks
+from sorvolo.survey.findings import Change, ChangeKind, Verdict
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A site with the flight "a" mapped."""
+    with Archive.open(tmp_path / "site", write=True) as archive:
+        archive.create_site(SITE)
+        map_flight(archive, "a", 20)
+    return tmp_path / "site"
+
+
+def compare(archive: Archive, flight_id: str, changes: list[Change] | None, colour: int = 0) -> int:
+    """Compare a fake flight; it paints one tile unless `colour` is 0."""
+    with archive.begin_flight(flight_id, "print", {"method": "compare-robust"}) as writer:
+        if colour:
+            writer.tiles[0, 0] = tile(colour)
+        report = {"flight": flight_id, "site": "field", "comparison": fake_comparison()}
+        return writer.commit([frame(0)], {}, report, "<html></html>", changes=changes)
+
+
+def properties(folder: Path, flight_id: str = "b") -> list[dict]:
+    collection = json.loads((folder / "flights" / flight_id / "changes.geojson").read_text())
+    return [feature["properties"] for feature in collection["features"]]
+
+
+def same(one: StoredChange, other: Change) -> bool:
+    return (
+        (one.id, one.kind, one.score, one.views, one.first_seen_ns, one.last_seen_ns, one.class_after)
+        == (other.id, other.kind, other.score, other.views, other.first_seen_ns, other.last_seen_ns, other.class_after)
+        and np.array_equal(one.outline_m, other.outline_m)
+        and np.allclose([one.area_m2, one.length_m, one.sigma_m], [other.area_m2, other.length_m, other.sigma_m])
+    )
+
+
+def test_changes_come_back_as_they_were_found(folder: Path) -> None:
+    made = [
+        fake_change(2, kind=ChangeKind.MOVING, velocity_m_s=(1.0, -0.5)), fake_change(1, kind=ChangeKind.DISAPPEARED),
+    ]
+    with Archive.open(folder, write=True) as archive:
+        compare(archive, "b", made, colour=90)
+    with Archive.open(folder, write=False) as archive:
+        first, second = archive.changes()
+        assert same(first, made[1]) and same(second, made[0])
+        assert (first.number, second.number, first.flight_id, first.verdict) == (1, 2, "b", None)
+        assert list(second.velocity_m_s) == [1.0, -0.5]
+        assert first.crop.width_px == 64 and first.crop.m_per_px == made[1].patch.m_per_px
+        assert archive.changes("a") == []
+        assert archive.comparisons() == {2: {"appeared": 0, "disappeared": 1, "replaced": 0, "moving": 1}}
+    written = cv2.imread(str(folder / "flights/b/changes/b-1-before.png"), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(cv2.cvtColor(written, cv2.COLOR_BGRA2RGBA), made[1].patch.before)
+    page = (folder / "flights/b/changes.html").read_text()
+    assert "2 changes" not in page and "1 change " in page and "1 moving thing" in page
+    assert "version 1: flight a" in page and "version 2: flight b" in page
+
+
+def test_the_geojson_says_what_is_promised_in_wgs84(folder: Path) -> None:
+    with Archive.open(folder, write=True) as archive:
+        compare(archive, "b", [fake_change(3, score=0.875)])
+        site = archive.site()
+    text = (folder / "flights/b/changes.geojson").read_text()
+    (feature,) = json.loads(text)["features"]
+    assert set(feature["properties"]) >= {
+        "id", "kind", "score", "first_seen", "last_seen", "views", "area_m2", "length_m", "sigma_m", "class_before",
+        "class_after", "number", "east_m", "north_m", "velocity_m_s", "review",
+    }
+    said = feature["properties"]
+    assert (said["id"], said["kind"], said["score"], said["number"]) == ("b-3", "appeared", 0.875, 3)
+    assert said["review"] is said["class_after"] is said["velocity_m_s"] is None
+    seen = datetime.fromisoformat(said["first_seen"])
+    assert abs(seen.timestamp() - SEEN_NS / 1e9) < 1e-6 and said["first_seen"].endswith("Z")
+    ring = np.array(feature["geometry"]["coordinates"][0])
+    assert np.array_equal(ring[0], ring[-1]) and signed_area(ring[:-1]) > 0
+    # every corner lies where the outline does, to a tenth of a millimetre
+    back_m = site.frame.site_from_wgs84(ring[:-1, 1], ring[:-1, 0], np.full(5, site.origin.height_m))[:, :2]
+    gaps_m = np.linalg.norm(back_m[:, None] - fake_change(3).outline_m[None], axis=-1).min(axis=1)
+    assert gaps_m.max() < 1e-4
+    assert np.allclose(feature["outline_m"], fake_change(3).outline_m, atol=1e-4)
+
+
+def test_a_local_site_gives_its_own_units(tmp_path: Path) -> None:
+    with Archive.open(tmp_path / "site", write=True) as archive:
+        archive.create_site(LOCAL_SITE)
+        map_flight(archive, "a", 20, count=1)
+        compare(archive, "b", [fake_change(1)])
+    collection = json.loads((tmp_path / "site/flights/b/changes.geojson").read_text())
+    assert collection["crs"] is None
+    ring = np.array(collection["features"][0]["geometry"]["coordinates"][0])
+    assert np.allclose(ring.max(axis=0), fake_change(1).outline_m.max(axis=0))
+    assert " m²" not in (tmp_path / "site/flights/b/changes.html").read_text().split("All changes")[1]
+
+
+@given(st.lists(st.tuples(st.floats(-5e3, 5e3), st.floats(-5e3, 5e3), st.floats(0.05, 50)), max_size=4))
+def test_any_change_makes_plain_json(places: list[tuple[float, float, float]]) -> None:
+    changes = [
+        fake_change(k, east_m=east, north_m=north, size_m=size) for k, (east, north, size) in enumerate(places)
+    ]
+    collection = changes_geojson(stored_changes("b", changes), SITE)
+    assert json.loads(json.dumps(collection, allow_nan=False)) == collection
+
+
+def test_a_comparison_without_changes_says_so_and_a_mapping_says_nothing(folder: Path) -> None:
+    with Archive.open(folder, write=True) as archive:
+        compare(archive, "b", [])
+        assert list(archive.comparisons()) == [2]
+    assert properties(folder) == []
+    assert "No change was found" in (folder / "flights/b/changes.html").read_text()
+    assert not (folder / "flights/b/changes").exists()
+    assert not (folder / "flights/a/changes.geojson").exists()
+
+
+def test_comparing_again_replaces_everything(folder: Path) -> None:
+    with Archive.open(folder, write=True) as archive:
+        for number in (1, 2):  # the second time other changes, without masks
+            with archive.begin_flight("b", "", {}) as writer:
+                if number == 1:
+                    writer.save_masks("7", np.zeros((4, 4), np.uint8), np.ones((4, 4), bool), np.zeros((0, 4), int))
+                changes = [fake_change(number), fake_change(3, east_m=number)]
+                more = {f"notes-{number}.txt": b"x"}
+                writer.commit([], {}, {"flight": "b"}, "<html></html>", changes=changes, documents=more)
+        assert [each.id for each in archive.changes()] == ["b-2", "b-3"]
+        assert archive.changes()[1].centre_m[0] == pytest.approx(2)
+    flight = folder / "flights" / "b"
+    assert {path.name for path in flight.iterdir()} == {
+        "frames.geojson", "report.json", "report.html", "changes.geojson", "changes.html", "changes", "notes-2.txt",
+    }
+    assert {path.name for path in (flight / "changes").iterdir()} == {
+        "b-2-before.png", "b-2-after.png", "b-3-before.png", "b-3-after.png"
+    }
+    assert [each["id"] for each in properties(folder)] == ["b-2", "b-3"]
+    with Archive.open(folder, write=True) as archive:
+        compare(archive, "b", None)
+    assert {path.name for path in flight.iterdir()} == {"frames.geojson", "report.json", "report.html"}
+
+
+def test_leaving_a_comparison_without_commit_changes_nothing(folder: Path) -> None:
+    with Archive.open(folder, write=True) as archive:
+        compare(archive, "b", [fake_change(1)])
+        before = {path: path.read_bytes() for path in folder.glob("flights/**/*") if path.is_file()}
+        with pytest.raises(ZeroDivisionError), archive.begin_flight("b", "", {}) as writer:
+            writer.save_masks("1", np.zeros((4, 4), np.uint8), np.ones((4, 4), bool), np.zeros((0, 4), int))
+            raise ZeroDivisionError
+    assert {path: path.read_bytes() for path in folder.glob("flights/**/*") if path.is_file()} == before
+    assert not (folder / "flights/b/staged").exists()
+
+
+def test_files_that_a_commit_still_owed_are_written_by_the_next_opening(folder: Path) -> None:
+    (folder / "flights/b/changes.geojson/in the way").mkdir(parents=True)  # as good as a kill: the commit stops here
+    with Archive.open(folder, write=True) as archive:
+        with pytest.raises(OSError, match=r"changes\.geojson"):
+            compare(archive, "b", [fake_change(1)])
+        assert [each.id for each in archive.changes()] == ["b-1"]
+    (folder / "flights/b/changes.geojson/in the way").rmdir()
+    (folder / "flights/b/changes.geojson").rmdir()
+    with Archive.open(folder, write=True):
+        pass
+    assert [each["id"] for each in properties(folder)] == ["b-1"]
+    assert len(list((folder / "flights/b/changes").iterdir())) == 2
+    assert (folder / "flights/b/changes.html").is_file()
+    assert not (folder / "flights/b/staged").exists()
+
+
+@pytest.mark.parametrize("bad", ["a/b", "", ".hidden"])
+def test_an_id_must_name_a_file_once(folder: Path, bad: str) -> None:
+    change = fake_change(1)
+    object.__setattr__(change, "id", bad)
+    with Archive.open(folder, write=True) as archive:
+        with pytest.raises(StoreError, match="cannot name"):
+            compare(archive, "b", [change])
+        with pytest.raises(StoreError, match="two changes"):
+            compare(archive, "b", [fake_change(1), fake_change(1)])
+        compare(archive, "b", [fake_change(1)])
+        with pytest.raises(StoreError, match="another flight"):
+            compare(archive, "c", [fake_change(1, flight_id="b")])
+        assert [each.flight_id for each in archive.changes()] == ["b"]
+        assert [flight.id for flight in archive.flights()] == ["a", "b"]
+
+
+def test_a_verdict_reaches_the_files_and_outlives_the_run(folder: Path) -> None:
+    with Archive.open(folder, write=True) as archive:
+        compare(archive, "b", [fake_change(1), fake_change(2, east_m=-8)], colour=90)
+        archive.review("b-2", Verdict.CONFIRMED)
+        archive.review(["b-1", "b-2"], Verdict.REJECTED, "Schatten <&>")
+        archive.review("b-1", Verdict.CONFIRMED)
+    assert [each["review"] for each in properties(folder)] == ["confirmed", "rejected"]
+    page = (folder / "flights/b/changes.html").read_text()
+    assert "1 confirmed and 1 rejected" in page and "Schatten &lt;&amp;&gt;" in page
+    with Archive.open(folder, write=True) as archive:
+        said = {review.change_id: review for review in archive.reviews()}
+        assert {each: said[each].verdict.value for each in said} == {"b-1": "confirmed", "b-2": "rejected"}
+        assert said["b-2"].note == "Schatten <&>" and said["b-2"].kind is ChangeKind.APPEARED
+        assert np.array_equal(said["b-2"].outline_m, fake_change(2, east_m=-8).outline_m)
+        assert np.allclose(said["b-2"].centre_m, [-8, -4])
+        # the same number on other ground was not reviewed; the same ground was
+        compare(archive, "b", [fake_change(1, east_m=60), fake_change(2, east_m=-8.2)])
+        assert [each.verdict for each in archive.changes()] == [None, Verdict.REJECTED]
+        assert len(archive.reviews()) == 2
+        compare(archive, "b", [])
+        assert len(archive.reviews()) == 2
+
+
+def test_an_unknown_id_is_named_and_nothing_is_said(folder: Path) -> None:
+    with Archive.open(folder, write=True) as archive:
+        compare(archive, "b", [fake_change(1)])
+        with pytest.raises(InputError, match="b-9"):
+            archive.review(["b-1", "b-9"], Verdict.REJECTED)
+        assert archive.reviews() == []
+    with Archive.open(folder, write=False) as archive, pytest.raises(StoreError, match="write=True"):
+        archive.review("b-1", Verdict.REJECTED)
+
+
+def test_masks_say_changed_unchanged_and_unknown(folder: Path) -> None:
+    changed = np.zeros((6, 8), np.uint8)
+    changed[2:4, 3:6] = 255
+    valid = np.ones((6, 8), bool)
+    valid[:, :2] = False
+    with Archive.open(folder, write=True) as archive, archive.begin_flight("b", "", {}) as writer:
+        writer.save_masks("12", changed, valid, np.array([[3, 2, 3, 2]]))
+        writer.save_masks("IMG_01.JPG", np.zeros((6, 8), np.uint8), valid, np.zeros((0, 4), np.int64))
+        assert not (folder / "flights/b/masks").exists()
+        writer.commit([], {}, {}, "", changes=())
+    masks = folder / "flights/b/masks"
+    assert {path.name for path in masks.iterdir()} == {"12.png", "IMG_01.png", "boxes.json"}
+    assert json.loads((masks / "boxes.json").read_text()) == {"12": [[3, 2, 3, 2]], "IMG_01": []}
+    mask = cv2.imread(str(masks / "12.png"), cv2.IMREAD_UNCHANGED)
+    assert mask.shape == (6, 8)
+    assert np.array_equal(mask, np.where(valid, changed, 128))
+    assert write_view_masks(masks, "x", changed, valid).read_bytes() == (masks / "12.png").read_bytes()
+
+
+def test_frames_of_one_name_keep_a_mask_each() -> None:
+    assert mask_name("a.jpg") == "a" and mask_name("a.dng", {"a"}) == "a.dng" and mask_name("1.5") == "1.5"
+    assert "/" not in mask_name("../up.jpg")
+
+
+def test_a_month_without_change_costs_no_tiles_and_little_else(folder: Path) -> None:
+    blobs = set(folder.glob("tiles/*/*"))
+    with Archive.open(folder, write=True) as archive:
+        compare(archive, "day-0", [])
+    before = (folder / "site.db").stat().st_size
+    for day in range(1, 11):
+        with Archive.open(folder, write=True) as archive:
+            compare(archive, f"day-{day}", [])
+    assert set(folder.glob("tiles/*/*")) == blobs
+    assert not list(folder.glob("flights/day-*/keyframes/*"))
+    assert ((folder / "site.db").stat().st_size - before) / 10 < 100_000
+    with Archive.open(folder, write=False) as archive:
+        newest = archive.versions()[-1]
+        assert newest.tiles == 4 and archive.tile_difference(newest).changed == 0
+
+
+def test_a_version_is_found_by_its_time_and_differs_by_its_tiles(folder: Path) -> None:
+    with Archive.open(folder, write=True) as archive:
+        compare(archive, "b", [fake_change(1)], colour=90)
+        first, second = archive.versions()
+        difference = archive.tile_difference(second)
+        blob = max(folder.glob("tiles/*/*"), key=lambda path: path.stat().st_mtime_ns)
+        assert (difference.changed, difference.removed, difference.changed_bytes) == (1, 0, blob.stat().st_size)
+        assert archive.tile_difference(first).changed == 4
+        made = [datetime.fromisoformat(version.created_utc) for version in (first, second)]
+        assert archive.version_at(made[0]).id == archive.version_at(made[1] - timedelta(milliseconds=1)).id == 1
+        assert archive.version_at(made[1]).id == archive.version_at(datetime.now(UTC)).id == 2
+        assert archive.version_at(made[1].replace(tzinfo=None)).id == 2
+        with pytest.raises(InputError, match="had no map"):
+            archive.version_at(made[0] - timedelta(seconds=1))
+
+
+def older_format(folder: Path) -> None:
+    """Take away what the second format added."""
+    connection = sqlite3.connect(folder / "site.db")
+    for name in ("changes", "comparisons", "reviews"):
+        connection.execute(f"DROP TABLE {name}")
+    connection.execute("PRAGMA user_version = 1")
+    connection.commit()
+    connection.close()
+
+
+def test_a_site_of_the_first_format_is_read_as_it_is_and_upgraded_to_be_written(folder: Path) -> None:
+    older_format(folder)
+    with Archive.open(folder, write=False) as archive:
+        assert archive.changes() == archive.reviews() == [] and archive.comparisons() == {}
+        assert len(archive.tiles()) == 4 and len(archive.keyframes()) == 4
+    with sqlite3.connect(folder / "site.db") as connection:
+        assert connection.execute("PRAGMA user_version").fetchone() == (1,)
+    connection.close()
+    with Archive.open(folder, write=True) as archive:
+        assert len(archive.tiles()) == 4 and len(archive.keyframes()) == 4
+        compare(archive, "b", [fake_change(1)])
+        assert len(archive.changes()) == 1
+    with sqlite3.connect(folder / "site.db") as connection:
+        assert connection.execute("PRAGMA user_version").fetchone() == (schema.SCHEMA_VERSION,)
+    connection.close()
+
+
+def test_an_upgrade_that_fails_leaves_the_first_format(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    older_format(folder)
+    monkeypatch.setattr(schema, "SCHEMA_VERSION", "no number")  # the last statement of the upgrade fails
+    with pytest.raises(StoreError), Archive.open(folder, write=True):
+        pass
+    connection = sqlite3.connect(folder / "site.db")
+    tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    assert connection.execute("PRAGMA user_version").fetchone() == (1,)
+    connection.close()
+    assert not tables & {"changes", "comparisons", "reviews"}
