@@ -9,6 +9,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from sorvolo.change.metrics import EventScores
+from sorvolo.missions.evaluate_changes import FlightChanges, evaluate_changes
+from sorvolo.missions.evaluate_changes import as_json as measures_as_json
 from sorvolo.missions.evaluate_mosaic import MosaicEvaluation, evaluate_mosaic
 from sorvolo.mosaic.quality import Spread
 from sorvolo.store.exports import plain_json
@@ -42,6 +45,81 @@ def mosaic(
         typer.echo(json.dumps(plain_json(measured), indent=1))
     else:
         _show(measured)
+
+
+@evaluate_app.command()
+def changes(
+    found: Annotated[Path, typer.Argument(help="The site folder of `sorvolo compare`, or a folder of masks.")],
+    truth: Annotated[Path, typer.Option(help="Folder that `sorvolo simulate` made, or a folder of masks.")],
+    flight: Annotated[str | None, typer.Option(help="One of the site's compared flights; else all.")] = None,
+    least_px: Annotated[
+        int, typer.Option(help="So many changed pixels make a frame positive; the thesis counts any.")
+    ] = 1,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
+) -> None:
+    """Changes against the truth: by pixel and frame as in the thesis's Tables 4.3 to 4.5, and by event.
+
+    Example: sorvolo evaluate changes field-map --truth simulated-field
+
+    Example: sorvolo evaluate changes my-masks --truth dataset/masks --json
+    """
+    measured = evaluate_changes(found, truth, flight=flight, least_px=least_px)
+    if as_json:
+        typer.echo(json.dumps(measures_as_json(measured), indent=1))
+        return
+    console = Console()
+    for each in measured:
+        show_changes(console, each)
+
+
+def show_changes(console: Console, measured: FlightChanges) -> None:
+    """The tables of one flight's changes."""
+    if measured.masks is not None:
+        masks = measured.masks
+        table = Table("per", "TP", "FP", "FN", "TN", "precision", "recall", "accuracy", "F1", "unknown")
+        for name, counts in (("pixel", masks.pixels), ("frame", masks.frames)):
+            shares = (counts.precision, counts.recall, counts.accuracy, counts.f1)
+            table.add_row(
+                name, *(f"{number:,}" for number in (counts.tp, counts.fp, counts.fn, counts.tn)),
+                *(_share(share, 2) for share in shares), f"{counts.unknown:,}",
+            )
+        console.print(table)
+        console.print(
+            f"{measured.flight}: {masks.compared} masks compared; {masks.only_found} found ones have no truth, "
+            f"{masks.only_true} true ones no mask; a frame counts from {masks.least_px} changed pixel(s) on"
+        )
+    if measured.events is not None:
+        _show_events(console, measured.flight, measured.events, measured.map_shift_m)
+    for remark in measured.remarks:
+        console.print(f"{measured.flight}: {remark}")
+
+
+def _show_events(console: Console, flight: str, scores: EventScores, map_shift_m: float) -> None:
+    table = Table("events", "to find", "found", "named right", "late", "reported twice", "false")
+    for name, kind in scores.by_kind.items():
+        numbers = kind.must_find, kind.found, kind.named_right, kind.late, kind.twice, kind.false
+        if any(numbers):
+            table.add_row(name, *map(str, numbers))
+    table.add_section()
+    table.add_row("all", *map(str, (
+        scores.must_find, scores.found, scores.named_right, scores.late, scores.twice, scores.false
+    )))
+    console.print(table)
+    console.print(
+        f"{flight}: found {_share(scores.found_share)}, {scores.false_per_hectare:.2f} false per hectare of "
+        f"{scores.compared_m2:.0f} m2 compared, {scores.twice} reported twice; {scores.late} of {scores.judged_late} "
+        "late"
+    )
+    if math.isfinite(scores.error_median_m):
+        shift = f" (the map's own shift of {map_shift_m:.2f} m taken out)" if math.isfinite(map_shift_m) else ""
+        console.print(
+            f"{flight}: places off by {scores.error_median_m:.2f} m median, {scores.error_p95_m:.2f} m at 95 %{shift}; "
+            f"{_share(scores.within_two_sigma)} within twice the stated sigma, median {scores.sigma_median_m:.2f} m"
+        )
+
+
+def _share(value: float, decimals: int = 1) -> str:
+    return f"{value:.{decimals}%}" if math.isfinite(value) else "-"
 
 
 def _show(measured: MosaicEvaluation) -> None:

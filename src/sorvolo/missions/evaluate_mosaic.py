@@ -3,20 +3,19 @@ places.
 """
 
 import csv
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Anything, Floats, ImageGray, ImageRGBA, Mask, PointsPx
-from sorvolo.geometry.geodesy import LocalFrame, Projection
+from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.grid import SiteGrid, TileIndex
-from sorvolo.mosaic.canvas import CanvasFrame, coverage, warp
+from sorvolo.missions.frame_rows import FrameRow, frame_row, map_frames, read_features, site_points, truth_file
+from sorvolo.mosaic.canvas_frame import CanvasFrame, coverage, warp
 from sorvolo.mosaic.quality import (
     DEVIATION_BINS,
     CornerErrors,
@@ -111,18 +110,6 @@ class MosaicEvaluation:
     positions: PositionErrors | None
 
 
-@dataclass(frozen=True, eq=False)
-class _FrameRow:
-    """One frame of a frames.geojson, map or truth, in site metres; NaN where the file says nothing."""
-
-    name: str
-    status: str
-    outline_m: Floats  # (4, 2)
-    camera_m: Floats  # (2,)
-    camera_height_m: float
-    fix_m: Floats  # (2,)
-
-
 def evaluate_mosaic(
     site: Path, *, truth: Path | None = None, reference: Path | None = None, positions: Path | None = None
 ) -> MosaicEvaluation:
@@ -135,7 +122,7 @@ def evaluate_mosaic(
     """
     with Archive.open(site, write=False) as archive:
         described = archive.site()
-        flights = _map_frames(site, described)
+        flights = map_frames(site, described)
         if (truth or reference or positions) and described.is_local:
             raise InputError(
                 f"{site}: a map without geo-reference cannot be compared with truth, maps or positions"
@@ -143,7 +130,7 @@ def evaluate_mosaic(
         tallies = _tally(flights)
         errors: tuple[TruthErrors, ...] = ()
         if truth:
-            tallies, errors = _against_truth(flights, _truth_file(truth), described)
+            tallies, errors = _against_truth(flights, truth_file(truth), described)
         return MosaicEvaluation(
             described.name, described.m_per_px, tallies, errors,
             _deviation(archive),
@@ -152,64 +139,8 @@ def evaluate_mosaic(
         )
 
 
-def _map_frames(site: Path, described: Site) -> dict[str, list[_FrameRow]]:
-    files = sorted((site / "flights").glob("*/frames.geojson"))
-    if not files:
-        raise InputError(f"{site}: no flights/*/frames.geojson; map a flight into it first")
-    return {
-        path.parent.name: [_row(each, described.frame, path) for each in _features(path)] for path in files
-    }
-
-
-def _truth_file(truth: Path) -> Path:
-    for path in (truth / "truth" / "frames.geojson", truth / "frames.geojson", truth):
-        if path.is_file():
-            return path
-    raise InputError(f"{truth}: no truth/frames.geojson in it; give the folder that `sorvolo simulate` made")
-
-
-def _features(path: Path) -> list[dict[str, Any]]:
-    try:
-        features = json.loads(path.read_text(encoding="utf-8"))["features"]
-    except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: cannot be read as GeoJSON ({error}); make it anew") from error
-    if not isinstance(features, list):
-        raise InputError(f"{path}: its features are no list; make it anew")
-    return features
-
-
-def _row(feature: Mapping[str, Any], frame: LocalFrame, path: Path) -> _FrameRow:
-    try:
-        properties, geometry = feature["properties"], feature["geometry"]
-        outline = np.full((4, 2), np.nan)
-        if geometry is not None:
-            outline = _site_points(frame, np.array(geometry["coordinates"][0][:4], dtype=np.float64)[:, :2])
-        camera, fix = (
-            _site_points(frame, np.array([[_number(properties, f"{kind}_longitude_deg"),
-                                           _number(properties, f"{kind}_latitude_deg")]]))[0]
-            for kind in ("camera", "fix")
-        )
-        return _FrameRow(
-            str(properties["frame"]), str(properties.get("status", "")), outline, camera,
-            _number(properties, "camera_height_m"), fix,
-        )
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(f"{path}: a feature is not as docs/formats.md says ({error!r})") from error
-
-
-def _number(properties: Mapping[str, Any], name: str) -> float:
-    value = properties.get(name)
-    return float("nan") if value is None else float(value)
-
-
-def _site_points(frame: LocalFrame, lonlat_deg: Floats) -> Floats:
-    """(N, 2) east, north of longitude, latitude, shape (N, 2), on the site's ground."""
-    height_m = np.full(len(lonlat_deg), frame.origin.height_m)
-    return frame.site_from_wgs84(lonlat_deg[:, 1], lonlat_deg[:, 0], height_m)[:, :2]
-
-
 def _tally(
-    flights: Mapping[str, Sequence[_FrameRow]], known: Mapping[str, Mapping[str, _FrameRow]] | None = None
+    flights: Mapping[str, Sequence[FrameRow]], known: Mapping[str, Mapping[str, FrameRow]] | None = None
 ) -> tuple[FlightTally, ...]:
     tallies = []
     for name, rows in flights.items():
@@ -223,11 +154,11 @@ def _tally(
 
 
 def _against_truth(
-    flights: Mapping[str, Sequence[_FrameRow]], path: Path, described: Site
+    flights: Mapping[str, Sequence[FrameRow]], path: Path, described: Site
 ) -> tuple[tuple[FlightTally, ...], tuple[TruthErrors, ...]]:
-    true: dict[str, dict[str, _FrameRow]] = {}
-    for feature in _features(path):
-        row = _row(feature, described.frame, path)
+    true: dict[str, dict[str, FrameRow]] = {}
+    for feature in read_features(path):
+        row = frame_row(feature, described.frame, path)
         true.setdefault(str(feature["properties"].get("flight", "")), {})[row.name] = row
     if len(true) == len(flights) == 1:
         # one flight on both sides: photos of a simulated flight may be mapped under their folder's name
@@ -252,7 +183,7 @@ def _against_truth(
     return _tally(flights, true), tuple(errors)
 
 
-def _errors(name: str, pairs: Sequence[tuple[_FrameRow, _FrameRow]], m_per_px: float) -> TruthErrors:
+def _errors(name: str, pairs: Sequence[tuple[FrameRow, FrameRow]], m_per_px: float) -> TruthErrors:
     placed = [(mine, true) for mine, true in pairs if np.isfinite([mine.outline_m, true.outline_m]).all()]
     seen = [pair for pair in placed if pair[0].status == Status.VISION]
     by_gps = [pair for pair in placed if pair[0].status == Status.GPS_ONLY]
@@ -392,7 +323,7 @@ def _resampled(raster: Raster, onto: Raster) -> tuple[ImageGray, Mask]:
 
 
 def _against_positions(
-    flights: Mapping[str, Sequence[_FrameRow]], path: Path, described: Site
+    flights: Mapping[str, Sequence[FrameRow]], path: Path, described: Site
 ) -> PositionErrors:
     known = _positions(path)
     mine, reference, missing = [], [], 0
@@ -404,7 +335,7 @@ def _against_positions(
         if not found or not np.isfinite(found[0].camera_m).all():
             missing += 1
             continue
-        place = _site_points(described.frame, np.array([[longitude_deg, latitude_deg]]))[0]
+        place = site_points(described.frame, np.array([[longitude_deg, latitude_deg]]))[0]
         mine.append([*found[0].camera_m, found[0].camera_height_m])
         reference.append([*place, height_m])
     if not mine:
