@@ -21,7 +21,7 @@ check: $(READY)
 bench: $(READY)
 	$(BIN)/python benchmarks/mosaic_methods.py $(SEEDS)
 
-$(READY): requirements.lock pyproject.toml
+$(READY): requirements.lock pyproject.toml setup.py $(wildcard src/sorvolo/kernels/*.?pp)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -e .

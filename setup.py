@@ -1,0 +1,23 @@
+"""The compiled kernels; everything else of the build is in pyproject.toml."""
+
+import sys
+
+from pybind11.setup_helpers import Pybind11Extension
+from setuptools import setup
+
+# No -march: the sources choose the processor's instructions at run time. No contraction: the same sums everywhere.
+OPTIONS = ["/O2"] if sys.platform == "win32" else ["-O3", "-ffp-contract=off", "-pthread"]
+LINKING = [] if sys.platform == "win32" else ["-pthread"]
+FOLDER = "src/sorvolo/kernels"
+
+native = Pybind11Extension(
+    "sorvolo.kernels._native",
+    [f"{FOLDER}/_native.cpp", f"{FOLDER}/_robust.cpp"],
+    depends=[f"{FOLDER}/_native.hpp", "setup.py"],
+    cxx_std=17,
+    extra_compile_args=OPTIONS,
+    extra_link_args=LINKING,
+)
+native.optional = True  # without a compiler sorvolo works all the same, on kernels/reference.py
+
+setup(ext_modules=[native])
