@@ -12,6 +12,7 @@ from types import FrameType
 
 import numpy as np
 import rasterio
+from fake_changes import fake_change
 
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, utm_epsg
@@ -26,6 +27,7 @@ ORIGIN = Geodetic(46.5, 13.25, 310.0)
 SITE = Site("field", ORIGIN, f"EPSG:{utm_epsg(46.5, 13.25)}", 0.05, height_reference="ellipsoidal")
 LOCAL_SITE = Site("pond", Geodetic(0.0, 0.0), "", 1.0, is_local=True)
 CAMERA = Camera(96, 54, 80.0, 80.0, 47.5, 26.5, np.array([-0.1, 0.02, 0.0, 0.0, 0.0]))
+_NO_BOXES = np.zeros((0, 4), np.int64)
 
 
 def tile(colour: int, opaque_columns: int = 512) -> np.ndarray:
@@ -59,9 +61,13 @@ def image(seed: int) -> np.ndarray:
     return np.dstack([x * 2, y * 4, np.full_like(x, (seed * 37) % 256)]).astype(np.uint8)
 
 
-def map_flight(archive: Archive, flight_id: str, colour: int, count: int = 4) -> int:
-    """Map a fake flight of `count` tiles, painted `count` deep, and as many frames, and commit it."""
+def map_flight(archive: Archive, flight_id: str, colour: int, count: int = 4, *, compared: bool = False) -> int:
+    """Map a fake flight of `count` tiles, painted `count` deep, and as many frames, and commit it.
+
+    A flight that is `compared` finds `count` changes and saves as many masks, of its colour.
+    """
     settings = {"method": "planar", "colour": colour, "count": count}
+    changes = [fake_change(number, flight_id, size_m=colour / 100) for number in range(count)] if compared else None
     with archive.begin_flight(flight_id, f"print-{flight_id}", settings) as writer:
         paths = {}
         for index in range(count):
@@ -69,8 +75,10 @@ def map_flight(archive: Archive, flight_id: str, colour: int, count: int = 4) ->
             for column in range(index + 1):  # repainted again and again, as a canvas does
                 writer.tiles[column - 1, 0] = tile(colour + index)
             writer.flush()
+            if compared:
+                writer.save_masks(str(index), np.full((8, 8), colour, np.uint8), np.ones((8, 8), bool), _NO_BOXES)
         placed = [frame(index) for index in range(count)] + [frame(count, Status.REJECTED)]
-        return writer.commit(placed, paths, {"colour": colour}, f"<html>{colour}</html>")
+        return writer.commit(placed, paths, {"colour": colour}, f"<html>{colour}</html>", changes=changes)
 
 
 def check_whole(folder: Path) -> None:
@@ -88,6 +96,9 @@ def check_whole(folder: Path) -> None:
             assert [keyframe.index for keyframe in keyframes] == list(range(flight.settings["count"]))
             for keyframe in keyframes:
                 assert np.abs(archive.image(keyframe).astype(int) - image(keyframe.index)).mean() < 4
+            changes = archive.changes(flight_id)
+            assert [change.number for change in changes] == list(range(flight.settings["count"]))
+            assert {change.length_m for change in changes} == {flight.settings["colour"] / 100}
         if complete:
             newest = flights[complete[-1].flight_id].settings
             for column in range(newest["count"]):
@@ -106,7 +117,7 @@ def map_for_ever(folder: Path, seed: int) -> None:
         with Archive.open(folder, write=True) as archive:
             if not archive.has_site:
                 archive.create_site(SITE)
-            map_flight(archive, f"flight-{seed % 2}", 10 + seed % 200, count=2 + seed % 2)
+            map_flight(archive, f"flight-{seed % 2}", 10 + seed % 200, count=2 + seed % 2, compared=True)
 
 
 def _forked(task: Callable[..., None], *arguments: object) -> int:
@@ -144,7 +155,8 @@ def kill_at_steps(folder: Path, seed: int, rounds: int) -> None:
     os.waitpid(_forked(_map_to_step, folder, seed, 1_000_000, steps), 0)
     count, commit = (int(word) for word in steps.read_text().split())
     spread = np.linspace(0, 0.95 * count, rounds).astype(int)
-    for place in sorted({*spread.tolist(), *range(commit - 6, commit + 5)}):
+    around = [*range(commit - 6, commit + 5), *range(commit + 5, commit + 50, 7)]
+    for place in sorted({*spread.tolist(), *around}):
         seed += 2  # the same flight in another colour
         _, ending = os.waitpid(_forked(_map_to_step, folder, seed, place, steps), 0)
         if not os.WIFSIGNALED(ending):
@@ -158,7 +170,7 @@ def _map_to_step(folder: Path, seed: int, last: int, steps: Path) -> None:
 
     def watch(called: FrameType, event: str, _: object) -> None:
         nonlocal count, commit
-        ordering = ("archive.py", "catalogue.py", "atomic.py")
+        ordering = ("archive.py", "flight_writer.py", "catalogue.py", "derived.py", "atomic.py")
         if event != "call" or not called.f_code.co_filename.endswith(ordering):
             return
         if count == last:
@@ -171,7 +183,7 @@ def _map_to_step(folder: Path, seed: int, last: int, steps: Path) -> None:
         if not archive.has_site:
             archive.create_site(SITE)
         sys.setprofile(watch)
-        map_flight(archive, f"flight-{seed % 2}", 10 + seed % 200, count=2 + seed % 2)
+        map_flight(archive, f"flight-{seed % 2}", 10 + seed % 200, count=2 + seed % 2, compared=True)
         sys.setprofile(None)
     steps.write_text(f"{count} {commit}")
 

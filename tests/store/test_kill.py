@@ -1,5 +1,6 @@
 """kill -9 at any moment: the site stays whole and readable, and mapping again ends whole."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -20,12 +21,21 @@ def test_a_site_survives_being_killed(tmp_path: Path, moments: str, rounds: int)
     with Archive.open(folder, write=True) as archive:
         if not archive.has_site:
             archive.create_site(fake_flights.SITE)
-        version = fake_flights.map_flight(archive, "flight-0", 77)
+        version = fake_flights.map_flight(archive, "flight-0", 77, compared=True)
         assert archive.versions()[-1].id == version
         assert all(entry.complete for entry in archive.versions())
         named = {keyframe.image_path for keyframe in archive.keyframes()}
     fake_flights.check_whole(folder)
     assert {str(path.relative_to(folder)) for path in folder.glob("flights/*/keyframes/*/*")} == named
     assert not list(folder.rglob(".tmp-*"))
+    assert not list(folder.glob("flights/*/staged"))
+    for flight in folder.glob("flights/*"):
+        features = json.loads((flight / "changes.geojson").read_text())["features"]
+        ids = {feature["id"] for feature in features}
+        assert {path.name for path in (flight / "changes").iterdir()} == {
+            f"{change_id}-{when}.png" for change_id in ids for when in ("before", "after")
+        }
+        assert len(list((flight / "masks").glob("*.png"))) == len(ids)
+        assert (flight / "changes.html").is_file()
     for name in ("mosaic.tif", "preview.png", "mosaic.kmz", "flights/flight-0/report.html"):
         assert (folder / name).is_file()
