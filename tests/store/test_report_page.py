@@ -3,13 +3,13 @@
 import base64
 import math
 import re
-from html.parser import HTMLParser
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from fake_reports import fake_picture, fake_report
+from html_checker import checked
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,55 +17,14 @@ from sorvolo.store.exports import plain_json
 from sorvolo.store.report_page import report_page
 from sorvolo.store.report_plots import Scale, round_length
 
-_VOID = {"meta", "img", "br", "path", "line", "circle", "rect", "polyline"}
-
-
-class _Checker(HTMLParser):
-    """Collects text, addresses and elements; fails on elements that are not closed in order."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.text: list[str] = []
-        self.addresses: list[str] = []
-        self.names: list[str] = []
-        self.classes: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.names.append(tag)
-        self.classes += [value or "" for name, value in attrs if name == "class"]
-        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data")]
-        assert not [name for name, _ in attrs if name.startswith("on")]
-        if tag not in _VOID or tag in ("circle", "rect", "path"):
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.names.append(tag)
-        self.classes += [value or "" for name, value in attrs if name == "class"]
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open and self.open[-1] == tag, f"</{tag}> closes {self.open[-1:]}"
-        self.open.pop()
-
-    def handle_data(self, data: str) -> None:
-        self.text.append(data)
-
-
-def _checked(page: str) -> _Checker:
-    checker = _Checker()
-    checker.feed(page)
-    checker.close()
-    assert checker.open == []
-    return checker
-
 
 def _words(page: str) -> str:
-    return " ".join(" ".join(_checked(page).text).split())
+    return " ".join(" ".join(checked(page).text).split())
 
 
 def test_page_needs_nothing_else() -> None:
     page = report_page(fake_report(), fake_picture())
-    checker = _checked(page)
+    checker = checked(page)
     assert "script" not in checker.names and "link" not in checker.names
     assert len(checker.addresses) == 1 and checker.addresses[0].startswith("data:image/jpeg;base64,")
     assert "http" not in page and "url(" not in page and "@import" not in page
@@ -91,14 +50,14 @@ def test_large_pictures_are_made_to_fit() -> None:
 
 def test_nothing_seen_is_no_picture() -> None:
     page = report_page(fake_report(), np.zeros((4, 4, 4), np.uint8))
-    assert "img" not in _checked(page).names
+    assert "img" not in checked(page).names
 
 
 def test_everything_from_outside_is_escaped() -> None:
     evil = '<script>alert("1")</script>&\'"><img src=x>'
     report = _with_every_text(fake_report(), evil)
     page = report_page(report, fake_picture(60, 40))
-    checker = _checked(page)
+    checker = checked(page)
     assert "script" not in checker.names and checker.names.count("img") == 1
     assert "<script" not in page and "alert(&quot;1&quot;)" in page
 
@@ -203,9 +162,9 @@ def _without_numbers(value: Any) -> Any:
 def test_any_part_may_be_missing(key: str) -> None:
     report = fake_report(5)
     report[key] = None
-    _checked(report_page(report, fake_picture(60, 40)))
+    checked(report_page(report, fake_picture(60, 40)))
     del report[key]
-    _checked(report_page(report, fake_picture(60, 40)))
+    checked(report_page(report, fake_picture(60, 40)))
 
 
 @given(st.lists(
@@ -221,7 +180,7 @@ def test_any_track_can_be_drawn(rows: list[tuple[str, list[float | None]]]) -> N
     report["track"] = [{"frame": str(k), "status": status, **dict(zip(names, numbers))}
                        for k, (status, numbers) in enumerate(rows)]
     page = report_page(report, np.zeros((2, 2, 4), np.uint8))
-    _checked(page)
+    checked(page)
     drawn = "".join(re.findall("<svg.*?</svg>", page, re.DOTALL))
     assert not re.search(r"[\"\s,MLHV](nan|inf)", drawn)
 

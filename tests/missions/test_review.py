@@ -1,0 +1,100 @@
+"""Changes are listed, confirmed and rejected, by id or by a flight's numbers."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "store"))
+from fake_changes import fake_change
+from fake_flights import SITE, frame, map_flight
+
+from sorvolo.cli.main import main
+from sorvolo.errors import InputError, StoreError
+from sorvolo.missions.review_changes import list_changes, review_changes
+from sorvolo.store.archive import Archive
+from sorvolo.survey.findings import Verdict
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    """Flight a mapped; b and c compared, with two changes each."""
+    with Archive.open(tmp_path / "site", write=True) as archive:
+        archive.create_site(SITE)
+        map_flight(archive, "a", 20, count=1)
+        for flight in ("b", "c"):
+            with archive.begin_flight(flight, "", {}) as writer:
+                changes = [fake_change(number, flight, east_m=5.0 * number) for number in (1, 2)]
+                writer.commit([frame(0)], {}, {}, "<html></html>", changes=changes)
+    return tmp_path / "site"
+
+
+def verdicts(site: Path) -> dict[str, str]:
+    return {each.id: each.verdict.value for each in list_changes(site) if each.verdict is not None}
+
+
+def test_changes_are_listed_by_flight_and_number(site: Path) -> None:
+    assert [each.id for each in list_changes(site)] == ["b-1", "b-2", "c-1", "c-2"]
+    assert [each.id for each in list_changes(site, "c")] == ["c-1", "c-2"]
+    assert list_changes(site, "a") == []
+    with pytest.raises(InputError, match="no flight d; it has a, b, c"):
+        list_changes(site, "d")
+
+
+def test_verdicts_are_kept_and_changed(site: Path) -> None:
+    said = review_changes(site, ["b-1", "c-2"], Verdict.REJECTED, "leaves")
+    assert [(each.id, each.verdict, each.note) for each in said] == [
+        ("b-1", Verdict.REJECTED, "leaves"), ("c-2", Verdict.REJECTED, "leaves"),
+    ]
+    review_changes(site, ["2"], Verdict.CONFIRMED, flight="c")
+    assert verdicts(site) == {"b-1": "rejected", "c-2": "confirmed"}
+    features = json.loads((site / "flights/b/changes.geojson").read_text())["features"]
+    assert [each["properties"]["review"] for each in features] == ["rejected", None]
+    assert [each["properties"]["note"] for each in features] == ["leaves", None]
+
+
+@pytest.mark.parametrize(("ids", "flight", "words"), [
+    (["b-1", "x-9"], None, "x-9"), (["1"], None, "no change 1"), (["3"], "b", "no change 3"),
+    ([], None, "no change was"), (["1"], "z", "no flight z"),
+])
+def test_an_unknown_change_is_named_and_nothing_is_said(
+    site: Path, ids: list[str], flight: str | None, words: str
+) -> None:
+    with pytest.raises(InputError, match=words):
+        review_changes(site, ids, Verdict.REJECTED, flight=flight)
+    assert verdicts(site) == {}
+
+
+def test_a_folder_that_is_no_site_is_not_made_one(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="no site"):
+        review_changes(tmp_path / "none", ["b-1"], Verdict.REJECTED)
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_command_lists_and_says(
+    site: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    assert main(["review", str(site), "b-2", "--reject", "--note", "[bold]grass"]) == 0
+    assert "rejected: [bold]grass" in capsys.readouterr().out
+    assert main(["review", str(site), "1", "--flight", "c", "--confirm", "--json"]) == 0
+    (said,) = json.loads(capsys.readouterr().out)["changes"]
+    assert (said["id"], said["review"], said["east_m"]) == ("c-1", "confirmed", 5.0)
+    assert main(["review", str(site)]) == 0
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in ("b-1", "b-2", "c-1", "c-2"))
+    assert main(["review", str(site), "--flight", "a"]) == 0
+    assert "no changes" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["b-1"], "--confirm or --reject"), (["b-1", "--confirm", "--reject"], "contradict"),
+    (["--reject"], "which changes"), (["nope", "--reject"], "no change nope"),
+])
+def test_the_command_says_what_is_wrong(
+    site: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
+) -> None:
+    assert main(["review", str(site), *arguments]) == 1
+    assert words in capsys.readouterr().err
+    assert verdicts(site) == {}

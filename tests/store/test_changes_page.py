@@ -1,0 +1,157 @@
+"""The page of changes: whole, self-contained, escaped, and honest about what was not compared."""
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from fake_changes import fake_change, fake_comparison
+from fake_flights import LOCAL_SITE, SITE
+from fake_reports import fake_picture, fake_report
+from html_checker import checked
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sorvolo.geometry.grid import SiteGrid
+from sorvolo.store.change_records import StoredChange, stored_changes
+from sorvolo.store.changes_page import changes_page
+from sorvolo.store.changes_style import SCRIPT
+from sorvolo.store.exports import Picture
+from sorvolo.survey.findings import Change, ChangeKind, Verdict
+
+KINDS = list(ChangeKind)
+
+
+def page_of(changes: list[Change], report: dict[str, Any] | None = None, **changed: Any) -> str:
+    stored = [replace(each, **changed) for each in stored_changes("b", changes)]
+    return page_of_stored(stored, changes, report)
+
+
+def page_of_stored(stored: list[StoredChange], changes: list[Change], report: dict[str, Any] | None = None) -> str:
+    picture = Picture(fake_picture(300, 200), (-150.5, -100.5), 1)
+    crops = {each.id: (each.patch.before, each.patch.after) for each in changes}
+    said = fake_report(5) | {"flight": "b", "comparison": fake_comparison()} if report is None else report
+    return changes_page(said, stored, picture, picture, SITE, crops)
+
+
+@pytest.mark.parametrize("count", [0, 1, 12, 150])
+def test_any_number_of_changes_makes_a_whole_page(count: int) -> None:
+    changes = [
+        fake_change(k + 1, kind=KINDS[k % 4], east_m=k % 13 - 6, north_m=k % 9 - 4, size_m=0.5) for k in range(count)
+    ]
+    page = page_of(changes)
+    checker = checked(page)
+    assert checker.names.count("article") == count
+    assert checker.names.count("img") == 2 * count + 2
+    assert sum("pin" in each.split() for each in checker.classes) == count
+    ids = set(re.findall(r'id="([^"]+)"', page))
+    targets = {each[1:] for each in checker.addresses if each.startswith("#")}
+    assert targets <= ids and (count == 0 or {"map", "change-1", f"change-{count}"} <= targets)
+    for kind in KINDS:  # each box of the legend rules over things that are there
+        assert (f'id="show-{kind.value}"' in page) == (f'data-kind="{kind.value}"' in page)
+    assert len(page) < 2_000_000
+
+
+def test_the_page_needs_nothing_else() -> None:
+    page = page_of([fake_change(1)])
+    for address in checked(page).addresses:
+        assert address.startswith(("data:image/jpeg;base64,", "#"))
+    assert "http" not in page and "@import" not in page and "url(" not in page
+    assert page.count("<script>") == 1 and SCRIPT in page
+
+
+def test_the_numbers_stand_on_their_ground() -> None:
+    change = fake_change(1, east_m=2.0, north_m=3.0, size_m=1.0)
+    page = page_of([change])
+    grid = SiteGrid.at(SITE.origin, SITE.m_per_px, SITE.crs)
+    corners = grid.grid_from_site(change.outline_m) + np.array([150.5, 100.5])
+    drawn = re.search(r'<polygon class="appeared" [^>]*points="([^"]+)"', page)
+    assert drawn is not None
+    points = np.array([[float(number) for number in pair.split(",")] for pair in drawn.group(1).split()])
+    gaps = np.linalg.norm(points[:, None] - corners[None], axis=-1)
+    assert gaps.min(axis=1).max() < 0.1 and gaps.min(axis=0).max() < 0.5
+    pin = re.search(r'left:([\d.]+)%;top:([\d.]+)%', page)
+    assert pin is not None
+    assert np.allclose(
+        [float(pin.group(1)) * 3, float(pin.group(2)) * 2], [corners[:, 0].max(), corners[:, 1].min()], atol=0.01
+    )
+
+
+def test_names_are_escaped() -> None:
+    evil = '<img src=x onerror="alert(1)">&Überflug'
+    report = fake_report(5) | {
+        "flight": evil, "site": evil, "warnings": [evil],
+        "comparison": fake_comparison(reasons={evil: 2}, chosen={evil: evil}, method=evil),
+    }
+    page = page_of([fake_change(1)], report, note=evil, class_after=evil)
+    assert "<img src=x" not in page
+    assert page.count("&amp;Überflug") >= 8
+    checked(page)
+
+
+def test_the_headline_counts_and_does_not_count_what_moves() -> None:
+    changes = [fake_change(1), fake_change(2, kind=ChangeKind.MOVING, velocity_m_s=(-1.0, 0.0))]
+    page = page_of(changes)
+    text = " ".join("".join(checked(page).text).split())
+    assert "1 change on 3 412 m²" in text and ": 1 appeared; 1 moving thing besides." in text
+    assert "1.0 m/s to the west" in text
+    assert "180 of 197 views were compared" in text and "3.1% of the ground" in text
+
+
+@pytest.mark.parametrize(("changed", "words"), [
+    ({"views": {"compared": 0, "not-aligned": 40}}, "No view could be compared"),
+    ({"views": {"compared": 10, "not-aligned": 40}}, "40 of 50 views: not-aligned"),
+    ({"unknown_share": 0.42}, "42% of the ground under the views was unknown"),
+    ({"suppressed": 3}, "3 changes were left out"),
+    ({"map_updated": False}, "not brought up to date"),
+    ({"reasons": {"too few points fit": 9}}, "too few points fit"),
+])
+def test_what_was_not_compared_is_said(changed: dict[str, Any], words: str) -> None:
+    report = fake_report(5) | {"warnings": [], "comparison": fake_comparison(**changed)}
+    assert words in "".join(checked(page_of([], report)).text)
+
+
+def test_nothing_to_look_at_first_when_all_is_well() -> None:
+    report = fake_report(5) | {"warnings": [], "comparison": fake_comparison()}
+    assert "Look at this first" not in page_of([fake_change(1)], report)
+
+
+def test_verdicts_are_shown_and_rejected_ones_can_be_hidden() -> None:
+    changes = [fake_change(1), fake_change(2)]
+    stored = stored_changes("b", changes)
+    stored[1] = replace(stored[1], verdict=Verdict.REJECTED, note="a shadow")
+    page = page_of_stored(stored, changes)
+    assert 'id="show-rejected"' in page and "a shadow" in page and "1 rejected by a person" in page
+    assert page.count("is-rejected") > page_of(changes).count("is-rejected")
+
+
+def test_pictures_that_are_gone_are_said_to_be() -> None:
+    changes = [fake_change(1)]
+    page = changes_page({}, stored_changes("b", changes), None, None, LOCAL_SITE, {})
+    assert page.count("the picture is gone") == 2
+    assert "class=\"swipe" not in page
+    checked(page)
+
+
+@settings(max_examples=25)
+@given(st.dictionaries(
+    st.sampled_from(["flight", "site", "warnings", "georeferenced", "comparison"]),
+    st.none() | st.fixed_dictionaries({}, optional={
+        "views": st.none() | st.dictionaries(st.sampled_from(["compared", "lost"]), st.integers(0, 9)),
+        "reasons": st.none(), "unknown_share": st.none() | st.floats(0, 1), "chosen": st.none(), "votes": st.none(),
+        "residual_px": st.none(),
+    }),
+))
+def test_whatever_is_unknown_the_page_is_whole(report: dict[str, Any]) -> None:
+    checked(page_of([], report))
+    checked(page_of([fake_change(1, size_m=0.3)], report, sigma_m=np.nan, area_m2=np.nan, length_m=np.nan))
+
+
+def test_crops_stay_small_when_there_are_many() -> None:
+    large = cv2.resize(np.random.default_rng(1).integers(0, 255, (64, 64, 4), dtype=np.uint8), (512, 512))
+    large[..., 3] = 255
+    changes = [fake_change(k + 1) for k in range(100)]
+    crops = {each.id: (large, large) for each in changes}
+    assert len(changes_page({}, stored_changes("b", changes), None, None, SITE, crops)) < 9_000_000
