@@ -164,6 +164,7 @@ class EvidenceMap:
         if not (sure & (evidence.owner == 0)).any():
             return []
         new = []
+        cut_off: Mask | None = None
         least_cells = max(2, settings.least_area_m2 / self._cell_m**2)
         for piece, part in self._pieces(sure | (evidence.owner > 0)):
             cells = sure[part] & piece
@@ -174,6 +175,10 @@ class EvidenceMap:
             if not owners:
                 if np.count_nonzero(cells) < least_cells or np.mean(laid.held[part][cells]) > 0.5:
                     continue
+                if cut_off is None:
+                    cut_off = _cut_off(laid)
+                if (cells & cut_off[part]).any() and int(evidence.votes[part][cells].max()) < settings.n:
+                    continue  # more of it will come into view soon
                 known = self._known_at(laid.window, part, cells)
                 change = self._found[known] if known else self._begin(view, earlier, witness, part, cells, budget)
                 if not known:
@@ -355,7 +360,7 @@ class EvidenceMap:
         seen, changed = evidence.seen.astype(float), evidence.changed
         needed = np.maximum(settings.least_views, np.ceil(settings.k * np.minimum(seen, settings.n) / settings.n))
         free = evidence.owner == 0
-        late = free & (changed >= needed) & (seen < settings.n)
+        late = free & (((changed >= needed) & (seen < settings.n)) | (evidence.votes >= settings.k))
         single = free & (changed == 1) & (seen == 1)
         least_cells = max(2, settings.least_area_m2 / self._cell_m**2)
         if np.count_nonzero(late) >= least_cells:
@@ -363,6 +368,17 @@ class EvidenceMap:
         elif np.count_nonzero(single) >= least_cells and seed.score * 1.5 >= settings.single_view_score:
             cells, views, asked, seed.weakness = single, 1, 1, 0.5
         else:
+            return
+        gap = int(np.ceil(self._join_m / self._cell_m)) + 1
+        around = CellWindow(
+            seed.cells.x0 - gap, seed.cells.y0 - gap, seed.cells.x1 + gap, seed.cells.y1 + gap
+        )
+        beside = self._grid.read(around).owner
+        if beside.any():
+            change = self._found[self._current(int(beside[beside > 0].min()))]
+            if change.cells is not None:
+                self._grid.own(seed.cells, cells, change.number)
+                change.cells = change.cells.joined(seed.cells)
             return
         seed.number = self._next_number()
         for _ in range(views - seed.views):
@@ -409,12 +425,21 @@ class EvidenceMap:
             change_id, ChangeKind.MOVING, float(np.clip(score, 0, 1)), outline_m, track.first.time_ns,
             track.last.time_ns, track.count, size.area_m2, size.length_m,
             float(np.hypot(residual_m, self._cell_m / np.sqrt(12))), patch_of(window, cut(view, window), outline_m),
-            track.velocity_m_s(),
+            track.velocity_m_s,
         )
 
 
 def _number_of(change: Change) -> int:
     return int(change.id.rsplit("-", 1)[1])
+
+
+def _cut_off(laid: LaidView) -> Mask:
+    """The flagged pieces of a view that end at unknown ground or at the view's rim."""
+    unseen = cv2.copyMakeBorder((~laid.seen).view(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
+    beside = cv2.dilate(unseen, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
+    _, labels = cv2.connectedComponents(laid.flagged.view(np.uint8), connectivity=8)
+    cut = np.unique(labels[beside & laid.flagged])
+    return np.isin(labels, cut) if len(cut) else np.zeros_like(laid.flagged)
 
 
 def _square(place_m: Floats, side_m: float) -> PointsM:

@@ -14,8 +14,9 @@ from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 
 _MOST_PX = 512
-_VOTING_VIEWS = 12  # more of them hardly move the outline
+_VOTING_VIEWS = 40  # more of them hardly move the outline
 _BETTER = 1.15  # a view's pictures replace the older ones when it is so much better
+_GOOD = 0.75  # quality beyond which no better pictures are looked for
 _ONE_PLACE = 0.05  # of the flying height: seen from no wider apart, a ghost of something tall looks the same
 
 
@@ -89,6 +90,8 @@ class GatheredChange:
         """How much better, as a factor, the view's pictures are than those it has; infinite if it has to grow."""
         if self._window is None or not self._window.holds(low_m, high_m) or self._pictures is None:
             return np.inf
+        if self._quality > _GOOD:
+            return 0.0
         return quality(view, low_m, high_m) / max(self._quality, 1e-9)
 
     @property
@@ -147,8 +150,10 @@ class GatheredChange:
         site_from_cells = self.cells.site_from_cell(cell_m)
         if self._window is not None and self._votes:
             window = self._window
-            grown = cv2.dilate(cells.view(np.uint8), np.ones((3, 3), np.uint8))
-            patch_from_cells = np.linalg.inv(window.site_from_patch) @ site_from_cells
+            padded = cv2.copyMakeBorder(cells.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+            grown = cv2.dilate(padded, np.ones((3, 3), np.uint8))
+            cells_from_padded = np.array([[1, 0, -1], [0, 1, -1], [0, 0, 1.0]])
+            patch_from_cells = np.linalg.inv(window.site_from_patch) @ site_from_cells @ cells_from_padded
             near = cv2.warpAffine(grown, patch_from_cells[:2], window.size_px, flags=cv2.INTER_NEAREST) > 0
             majority = (2 * self._yes.astype(np.int16) > self._asked_px) & near
             if np.count_nonzero(majority) * window.m_per_px**2 >= 0.3 * np.count_nonzero(cells) * cell_m**2:

@@ -89,6 +89,7 @@ class Track:
     points: tuple[TrackPoint, ...]
     count: int
     score_sum: float
+    velocity_m_s: Floats  # (2,) over its last points; zeros while there is but one
     mover: int = 0
 
     @property
@@ -99,11 +100,10 @@ class Track:
     def with_point(self, point: TrackPoint) -> "Track":
         """The track, one view longer."""
         points = (*self.points, point)[-_POINTS:]
-        return replace(self, points=points, count=self.count + 1, score_sum=self.score_sum + point.blob.score)
-
-    def velocity_m_s(self) -> Floats:
-        """(2,) over its last points; zeros while there is but one."""
-        return motion(self.points).velocity_m_s if len(self.points) > 1 else np.zeros(2)
+        return Track(
+            self.first, points, self.count + 1, self.score_sum + point.blob.score, motion(points).velocity_m_s,
+            self.mover,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,17 +119,25 @@ class Followed:
 
 def motion(points: Sequence[TrackPoint]) -> Motion:
     """The steady motion that fits a track's points best (least squares), N >= 2, less what parallax explains."""
-    times = np.array([each.time_ns - points[0].time_ns for each in points]) * 1e-9
-    spread = times - times.mean()
-    weight = spread / max(float(spread @ spread), 1e-12)
-    places = np.array([each.blob.place_m for each in points])
-    velocity = weight @ places
-    error_m = float(np.sqrt(np.mean(np.sum((places - places.mean(axis=0) - np.outer(spread, velocity)) ** 2, axis=1))))
-    camera = weight @ np.array([each.camera_m for each in points])
-    speed2 = float(camera @ camera)
-    parallax = float(np.clip(-(velocity @ camera) / speed2, 0, _MOST_PARALLAX)) if speed2 > 1e-4 else 0.0
+    # plain numbers: a dozen points are too few for arrays to be faster
+    start_ns, count = points[0].time_ns, len(points)
+    times = [(each.time_ns - start_ns) * 1e-9 for each in points]
+    middle_s = sum(times) / count
+    spread = [each - middle_s for each in times]
+    weight = max(sum(each * each for each in spread), 1e-12)
+    places = [complex(each.blob.place_m[0], each.blob.place_m[1]) for each in points]
+    cameras = [complex(each.camera_m[0], each.camera_m[1]) for each in points]
+    velocity = sum(s * place for s, place in zip(spread, places)) / weight
+    camera = sum(s * place for s, place in zip(spread, cameras)) / weight
+    centre = sum(places) / count
+    rest = sum(abs(place - centre - s * velocity) ** 2 for s, place in zip(spread, places))
+    against = -(velocity * camera.conjugate()).real
+    parallax = min(max(against / abs(camera) ** 2, 0.0), _MOST_PARALLAX) if abs(camera) > 1e-2 else 0.0
     own = velocity + parallax * camera
-    return Motion(velocity, own, float(np.hypot(*own) * times[-1]), error_m)
+    return Motion(
+        np.array([velocity.real, velocity.imag]), np.array([own.real, own.imag]), abs(own) * times[-1],
+        (rest / count) ** 0.5,
+    )
 
 
 class BlobTracker:
@@ -170,7 +178,10 @@ class BlobTracker:
         for blob_index, blob in enumerate(blobs):
             if blob_index not in taken:
                 point = TrackPoint(now_ns, blob, camera_m)
-                tracks.append(Track(point, (point,), 1, blob.score))
+                tracks.append(Track(point, (point,), 1, blob.score, np.zeros(2)))
+                may_move[blob.box] = True  # nobody knows yet
+        whole = {blob.box for blob in blobs}
+        _follow_over_rim(view, [each for each in tracks if each.mover], whole, is_moving, may_move)
         self._tracks = tracks
         return Followed(is_moving, may_move, tuple(movers))
 
@@ -190,7 +201,7 @@ class BlobTracker:
         start = track.points[0]
         for lost in self._lost:
             gap_s = (start.time_ns - lost.last.time_ns) * 1e-9
-            expected_m = lost.last.blob.place_m + gap_s * lost.velocity_m_s()
+            expected_m = lost.last.blob.place_m + gap_s * lost.velocity_m_s
             reach_m = 1.0 + 0.4 * gap_s * float(np.hypot(*move.velocity_m_s))
             is_near = float(np.hypot(*(start.blob.place_m - expected_m))) < reach_m
             if gap_s > 0 and is_near and _alike(lost.last.blob, start.blob):
@@ -202,14 +213,34 @@ class BlobTracker:
 
 def _may_move(track: Track, move: Motion) -> bool:
     if track.count < 3:
-        return bool(track.mover)
+        return True
     recent = track.points[-5:]
     camera_m = recent[-1].camera_m - recent[0].camera_m
     way_m = move.velocity_m_s * (recent[-1].time_ns - recent[0].time_ns) * 1e-9
     camera_way_m = float(np.hypot(*camera_m))
     against_m = -float(way_m @ camera_m) / camera_way_m if camera_way_m > 0.1 else 0.0
-    is_ghost = against_m > max(_UNLIKELY_PARALLAX * camera_way_m, 0.5 * track.last.blob.length_m)
+    is_ghost = against_m > max(_UNLIKELY_PARALLAX * camera_way_m, 0.25)
     return bool(move.path_m > max(0.25, 2 * move.error_m) or is_ghost)
+
+
+def _follow_over_rim(
+    view: ComparedView, movers: Sequence[Track], whole: set[int], is_moving: NDArray[np.bool_],
+    may_move: NDArray[np.bool_],
+) -> None:
+    """Mark the boxes that are cut by the view's rim, thus no blobs, and lie where a moving thing must be by now."""
+    if not movers:
+        return
+    m_per_px = scale_m_per_px(view)
+    image_from_site = np.linalg.inv(view.site_from_image)
+    for track in movers:
+        ahead_s = (view.time_ns - track.last.time_ns) * 1e-9
+        expected_m = track.last.blob.place_m + ahead_s * track.velocity_m_s
+        pixel = apply_homography(image_from_site, expected_m[None])[0]
+        reach_px = 0.75 * track.last.blob.length_m / m_per_px + _RIM_PX
+        for index, (x, y, w, h) in enumerate(view.boxes):
+            nearest = np.clip(pixel, [x, y], [x + w, y + h])
+            if index not in whole and float(np.hypot(*(pixel - nearest))) < reach_px:
+                is_moving[index] = may_move[index] = True
 
 
 def _is_still_there(first: TrackPoint, view: ComparedView) -> bool:
@@ -238,7 +269,7 @@ def _pairs(
     costs = np.full((len(tracks), len(blobs)), np.inf)
     for row, track in enumerate(tracks):
         ahead_s = (now_ns - track.last.time_ns) * 1e-9
-        velocity = track.velocity_m_s()
+        velocity = track.velocity_m_s
         if len(track.points) == 1:
             gate_m = 0.3 + min(settings.most_speed_m_s * ahead_s, settings.most_step_m)
         else:
