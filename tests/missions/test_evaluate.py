@@ -19,7 +19,8 @@ from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose
 from sorvolo.missions.evaluate_mosaic import evaluate_mosaic
-from sorvolo.mosaic.canvas import Canvas, CanvasFrame
+from sorvolo.mosaic.canvas import Canvas
+from sorvolo.mosaic.canvas_frame import CanvasFrame
 from sorvolo.store.archive import Archive
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame, Status

@@ -11,10 +11,16 @@ import pytest
 import rasterio
 from pyproj import Transformer
 
+from sorvolo.capture.source import open_sources
 from sorvolo.cli import main as cli
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.missions.flight_setup import prepare
+from sorvolo.missions.map_planar import PlanarRun
+from sorvolo.missions.settings import MapSettings
 from sorvolo.store.archive import Archive
+from sorvolo.survey.flight import Frame, PosedFrame
+from sorvolo.survey.mosaic import Status
 
 _M_PER_PX = 0.05  # of the simulated pictures
 _PROPERTIES = {
@@ -293,11 +299,24 @@ def test_every_selected_frame_ends_once_with_a_reason_unless_by_vision(filmed: P
         assert (each["geometry"] is None) == (each["properties"]["status"] == "rejected")
 
 
-def _eroded(mask: np.ndarray, by_px: int) -> np.ndarray:
-    """The mask without its rim of `by_px`; ground beyond the tile's own edge counts as outside."""
-    padded = np.pad(np.cumsum(np.cumsum(mask.astype(np.int64), 0), 1), ((1, 0), (1, 0)))
-    side = 2 * by_px + 1
-    sums = padded[side:, side:] - padded[:-side, side:] - padded[side:, :-side] + padded[:-side, :-side]
-    result = np.zeros_like(mask)
-    result[by_px:-by_px, by_px:-by_px] = sums == side**2
-    return result
+def test_a_planar_run_paints_through_a_writer_that_another_began(photographed: Path, tmp_path: Path) -> None:
+    first = _some_photos(photographed, tmp_path / "first", 0, 8)
+    second = _some_photos(photographed, tmp_path / "second", 6, 14)
+    site = tmp_path / "site"
+    run_map(site, first, "--camera", photographed / "camera.xml")
+    (source,) = open_sources([second], None, photographed / "camera.xml")
+    with Archive.open(site, write=True) as archive:
+        setup = prepare(source, MapSettings(), archive.site(), telemetry_named=False)
+        known = len(archive.tiles())
+        with archive.begin_flight("second", source.fingerprint, {}) as writer:
+            with PlanarRun(setup, archive, MapSettings(), writer) as run:
+                assert run.begin() is writer and run.complete() == [] and not run.images
+                for frame in source.frames(lambda *_: True):
+                    assert isinstance(frame, Frame)
+                    run.add(PosedFrame(frame, setup.prior(frame, first=False)))
+                placed = run.complete()
+            writer.flush()  # the run's end is not the writer's
+            assert [each.status for each in placed] == [Status.VISION] * 8 and sorted(run.images) == list(range(8))
+            writer.commit(placed, run.images, {}, "")
+        assert len(archive.tiles()) > known
+        assert [flight.id for flight in archive.flights()] == ["first", "second"]

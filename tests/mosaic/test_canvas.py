@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.grid import Grid
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.mosaic.canvas import Canvas, CanvasFrame, CanvasSettings, coverage, warp
+from sorvolo.mosaic.canvas import Canvas, CanvasSettings
+from sorvolo.mosaic.canvas_frame import CanvasFrame, coverage, warp
 
 WIDTH, HEIGHT = 320, 240
 

@@ -17,7 +17,8 @@ from sorvolo.missions.flight_report import Stage, build_report, nothing_placed
 from sorvolo.missions.flight_run import FlightRun
 from sorvolo.missions.flight_setup import FlightSetup
 from sorvolo.missions.settings import MapSettings
-from sorvolo.mosaic.canvas import Canvas, CanvasFrame
+from sorvolo.mosaic.canvas import Canvas
+from sorvolo.mosaic.canvas_frame import CanvasFrame
 from sorvolo.mosaic.exposure import Exposure
 from sorvolo.mosaic.lens import Undistorter, refined_camera
 from sorvolo.mosaic.placing import canvas_frame, rejected

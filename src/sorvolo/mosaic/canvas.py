@@ -7,17 +7,16 @@ images.
 """
 
 from collections.abc import Callable, Iterable, Iterator, MutableMapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.errors import GeometryError, SettingsError
-from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, ImageRGBA, Mask, Matrix3, PointsPx, frozen
+from sorvolo.errors import SettingsError
+from sorvolo.geometry.arrays import Anything, ImageRGB, ImageRGBA, Mask, PointsPx
 from sorvolo.geometry.grid import Grid, TileIndex
-from sorvolo.geometry.homography import apply_homography
 from sorvolo.mosaic.blending import (
     ALIGN_PX,
     LAYER_APRON_PX,
@@ -25,14 +24,12 @@ from sorvolo.mosaic.blending import (
     Labels,
     Layer,
     blend,
-    fill_invalid,
     pixels_of,
     winners_from_shares,
 )
-from sorvolo.mosaic.exposure import corrected
-from sorvolo.mosaic.known_ground import KnownGround
+from sorvolo.mosaic.canvas_frame import CELL_PX, CanvasFrame, cell_merits, coverage, warp
+from sorvolo.mosaic.known_ground import SETTLING_PX, KnownGround, settled
 
-_CELL_PX = 8
 _CHUNK_CELLS = 64
 _NOBODY = -1
 # A changed winner is felt as far as the bands spread (62 px) and its outline is smoothed (2 cells) around it.
@@ -50,44 +47,6 @@ class CanvasSettings:
     def __post_init__(self) -> None:
         if self.moved_px < 0 or self.gain_step < 0 or self.window_px < 64:
             raise SettingsError("canvas: moved_px and gain_step must not be negative, window_px at least 64")
-
-
-@dataclass(frozen=True, eq=False)
-class CanvasFrame:
-    """One keyframe as the canvas needs it.
-
-    `rank` is the order of its flight on the site: ground that an earlier flight covers stays that flight's.
-    `gains` (3,) multiply the undistorted image's channels; `vignette` (2,) is undone first (see
-    `exposure.corrected`). `valid` marks the undistorted image's pixels that exist, None = all.
-    Raises GeometryError when not all of the image lies in front of the camera's horizon.
-    """
-
-    id: int
-    rank: int
-    width_px: int
-    height_px: int
-    grid_from_image: Matrix3
-    gains: Floats = field(default_factory=lambda: np.ones(3))
-    vignette: Floats = field(default_factory=lambda: np.zeros(2))
-    valid: Mask | None = None
-
-    def __post_init__(self) -> None:
-        for name, shape in (("grid_from_image", (3, 3)), ("gains", (3,)), ("vignette", (2,))):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
-            if getattr(self, name).shape != shape or not np.isfinite(getattr(self, name)).all():
-                raise GeometryError(f"frame {self.id}: {name} needs {shape} finite numbers")
-        if self.id < 0:
-            raise GeometryError(f"frame ids count up from 0, got {self.id}")
-        if self.valid is not None and self.valid.shape != (self.height_px, self.width_px):
-            raise GeometryError(f"frame {self.id}: valid mask {self.valid.shape} is not of the image's size")
-        if not np.isfinite(self.outline_px).all() or abs(np.linalg.det(self.grid_from_image)) < 1e-12:
-            raise GeometryError(f"frame {self.id}: a corner of the image lies at or beyond the horizon")
-
-    @property
-    def outline_px(self) -> PointsPx:
-        """(4, 2) the image's outer corners on the grid: top-left, top-right, bottom-right, bottom-left."""
-        w, h = self.width_px - 0.5, self.height_px - 0.5
-        return apply_homography(self.grid_from_image, np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]]))
 
 
 class _Chunk:
@@ -158,7 +117,7 @@ class Canvas:
         """The share, 0-1, of an outline on the grid, shape (N, 2), that is painted; right to about a cell of
         8 px.
         """
-        cells = (np.asarray(outline_px, dtype=np.float64) + 0.5) / _CELL_PX - 0.5
+        cells = (np.asarray(outline_px, dtype=np.float64) + 0.5) / CELL_PX - 0.5
         low = np.floor(cells.min(axis=0)).astype(int)
         width, height = (np.ceil(cells.max(axis=0)).astype(int) - low + 1).tolist()
         inside = np.zeros((height, width), np.uint8)
@@ -179,7 +138,7 @@ class Canvas:
 
     @staticmethod
     def _chunks_of(frame: CanvasFrame) -> frozenset[TileIndex]:
-        return Grid((0.0, 0.0), 1.0, _CELL_PX * _CHUNK_CELLS).tiles_touched(frame.outline_px)
+        return Grid((0.0, 0.0), 1.0, CELL_PX * _CHUNK_CELLS).tiles_touched(frame.outline_px)
 
     def _add(self, frame: CanvasFrame) -> None:
         self._frames[frame.id] = frame
@@ -189,7 +148,7 @@ class Canvas:
     def _enter(self, frame: CanvasFrame, key: TileIndex) -> None:
         chunk = self._chunks.setdefault(key, _Chunk())
         chunk.frames.add(frame.id)
-        merit = _merit(frame, key[0] * _CHUNK_CELLS, key[1] * _CHUNK_CELLS, _CHUNK_CELLS, _CHUNK_CELLS)
+        merit = cell_merits(frame, key[0] * _CHUNK_CELLS, key[1] * _CHUNK_CELLS, _CHUNK_CELLS, _CHUNK_CELLS)
         wins = (merit > chunk.merit) | ((merit == chunk.merit) & (frame.id < chunk.winner))
         wins &= np.isfinite(merit)
         if self._known is not None and key in self._bounded and frame.id in self._painted_before:
@@ -215,8 +174,8 @@ class Canvas:
         theirs = np.isin(self._winners(column - 1, row - 1, _CHUNK_CELLS + 2, _CHUNK_CELLS + 2), list(ids))
         if theirs.any():
             cells = cv2.dilate(theirs.astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
-            ground = np.repeat(np.repeat(cells, _CELL_PX, axis=0), _CELL_PX, axis=1)
-            known.release(column * _CELL_PX, row * _CELL_PX, ground)
+            ground = np.repeat(np.repeat(cells, CELL_PX, axis=0), CELL_PX, axis=1)
+            known.release(column * CELL_PX, row * CELL_PX, ground)
 
     def _remove(self, ids: set[int]) -> None:
         emptied: set[TileIndex] = set()
@@ -261,7 +220,7 @@ class Canvas:
             cells[y:y + _CHUNK_CELLS, x:x + _CHUNK_CELLS] = mask
         cells = cv2.dilate(cells, np.ones((2 * _REACH_CELLS + 1,) * 2, np.uint8))
         left, top, width, height = cv2.boundingRect(cells)
-        across, down = (max(1, -(-side * _CELL_PX // self._settings.window_px)) for side in (width, height))
+        across, down = (max(1, -(-side * CELL_PX // self._settings.window_px)) for side in (width, height))
         xs = np.linspace(left, left + width, across + 1).astype(int)
         ys = np.linspace(top, top + height, down + 1).astype(int)
         for y0, y1 in pairwise(ys.tolist()):
@@ -269,17 +228,22 @@ class Canvas:
                 x, y, w, h = cv2.boundingRect(cells[y0:y1, x0:x1])
                 if w and h:
                     first = low + np.array([x0 + x, y0 + y])
-                    begin = first * _CELL_PX // ALIGN_PX * ALIGN_PX
-                    end = -(-(first + np.array([w, h])) * _CELL_PX // ALIGN_PX) * ALIGN_PX
+                    begin = first * CELL_PX // ALIGN_PX * ALIGN_PX
+                    end = -(-(first + np.array([w, h])) * CELL_PX // ALIGN_PX) * ALIGN_PX
                     yield int(begin[0]), int(begin[1]), int(end[0]), int(end[1])
 
     def _render(self, x0: int, y0: int, x1: int, y1: int) -> ImageRGBA:
         """The picture of an aligned window of grid pixels, ends exclusive."""
-        x, y = x0 - WINDOW_APRON_PX, y0 - WINDOW_APRON_PX
-        width, height = x1 - x0 + 2 * WINDOW_APRON_PX, y1 - y0 + 2 * WINDOW_APRON_PX
+        apron = WINDOW_APRON_PX
+        if self._known is not None:
+            wide = apron + SETTLING_PX
+            if self._known.lasting(x0 - wide, y0 - wide, x1 + wide, y1 + wide).any():
+                apron = wide
+        x, y = x0 - apron, y0 - apron
+        width, height = x1 - x0 + 2 * apron, y1 - y0 + 2 * apron
         pad = 2
-        columns, rows = width // _CELL_PX + 2 * pad, height // _CELL_PX + 2 * pad
-        winners = self._winners(x // _CELL_PX - pad, y // _CELL_PX - pad, columns, rows)
+        columns, rows = width // CELL_PX + 2 * pad, height // CELL_PX + 2 * pad
+        winners = self._winners(x // CELL_PX - pad, y // CELL_PX - pad, columns, rows)
         ids = [int(each) for each in np.unique(winners) if each != _NOBODY]
         shown = None if self._known is None else self._known.opaque(x, y, x + width, y + height)
 
@@ -291,7 +255,10 @@ class Canvas:
 
         labels = winners_from_shares(((number, *share_of(each)) for number, each in enumerate(ids)), height, width)
         picture = blend(labels, self._layers(ids, labels, x, y))
-        inner = slice(WINDOW_APRON_PX, -WINDOW_APRON_PX)
+        if self._known is not None and apron > WINDOW_APRON_PX:
+            lasting = self._known.lasting(x, y, x + width, y + height) & (labels >= 0)
+            picture = settled(picture, self._stored(x, y, width, height), lasting)
+        inner = slice(apron, -apron)
         alpha = (labels[inner, inner] >= 0).view(np.uint8) * np.uint8(255)
         rgba = cv2.merge([*cv2.split(picture[inner, inner]), alpha])
         return cv2.copyTo(rgba, alpha)  # type: ignore[return-value]
@@ -320,6 +287,17 @@ class Canvas:
                 _paste(result, chunk.winner, x, y)
         return result
 
+    def _stored(self, x: int, y: int, width: int, height: int) -> ImageRGB:
+        """The picture that the tiles hold in a window, black where they hold none."""
+        side = self._grid.tile_px
+        result = np.zeros((height, width, 3), np.uint8)
+        for row in range(y // side, (y + height - 1) // side + 1):
+            for column in range(x // side, (x + width - 1) // side + 1):
+                tile = self._tiles.get((column, row))
+                if tile is not None:
+                    _paste(result, tile[..., :3], column * side - x, row * side - y)
+        return result
+
     def _store(self, x: int, y: int, rgba: ImageRGBA) -> set[TileIndex]:
         """Put a rendered window into its tiles and name those that it changed."""
         side = self._grid.tile_px
@@ -345,118 +323,6 @@ class Canvas:
         return changed
 
 
-def warp(image: ImageRGB, frame: CanvasFrame, window: tuple[int, int, int, int]) -> ImageRGB:
-    """A frame's image, its exposure corrected, in a window of grid pixels (x0, y0, x1, y1, ends exclusive).
-
-    Beyond its border the image is reflected as far as blending looks, and black from there on. Raises
-    GeometryError when the image is not of the frame's size.
-    """
-    if image.shape[:2] != (frame.height_px, frame.width_px):
-        raise GeometryError(
-            f"frame {frame.id}: image {image.shape[1]}x{image.shape[0]}, "
-            f"expected {frame.width_px}x{frame.height_px}"
-        )
-    source = image if frame.valid is None else fill_invalid(image, frame.valid)
-    window_from_source = _shift(-window[0], -window[1]) @ frame.grid_from_image
-    grid_px_per_px = float(np.sqrt(np.prod(_stretch(frame))))
-    while grid_px_per_px < 0.5 and min(source.shape[:2]) > 32:
-        # a mere interpolation would skip source pixels and shimmer
-        source = cv2.pyrDown(source)  # type: ignore[assignment]
-        window_from_source = window_from_source @ np.diag([2.0, 2.0, 1.0])
-        grid_px_per_px *= 2
-    # four channels and a constant border are OpenCV's fast path: three times faster than RGB and reflection
-    pad = int(np.ceil(1.5 * WINDOW_APRON_PX / grid_px_per_px))
-    rgba = cv2.cvtColor(corrected(source, frame.gains, frame.vignette), cv2.COLOR_RGB2RGBA)
-    warped = cv2.warpPerspective(
-        cv2.copyMakeBorder(rgba, pad, pad, pad, pad, cv2.BORDER_REFLECT),
-        window_from_source @ _shift(-pad, -pad),
-        (window[2] - window[0], window[3] - window[1]), flags=cv2.INTER_LINEAR,
-    )
-    return cv2.cvtColor(warped, cv2.COLOR_RGBA2RGB)  # type: ignore[return-value]
-
-
-def coverage(frame: CanvasFrame, window: tuple[int, int, int, int]) -> NDArray[np.uint8]:
-    """255 where a frame has pixels in a window of grid pixels (x0, y0, x1, y1, ends exclusive), else 0."""
-    size = window[2] - window[0], window[3] - window[1]
-    window_from_image = _shift(-window[0], -window[1]) @ frame.grid_from_image
-    if frame.valid is not None:
-        valid = cv2.erode(frame.valid.astype(np.uint8) * 255, np.ones((3, 3), np.uint8))
-        return cv2.warpPerspective(valid, window_from_image, size, flags=cv2.INTER_NEAREST)  # type: ignore[return-value]
-    left, right = _spans(frame.outline_px, np.arange(window[1], window[3]))
-    first = np.clip(np.ceil(left) - window[0], 0, size[0]).astype(np.int32)[:, None]
-    end = np.clip(np.floor(right) - window[0] + 1, 0, size[0]).astype(np.int32)[:, None]
-    columns = np.arange(size[0], dtype=np.int32)
-    return ((columns >= first) & (columns < end)).view(np.uint8) * np.uint8(255)
-
-
-def _spans(outline_px: PointsPx, rows: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Where each row of grid pixels enters and leaves a convex outline; entry beyond exit where it misses it.
-
-    Drawn by half planes in grid coordinates, a frame's border is the same pixels whatever window it is drawn
-    in.
-    """
-    left, right = np.full(len(rows), -1e9), np.full(len(rows), 1e9)
-    edges = np.roll(outline_px, -1, axis=0) - outline_px
-    turn = np.sign(edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0])
-    for corner, edge in zip(outline_px, edges * turn):
-        # inside lies where edge x (point - corner) >= 0
-        if abs(edge[1]) < 1e-12:
-            left[edge[0] * (rows - corner[1]) < 0] = np.inf
-        else:
-            crossing = corner[0] + edge[0] / edge[1] * (rows - corner[1])
-            if edge[1] > 0:
-                right = np.minimum(right, crossing)
-            else:
-                left = np.maximum(left, crossing)
-    return np.minimum(left, 1e9), right
-
-
-def _merit(frame: CanvasFrame, column: int, row: int, width: int, height: int) -> Floats:
-    """(height, width) how well a frame shows each cell; -inf where it does not.
-
-    Within the image merit falls from its centre to its border and with the ground area of a pixel, and is
-    lower for oblique views; the flight's rank outweighs it. Just outside, where a cell may still be partly
-    covered, it is very low, the lower the farther.
-    """
-    xs = (np.arange(column, column + width) + 0.5) * _CELL_PX - 0.5
-    ys = (np.arange(row, row + height) + 0.5) * _CELL_PX - 0.5
-    image_from_grid = np.linalg.inv(frame.grid_from_image)
-    centre = np.array([(frame.width_px - 1) / 2, (frame.height_px - 1) / 2, 1.0])
-    image_from_grid *= np.sign((frame.grid_from_image @ centre)[2])
-    u, v, z = (a * xs[None, :] + b * ys[:, None] + c for a, b, c in image_from_grid)
-    seen = z > 1e-9
-    z = np.where(seen, z, 1.0)
-    u, v = u / z, v / z
-    across = (u - centre[0]) / (frame.width_px / 2)
-    down = (v - centre[1]) / (frame.height_px / 2)
-    # grid pixels per image pixel: the smaller, the finer the image sees this ground
-    coarseness = np.sqrt(z**3 / abs(np.linalg.det(image_from_grid)))
-    inner_px = np.minimum((1 - abs(across)) * frame.width_px, (1 - abs(down)) * frame.height_px) / 2
-    inner_px = inner_px * coarseness
-    inside = seen & (inner_px > 0)
-    if frame.valid is not None:
-        ui = np.clip(np.rint(u), 0, frame.width_px - 1).astype(int)
-        vi = np.clip(np.rint(v), 0, frame.height_px - 1).astype(int)
-        inside &= frame.valid[vi, ui]
-    small, large = _stretch(frame)
-    # small / large is the cosine of the angle of view at the centre: a tilted camera foreshortens the ground
-    quality = (1 - across**2) * (1 - down**2) * (small / large) ** 2 / coarseness**2
-    near = seen & (inner_px > -1.5 * _CELL_PX)
-    outside = np.where(near, np.minimum(inner_px, 0.0) - 1e6, -np.inf)
-    return np.where(inside, quality / (1 + quality) - frame.rank, outside)
-
-
-def _stretch(frame: CanvasFrame) -> tuple[float, float]:
-    """How many grid pixels an image pixel spans at the image's centre, on its least and its most stretched
-    axis.
-    """
-    u, v = (frame.width_px - 1) / 2, (frame.height_px - 1) / 2
-    x, y, z = frame.grid_from_image @ np.array([u, v, 1.0])
-    linear = frame.grid_from_image[:2, :2] / z - np.outer([x, y], frame.grid_from_image[2, :2]) / z**2
-    large, small = np.linalg.svd(linear, compute_uv=False)
-    return float(small), float(large)
-
-
 def _share(
     wins: Mask, frame: CanvasFrame, x: int, y: int, pad: int
 ) -> tuple[int, int, NDArray[np.uint8]]:
@@ -465,14 +331,14 @@ def _share(
 
     `wins` holds the window's cells and `pad` more on each side. Smoothing makes the seams curves, not stairs.
     """
-    height, width = ((side - 2 * pad) * _CELL_PX for side in wins.shape)
+    height, width = ((side - 2 * pad) * CELL_PX for side in wins.shape)
     left, top, columns, rows = cv2.boundingRect(wins.astype(np.uint8))
     c0, c1 = max(0, left - 2), min(wins.shape[1], left + columns + 2)
     r0, r1 = max(0, top - 2), min(wins.shape[0], top + rows + 2)
     cells: Anything = cv2.GaussianBlur(wins[r0:r1, c0:c1].astype(np.uint8) * 255, (3, 3), 0)
-    share: Anything = cv2.resize(cells, None, fx=_CELL_PX, fy=_CELL_PX, interpolation=cv2.INTER_LINEAR)
+    share: Anything = cv2.resize(cells, None, fx=CELL_PX, fy=CELL_PX, interpolation=cv2.INTER_LINEAR)
     # the padding cells were needed for smoothing only
-    x0, y0 = (c0 - pad) * _CELL_PX, (r0 - pad) * _CELL_PX
+    x0, y0 = (c0 - pad) * CELL_PX, (r0 - pad) * CELL_PX
     cut_x, cut_y = max(0, -x0), max(0, -y0)
     x0, y0 = x0 + cut_x, y0 + cut_y
     share = share[cut_y:cut_y + height - y0, cut_x:cut_x + width - x0]
@@ -482,9 +348,9 @@ def _share(
 
 def _shown_cells(known: KnownGround, key: TileIndex) -> Mask:
     """(64, 64) the cells of a chunk in which the map showed any pixel."""
-    side = _CHUNK_CELLS * _CELL_PX
+    side = _CHUNK_CELLS * CELL_PX
     shown = known.opaque(key[0] * side, key[1] * side, (key[0] + 1) * side, (key[1] + 1) * side)
-    blocks: Mask = shown.reshape(_CHUNK_CELLS, _CELL_PX, _CHUNK_CELLS, _CELL_PX).any(axis=(1, 3))  # type: ignore[assignment]
+    blocks: Mask = shown.reshape(_CHUNK_CELLS, CELL_PX, _CHUNK_CELLS, CELL_PX).any(axis=(1, 3))  # type: ignore[assignment]
     return blocks
 
 
@@ -494,7 +360,3 @@ def _paste(target: NDArray[np.generic], patch: NDArray[np.generic], x: int, y: i
     x1, y1 = min(target.shape[1], x + patch.shape[1]), min(target.shape[0], y + patch.shape[0])
     if x0 < x1 and y0 < y1:
         target[y0:y1, x0:x1] = patch[y0 - y:y1 - y, x0 - x:x1 - x]
-
-
-def _shift(x: float, y: float) -> Matrix3:
-    return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])

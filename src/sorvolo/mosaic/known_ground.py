@@ -1,12 +1,21 @@
-"""The ground that a map showed before a flight was painted into it, pixel by pixel."""
+"""The ground that a map showed before a flight was painted into it: which pixels, and how new ones are fitted to it."""
 
 from collections.abc import Mapping
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import ImageRGBA, Mask
+from sorvolo.geometry.arrays import Anything, ImageRGB, ImageRGBA, Mask
 from sorvolo.geometry.grid import Grid, TileIndex
+
+SETTLING_PX = 64
+"""How far beyond a window its known ground must be seen for `settled` not to depend on where the window ends."""
+
+_SHRINK = 4
+_RIM_PX = 3.0  # known pixels so deep within the rim tell the step at it
+_REACH_PX = 48
+_LARGEST_STEP = 24  # gray levels: more is no light but another thing
 
 
 class KnownGround:
@@ -76,3 +85,30 @@ class KnownGround:
             (slice(y0 - tile[1], y1 - tile[1]), slice(x0 - tile[0], x1 - tile[0])),
             (slice(y0 - window[1], y1 - window[1]), slice(x0 - window[0], x1 - window[0])),
         )
+
+
+def settled(picture: ImageRGB, stored: ImageRGB, lasting: Mask) -> ImageRGB:
+    """A picture, (H, W, 3), whose light at the rim of lasting ground is brought to that of the stored picture.
+
+    Blending would have met new ground half-way; here the known side does not move, so the new side goes all the way
+    and comes back to its own light within some 40 px. H and W are multiples of 4.
+    """
+    if lasting.all() or not lasting.any():
+        return picture
+    height, width = lasting.shape
+    small = (width // _SHRINK, height // _SHRINK)
+    inwards_px = cv2.distanceTransform(lasting.view(np.uint8), cv2.DIST_L2, 3)
+    outwards_px = cv2.distanceTransform((~lasting).view(np.uint8), cv2.DIST_L2, 3)
+    rim: Anything = np.exp(inwards_px / -_RIM_PX) * lasting
+    step = np.clip(cv2.subtract(stored, picture, dtype=cv2.CV_16S), -_LARGEST_STEP, _LARGEST_STEP) * rim[..., None]
+    side = 2 * (_REACH_PX // _SHRINK) + 1
+    steps, shares = (
+        cv2.GaussianBlur(cv2.resize(each, small, interpolation=cv2.INTER_AREA), (side, side), _REACH_PX / 3 / _SHRINK)
+        for each in (step.astype(np.float32), rim.astype(np.float32))
+    )
+    at_rim = steps / np.maximum(shares, 1e-6)[..., None]
+    kept = np.clip(1 - outwards_px / _REACH_PX, 0, 1) ** 2
+    fitted = picture + cv2.resize(at_rim, (width, height), interpolation=cv2.INTER_LINEAR) * kept[..., None]
+    result: Anything = np.clip(fitted + 0.5, 0, 255).astype(np.uint8)
+    result[lasting] = picture[lasting]
+    return result

@@ -6,7 +6,7 @@ from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Floats, Mask, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.mosaic.canvas import CanvasFrame
+from sorvolo.mosaic.canvas_frame import CanvasFrame
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
 
