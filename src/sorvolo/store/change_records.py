@@ -51,6 +51,7 @@ class StoredChange:
     velocity_m_s: Floats
     class_before: str
     class_after: str
+    announced_ns: int
     crop: CropPlace
     verdict: Verdict | None = None
     note: str = ""
@@ -206,7 +207,7 @@ def _stored(flight_id: str, number: int, change: Change) -> StoredChange:
     return StoredChange(
         change.id, flight_id, number, change.kind, change.score, change.outline_m, change.first_seen_ns,
         change.last_seen_ns, change.views, change.area_m2, change.length_m, change.sigma_m, change.velocity_m_s,
-        change.class_before, change.class_after,
+        change.class_before, change.class_after, change.announced_ns,
         CropPlace(patch.west_m, patch.north_m, patch.m_per_px, width_px, height_px),
     )
 
@@ -218,7 +219,7 @@ def _row_of(change: StoredChange, run_id: int) -> dict[str, Any]:
         "properties": {
             "score": float(change.score), "outline_m": change.outline_m.tolist(),
             "first_seen_ns": int(change.first_seen_ns), "last_seen_ns": int(change.last_seen_ns),
-            "views": int(change.views),
+            "announced_ns": int(change.announced_ns), "views": int(change.views),
             "area_m2": _finite(change.area_m2), "length_m": _finite(change.length_m),
             "sigma_m": _finite(change.sigma_m), "velocity_m_s": change.velocity_m_s.tolist(),
             "class_before": change.class_before, "class_after": change.class_after,
@@ -235,7 +236,8 @@ def _change_of(row: Row[Any], review: StoredReview | None) -> StoredChange:
         row.id, row.flight_id, row.number, ChangeKind(row.kind), values["score"], outline_m,
         values["first_seen_ns"], values["last_seen_ns"], values["views"],
         _number(values["area_m2"]), _number(values["length_m"]), _number(values["sigma_m"]),
-        frozen(values["velocity_m_s"]), values["class_before"], values["class_after"], CropPlace(*values["crop"]),
+        frozen(values["velocity_m_s"]), values["class_before"], values["class_after"],
+        values["announced_ns"], CropPlace(*values["crop"]),
         review.verdict if review is not None and is_reviewed else None,
         review.note if review is not None and is_reviewed else "",
     )

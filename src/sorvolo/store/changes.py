@@ -84,6 +84,7 @@ def _feature(change: StoredChange, site: Site) -> dict[str, Any]:
         "score": rounded(change.score, 4),
         "first_seen": utc_text(change.first_seen_ns),
         "last_seen": utc_text(change.last_seen_ns),
+        "announced": utc_text(change.announced_ns) if change.announced_ns >= 0 else None,
         "views": change.views,
         "area_m2": rounded(change.area_m2, 4),
         "length_m": rounded(change.length_m, 4),

@@ -129,6 +129,7 @@ class Change:
     velocity_m_s: Floats = field(default_factory=lambda: np.zeros(2))
     class_before: str = ""
     class_after: str = ""
+    announced_ns: int = -1  # when it was told; -1: only after the last frame
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "outline_m", frozen(self.outline_m))
