@@ -18,6 +18,7 @@ from sorvolo.store.exports import (
     frames_geojson,
     geojson_bytes,
     picture,
+    pictures,
     plain_json,
     utc_text,
     write_kmz,
@@ -215,3 +216,23 @@ def test_a_site_says_what_its_height_is_counted_from() -> None:
     above_takeoff = replace(SITE, origin=Geodetic(46.5, 13.25, 0.0), height_reference="above take-off")
     properties = feature(frames_geojson([frame(0)], above_takeoff))["properties"]
     assert (properties["camera_height_m"], properties["height_reference"]) == (20, "above take-off")
+
+
+def test_two_maps_are_shown_on_the_same_ground_and_common_tiles_are_read_once() -> None:
+    class Watched(dict):
+        def __getitem__(self, index: tuple[int, int]) -> np.ndarray:
+            read.append(index)
+            return super().__getitem__(index)
+
+    read: list[tuple[int, int]] = []
+    before = {(0, 0): tile(10), (1, 0): tile(30)}
+    after = Watched({(0, 0): tile(10), (1, 0): tile(60), (2, 1): tile(90)})
+    one, two = pictures([before, after], 512, alike={(0, 0)})
+    assert one.rgba.shape == two.rgba.shape == (256, 384, 4)
+    assert one.corner_px == two.corner_px == (-0.5, -0.5) and one.step_px == two.step_px == 4
+    assert np.array_equal(one.rgba[:128, :128], two.rgba[:128, :128])
+    assert not one.rgba[128:, 256:, 3].any() and (two.rgba[128:, 256:, 0] == 90).all()
+    assert (two.rgba[:128, 128:256, 0] == 60).all()
+    assert (0, 0) not in read and {(1, 0), (2, 1)} <= set(read)
+    empty, same = pictures([{}, before], 512)
+    assert not empty.rgba.any() and same.rgba.shape == empty.rgba.shape

@@ -13,7 +13,7 @@ from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.store import catalogue as records
 from sorvolo.store import change_records
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
-from sorvolo.store.catalogue import Catalogue, FlightEntry, StoredKeyframe, TileDifference, VersionEntry
+from sorvolo.store.catalogue import Catalogue, FlightEntry, OwedFiles, StoredKeyframe, TileDifference, VersionEntry
 from sorvolo.store.change_records import StoredChange, StoredReview
 from sorvolo.store.derived import STAGED, map_is_there, take_staged, write_change_files, write_map_files
 from sorvolo.store.exports import plain_json
@@ -170,6 +170,12 @@ class Archive:
             changed, removed = records.tile_changes(connection, version)
         return TileDifference(len(changed), removed, self._blobs.size_bytes(changed))
 
+    def tiles_alike(self, version: int, other: int) -> set[TileIndex]:
+        """The places at which two versions have the same tile."""
+        with self._catalogue.reading() as connection:
+            one, two = records.tile_hashes(connection, version), records.tile_hashes(connection, other)
+        return {index for index, sha256 in one.items() if two.get(index) == sha256}
+
     def comparisons(self) -> dict[int, Mapping[str, int]]:
         """The versions that comparisons made: how many changes of each kind each found."""
         with self._catalogue.reading() as connection:
@@ -265,17 +271,17 @@ class Archive:
         """
         self._require_writable()
         with self._catalogue.reading() as connection:
-            owed = records.unwritten_documents(connection)
+            owed = records.owed_files(connection)
             shown = records.derived_version(connection)
             newest = next((v for v in reversed(records.list_versions(connection)) if v.complete), None)
-        for flight_id, run_id, documents in owed:
-            self._write_flight_files(flight_id, run_id, documents)
+        for files in owed:
+            self._write_flight_files(files)
         if newest is None:
             return
         if not self._looks_like(newest, shown) or (newest.tiles and not map_is_there(self)):
             write_map_files(self, newest)
         with self._catalogue.changing() as connection:
-            records.mark_written(connection, [run_id for _, run_id, _ in owed], newest.id)
+            records.mark_written(connection, [files.run_id for files in owed], newest.id)
 
     def _looks_like(self, version: VersionEntry, shown: int) -> bool:
         """Whether the map's files, which show another version, would be the same for this one."""
@@ -286,20 +292,20 @@ class Archive:
             same = records.tile_hashes(connection, version.id) == records.tile_hashes(connection, shown)
         return same and crs == version.export_crs
 
-    def _write_flight_files(self, flight_id: str, run_id: int, documents: Mapping[str, bytes]) -> None:
-        folder = self.flight_folder(flight_id)
+    def _write_flight_files(self, files: OwedFiles) -> None:
+        folder = self.flight_folder(files.flight_id)
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        for name, content in documents.items():
+        for name, content in files.documents.items():
             if content:
                 atomic_write_bytes(folder / name, content)
-            else:
-                (folder / name).unlink(missing_ok=True)
-        take_staged(folder, run_id)
+        for name in files.leftovers:
+            (folder / name).unlink(missing_ok=True)
+        take_staged(folder, files.run_id)
         with self._catalogue.reading() as connection:
-            is_compared = change_records.is_compared(connection, run_id)
-        version = next((each for each in self.versions() if each.run_id == run_id and is_compared), None)
-        write_change_files(self, flight_id, version, documents.get("report.json", b""))
+            is_compared = change_records.is_compared(connection, files.run_id)
+        version = next((each for each in self.versions() if each.run_id == files.run_id and is_compared), None)
+        write_change_files(self, files.flight_id, version)
 
     def _view(self, version_id: int) -> TileView:
         def hashes() -> Mapping[TileIndex, str]:

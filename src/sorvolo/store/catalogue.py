@@ -316,18 +316,20 @@ def complete_run(
     notes: Sequence[str],
     export_crs: str,
 ) -> None:
-    """Switch a flight from its former run to this one, and the map to this version.
-
-    A document of the former run that this one does not have stays as an empty one: its file is to be removed.
-    """
+    """Switch a flight from its former run to this one, and the map to this version."""
     this_run = schema.runs.c.id == run_id
     flight_id = connection.execute(select(schema.runs.c.flight_id).where(this_run)).scalar_one()
     former = (schema.runs.c.flight_id == flight_id, schema.runs.c.id != run_id)
-    names = connection.execute(
-        select(schema.documents.c.name).join(schema.runs, schema.runs.c.id == schema.documents.c.run_id).where(*former)
-    ).scalars()
-    documents = {**dict.fromkeys(names, b""), **documents}
+    gone = {
+        name
+        for table in (schema.documents, schema.leftovers)
+        for name in connection.execute(
+            select(table.c.name).join(schema.runs, schema.runs.c.id == table.c.run_id).where(*former)
+        ).scalars()
+    } - documents.keys()
     connection.execute(delete(schema.runs).where(*former))
+    if gone:
+        connection.execute(insert(schema.leftovers), [{"run_id": run_id, "name": name} for name in sorted(gone)])
     connection.execute(update(schema.runs).where(this_run).values(
         status="complete", finished_utc=utc_now(), frames=dict(frames), notes=list(notes)
     ))
@@ -365,16 +367,6 @@ def owe_documents(connection: Connection, flight_ids: Collection[str]) -> None:
     )
 
 
-def document(connection: Connection, flight_id: str, name: str) -> bytes:
-    """A document of a flight's complete run; b"" when it has none of that name."""
-    return connection.execute(
-        select(schema.documents.c.content)
-        .join(schema.runs, schema.runs.c.id == schema.documents.c.run_id)
-        .where(schema.runs.c.flight_id == flight_id, schema.runs.c.status == "complete")
-        .where(schema.documents.c.name == name)
-    ).scalar() or b""
-
-
 def run_ids(connection: Connection) -> dict[str, set[int]]:
     """The runs of each flight."""
     runs: dict[str, set[int]] = {}
@@ -397,24 +389,41 @@ def load_keyframes(connection: Connection, flight_id: str | None) -> list[Stored
     return [_keyframe_of(row) for row in connection.execute(query)]
 
 
-def unwritten_documents(connection: Connection) -> list[tuple[str, int, dict[str, bytes]]]:
-    """Flight id, run id and documents of each complete run whose files were not all written."""
+@dataclass(frozen=True)
+class OwedFiles:
+    """What a complete run owes its flight's folder: text files by name (empty: already there), names to remove."""
+
+    flight_id: str
+    run_id: int
+    documents: Mapping[str, bytes]
+    leftovers: tuple[str, ...]
+
+
+def owed_files(connection: Connection) -> list[OwedFiles]:
+    """The files of each complete run that were not all written."""
     runs = connection.execute(
         select(schema.runs.c.flight_id, schema.runs.c.id)
         .where(schema.runs.c.status == "complete", schema.runs.c.files_written.is_(False))
     ).all()
+    documents, leftovers = schema.documents, schema.leftovers
     return [
-        (flight_id, run_id, {
-            row.name: row.content
-            for row in connection.execute(select(schema.documents).where(schema.documents.c.run_id == run_id))
-        })
+        OwedFiles(
+            flight_id, run_id,
+            {
+                row.name: row.content
+                for row in connection.execute(select(documents).where(documents.c.run_id == run_id))
+            },
+            tuple(connection.execute(select(leftovers.c.name).where(leftovers.c.run_id == run_id)).scalars()),
+        )
         for flight_id, run_id in runs
     ]
 
 
 def mark_written(connection: Connection, run_ids: Sequence[int], derived_version: int) -> None:
-    """Note that these runs' files, and the map's files for this version, are on the disk."""
+    """Note that these runs' files, and the map's files for this version, are on the disk: documents are emptied."""
     connection.execute(update(schema.runs).where(schema.runs.c.id.in_(run_ids)).values(files_written=True))
+    connection.execute(update(schema.documents).where(schema.documents.c.run_id.in_(run_ids)).values(content=b""))
+    connection.execute(delete(schema.leftovers).where(schema.leftovers.c.run_id.in_(run_ids)))
     connection.execute(update(schema.site).values(derived_version=derived_version))
 
 

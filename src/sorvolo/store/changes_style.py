@@ -86,6 +86,8 @@ SCRIPT = """
   slider.addEventListener("input", show);
   stack.addEventListener("pointerdown", function (event) {
     if (event.target.closest(".pin") || event.button !== 0) { return; }
+    var box = stack.getBoundingClientRect(), line = box.left + box.width * slider.value / 100;
+    if (zoom > 1 && Math.abs(event.clientX - line) > 40) { return; }
     held = true;
     stack.setPointerCapture(event.pointerId);
     follow(event);
@@ -101,6 +103,7 @@ SCRIPT = """
       zoom = Math.max(1, Math.min(8, button.value === "closer" ? zoom * 2 : zoom / 2));
       if (zoom !== wide) {
         stack.style.width = 100 * zoom + "%";
+        stack.style.touchAction = zoom > 1 ? "auto" : "pan-y";
         view.scrollLeft = x * zoom - view.clientWidth / 2;
         view.scrollTop = y * zoom - view.clientHeight / 2;
       }

@@ -3,8 +3,9 @@
 import json
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes, sync_file, writing
@@ -22,7 +23,7 @@ STAGED = "staged"
 """The folder of a flight in which its next run collects pictures until it is committed."""
 
 STAGED_FOLDERS = ("changes", "masks")
-_PICTURE_PX = 1600
+_PICTURE_PX, _UNCHANGED_PX = 1600, 800  # of the map in changes.html; daily flights without change should cost little
 
 
 def write_map_files(archive: "Archive", version: VersionEntry) -> None:
@@ -66,10 +67,10 @@ def take_staged(flight_folder: Path, run_id: int) -> None:
     shutil.rmtree(flight_folder / STAGED, ignore_errors=True)
 
 
-def write_change_files(archive: "Archive", flight_id: str, version: VersionEntry | None, report_json: bytes) -> None:
+def write_change_files(archive: "Archive", flight_id: str, version: VersionEntry | None) -> None:
     """Write changes.geojson and changes.html of a flight; remove them when `version` is None: it was not compared.
 
-    `version` is the map that the comparison made, `report_json` the flight's report.
+    `version` is the map that the comparison made. The page tells what report.json in the flight's folder says.
     """
     folder = archive.flight_folder(flight_id)
     if version is None:
@@ -80,13 +81,25 @@ def write_change_files(archive: "Archive", flight_id: str, version: VersionEntry
     atomic_write_bytes(folder / "changes.geojson", geojson_bytes(changes_geojson(changes, site)))
     crops = {each.id: _crops(folder / "changes", each.id) for each in changes}
     maps = [archive.tiles(version.parent_id) if version.parent_id else {}, archive.tiles(version.id)]
-    before, after = pictures(maps, _PICTURE_PX) if any(maps) else (None, None)
+    before, after = None, None
+    if any(maps):
+        alike = archive.tiles_alike(version.id, version.parent_id)
+        before, after = pictures(maps, _PICTURE_PX if changes else _UNCHANGED_PX, alike)
     made = {each.id: each for each in archive.versions()}
     page = changes_page(
-        json.loads(report_json or b"{}"), changes, before, after, site, crops,
+        _report(folder / "report.json"), changes, before, after, site, crops,
         before_words=_words_of(made.get(version.parent_id)), after_words=_words_of(version),
     )
     atomic_write_bytes(folder / "changes.html", page.encode())
+
+
+def _report(path: Path) -> Mapping[str, Any]:
+    """The flight's report; empty when somebody took it away or broke it: the page then says less."""
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return report if isinstance(report, dict) else {}
 
 
 def _words_of(version: VersionEntry | None) -> str:

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from datetime import UTC, datetime
 from enum import Enum
@@ -109,8 +109,13 @@ def picture(tiles: Mapping[TileIndex, ImageRGBA], max_px: int) -> Picture:
     return pictures([tiles], max_px)[0]
 
 
-def pictures(maps: Sequence[Mapping[TileIndex, ImageRGBA]], max_px: int) -> list[Picture]:
-    """Several maps of one site as `picture` shows one, all of the same size and the same ground; one is not empty."""
+def pictures(
+    maps: Sequence[Mapping[TileIndex, ImageRGBA]], max_px: int, alike: Collection[TileIndex] = ()
+) -> list[Picture]:
+    """Several maps of one site as `picture` shows one, all of the same size and the same ground; one is not empty.
+
+    Tiles at the places `alike` are the same in all maps and are read once.
+    """
     indexes = sorted(set().union(*maps))
     tile_px = next(tiles[index].shape[0] for index in indexes[:1] for tiles in maps if index in tiles)
     columns, rows = np.array(indexes).T
@@ -125,7 +130,11 @@ def pictures(maps: Sequence[Mapping[TileIndex, ImageRGBA]], max_px: int) -> list
     for canvas, tiles in zip(canvases, maps):
         for column, row in sorted(tiles):
             y, x = (row - top) * small_px, (column - left) * small_px
-            canvas[y:y + small_px, x:x + small_px] = shrink(tiles[column, row], small_px, small_px)
+            part = np.s_[y:y + small_px, x:x + small_px]
+            if canvas is not canvases[0] and (column, row) in alike:
+                canvas[part] = canvases[0][part]
+            else:
+                canvas[part] = shrink(tiles[column, row], small_px, small_px)
         seen |= canvas[..., 3] > 0
     (y0, y1), (x0, x1) = (np.flatnonzero(seen.any(axis=axis))[[0, -1]] + [0, 1] for axis in (1, 0))
     corner_px = (left * tile_px + int(x0) * step - 0.5, top * tile_px + int(y0) * step - 0.5)

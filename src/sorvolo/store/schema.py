@@ -81,10 +81,15 @@ keyframes = Table(
     Column("residual_px", Float),
 )
 documents = Table(
-    "documents", metadata,  # the text files of a run, verbatim, to write them again after a kill
+    "documents", metadata,  # the text files of a run, verbatim until they are written, then emptied to save room
     Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
     Column("name", String, primary_key=True),
-    Column("content", LargeBinary, nullable=False),
+    Column("content", LargeBinary, nullable=False),  # b"": the file is on the disk
+)
+leftovers = Table(
+    "leftovers", metadata,  # text files of the run before that this one has not: to be removed
+    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
+    Column("name", String, primary_key=True),
 )
 versions = Table(
     "versions", metadata,
@@ -130,7 +135,7 @@ reviews = Table(
     Column("kind", String, nullable=False),
     Column("outline_m", JSON, nullable=False),
 )
-_NEW_IN_2 = [comparisons, changes, reviews]
+_NEW_IN_2 = [leftovers, comparisons, changes, reviews]
 
 
 def create_tables(path: Path) -> None:
