@@ -23,6 +23,7 @@ from sorvolo.simulation.settings import (
     SimulationSettings,
 )
 from sorvolo.store.archive import Archive
+from sorvolo.store.exports import utc_text
 from sorvolo.survey.flight import Site
 
 SETTINGS = SimulationSettings(
@@ -124,23 +125,20 @@ def test_each_fault_is_counted_as_what_it_is(site, simulated):
 
 
 def test_late_needs_to_know_when(site, simulated):
-    true = {each["properties"]["number"]: each["properties"] for each in
-            features(simulated / "truth/flight2/events.geojson")}
     (measured,) = evaluate_changes(site, simulated)
-    on_time = {
-        pair.found.id: int(pair.true.clear_ns[2]) + 900_000_000 for pair in measured.match.pairs
-    }
-    (known,) = evaluate_changes(site, simulated, announced_ns=on_time)
-    assert (known.events.judged_late, known.events.late) == (len(on_time), 0)
+    assert measured.events.judged_late == 0
+    third_ns = {pair.found.id: int(pair.true.clear_ns[2]) for pair in measured.match.pairs}
+    for delay_s, late in ((0.9, 0), (1.1, len(third_ns)), (None, None)):
+        def say(events, delay_s=delay_s):
+            for each in events:
+                told_ns = third_ns.get(each["properties"]["id"])
+                said = None if told_ns is None or delay_s is None else utc_text(told_ns + round(delay_s * 1e9))
+                each["properties"]["announced"] = said
 
-    def say(events):
-        for each in events:
-            clear = true[int(each["properties"]["id"].split("-")[1])]["clear_views"]
-            each["properties"]["announced"] = "2026-05-19T23:00:00Z" if clear else None
-
-    edit(site, say)
-    (said,) = evaluate_changes(site, simulated)
-    assert said.events.late == said.events.judged_late > 0
+        edit(site, say)
+        (said,) = evaluate_changes(site, simulated)
+        assert said.events.judged_late == len(third_ns)
+        assert said.events.late == late or (late is None and said.events.late > 0)  # told only after the last frame
 
 
 def test_only_what_lies_on_compared_ground_must_be_found(site, simulated):

@@ -62,14 +62,13 @@ class FlightChanges:
 
 
 def evaluate_changes(
-    found: Path, truth: Path, *, flight: str | None = None, least_px: int = 1,
-    announced_ns: Mapping[str, int] | None = None,
+    found: Path, truth: Path, *, flight: str | None = None, least_px: int = 1
 ) -> tuple[FlightChanges, ...]:
     """Measure the compared flights of a site folder, or a folder of masks, against the truth.
 
     `truth` is a simulation's folder, the truth folder in it, or a folder of masks; `flight` one of the site's flights;
-    `least_px` how many changed pixels make a frame positive; `announced_ns` when each event was announced, by its id,
-    where the site does not say so. Raises InputError for folders that hold neither, or not the same frames.
+    `least_px` how many changed pixels make a frame positive. Raises InputError for folders that hold neither, or not the
+    same frames.
     """
     is_site = (found / "flights").is_dir()
     true_flights = _true_flights(truth)
@@ -95,7 +94,7 @@ def evaluate_changes(
             "frame is in both; give the truth of these flights"
         )
     return tuple(
-        _evaluate(found, described, flights, name, true_flights[flights.true_name(name)], least_px, announced_ns or {})
+        _evaluate(found, described, flights, name, true_flights[flights.true_name(name)], least_px)
         for name in known
     )
 
@@ -233,8 +232,7 @@ class _Flights:
 
 
 def _evaluate(
-    site: Path, described: Site, flights: _Flights, flight: str, true_folder: Path, least_px: int,
-    announced_ns: Mapping[str, int],
+    site: Path, described: Site, flights: _Flights, flight: str, true_folder: Path, least_px: int
 ) -> FlightChanges:
     remarks = []
     masks = None
@@ -252,7 +250,8 @@ def _evaluate(
     is_photos = any(not row.name.isdecimal() for row in flights.mine[flight])
     settings = EventSettings(views=PHOTO_VIEWS if is_photos else VIDEO_VIEWS)
     true = _read_true(true_folder / "events.geojson", described, map_from_truth, ground, settings.views)
-    found = _read_found(site / "flights" / flight / "changes.geojson", described, announced_ns)
+    ended_ns = max((row.time_ns for row in flights.mine[flight]), default=0)
+    found = _read_found(site / "flights" / flight / "changes.geojson", described, ended_ns)
     match = match_events(found, true, settings)
     scores = score_events(match, ground.area_m2, settings)
     if match.pairs and not scores.judged_late:
@@ -285,17 +284,16 @@ def _read_true(
     return events
 
 
-def _read_found(path: Path, described: Site, announced_ns: Mapping[str, int]) -> list[FoundEvent]:
+def _read_found(path: Path, described: Site, ended_ns: int) -> list[FoundEvent]:
+    """The reported events; those that were told only at the end were announced with the last frame."""
     events = []
     for feature in read_features(path):
         try:
             said = feature["properties"]
-            announced = announced_ns.get(str(said["id"]))
-            if announced is None and said.get("announced"):
-                announced = time_ns_of(said["announced"])
+            announced_ns = (time_ns_of(said["announced"] or "") or ended_ns) if "announced" in said else None
             sigma_m = math.nan if said.get("sigma_m") is None else float(said["sigma_m"])
             outline_m = _ring(feature, described, np.eye(3), path)
-            events.append(FoundEvent(str(said["id"]), ChangeKind(said["kind"]), outline_m, sigma_m, announced))
+            events.append(FoundEvent(str(said["id"]), ChangeKind(said["kind"]), outline_m, sigma_m, announced_ns))
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(f"{path}: a change is not as docs/formats.md says ({error!r})") from error
     return events
