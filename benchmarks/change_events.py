@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -142,7 +143,7 @@ def run_method(method: str, masks: bool, simulation: Path, site: Path) -> None:
     """In the child: compare, then print the cost as JSON."""
     settings = CompareSettings(method=method, writes_masks=masks)
     before, started = resource.getrusage(resource.RUSAGE_SELF), time.monotonic()
-    *_, last = compare_flights([flight(simulation, 2)], site, settings, camera=simulation / "camera.xml")
+    (last,) = deque(compare_flights([flight(simulation, 2)], site, settings, camera=simulation / "camera.xml"), 1)
     after = resource.getrusage(resource.RUSAGE_SELF)
     wall_s = time.monotonic() - started
     cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import deque
 from pathlib import Path
 
 import cv2
@@ -130,7 +131,7 @@ def halves(photos: Path, folder: Path, parity: int) -> tuple[Path, Path]:
 def compare(method: str, photos: Path, site: Path) -> None:
     """In the child: compare, then print the cost as JSON."""
     started = time.monotonic()
-    *_, last = compare_flights([photos], site, CompareSettings(method=method))
+    (last,) = deque(compare_flights([photos], site, CompareSettings(method=method)), 1)
     used = resource.getrusage(resource.RUSAGE_SELF)
     print(json.dumps({
         "photos": last.frames_expected, "views": last.views, "compared": last.compared,

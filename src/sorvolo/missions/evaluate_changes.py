@@ -67,8 +67,8 @@ def evaluate_changes(
     """Measure the compared flights of a site folder, or a folder of masks, against the truth.
 
     `truth` is a simulation's folder, the truth folder in it, or a folder of masks; `flight` one of the site's flights;
-    `least_px` how many changed pixels make a frame positive. Raises InputError for folders that hold neither, or not the
-    same frames.
+    `least_px` how many changed pixels make a frame positive. Raises InputError for folders that hold neither, or not
+    the same frames.
     """
     is_site = (found / "flights").is_dir()
     true_flights = _true_flights(truth)
