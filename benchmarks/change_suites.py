@@ -1,11 +1,12 @@
 """Pairs of aligned pictures with an exact answer: what changed, each suite isolating one nuisance.
 
 The grounds are real photos; objects are painted on the reference's ground (they disappeared) or on the query's (they
-appeared), half of the pairs have none. Development and test use different photos, flights and random numbers. Shadows
-that objects cast are left out of the score. Without the photos the grounds are procedural, and `Ground.source` says so.
+appeared), half of the pairs have none. `real` pairs neighbouring photos of one flight. Development and test use
+different photos, flights and random numbers. Shadows that objects cast are left out of the score. Without the photos
+the grounds are procedural, and `Ground.source` says so.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -33,6 +34,7 @@ class Nuisance:
     object_scale: float = 1.0
     low_contrast: float = 0.0  # how often an object has the ground's own colours
     changed: float = 0.5  # how often anything changed
+    cast_shadows: float = 0.0  # how often shadows of standing things lie elsewhere: the sun has moved
     exact: bool = True  # the value itself rather than anything up to it
 
 
@@ -51,7 +53,11 @@ SUITES: dict[str, Nuisance] = {
     "low contrast": Nuisance(low_contrast=1.0),
     "hard": Nuisance(1.0, 0.6, 2.5, 10.0, 4.0, 0.8, 0.25, exact=False),
     "none": Nuisance(1.0, 0.6, 2.5, 10.0, 4.0, changed=0.0, exact=False),
+    "large": Nuisance(0.3, wind_px=1.0, parallax_px=3.0, misaligned_px=2.0, object_scale=5.0),
+    "cast shadows": Nuisance(0.3, parallax_px=3.0, misaligned_px=1.0, cast_shadows=1.0),
+    "real": Nuisance(),
 }
+REAL = ("brighton_beach", "caliterra")  # neighbouring photos of a flight, registered: leaning trees as they are
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,23 +123,26 @@ def pairs(suite: str, seed: int, count: int, places: list[Ground], split: str) -
     """`count` pairs of a suite; the same arguments give the same pairs."""
     for number in range(count):
         rng = _random(suite, seed, number, split)
-        scene, source = _scene(rng, SUITES[suite], places)
-        yield _pair(suite, source, scene, SUITES[suite], rng, clouds_before=True)
+        scene, source, known = _scene(rng, suite, places)
+        yield _pair(suite, source, scene, known, rng, clouds_before=True)
 
 
 def views(suite: str, seed: int, number: int, places: list[Ground], split: str, count: int = 5) -> list[Pair]:
     """`count` views of one ground, each with nuisances of its own; they show the same changes."""
     rng = _random(f"{suite} views", seed, number, split)
-    scene, source = _scene(rng, SUITES[suite], places)
-    return [_pair(suite, source, scene, SUITES[suite], rng, clouds_before=False) for _ in range(count)]
+    scene, source, known = _scene(rng, suite, places)
+    return [_pair(suite, source, scene, known, rng, clouds_before=False) for _ in range(count)]
 
 
 def _random(suite: str, seed: int, number: int, split: str) -> np.random.Generator:
     return np.random.default_rng([seed, number, *f"{split} {suite}".encode()])
 
 
-def _scene(rng: np.random.Generator, nuisance: Nuisance, places: list[Ground]) -> tuple[Scene, str]:
-    """Ground with a margin before and after, and the masks of what differs; sources weigh the same."""
+def _scene(rng: np.random.Generator, suite: str, places: list[Ground]) -> tuple[Scene, str, np.ndarray]:
+    """Ground with a margin before and after, masks of what differs, where both are known; sources weigh the same."""
+    nuisance = SUITES[suite]
+    if suite == "real":
+        places = [each for each in places if each.source in REAL]
     sources = sorted({each.source for each in places})
     source = sources[int(rng.integers(len(sources)))]
     choice = [each for each in places if each.source == source]
@@ -142,33 +151,64 @@ def _scene(rng: np.random.Generator, nuisance: Nuisance, places: list[Ground]) -
     whole = picture(place.path)
     if min(whole.shape[0] / size[1], whole.shape[1] / size[0]) < 1.2:
         size = SIZES[1]
-    world = _cut(whole, size, rng)
+    pictures = (whole, whole, np.full(whole.shape[:2], 255, np.uint8))
+    if suite == "real":
+        at = choice.index(place)
+        pictures = _registered(place.path, choice[at + 1 if at + 1 < len(choice) else at - 1].path)
+    for _attempt in range(20):
+        before, after, known = _cut(pictures, size, rng)
+        if (known > 250).mean() > 0.7:
+            break
     scale = size[0] / 1280 * nuisance.object_scale
-    empty = Scene(world, world, *[np.zeros(world.shape[:2], np.float32)] * 4)
+    empty = Scene(before, after, *[np.zeros(before.shape[:2], np.float32)] * 4)
+    inside = known[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX] > 250
     if rng.uniform() >= nuisance.changed:
-        return empty, source
+        return empty, source, inside
     cutouts = [_cutout(choice, rng) for _ in range(3)]
     donor = picture(choice[int(rng.integers(len(choice)))].path)
-    known = [each for each in cutouts if each is not None]
-    return paint_objects(empty, rng, scale, nuisance.low_contrast, known, donor, MARGIN_PX), source
+    kept = [each for each in cutouts if each is not None]
+    return paint_objects(empty, rng, scale, nuisance.low_contrast, kept, donor, MARGIN_PX), source, inside
 
 
-def _cut(whole: np.ndarray, size: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
-    """A piece of a photo as a frame of `size` with the margin, float32, turned and mirrored at random."""
+def _cut(pictures: tuple[np.ndarray, ...], size: tuple[int, int], rng: np.random.Generator) -> list[np.ndarray]:
+    """The same piece of all pictures as frames of `size` with the margin, float32, turned and mirrored at random."""
     width, height = size[0] + 2 * MARGIN_PX, size[1] + 2 * MARGIN_PX
-    largest = min(whole.shape[1] / width, whole.shape[0] / height)
+    whole = pictures[0].shape
+    largest = min(whole[1] / width, whole[0] / height)
     factor = rng.uniform(min(1.0, largest), max(min(2.0, largest), min(1.0, largest)))
     cut_width, cut_height = int(width * factor), int(height * factor)
-    x = int(rng.integers(whole.shape[1] - cut_width + 1))
-    y = int(rng.integers(whole.shape[0] - cut_height + 1))
-    piece = whole[y : y + cut_height, x : x + cut_width]
+    x = int(rng.integers(whole[1] - cut_width + 1))
+    y = int(rng.integers(whole[0] - cut_height + 1))
+    across, down = (-1 if rng.uniform() < 0.5 else 1 for _ in range(2))
     how = cv2.INTER_AREA if factor > 1 else cv2.INTER_CUBIC
-    piece = cv2.resize(piece, (width, height), interpolation=how)
-    if rng.uniform() < 0.5:
-        piece = piece[:, ::-1]
-    if rng.uniform() < 0.5:
-        piece = piece[::-1]
-    return np.ascontiguousarray(piece, np.float32)
+    pieces = [
+        cv2.resize(each[y : y + cut_height, x : x + cut_width], (width, height), interpolation=how)[::down, ::across]
+        for each in pictures
+    ]
+    return [np.ascontiguousarray(piece, np.float32) for piece in pieces]
+
+
+@lru_cache(maxsize=8)
+def _registered(path: str, other: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A photo, its neighbour laid over it by a homography, and where both are known (255); itself if it fits not."""
+    before, after = picture(path), picture(other)
+    factor = 1000 / before.shape[1]
+    sift = cv2.SIFT_create(4000)
+    found = [
+        sift.detectAndCompute(cv2.resize(cv2.cvtColor(each, cv2.COLOR_BGR2GRAY), None, fx=factor, fy=factor), None)
+        for each in (after, before)
+    ]
+    pairs_of = cv2.BFMatcher().knnMatch(found[0][1], found[1][1], k=2)
+    good = [near for near, far in pairs_of if near.distance < 0.75 * far.distance]
+    from_points = np.float32([found[0][0][each.queryIdx].pt for each in good]) / factor
+    to_points = np.float32([found[1][0][each.trainIdx].pt for each in good]) / factor
+    homography, inliers = cv2.findHomography(from_points, to_points, cv2.USAC_MAGSAC, 3.0)
+    size = before.shape[1::-1]
+    if homography is None or inliers.sum() < 40:
+        return before, before, np.full(before.shape[:2], 255, np.uint8)
+    warped = cv2.warpPerspective(after, homography, size, flags=cv2.INTER_CUBIC)
+    known = cv2.warpPerspective(np.full(after.shape[:2], 255, np.uint8), homography, size)
+    return before, warped, cv2.erode(known, np.ones((5, 5), np.uint8))
 
 
 def _cutout(choice: list[Ground], rng: np.random.Generator) -> Cutout | None:
@@ -189,8 +229,9 @@ def _cutout(choice: list[Ground], rng: np.random.Generator) -> Cutout | None:
 
 
 def _pair(
-    suite: str, source: str, scene: Scene, nuisance: Nuisance, rng: np.random.Generator, clouds_before: bool
+    suite: str, source: str, scene: Scene, known: np.ndarray, rng: np.random.Generator, clouds_before: bool
 ) -> Pair:
+    nuisance = SUITES[suite]
     size = scene.before.shape[1] - 2 * MARGIN_PX, scene.before.shape[0] - 2 * MARGIN_PX
     scale = size[0] / 1280
     given = nuisance if nuisance.exact else _some_of(nuisance, rng)
@@ -212,9 +253,11 @@ def _pair(
     if rng.uniform() < given.cloud:
         shadowed = int(rng.uniform() < 0.7) if clouds_before else 1
         pictures[shadowed] = pictures[shadowed] * _cloud_shadow(pictures[shadowed].shape[:2], rng)
+    if rng.uniform() < given.cast_shadows:
+        pictures = [each * _cast_shadows(each.shape[:2], rng) for each in pictures]
     if given.illumination:
         pictures[1] = _relit(pictures[1], rng)
-    valid = _coverage(size, rng)
+    valid = _coverage(size, rng) & known
     reference = _taken(pictures[0], rng, rng.uniform(0.3, 0.8), int(rng.integers(85, 96)))
     query = _taken(pictures[1], rng, rng.uniform(0.0, 0.7), int(rng.integers(80, 96)))
     reference[~valid] = 0
@@ -309,6 +352,24 @@ def _cloud_shadow(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarra
     return 1 - cover[..., None] * depth
 
 
+def _cast_shadows(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+    """Sharp shadows of crowns and roofs at one time of day."""
+    height, width = shape
+    cover = np.zeros(shape, np.float32)
+    for _ in range(int(rng.integers(2, 7))):
+        one = np.zeros(shape, np.float32)
+        centre = int(rng.integers(width)), int(rng.integers(height))
+        axes = tuple(int(v) for v in np.exp(rng.uniform(np.log(12), np.log(110), 2)))
+        if rng.uniform() < 0.6:
+            cv2.ellipse(one, centre, axes, rng.uniform(0, 180), 0, 360, 1.0, -1)
+            one = (cv2.GaussianBlur(one, (0, 0), 3) + 0.15 * _clouds(shape, rng, 9.0) > 0.5).astype(np.float32)
+        else:
+            cv2.fillConvexPoly(one, cv2.boxPoints((centre, axes, float(rng.uniform(0, 90)))).astype(np.int32), 1.0)
+        cover = np.maximum(cover, one)
+    cover = cv2.GaussianBlur(cover, (0, 0), rng.uniform(0.7, 2.5))
+    return 1 - cover[..., None] * rng.uniform(0.35, 0.6) * np.float32([0.88, 0.98, 1.04])
+
+
 def _relit(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     gain = rng.uniform(0.6, 1.5) * rng.uniform(0.85, 1.15, 3)
     powered = 255 * np.clip(image / 255, 0, None) ** rng.uniform(0.75, 1.35) * gain
@@ -333,7 +394,3 @@ def _coverage(size: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
         x, y = np.meshgrid(np.linspace(-1, 1, size[0]), np.linspace(-1, 1, size[1]))
         valid = x * np.cos(angle) + y * np.sin(angle) < rng.uniform(0.5, 1.0)
     return valid
-
-
-Method = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""(reference, query, valid) -> mask, 255 where changed."""

@@ -5,8 +5,152 @@
 // NumPy in reference_robust.py, let __init__.py hand it on, and test that both agree. Then `pip install --no-deps -e .`.
 #include "_native.hpp"
 
+#include <cmath>
+#include <cstdlib>
+
+// Compiled twice, the better one chosen when the module is loaded.
+#if defined(__x86_64__) && defined(__linux__) && defined(__GNUC__)
+#define ROBUST_CLONES __attribute__((target_clones("avx2", "default")))
+#else
+#define ROBUST_CLONES
+#endif
+
 namespace sorvolo {
 
-void bind_robust(pybind11::module_ &) {}
+namespace {
+
+using Integers32 = pybind11::array_t<std::int32_t, pybind11::array::c_style>;
+using Words = pybind11::array_t<std::uint16_t, pybind11::array::c_style>;
+using Doubles = pybind11::array_t<double, pybind11::array::c_style>;
+
+ROBUST_CLONES
+void relight_pixels(const std::uint8_t *from, const std::int32_t *curves, const std::uint16_t *gains, std::uint8_t *to,
+                    std::int64_t pixels) {
+    for (std::int64_t at = 0; at < pixels * 3; at += 3) {
+        for (int channel = 0; channel < 3; ++channel) {
+            const std::int32_t product = curves[channel * 256 + from[at + channel]] * gains[at + channel];
+            to[at + channel] = static_cast<std::uint8_t>(std::clamp(((product + (1 << 15)) >> 16) - 8, 0, 255));
+        }
+    }
+}
+
+Bytes relight(const Bytes &image, const Integers32 &curves, const Words &gains) {
+    Bytes lit({image.shape(0), image.shape(1), pybind11::ssize_t(3)});
+    const std::uint8_t *from = image.data();
+    const std::int32_t *curve = curves.data();
+    const std::uint16_t *gain = gains.data();
+    std::uint8_t *to = lit.mutable_data();
+    const std::int64_t pixels = image.shape(0) * image.shape(1);
+    pybind11::gil_scoped_release released;
+    relight_pixels(from, curve, gain, to, pixels);
+    return lit;
+}
+
+Integers64 measure_regions(const Integers32 &labels, const Integers32 &boxes, const Bytes &channels, int margin) {
+    const int height = static_cast<int>(labels.shape(0)), width = static_cast<int>(labels.shape(1));
+    const int count = static_cast<int>(channels.shape(2)), fields = 2 * count + 1;
+    const pybind11::ssize_t regions = boxes.shape(0);
+    Integers64 sums({regions, pybind11::ssize_t(2), pybind11::ssize_t(fields)});
+    const std::int32_t *label = labels.data(), *box = boxes.data();
+    const std::uint8_t *values = channels.data();
+    std::int64_t *to = sums.mutable_data();
+    pybind11::gil_scoped_release released;
+    std::fill(to, to + regions * 2 * fields, 0);
+    for (pybind11::ssize_t region = 0; region < regions; ++region, box += 4, to += 2 * fields) {
+        const int left = std::max(box[0] - margin, 0), right = std::min(box[0] + box[2] + margin, width);
+        const int top = std::max(box[1] - margin, 0), bottom = std::min(box[1] + box[3] + margin, height);
+        for (int y = top; y < bottom; ++y) {
+            for (int x = left; x < right; ++x) {
+                const std::int64_t at = static_cast<std::int64_t>(y) * width + x;
+                const std::int32_t here = label[at];
+                if (here != 0 && here != region + 1) continue;
+                std::int64_t *row = here == 0 ? to + fields : to;
+                const std::uint8_t *value = values + at * count;
+                ++row[0];
+                for (int channel = 0; channel < count; ++channel) {
+                    row[1 + channel] += value[channel];
+                    row[1 + count + channel] += static_cast<std::int32_t>(value[channel]) * value[channel];
+                }
+            }
+        }
+    }
+    return sums;
+}
+
+struct Sums {
+    std::int64_t n = 0, q = 0, qq = 0, t = 0, tt = 0, qt = 0, apart = 0;
+};
+
+// How alike two windows are, from their sums: -1 to 1, and 0 where one of them is flat.
+double correlation(const Sums &s) {
+    const std::int64_t spread_q = s.n * s.qq - s.q * s.q, spread_t = s.n * s.tt - s.t * s.t;
+    if (spread_q <= 0 || spread_t <= 0) return 0.0;
+    return static_cast<double>(s.n * s.qt - s.q * s.t) /
+           (std::sqrt(static_cast<double>(spread_q)) * std::sqrt(static_cast<double>(spread_t)));
+}
+
+// `query` points at the window's first value, `reference` at the one it is laid over; rows and columns in steps.
+ROBUST_CLONES
+void sum_window(const std::uint8_t *query, std::int64_t query_row, const std::uint8_t *reference,
+                std::int64_t reference_row, int wide, int high, int step, Sums *total) {
+    for (int y = 0; y < high; y += step) {
+        const std::uint8_t *a = query + y * query_row, *b = reference + y * reference_row;
+        std::int32_t n = 0, q = 0, qq = 0, t = 0, tt = 0, qt = 0, apart = 0;
+        if (step == 1) {
+            for (int x = 0; x < wide; ++x) {
+                const std::int32_t u = a[x], v = b[x];
+                q += u, t += v, qq += u * u, tt += v * v, qt += u * v, apart += std::abs(u - v);
+            }
+            n = wide;
+        } else {
+            for (int x = 0; x < wide; x += step) {
+                const std::int32_t u = a[x], v = b[x];
+                ++n, q += u, t += v, qq += u * u, tt += v * v, qt += u * v, apart += std::abs(u - v);
+            }
+        }
+        total->n += n, total->q += q, total->qq += qq, total->t += t, total->tt += tt, total->qt += qt;
+        total->apart += apart;
+    }
+}
+
+Doubles match_regions(const Bytes &query, const Bytes &reference, const Integers32 &boxes, int reach) {
+    const std::int64_t width = query.shape(1), padded = reference.shape(1);
+    const pybind11::ssize_t regions = boxes.shape(0);
+    Doubles found({regions, pybind11::ssize_t(6)});
+    const std::int32_t *box = boxes.data();
+    double *to = found.mutable_data();
+    const std::uint8_t *q0 = query.data(), *t0 = reference.data();
+    pybind11::gil_scoped_release released;
+    for (pybind11::ssize_t region = 0; region < regions; ++region, box += 4, to += 6) {
+        const int step = std::max(1, std::max(box[2], box[3]) / 32);
+        double best = -2.0, least = 256.0;
+        for (int dy = -reach; dy <= reach; ++dy) {
+            for (int dx = -reach; dx <= reach; ++dx) {
+                Sums sums;
+                sum_window(q0 + box[1] * width + box[0], width,
+                           t0 + (box[1] + reach + dy) * padded + box[0] + reach + dx, padded, box[2], box[3], step,
+                           &sums);
+                const double alike = correlation(sums);
+                const double apart = static_cast<double>(sums.apart) / static_cast<double>(sums.n);
+                if (dx == 0 && dy == 0) to[0] = alike, to[4] = apart;
+                if (alike > best) best = alike, to[2] = dx, to[3] = dy;
+                least = std::min(least, apart);
+            }
+        }
+        to[1] = best, to[5] = least;
+    }
+    return found;
+}
+
+}  // namespace
+
+void bind_robust(pybind11::module_ &module) {
+    using pybind11::arg;
+    module.def("relight", &relight, arg("image").noconvert(), arg("curves").noconvert(), arg("gains").noconvert());
+    module.def("measure_regions", &measure_regions, arg("labels").noconvert(), arg("boxes").noconvert(),
+               arg("channels").noconvert(), arg("margin"));
+    module.def("match_regions", &match_regions, arg("query").noconvert(), arg("reference").noconvert(),
+               arg("boxes").noconvert(), arg("reach"));
+}
 
 }  // namespace sorvolo

@@ -1,0 +1,113 @@
+"""Train the check of regions: python benchmarks/train_blob_check.py [--data ../shared/data] [--count 120]
+
+Answers are exact: the suites of change_suites.py over the caliterra flight's photos (CC0) and procedural grounds, with
+random numbers that no score uses. Boosted oblivious trees, written to src/sorvolo/change/blob_check.json.
+"""
+
+import argparse
+import json
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from change_suites import SUITES, Ground, grounds, pairs
+from sorvolo.change.blobs import FEATURES, RegionSettings
+from sorvolo.change.robust import RobustSettings, examine
+from sorvolo.simulation.ground import GroundKind
+
+TARGET = Path(__file__).parents[1] / "src" / "sorvolo" / "change" / "blob_check.json"
+SPLIT, SEED = "train", 9000
+TREES, DEPTH, RATE, BINS = 200, 4, 0.1, 48
+
+
+def main() -> None:
+    """Collect regions with their answers, train, write the numbers."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path(__file__).parents[2] / "shared" / "data")
+    parser.add_argument("--count", type=int, default=120, help="pairs of each suite")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--output", type=Path, default=TARGET)
+    options = parser.parse_args()
+    places = [each for each in grounds(options.data, "dev") if each.source == "caliterra"]
+    is_real = bool(places)
+    places += [Ground("procedural", f"{kind.value} {500 + n}") for kind in GroundKind for n in range(3)]
+    names = [name for name in SUITES if is_real or name != "real"]
+    tasks = [(name, SEED + part, 20, places) for name in names for part in range(-(-options.count // 20))]
+    with ProcessPoolExecutor(options.jobs) as pool:
+        collected = list(pool.map(collect, *zip(*tasks)))
+    rows = np.concatenate([rows for rows, _ in collected])
+    answers = np.concatenate([answers for _, answers in collected])
+    trees = train(rows, answers)
+    print(f"{len(rows)} regions, {int(answers.sum())} of them changes, from {len(tasks) * 20} pairs")
+    trees["trained"] = {
+        "regions": len(rows), "changes": int(answers.sum()), "pairs": len(tasks) * 20, "seed": SEED,
+        "sources": sorted({each.source for each in places}), "command": f"train_blob_check.py --count {options.count}",
+    }
+    options.output.write_text(json.dumps(trees) + "\n")
+
+
+def collect(suite: str, seed: int, count: int, places: list[Ground]) -> tuple[np.ndarray, np.ndarray]:
+    """Features (N, F) and answers (N,) of the regions found in a suite's pairs."""
+    cv2.setNumThreads(1)
+    rows, answers = [], []
+    settings = RobustSettings(regions=RegionSettings())
+    for pair in pairs(suite, seed, count, places, SPLIT):
+        regions, *_ = examine(pair.reference, pair.query, pair.valid, settings)
+        size = regions.labels.shape[::-1]
+        total = np.bincount(regions.labels.ravel(), minlength=len(regions.boxes) + 1)[1:]
+        shares = []
+        for mask in (pair.truth, pair.ignored):
+            cover = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+            shares.append(np.bincount(regions.labels.ravel(), cover.ravel(), minlength=len(total) + 1)[1:] / total)
+        changed, ignored = shares
+        clear = (changed > 0.3) | ((changed < 0.05) & (ignored < 0.2))
+        rows.append(regions.features[clear])
+        answers.append(changed[clear] > 0.3)
+    return np.concatenate(rows), np.concatenate(answers)
+
+
+def train(rows: np.ndarray, answers: np.ndarray) -> dict[str, object]:
+    """Boosted oblivious trees: each level of a tree asks one question of all; logistic loss."""
+    rng = np.random.default_rng(5)
+    cuts = [np.unique(np.quantile(column, np.linspace(0, 1, BINS + 1)[1:-1])) for column in rows.T]
+    binned = np.column_stack([np.searchsorted(cut, column, "left") for cut, column in zip(cuts, rows.T)])
+    count, width = binned.shape
+    weights = np.where(answers, 0.5 / max(answers.mean(), 1e-9), 0.5 / max(1 - answers.mean(), 1e-9)) ** 0.5
+    prior = float(np.log((weights @ answers) / (weights @ ~answers)))
+    margin = np.full(count, prior)
+    features, thresholds, leaves = [], [], []
+    for _ in range(TREES):
+        chance = 1 / (1 + np.exp(-margin))
+        sample = rng.uniform(size=count) < 0.7
+        slope, bend = (answers - chance) * weights * sample, chance * (1 - chance) * weights * sample
+        asked = np.sort(rng.choice(width, size=max(1, int(width * 0.6)), replace=False))
+        leaf = np.zeros(count, np.int64)
+        tree_features, tree_thresholds = [], []
+        for level in range(DEPTH):
+            best = (-np.inf, 0, 0)
+            for one in asked:
+                shape = (2**level, BINS)
+                at = leaf * BINS + binned[:, one]
+                left_slope = np.bincount(at, slope, minlength=shape[0] * BINS).reshape(shape).cumsum(axis=1)
+                left_bend = np.bincount(at, bend, minlength=shape[0] * BINS).reshape(shape).cumsum(axis=1)
+                gain = left_slope**2 / (left_bend + 4)
+                gain += (left_slope[:, -1:] - left_slope) ** 2 / (left_bend[:, -1:] - left_bend + 4)
+                total = gain.sum(axis=0)[: len(cuts[one])]
+                if len(total) and total.max() > best[0]:
+                    best = (float(total.max()), int(one), int(total.argmax()))
+            _, one, cut = best
+            tree_features.append(one)
+            tree_thresholds.append(float(np.float32(cuts[one][cut])))
+            leaf = 2 * leaf + (rows[:, one] > np.float32(cuts[one][cut]))
+        values = RATE * np.bincount(leaf, slope, minlength=2**DEPTH) / (np.bincount(leaf, bend, minlength=2**DEPTH) + 4)
+        margin += values[leaf]
+        features.append(tree_features)
+        thresholds.append([float(f"{value:.6g}") for value in tree_thresholds])
+        leaves.append([round(float(value), 4) for value in values])
+    return {"names": list(FEATURES), "prior": prior, "features": features, "thresholds": thresholds, "leaves": leaves}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,171 @@
+"""Where two pictures in the same light differ: regions, and what is measured of each to tell changes from the rest."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.geometry.arrays import Anything, Floats, Mask
+from sorvolo.kernels import match_regions, measure_regions
+
+RING_PX = 4
+SPECK_PX = 9
+MOST_SPECK = 48.0
+MATCH_MARGIN_PX = 3
+MATCH_REACH_PX = 6
+MOST_REGIONS = 64
+
+FEATURES = (
+    "log area", "log length", "aspect", "fill", "difference", "difference spread", "chroma share", "sharpness",
+    "difference over activity", "difference over noise", "ratio", "ratio step", "ratio spread", "ratio spread outside",
+    "edges after", "edges before", "edges outside", "edge contrast", "detail difference", "detail outside",
+    "alike in place", "alike best", "alike gain", "match length", "match rest", "match gain", "level", "activity",
+    "came", "noise", "rest", "unevenness", "regions",
+)
+
+_LOG = np.clip(np.rint(np.log2((np.arange(256) + 8) / 8) * 50), 0, 255).astype(np.uint8)
+Image = Anything
+"""uint8, (h, w) or (h, w, 3)."""
+
+
+@dataclass(frozen=True)
+class RegionSettings:
+    """What is looked at as a possible change. Lengths in px of the (half size) pictures."""
+
+    reach_px: int = 2  # a value counts as known where it occurs this near in the other picture
+    chroma_weight: int = 2
+    least_difference: float = 9.0  # grey levels, weak threshold where nothing disturbs
+    noise_factor: float = 0.8  # of the frame's own 95 % quantile of differences
+    activity_factor: float = 1.4  # of the mean difference around
+    strong_factor: float = 1.5  # strong over weak threshold
+    core: float = 0.45  # a region keeps what exceeds this part of its own height
+    least_area_px: int = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """Regions 1 .. N of `labels` (h, w) int32: `boxes` (N, 4) int32 x, y, w, h and `features` (N, len(FEATURES)).
+
+    `weak` (h, w) uint8 is 255 wherever the pictures differ at all, `noise` the 95 % quantile of small differences.
+    """
+
+    labels: NDArray[np.int32]
+    boxes: NDArray[np.int32]
+    features: Floats
+    weak: Image
+    noise: float
+
+
+def find_regions(
+    reference: Image, query: Image, known: Mask | None, settings: RegionSettings, rest_px: float, unevenness: float
+) -> Regions:
+    """Regions that differ between two pictures (h, w, 3) uint8 BGR in the same light; none where not `known`."""
+    before = cv2.cvtColor(cv2.blur(reference, (3, 3)), cv2.COLOR_BGR2YCrCb)
+    after = cv2.cvtColor(cv2.blur(query, (3, 3)), cv2.COLOR_BGR2YCrCb)
+    came, came_chroma = _outside(after, before, settings)
+    went, went_chroma = _outside(before, after, settings)
+    difference, chroma = cv2.max(came, went), cv2.max(came_chroma, went_chroma)
+    if known is not None:
+        difference[~known] = 0
+    # a large thing's inside is no clutter: only what is small among the differences raises the thresholds around it
+    window = np.ones((SPECK_PX, SPECK_PX), np.uint8)
+    specks = cv2.subtract(difference, cv2.morphologyEx(difference, cv2.MORPH_OPEN, window))
+    noise = float(np.quantile(specks[::4, ::4], 0.95))
+    smooth = cv2.blur(difference, (3, 3))
+    activity = cv2.blur(cv2.threshold(specks, MOST_SPECK, MOST_SPECK, cv2.THRESH_TRUNC)[1], (41, 41))
+    base = settings.least_difference + settings.noise_factor * noise
+    threshold = cv2.addWeighted(activity, settings.activity_factor, activity, 0.0, base)
+    weak = np.asarray(cv2.compare(smooth, threshold, cv2.CMP_GT), np.uint8)
+    labels, boxes = _label(smooth, weak, threshold, settings)
+    if len(boxes) == 0:
+        return Regions(labels, boxes, np.zeros((0, len(FEATURES))), weak, noise)
+    logs = [cv2.LUT(np.ascontiguousarray(each[..., 0]), _LOG) for each in (before, after)]
+    frame = np.array([noise, rest_px, unevenness, np.log1p(len(boxes))])
+    channels = [difference, chroma, activity, after[..., 0], came, went, *logs]
+    return Regions(labels, boxes, _measured(labels, boxes, channels, frame), weak, noise)
+
+
+def _outside(values: Image, others: Image, settings: RegionSettings) -> tuple[Image, Image]:
+    """How far each value lies outside the other picture's range of values around it: light with colour, and colour."""
+    window = np.ones((2 * settings.reach_px + 1,) * 2, np.uint8)
+    over, under = cv2.subtract(values, cv2.dilate(others, window)), cv2.subtract(cv2.erode(others, window), values)
+    luma, red, blue = cv2.split(cv2.max(over, under))
+    chroma = cv2.add(red, blue)
+    return np.asarray(cv2.addWeighted(luma, 1.0, chroma, float(settings.chroma_weight), 0.0), np.uint8), chroma
+
+
+def _label(
+    smooth: Image, weak: Image, threshold: Image, settings: RegionSettings
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Connected parts over `weak` that are somewhere strong, each cut down to its core, largest differences first."""
+    count, labels, _, _ = cv2.connectedComponentsWithStats(weak, connectivity=8)
+    inside = np.flatnonzero(labels)
+    of, values = labels.ravel()[inside], smooth.ravel()[inside].astype(np.float64)
+    total = np.bincount(of, values, minlength=count)
+    height = np.bincount(of, values * values, minlength=count) / np.maximum(total, 1e-9)
+    strong = values > settings.strong_factor * threshold.ravel()[inside]
+    kept = (values > settings.core * height[of]) & (np.bincount(of[strong], minlength=count)[of] >= 2)
+    core = np.zeros(smooth.shape, np.uint8)
+    core.ravel()[inside[kept]] = 255
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(core, connectivity=8)
+    inside = np.flatnonzero(labels)
+    of = labels.ravel()[inside]
+    total = np.bincount(of, smooth.ravel()[inside], minlength=count)
+    total[stats[:, cv2.CC_STAT_AREA] < settings.least_area_px] = 0
+    order = np.argsort(-total[1:], kind="stable") + 1
+    order = order[total[order] > 0][:MOST_REGIONS]
+    renamed = np.zeros(count, np.int32)
+    renamed[order] = np.arange(1, len(order) + 1)
+    named = np.zeros(smooth.shape, np.int32)
+    named.ravel()[inside] = renamed[of]
+    return named, np.ascontiguousarray(stats[order, :4], np.int32)
+
+
+def _measured(
+    labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: list[Image], frame: NDArray[np.float64]
+) -> Floats:
+    difference, chroma, activity, level, came, went, log_before, log_after = channels
+    detail_before, detail_after = _details(log_before), _details(log_after)
+    window = np.ones((3, 3), np.uint8)
+    ratio = cv2.addWeighted(log_after, 0.5, log_before, -0.5, 128)
+    edges_after = cv2.morphologyEx(log_after, cv2.MORPH_GRADIENT, window)
+    edges_before = cv2.morphologyEx(log_before, cv2.MORPH_GRADIENT, window)
+    detail = cv2.absdiff(detail_after, detail_before)
+    stack: Anything = cv2.merge(
+        [difference, chroma, activity, level, ratio, edges_after, edges_before, detail, came, went]
+    )
+    sums = measure_regions(labels, boxes, stack, RING_PX).astype(np.float64)
+    count = np.maximum(sums[:, :, :1], 1)
+    means = sums[:, :, 1:11] / count
+    spreads = np.sqrt(np.maximum(sums[:, :, 11:] / count - means**2, 0))
+    within, around = means[:, 0], means[:, 1]
+    matched = match_regions(
+        detail_after, np.pad(detail_before, MATCH_REACH_PX, mode="symmetric"),
+        _grown(boxes, labels.shape), MATCH_REACH_PX,
+    )
+    area, long, short = sums[:, 0, 0], boxes[:, 2:].max(axis=1), boxes[:, 2:].min(axis=1)
+    difference_in, noise = within[:, 0], frame[0]
+    columns = [
+        np.log(area), np.log(long), short / long, area / (boxes[:, 2] * boxes[:, 3]),
+        difference_in, spreads[:, 0, 0], 2 * within[:, 1] / np.maximum(difference_in, 1),
+        around[:, 0] / np.maximum(difference_in, 1), difference_in / (within[:, 2] + 2), difference_in / (noise + 4),
+        within[:, 4] - 128, within[:, 4] - around[:, 4], spreads[:, 0, 4], spreads[:, 1, 4],
+        within[:, 5], within[:, 6], np.maximum(around[:, 5], around[:, 6]),
+        (within[:, 5] - within[:, 6]) / (within[:, 5] + within[:, 6] + 4), within[:, 7], around[:, 7],
+        matched[:, 0], matched[:, 1], matched[:, 1] - matched[:, 0], np.hypot(matched[:, 2], matched[:, 3]),
+        matched[:, 5], matched[:, 5] / np.maximum(matched[:, 4], 1), within[:, 3], within[:, 2],
+        (within[:, 8] - within[:, 9]) / np.maximum(difference_in, 1),
+    ]
+    return np.column_stack(columns + [np.full(len(boxes), value) for value in frame])
+
+
+def _details(logarithm: Image) -> Image:
+    return np.asarray(cv2.addWeighted(logarithm, 1, cv2.blur(logarithm, (11, 11)), -1, 128), np.uint8)
+
+
+def _grown(boxes: NDArray[np.int32], shape: tuple[int, ...]) -> NDArray[np.int32]:
+    """Boxes with a margin, inside the picture."""
+    low = np.maximum(boxes[:, :2] - MATCH_MARGIN_PX, 0)
+    high = np.minimum(boxes[:, :2] + boxes[:, 2:] + MATCH_MARGIN_PX, [shape[1], shape[0]])
+    return np.ascontiguousarray(np.hstack([low, high - low]), np.int32)

@@ -1,0 +1,132 @@
+"""One picture in the light of another: a power law per channel for the camera, a smooth gain for clouds' shadows."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.geometry.arrays import Anything, Floats, Mask
+from sorvolo.kernels import relight
+
+Bgr = NDArray[np.uint8]
+"""(height, width, 3) uint8, blue green red."""
+
+BLACK_LEVEL = 8.0  # added before logarithms: below it a camera shows noise, not light
+CELL_PX = 8
+MEDIAN_CELLS = 5  # what is smaller than half of it cannot change the local gain
+LEAST_ALIKE, MOST_ALIKE = 0.2, 0.5  # correlation of details: the ground is another one, and surely the same
+FLAT = 6.0  # what noise leaves of the variance of details, in squared steps of the logarithm
+REACHES_CELLS = ((3, 1.0), (7, 0.1), (17, 0.01), (49, 1e-3))  # how far a cell's gain tells about its neighbours'
+STEPS_PER_OCTAVE = 48.0
+GAIN_ONE = 4096
+CURVE_ONE = 16
+
+_LOG = (np.log2(np.arange(256) + BLACK_LEVEL) * 48).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """What turns the reference's light into the query's: query + 8 = 2**offset * (reference + 8)**exponent * gain.
+
+    `exponents` and `offsets` (3,) are per channel, blue green red; `gains` (h, w, 3) float32 are factors on a coarse
+    grid over the picture; `unevenness` is their spread in octaves, what clouds do.
+    """
+
+    exponents: Floats
+    offsets: Floats
+    gains: NDArray[np.float32]
+    unevenness: float
+
+    @property
+    def brightness(self) -> Floats:
+        """(3,) by which factor a middle grey of the reference is brighter in the query."""
+        middle = np.log2(100.0 + BLACK_LEVEL)
+        return np.asarray(2.0 ** (self.offsets + (self.exponents - 1.0) * middle))
+
+
+def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
+    """The light of `query` seen against `reference`, aligned to a few pixels; where not `known` it is the middle one.
+
+    The exponents come from what both pictures show at middle scales, where neither clouds nor pixels' noise matter;
+    fits are robust against things that changed.
+    """
+    height, width = reference.shape[:2]
+    size = max(4, width // CELL_PX), max(4, height // CELL_PX)
+    before, after = _logarithm(_smaller(reference, size)), _logarithm(_smaller(query, size))
+    sure = np.ones(size[::-1], bool) if known is None else _smaller(known.astype(np.uint8) * 255, size) > 250
+    if sure.sum() < 16:
+        return Light(np.ones(3), np.zeros(3), np.ones((*size[::-1], 3), np.float32), 0.0)
+    window = (9, 9)
+    detail_before = (before - cv2.blur(before, window))[sure]
+    detail_after = (after - cv2.blur(after, window))[sure]
+    exponents = np.array([_exponent(detail_before[:, channel], detail_after[:, channel]) for channel in range(3)])
+    offset = after - exponents.astype(np.float32) * before
+    offsets = np.median(offset[sure], axis=0)
+    local = np.clip(np.rint((offset - offsets.astype(np.float32)) * STEPS_PER_OCTAVE + 128), 0, 255).astype(np.uint8)
+    same = np.where(sure, _sameness(reference, query, size), np.float32(0))
+    octaves = _spread(cv2.medianBlur(local, MEDIAN_CELLS).astype(np.float32) - 128, same) / STEPS_PER_OCTAVE
+    unevenness = float(octaves[sure].mean(axis=1).std())
+    return Light(exponents, offsets, np.exp2(octaves).astype(np.float32), unevenness)
+
+
+def relit(image: Bgr, light: Light) -> Bgr:
+    """`image`, of the reference, in the query's light."""
+    levels = np.log2(np.arange(256) + BLACK_LEVEL)
+    curves = 2.0 ** (light.exponents[:, None] * levels + light.offsets[:, None])
+    table = np.clip(np.rint(curves * CURVE_ONE), 0, 16383).astype(np.int32)
+    coarse = np.clip(np.rint(light.gains * GAIN_ONE), 0, 65535).astype(np.uint16)
+    gains = cv2.resize(coarse, image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    return relight(image, table, np.asarray(gains, np.uint16))
+
+
+def _sameness(reference: Bgr, query: Bgr, size: tuple[int, int]) -> NDArray[np.float32]:
+    """How sure each cell shows the same ground, 0 to 1: its finest structure is there in both, whatever the light.
+
+    Things put on the ground, however large, hide its structure: their cells say nothing about the light.
+    """
+    fine = 4 * size[0], 4 * size[1]
+    before, after = (_details(cv2.cvtColor(_smaller(each, fine), cv2.COLOR_BGR2GRAY)) for each in (reference, query))
+    sums = [
+        cv2.blur(cv2.resize(product, size, interpolation=cv2.INTER_AREA), (3, 3))
+        for product in (before * after, before * before, after * after)
+    ]
+    alike = sums[0] / np.sqrt((sums[1] + FLAT) * (sums[2] + FLAT))
+    return np.asarray(np.clip((alike - LEAST_ALIKE) / (MOST_ALIKE - LEAST_ALIKE), 0, 1), np.float32)
+
+
+def _details(gray: NDArray[Any]) -> NDArray[np.float32]:
+    logarithm = cv2.LUT(gray, _LOG)
+    return np.asarray(logarithm - cv2.blur(logarithm, (9, 9)), np.float32)
+
+
+def _spread(values: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Values (h, w, 3) smoothed with weights (h, w); where there are none, those of the nearest around."""
+    stack = np.dstack([values * weights[..., None], weights])
+    total = np.zeros_like(stack)
+    for reach, weight in REACHES_CELLS:
+        total += np.float32(weight) * cv2.blur(stack, (reach, reach))
+    return np.asarray(total[..., :3] / (total[..., 3:] + np.float32(1e-6)), np.float32)
+
+
+def _logarithm(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    return np.log2(image.astype(np.float32) + np.float32(BLACK_LEVEL))
+
+
+def _smaller(image: NDArray[Any], size: tuple[int, int]) -> NDArray[np.uint8]:
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _exponent(before: NDArray[np.float32], after: NDArray[np.float32]) -> float:
+    """The slope of `after` over `before` by re-weighted least squares, drawn to one where there is little to see."""
+    weights: Anything = np.ones_like(before)
+    prior = 2e-4 * before.size
+    slope = 1.0
+    for _ in range(5):
+        weighted = weights * before
+        slope = float((weighted @ after + prior) / (weighted @ before + prior))
+        rest = after - np.float32(slope) * before
+        scale = max(1.5 * float(np.median(np.abs(rest))), 0.01)
+        weights = 1 / (1 + (rest / np.float32(scale)) ** 2)
+    return float(np.clip(slope, 0.5, 2.0))

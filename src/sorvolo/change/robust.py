@@ -1,0 +1,151 @@
+"""The robust change method: two aligned pictures -> what changed, whatever the light, leaves and leaning trees do."""
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.change.blob_check import how_sure
+from sorvolo.change.blobs import FEATURES, Regions, RegionSettings, find_regions
+from sorvolo.change.radiometry import Light, fit_light, relit
+from sorvolo.change.settling import Settling, settle
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
+
+LEAST_SIDE_PX = 32
+RIM_PX = 4  # around the unknown, in half size pixels: resampling mixes the unknown into it
+
+
+@dataclass(frozen=True)
+class RobustSettings:
+    """How sure a change must be, and what is looked at; the rest each pair of pictures sets itself."""
+
+    least_score: float = 0.5
+    settles: bool = True  # take out the last pixels of misalignment
+    regions: RegionSettings = field(default_factory=RegionSettings)
+
+
+@dataclass(frozen=True, eq=False)
+class RobustResult:
+    """What changed: `mask` (h, w) uint8 0 or 255, `boxes` (N, 4) x, y, width, height and `scores` (N,) from 0 to 1.
+
+    `light`, `settling` and `noise` tell what the pair set itself: the light, the misalignment, and the 95 % quantile
+    of differences where nothing changed; lengths of `settling` are in half size pixels. `known` is the share compared.
+    """
+
+    mask: ImageGray
+    boxes: Boxes
+    scores: Floats
+    light: Light
+    settling: Settling
+    noise: float
+    known: float
+
+
+def compare_robust(
+    reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask | None = None,
+    settings: RobustSettings | None = None,
+) -> RobustResult:
+    """Compare two aligned BGR pictures (h, w, 3) uint8 of at least 32 px; up to about 5 px apart is fine.
+
+    Where `valid` (h, w) is False the answer is unknown: nothing is found there, nor in a thin rim around it. Raises
+    InputError where the pictures do not fit together.
+    """
+    _check(reference, query, valid)
+    settings = settings or RobustSettings()
+    regions, light, settling, known = examine(reference, query, valid, settings)
+    scores = how_sure(regions.features, FEATURES)
+    return _result(regions, scores, settings, light, settling, known, query.shape[1::-1])
+
+
+def examine(
+    reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask | None, settings: RobustSettings
+) -> tuple[Regions, Light, Settling, float]:
+    """The regions that differ at half size, before anything is said about them; and what the pair set itself."""
+    height, width = query.shape[:2]
+    half = width // 2, height // 2
+    before = np.asarray(cv2.resize(reference, half, interpolation=cv2.INTER_AREA), np.uint8)
+    after = np.asarray(cv2.resize(query, half, interpolation=cv2.INTER_AREA), np.uint8)
+    known = _half_known(valid, half)
+    if known is not None:
+        before[~known] = after[~known]
+    settling = Settling(np.eye(3), 0.0, 0.0)
+    if settings.settles:
+        grays = [np.asarray(cv2.cvtColor(each, cv2.COLOR_BGR2GRAY), np.uint8) for each in (before, after)]
+        settling = settle(grays[0], grays[1], known)
+    if settling.moved_px > 0:
+        how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        before = np.asarray(cv2.warpPerspective(
+            before, settling.reference_from_query, half, flags=how, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+    light = fit_light(before, after, known)
+    rim = None if known is None else _without_rim(known)
+    regions = find_regions(relit(before, light), after, rim, settings.regions, settling.rest_px, light.unevenness)
+    return regions, light, settling, 1.0 if rim is None else float(rim.mean())
+
+
+def _check(reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask | None) -> None:
+    for name, image in (("reference", reference), ("query", query)):
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+            raise InputError(f"{name}: found {image.dtype} of shape {image.shape}; give a BGR picture, (h, w, 3) uint8")
+    if reference.shape != query.shape:
+        raise InputError(f"the reference is {reference.shape}, the query {query.shape}; align them to the same pixels")
+    height, width = query.shape[:2]
+    if min(height, width) < LEAST_SIDE_PX:
+        raise InputError(f"the pictures are {width} x {height} px; at least {LEAST_SIDE_PX} px are needed each way")
+    if valid is not None and (valid.shape != query.shape[:2] or valid.dtype != np.bool_):
+        raise InputError(f"valid: found {valid.dtype} of shape {valid.shape}; give a bool mask of {query.shape[:2]}")
+
+
+def _half_known(valid: Mask | None, half: tuple[int, int]) -> Mask | None:
+    if valid is None or valid.all():
+        return None
+    return np.asarray(cv2.resize(valid.astype(np.uint8) * 255, half, interpolation=cv2.INTER_AREA) == 255)
+
+
+def _without_rim(known: Mask) -> Mask:
+    window = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
+    return np.asarray(cv2.erode(known.astype(np.uint8), window, borderValue=1) > 0)
+
+
+def _result(
+    regions: Regions, scores: Floats, settings: RobustSettings, light: Light, settling: Settling, known: float,
+    size: tuple[int, int],
+) -> RobustResult:
+    sure = scores >= settings.least_score
+    went = regions.features[:, FEATURES.index("came")] < 0
+    half = regions.labels.shape[::-1]
+    half_mask = np.concatenate([[False], sure])[regions.labels].astype(np.uint8) * 255
+    if sure.any():
+        half_mask = _filled(half_mask, regions)
+    boxes_px = regions.boxes.astype(np.float64)
+    if settling.moved_px > 0 and (sure & went).any():
+        # what disappeared is seen in the reference: it keeps the reference's pixels
+        gone = np.concatenate([[False], sure & went])[regions.labels].astype(np.uint8) * 255
+        back = cv2.warpPerspective(gone, settling.reference_from_query, half, flags=cv2.INTER_LINEAR)
+        half_mask = np.asarray(cv2.max(cv2.subtract(half_mask, gone), back), np.uint8)
+        middle = boxes_px[:, :2] + boxes_px[:, 2:] / 2
+        moved = np.column_stack([middle, np.ones(len(middle))]) @ settling.reference_from_query.T
+        boxes_px[went, :2] += (moved[:, :2] / moved[:, 2:] - middle)[went]
+    mask = np.zeros(size[::-1], np.uint8)
+    if sure.any():
+        larger = cv2.resize(half_mask, size, interpolation=cv2.INTER_LINEAR)
+        mask = np.asarray(cv2.threshold(larger, 127, 255, cv2.THRESH_BINARY)[1], np.uint8)
+    factor = np.array([size[0] / half[0], size[1] / half[1]])
+    corners = np.clip(np.rint(boxes_px[sure, :2] * factor), 0, np.array(size) - 1).astype(np.int64)
+    sides = np.rint(boxes_px[sure, 2:] * factor).astype(np.int64)
+    boxes = np.hstack([corners, np.minimum(sides, np.array(size) - corners)])
+    return RobustResult(mask, boxes, scores[sure], light, settling, regions.noise, known)
+
+
+def _filled(half_mask: ImageGray, regions: Regions) -> ImageGray:
+    """The accepted regions with what weakly differs around their cores, less a rim of blur, and without holes."""
+    window = np.ones((3, 3), np.uint8)
+    count, parts = cv2.connectedComponents(regions.weak, connectivity=8)
+    held = np.zeros(count, bool)
+    held[parts[half_mask > 0]] = True
+    held[0] = False
+    around = np.asarray(cv2.erode(held[parts].astype(np.uint8) * 255, window), np.uint8)
+    around[regions.labels > 0] = 0
+    whole = cv2.max(half_mask, around)
+    return np.asarray(cv2.morphologyEx(whole, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)), np.uint8)

@@ -1,0 +1,89 @@
+"""The last pixels of alignment: a homography close to identity from dense flow, and what no homography explains."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.geometry.arrays import Anything, Mask, Matrix3
+
+LARGEST_PX = 6.0  # at the pictures' corners, in their own pixels; what says more has lost its way
+SMALLEST_PX = 0.12  # a resampling costs more than this is worth
+GRID = (32, 20)
+
+_LOG = np.clip(np.rint(np.log2((np.arange(256) + 8) / 8) * 50), 0, 255).astype(np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class Settling:
+    """`reference_from_query` (3, 3) takes the query's pixels to the reference's; identity where nothing is gained.
+
+    `moved_px` is its largest displacement; `rest_px` the median length of the flow that is left, what parallax and
+    wind do, in the pixels of the pictures given.
+    """
+
+    reference_from_query: Matrix3
+    moved_px: float
+    rest_px: float
+
+
+def settle(reference: NDArray[np.uint8], query: NDArray[np.uint8], known: Mask | None = None) -> Settling:
+    """Settle two gray pictures (h, w) uint8 that are a few pixels apart, whatever their light."""
+    height, width = query.shape
+    small = max(16, width // 2), max(16, height // 2)
+    scale = np.array([width / small[0], height / small[1]])
+    details = [_details(cv2.resize(image, small, interpolation=cv2.INTER_AREA)) for image in (reference, query)]
+    if min(small) < 24:
+        return Settling(np.eye(3), 0.0, 0.0)
+    start: Any = None
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(details[1], details[0], start)
+    flow_px = cv2.resize(flow, GRID, interpolation=cv2.INTER_AREA).reshape(-1, 2) * scale
+    strength = np.abs(details[1].astype(np.float32) - 128)
+    texture = cv2.resize(strength, GRID, interpolation=cv2.INTER_AREA).ravel()
+    trust = np.clip(texture.astype(np.float64) / 8, 0.05, 1)
+    if known is not None:
+        trust *= cv2.resize(known.astype(np.float32), GRID, interpolation=cv2.INTER_AREA).ravel() > 0.99
+    if np.count_nonzero(trust) < 30:
+        return Settling(np.eye(3), 0.0, 0.0)
+    x, y = (each.ravel() for each in np.meshgrid(*[(np.arange(n) + 0.5) / n - 0.5 for n in GRID]))
+    matrix, rest_px = _near_homography(x, y, flow_px / (width, height), trust, (width, height))
+    corners = np.array([[0.0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]]) @ matrix.T
+    moved_px = float(np.abs(corners[:, :2] / corners[:, 2:] - [[0, 0], [width, 0], [0, height], [width, height]]).max())
+    if not SMALLEST_PX <= moved_px <= LARGEST_PX:
+        return Settling(np.eye(3), 0.0, rest_px)
+    return Settling(matrix, moved_px, rest_px)
+
+
+def _details(gray: Anything) -> NDArray[np.uint8]:
+    """What is finer than clouds, in logarithms: light falls out of it."""
+    logarithm = cv2.LUT(gray, _LOG)
+    return np.asarray(cv2.addWeighted(logarithm, 2, cv2.blur(logarithm, (15, 15)), -2, 128), np.uint8)
+
+
+def _near_homography(
+    x: NDArray[np.float64], y: NDArray[np.float64], moves: NDArray[np.float64], trust: NDArray[np.float64],
+    size_px: tuple[int, int],
+) -> tuple[Matrix3, float]:
+    """Homography in pixels, to first order, from displacements at x, y (all as parts of the size); median rest, px."""
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    rows_x = np.column_stack([one, x, y, zero, zero, zero, x * x, x * y])
+    rows_y = np.column_stack([zero, zero, zero, one, x, y, x * y, y * y])
+    weights = trust.copy()
+    solution = np.zeros(8)
+    rest_px = np.zeros(len(x))
+    for _ in range(5):
+        normal = (rows_x * weights[:, None]).T @ rows_x + (rows_y * weights[:, None]).T @ rows_y
+        right = (rows_x * weights[:, None]).T @ moves[:, 0] + (rows_y * weights[:, None]).T @ moves[:, 1]
+        solution = np.linalg.solve(normal + 1e-4 * weights.sum() * np.diag([0, 0.01, 0.01, 0, 0.01, 0.01, 1, 1]), right)
+        rest = moves - np.column_stack([rows_x @ solution, rows_y @ solution])
+        rest_px = np.hypot(rest[:, 0] * size_px[0], rest[:, 1] * size_px[1])
+        scale = max(1.5 * float(np.median(rest_px[trust > 0])), 0.05)
+        weights = trust / (1 + (rest_px / scale) ** 2)
+    a = solution
+    near = np.array([[1 + a[1], a[2], a[0]], [a[4], 1 + a[5], a[3]], [-a[6], -a[7], 1.0]])
+    parts_from_px = np.array([[1 / size_px[0], 0, 0.5 / size_px[0] - 0.5], [0, 1 / size_px[1], 0.5 / size_px[1] - 0.5],
+                              [0, 0, 1.0]])
+    matrix = np.linalg.inv(parts_from_px) @ near @ parts_from_px
+    return np.asarray(matrix / matrix[2, 2]), float(np.median(rest_px[trust > 0]))
