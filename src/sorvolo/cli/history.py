@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -50,7 +51,9 @@ def _show(entries: Sequence[HistoryEntry], console: Console) -> None:
     if not entries:
         console.print("no map yet")
         return
-    table = Table("version", "date (UTC)", "flight", "by", "tiles", "changed", "new MB", "changes", "reviewed")
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in ("no", "complete (UTC)", "flight", "by", "new tiles", "MB", "changes", "reviewed"):
+        table.add_column(name, no_wrap=name not in ("flight", "changes", "reviewed"), overflow="fold")
     for each in entries:
         removed = f" (-{each.tiles_removed})" if each.tiles_removed else ""
         changes = ", ".join(f"{count} {kind}" for kind, count in each.changes.items())
@@ -59,8 +62,8 @@ def _show(entries: Sequence[HistoryEntry], console: Console) -> None:
         )
         again = " (again since)" if each.is_replaced else ""
         table.add_row(
-            str(each.version), each.date_utc[:19].replace("T", " "), escape(each.flight) + again, each.kind,
-            str(each.tiles), f"{each.tiles_changed}{removed}", f"{each.bytes_changed / 1e6:.1f}",
+            str(each.version), each.date_utc[:16].replace("T", " "), escape(each.flight) + again, each.kind,
+            f"{each.tiles_changed} of {each.tiles}{removed}", f"{each.bytes_changed / 1e6:.1f}",
             changes or ("none" if each.kind == "compare" else ""), reviewed,
         )
     console.print(table)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -59,17 +60,17 @@ def _show(changes: Sequence[StoredChange], console: Console) -> None:
     if not changes:
         console.print("no changes were found, or no flight was compared yet")
         return
-    table = Table("id", "flight", "kind", "score", "size m", "views", "first seen UTC", "east m", "north m", "verdict")
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in ("id", "kind", "score", "size m", "views", "first seen (UTC)", "verdict"):
+        table.add_column(name, no_wrap=name != "verdict", overflow="fold")
     for each in changes:
-        east_m, north_m = each.centre_m
         verdict = ""
         if each.verdict is not None:
             colour = _COLOURS[each.verdict]
             verdict = f"[{colour}]{each.verdict.value}[/{colour}]" + (f": {escape(each.note)}" if each.note else "")
         table.add_row(
-            escape(each.id), escape(each.flight_id), each.kind.value, f"{each.score:.2f}", f"{each.length_m:.2f}",
-            str(each.views), utc_text(each.first_seen_ns)[:19].replace("T", " "), f"{east_m:.1f}", f"{north_m:.1f}",
-            verdict,
+            escape(each.id), each.kind.value, f"{each.score:.2f}", f"{each.length_m:.2f}", str(each.views),
+            utc_text(each.first_seen_ns)[:16].replace("T", " "), verdict,
         )
     console.print(table)
 
