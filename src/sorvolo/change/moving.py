@@ -23,6 +23,7 @@ _UNLIKELY_PARALLAX = 0.5  # no thing that came is a third as high as the camera 
 _POINTS = 12  # of a track, that its velocity is fitted to
 _MOST_BOXES = 64
 _RIM_PX = 2
+_RIGID_POINTS, _RIGID_LENGTHS, _RIGID_LENGTH_M = 5, 2.0, 2.5
 _LOST_FOR_S = 10.0  # a thing that moves steadily is known again after so long
 
 
@@ -30,10 +31,12 @@ _LOST_FOR_S = 10.0  # a thing that moves steadily is known again after so long
 class MovingSettings:
     """When something counts as moving."""
 
-    least_views: int = 3
+    least_views: int = 4
     least_move_m: float = 1.0  # beyond what alignment and a swaying crown do
     least_lengths: float = 1.2  # of its own: then its places do not overlap, and nothing that grew explains it
-    most_speed_m_s: float = 15.0
+    least_length_m: float = 0.3  # a person from above; smaller specks jump about
+    most_speed_m_s: float = 3.0  # of something small ...
+    most_lengths_s: float = 4.0  # ... and lengths a second more: a car of 4 m may go 19 m/s
     most_step_m: float = 6.0  # between two views: further away anything could be it
     forget_s: float = 2.5  # a track without a blob for so long has ended
 
@@ -42,6 +45,10 @@ class MovingSettings:
             raise SettingsError(f"moving needs at least 3 views to see a steady velocity, got {self.least_views}")
         if min(self.least_move_m, self.least_lengths, self.most_speed_m_s, self.most_step_m, self.forget_s) <= 0:
             raise SettingsError("moving: distances, speeds and times must be above 0")
+
+    def fastest_m_s(self, length_m: float) -> float:
+        """The greatest speed that something of this length may have."""
+        return self.most_speed_m_s + self.most_lengths_s * length_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,10 +76,12 @@ class TrackPoint:
 class Motion:
     """How a track moves: `velocity_m_s` (2,) as fitted, `own_m_s` (2,) what no parallax explains.
 
-    `path_m` is how far its own motion took it, `error_m` the rms distance of its points from steady motion.
+    `camera_m_s` (2,) is the camera's velocity meanwhile. `path_m` is how far the thing's own motion took it, `error_m`
+    the rms distance of its points from steady motion.
     """
 
     velocity_m_s: Floats
+    camera_m_s: Floats
     own_m_s: Floats
     path_m: float
     error_m: float
@@ -96,6 +105,11 @@ class Track:
     def last(self) -> TrackPoint:
         """Where it was seen last."""
         return self.points[-1]
+
+    @property
+    def seconds(self) -> float:
+        """The time over which its last points are spread."""
+        return (self.points[-1].time_ns - self.points[0].time_ns) * 1e-9
 
     def with_point(self, point: TrackPoint) -> "Track":
         """The track, one view longer."""
@@ -135,8 +149,8 @@ def motion(points: Sequence[TrackPoint]) -> Motion:
     parallax = min(max(against / abs(camera) ** 2, 0.0), _MOST_PARALLAX) if abs(camera) > 1e-2 else 0.0
     own = velocity + parallax * camera
     return Motion(
-        np.array([velocity.real, velocity.imag]), np.array([own.real, own.imag]), abs(own) * times[-1],
-        (rest / count) ** 0.5,
+        np.array([velocity.real, velocity.imag]), np.array([camera.real, camera.imag]),
+        np.array([own.real, own.imag]), abs(own) * times[-1], (rest / count) ** 0.5,
     )
 
 
@@ -181,19 +195,27 @@ class BlobTracker:
                 tracks.append(Track(point, (point,), 1, blob.score, np.zeros(2)))
                 may_move[blob.box] = True  # nobody knows yet
         whole = {blob.box for blob in blobs}
-        _follow_over_rim(view, [each for each in tracks if each.mover], whole, is_moving, may_move)
+        unsteady = [
+            each for each in tracks
+            if each.mover or (each.count > 2 and _may_move(each, motion(each.points[-5:])))
+        ]
+        _follow_over_rim(view, unsteady, whole, is_moving, may_move)
         self._tracks = tracks
         return Followed(is_moving, may_move, tuple(movers))
 
     def _moves(self, track: Track, move: Motion, view: ComparedView) -> bool:
         settings = self._settings
-        lengths = [each.blob.length_m for each in track.points]
-        needed_m = max(settings.least_move_m, settings.least_lengths * float(np.median(lengths)))
+        length_m = float(np.median([each.blob.length_m for each in track.points]))
+        needed_m = max(settings.least_move_m, settings.least_lengths * length_m)
+        speed_m_s = float(np.hypot(*move.velocity_m_s))
+        is_own = move.path_m > needed_m and float(np.hypot(*move.own_m_s)) > 0.35 * speed_m_s
         return (
             track.count >= settings.least_views
-            and move.path_m > needed_m
-            and np.hypot(*move.own_m_s) > 0.35 * np.hypot(*move.velocity_m_s)
-            and move.error_m < 0.1 + 0.08 * move.path_m
+            and settings.least_length_m <= length_m
+            and speed_m_s <= settings.fastest_m_s(length_m)
+            and (is_own or _is_rigid(track, length_m))
+            and float(np.hypot(*(move.velocity_m_s - move.camera_m_s))) > 0.3 * float(np.hypot(*move.camera_m_s))
+            and move.error_m < 0.05 + 0.05 * speed_m_s * track.seconds
             and not _is_still_there(track.points[0], view)
         )
 
@@ -211,6 +233,23 @@ class BlobTracker:
         return self._movers
 
 
+def _is_rigid(track: Track, length_m: float) -> bool:
+    """Whether a blob went far without changing its size, so that no parallax explains it after all.
+
+    What leans over the ground stands on it: its ghost grows and shrinks with the camera's way, down to nothing.
+    """
+    if len(track.points) < _RIGID_POINTS or length_m > _RIGID_LENGTH_M:
+        return False
+    way_m = float(np.hypot(*(track.last.blob.place_m - track.points[0].blob.place_m)))
+    areas = [each.blob.area_m2 for each in track.points]
+    lengths = [each.blob.length_m for each in track.points]
+    return (
+        way_m > max(1.0, _RIGID_LENGTHS * length_m)
+        and max(areas) < 1.7 * min(areas)
+        and max(lengths) < 1.35 * min(lengths)
+    )
+
+
 def _may_move(track: Track, move: Motion) -> bool:
     if track.count < 3:
         return True
@@ -224,15 +263,15 @@ def _may_move(track: Track, move: Motion) -> bool:
 
 
 def _follow_over_rim(
-    view: ComparedView, movers: Sequence[Track], whole: set[int], is_moving: NDArray[np.bool_],
+    view: ComparedView, tracks: Sequence[Track], whole: set[int], is_moving: NDArray[np.bool_],
     may_move: NDArray[np.bool_],
 ) -> None:
-    """Mark the boxes that are cut by the view's rim, thus no blobs, and lie where a moving thing must be by now."""
-    if not movers:
+    """Mark the boxes that are cut by the view's rim, thus no blobs, and lie where an unsteady thing must be by now."""
+    if not tracks:
         return
     m_per_px = scale_m_per_px(view)
     image_from_site = np.linalg.inv(view.site_from_image)
-    for track in movers:
+    for track in tracks:
         ahead_s = (view.time_ns - track.last.time_ns) * 1e-9
         expected_m = track.last.blob.place_m + ahead_s * track.velocity_m_s
         pixel = apply_homography(image_from_site, expected_m[None])[0]
@@ -240,7 +279,8 @@ def _follow_over_rim(
         for index, (x, y, w, h) in enumerate(view.boxes):
             nearest = np.clip(pixel, [x, y], [x + w, y + h])
             if index not in whole and float(np.hypot(*(pixel - nearest))) < reach_px:
-                is_moving[index] = may_move[index] = True
+                may_move[index] = True
+                is_moving[index] |= bool(track.mover)
 
 
 def _is_still_there(first: TrackPoint, view: ComparedView) -> bool:
@@ -271,13 +311,14 @@ def _pairs(
         ahead_s = (now_ns - track.last.time_ns) * 1e-9
         velocity = track.velocity_m_s
         if len(track.points) == 1:
-            gate_m = 0.3 + min(settings.most_speed_m_s * ahead_s, settings.most_step_m)
+            fastest_m_s = settings.fastest_m_s(track.last.blob.length_m)
+            gate_m = 0.3 + min(fastest_m_s * ahead_s, settings.most_step_m)
         else:
             gate_m = 0.4 + 0.35 * float(np.hypot(*velocity)) * ahead_s
         distance = np.hypot(*(places - track.last.blob.place_m - velocity * ahead_s).T)
         growth = np.abs(np.log((areas + 0.02) / (track.last.blob.area_m2 + 0.02)))
         tint = np.abs(colours - track.last.blob.colour).max(axis=1)
-        fits = (distance < gate_m) & (growth < np.log(3)) & (tint < 80)
+        fits = (distance < gate_m) & (growth < np.log(2.5)) & (tint < 45)
         costs[row] = np.where(fits, distance + 0.3 * growth + tint / 100, np.inf)
     found = []
     for flat in np.argsort(costs, axis=None, kind="stable"):
