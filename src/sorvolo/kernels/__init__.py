@@ -7,7 +7,10 @@ computes. Both give the same numbers. Where nothing was compiled the slow ones a
 import warnings
 from types import ModuleType
 
-from sorvolo.kernels import reference
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.kernels import reference, reference_robust
 
 _native: ModuleType | None
 try:
@@ -23,3 +26,136 @@ except ImportError:
 
 COMPILED = _native is not None
 """Whether the compiled kernels are in use."""
+
+LARGEST_WINDOW_PX = 127
+"""The longest side of a window that the kernels take."""
+
+_thesis = reference if _native is None else _native
+
+Bytes = NDArray[np.uint8]
+
+
+def equalising_tables(image: Bytes, known: Bytes | None = None, threads: int = 1) -> Bytes:
+    """The tables (3, 256) that equalise an image's channels, (h, w, 3): see reference."""
+    _check_image(image)
+    if known is not None and known.shape != image.shape[:2]:
+        raise ValueError(f"equalising_tables: known {known.shape} does not fit the image {image.shape}")
+    tables: Bytes = _thesis.equalising_tables(_bytes(image), None if known is None else _bytes(known), threads)
+    return tables
+
+
+def averaged(image: Bytes, tables: Bytes, width: int, height: int, threads: int = 1) -> tuple[Bytes, Bytes]:
+    """An equalised image's window means as planes (3, h, w), and their gray (h, w): see reference."""
+    _check_image(image)
+    _check_tables(tables)
+    _check_window(width, height)
+    result: tuple[Bytes, Bytes] = _thesis.averaged(_bytes(image), _bytes(tables), width, height, threads)
+    return result
+
+
+def texture_changes(
+    reference: Bytes, query: Bytes, asked: Bytes, width: int, height: int, most: int, threads: int = 1
+) -> Bytes:
+    """Which of the pixels `asked` (h, w) differ in their patterns, planes being (3, h, w): see reference."""
+    _check_window(width, height)
+    if not reference.shape == query.shape == (3, *asked.shape) or asked.ndim != 2:
+        raise ValueError(f"texture_changes: {reference.shape}, {query.shape} and asked {asked.shape} do not fit")
+    mask: Bytes = _thesis.texture_changes(
+        _bytes(reference), _bytes(query), _bytes(asked), width, height, most, threads
+    )
+    return mask
+
+
+def without_isolations(mask: Bytes, width: int, height: int, most_black: int, threads: int = 1) -> Bytes:
+    """A mask (h, w) black wherever the window around has more than `most_black` black, else white: see reference."""
+    _check_mask(mask)
+    _check_window(width, height)
+    kept: Bytes = _thesis.without_isolations(_bytes(mask), width, height, most_black, threads)
+    return kept
+
+
+def region_boxes(mask: Bytes) -> NDArray[np.int64]:
+    """The boxes (N, 4) x, y, width, height of a mask's 8-connected regions: see reference."""
+    _check_mask(mask)
+    boxes: NDArray[np.int64] = _thesis.region_boxes(_bytes(mask))
+    return boxes
+
+
+def gray_histograms(image: Bytes, tables: Bytes, boxes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The gray histograms (N, 256) of boxes of an equalised image: see reference."""
+    _check_image(image)
+    _check_tables(tables)
+    boxes = np.ascontiguousarray(boxes, np.int64).reshape(-1, 4)
+    height, width = image.shape[:2]
+    if (boxes < 0).any() or (boxes[:, :2] + boxes[:, 2:] > [width, height]).any():
+        raise ValueError(f"gray_histograms: boxes outside of the {width} x {height} px image")
+    counts: NDArray[np.int64] = _thesis.gray_histograms(_bytes(image), _bytes(tables), boxes)
+    return counts
+
+
+_robust = reference_robust if _native is None else _native
+
+
+def relight(image: NDArray[np.uint8], curves: NDArray[np.int32], gains: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """A picture (h, w, 3) through curves (3, 256) and times gains (h, w, 3): see reference_robust."""
+    if image.shape != gains.shape or image.ndim != 3 or image.shape[2] != 3 or curves.shape != (3, 256):
+        raise ValueError(f"relight: image {image.shape}, gains {gains.shape}, curves {curves.shape} do not fit")
+    lit: NDArray[np.uint8] = _robust.relight(
+        np.ascontiguousarray(image, np.uint8), np.ascontiguousarray(curves, np.int32),
+        np.ascontiguousarray(gains, np.uint16),
+    )
+    return lit
+
+
+def measure_regions(
+    labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: NDArray[np.uint8], margin: int
+) -> NDArray[np.int64]:
+    """Sums over regions and over what is around them, (N, 2, 2 C + 1): see reference_robust."""
+    if labels.shape != channels.shape[:2] or channels.ndim != 3:
+        raise ValueError(f"measure_regions: labels {labels.shape} and channels {channels.shape} do not fit")
+    sums: NDArray[np.int64] = _robust.measure_regions(
+        np.ascontiguousarray(labels, np.int32), np.ascontiguousarray(boxes, np.int32).reshape(-1, 4),
+        np.ascontiguousarray(channels, np.uint8), margin,
+    )
+    return sums
+
+
+def match_regions(
+    query: NDArray[np.uint8], searched: NDArray[np.uint8], boxes: NDArray[np.int32], reach: int
+) -> NDArray[np.float64]:
+    """How well boxes of one picture are found again in another, (N, 6): see reference_robust."""
+    boxes = np.ascontiguousarray(boxes, np.int32).reshape(-1, 4)
+    height, width = query.shape
+    if searched.shape != (height + 2 * reach, width + 2 * reach):
+        raise ValueError(f"match_regions: searched {searched.shape}, query {query.shape}, reach {reach} do not fit")
+    ends = boxes[:, :2] + boxes[:, 2:]
+    if (boxes[:, :2] < 0).any() or (boxes[:, 2:] < 1).any() or (ends > [width, height]).any():
+        raise ValueError(f"match_regions: boxes outside of the {width} x {height} px picture")
+    found: NDArray[np.float64] = _robust.match_regions(
+        np.ascontiguousarray(query, np.uint8), np.ascontiguousarray(searched, np.uint8), boxes, reach
+    )
+    return found
+
+
+def _bytes(array: Bytes) -> Bytes:
+    return np.ascontiguousarray(array, np.uint8)
+
+
+def _check_image(image: Bytes) -> None:
+    if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
+        raise ValueError(f"an image is (height, width, 3) and not empty, got {image.shape}")
+
+
+def _check_mask(mask: Bytes) -> None:
+    if mask.ndim != 2 or mask.size == 0:
+        raise ValueError(f"a mask is (height, width) and not empty, got {mask.shape}")
+
+
+def _check_tables(tables: Bytes) -> None:
+    if tables.shape != (3, 256):
+        raise ValueError(f"tables are (3, 256), got {tables.shape}")
+
+
+def _check_window(width: int, height: int) -> None:
+    if not (1 <= width <= LARGEST_WINDOW_PX and 1 <= height <= LARGEST_WINDOW_PX):
+        raise ValueError(f"a window is 1 to {LARGEST_WINDOW_PX} px wide and high, got {width} x {height}")

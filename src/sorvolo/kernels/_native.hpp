@@ -6,22 +6,29 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <cstring>
 #include <exception>
 #include <stdexcept>
 #include <thread>
 #include <vector>
 
-// Put before a function: compiled for each of these, and the best one chosen when the module is loaded.
-// Only what is inlined into such a function gains, hence SORVOLO_INLINE for its helpers.
-#if defined(__x86_64__) && defined(__linux__) && (defined(__GNUC__) || defined(__clang__))
-#define SORVOLO_CLONES __attribute__((target_clones("avx512bw", "avx2", "default")))
-#else
-#define SORVOLO_CLONES
+#if defined(__x86_64__) && (defined(__GNUC__) || defined(__clang__))
+#define SORVOLO_X86 1
+#define SORVOLO_AVX512 __attribute__((target("avx512f,avx512bw,avx512vl,avx512dq,avx2,bmi,bmi2")))
+#define SORVOLO_AVX2 __attribute__((target("avx2,bmi,bmi2")))
 #endif
 #if defined(__GNUC__) || defined(__clang__)
 #define SORVOLO_INLINE inline __attribute__((always_inline))
 #else
 #define SORVOLO_INLINE inline
+#endif
+
+// Put before a function: compiled for each of these, and the best one chosen when the module is loaded. Only what is
+// inlined into such a function gains, hence SORVOLO_INLINE for its helpers. Needs the loader of glibc.
+#if defined(SORVOLO_X86) && defined(__GLIBC__)
+#define SORVOLO_CLONES __attribute__((target_clones("avx2", "default")))
+#else
+#define SORVOLO_CLONES
 #endif
 
 namespace sorvolo {
@@ -31,6 +38,11 @@ namespace sorvolo {
 using Bytes = pybind11::array_t<std::uint8_t, pybind11::array::c_style>;
 using Floats32 = pybind11::array_t<float, pybind11::array::c_style>;
 using Integers64 = pybind11::array_t<std::int64_t, pybind11::array::c_style>;
+
+enum class Instructions { plain, avx2, avx512 };
+
+// The best that both the processor and `SORVOLO_INSTRUCTIONS` (plain, avx2; for tests) allow; asked once.
+Instructions instructions();
 
 // Calls work(first, last) for `threads` bands of the rows 0 .. rows - 1, at the same time. The GIL must be released.
 template <typename Work>
@@ -53,6 +65,41 @@ void in_bands(int rows, int threads, Work work) {
         if (failure) std::rethrow_exception(failure);
 }
 
+// Gray of BGR as in ITU-R BT.601, in whole numbers.
+constexpr int BLUE = 3735, GREEN = 19235, RED = 9798, GRAY_HALF = 16384, GRAY_SHIFT = 15;
+
+// Where position `at` of an endlessly mirrored row of `size` pixels lies; the rim itself is not repeated.
+SORVOLO_INLINE int mirrored(int at, int size) {
+    if (size == 1) return 0;
+    const int period = 2 * size - 2;
+    at = ((at % period) + period) % period;
+    return at < size ? at : period - at;
+}
+
+// The sums of `width` neighbours: out[x] = sums[x] + ... + sums[x + width - 1]; doubling needs few additions.
+template <typename Sum>
+SORVOLO_INLINE void slide(Sum *sums, int width, int columns, Sum *out) {
+    std::memset(out, 0, columns * sizeof(Sum));
+    int done = 0;
+    for (int bit = 1; bit <= width; bit *= 2) {
+        if (width & bit) {
+            for (int x = 0; x < columns; ++x) out[x] = static_cast<Sum>(out[x] + sums[x + done]);
+            done += bit;
+        }
+        if (2 * bit > width) break;
+        const int left = columns + width - 2 * bit;
+        for (int x = 0; x < left; ++x) sums[x] = static_cast<Sum>(sums[x] + sums[x + bit]);
+    }
+}
+
+template <typename Sum>
+SORVOLO_INLINE void padded(const Sum *row, int before, int after, int columns, Sum *out) {
+    for (int x = -before; x < 0; ++x) out[x + before] = row[mirrored(x, columns)];
+    std::memcpy(out + before, row, columns * sizeof(Sum));
+    for (int x = columns; x < columns + after; ++x) out[x + before] = row[mirrored(x, columns)];
+}
+
+void bind_regions(pybind11::module_ &module);
 void bind_robust(pybind11::module_ &module);
 
 }  // namespace sorvolo
