@@ -127,6 +127,11 @@ def test_verdicts_are_shown_and_rejected_ones_can_be_hidden() -> None:
     assert page.count("is-rejected") > page_of(changes).count("is-rejected")
 
 
+def test_times_without_a_date_are_times_into_the_flight() -> None:
+    page = page_of([fake_change(1)], first_seen_ns=125_400_000_000)
+    assert "2:05 into the flight" in page and "1970" not in page and "2023-11-14 22:13:23" in page
+
+
 def test_pictures_that_are_gone_are_said_to_be() -> None:
     changes = [fake_change(1)]
     page = changes_page({}, stored_changes("b", changes), None, None, LOCAL_SITE, {})

@@ -37,6 +37,7 @@ _MANY = 40  # changes on one map: their numbers become small
 _CROP_PX = 320
 _CROPS_BYTES = 6_000_000  # of all crops in the page together
 _UNKNOWN_SHARE = 0.1  # of the ground: more is said first
+_DAY_NS = 86_400_000_000_000
 _KIND_WORDS = {
     ChangeKind.APPEARED: "is there now and was not before",
     ChangeKind.DISAPPEARED: "was there before and is gone",
@@ -206,10 +207,11 @@ def _overview(changes: Sequence[StoredChange], site: Site) -> str:
     unit = "" if site.is_local else " m"
     area = "" if site.is_local else " m²"
     measured = (f"size{unit}", f"area{area}", f"within{unit}")
-    names = ("", "kind", "verdict", "score", *measured, "views", "seen", "place", "id")
+    is_reviewed = any(each.verdict is not None for each in changes)
+    names = ("", "kind", *(("verdict",) if is_reviewed else ()), "score", *measured, "views", "seen", "place", "id")
     rows = "".join(
         f'<tr class="{_classes(each)}" data-kind="{each.kind.value}">' + "".join(f"<td>{cell}</td>" for cell in (
-            f'<a href="#change-{each.number}">{each.number}</a>', _kind(each), _verdict(each),
+            f'<a href="#change-{each.number}">{each.number}</a>', _kind(each), *((_verdict(each),) if is_reviewed else ()),
             f"{each.score:.2f}", _decimal(each.length_m), _decimal(each.area_m2), _decimal(each.sigma_m),
             str(each.views), _seconds(each.first_seen_ns), _place(each, site), f"<code>{escaped(each.id)}</code>",
         )) + "</tr>"
@@ -388,5 +390,7 @@ def _decimal(value: float) -> str:
 
 
 def _seconds(time_ns: int) -> str:
-    """UTC to the second."""
+    """UTC to the second; the time into the flight where no clock told the date."""
+    if 0 <= time_ns < _DAY_NS:
+        return f"{time_ns // 60_000_000_000}:{time_ns // 1_000_000_000 % 60:02d} into the flight"
     return utc_text(time_ns)[:19].replace("T", " ")
