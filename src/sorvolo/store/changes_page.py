@@ -211,7 +211,8 @@ def _overview(changes: Sequence[StoredChange], site: Site) -> str:
     names = ("", "kind", *(("verdict",) if is_reviewed else ()), "score", *measured, "views", "seen", "place", "id")
     rows = "".join(
         f'<tr class="{_classes(each)}" data-kind="{each.kind.value}">' + "".join(f"<td>{cell}</td>" for cell in (
-            f'<a href="#change-{each.number}">{each.number}</a>', _kind(each), *((_verdict(each),) if is_reviewed else ()),
+            f'<a href="#change-{each.number}">{each.number}</a>', _kind(each),
+            *((_verdict(each),) if is_reviewed else ()),
             f"{each.score:.2f}", _decimal(each.length_m), _decimal(each.area_m2), _decimal(each.sigma_m),
             str(each.views), _seconds(each.first_seen_ns), _place(each, site), f"<code>{escaped(each.id)}</code>",
         )) + "</tr>"
