@@ -14,7 +14,7 @@ from rich.table import Table
 from sorvolo.errors import SettingsError
 from sorvolo.missions.review_changes import list_changes, review_changes
 from sorvolo.store.change_records import StoredChange
-from sorvolo.store.exports import utc_text
+from sorvolo.store.exports import time_words, utc_text
 from sorvolo.survey.findings import Verdict
 
 _COLOURS = {Verdict.CONFIRMED: "green", Verdict.REJECTED: "red"}
@@ -70,7 +70,7 @@ def _show(changes: Sequence[StoredChange], console: Console) -> None:
             verdict = f"[{colour}]{each.verdict.value}[/{colour}]" + (f": {escape(each.note)}" if each.note else "")
         table.add_row(
             escape(each.id), each.kind.value, f"{each.score:.2f}", f"{each.length_m:.2f}", str(each.views),
-            utc_text(each.first_seen_ns)[:16].replace("T", " "), verdict,
+            time_words(each.first_seen_ns), verdict,
         )
     console.print(table)
 

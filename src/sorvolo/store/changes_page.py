@@ -15,7 +15,7 @@ from sorvolo.geometry.grid import SiteGrid
 from sorvolo.store.change_records import StoredChange
 from sorvolo.store.changes_style import SCRIPT
 from sorvolo.store.changes_style import STYLE as CHANGES_STYLE
-from sorvolo.store.exports import Picture, longitude_latitude, utc_text
+from sorvolo.store.exports import Picture, longitude_latitude, time_words
 from sorvolo.store.images import shrink
 from sorvolo.store.page_parts import (
     area_words,
@@ -37,7 +37,6 @@ _MANY = 40  # changes on one map: their numbers become small
 _CROP_PX = 320
 _CROPS_BYTES = 6_000_000  # of all crops in the page together
 _UNKNOWN_SHARE = 0.1  # of the ground: more is said first
-_DAY_NS = 86_400_000_000_000
 _KIND_WORDS = {
     ChangeKind.APPEARED: "is there now and was not before",
     ChangeKind.DISAPPEARED: "was there before and is gone",
@@ -214,7 +213,7 @@ def _overview(changes: Sequence[StoredChange], site: Site) -> str:
             f'<a href="#change-{each.number}">{each.number}</a>', _kind(each),
             *((_verdict(each),) if is_reviewed else ()),
             f"{each.score:.2f}", _decimal(each.length_m), _decimal(each.area_m2), _decimal(each.sigma_m),
-            str(each.views), _seconds(each.first_seen_ns), _place(each, site), f"<code>{escaped(each.id)}</code>",
+            str(each.views), time_words(each.first_seen_ns), _place(each, site), f"<code>{escaped(each.id)}</code>",
         )) + "</tr>"
         for each in changes
     )
@@ -249,7 +248,7 @@ def _pair(
         ("score", f"{change.score:.2f}"), ("views", str(change.views)),
         ("size", _length(change.length_m, site)), ("area", _area(change.area_m2, site)),
         ("place known to", _length(change.sigma_m, site)), ("place", _place(change, site)),
-        ("first seen", _seconds(change.first_seen_ns)), ("last seen", _seconds(change.last_seen_ns)),
+        ("first seen", time_words(change.first_seen_ns)), ("last seen", time_words(change.last_seen_ns)),
     ]
     if change.class_before or change.class_after:
         was, now = escaped(change.class_before or "nothing known"), escaped(change.class_after or "nothing known")
@@ -388,10 +387,3 @@ def _area(value_m2: float, site: Site) -> str:
 
 def _decimal(value: float) -> str:
     return f"{value:.2f}" if np.isfinite(value) else "unknown"
-
-
-def _seconds(time_ns: int) -> str:
-    """UTC to the second; the time into the flight where no clock told the date."""
-    if 0 <= time_ns < _DAY_NS:
-        return f"{time_ns // 60_000_000_000}:{time_ns // 1_000_000_000 % 60:02d} into the flight"
-    return utc_text(time_ns)[:19].replace("T", " ")

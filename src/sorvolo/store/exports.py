@@ -23,6 +23,7 @@ from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame
 
 PREVIEW_PX = 2048
+_DAY_NS = 86_400_000_000_000
 LIVE_PREVIEW_PX = 1024
 _KMZ_PX = 4096
 _KMZ_PIECE_PX = 1024  # viewers on phones refuse textures much larger
@@ -87,6 +88,13 @@ def utc_text(time_ns: int) -> str:
     seconds, rest_ns = divmod(time_ns, 1_000_000_000)
     day = datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%S")
     return f"{day}.{rest_ns // 1000:06d}Z" if rest_ns % 1000 == 0 else f"{day}.{rest_ns:09d}Z"
+
+
+def time_words(time_ns: int) -> str:
+    """UTC to the second for people; the time into the flight where no clock told the date."""
+    if 0 <= time_ns < _DAY_NS:
+        return f"{time_ns // 60_000_000_000}:{time_ns // 1_000_000_000 % 60:02d} into the flight"
+    return utc_text(time_ns)[:19].replace("T", " ")
 
 
 @dataclass(frozen=True, eq=False)
