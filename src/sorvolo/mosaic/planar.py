@@ -14,7 +14,7 @@ from sorvolo.geometry.pose import Pose
 from sorvolo.mosaic.exposure import ColourPairs, Exposure, solve_exposure, tie_colours
 from sorvolo.mosaic.pose_graph import GraphReport, PoseGraph, PoseGraphSettings, pose_from_link
 from sorvolo.registration.features import gray_from_rgb, normalise_contrast, orb_features
-from sorvolo.registration.link import LinkCache, LinkPrediction, LinkSettings, link
+from sorvolo.registration.link import Effort, LinkCache, LinkPrediction, LinkSettings, link
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Keyframe, Link, NoLink, Status
 
@@ -52,6 +52,26 @@ class Outcome:
     status: Status
     reason: str
     moved: frozenset[int]
+
+
+@dataclass(frozen=True, eq=False)
+class _Refusal:
+    reason: str
+    prediction: LinkPrediction | None
+
+    @property
+    def was_tight(self) -> bool:
+        return self.prediction is not None and self.prediction.is_tight
+
+
+@dataclass(eq=False)
+class _Tie:
+    """A new keyframe while its links are sought: where it stands by what is known so far, and who refused it."""
+
+    new: Keyframe
+    guess: Pose | None
+    links: list[Link] = field(default_factory=list)
+    refusals: dict[int, _Refusal] = field(default_factory=dict)
 
 
 class PlanarMapper:
@@ -177,45 +197,59 @@ class PlanarMapper:
         return Keyframe(keyframe_id, camera, gray, orb_features(gray, self._settings.links.features), prior)
 
     def _tie(self, new: Keyframe) -> tuple[list[Link], Pose | None, str]:
-        """The links of a new keyframe, where it stands by them or by telemetry, and what failed."""
+        """The links of a new keyframe, where it stands by them or by telemetry, and what failed.
+
+        All candidates are asked the cheap way first. Only where all of them say no they are asked with SIFT and
+        correlation, up to the first that says yes: then it is known where the others lie, and cheap is enough.
+        """
         previous = self._own[::-1][: self._settings.previous]
-        links: list[Link] = []
-        tried: set[int] = set()
-        failures: list[str] = []
-        guess = self._guess_by_telemetry(new)
-
-        def attempt(other: int, prediction: LinkPrediction | None) -> None:
-            tried.add(other)
-            old = self._picture(other)
-            found = link(new, old, prediction, self._settings.links, self._cache)
-            if isinstance(found, NoLink) and prediction is not None and not links:
-                # telemetry may be plainly wrong (pictures turned by half a turn, a compass that hangs): ask them alone
-                found = link(new, old, None, self._settings.links, self._cache)
-            if isinstance(found, NoLink):
-                failures.append(found.reason)
-            else:
-                links.append(found)
-
+        tie = _Tie(new, self._guess_by_telemetry(new))
         if previous:
-            attempt(previous[0], self._loose_prediction(new, previous[0], guess))
-            guess = self._by_link(new, links) or guess
-        if guess is not None:
-            for each in self._under(new, guess, tried, previous, bool(links)):
-                before = len(links)
-                attempt(each, self._prediction(new, each, guess, tight=bool(links)))
-                if len(links) > before == 0:
-                    guess = self._by_link(new, links) or guess
-        if not links and not new.prior.knows_place:
+            self._ask(tie, previous[0], self._loose_prediction(new, previous[0], tie.guess), Effort.CHEAP)
+        self._ask_under(tie, previous)
+        if not tie.links:
+            self._ask_dearly(tie)
+        if tie.links and tie.refusals:
+            self._ask_under(tie, previous)
+        if not tie.links and not new.prior.knows_place:
             for each in [*self._own[::-1][1:10], *self._own[:: max(1, len(self._own) // 20)]]:
-                if each not in tried and len(tried) < self._settings.recovery and not links:
-                    attempt(each, None)
-            guess = self._by_link(new, links)
-        if not self._own and guess is None:
-            guess = Pose(new.prior.rotation, new.prior.position_m)
-        reason = failures[0] if failures else "nothing of the map lies under it"
-        if not links and self._own and not new.prior.knows_place:
+                if each not in tie.refusals and len(tie.refusals) < self._settings.recovery and not tie.links:
+                    self._ask(tie, each, None, Effort.ALL)
+        if not self._own and tie.guess is None:
+            tie.guess = Pose(new.prior.rotation, new.prior.position_m)
+        reason = next(iter(tie.refusals.values())).reason if tie.refusals else "nothing of the map lies under it"
+        if not tie.links and self._own and not new.prior.knows_place:
             return [], None, f"no picture of the map fits it ({reason}) and telemetry does not say where it is"
-        return links, guess, reason
+        return tie.links, tie.guess, reason
+
+    def _ask(self, tie: _Tie, other: int, prediction: LinkPrediction | None, effort: Effort) -> None:
+        """Try to link one picture; the first link says where the new keyframe stands."""
+        found = link(tie.new, self._picture(other), prediction, self._settings.links, self._cache, effort)
+        if isinstance(found, NoLink):
+            tie.refusals[other] = _Refusal(found.reason, prediction)
+            return
+        tie.refusals.pop(other, None)
+        tie.links.append(found)
+        if len(tie.links) == 1:
+            tie.guess = self._by_link(tie.new, found) or tie.guess
+
+    def _ask_under(self, tie: _Tie, previous: Sequence[int]) -> None:
+        """Ask the pictures under the predicted view the cheap way; again those that refused a vague prediction."""
+        if tie.guess is None:
+            return
+        asked = {each.old_id for each in tie.links}
+        asked |= {other for other, no in tie.refusals.items() if not tie.links or no.was_tight}
+        for each in self._under(tie.new, tie.guess, asked, previous, bool(tie.links)):
+            self._ask(tie, each, self._prediction(tie.new, each, tie.guess, tight=bool(tie.links)), Effort.CHEAP)
+
+    def _ask_dearly(self, tie: _Tie) -> None:
+        for other, refusal in list(tie.refusals.items()):
+            self._ask(tie, other, refusal.prediction, Effort.DEAR)
+            if not tie.links and refusal.prediction is not None:
+                # telemetry may be plainly wrong (pictures turned by half a turn, a compass that hangs): ask them alone
+                self._ask(tie, other, None, Effort.ALL)
+            if tie.links:
+                return
 
     def _guess_by_telemetry(self, new: Keyframe) -> Pose | None:
         prior = new.prior
@@ -252,13 +286,9 @@ class PlanarMapper:
             search = float(np.clip(2.5 * new.camera.fx_px * (tilt + place), 0.08 * side, 0.5 * side))
         return LinkPrediction(new_from_old, search, is_tight=tight)
 
-    def _by_link(self, new: Keyframe, links: Sequence[Link]) -> Pose | None:
-        for each in links:
-            old = self._graph.camera(each.old_id)
-            found = pose_from_link(each, self._graph.refined(new.camera), old, self._graph.pose(each.old_id))
-            if found is not None:
-                return found
-        return None
+    def _by_link(self, new: Keyframe, each: Link) -> Pose | None:
+        old = self._graph.camera(each.old_id)
+        return pose_from_link(each, self._graph.refined(new.camera), old, self._graph.pose(each.old_id))
 
     def _under(
         self, new: Keyframe, guess: Pose, tried: set[int], previous: Sequence[int], linked: bool

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Any
 
 import cv2
@@ -64,17 +65,26 @@ class LinkCache:
         return self._sift[keyframe.id]
 
 
+class Effort(StrEnum):
+    """Which fits `link` tries, for a caller with several pictures to ask: the dear ones cost fifty times the cheap."""
+
+    CHEAP = "cheap"
+    DEAR = "dear"  # only what cheap leaves out
+    ALL = "all"
+
+
 def link(
-    new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache
+    new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache,
+    effort: Effort = Effort.ALL,
 ) -> Link | NoLink:
     """How `new` fits `old`.
 
-    Fits are tried from cheap to dear: a tight prediction as it is, ORB, SIFT, then, where a prediction exists,
+    Fits are tried from cheap to dear: a tight prediction as it is, ORB, then SIFT, then, where a prediction exists,
     correlation of the images laid over each other as predicted. The first believable one is refined to sub-pixel
     pairs (Lucas-Kanade on the old image warped into the new one) and must make the overlaid images correlate.
     """
     reason = "too few matching points"
-    for found in _candidates(new, old, prediction, settings, cache):
+    for found in _candidates(new, old, prediction, settings, cache, effort):
         refined = refine(new, old, found.new_from_old, settings, cache)
         if isinstance(refined, Link):
             return refined
@@ -95,14 +105,18 @@ class _Fit:
 
 
 def _candidates(
-    new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache
+    new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache,
+    effort: Effort,
 ) -> Iterator[_Fit]:
     nothing = np.zeros((0, 2))
-    if prediction is not None and prediction.is_tight:
-        yield _Fit(prediction.new_from_old, nothing, nothing)
-    fitted = _fit(new.features, old.features, prediction, settings)
-    if fitted is not None:
-        yield fitted
+    if effort is not Effort.DEAR:
+        if prediction is not None and prediction.is_tight:
+            yield _Fit(prediction.new_from_old, nothing, nothing)
+        fitted = _fit(new.features, old.features, prediction, settings)
+        if fitted is not None:
+            yield fitted
+    if effort is Effort.CHEAP:
+        return
     fitted = _fit(cache.sift(new), cache.sift(old), prediction, settings)
     if fitted is not None:
         yield fitted
