@@ -40,6 +40,7 @@ class EvidenceSettings:
     least_views: int = 2  # where fewer than n ever see it
     least_views_apart_s: float = 0.1  # frames nearer in time see the same thing and say nothing new
     least_share: float = 0.3  # of all views of its ground must show it, or it was nothing lasting
+    least_score: float = 0.2  # less sure, it is kept but not told
     least_area_m2: float = 0.02
     join_m: float = 0.3  # a smaller gap does not make two things of one
     single_view_score: float = 0.9  # a single view's change this sure is told at the end; above 1: never
@@ -50,8 +51,10 @@ class EvidenceSettings:
             raise SettingsError(f"evidence needs 1 <= k <= n <= 8 views, got k = {self.k}, n = {self.n}")
         if not 1 <= self.least_views <= self.k:
             raise SettingsError(f"least_views must lie in 1 to k = {self.k}, got {self.least_views}")
-        if not 0 <= self.least_share <= 1:
-            raise SettingsError(f"least_share must lie in 0 to 1, got {self.least_share}")
+        if not (0 <= self.least_share <= 1 and 0 <= self.least_score <= 1):
+            raise SettingsError(
+                f"least_share and least_score must lie in 0 to 1, got {self.least_share} and {self.least_score}"
+            )
         if min(self.least_views_apart_s, self.least_area_m2, self.join_m) < 0:
             raise SettingsError("times, areas and gaps of the evidence must not be negative")
 
@@ -90,6 +93,7 @@ class EvidenceMap:
         self._found: dict[int, GatheredChange] = {}  # by number, in order
         self._merged: dict[int, int] = {}
         self._movers: dict[int, Change] = {}  # by the tracker's number
+        self._unwanted_movers: set[int] = set()
         self._seeds: list[GatheredChange] = []
         self._recent: deque[_Witness] = deque(maxlen=settings.n)
         self._number = 0
@@ -118,15 +122,15 @@ class EvidenceMap:
         self._recent.append(witness)
         budget = [_PICTURES_A_VIEW]
         new = self._gather(view, witness, earlier, evidence, budget)
-        self._update(view, witness, evidence.owner, {each.number for each in new}, budget)
-        announced = [self._change(each) for each in new]
+        shown = self._update(view, witness, evidence.owner, {each.number for each in new}, budget)
+        announced = [self._change(each) for each in shown if self._tell(each, view.time_ns)]
         announced += self._tell_movers(view, followed.movers)
         self._keep_seeds(view, laid, evidence, budget)
         return tuple(each for each in announced if each is not None)
 
     def changes(self) -> tuple[Change, ...]:
         """All changes told so far as they are known now, in the order of their numbers."""
-        found = [self._change(each) for each in self._found.values() if not each.is_hidden]
+        found = [self._change(each) for each in self._found.values() if each.is_told and not each.is_hidden]
         return tuple(sorted([each for each in found if each is not None] + list(self._movers.values()), key=_number_of))
 
     def conclude(self) -> tuple[Change, ...]:
@@ -135,11 +139,15 @@ class EvidenceMap:
         A change that too small a share of all views of its ground showed is taken back. A change that only one view
         saw, and no other could, is told if that view was very sure, with half the score.
         """
-        for change in self._found.values():
-            change.is_hidden = change.is_hidden or change.share < self._settings.least_share
+        settings = self._settings
         for seed in self._seeds:
             self._grow_late(seed)
         self._seeds = []
+        for change in self._found.values():
+            if not change.is_told:
+                self._tell(change, -1)
+            elif change.share < settings.least_share or change.score < settings.least_score:
+                change.is_hidden = True
         return self.changes()
 
     def _is_new_place(self, view: ComparedView) -> bool:
@@ -191,7 +199,7 @@ class EvidenceMap:
             change.cells = window if change.cells is None else change.cells.joined(window)
             self._grid.own(window, cells, change.number)
             owner[cells] = change.number
-        return [each for each in new if self._current(each.number) == each.number and self._is_told(each)]
+        return [each for each in new if self._current(each.number) == each.number]
 
     def _begin(
         self, view: ComparedView, earlier: Sequence[_Witness], witness: _Witness, part: tuple[slice, slice],
@@ -213,12 +221,19 @@ class EvidenceMap:
                 change.miss(each.counts)
         return change
 
-    def _is_told(self, change: GatheredChange) -> bool:
+    def _tell(self, change: GatheredChange, now_ns: int) -> bool:
+        """Whether a change is to be told now for the first time: sure enough, and nobody said no to it before."""
+        settings = self._settings
+        is_sure = change.score >= settings.least_score and change.share >= settings.least_share
+        if change.is_told or change.is_hidden or not is_sure:
+            return False
         record = self._change(change)
-        if record is None or is_known(record.outline_m, record.kind, self._rejected):
-            change.is_hidden = True
-            self.suppressed += record is not None
-        return not change.is_hidden
+        if record is None:
+            return False
+        change.is_hidden = is_known(record.outline_m, record.kind, self._rejected)
+        self.suppressed += change.is_hidden
+        change.is_told, change.announced_ns = not change.is_hidden, now_ns
+        return change.is_told
 
     def _answer(self, laid: LaidView, window: CellWindow, cells: Mask) -> tuple[float, float, float, Floats]:
         """What a view says of some cells: the shares of them it saw and flagged, how sure, where the flagged lie."""
@@ -240,11 +255,12 @@ class EvidenceMap:
 
     def _update(
         self, view: ComparedView, witness: _Witness, owner: NDArray[np.int32], new: set[int], budget: list[int]
-    ) -> None:
-        """Tell the known changes what this view says of them."""
+    ) -> list[GatheredChange]:
+        """Bring the known changes up to date with this view; those that it shows, in the order of their numbers."""
         if not owner.any():
-            return
+            return []
         laid = witness.laid
+        shown = []
         wishes = []
         for number in sorted({self._current(int(each)) for each in np.unique(owner[owner > 0])}):
             change = self._found[number]
@@ -262,6 +278,7 @@ class EvidenceMap:
             change.from_camera(view.camera_m)
             if change.still_votes and number not in new:
                 change.vote(view.site_from_image, view.changed, view.valid)
+            shown.append(change)
             wishes.append((change.wants(*_box_m(change.cells, self._cell_m), view), -number))
         for gain, minus_number in sorted(wishes, reverse=True):
             if gain <= 1.15 or budget[0] <= 0:
@@ -273,6 +290,7 @@ class EvidenceMap:
         for number in new:
             change = self._found[number]
             change.vote(view.site_from_image, view.changed, view.valid)
+        return shown
 
     def _merge(self, older: GatheredChange, younger: GatheredChange) -> None:
         if younger.cells is not None:
@@ -305,7 +323,8 @@ class EvidenceMap:
     def _pieces(self, cells: Mask) -> Iterator[tuple[Mask, tuple[slice, slice]]]:
         """The connected pieces of cells, small gaps closed: each with the window, as slices, that holds it."""
         gap = int(np.ceil(self._join_m / self._cell_m))
-        kernel = np.ones((gap + 1, gap + 1), np.uint8)
+        side = 2 * ((gap + 1) // 2) + 1  # odd: an even one would shift the cells
+        kernel = np.ones((side, side), np.uint8)
         closed = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_CLOSE, kernel)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
         for label in range(1, count):
@@ -387,21 +406,24 @@ class EvidenceMap:
             seed.miss(True)
         self._grid.own(seed.cells, cells, seed.number)
         self._found[seed.number] = seed
-        self._is_told(seed)
 
     def _tell_movers(self, view: ComparedView, movers: Sequence[Track]) -> list[Change]:
         """Bring the moving things up to date; those told for the first time."""
         told = []
         for track in movers:
+            if track.mover in self._unwanted_movers:
+                continue
             known = self._movers.get(track.mover)
             number = _number_of(known) if known else self._next_number()
             change = self._moving(view, track, f"{self._prefix}-{number}")
             if known:
                 change = replace(
-                    change, first_seen_ns=known.first_seen_ns, views=max(change.views, known.views + 1)
+                    change, first_seen_ns=known.first_seen_ns, views=max(change.views, known.views + 1),
+                    announced_ns=known.announced_ns,
                 )
             elif is_known(change.outline_m, change.kind, self._rejected):
                 self.suppressed += 1
+                self._unwanted_movers.add(track.mover)
                 continue
             else:
                 told.append(change)
@@ -425,7 +447,7 @@ class EvidenceMap:
             change_id, ChangeKind.MOVING, float(np.clip(score, 0, 1)), outline_m, track.first.time_ns,
             track.last.time_ns, track.count, size.area_m2, size.length_m,
             float(np.hypot(residual_m, self._cell_m / np.sqrt(12))), patch_of(window, cut(view, window), outline_m),
-            track.velocity_m_s,
+            track.velocity_m_s, announced_ns=view.time_ns,
         )
 
 

@@ -25,6 +25,8 @@ class GatheredChange:
 
     def __init__(self, number: int, first_seen_ns: int) -> None:
         self.number = number
+        self.is_told = False
+        self.announced_ns = -1
         self.is_hidden = False  # a person said no to it, or it turned out to be nothing
         self.first_seen_ns = self.last_seen_ns = first_seen_ns
         self.views = self.asked = 0
@@ -139,6 +141,8 @@ class GatheredChange:
         self.first_seen_ns = min(self.first_seen_ns, younger.first_seen_ns)
         self.last_seen_ns = max(self.last_seen_ns, younger.last_seen_ns)
         self.is_hidden = self.is_hidden and younger.is_hidden
+        if younger.is_told and not self.is_told:
+            self.is_told, self.announced_ns = True, younger.announced_ns
         if self.cells is not None and younger.cells is not None:
             self.cells = self.cells.joined(younger.cells)
 
@@ -178,7 +182,7 @@ class GatheredChange:
         sigma_m = np.sqrt(residual_m**2 + cell_m**2 / 12 + spread_m**2 / max(len(self._places), 1))
         return Change(
             f"{id_prefix}-{self.number}", self._kind, self.score, outline_m, self.first_seen_ns, self.last_seen_ns,
-            self.views, size.area_m2, size.length_m, float(sigma_m), patch,
+            self.views, size.area_m2, size.length_m, float(sigma_m), patch, announced_ns=self.announced_ns,
         )
 
 

@@ -31,7 +31,7 @@ _LOST_FOR_S = 10.0  # a thing that moves steadily is known again after so long
 class MovingSettings:
     """When something counts as moving."""
 
-    least_views: int = 4
+    least_views: int = 5
     least_move_m: float = 1.0  # beyond what alignment and a swaying crown do
     least_lengths: float = 1.2  # of its own: then its places do not overlap, and nothing that grew explains it
     least_length_m: float = 0.3  # a person from above; smaller specks jump about
@@ -215,7 +215,7 @@ class BlobTracker:
             and speed_m_s <= settings.fastest_m_s(length_m)
             and (is_own or _is_rigid(track, length_m))
             and float(np.hypot(*(move.velocity_m_s - move.camera_m_s))) > 0.3 * float(np.hypot(*move.camera_m_s))
-            and move.error_m < 0.05 + 0.05 * speed_m_s * track.seconds
+            and move.error_m < 0.05 + 0.03 * speed_m_s * track.seconds
             and not _is_still_there(track.points[0], view)
         )
 
@@ -314,7 +314,7 @@ def _pairs(
             fastest_m_s = settings.fastest_m_s(track.last.blob.length_m)
             gate_m = 0.3 + min(fastest_m_s * ahead_s, settings.most_step_m)
         else:
-            gate_m = 0.4 + 0.35 * float(np.hypot(*velocity)) * ahead_s
+            gate_m = 0.3 + 0.25 * float(np.hypot(*velocity)) * ahead_s
         distance = np.hypot(*(places - track.last.blob.place_m - velocity * ahead_s).T)
         growth = np.abs(np.log((areas + 0.02) / (track.last.blob.area_m2 + 0.02)))
         tint = np.abs(colours - track.last.blob.colour).max(axis=1)

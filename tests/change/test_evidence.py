@@ -1,0 +1,244 @@
+"""Changes collected over views of a world whose things are known: each told once, ghosts and noise not at all."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from blob_world import CAMERA_HEIGHT_M, M_PER_PX, START_NS, Thing, flight, view_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
+from sorvolo.change.outlines import KnownPlace
+from sorvolo.errors import SettingsError
+from sorvolo.survey.findings import Change, ChangeKind
+
+
+def collect(views, rejected=(), **how) -> tuple[EvidenceMap, list[tuple[int, Change]]]:
+    evidence = EvidenceMap(M_PER_PX, EvidenceSettings(**how), "f", rejected)
+    return evidence, [(view.index, change) for view in views for change in evidence.add(view)]
+
+
+def centre(change: Change) -> np.ndarray:
+    return (change.outline_m.min(axis=0) + change.outline_m.max(axis=0)) / 2
+
+
+def test_what_came_and_what_left_is_told_once_with_its_place_size_and_time():
+    came, left = Thing(0, 0), Thing(3, 2, (1.4, 0.8), colour=(40, 40, 200), on_map=True, in_flight=False)
+    stays = Thing(-2, -2, on_map=True)
+    evidence, told = collect(flight([came, left, stays]))
+    assert [each.id for _, each in told] == ["f-1", "f-2"]
+    final = evidence.conclude()
+    assert [each.kind for each in final] == [ChangeKind.APPEARED, ChangeKind.DISAPPEARED]
+    for change, thing in zip(final, (came, left)):
+        assert np.hypot(*(centre(change) - [thing.east_m, thing.north_m])) < 0.15
+        assert change.area_m2 == pytest.approx(thing.size_m[0] * thing.size_m[1], rel=0.2)
+        assert change.length_m == pytest.approx(max(thing.size_m), abs=0.15)
+        assert change.score > 0.8 and change.views > 15
+        assert 0.02 < change.sigma_m < 0.15
+        assert not change.velocity_m_s.any()
+        assert change.patch.changed.any() and (change.patch.after[..., 3] == 255).all()
+    assert evidence.conclude() is not None and len(evidence.conclude()) == 2  # again: the same
+
+
+def test_it_is_told_within_a_second_of_being_in_view_whatever_the_frame_rate():
+    for fps in (5.0, 30.0):
+        _, told = collect(flight([Thing(2, 0)], fps=fps))
+        (index, change), = told
+        whole_in_view_s = (2 + 0.5 + 8 - 8) / 3  # the view reaches 8 m ahead of a drone that starts at -8 m
+        assert index / fps < whole_in_view_s + 1.0
+        assert change.announced_ns == START_NS + round(index / fps * 1e9)
+
+
+def test_the_patch_shows_both_dates_north_up():
+    evidence, _ = collect(flight([Thing(0, 0, (1, 1), colour=(220, 30, 30))]))
+    patch = evidence.conclude()[0].patch
+    inside = patch.changed
+    assert np.median(patch.after[inside][:, 0]) > 200 and np.median(patch.before[inside][:, 0]) < 170
+    rows, columns = np.nonzero(inside)
+    middle = patch.site_from_patch @ [columns.mean(), rows.mean(), 1]
+    assert np.hypot(*middle[:2]) < 0.1
+    assert patch.m_per_px == M_PER_PX and max(inside.shape) <= 512
+
+
+def test_things_apart_stay_two_and_pieces_that_nearly_touch_are_one():
+    evidence, _ = collect(flight([Thing(0, 0), Thing(2.0, 0)]))
+    assert len(evidence.conclude()) == 2
+    evidence, told = collect(flight([Thing(0, 0), Thing(1.2, 0)]))
+    assert len(told) == 1
+    (change,) = evidence.conclude()
+    assert change.length_m == pytest.approx(2.2, abs=0.2)
+
+
+def test_changes_that_grow_together_keep_the_older_id():
+    left, right, bridge = Thing(0, 0), Thing(3, 0), Thing(1.5, 0, (2.2, 1.0))
+    views = list(flight([left, right], seconds=3.4))
+    more = [view_of(17 + i, 3.4 + i / 5, (2.2 + 0.6 * i, 0, CAMERA_HEIGHT_M), [left, right, bridge])
+            for i in range(8)]
+    evidence, told = collect(views + more)
+    assert [each.id for _, each in told] == ["f-1", "f-2"]
+    assert [each.id for each in evidence.changes()] == ["f-1"]
+
+
+
+
+def test_noise_that_does_not_come_back_at_its_place_is_nothing():
+    rng = np.random.default_rng(3)
+    views = []
+    for view in flight([]):
+        things = [Thing(*rng.uniform([-12, -4], [8, 4]), (0.4, 0.4)) for _ in range(3)]
+        views.append(view_of(view.index, view.index / 5, view.camera_m, things))
+    evidence, told = collect(views)
+    assert told == []
+    assert [each for each in evidence.conclude() if each.kind != ChangeKind.MOVING] == []
+
+
+def test_the_moving_ghost_of_something_tall_is_no_event():
+    # stands on both dates: the map shows it from one side, each view from another; only its foot stays in place
+    pole = Thing(0, 0, (0.3, 0.3), height_m=5, on_map=True)
+    evidence, told = collect(flight([pole], map_eye_m=(0.5, 0.3, CAMERA_HEIGHT_M)))
+    assert all(np.abs(centre(each) - [0, 0]).max() < 1.0 for _, each in told)  # its lean in the map stays in place
+    assert not any(each.kind == ChangeKind.MOVING for each in evidence.conclude())
+
+
+def test_a_drone_that_hovers_tells_a_ghost_only_with_half_the_score_and_takes_it_back_when_it_flies_on():
+    pole = Thing(0, -1, (0.5, 0.5), height_m=4, on_map=True)
+    hover = [view_of(i, i / 5, (-5, 0, CAMERA_HEIGHT_M), [pole]) for i in range(10)]
+    evidence, told = collect(hover)
+    assert told and all(each.score <= 0.5 for _, each in told)
+    ghosts = len(evidence.changes())
+    for i in range(10, 40):
+        camera_m = (-5 + 0.5 * (i - 10), 0, CAMERA_HEIGHT_M)
+        evidence.add(view_of(i, i / 5, camera_m, [pole], map_eye_m=camera_m))  # from here it looks as in the map
+    assert ghosts > 0 and evidence.conclude() == ()
+
+
+def test_a_view_given_twice_counts_once():
+    views = list(flight([Thing(0, 0)], seconds=5))
+    once, told_once = collect(views)
+    twice, told_twice = collect([each for view in views for each in (view, view)])
+    assert [each.id for _, each in told_once] == [each.id for _, each in told_twice]
+    assert once.conclude()[0].views == twice.conclude()[0].views
+
+
+def test_the_same_views_give_the_same_changes():
+    first, _ = collect(flight([Thing(0, 0), Thing(3, 2)]))
+    second, _ = collect(flight([Thing(0, 0), Thing(3, 2)]))
+    for a, b in zip(first.conclude(), second.conclude()):
+        assert a.id == b.id and a.score == b.score and np.array_equal(a.outline_m, b.outline_m)
+
+
+def test_views_with_gaps_between_them_still_add_up():
+    evidence, told = collect(flight([Thing(0, 0)], fps=1.0))
+    assert len(told) == 1
+    assert len(evidence.conclude()) == 1
+
+
+def test_unknown_ground_says_nothing():
+    # the map has a hole over half of the thing, then over all of it
+    half = (0.0, -2.0, 3.0, 2.0)
+    evidence, _ = collect(flight([Thing(0, 0)], hole_m=half))
+    (change,) = evidence.conclude()
+    assert change.outline_m[:, 0].max() < 0.2
+    evidence, _ = collect(flight([Thing(0, 0)], hole_m=(-2.0, -2.0, 3.0, 2.0)))
+    assert evidence.conclude() == ()
+
+
+def test_a_hole_does_not_wipe_out_what_was_seen():
+    views = list(flight([Thing(0, 0)]))
+    blind = [view_of(v.index, v.index / 5, v.camera_m, [Thing(0, 0)], hole_m=(-3, -3, 3, 3)) for v in views]
+    mixed = [blind[i] if i % 2 else views[i] for i in range(len(views))]
+    evidence, told = collect(mixed)
+    assert len(told) == 1
+    assert evidence.conclude()[0].score > 0.7
+
+
+def test_snow_is_one_event_in_bounded_time_and_memory():
+    evidence, told = collect(flight([Thing(0, 0)], all_changed=True))
+    assert len(told) == 1
+    (change,) = evidence.conclude()
+    assert change.area_m2 > 150
+    assert max(change.patch.changed.shape) <= 512
+
+
+def test_photos_tell_what_most_of_the_few_that_saw_it_show():
+    thing = Thing(0, 0)
+    photos = [view_of(i, 2.0 * i, (-3 + 6 * i, 0, CAMERA_HEIGHT_M), [thing]) for i in range(2)]
+    evidence, told = collect(photos)
+    assert told == []
+    (change,) = evidence.conclude()
+    assert change.views == 2 and change.announced_ns == -1
+    assert change.kind == ChangeKind.APPEARED
+
+
+def test_a_single_view_is_believed_only_if_very_sure_and_at_half_the_score():
+    thing = Thing(0, 0)
+    sure = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [thing], score=0.95)
+    unsure = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [thing], score=0.7)
+    evidence, told = collect([sure])
+    assert told == []
+    (change,) = evidence.conclude()
+    assert change.views == 1 and change.score < 0.4
+    assert collect([unsure])[0].conclude() == ()
+    assert collect([sure], single_view_score=1.1)[0].conclude() == ()
+
+
+def test_what_a_person_rejected_does_not_come_back():
+    views = list(flight([Thing(0, 0), Thing(3, 2)]))
+    known, _ = collect(views)
+    rejected = known.conclude()[0]
+    evidence, told = collect(views, [KnownPlace(rejected.outline_m, rejected.kind)])
+    assert [each.id for _, each in told] == ["f-2"]  # ids stay those of the first comparison
+    assert [each.id for each in evidence.conclude()] == ["f-2"]
+    assert evidence.suppressed == 1
+    # the same place with another kind is news
+    other, _ = collect(views, [KnownPlace(rejected.outline_m, ChangeKind.DISAPPEARED)])
+    assert len(other.conclude()) == 2 and other.suppressed == 0
+
+
+def test_low_scores_are_kept_but_not_told():
+    evidence, told = collect(flight([Thing(0, 0)], score=0.1))
+    assert told == [] and evidence.conclude() == ()
+
+
+def test_something_seen_for_a_while_only_is_taken_back():
+    thing = Thing(-4, 0)
+    views = [view_of(i, i / 5, (-6 + 0.2 * i, 0, CAMERA_HEIGHT_M), [thing] if i < 6 else []) for i in range(30)]
+    evidence, told = collect(views)
+    assert len(told) == 1
+    assert evidence.conclude() == ()
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 10_000))
+def test_every_well_seen_thing_is_found_once_and_nothing_else(seed):
+    rng = np.random.default_rng(seed)
+    spots = [np.array([x, y]) for x in (-4, 0, 4) for y in (-2.5, 2.5)]
+    things = [
+        Thing(*(spot + rng.uniform(-0.5, 0.5, 2)), tuple(rng.uniform(0.6, 1.8, 2)), colour=(230, 60, 40),
+              on_map=bool(flip), in_flight=not flip)
+        for spot, flip in zip(spots, rng.integers(0, 2, 6)) if rng.random() < 0.7
+    ]
+    evidence, told = collect(flight(things, seconds=6))
+    final = evidence.conclude()
+    assert len(final) == len(things) == len({each.id for _, each in told})
+    for thing in things:
+        distances = [float(np.hypot(*(centre(each) - [thing.east_m, thing.north_m]))) for each in final]
+        assert min(distances) < 0.3
+        kind = final[int(np.argmin(distances))].kind
+        assert kind == (ChangeKind.APPEARED if thing.in_flight else ChangeKind.DISAPPEARED)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"k": 6}, {"k": 0}, {"n": 9}, {"least_views": 4}, {"least_share": 2.0}, {"join_m": -1}]
+)
+def test_settings_that_contradict_themselves_are_refused(wrong):
+    with pytest.raises(SettingsError):
+        EvidenceSettings(**wrong)
+
+
+def test_a_view_without_any_known_ground_is_harmless():
+    view = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [])
+    blind = replace(view, valid=np.zeros_like(view.valid), changed=np.zeros_like(view.changed))
+    evidence, told = collect([blind])
+    assert told == [] and evidence.conclude() == ()

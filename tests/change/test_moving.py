@@ -1,0 +1,123 @@
+"""People and cars that move while they are seen: told once as moving, never as changes of the ground."""
+
+import numpy as np
+import pytest
+from blob_world import CAMERA_HEIGHT_M, M_PER_PX, Thing, flight, view_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
+from sorvolo.change.moving import Blob, BlobTracker, MovingSettings, TrackPoint, motion
+from sorvolo.change.outlines import KnownPlace
+from sorvolo.errors import SettingsError
+from sorvolo.survey.findings import ChangeKind
+
+
+def events(views, rejected=()):
+    evidence = EvidenceMap(M_PER_PX, EvidenceSettings(), "f", rejected)
+    told = [change for view in views for change in evidence.add(view)]
+    return told, evidence.conclude(), evidence
+
+
+def point(time_s, place_m, camera_m):
+    blob = Blob(0, np.array(place_m, float), 0.5, 0.2, np.zeros(3), 1.0)
+    return TrackPoint(round(time_s * 1e9), blob, np.array(camera_m, float))
+
+
+@pytest.mark.parametrize(
+    ("thing", "velocity"),
+    [
+        (Thing(-2, -2, (0.5, 0.5), velocity_m_s=(0.5, 1.2)), (0.5, 1.2)),
+        (Thing(-6, 2, (4.5, 1.8), velocity_m_s=(5, 0)), (5, 0)),
+        (Thing(0, 3, (0.5, 0.5), velocity_m_s=(0, -1.3)), (0, -1.3)),
+    ],
+    ids=["walker", "car ahead", "walker across"],
+)
+def test_what_moves_is_one_event_of_its_own_kind(thing, velocity):
+    told, final, _ = events(flight([thing]))
+    assert [each.kind for each in told] == [ChangeKind.MOVING]
+    (change,) = final
+    assert change.kind == ChangeKind.MOVING and change.id == told[0].id
+    assert np.abs(change.velocity_m_s - velocity).max() < 0.2
+    assert change.views >= 5 and change.announced_ns > 0
+    way = thing.outline_m((change.last_seen_ns - flight_start_ns()) * 1e-9).mean(axis=0)
+    assert np.hypot(*(change.outline_m.mean(axis=0) - way)) < 0.3
+
+
+def flight_start_ns() -> int:
+    return next(iter(flight([]))).time_ns
+
+
+def test_a_walker_straight_against_the_drone_keeps_its_size_and_so_is_no_ghost():
+    _, final, _ = events(flight([Thing(4, 3, (0.5, 0.5), velocity_m_s=(-1.4, 0))]))
+    assert [each.kind for each in final] == [ChangeKind.MOVING]
+
+
+def test_a_fast_thing_that_cannot_be_told_from_a_ghost_is_at_least_no_change_of_the_ground():
+    _, final, _ = events(flight([Thing(6, 2, (4.5, 1.8), velocity_m_s=(-5, 0))]))
+    assert final == ()
+
+
+def test_where_a_walker_stood_on_the_map_something_disappeared():
+    stood = Thing(0, 2, (0.5, 0.5), on_map=True, in_flight=False)
+    walks = Thing(-2, -2, (0.5, 0.5), velocity_m_s=(0.3, 0.9))
+    _, final, _ = events(flight([stood, walks], seconds=3))
+    assert sorted(each.kind for each in final) == [ChangeKind.DISAPPEARED, ChangeKind.MOVING]
+
+
+def test_a_thing_that_stands_is_not_moving_though_its_head_slides_over_the_ground():
+    _, final, _ = events(flight([Thing(0, 1, (0.6, 0.6), height_m=1.8)]))
+    assert [each.kind for each in final] == [ChangeKind.APPEARED]
+
+
+def test_a_walker_lost_for_a_while_is_the_same_one():
+    thing = Thing(-3, -2, (0.5, 0.5), velocity_m_s=(0.9, 0.8))
+    views = [
+        view_of(i, i / 5, (-4 + 0.5 * i / 5, 0, CAMERA_HEIGHT_M), [] if 9 <= i < 24 else [thing]) for i in range(34)
+    ]
+    told, final, _ = events(views)
+    assert len(told) == 1
+    assert [each.kind for each in final] == [ChangeKind.MOVING]
+
+
+def test_a_rejected_mover_stays_away():
+    views = list(flight([Thing(-2, -2, (0.5, 0.5), velocity_m_s=(0.5, 1.2))]))
+    told, _, _ = events(views)
+    again, final, evidence = events(views, [KnownPlace(told[0].outline_m, ChangeKind.MOVING)])
+    assert again == [] and final == () and evidence.suppressed == 1
+
+
+def test_noise_is_not_moving():
+    rng = np.random.default_rng(11)
+    tracker = BlobTracker()
+    for view in flight([]):
+        things = [Thing(*rng.uniform([-12, -4], [8, 4]), (0.5, 0.5)) for _ in range(3)]
+        assert tracker.follow(view_of(view.index, view.index / 5, view.camera_m, things)).movers == ()
+
+
+@given(
+    st.floats(0.05, 0.55), st.floats(0, 2 * np.pi), st.floats(1, 10), st.floats(8, 60),
+)
+def test_the_ghost_of_something_tall_has_no_motion_of_its_own(height_share, heading, speed, camera_height_m):
+    height_m = height_share * camera_height_m
+    lean = height_m / (camera_height_m - height_m)
+    foot, way = np.array([3.0, -2.0]), speed * np.array([np.cos(heading), np.sin(heading)])
+    cameras = [way * t for t in np.arange(6) / 5]
+    moved = motion([point(i / 5, foot + (foot - camera) * lean, camera) for i, camera in enumerate(cameras)])
+    assert moved.path_m < 1e-6 and moved.error_m < 1e-6
+    assert np.allclose(moved.velocity_m_s, -lean * way)
+
+
+@settings(max_examples=30)
+@given(st.floats(-3, 3), st.floats(0.5, 3), st.floats(1, 8))
+def test_motion_across_the_drones_way_counts_in_full(along, across, speed):
+    moved = motion([point(t, (along * t, across * t), (speed * t, 0)) for t in (0.0, 0.2, 0.4, 0.8)])
+    assert abs(moved.own_m_s[1] - across) < 1e-9
+    assert moved.path_m >= 0.8 * across - 1e-9
+
+
+def test_settings_are_checked():
+    with pytest.raises(SettingsError):
+        MovingSettings(least_views=2)
+    with pytest.raises(SettingsError):
+        MovingSettings(forget_s=0)
