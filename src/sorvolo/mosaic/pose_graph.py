@@ -11,7 +11,8 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import fit_similarity, pose_from_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
-from sorvolo.mosaic.bundle import SHARED, Nodes, Pairs, Solution, linearise, rotation_vector, solve
+from sorvolo.mosaic.bundle import SHARED, Nodes, Solution, linearise, rotation_vector, solve
+from sorvolo.mosaic.graph_rows import LinkRows, NodeRows
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
 
@@ -19,7 +20,6 @@ _ENOUGH = 8  # frames from which telemetry's own errors are learnt
 _OFFSET_GROUPS = ((2,), (5, 6), (7,))  # of SHARED: altitude's zero, tilt, heading; judged together
 _OFFSETS = tuple(k for group in _OFFSET_GROUPS for k in group)
 _AT_WORD = np.array([np.inf, np.inf, 0.1, np.inf, np.inf, 0.002, 0.002, 0.003])  # sigma of an offset not believed in
-_UNKNOWN_SIGMA_M = 1e6  # stands in for an infinite sigma; its weight is nothing, its arithmetic finite
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,6 @@ class _Trust:
 @dataclass(eq=False)
 class _Node:
     camera: Camera
-    prior: CameraPrior
     own: bool
     reported_m: PointsM
 
@@ -79,15 +78,10 @@ class PoseGraph:
     def __init__(self, settings: PoseGraphSettings = PoseGraphSettings()) -> None:
         self._settings = settings
         self._ids: dict[int, int] = {}
+        self._names: list[int] = []
         self._nodes: list[_Node] = []
-        self._rotations = np.zeros((0, 3, 3))
-        self._centres_m = np.zeros((0, 3))
-        self._links: list[Link] = []
-        self._old: list[int] = []
-        self._new: list[int] = []
-        self._padded: list[tuple[Floats, Floats, Floats]] = []
-        self._sigma_px: list[float] = []
-        self._relief_m: list[float] = []
+        self._rows = NodeRows()
+        self._links = LinkRows(settings.pairs_per_link, settings.independent_pairs)
         self._shared = np.zeros(len(SHARED))
         self._dropped = 0
         self._solved_at = 0
@@ -103,7 +97,7 @@ class PoseGraph:
     def pose(self, keyframe_id: int) -> Pose:
         """site_from_camera as it stands now."""
         at = self._ids[keyframe_id]
-        return Pose(self._rotations[at], self._centres_m[at])
+        return Pose(self._rows.rotations[at].copy(), self._rows.centres_m[at].copy())
 
     def camera(self, keyframe_id: int) -> Camera:
         """The keyframe's registration camera with the focal length and radial distortion found so far."""
@@ -131,36 +125,34 @@ class PoseGraph:
 
     def centres_m(self, keyframe_ids: Sequence[int]) -> PointsM:
         """(N, 3) camera positions."""
-        return self._centres_m[[self._ids[each] for each in keyframe_ids]].reshape(-1, 3)
+        return self._rows.centres_m[[self._ids[each] for each in keyframe_ids]].reshape(-1, 3)
 
     def axes(self, keyframe_ids: Sequence[int]) -> PointsM:
         """(N, 3) unit vectors that the cameras look along."""
-        return self._rotations[[self._ids[each] for each in keyframe_ids], :, 2].reshape(-1, 3)
+        return self._rows.rotations[[self._ids[each] for each in keyframe_ids], :, 2].reshape(-1, 3)
 
     def ids(self) -> list[int]:
         """All keyframes in the order of their coming."""
-        return list(self._ids)
+        return list(self._names)
 
     def neighbours(self, keyframe_id: int) -> list[int]:
         """The keyframes that links tie to this one."""
-        at, names = self._ids[keyframe_id], list(self._ids)
-        return [
-            names[old if new == at else new]
-            for old, new in zip(self._old, self._new, strict=True) if at in (old, new)
-        ]
+        at, old, new = self._ids[keyframe_id], self._links.old, self._links.new
+        theirs = np.flatnonzero((old == at) | (new == at))
+        return [self._names[int(old[k] if new[k] == at else new[k])] for k in theirs]
 
     def add_known(self, keyframe_id: int, camera: Camera, site_from_camera: Pose) -> None:
         """A keyframe of the known map: it ties others down and never moves."""
         prior = CameraPrior(
             site_from_camera.translation_m, np.full(3, np.inf), site_from_camera.rotation, np.full(3, np.inf)
         )
-        self._append(keyframe_id, _Node(camera, prior, False, np.zeros((4, 2))), site_from_camera)
+        self._append(keyframe_id, _Node(camera, False, np.zeros((4, 2))), prior, site_from_camera)
 
     def add(
         self, keyframe_id: int, camera: Camera, prior: CameraPrior, links: Sequence[Link], guess: Pose
     ) -> frozenset[int]:
         """Tie a new keyframe to the graph by its links (`new_id` is this one), starting from `guess`."""
-        self._append(keyframe_id, _Node(camera, prior, True, np.full((4, 2), np.inf)), guess)
+        self._append(keyframe_id, _Node(camera, True, np.full((4, 2), np.inf)), prior, guess)
         for each in links:
             self._append_link(each)
         free = np.zeros(len(self._nodes), bool)
@@ -185,7 +177,7 @@ class PoseGraph:
     def retime(self, priors: Mapping[int, CameraPrior]) -> frozenset[int]:
         """Replace what telemetry says of some keyframes (another clock offset) and solve again."""
         for keyframe_id, prior in priors.items():
-            self._nodes[self._ids[keyframe_id]].prior = prior
+            self._rows.set_prior(self._ids[keyframe_id], prior)
         return self.conclude()
 
     def conclude(self) -> frozenset[int]:
@@ -207,25 +199,24 @@ class PoseGraph:
         rms = np.array([value for value in self.residuals_px().values() if np.isfinite(value)])
         return GraphReport(
             float(np.exp(self._shared[0])), sigma, float(self._shared[1]), float(self._shared[2]), len(self._links),
-            self._dropped, float(np.median(self._relief_m)) if self._relief_m else 0.0,
+            self._dropped, float(np.median(self._links.relief_m)) if len(self._links) else 0.0,
             float(np.sqrt(np.mean(rms**2))) if len(rms) else float("nan"),
         )
 
     def residuals_px(self) -> dict[int, float]:
         """Each keyframe's median transfer residual over its links, px at registration size; NaN without links."""
         result = dict.fromkeys(self._ids, float("nan"))
-        if not self._links:
+        if not len(self._links):
             return result
-        pairs = self._pairs()
+        pairs = self._links.pairs()
         miss = np.linalg.norm(linearise(self._state(), pairs, self._shared).residual_px, axis=-1)
         miss[pairs.weight <= 0] = np.nan
-        names = list(self._ids)
         gathered: dict[int, list[Floats]] = {}
-        for row, (old, new) in enumerate(zip(self._old, self._new, strict=True)):
-            gathered.setdefault(old, []).append(miss[row])
-            gathered.setdefault(new, []).append(miss[row])
+        for row, ends in enumerate(zip(pairs.old.tolist(), pairs.new.tolist(), strict=True)):
+            for at in ends:
+                gathered.setdefault(at, []).append(miss[row])
         for at, rows in gathered.items():
-            result[names[at]] = float(np.nanmedian(np.concatenate(rows)))
+            result[self._names[at]] = float(np.nanmedian(np.concatenate(rows)))
         return result
 
     def sigmas_m(self) -> dict[int, float]:
@@ -248,8 +239,7 @@ class PoseGraph:
             for k, (start, block) in enumerate(blocks)
         ]
         every = np.interp(index, sample, found) if len(sample) else np.zeros(0)
-        names = list(self._ids)
-        return {names[at]: float(value) for at, value in zip(index, every, strict=True)}
+        return {self._names[at]: float(value) for at, value in zip(index, every, strict=True)}
 
     def common_sigma_m(self) -> float:
         """What all fixes of the flight err in common, per axis, m; 0 without fixes.
@@ -257,89 +247,48 @@ class PoseGraph:
         A receiver's errors repeat for minutes, so a map made from a hundred fixes is hardly better placed than one
         fix: seven tenths of a fix's sigma, or of the scatter that the pictures found if that is larger.
         """
-        stated_m = self._stated_sigmas()[0][self._own(), 0]
+        stated_m = self._rows.stated_sigma_m[self._own(), 0]
         stated_m = stated_m[np.isfinite(stated_m)]
         fixes = self._own().any() and len(stated_m) >= 2
         return float(0.7 * np.median(stated_m) * max(1.0, self._trust.place[0])) if fixes else 0.0
 
     def gps_residuals_m(self) -> dict[int, Floats]:
         """Own keyframes' camera position minus what telemetry said, (3,) east, north, up; NaN where it said nothing."""
-        names = list(self._ids)
-        result = {}
-        for at in np.flatnonzero(self._own()):
-            prior = self._nodes[at].prior
-            miss = self._centres_m[at] + self._shared[[3, 4, 2]] - prior.position_m
-            result[names[at]] = np.where(np.isfinite(prior.position_sigma_m), miss, np.nan)
-        return result
+        miss_m = np.where(np.isfinite(self._rows.stated_sigma_m), self._gps_miss_m(), np.nan)
+        return {self._names[at]: miss_m[at] for at in np.flatnonzero(self._own())}
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
-    def _append(self, keyframe_id: int, node: _Node, pose: Pose) -> None:
+    def _append(self, keyframe_id: int, node: _Node, prior: CameraPrior, pose: Pose) -> None:
         self._ids[keyframe_id] = len(self._nodes)
+        self._names.append(keyframe_id)
         self._nodes.append(node)
-        self._rotations = np.concatenate([self._rotations, pose.rotation[None]])
-        self._centres_m = np.concatenate([self._centres_m, pose.translation_m[None]])
+        self._rows.append(prior, pose, own=node.own)
 
     def _append_link(self, each: Link) -> None:
-        count = self._settings.pairs_per_link
-        old, new = self._nodes[self._ids[each.old_id]].camera, self._nodes[self._ids[each.new_id]].camera
-        pick = np.arange(len(each.new_px))
-        if len(pick) > count:
-            pick = np.linspace(0, len(pick) - 1, count).round().astype(int)
-        ideal = np.zeros((2, count, 2))
-        ideal[0, :len(pick)] = _ideal(old, each.old_px[pick])
-        ideal[1, :len(pick)] = _ideal(new, each.new_px[pick])
-        weight = np.zeros(count)
-        weight[:len(pick)] = min(1.0, self._settings.independent_pairs / len(pick))
-        self._links.append(each)
-        self._old.append(self._ids[each.old_id])
-        self._new.append(self._ids[each.new_id])
-        self._padded.append((ideal[0], ideal[1], weight))
-        self._sigma_px.append(max(self._settings.sigma_px, each.sigma_px))
-        self._relief_m.append(float(np.median(self._relief_m)) if self._relief_m else 0.1)
+        old, new = self._ids[each.old_id], self._ids[each.new_id]
+        self._links.append(
+            each, (old, self._nodes[old].camera), (new, self._nodes[new].camera),
+            max(self._settings.sigma_px, each.sigma_px),
+        )
 
     def _own(self) -> Anything:
-        return np.array([node.own for node in self._nodes], bool)
+        return self._rows.own
 
     def _state(self) -> Nodes:
-        sigma_m, sigma_rad = self._stated_sigmas()
-        sigma_m = sigma_m * self._trust.place
-        sigma_rad = sigma_rad * self._trust.attitude
-        if len(self._trust.contradicted):
-            sigma_rad[self._trust.contradicted] = np.inf
-        return Nodes(
-            self._rotations, self._centres_m,
-            np.array([node.prior.position_m for node in self._nodes]),
-            np.where(np.isfinite(sigma_m), np.maximum(sigma_m, 1e-3), _UNKNOWN_SIGMA_M),
-            np.array([node.prior.rotation for node in self._nodes]),
-            np.where(np.isfinite(sigma_rad), np.maximum(sigma_rad, 1e-4), _UNKNOWN_SIGMA_M),
-            self._own(),
-        )
+        return self._rows.nodes(self._trust.place, self._trust.attitude, self._trust.contradicted)
 
-    def _stated_sigmas(self) -> tuple[Floats, Floats]:
-        """(N, 3) m and (N, 3) rad as telemetry states them."""
-        sigma_m = np.array([node.prior.position_sigma_m for node in self._nodes])
-        return sigma_m, np.radians([node.prior.attitude_sigma_deg for node in self._nodes])
-
-    def _pairs(self) -> Pairs:
-        if not self._links:
-            none = np.zeros(0, int)
-            return Pairs(none, none, np.zeros((0, 1, 2)), np.zeros((0, 1, 2)), np.zeros((0, 1)), none, none, none)
-        old, new, weight = (np.stack(column) for column in zip(*self._padded, strict=True))
-        focal = np.array([self._nodes[at].camera.fx_px for at in self._new])
-        return Pairs(
-            np.array(self._old), np.array(self._new), old, new, weight, focal, np.array(self._sigma_px),
-            np.array(self._relief_m),
-        )
+    def _gps_miss_m(self) -> Floats:
+        return self._rows.centres_m + self._shared[[3, 4, 2]] - self._rows.prior_centres_m
 
     def _solve(self, free: Anything, *, shared: bool, iterations: int) -> Solution:
-        pairs = self._pairs()
+        pairs = self._links.pairs()
         if len(pairs.old):
             pairs = pairs.of(free[pairs.old] | free[pairs.new])
         sigma = self._shared_sigma() if shared else np.zeros(len(SHARED))
         solution = solve(self._state(), pairs, self._shared, sigma, free, iterations)
         if iterations:
-            self._rotations, self._centres_m = solution.nodes.rotations, solution.nodes.centres_m
+            self._rows.rotations[:], self._rows.centres_m[:] = solution.nodes.rotations, solution.nodes.centres_m
             self._shared = solution.shared
         return solution
 
@@ -386,12 +335,12 @@ class PoseGraph:
     def _align(self) -> None:
         """Bring the whole map to its GPS fixes by a similarity where it is far off: the solve only bends a little."""
         own = self._own()
-        sigma = np.array([node.prior.position_sigma_m[:2].max() for node in self._nodes])
+        sigma = self._rows.stated_sigma_m[:, :2].max(axis=1)
         usable = own & np.isfinite(sigma)
         if usable.sum() < 3 or not own.all():
             return
-        fixes = np.array([node.prior.position_m for node in self._nodes])[usable, :2]
-        places = self._centres_m[usable, :2]
+        fixes = self._rows.prior_centres_m[usable, :2]
+        places = self._rows.centres_m[usable, :2]
         for _ in range(3):  # trimmed: a few wild fixes must not turn the map
             spread = float(np.sqrt(((fixes - fixes.mean(0)) ** 2).sum(1).mean()))
             uncertainty = float(np.median(sigma[usable])) / (np.sqrt(len(fixes)) * max(spread, 1e-9))
@@ -408,16 +357,15 @@ class PoseGraph:
         if abs(np.log(scale)) < max(3 * uncertainty, 0.02) and abs(turn) < max(3 * uncertainty, 0.03):
             return
         matrix = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]])
-        self._rotations = matrix @ self._rotations
-        self._centres_m = np.column_stack([
-            self._centres_m[:, :2] @ change[:2, :2].T + change[:2, 2], self._centres_m[:, 2] * scale
-        ])
+        centres_m = self._rows.centres_m
+        self._rows.rotations[:] = matrix @ self._rows.rotations
+        centres_m[:] = np.column_stack([centres_m[:, :2] @ change[:2, :2].T + change[:2, 2], centres_m[:, 2] * scale])
 
     def _weigh_links(self) -> None:
         """Learn each link's noise across the parallax and the relief along it; drop links that cannot be true."""
-        if not self._links:
+        if not len(self._links):
             return
-        pairs = self._pairs()
+        pairs = self._links.pairs()
         line = linearise(self._state(), pairs, self._shared)
         length = np.linalg.norm(line.parallax, axis=-1)
         along = line.parallax / np.maximum(length, 1e-9)[..., None]
@@ -430,14 +378,13 @@ class PoseGraph:
             reach = np.nanmedian(np.where(unused, np.nan, length), axis=1)
         relief = np.sqrt(np.maximum(sigma_along**2 - sigma_across**2, 0)) / np.maximum(reach, 1e-6)
         overall = float(np.median(relief))
-        self._relief_m = list(np.clip(np.sqrt(0.5 * (relief**2 + overall**2)), 0.0, 5.0))
-        self._sigma_px = list(np.clip(sigma_across, self._settings.sigma_px, 5.0))
+        self._links.relief_m[:] = np.clip(np.sqrt(0.5 * (relief**2 + overall**2)), 0.0, 5.0)
+        self._links.sigma_px[:] = np.clip(sigma_across, self._settings.sigma_px, 5.0)
         typical = float(np.median(sigma_across))
         false = sigma_across > max(6.0, 8 * typical)
         if false.any():
             self._dropped += int(false.sum())
-            for name in ("_links", "_old", "_new", "_padded", "_sigma_px", "_relief_m"):
-                setattr(self, name, [each for each, bad in zip(getattr(self, name), false, strict=True) if not bad])
+            self._links.keep(~false)
 
     def _weigh_telemetry(self) -> None:
         """Learn how good telemetry really is from how it departs from the pictures, once there are enough of them.
@@ -446,16 +393,15 @@ class PoseGraph:
         are plainly wrong are left out one by one.
         """
         tied = np.zeros(len(self._nodes), bool)
-        tied[[*self._old, *self._new]] = True
+        tied[self._links.old] = tied[self._links.new] = True
         tied &= self._own()
-        stated_m, stated_rad = self._stated_sigmas()
-        prior_rotations = np.array([node.prior.rotation for node in self._nodes])
-        error_rad = rotation_vector(prior_rotations.transpose(0, 2, 1) @ self._rotations)
+        stated_m, stated_rad = self._rows.stated_sigma_m, self._rows.stated_sigma_rad
+        error_rad = rotation_vector(self._rows.prior_rotations.transpose(0, 2, 1) @ self._rows.rotations)
         size = np.linalg.norm(error_rad, axis=1)
         angled = np.isfinite(stated_rad[:, 2])
         contradicted = np.flatnonzero(tied & angled & (size > np.maximum(5 * stated_rad.max(axis=1), np.radians(15))))
         place, attitude = np.ones(3), np.ones(3)
-        miss_m = self._centres_m + self._shared[[3, 4, 2]] - np.array([n.prior.position_m for n in self._nodes])
+        miss_m = self._gps_miss_m()
         fixed = tied & np.isfinite(stated_m[:, 0])
         if fixed.sum() >= _ENOUGH:
             ratio = np.linalg.norm(miss_m[fixed, :2], axis=1) / stated_m[fixed, 0] / 1.1774
@@ -473,26 +419,25 @@ class PoseGraph:
         self._trust = _Trust(place, attitude, contradicted)
 
     def _moved(self, candidates: Iterable[int]) -> frozenset[int]:
-        names = list(self._ids)
         moved = set()
         for at in candidates:
             node = self._nodes[at]
             camera = self.refined(node.camera)
-            outline = footprint(camera, Pose(self._rotations[at], self._centres_m[at]))
-            m_per_px = max(self._centres_m[at, 2], 1e-6) / camera.fx_px
+            outline = footprint(camera, Pose(self._rows.rotations[at].copy(), self._rows.centres_m[at].copy()))
+            m_per_px = max(self._rows.centres_m[at, 2], 1e-6) / camera.fx_px
             if not np.nanmax(np.abs(outline - node.reported_m), initial=0.0) <= 0.5 * m_per_px:
                 node.reported_m = outline
-                moved.add(names[at])
+                moved.add(self._names[at])
         return frozenset(moved)
 
     def _ground_centre_jacobian(self, at: int) -> Floats:
         """(2, 6) how the ground point at the image's centre moves with the camera's turn and shift."""
-        ray = self._rotations[at][:, 2]
+        ray = self._rows.rotations[at][:, 2]
         slope = ray / min(ray[2], -1e-3)
         flat = np.eye(3)
         flat[:, 2] -= slope
         cross = np.array([[0, -ray[2], ray[1]], [ray[2], 0, -ray[0]], [-ray[1], ray[0], 0]])
-        turn = -self._centres_m[at, 2] / min(ray[2], -1e-3) * flat @ -cross
+        turn = -self._rows.centres_m[at, 2] / min(ray[2], -1e-3) * flat @ -cross
         return np.concatenate([turn, flat], axis=1)[:2]
 
 
@@ -501,10 +446,6 @@ def pose_from_link(each: Link, new: Camera, old: Camera, site_from_old: Pose) ->
     site_from_new = site_from_image_homography(old, site_from_old) @ np.linalg.inv(each.new_from_old)
     centre = site_from_new @ np.array([new.cx_px, new.cy_px, 1.0])
     return pose_from_homography(site_from_new * np.sign(centre[2]), new)
-
-
-def _ideal(camera: Camera, points_px: Floats) -> Floats:
-    return (points_px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
 
 
 def _solve_sparse(normal: Anything, right: Floats) -> Floats:

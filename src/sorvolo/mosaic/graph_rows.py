@@ -1,0 +1,178 @@
+"""The pose graph's keyframes and links as arrays that stay stacked while they grow, as the solver wants them."""
+
+from typing import Any
+
+import numpy as np
+
+from sorvolo.geometry.arrays import Anything, Floats
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.pose import Pose
+from sorvolo.mosaic.bundle import Nodes, Pairs
+from sorvolo.survey.flight import CameraPrior
+from sorvolo.survey.mosaic import Link
+
+_UNKNOWN_SIGMA_M = 1e6  # stands in for an infinite sigma; its weight is nothing, its arithmetic finite
+_FIRST_ROOM = 16
+
+
+class _Rows:
+    """Equally long columns, each (N, ...); appending costs the same however long they are."""
+
+    def __init__(self, **shapes: tuple[type, tuple[int, ...]]) -> None:
+        self._columns: dict[str, Anything] = {
+            name: np.zeros((_FIRST_ROOM, *shape), dtype) for name, (dtype, shape) in shapes.items()
+        }
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def column(self, name: str) -> Anything:
+        """(N, ...) a view, good until the next `append` or `keep`."""
+        return self._columns[name][:self._count]
+
+    def append(self, **row: Any) -> None:
+        """One value for each column."""
+        if self._count == len(next(iter(self._columns.values()))):
+            self._columns = {name: np.concatenate([each, np.zeros_like(each)]) for name, each in self._columns.items()}
+        for name, value in row.items():
+            self._columns[name][self._count] = value
+        self._count += 1
+
+    def keep(self, chosen: Anything) -> None:
+        """Drop the rows where `chosen` (N,) is False."""
+        count = int(np.sum(chosen))
+        for each in self._columns.values():
+            each[:count] = each[:self._count][chosen]
+        self._count = count
+
+
+class NodeRows:
+    """Where each keyframe stands and what telemetry says of it; rows are views and may be written to."""
+
+    def __init__(self) -> None:
+        self._rows = _Rows(
+            rotations=(float, (3, 3)), centres_m=(float, (3,)), prior_centres_m=(float, (3,)),
+            prior_sigma_m=(float, (3,)), prior_rotations=(float, (3, 3)), prior_sigma_rad=(float, (3,)), own=(bool, ()),
+        )
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def rotations(self) -> Floats:
+        """(N, 3, 3) site_from_camera."""
+        return self._rows.column("rotations")
+
+    @property
+    def centres_m(self) -> Floats:
+        """(N, 3)."""
+        return self._rows.column("centres_m")
+
+    @property
+    def prior_centres_m(self) -> Floats:
+        """(N, 3) by telemetry."""
+        return self._rows.column("prior_centres_m")
+
+    @property
+    def prior_rotations(self) -> Floats:
+        """(N, 3, 3) by telemetry."""
+        return self._rows.column("prior_rotations")
+
+    @property
+    def stated_sigma_m(self) -> Floats:
+        """(N, 3) as telemetry states it, infinite: not known."""
+        return self._rows.column("prior_sigma_m")
+
+    @property
+    def stated_sigma_rad(self) -> Floats:
+        """(N, 3) about the camera's own axes, infinite: not known."""
+        return self._rows.column("prior_sigma_rad")
+
+    @property
+    def own(self) -> Anything:
+        """(N,) bool: of the flight that is mapped."""
+        return self._rows.column("own")
+
+    def append(self, prior: CameraPrior, pose: Pose, *, own: bool) -> None:
+        """A keyframe more, at `pose` for now."""
+        self._rows.append(rotations=pose.rotation, centres_m=pose.translation_m, own=own)
+        self.set_prior(len(self) - 1, prior)
+
+    def set_prior(self, at: int, prior: CameraPrior) -> None:
+        """What telemetry says of a keyframe."""
+        self.prior_centres_m[at], self.stated_sigma_m[at] = prior.position_m, prior.position_sigma_m
+        self.prior_rotations[at], self.stated_sigma_rad[at] = prior.rotation, np.radians(prior.attitude_sigma_deg)
+
+    def nodes(self, place: Floats, attitude: Floats, contradicted: Anything) -> Nodes:
+        """For the solver: stated sigmas times `place` and `attitude`, (3,) each, no angles where contradicted."""
+        sigma_m, sigma_rad = self.stated_sigma_m * place, self.stated_sigma_rad * attitude
+        sigma_rad[contradicted] = np.inf
+        return Nodes(
+            self.rotations, self.centres_m, self.prior_centres_m,
+            np.where(np.isfinite(sigma_m), np.maximum(sigma_m, 1e-3), _UNKNOWN_SIGMA_M),
+            self.prior_rotations, np.where(np.isfinite(sigma_rad), np.maximum(sigma_rad, 1e-4), _UNKNOWN_SIGMA_M),
+            self.own,
+        )
+
+
+class LinkRows:
+    """The links' matched points, each link's padded to the same number."""
+
+    def __init__(self, pairs_per_link: int, independent_pairs: float) -> None:
+        self._count, self._independent = pairs_per_link, independent_pairs
+        self._rows = _Rows(
+            old=(int, ()), new=(int, ()), old_ideal=(float, (pairs_per_link, 2)),
+            new_ideal=(float, (pairs_per_link, 2)), weight=(float, (pairs_per_link,)), focal_px=(float, ()),
+            sigma_px=(float, ()), relief_m=(float, ()),
+        )
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def old(self) -> Anything:
+        """(L,) node index."""
+        return self._rows.column("old")
+
+    @property
+    def new(self) -> Anything:
+        """(L,) node index."""
+        return self._rows.column("new")
+
+    @property
+    def relief_m(self) -> Floats:
+        """(L,) height of things above the ground."""
+        return self._rows.column("relief_m")
+
+    @property
+    def sigma_px(self) -> Floats:
+        """(L,) across the parallax."""
+        return self._rows.column("sigma_px")
+
+    def append(self, each: Link, old: tuple[int, Camera], new: tuple[int, Camera], sigma_px: float) -> None:
+        """A link more, between two nodes and their registration cameras; its relief is that of the others."""
+        pick = np.arange(len(each.new_px))
+        if len(pick) > self._count:
+            pick = np.linspace(0, len(pick) - 1, self._count).round().astype(int)
+        old_ideal, new_ideal, weight = np.zeros((self._count, 2)), np.zeros((self._count, 2)), np.zeros(self._count)
+        old_ideal[:len(pick)] = _ideal(old[1], each.old_px[pick])
+        new_ideal[:len(pick)] = _ideal(new[1], each.new_px[pick])
+        weight[:len(pick)] = min(1.0, self._independent / len(pick))
+        self._rows.append(
+            old=old[0], new=new[0], old_ideal=old_ideal, new_ideal=new_ideal, weight=weight, focal_px=new[1].fx_px,
+            sigma_px=sigma_px, relief_m=float(np.median(self.relief_m)) if len(self) else 0.1,
+        )
+
+    def keep(self, chosen: Anything) -> None:
+        """Drop the links where `chosen` (L,) is False."""
+        self._rows.keep(chosen)
+
+    def pairs(self) -> Pairs:
+        """For the solver; views."""
+        names = ("old", "new", "old_ideal", "new_ideal", "weight", "focal_px", "sigma_px", "relief_m")
+        return Pairs(*(self._rows.column(name) for name in names))
+
+
+def _ideal(camera: Camera, points_px: Floats) -> Floats:
+    return (points_px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
