@@ -18,7 +18,7 @@ from sorvolo.change.robust import RobustSettings, examine
 from sorvolo.simulation.ground import GroundKind
 
 TARGET = Path(__file__).parents[1] / "src" / "sorvolo" / "change" / "blob_check.json"
-SPLIT, SEED = "train", 9000
+SPLIT, SEED, EACH = "train", 9000, 20
 TREES, DEPTH, RATE, BINS = 200, 4, 0.1, 48
 
 
@@ -34,15 +34,15 @@ def main() -> None:
     is_real = bool(places)
     places += [Ground("procedural", f"{kind.value} {500 + n}") for kind in GroundKind for n in range(3)]
     names = [name for name in SUITES if is_real or name != "real"]
-    tasks = [(name, SEED + part, 20, places) for name in names for part in range(-(-options.count // 20))]
+    tasks = [(name, SEED + part, EACH, places) for name in names for part in range(-(-options.count // EACH))]
     with ProcessPoolExecutor(options.jobs) as pool:
         collected = list(pool.map(collect, *zip(*tasks)))
     rows = np.concatenate([rows for rows, _ in collected])
     answers = np.concatenate([answers for _, answers in collected])
     trees = train(rows, answers)
-    print(f"{len(rows)} regions, {int(answers.sum())} of them changes, from {len(tasks) * 20} pairs")
+    print(f"{len(rows)} regions, {int(answers.sum())} of them changes, from {len(tasks) * EACH} pairs")
     trees["trained"] = {
-        "regions": len(rows), "changes": int(answers.sum()), "pairs": len(tasks) * 20, "seed": SEED,
+        "regions": len(rows), "changes": int(answers.sum()), "pairs": len(tasks) * EACH, "seed": SEED,
         "sources": sorted({each.source for each in places}), "command": f"train_blob_check.py --count {options.count}",
     }
     options.output.write_text(json.dumps(trees) + "\n")

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Anything, Floats, Mask
-from sorvolo.kernels import match_regions, measure_regions
+from sorvolo.kernels import core_regions, match_regions, measure_regions
 
 RING_PX = 4
 SPECK_PX = 9
@@ -21,7 +21,7 @@ FEATURES = (
     "difference over activity", "difference over noise", "ratio", "ratio step", "ratio spread", "ratio spread outside",
     "edges after", "edges before", "edges outside", "edge contrast", "detail difference", "detail outside",
     "alike in place", "alike best", "alike gain", "match length", "match rest", "match gain", "level", "activity",
-    "came", "noise", "rest", "unevenness", "regions",
+    "came", "colour step", "colour spread", "noise", "rest", "unevenness", "regions",
 )
 
 _LOG = np.clip(np.rint(np.log2((np.arange(256) + 8) / 8) * 50), 0, 255).astype(np.uint8)
@@ -71,18 +71,28 @@ def find_regions(
     # a large thing's inside is no clutter: only what is small among the differences raises the thresholds around it
     window = np.ones((SPECK_PX, SPECK_PX), np.uint8)
     specks = cv2.subtract(difference, cv2.morphologyEx(difference, cv2.MORPH_OPEN, window))
-    noise = float(np.quantile(specks[::4, ::4], 0.95))
+    counts = np.bincount(specks[::4, ::4].ravel(), minlength=256).cumsum()
+    noise = float(np.searchsorted(counts, 0.95 * counts[-1]))
     smooth = cv2.blur(difference, (3, 3))
     activity = cv2.blur(cv2.threshold(specks, MOST_SPECK, MOST_SPECK, cv2.THRESH_TRUNC)[1], (41, 41))
     base = settings.least_difference + settings.noise_factor * noise
     threshold = cv2.addWeighted(activity, settings.activity_factor, activity, 0.0, base)
     weak = np.asarray(cv2.compare(smooth, threshold, cv2.CMP_GT), np.uint8)
-    labels, boxes = _label(smooth, weak, threshold, settings)
+    labels, boxes = core_regions(
+        np.asarray(smooth, np.uint8), np.asarray(threshold, np.uint8), settings.strong_factor, settings.core,
+        settings.least_area_px, MOST_REGIONS,
+    )
     if len(boxes) == 0:
         return Regions(labels, boxes, np.zeros((0, len(FEATURES))), weak, noise)
-    logs = [cv2.LUT(np.ascontiguousarray(each[..., 0]), _LOG) for each in (before, after)]
+    logs = [cv2.LUT(cv2.extractChannel(each, 0), _LOG) for each in (before, after)]
+    # a shadow takes from all colours alike: red over blue stays
+    reds, blues = ([cv2.LUT(cv2.extractChannel(each, band), _LOG) for each in (reference, query)] for band in (2, 0))
+    tint = cv2.addWeighted(
+        cv2.addWeighted(reds[1], 0.25, reds[0], -0.25, 64.0), 1.0,
+        cv2.addWeighted(blues[1], -0.25, blues[0], 0.25, 64.0), 1.0, 0.0,
+    )
     frame = np.array([noise, rest_px, unevenness, np.log1p(len(boxes))])
-    channels = [difference, chroma, activity, after[..., 0], came, went, *logs]
+    channels = [difference, chroma, activity, cv2.extractChannel(after, 0), came, went, tint, *logs]
     return Regions(labels, boxes, _measured(labels, boxes, channels, frame), weak, noise)
 
 
@@ -95,37 +105,10 @@ def _outside(values: Image, others: Image, settings: RegionSettings) -> tuple[Im
     return np.asarray(cv2.addWeighted(luma, 1.0, chroma, float(settings.chroma_weight), 0.0), np.uint8), chroma
 
 
-def _label(
-    smooth: Image, weak: Image, threshold: Image, settings: RegionSettings
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Connected parts over `weak` that are somewhere strong, each cut down to its core, largest differences first."""
-    count, labels, _, _ = cv2.connectedComponentsWithStats(weak, connectivity=8)
-    inside = np.flatnonzero(labels)
-    of, values = labels.ravel()[inside], smooth.ravel()[inside].astype(np.float64)
-    total = np.bincount(of, values, minlength=count)
-    height = np.bincount(of, values * values, minlength=count) / np.maximum(total, 1e-9)
-    strong = values > settings.strong_factor * threshold.ravel()[inside]
-    kept = (values > settings.core * height[of]) & (np.bincount(of[strong], minlength=count)[of] >= 2)
-    core = np.zeros(smooth.shape, np.uint8)
-    core.ravel()[inside[kept]] = 255
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(core, connectivity=8)
-    inside = np.flatnonzero(labels)
-    of = labels.ravel()[inside]
-    total = np.bincount(of, smooth.ravel()[inside], minlength=count)
-    total[stats[:, cv2.CC_STAT_AREA] < settings.least_area_px] = 0
-    order = np.argsort(-total[1:], kind="stable") + 1
-    order = order[total[order] > 0][:MOST_REGIONS]
-    renamed = np.zeros(count, np.int32)
-    renamed[order] = np.arange(1, len(order) + 1)
-    named = np.zeros(smooth.shape, np.int32)
-    named.ravel()[inside] = renamed[of]
-    return named, np.ascontiguousarray(stats[order, :4], np.int32)
-
-
 def _measured(
     labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: list[Image], frame: NDArray[np.float64]
 ) -> Floats:
-    difference, chroma, activity, level, came, went, log_before, log_after = channels
+    difference, chroma, activity, level, came, went, tint, log_before, log_after = channels
     detail_before, detail_after = _details(log_before), _details(log_after)
     window = np.ones((3, 3), np.uint8)
     ratio = cv2.addWeighted(log_after, 0.5, log_before, -0.5, 128)
@@ -133,16 +116,18 @@ def _measured(
     edges_before = cv2.morphologyEx(log_before, cv2.MORPH_GRADIENT, window)
     detail = cv2.absdiff(detail_after, detail_before)
     stack: Anything = cv2.merge(
-        [difference, chroma, activity, level, ratio, edges_after, edges_before, detail, came, went]
+        [difference, chroma, activity, level, ratio, edges_after, edges_before, detail, came, went, tint]
     )
     sums = measure_regions(labels, boxes, stack, RING_PX).astype(np.float64)
     count = np.maximum(sums[:, :, :1], 1)
-    means = sums[:, :, 1:11] / count
-    spreads = np.sqrt(np.maximum(sums[:, :, 11:] / count - means**2, 0))
+    means = sums[:, :, 1:12] / count
+    spreads = np.sqrt(np.maximum(sums[:, :, 12:] / count - means**2, 0))
     within, around = means[:, 0], means[:, 1]
+    reach = MATCH_REACH_PX
     matched = match_regions(
-        detail_after, np.pad(detail_before, MATCH_REACH_PX, mode="symmetric"),
-        _grown(boxes, labels.shape), MATCH_REACH_PX,
+        detail_after,
+        np.asarray(cv2.copyMakeBorder(detail_before, reach, reach, reach, reach, cv2.BORDER_REFLECT), np.uint8),
+        _grown(boxes, labels.shape), reach,
     )
     area, long, short = sums[:, 0, 0], boxes[:, 2:].max(axis=1), boxes[:, 2:].min(axis=1)
     difference_in, noise = within[:, 0], frame[0]
@@ -155,7 +140,7 @@ def _measured(
         (within[:, 5] - within[:, 6]) / (within[:, 5] + within[:, 6] + 4), within[:, 7], around[:, 7],
         matched[:, 0], matched[:, 1], matched[:, 1] - matched[:, 0], np.hypot(matched[:, 2], matched[:, 3]),
         matched[:, 5], matched[:, 5] / np.maximum(matched[:, 4], 1), within[:, 3], within[:, 2],
-        (within[:, 8] - within[:, 9]) / np.maximum(difference_in, 1),
+        (within[:, 8] - within[:, 9]) / np.maximum(difference_in, 1), within[:, 10] - around[:, 10], spreads[:, 0, 10],
     ]
     return np.column_stack(columns + [np.full(len(boxes), value) for value in frame])
 

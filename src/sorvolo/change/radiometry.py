@@ -16,7 +16,7 @@ Bgr = NDArray[np.uint8]
 BLACK_LEVEL = 8.0  # added before logarithms: below it a camera shows noise, not light
 CELL_PX = 8
 MEDIAN_CELLS = 5  # what is smaller than half of it cannot change the local gain
-LEAST_ALIKE, MOST_ALIKE = 0.2, 0.5  # correlation of details: the ground is another one, and surely the same
+LEAST_ALIKE, MOST_ALIKE = 0.25, 0.5  # correlation of details: the ground is another one, and surely the same
 FLAT = 6.0  # what noise leaves of the variance of details, in squared steps of the logarithm
 REACHES_CELLS = ((3, 1.0), (7, 0.1), (17, 0.01), (49, 1e-3))  # how far a cell's gain tells about its neighbours'
 STEPS_PER_OCTAVE = 48.0
@@ -59,8 +59,8 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     if sure.sum() < 16:
         return Light(np.ones(3), np.zeros(3), np.ones((*size[::-1], 3), np.float32), 0.0)
     window = (9, 9)
-    detail_before = (before - cv2.blur(before, window))[sure]
-    detail_after = (after - cv2.blur(after, window))[sure]
+    detail_before = (before - cv2.blur(before, window))[sure][::2]
+    detail_after = (after - cv2.blur(after, window))[sure][::2]
     exponents = np.array([_exponent(detail_before[:, channel], detail_after[:, channel]) for channel in range(3)])
     offset = after - exponents.astype(np.float32) * before
     offsets = np.median(offset[sure], axis=0)
@@ -89,11 +89,12 @@ def _sameness(reference: Bgr, query: Bgr, size: tuple[int, int]) -> NDArray[np.f
     fine = 4 * size[0], 4 * size[1]
     before, after = (_details(cv2.cvtColor(_smaller(each, fine), cv2.COLOR_BGR2GRAY)) for each in (reference, query))
     sums = [
-        cv2.blur(cv2.resize(product, size, interpolation=cv2.INTER_AREA), (3, 3))
+        cv2.blur(cv2.resize(product, size, interpolation=cv2.INTER_AREA), (5, 5))
         for product in (before * after, before * before, after * after)
     ]
     alike = sums[0] / np.sqrt((sums[1] + FLAT) * (sums[2] + FLAT))
-    return np.asarray(np.clip((alike - LEAST_ALIKE) / (MOST_ALIKE - LEAST_ALIKE), 0, 1), np.float32)
+    sure = np.clip((alike - LEAST_ALIKE) / (MOST_ALIKE - LEAST_ALIKE), 0, 1)
+    return np.asarray(cv2.erode(sure, np.ones((3, 3), np.uint8)), np.float32)
 
 
 def _details(gray: NDArray[Any]) -> NDArray[np.float32]:
@@ -123,7 +124,7 @@ def _exponent(before: NDArray[np.float32], after: NDArray[np.float32]) -> float:
     weights: Anything = np.ones_like(before)
     prior = 2e-4 * before.size
     slope = 1.0
-    for _ in range(5):
+    for _ in range(4):
         weighted = weights * before
         slope = float((weighted @ after + prior) / (weighted @ before + prior))
         rest = after - np.float32(slope) * before

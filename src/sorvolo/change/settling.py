@@ -11,7 +11,7 @@ from sorvolo.geometry.arrays import Anything, Mask, Matrix3
 
 LARGEST_PX = 6.0  # at the pictures' corners, in their own pixels; what says more has lost its way
 SMALLEST_PX = 0.12  # a resampling costs more than this is worth
-GRID = (32, 20)
+GRID = (28, 16)
 
 _LOG = np.clip(np.rint(np.log2((np.arange(256) + 8) / 8) * 50), 0, 255).astype(np.uint8)
 
@@ -73,7 +73,7 @@ def _near_homography(
     weights = trust.copy()
     solution = np.zeros(8)
     rest_px = np.zeros(len(x))
-    for _ in range(5):
+    for _ in range(4):
         normal = (rows_x * weights[:, None]).T @ rows_x + (rows_y * weights[:, None]).T @ rows_y
         right = (rows_x * weights[:, None]).T @ moves[:, 0] + (rows_y * weights[:, None]).T @ moves[:, 1]
         solution = np.linalg.solve(normal + 1e-4 * weights.sum() * np.diag([0, 0.01, 0.01, 0, 0.01, 0.01, 1, 1]), right)

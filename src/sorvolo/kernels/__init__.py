@@ -38,9 +38,7 @@ Bytes = NDArray[np.uint8]
 def equalising_tables(image: Bytes, known: Bytes | None = None, threads: int = 1) -> Bytes:
     """The tables (3, 256) that equalise an image's channels, (h, w, 3): see reference."""
     _check_image(image)
-    if known is not None and known.shape != image.shape[:2]:
-        raise ValueError(f"equalising_tables: known {known.shape} does not fit the image {image.shape}")
-    tables: Bytes = _thesis.equalising_tables(_bytes(image), None if known is None else _bytes(known), threads)
+    tables: Bytes = _thesis.equalising_tables(_bytes(image), _known(known, image), threads)
     return tables
 
 
@@ -81,7 +79,9 @@ def region_boxes(mask: Bytes) -> NDArray[np.int64]:
     return boxes
 
 
-def gray_histograms(image: Bytes, tables: Bytes, boxes: NDArray[np.int64]) -> NDArray[np.int64]:
+def gray_histograms(
+    image: Bytes, tables: Bytes, boxes: NDArray[np.int64], known: Bytes | None = None
+) -> NDArray[np.int64]:
     """The gray histograms (N, 256) of boxes of an equalised image: see reference."""
     _check_image(image)
     _check_tables(tables)
@@ -89,7 +89,9 @@ def gray_histograms(image: Bytes, tables: Bytes, boxes: NDArray[np.int64]) -> ND
     height, width = image.shape[:2]
     if (boxes < 0).any() or (boxes[:, :2] + boxes[:, 2:] > [width, height]).any():
         raise ValueError(f"gray_histograms: boxes outside of the {width} x {height} px image")
-    counts: NDArray[np.int64] = _thesis.gray_histograms(_bytes(image), _bytes(tables), boxes)
+    counts: NDArray[np.int64] = _thesis.gray_histograms(
+        _bytes(image), _bytes(tables), boxes, _known(known, image)
+    )
     return counts
 
 
@@ -105,6 +107,19 @@ def relight(image: NDArray[np.uint8], curves: NDArray[np.int32], gains: NDArray[
         np.ascontiguousarray(gains, np.uint16),
     )
     return lit
+
+
+def core_regions(
+    values: NDArray[np.uint8], thresholds: NDArray[np.uint8], strong: float, core: float, least_area: int, most: int
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Where values lie over thresholds, both (h, w), each part cut to its core: see reference_robust."""
+    if values.shape != thresholds.shape or values.ndim != 2:
+        raise ValueError(f"core_regions: values {values.shape} and thresholds {thresholds.shape} do not fit")
+    found: tuple[NDArray[np.int32], NDArray[np.int32]] = _robust.core_regions(
+        np.ascontiguousarray(values, np.uint8), np.ascontiguousarray(thresholds, np.uint8), strong, core,
+        least_area, most,
+    )
+    return found
 
 
 def measure_regions(
@@ -139,6 +154,12 @@ def match_regions(
 
 def _bytes(array: Bytes) -> Bytes:
     return np.ascontiguousarray(array, np.uint8)
+
+
+def _known(known: Bytes | None, image: Bytes) -> Bytes | None:
+    if known is not None and known.shape != image.shape[:2]:
+        raise ValueError(f"known {known.shape} does not fit the image {image.shape}")
+    return None if known is None else _bytes(known)
 
 
 def _check_image(image: Bytes) -> None:

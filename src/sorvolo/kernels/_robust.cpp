@@ -46,6 +46,86 @@ Bytes relight(const Bytes &image, const Integers32 &curves, const Words &gains) 
     return lit;
 }
 
+// Collects the 8-connected parts of `from`, where it is `wanted`, and hands each to `take`, in order of first pixels.
+template <typename Wanted, typename Take>
+void collect_parts(int width, int height, std::vector<std::uint8_t> &seen, Wanted wanted, Take take) {
+    std::vector<std::int32_t> part;
+    for (std::int32_t start = 0; start < width * height; ++start) {
+        if (seen[start] || !wanted(start)) continue;
+        part.assign(1, start);
+        seen[start] = 1;
+        for (std::size_t next = 0; next < part.size(); ++next) {
+            const int x = part[next] % width, y = part[next] / width;
+            for (int ny = std::max(y - 1, 0); ny <= std::min(y + 1, height - 1); ++ny) {
+                for (int nx = std::max(x - 1, 0); nx <= std::min(x + 1, width - 1); ++nx) {
+                    const std::int32_t near = ny * width + nx;
+                    if (seen[near] || !wanted(near)) continue;
+                    seen[near] = 1;
+                    part.push_back(near);
+                }
+            }
+        }
+        take(part);
+    }
+}
+
+struct Core {
+    std::int64_t total;
+    std::vector<std::int32_t> pixels;
+};
+
+pybind11::tuple core_regions(const Bytes &values, const Bytes &thresholds, double strong, double core, int least_area,
+                             int most) {
+    const int height = static_cast<int>(values.shape(0)), width = static_cast<int>(values.shape(1));
+    const std::uint8_t *value = values.data(), *threshold = thresholds.data();
+    Integers32 labels({values.shape(0), values.shape(1)});
+    std::int32_t *label = labels.mutable_data();
+    std::vector<Core> cores;
+    {
+        pybind11::gil_scoped_release released;
+        const std::int64_t pixels = static_cast<std::int64_t>(width) * height;
+        std::fill(label, label + pixels, 0);
+        std::vector<std::uint8_t> seen(pixels, 0), inside(pixels, 0), taken(pixels, 0);
+        std::vector<std::int32_t> kept;
+        const auto weak = [&](std::int32_t at) { return value[at] > threshold[at]; };
+        collect_parts(width, height, seen, weak, [&](const std::vector<std::int32_t> &part) {
+            std::int64_t total = 0, squares = 0;
+            int strong_ones = 0;
+            for (const std::int32_t at : part) {
+                total += value[at], squares += static_cast<std::int64_t>(value[at]) * value[at];
+                strong_ones += static_cast<double>(value[at]) > strong * threshold[at];
+            }
+            if (strong_ones < 2) return;
+            const double least = core * static_cast<double>(squares) / static_cast<double>(total);
+            for (const std::int32_t at : part)
+                if (static_cast<double>(value[at]) > least) inside[at] = 1;
+        });
+        collect_parts(width, height, taken, [&](std::int32_t at) { return inside[at] != 0; },
+                      [&](const std::vector<std::int32_t> &part) {
+                          if (static_cast<int>(part.size()) < least_area) return;
+                          std::int64_t total = 0;
+                          for (const std::int32_t at : part) total += value[at];
+                          cores.push_back({total, part});
+                      });
+        std::stable_sort(cores.begin(), cores.end(), [](const Core &a, const Core &b) { return a.total > b.total; });
+        if (static_cast<int>(cores.size()) > most) cores.resize(most);
+        for (std::size_t each = 0; each < cores.size(); ++each)
+            for (const std::int32_t at : cores[each].pixels) label[at] = static_cast<std::int32_t>(each) + 1;
+    }
+    Integers32 boxes({static_cast<pybind11::ssize_t>(cores.size()), pybind11::ssize_t(4)});
+    std::int32_t *box = boxes.mutable_data();
+    for (const Core &each : cores) {
+        int left = width, right = 0, top = height, bottom = 0;
+        for (const std::int32_t at : each.pixels) {
+            left = std::min(left, at % width), right = std::max(right, at % width);
+            top = std::min(top, at / width), bottom = std::max(bottom, at / width);
+        }
+        box[0] = left, box[1] = top, box[2] = right - left + 1, box[3] = bottom - top + 1;
+        box += 4;
+    }
+    return pybind11::make_tuple(labels, boxes);
+}
+
 Integers64 measure_regions(const Integers32 &labels, const Integers32 &boxes, const Bytes &channels, int margin) {
     const int height = static_cast<int>(labels.shape(0)), width = static_cast<int>(labels.shape(1));
     const int count = static_cast<int>(channels.shape(2)), fields = 2 * count + 1;
@@ -147,6 +227,8 @@ Doubles match_regions(const Bytes &query, const Bytes &reference, const Integers
 void bind_robust(pybind11::module_ &module) {
     using pybind11::arg;
     module.def("relight", &relight, arg("image").noconvert(), arg("curves").noconvert(), arg("gains").noconvert());
+    module.def("core_regions", &core_regions, arg("values").noconvert(), arg("thresholds").noconvert(), arg("strong"),
+               arg("core"), arg("least_area"), arg("most"));
     module.def("measure_regions", &measure_regions, arg("labels").noconvert(), arg("boxes").noconvert(),
                arg("channels").noconvert(), arg("margin"));
     module.def("match_regions", &match_regions, arg("query").noconvert(), arg("reference").noconvert(),

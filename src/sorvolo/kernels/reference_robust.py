@@ -16,6 +16,49 @@ def relight(
     return np.asarray(np.clip(((product + (1 << 15)) >> 16) - 8, 0, 255), np.uint8)
 
 
+def core_regions(
+    values: NDArray[np.uint8], thresholds: NDArray[np.uint8], strong: float, core: float, least_area: int, most: int
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Where `values` (h, w) lie over `thresholds` (h, w): labels (h, w), 0 none, and boxes (N, 4) x, y, w, h.
+
+    An 8-connected part with two pixels over `strong` times their thresholds counts; it keeps the pixels over `core`
+    times its own height (its sum of squares by its sum). What is then connected and has `least_area` pixels is a
+    region; the `most` largest sums of values are kept, largest first, equals in the order of their first pixels.
+    """
+    inside = np.zeros(values.shape, bool)
+    for part in _parts(values > thresholds):
+        held = values[part].astype(np.int64)
+        if np.count_nonzero(held > strong * thresholds[part]) >= 2:
+            least = core * float((held * held).sum()) / float(held.sum())
+            inside[part[0][held > least], part[1][held > least]] = True
+    cores = [part for part in _parts(inside) if len(part[0]) >= least_area]
+    cores = sorted(cores, key=lambda part: -int(values[part].astype(np.int64).sum()))[:most]
+    labels, boxes = np.zeros(values.shape, np.int32), np.zeros((len(cores), 4), np.int32)
+    for number, (y, x) in enumerate(cores):
+        labels[y, x] = number + 1
+        boxes[number] = x.min(), y.min(), x.max() - x.min() + 1, y.max() - y.min() + 1
+    return labels, boxes
+
+
+def _parts(mask: NDArray[np.bool_]) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """The 8-connected parts of a mask, rows and columns of each, in the order of their first pixels."""
+    left = mask.copy()
+    parts = []
+    for y, x in zip(*np.nonzero(mask), strict=True):
+        if not left[y, x]:
+            continue
+        left[y, x] = False
+        part = [(int(y), int(x))]
+        for row, column in part:
+            rows, columns = slice(max(row - 1, 0), row + 2), slice(max(column - 1, 0), column + 2)
+            near = [(rows.start + dy, columns.start + dx) for dy, dx in np.argwhere(left[rows, columns]).tolist()]
+            left[rows, columns] = False
+            part += near
+        found = np.array(sorted(part), np.int64)
+        parts.append((found[:, 0], found[:, 1]))
+    return parts
+
+
 def measure_regions(
     labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: NDArray[np.uint8], margin: int
 ) -> NDArray[np.int64]:
