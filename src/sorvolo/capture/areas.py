@@ -20,6 +20,7 @@ import numpy as np
 from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
+from sorvolo.capture.small_files import read_small_file, text_of
 from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
@@ -44,15 +45,10 @@ def read_area(path: Path) -> Area:
     Raises InputError for a file that is missing, empty, of another kind, without polygon or path, or whose
     coordinates are off the Earth, cross themselves or are not WGS84 longitude and latitude.
     """
-    raw = _read_bytes(path)
+    raw = read_small_file(path, "area file", _MOST_BYTES)
     if raw[:2] == b"PK":
         raw = _kml_in_kmz(path, raw)
-    try:
-        text = raw.decode("utf-8-sig").strip()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not an area file: neither GeoJSON, KML, KMZ nor text") from error
-    if not text:
-        raise InputError(f"{path}: the area file is empty; a polygon or a list of coordinates is needed")
+    text = text_of(path, raw, "area file", "GeoJSON, KML, KMZ or a list of coordinates")
     try:
         if text.startswith("{"):
             polygons = _from_geojson(path, text)
@@ -63,17 +59,6 @@ def read_area(path: Path) -> Area:
         return Area(tuple(polygons), path.stem)
     except GeometryError as error:
         raise InputError(f"{path}: {error}") from error
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            raw = file.read(_MOST_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"{path}: the area file cannot be read: {error.strerror or error}") from error
-    if len(raw) > _MOST_BYTES:
-        raise InputError(f"{path}: larger than {_MOST_BYTES // 1_000_000} MB; an outline is needed")
-    return raw
 
 
 def _kml_in_kmz(path: Path, raw: bytes) -> bytes:

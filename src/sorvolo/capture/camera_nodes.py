@@ -15,6 +15,7 @@ import numpy as np
 from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
+from sorvolo.capture.small_files import read_small_file, text_of
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
 
@@ -29,19 +30,8 @@ def read_nodes(path: Path) -> Mapping[str, Node]:
 
     Raises InputError for a file that is missing, empty, far too large, or no XML, YAML or JSON.
     """
-    try:
-        with path.open("rb") as file:
-            raw = file.read(_MOST_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"{path}: the camera file cannot be read: {error.strerror or error}") from error
-    if len(raw) > _MOST_BYTES:
-        raise InputError(f"{path}: larger than {_MOST_BYTES // 1_000_000} MB, so no camera file")
-    try:
-        text = raw.decode("utf-8-sig").strip()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a camera file: it is not text") from error
-    if not text:
-        raise InputError(f"{path}: the camera file is empty")
+    raw = read_small_file(path, "camera file", _MOST_BYTES)
+    text = text_of(path, raw, "camera file", "XML, YAML or JSON with named values")
     if text.startswith("<"):
         nodes = _from_xml(path, text)
     elif text.startswith("{"):

@@ -1,0 +1,34 @@
+"""Small text files that a person gives: read whole, within bounds, or refused in words."""
+
+from pathlib import Path
+
+from sorvolo.errors import InputError
+
+
+def read_small_file(path: Path, kind: str, most_bytes: int) -> bytes:
+    """The bytes of a file, `kind` being what it is in words ("area file").
+
+    Raises InputError for one that cannot be read or is larger than any of its kind.
+    """
+    try:
+        with path.open("rb") as file:
+            raw = file.read(most_bytes + 1)
+    except OSError as error:
+        raise InputError(f"{path}: the {kind} cannot be read: {error.strerror or error}") from error
+    if len(raw) > most_bytes:
+        raise InputError(f"{path}: larger than {most_bytes // 1_000_000} MB, so no {kind}")
+    return raw
+
+
+def text_of(path: Path, raw: bytes, kind: str, needed: str) -> str:
+    """Their UTF-8 text without blanks around it.
+
+    Raises InputError for bytes that are no text, and for none at all, saying what is `needed`.
+    """
+    try:
+        text = raw.decode("utf-8-sig").strip()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not text, so no {kind}; {needed} is needed") from error
+    if not text:
+        raise InputError(f"{path}: the {kind} is empty; {needed} is needed")
+    return text
