@@ -219,7 +219,7 @@ def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match=r"no .kml"):
         read_area(tmp_path / "b.kmz")
     (tmp_path / "c.geojson").write_bytes(bytes(range(256)))
-    with pytest.raises(InputError, match="not text.*GeoJSON"):
+    with pytest.raises(InputError, match=r"not text.*GeoJSON"):
         read_area(tmp_path / "c.geojson")
 
 
