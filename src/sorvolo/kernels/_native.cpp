@@ -213,13 +213,13 @@ struct Strings {
 
 constexpr int BLOCK = 64, LANES = 16;
 
-// One image's neighbourhood of a block of pixels: its row dy of a channel begins at start + both steps.
+// One image's neighbourhood of a block of pixels: the rows dy of channel 0, the others a step further each.
 struct Window {
-    const std::uint8_t *start;
-    std::ptrdiff_t channel_step, row_step;
+    const std::uint8_t *const *rows;
+    std::ptrdiff_t channel_step, across;
 
     SORVOLO_INLINE const std::uint8_t *row(int channel, int dy) const {
-        return start + channel * channel_step + dy * row_step;
+        return rows[dy] + channel * channel_step + across;
     }
 };
 
@@ -284,25 +284,23 @@ SORVOLO_AVX512 void count_block_avx512(const Strings &work, const Window &refere
     for (int channel = 0; channel < CHANNELS; ++channel) {
         const __m512i centre_r = _mm512_loadu_si512(reference.row(channel, above) + left);
         const __m512i centre_q = _mm512_loadu_si512(query.row(channel, above) + left);
-        __m512i even = _mm512_setzero_si512(), odd = even;
-        int rows = 0;
+        __m512i bits = _mm512_setzero_si512();
+        int added = 0;
         for (int dy = 0; dy < work.height; ++dy) {
             const std::uint8_t *row_r = reference.row(channel, dy), *row_q = query.row(channel, dy);
             for (int dx = 0; dx < work.width; ++dx) {
                 const __mmask64 differ =
-                    _kxor_mask64(_mm512_cmpge_epu8_mask(_mm512_loadu_si512(row_r + dx), centre_r),
-                                 _mm512_cmpge_epu8_mask(_mm512_loadu_si512(row_q + dx), centre_q));
-                __m512i &bits = dx & 1 ? odd : even;
+                    _mm512_cmpge_epu8_mask(_mm512_loadu_si512(row_r + dx), centre_r) ^
+                    _mm512_cmpge_epu8_mask(_mm512_loadu_si512(row_q + dx), centre_q);
                 bits = _mm512_mask_add_epi8(bits, differ, bits, one);
             }
-            if (++rows * work.width + work.width <= 255 && dy + 1 < work.height) continue;
-            rows = 0;
+            added += work.width;
+            if (added + work.width <= 255 && dy + 1 < work.height) continue;
             alignas(64) std::uint8_t each[BLOCK];
-            _mm512_store_si512(each, even);
+            _mm512_store_si512(each, bits);
             add_up(counts, each);
-            _mm512_store_si512(each, odd);
-            add_up(counts, each);
-            even = odd = _mm512_setzero_si512();
+            bits = _mm512_setzero_si512();
+            added = 0;
         }
     }
 }
@@ -336,53 +334,67 @@ SORVOLO_INLINE int count_pixel(const Strings &work, const Window &reference, con
     return total;
 }
 
+// The rows of both images that the window around one row reaches, mirrored over the rims, each copied once on its way.
+class NearRows {
+public:
+    NearRows(const Strings &work)
+        : work_(work), step_(work.columns + work.width + BLOCK + LANES),
+          bytes_(2 * CHANNELS * static_cast<std::size_t>(step_) * work.height), held_(work.height, -work.rows - 1000),
+          reference_(work.height), query_(work.height) {}
+
+    void around(int y) {
+        for (int dy = 0; dy < work_.height; ++dy) {
+            const int row = y - work_.height / 2 + dy;
+            const int slot = ((row % work_.height) + work_.height) % work_.height;
+            std::uint8_t *start = bytes_.data() + 2 * CHANNELS * static_cast<std::size_t>(step_) * slot;
+            reference_[dy] = start;
+            query_[dy] = start + CHANNELS * static_cast<std::size_t>(step_);
+            if (held_[slot] == row) continue;
+            held_[slot] = row;
+            for (int channel = 0; channel < CHANNELS; ++channel, start += step_) {
+                const std::size_t from =
+                    (static_cast<std::size_t>(channel) * work_.rows + mirrored(row, work_.rows)) * work_.columns;
+                const int left = work_.width / 2, right = work_.width - 1 - left;
+                padded(work_.reference + from, left, right, work_.columns, start);
+                padded(work_.query + from, left, right, work_.columns, start + CHANNELS * step_);
+            }
+        }
+    }
+    Window reference(int across) const { return {reference_.data(), step_, across}; }
+    Window query(int across) const { return {query_.data(), step_, across}; }
+
+private:
+    const Strings &work_;
+    std::ptrdiff_t step_;
+    std::vector<std::uint8_t> bytes_;
+    std::vector<int> held_;  // the row that each slot holds
+    std::vector<const std::uint8_t *> reference_, query_;
+};
+
 constexpr int FEW = 12;  // pixels in question in a block of 64: with fewer one by one is faster
 
 void compare_rows(const Strings &work, int first, int last) {
-    const int columns = work.columns, left = work.width / 2, above = work.height / 2;
-    const std::ptrdiff_t plane = static_cast<std::ptrdiff_t>(work.rows) * columns;
-    const int reach = BLOCK + std::max(work.width, LANES);  // bytes of a row that a block may read
-    std::vector<std::uint8_t> near(static_cast<std::size_t>(2) * CHANNELS * work.height * reach);
-    const std::ptrdiff_t near_plane = static_cast<std::ptrdiff_t>(work.height) * reach;
     const CountBlock count_block = best_count_block();
+    const bool one_by_one = work.width <= LANES && work.height <= 255;
+    NearRows near(work);
     std::uint16_t counts[BLOCK];
     for (int y = first; y < last; ++y) {
-        const std::uint8_t *asked = work.asked + static_cast<std::size_t>(y) * columns;
-        std::uint8_t *out = work.out + static_cast<std::size_t>(y) * columns;
-        const bool rows_inside = y >= above && y - above + work.height <= work.rows;
-        for (int x0 = 0; x0 < columns; x0 += BLOCK) {
-            const int pixels = std::min(BLOCK, columns - x0);
+        const std::uint8_t *asked = work.asked + static_cast<std::size_t>(y) * work.columns;
+        std::uint8_t *out = work.out + static_cast<std::size_t>(y) * work.columns;
+        bool prepared = false;
+        for (int x0 = 0; x0 < work.columns; x0 += BLOCK) {
+            const int pixels = std::min(BLOCK, work.columns - x0);
             int wanted = 0;
             for (int x = 0; x < pixels; ++x) wanted += asked[x0 + x] != 0;
             if (wanted == 0) continue;
-            Window reference{work.reference + static_cast<std::ptrdiff_t>(y - above) * columns + x0 - left, plane, columns};
-            Window query{work.query + (reference.start - work.reference), plane, columns};
-            if (!rows_inside || x0 < left || x0 - left + reach > columns) {
-                for (int channel = 0; channel < CHANNELS; ++channel)
-                    for (int dy = 0; dy < work.height; ++dy) {
-                        const std::ptrdiff_t row =
-                            channel * plane + static_cast<std::ptrdiff_t>(mirrored(y - above + dy, work.rows)) * columns;
-                        std::uint8_t *to = near.data() + channel * near_plane + static_cast<std::ptrdiff_t>(dy) * reach;
-                        for (int x = 0; x < reach; ++x) {
-                            const int from = mirrored(x0 - left + x, columns);
-                            to[x] = work.reference[row + from];
-                            to[CHANNELS * near_plane + x] = work.query[row + from];
-                        }
-                    }
-                reference = Window{near.data(), near_plane, reach};
-                query = Window{near.data() + CHANNELS * near_plane, near_plane, reach};
-            }
-            if (wanted < FEW && work.width <= LANES && work.height < 256) {
-                for (int x = 0; x < pixels; ++x) {
-                    if (!asked[x0 + x]) continue;
-                    const Window around_r{reference.start + x, reference.channel_step, reference.row_step};
-                    const Window around_q{query.start + x, query.channel_step, query.row_step};
-                    if (count_pixel(work, around_r, around_q) > work.most) out[x0 + x] = 255;
-                }
+            if (!prepared) near.around(y);
+            prepared = true;
+            if (wanted < FEW && one_by_one) {
+                for (int x = x0; x < x0 + pixels; ++x)
+                    if (asked[x] && count_pixel(work, near.reference(x), near.query(x)) > work.most) out[x] = 255;
             } else {
-                count_block(work, reference, query, counts);
-                for (int x = 0; x < pixels; ++x)
-                    if (asked[x0 + x] && counts[x] > work.most) out[x0 + x] = 255;
+                count_block(work, near.reference(x0), near.query(x0), counts);
+                for (int x = 0; x < pixels; ++x) out[x0 + x] = asked[x0 + x] && counts[x] > work.most ? 255 : 0;
             }
         }
     }

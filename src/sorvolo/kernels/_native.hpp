@@ -23,6 +23,14 @@
 #define SORVOLO_INLINE inline
 #endif
 
+#if defined(__clang__)
+#define SORVOLO_INDEPENDENT _Pragma("clang loop vectorize(assume_safety)")
+#elif defined(__GNUC__)
+#define SORVOLO_INDEPENDENT _Pragma("GCC ivdep")
+#else
+#define SORVOLO_INDEPENDENT
+#endif
+
 // Put before a function: compiled for each of these, and the best one chosen when the module is loaded. Only what is
 // inlined into such a function gains, hence SORVOLO_INLINE for its helpers. Needs the loader of glibc.
 #if defined(SORVOLO_X86) && defined(__GLIBC__)
@@ -88,6 +96,7 @@ SORVOLO_INLINE void slide(Sum *sums, int width, int columns, Sum *out) {
         }
         if (2 * bit > width) break;
         const int left = columns + width - 2 * bit;
+        SORVOLO_INDEPENDENT  // what is read lies ahead of what is written
         for (int x = 0; x < left; ++x) sums[x] = static_cast<Sum>(sums[x] + sums[x + bit]);
     }
 }
