@@ -35,7 +35,7 @@ from sorvolo.simulation.presets import preset
 from sorvolo.simulation.settings import ImagingSettings
 
 METHODS = ("thesis", "robust")
-PRESETS = ("compare", "compare-urban", "compare-dirt", "compare-photos")
+PRESETS = ("compare", "compare-urban", "compare-dirt", "compare-photos", "compare-none")
 RESULTS = Path(__file__).parent / "results"
 LEAST_PX = 50
 """Of a frame's mask: a sliver of an object at the picture's rim makes no frame changed."""

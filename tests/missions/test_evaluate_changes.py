@@ -13,6 +13,7 @@ from sorvolo.change.compared_ground import compared_ground
 from sorvolo.cli.evaluate import evaluate_app
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.evaluate_changes import evaluate_changes
+from sorvolo.missions.frame_rows import time_ns_of
 from sorvolo.missions.simulate_site import simulate_site
 from sorvolo.simulation.settings import (
     ImagingSettings,
@@ -139,6 +140,27 @@ def test_late_needs_to_know_when(site, simulated):
         (said,) = evaluate_changes(site, simulated)
         assert said.events.judged_late == len(third_ns)
         assert said.events.late == late or (late is None and said.events.late > 0)  # told only after the last frame
+
+
+def test_a_clock_without_a_date_is_understood(site, simulated):
+    """A log without dates counts from 1970: frames and announcements do, the truth does not."""
+    (measured,) = evaluate_changes(site, simulated)
+    start_ns = 1_779_000_000 * 10**9
+    path = site / "flights/flight2/frames.geojson"
+    rows = features(path)
+    for row in rows:
+        row["properties"]["time"] = utc_text(time_ns_of(row["properties"]["time"]) - start_ns)
+    write(path, rows)
+    told = {pair.found.id: int(pair.true.clear_ns[2]) - start_ns + 700_000_000 for pair in measured.match.pairs}
+
+    def say(events):
+        for each in events:
+            told_ns = told.get(each["properties"]["id"])
+            each["properties"]["announced"] = None if told_ns is None else utc_text(told_ns)
+
+    edit(site, say)
+    (said,) = evaluate_changes(site, simulated)
+    assert [pair.delay_s for pair in said.match.pairs] == pytest.approx([0.7] * len(told), abs=1e-3)
 
 
 def test_only_what_lies_on_compared_ground_must_be_found(site, simulated):

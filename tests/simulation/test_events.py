@@ -22,6 +22,7 @@ from sorvolo.simulation.settings import (
     SimulationSettings,
     WeatherSettings,
 )
+from sorvolo.simulation.truth import change_mask
 from sorvolo.simulation.world import World, build_day
 
 SETTINGS = SimulationSettings(
@@ -165,3 +166,14 @@ def test_a_comparing_preset_has_changes_of_every_kind():
 def test_impossible_later_flights_are_refused(make):
     with pytest.raises(SettingsError, match="must lie in"):
         make()
+
+
+def test_a_preset_without_changes_has_none():
+    settings = preset("compare-none")
+    small = replace(settings, imaging=ImagingSettings(160, 90, fps=5), scene=replace(
+        settings.scene, ground="dirt", has_scenery=False
+    ))
+    first, second = simulate_flights(small)
+    assert true_events(second) == []
+    assert not change_mask(second, 5).any()
+    assert np.abs(first.day.light.sun - second.day.light.sun).max() > 0.01

@@ -216,6 +216,12 @@ class _Flights:
             if row.status not in _NOT_COMPARED and np.isfinite(row.outline_m).all()
         ]
 
+    def clock(self, name: str) -> tuple[int, int]:
+        """When the flight ended by its own clock, and how far that is behind the truth's: logs may tell no date."""
+        true = self.true[self.names[name]]
+        behind_ns = [true[row.name].time_ns - row.time_ns for row in self.mine[name] if row.name in true]
+        return max((row.time_ns for row in self.mine[name]), default=0), int(np.median(behind_ns)) if behind_ns else 0
+
     def map_from_truth(self, names: Sequence[str]) -> tuple[Matrix3, float]:
         """The similarity that takes true places to where these flights lie; the rms of what it moves, NaN if none."""
         pairs = [
@@ -250,8 +256,7 @@ def _evaluate(
     is_photos = any(not row.name.isdecimal() for row in flights.mine[flight])
     settings = EventSettings(views=PHOTO_VIEWS if is_photos else VIDEO_VIEWS)
     true = _read_true(true_folder / "events.geojson", described, map_from_truth, ground, settings.views)
-    ended_ns = max((row.time_ns for row in flights.mine[flight]), default=0)
-    found = _read_found(site / "flights" / flight / "changes.geojson", described, ended_ns)
+    found = _read_found(site / "flights" / flight / "changes.geojson", described, flights.clock(flight))
     match = match_events(found, true, settings)
     scores = score_events(match, ground.area_m2, settings)
     if match.pairs and not scores.judged_late:
@@ -284,13 +289,16 @@ def _read_true(
     return events
 
 
-def _read_found(path: Path, described: Site, ended_ns: int) -> list[FoundEvent]:
+def _read_found(path: Path, described: Site, clock: tuple[int, int]) -> list[FoundEvent]:
     """The reported events; those that were told only at the end were announced with the last frame."""
+    ended_ns, behind_ns = clock
     events = []
     for feature in read_features(path):
         try:
             said = feature["properties"]
-            announced_ns = (time_ns_of(said["announced"] or "") or ended_ns) if "announced" in said else None
+            announced_ns = None
+            if "announced" in said:
+                announced_ns = behind_ns + (time_ns_of(said["announced"]) if said["announced"] else ended_ns)
             sigma_m = math.nan if said.get("sigma_m") is None else float(said["sigma_m"])
             outline_m = _ring(feature, described, np.eye(3), path)
             events.append(FoundEvent(str(said["id"]), ChangeKind(said["kind"]), outline_m, sigma_m, announced_ns))

@@ -193,6 +193,12 @@ def _compare_photos(name: str, ground: str = "countryside") -> SimulationSetting
     )
 
 
+def _compare_none(name: str) -> SimulationSettings:
+    """The flights of `compare` with nothing changed but light, clouds and wind: whatever is found is false."""
+    settings = _compare(name, later=LaterSettings(people=0, cars=0, small_objects=0, removed=0, moved=0))
+    return replace(settings, scene=replace(settings.scene, moving_share=0.0))
+
+
 def _compare_unlike(
     name: str, weather: WeatherSettings = _WEATHER, revisit: RevisitSettings = _REVISIT
 ) -> SimulationSettings:
@@ -214,6 +220,7 @@ _GENERAL: Mapping[str, Callable[[], SimulationSettings]] = {
     "compare-urban": lambda: _compare("compare-urban", "urban"),
     "compare-dirt": lambda: _compare("compare-dirt", "dirt"),
     "compare-photos": lambda: _compare_photos("compare-photos"),
+    "compare-none": lambda: _compare_none("compare-none"),
     "compare-higher": lambda: _compare_unlike("compare-higher", revisit=RevisitSettings(height_factor=1.5)),
     "compare-across": lambda: _compare_unlike("compare-across", revisit=RevisitSettings(heading_change_deg=90)),
     "compare-back": lambda: _compare_unlike("compare-back", revisit=RevisitSettings(heading_change_deg=180)),
