@@ -41,6 +41,7 @@ class RegionSettings:
     strong_factor: float = 1.5  # strong over weak threshold
     core: float = 0.45  # a region keeps what exceeds this part of its own height
     least_area_px: int = 6
+    least_noise: float = 0.0  # what the flight shows elsewhere: a frame is not taken for quieter than this
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +76,7 @@ def find_regions(
     noise = float(np.searchsorted(counts, 0.95 * counts[-1]))
     smooth = cv2.blur(difference, (3, 3))
     activity = cv2.blur(cv2.threshold(specks, MOST_SPECK, MOST_SPECK, cv2.THRESH_TRUNC)[1], (41, 41))
-    base = settings.least_difference + settings.noise_factor * noise
+    base = settings.least_difference + settings.noise_factor * max(noise, settings.least_noise)
     threshold = cv2.addWeighted(activity, settings.activity_factor, activity, 0.0, base)
     weak = np.asarray(cv2.compare(smooth, threshold, cv2.CMP_GT), np.uint8)
     labels, boxes = core_regions(

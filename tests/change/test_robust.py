@@ -1,0 +1,191 @@
+"""The robust method: what it finds, what it leaves alone, and its kernels against their NumPy twins."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sorvolo import kernels
+from sorvolo.change.blob_check import Trees, how_sure
+from sorvolo.change.blobs import FEATURES
+from sorvolo.change.robust import RobustSettings, compare_robust
+from sorvolo.change.settling import settle
+from sorvolo.change.tuning import FlightTuning
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.kernels import reference_robust
+from sorvolo.simulation.canvas import Area
+from sorvolo.simulation.ground import GroundKind, paint_ground
+
+
+@pytest.fixture(scope="module")
+def ground() -> np.ndarray:
+    """A piece of dirt road, 480 x 360 px."""
+    raster = paint_ground(GroundKind.DIRT, Area(-12.0, -9.0, 12.0, 9.0), 0.05, np.random.default_rng(3)).raster
+    return np.ascontiguousarray(raster.rgb[..., ::-1])
+
+
+def camera(image: np.ndarray, seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(0, 2, image.shape)
+    return np.clip(image + noise, 0, 255).astype(np.uint8)
+
+
+def with_box(image: np.ndarray, colour: tuple[int, int, int] = (190, 60, 40)) -> np.ndarray:
+    """A 44 x 28 px box at (200, 150)."""
+    return cv2.rectangle(image.copy(), (200, 150), (243, 177), colour, -1)
+
+
+def overlap(mask: np.ndarray) -> float:
+    truth = np.zeros(mask.shape, bool)
+    truth[150:178, 200:244] = True
+    return float((truth & (mask > 0)).sum() / (truth | (mask > 0)).sum())
+
+
+def test_a_box_that_came_is_found_where_it_is(ground: np.ndarray) -> None:
+    result = compare_robust(camera(ground, 1), camera(with_box(ground), 2))
+    assert overlap(result.mask) > 0.85
+    assert result.boxes.shape == (1, 4) and np.abs(result.boxes[0] - [200, 150, 44, 28]).max() <= 4
+    assert result.scores[0] > 0.8
+    assert set(np.unique(result.mask)) == {0, 255}
+
+
+def test_a_box_that_went_is_found_where_it_was(ground: np.ndarray) -> None:
+    moved = cv2.warpAffine(ground, np.float64([[1, 0, 3.0], [0, 1, -2.0]]), ground.shape[1::-1],
+                           borderMode=cv2.BORDER_REFLECT)
+    result = compare_robust(camera(with_box(ground), 1), camera(moved, 2))
+    assert overlap(result.mask) > 0.75
+
+
+def test_other_light_and_misalignment_are_no_change(ground: np.ndarray) -> None:
+    relit = np.clip(255 * (ground / 255.0) ** 0.8 * [0.8, 0.9, 1.0], 0, 255)
+    moved = cv2.warpAffine(relit, np.float64([[1, 0.004, 2.5], [-0.004, 1, 3.0]]), ground.shape[1::-1],
+                           borderMode=cv2.BORDER_REFLECT)
+    result = compare_robust(camera(ground, 1), camera(moved, 2))
+    assert not result.mask.any() and len(result.boxes) == len(result.scores) == 0
+
+
+def test_a_cloud_is_no_change_and_hides_none(ground: np.ndarray) -> None:
+    shade = np.zeros(ground.shape[:2], np.float32)
+    cv2.circle(shade, (380, 80), 120, 1.0, -1)
+    shade = 1 - 0.45 * cv2.GaussianBlur(shade, (0, 0), 20)[..., None]
+    assert not compare_robust(camera(ground, 1), camera(ground * shade, 2)).mask.any()
+    assert overlap(compare_robust(camera(ground, 1), camera(with_box(ground) * shade, 2)).mask) > 0.8
+
+
+def test_unknown_is_never_changed_nor_is_its_rim(ground: np.ndarray) -> None:
+    valid = np.ones(ground.shape[:2], bool)
+    valid[:, 220:] = False
+    hole = ground.copy()
+    hole[~valid] = 0
+    mask = compare_robust(camera(hole, 1), camera(with_box(ground), 2), valid).mask
+    assert not mask[:, 214:].any()
+    nothing = compare_robust(ground, with_box(ground), np.zeros_like(valid))
+    assert not nothing.mask.any() and nothing.known == 0
+
+
+@pytest.mark.parametrize("size", [(32, 32), (33, 47), (90, 61)])
+def test_small_and_odd_sizes_work(ground: np.ndarray, size: tuple[int, int]) -> None:
+    piece = np.ascontiguousarray(ground[: size[0], : size[1]])
+    result = compare_robust(piece, camera(piece, 4))
+    assert result.mask.shape == size and not result.mask.any()
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_flat_pictures_are_equal(value: int) -> None:
+    flat = np.full((64, 80, 3), value, np.uint8)
+    assert not compare_robust(flat, flat).mask.any()
+
+
+def test_bad_input_says_what_is_wrong(ground: np.ndarray) -> None:
+    with pytest.raises(InputError, match="same pixels"):
+        compare_robust(ground, ground[:-2])
+    with pytest.raises(InputError, match="uint8"):
+        compare_robust(ground.astype(np.float32), ground)
+    with pytest.raises(InputError, match="uint8"):
+        compare_robust(ground[..., 0], ground[..., 0])
+    with pytest.raises(InputError, match="at least 32"):
+        compare_robust(ground[:20], ground[:20])
+    with pytest.raises(InputError, match="valid"):
+        compare_robust(ground, ground, np.ones((3, 3), bool))
+
+
+def test_settling_finds_a_shift_whatever_the_light(ground: np.ndarray) -> None:
+    gray = cv2.cvtColor(ground, cv2.COLOR_BGR2GRAY)
+    moved = cv2.warpAffine(gray, np.float64([[1, 0, 2.0], [0, 1, -1.5]]), gray.shape[::-1],
+                           borderMode=cv2.BORDER_REFLECT)
+    settling = settle(gray, np.clip(moved * 0.7 + 5, 0, 255).astype(np.uint8))
+    middle = settling.reference_from_query @ [240.0, 180.0, 1.0]
+    np.testing.assert_allclose(middle[:2] / middle[2], [238.0, 181.5], atol=0.25)
+
+
+def test_trees_know_their_features() -> None:
+    trees = Trees(("a", "b"), 0.0, np.array([[0, 1]]), np.array([[1.0, 5.0]]), np.array([[-3.0, -1.0, 1.0, 3.0]]))
+    sure = how_sure(np.array([[0.0, 0.0], [0.0, 6.0], [2.0, 0.0], [2.0, 6.0]]), ("a", "b"), trees)
+    np.testing.assert_allclose(sure, 1 / (1 + np.exp([3.0, 1.0, -1.0, -3.0])))
+    with pytest.raises(SettingsError):
+        how_sure(np.zeros((1, 1)), ("a",), trees)
+    assert how_sure(np.zeros((0, len(FEATURES))), FEATURES).shape == (0,)
+
+
+def test_a_flight_tunes_itself_and_says_how(ground: np.ndarray) -> None:
+    tuning = FlightTuning()
+    assert tuning.settings() == RobustSettings() and "nothing" in str(tuning.chosen()["settings"])
+    loud = np.random.default_rng(5).normal(0, 14, ground.shape)
+    for seed in range(3):
+        query = np.clip(camera(ground, seed) + loud, 0, 255).astype(np.uint8)
+        tuning.observe(compare_robust(ground, query, settings=tuning.settings()))
+    chosen = tuning.chosen()
+    quiet = FlightTuning()
+    quiet.observe(compare_robust(ground, camera(ground, 1)))
+    assert chosen["frames"] == 3
+    assert float(chosen["noise_levels"]) > float(quiet.chosen()["noise_levels"])
+    assert float(chosen["least_difference_levels"]) > float(quiet.chosen()["least_difference_levels"])
+    assert tuning.settings().regions.least_noise > quiet.settings().regions.least_noise
+
+
+pictures = st.integers(0, 2**31).map(np.random.default_rng)
+
+
+@settings(max_examples=25, deadline=None)
+@given(pictures, st.integers(1, 40), st.integers(1, 40), st.floats(1.0, 2.0), st.floats(0.2, 1.0), st.integers(1, 8))
+def test_core_regions_agree(
+    rng: np.random.Generator, height: int, width: int, strong: float, core: float, least: int
+) -> None:
+    values = rng.integers(0, 90, (height, width), dtype=np.uint8)
+    thresholds = rng.integers(20, 100, (height, width), dtype=np.uint8)
+    ours = kernels.core_regions(values, thresholds, strong, core, least, 6)
+    plain = reference_robust.core_regions(values, thresholds, strong, core, least, 6)
+    for one, other in zip(ours, plain):
+        np.testing.assert_array_equal(one, other)
+
+
+@settings(max_examples=15, deadline=None)
+@given(pictures, st.integers(3, 80), st.integers(3, 80), st.integers(0, 3))
+def test_matches_agree(rng: np.random.Generator, height: int, width: int, reach: int) -> None:
+    query = rng.integers(0, 256, (height, width), dtype=np.uint8)
+    searched = rng.integers(0, rng.integers(1, 257), (height + 2 * reach, width + 2 * reach)).astype(np.uint8)
+    corner = rng.integers(0, [width, height], (5, 2))
+    boxes = np.hstack([corner, rng.integers(1, np.array([width, height]) - corner + 1)]).astype(np.int32)
+    np.testing.assert_array_equal(
+        kernels.match_regions(query, searched, boxes, reach),
+        reference_robust.match_regions(query, searched, boxes, reach),
+    )
+
+
+@settings(max_examples=15, deadline=None)
+@given(pictures, st.integers(1, 50), st.integers(1, 50), st.integers(1, 12), st.integers(0, 5))
+def test_measures_agree(rng: np.random.Generator, height: int, width: int, channels: int, margin: int) -> None:
+    labels = rng.integers(0, 4, (height, width)).astype(np.int32)
+    stack = rng.integers(0, 256, (height, width, channels), dtype=np.uint8)
+    corner = rng.integers(0, [width, height], (3, 2))
+    boxes = np.hstack([corner, rng.integers(1, np.array([width, height]) - corner + 1)]).astype(np.int32)
+    np.testing.assert_array_equal(
+        kernels.measure_regions(labels, boxes, stack, margin),
+        reference_robust.measure_regions(labels, boxes, stack, margin),
+    )
+
+
+def test_boxes_outside_are_refused() -> None:
+    picture = np.zeros((10, 10), np.uint8)
+    with pytest.raises(ValueError, match="outside"):
+        kernels.match_regions(picture, np.zeros((14, 14), np.uint8), np.int32([[5, 5, 6, 2]]), 2)
