@@ -24,9 +24,9 @@ from statistics import median
 
 from rich.console import Console
 from rich.table import Table
-from sorvolo.missions.compare_flights import compare_flights
 
 from mosaic_methods import commit, machine
+from sorvolo.missions.compare_flights import compare_flights
 from sorvolo.missions.evaluate_changes import as_json, evaluate_changes
 from sorvolo.missions.map_flight import map_flights
 from sorvolo.missions.settings import CompareSettings
