@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.change.cells import CellEvidence, CellGrid, CellWindow, LaidView, lay, scale_m_per_px
-from sorvolo.change.gathering import GatheredChange
+from sorvolo.change.gathering import GatheredChange, upright_weight
 from sorvolo.change.moving import BlobTracker, MovingSettings, Track
 from sorvolo.change.outlines import KnownPlace, is_known, measures, outline_of
 from sorvolo.change.patches import PatchWindow, cut, patch_of
@@ -24,6 +24,7 @@ from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 
 _CELL_PX = 3
 _LEAST_CELL_M = 0.05
+_LASTING = 0.3  # share of all views that must flag a cell
 _SHOWS = 0.3  # share of a change's cells that a view must flag to count as showing it
 _PICTURES_A_VIEW = 6  # cut anew at most, which bounds the time a view takes
 _MOST_SEEDS = 256
@@ -39,7 +40,7 @@ class EvidenceSettings:
     n: int = 5  # ... of the last ones that saw its ground
     least_views: int = 2  # where fewer than n ever see it
     least_views_apart_s: float = 0.1  # frames nearer in time see the same thing and say nothing new
-    least_share: float = 0.3  # of all views of its ground must show it, or it was nothing lasting
+    least_share: float = 0.45  # of all views of its ground must show it, those from above counting most
     least_score: float = 0.2  # less sure, it is kept but not told
     least_area_m2: float = 0.02
     join_m: float = 0.3  # a smaller gap does not make two things of one
@@ -167,7 +168,7 @@ class EvidenceMap:
     ) -> list[GatheredChange]:
         """Give the cells that are certain to the changes that they belong to; the changes that begin with this."""
         laid, settings = witness.laid, self._settings
-        lasting = evidence.changed >= settings.least_share * evidence.seen
+        lasting = evidence.changed >= _LASTING * evidence.seen
         sure = (evidence.votes >= settings.k) & lasting & laid.flagged
         if not (sure & (evidence.owner == 0)).any():
             return []
@@ -214,11 +215,11 @@ class EvidenceMap:
         for each in earlier:
             seen, flagged, score, place_m = self._answer(each.laid, change.cells, cells)
             if seen >= 0.5 and flagged >= _SHOWS * seen:
-                change.see(each.time_ns, score, place_m, None, each.counts)
+                change.see(each.time_ns, score, place_m, None, self._weight(each, change.cells))
                 change.from_camera(each.camera_m)
                 change.vote(each.site_from_image, each.changed, each.valid)
             elif seen >= 0.5:
-                change.miss(each.counts)
+                change.miss(self._weight(each, change.cells))
         return change
 
     def _tell(self, change: GatheredChange, now_ns: int) -> bool:
@@ -272,9 +273,10 @@ class EvidenceMap:
             if seen < 0.5 and not (is_large and flagged > 0):
                 continue
             if flagged < _SHOWS * seen:
-                change.miss(witness.counts)
+                change.miss(self._weight(witness, change.cells))
                 continue
-            change.see(view.time_ns, score, place_m if seen > 0.99 else None, view, witness.counts)
+            weight = self._weight(witness, change.cells)
+            change.see(view.time_ns, score, place_m if seen > 0.99 else None, view, weight)
             change.from_camera(view.camera_m)
             if change.still_votes and number not in new:
                 change.vote(view.site_from_image, view.changed, view.valid)
@@ -291,6 +293,10 @@ class EvidenceMap:
             change = self._found[number]
             change.vote(view.site_from_image, view.changed, view.valid)
         return shown
+
+    def _weight(self, witness: _Witness, window: CellWindow) -> float:
+        """What a view counts in a change's share; nothing if the camera stands where it stood before."""
+        return upright_weight(witness.camera_m, np.mean(_box_m(window, self._cell_m), axis=0)) * witness.counts
 
     def _merge(self, older: GatheredChange, younger: GatheredChange) -> None:
         if younger.cells is not None:
@@ -364,7 +370,7 @@ class EvidenceMap:
             seed = GatheredChange(0, view.time_ns)
             seed.cells = window
             seed.show(view, *_box_m(window, self._cell_m), self._site_m_per_px)
-            seed.see(view.time_ns, score, None, view, True)
+            seed.see(view.time_ns, score, None, view, 1.0)
             seed.from_camera(view.camera_m)
             seed.vote(view.site_from_image, view.changed, view.valid)
             self._seeds.append(seed)
@@ -401,9 +407,9 @@ class EvidenceMap:
             return
         seed.number = self._next_number()
         for _ in range(views - seed.views):
-            seed.see(seed.last_seen_ns, seed.score, None, None, True)
+            seed.see(seed.last_seen_ns, seed.score, None, None, 1.0)
         for _ in range(asked - seed.asked):
-            seed.miss(True)
+            seed.miss(1.0)
         self._grid.own(seed.cells, cells, seed.number)
         self._found[seed.number] = seed
 

@@ -17,6 +17,8 @@ _MOST_PX = 512
 _VOTING_VIEWS = 40  # more of them hardly move the outline
 _BETTER = 1.15  # a view's pictures replace the older ones when it is so much better
 _GOOD = 0.75  # quality beyond which no better pictures are looked for
+_ASIDE = 0.15  # of the flying height: views from further aside count less
+_LEAST_WEIGHT = 0.1
 _ONE_PLACE = 0.05  # of the flying height: seen from no wider apart, a ghost of something tall looks the same
 
 
@@ -30,7 +32,7 @@ class GatheredChange:
         self.is_hidden = False  # a person said no to it, or it turned out to be nothing
         self.first_seen_ns = self.last_seen_ns = first_seen_ns
         self.views = self.asked = 0
-        self.tallied_views = self.tallied_asked = 0
+        self._weight_for = self._weight_asked = 0.0
         self.weakness = 1.0  # factor of the score, for what too few views say
         self.cells: CellWindow | None = None
         self._score_sum = 0.0
@@ -48,13 +50,16 @@ class GatheredChange:
         self._kind_outline: PointsM | None = None
 
     def see(
-        self, time_ns: int, score: float, place_m: Floats | None, view: ComparedView | None, counts: bool
+        self, time_ns: int, score: float, place_m: Floats | None, view: ComparedView | None, weight: float
     ) -> None:
-        """One more view flagged it; `view` is None for one of those before it was found, whose pictures are gone."""
+        """One more view flagged it; `view` is None for one of those before it was found, whose pictures are gone.
+
+        `weight` says how much this view counts in `share`; see `upright_weight`.
+        """
         self.views += 1
         self.asked += 1
-        self.tallied_views += counts
-        self.tallied_asked += counts
+        self._weight_for += weight
+        self._weight_asked += weight
         self._score_sum += score
         self.first_seen_ns, self.last_seen_ns = min(self.first_seen_ns, time_ns), max(self.last_seen_ns, time_ns)
         if place_m is not None and len(self._places) < 64:
@@ -67,15 +72,15 @@ class GatheredChange:
         self._camera_low = np.minimum(self._camera_low, camera_m)
         self._camera_high = np.maximum(self._camera_high, camera_m)
 
-    def miss(self, counts: bool) -> None:
+    def miss(self, weight: float) -> None:
         """One more view that could have shown it does not."""
         self.asked += 1
-        self.tallied_asked += counts
+        self._weight_asked += weight
 
     @property
     def share(self) -> float:
-        """The share of the views from different places that show it, of those that could."""
-        return self.tallied_views / self.tallied_asked if self.tallied_asked else 1.0
+        """The share of the views that show it, of those that could, each with its weight."""
+        return self._weight_for / self._weight_asked if self._weight_asked else 1.0
 
     @property
     def score(self) -> float:
@@ -184,6 +189,15 @@ class GatheredChange:
             f"{id_prefix}-{self.number}", self._kind, self.score, outline_m, self.first_seen_ns, self.last_seen_ns,
             self.views, size.area_m2, size.length_m, float(sigma_m), patch, announced_ns=self.announced_ns,
         )
+
+
+def upright_weight(camera_m: Floats, place_m: Floats) -> float:
+    """How much a view's word on a place (2,) counts: most from right above, where also the map looks from.
+
+    What stands tall leans away on either date when seen from aside, least from above; a change is there in all views.
+    """
+    aside = float(np.hypot(*(camera_m[:2] - place_m))) / max(float(camera_m[2]), 1e-6)
+    return _LEAST_WEIGHT + float(np.exp(-0.5 * (aside / _ASIDE) ** 2))
 
 
 def quality(view: ComparedView, low_m: Floats, high_m: Floats) -> float:
