@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sorvolo.capture.areas import read_area
+    from sorvolo.change.compare import Comparison, compare_images
+    from sorvolo.change.thesis import ThesisSettings, prepare_reference, thesis_steps
     from sorvolo.errors import GeometryError, InputError, SettingsError, SorvoloError, StoreError
     from sorvolo.missions.calibrate_camera import (
         calibrate_camera,
@@ -36,6 +38,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Archive",
+    "Comparison",
     "GeometryError",
     "InputError",
     "MapSettings",
@@ -44,26 +47,32 @@ __all__ = [
     "SimulationSettings",
     "SorvoloError",
     "StoreError",
+    "ThesisSettings",
     "__version__",
     "answer_questions",
     "calibrate_camera",
     "camera_to_plan_with",
+    "compare_images",
     "evaluate_mosaic",
     "find_views",
     "inspect_input",
     "map_flights",
     "parse_board",
     "plan_over",
+    "prepare_reference",
     "preset",
     "preset_names",
     "read_area",
     "simulate_site",
+    "thesis_steps",
     "write_calibration",
     "write_plan",
 ]
 
 _HOMES = {
     "capture.areas": ("read_area",),
+    "change.compare": ("Comparison", "compare_images"),
+    "change.thesis": ("ThesisSettings", "prepare_reference", "thesis_steps"),
     "errors": ("GeometryError", "InputError", "SettingsError", "SorvoloError", "StoreError"),
     "missions.calibrate_camera": ("calibrate_camera", "find_views", "parse_board", "write_calibration"),
     "missions.evaluate_mosaic": ("evaluate_mosaic",),

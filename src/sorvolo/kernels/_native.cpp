@@ -141,7 +141,7 @@ SORVOLO_INLINE void average_rows(const Averaging &work, int first, int last) {
     const std::uint32_t area = static_cast<std::uint32_t>(work.width) * work.height;
     const Division division(area);
     std::vector<std::uint8_t> ring(static_cast<std::size_t>(slots) * row_size);
-    std::vector<Sum> sums(row_size), wide(columns + work.width), out(columns);
+    std::vector<Sum> sums(row_size), wide(columns + work.width), spare(columns + work.width), out(columns);
     auto slot = [&](int row) { return ring.data() + static_cast<std::size_t>(row - first + above) % slots * row_size; };
     for (int row = first - above; row < last + below; ++row) {
         const std::uint8_t *fresh = slot(row), *gone = slot(row - work.height + slots);
@@ -156,7 +156,7 @@ SORVOLO_INLINE void average_rows(const Averaging &work, int first, int last) {
         if (y < first) continue;
         for (int channel = 0; channel < CHANNELS; ++channel) {
             padded(total + channel * columns, left, right, columns, wide.data());
-            slide(wide.data(), work.width, columns, out.data());
+            slide(wide.data(), spare.data(), work.width, columns, out.data());
             std::uint8_t *mean = work.planes + (static_cast<std::size_t>(channel) * work.rows + y) * columns;
             const Sum *sum = out.data();
             const Sum half = static_cast<Sum>(area / 2);

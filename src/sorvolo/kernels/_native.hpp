@@ -84,20 +84,27 @@ SORVOLO_INLINE int mirrored(int at, int size) {
     return at < size ? at : period - at;
 }
 
-// The sums of `width` neighbours: out[x] = sums[x] + ... + sums[x + width - 1]; doubling needs few additions.
+// to[x] = a[x] + b[x]: apart, so that the compiler sees that nothing else is touched.
 template <typename Sum>
-SORVOLO_INLINE void slide(Sum *sums, int width, int columns, Sum *out) {
-    std::memset(out, 0, columns * sizeof(Sum));
+SORVOLO_INLINE void add(const Sum *a, const Sum *b, int count, Sum *to) {
+    SORVOLO_INDEPENDENT
+    for (int x = 0; x < count; ++x) to[x] = static_cast<Sum>(a[x] + b[x]);
+}
+
+// The sums of `width` neighbours: out[x] = sums[x] + ... + sums[x + width - 1]; doubling needs few additions.
+// `sums` and `spare` hold columns + width - 1 values and are used up.
+template <typename Sum>
+SORVOLO_INLINE void slide(Sum *sums, Sum *spare, int width, int columns, Sum *out) {
     int done = 0;
     for (int bit = 1; bit <= width; bit *= 2) {
         if (width & bit) {
-            for (int x = 0; x < columns; ++x) out[x] = static_cast<Sum>(out[x] + sums[x + done]);
+            if (done == 0) std::memcpy(out, sums, columns * sizeof(Sum));
+            else add(out, sums + done, columns, out);
             done += bit;
         }
         if (2 * bit > width) break;
-        const int left = columns + width - 2 * bit;
-        SORVOLO_INDEPENDENT  // what is read lies ahead of what is written
-        for (int x = 0; x < left; ++x) sums[x] = static_cast<Sum>(sums[x] + sums[x + bit]);
+        add(sums, sums + bit, columns + width - 2 * bit, spare);
+        std::swap(sums, spare);
     }
 }
 

@@ -1,7 +1,10 @@
 // Kernels on masks: isolated pixels, connected regions, what their boxes hold. reference.py is their specification.
 #include "_native.hpp"
 
+#include <pybind11/stl.h>
+
 #include <cstring>
+#include <optional>
 
 namespace py = pybind11;
 
@@ -18,7 +21,7 @@ struct Isolating {
 SORVOLO_CLONES void isolate_rows(const Isolating &work, int first, int last) {
     const int columns = work.columns, left = work.width / 2, right = work.width - 1 - left;
     const int above = work.height / 2, below = work.height - 1 - above;
-    std::vector<std::uint16_t> sums(columns), wide(columns + work.width), out(columns);
+    std::vector<std::uint16_t> sums(columns), wide(columns + work.width), spare(columns + work.width), out(columns);
     auto row_of = [&](int row) {
         return work.mask + static_cast<std::size_t>(mirrored(row, work.rows)) * columns;
     };
@@ -31,7 +34,7 @@ SORVOLO_CLONES void isolate_rows(const Isolating &work, int first, int last) {
         std::uint16_t *sum = sums.data();
         for (int x = 0; x < columns; ++x) sum[x] = static_cast<std::uint16_t>(sum[x] + (fresh[x] != 0));
         padded(sum, left, right, columns, wide.data());
-        slide(wide.data(), work.width, columns, out.data());
+        slide(wide.data(), spare.data(), work.width, columns, out.data());
         std::uint8_t *to = work.out + static_cast<std::size_t>(y) * columns;
         const std::uint16_t *white = out.data();
         const std::uint16_t least = static_cast<std::uint16_t>(work.least_white);
@@ -145,12 +148,14 @@ Integers64 region_boxes(const Bytes &mask) {
     return boxes;
 }
 
-Integers64 gray_histograms(const Bytes &image, const Bytes &tables, const Integers64 &boxes) {
+Integers64 gray_histograms(const Bytes &image, const Bytes &tables, const Integers64 &boxes,
+                           const std::optional<Bytes> &known) {
     const py::ssize_t columns = image.shape(1), count = boxes.shape(0);
     Integers64 histograms({count, static_cast<py::ssize_t>(256)});
     std::int64_t *out = histograms.mutable_data();
     const std::uint8_t *pixels = image.data(), *table = tables.data();
     const std::int64_t *box = boxes.data();
+    const std::uint8_t *counted = known ? known->data() : nullptr;
     py::gil_scoped_release released;
     std::int32_t weighted[3][256];
     for (int value = 0; value < 256; ++value) {
@@ -162,8 +167,10 @@ Integers64 gray_histograms(const Bytes &image, const Bytes &tables, const Intege
         std::uint32_t parts[4][256] = {};
         for (std::int64_t y = box[1]; y < box[1] + box[3]; ++y) {
             const std::uint8_t *pixel = pixels + 3 * (y * columns + box[0]);
+            const std::uint8_t *counts = counted ? counted + y * columns + box[0] : nullptr;
             for (std::int64_t x = 0; x < box[2]; ++x, pixel += 3)
-                ++parts[x & 3][(weighted[0][pixel[0]] + weighted[1][pixel[1]] + weighted[2][pixel[2]]) >> GRAY_SHIFT];
+                if (!counts || counts[x])
+                    ++parts[x & 3][(weighted[0][pixel[0]] + weighted[1][pixel[1]] + weighted[2][pixel[2]]) >> GRAY_SHIFT];
         }
         for (int value = 0; value < 256; ++value)
             out[value] = static_cast<std::int64_t>(parts[0][value]) + parts[1][value] + parts[2][value] +
@@ -179,7 +186,8 @@ void bind_regions(py::module_ &module) {
     module.def("without_isolations", &without_isolations, array("mask"), py::arg("width"), py::arg("height"),
                py::arg("most_black"), py::arg("threads"));
     module.def("region_boxes", &region_boxes, array("mask"));
-    module.def("gray_histograms", &gray_histograms, array("image"), array("tables"), array("boxes"));
+    module.def("gray_histograms", &gray_histograms, array("image"), array("tables"), array("boxes"),
+               array("known"));
 }
 
 }  // namespace sorvolo

@@ -80,10 +80,17 @@ def region_boxes(mask: Bytes) -> NDArray[np.int64]:
     return np.array(boxes, np.int64).reshape(-1, 4)
 
 
-def gray_histograms(image: Bytes, tables: Bytes, boxes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How often each gray of an image (h, w, 3), put through its tables, occurs in each box: (N, 256)."""
+def gray_histograms(
+    image: Bytes, tables: Bytes, boxes: NDArray[np.int64], known: Bytes | None
+) -> NDArray[np.int64]:
+    """How often each gray of an image (h, w, 3), put through its tables, occurs in each box: (N, 256).
+
+    Only pixels count where `known` (h, w) is not 0.
+    """
     gray = gray_of(looked_up(image, tables))
-    counts = [np.bincount(gray[y : y + h, x : x + w].ravel(), minlength=256) for x, y, w, h in boxes]
+    counted = np.ones(gray.shape, bool) if known is None else known != 0
+    places = [(slice(y, y + height), slice(x, x + width)) for x, y, width, height in boxes]
+    counts = [np.bincount(gray[place][counted[place]], minlength=256) for place in places]
     return np.array(counts, np.int64).reshape(-1, 256)
 
 

@@ -1,0 +1,76 @@
+"""The public comparison of two pictures: what it gives, and what it says of input that it cannot use."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sorvolo
+from sorvolo.change.robust import RobustSettings
+from sorvolo.errors import InputError, SettingsError
+
+
+def scene() -> tuple[Any, Any]:
+    before = np.random.default_rng(3).integers(60, 120, (96, 128, 3), np.uint8)
+    after = before.copy()
+    after[30:60, 40:80] = (240, 220, 30)
+    after[40:50, 50:70] = 10
+    return before, after
+
+
+@pytest.mark.parametrize("method", ["thesis", "robust"])
+def test_mask_and_boxes(method: str) -> None:
+    mask, boxes = sorvolo.compare_images(*scene(), method=method)
+    assert mask.shape == (96, 128) and mask.dtype == np.uint8 and set(np.unique(mask)) <= {0, 255}
+    assert boxes.ndim == 2 and boxes.shape[1] == 4 and boxes.dtype == np.int64
+
+
+def test_the_default_is_the_thesis_with_any_number_of_threads_and_any_layout() -> None:
+    before, after = scene()
+    found = sorvolo.compare_images(before, after)
+    assert found.mask[40:50, 50:70].all() and len(found.boxes) == 1
+    wide = np.zeros((96, 256, 3), np.uint8)
+    wide[:, ::2] = after
+    again = sorvolo.compare_images(sorvolo.prepare_reference(before), wide[:, ::2], threads=3)
+    np.testing.assert_array_equal(found.mask, again.mask)
+    np.testing.assert_array_equal(found.boxes, again.boxes)
+
+
+PICTURE = np.zeros((40, 50, 3), np.uint8)
+
+
+@pytest.mark.parametrize("method", ["thesis", "robust"])
+@pytest.mark.parametrize(
+    ("reference", "query", "valid", "message"),
+    [
+        (PICTURE[:-1], PICTURE, None, "reference is 50 x 39 px, query 50 x 40 px"),
+        (PICTURE.astype(np.float32), PICTURE, None, "reference holds float32; give uint8"),
+        (PICTURE, PICTURE[..., 0], None, r"query has the shape \(40, 50\)"),
+        (PICTURE, np.zeros((40, 50, 4), np.uint8), None, r"query has the shape \(40, 50, 4\)"),
+        (PICTURE[:0], PICTURE[:0], None, "reference is empty"),
+        ([[1, 2]], PICTURE, None, "reference is a list"),
+        (PICTURE, None, None, "query is a NoneType"),
+        (PICTURE, PICTURE, np.ones((50, 40), bool), r"valid has the shape \(50, 40\)"),
+        (PICTURE, PICTURE, PICTURE[..., 0], "valid is an array of uint8"),
+        (PICTURE, PICTURE, "yes", "valid is a str"),
+    ],
+)
+def test_input_that_cannot_be_used_is_named(method: str, reference: Any, query: Any, valid: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        sorvolo.compare_images(reference, query, valid, method=method)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "best"}, "method is 'best'; give one of thesis, robust"),
+        ({"settings": RobustSettings()}, "settings are RobustSettings; method 'thesis' needs ThesisSettings"),
+        ({"settings": sorvolo.ThesisSettings(), "method": "robust"}, "needs RobustSettings"),
+        ({"settings": {"T_B": 0.3}}, "settings are dict"),
+        ({"threads": 0}, "threads is 0"),
+        ({"threads": 1.5}, "threads is 1.5"),
+    ],
+)
+def test_settings_that_contradict_are_named(options: Any, message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        sorvolo.compare_images(PICTURE, PICTURE, **options)
