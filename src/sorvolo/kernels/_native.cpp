@@ -371,7 +371,7 @@ private:
     std::vector<const std::uint8_t *> reference_, query_;
 };
 
-constexpr int FEW = 12;  // pixels in question in a block of 64: with fewer one by one is faster
+constexpr int FEW = 4;  // pixels in question in a block of 64: with fewer one by one is faster
 
 void compare_rows(const Strings &work, int first, int last) {
     const CountBlock count_block = best_count_block();

@@ -168,9 +168,15 @@ Integers64 gray_histograms(const Bytes &image, const Bytes &tables, const Intege
         for (std::int64_t y = box[1]; y < box[1] + box[3]; ++y) {
             const std::uint8_t *pixel = pixels + 3 * (y * columns + box[0]);
             const std::uint8_t *counts = counted ? counted + y * columns + box[0] : nullptr;
-            for (std::int64_t x = 0; x < box[2]; ++x, pixel += 3)
-                if (!counts || counts[x])
-                    ++parts[x & 3][(weighted[0][pixel[0]] + weighted[1][pixel[1]] + weighted[2][pixel[2]]) >> GRAY_SHIFT];
+            auto gray = [&](std::int64_t x) {
+                const std::uint8_t *at = pixel + 3 * x;
+                return (weighted[0][at[0]] + weighted[1][at[1]] + weighted[2][at[2]]) >> GRAY_SHIFT;
+            };
+            std::int64_t x = 0;
+            for (; !counts && x + 4 <= box[2]; x += 4)
+                for (int k = 0; k < 4; ++k) ++parts[k][gray(x + k)];
+            for (; x < box[2]; ++x)
+                if (!counts || counts[x]) ++parts[x & 3][gray(x)];
         }
         for (int value = 0; value < 256; ++value)
             out[value] = static_cast<std::int64_t>(parts[0][value]) + parts[1][value] + parts[2][value] +
