@@ -11,6 +11,7 @@ import typer
 
 from sorvolo import __version__
 from sorvolo.cli.calibrate import calibrate
+from sorvolo.cli.compare import compare
 from sorvolo.cli.demo import demo
 from sorvolo.cli.evaluate import evaluate_app
 from sorvolo.cli.history import history
@@ -22,8 +23,8 @@ from sorvolo.cli.simulate import simulate
 from sorvolo.errors import SorvoloError
 
 _COMMANDS: dict[str, Callable[..., None]] = {
-    "inspect": inspect, "plan": plan, "map": map_command, "simulate": simulate, "calibrate": calibrate,
-    "demo": demo, "history": history, "review": review,
+    "inspect": inspect, "plan": plan, "map": map_command, "compare": compare, "simulate": simulate,
+    "calibrate": calibrate, "demo": demo, "history": history, "review": review,
 }
 _FAILED, _STOPPED = 1, 130
 _FULL = (errno.ENOSPC, errno.EDQUOT)

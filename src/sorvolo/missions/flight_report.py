@@ -31,6 +31,8 @@ class Stage(StrEnum):
 
     UNDISTORT = "undistort"
     REGISTER = "register"
+    COMPARE = "compare"
+    EVIDENCE = "evidence"
     PAINT = "paint"
     STORE = "store"
     REPORT = "report"
@@ -162,7 +164,7 @@ def build_report(
         "registration_cpu_s_per_keyframe": registering_s / selected,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "notices": [asdict(each) for each in all_notices],
-        "warnings": _warnings(placed, residuals, horizontal_m, seen, setup),
+        "warnings": [*_warnings(placed, residuals, horizontal_m, seen, setup), *_clock_warnings(setup, log)],
         "settings": asdict(settings),
         "versions": {
             "python": platform.python_version(),
@@ -209,6 +211,16 @@ def _warnings(
     if setup.source.camera.focal_sigma > 0.1:
         warnings.append(f"the camera is a guess ({setup.source.camera.origin}); give --camera for a true scale")
     return warnings
+
+
+def _clock_warnings(setup: FlightSetup, log: FlightLog) -> list[str]:
+    clock, applied_s = setup.clock, log.offset_applied_s
+    if clock is None or abs(applied_s) <= 2 * clock.sigma_s:
+        return []
+    return [
+        f"the pictures fit this telemetry best {applied_s:+.1f} s from where its clock puts them, more than clocks "
+        f"tied like these differ ({clock.tie}): is it the telemetry of this flight? --offset 0 keeps to its clock"
+    ]
 
 
 def _track_row(each: PlacedFrame) -> dict[str, Any]:

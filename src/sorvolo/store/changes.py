@@ -1,15 +1,15 @@
 """The files of a comparison: changes as GeoJSON, their crops before and after, and the views' masks."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any
 
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
+from sorvolo.geometry.arrays import Anything, Boxes, Floats, ImageGray, Mask
 from sorvolo.geometry.polygons import signed_area
-from sorvolo.store.atomic import atomic_write_bytes
+from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.change_records import StoredChange
 from sorvolo.store.exports import longitude_latitude, rounded, utc_text
 from sorvolo.store.images import png_from_rgba
@@ -60,6 +60,15 @@ def write_view_masks(folder: Path, name: str, changed: ImageGray, valid: Mask) -
     _, data = cv2.imencode(".png", mask)
     atomic_write_bytes(path, data.tobytes(), durable=False)
     return path
+
+
+def write_pictures(folder: Path, pictures: Mapping[str, Anything]) -> None:
+    """Write pictures, BGR or gray uint8, as `<name>.png` into the folder, which is made; StoreError on a full disk."""
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    for name, picture in pictures.items():
+        _, data = cv2.imencode(".png", picture)
+        atomic_write_bytes(folder / f"{name}.png", data.tobytes(), durable=False)
 
 
 def mask_name(frame_name: str, taken: Iterable[str] = ()) -> str:

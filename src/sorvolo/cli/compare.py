@@ -1,0 +1,176 @@
+"""`sorvolo compare`: a later flight against the map, its changes told as they are found."""
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from sorvolo.cli.map import newest_version, read_json, tell_path
+from sorvolo.missions.compare_flights import compare_flights
+from sorvolo.missions.settings import CompareSettings
+from sorvolo.store.archive import Archive
+from sorvolo.survey.findings import Change, ChangeKind, CompareUpdate
+
+_COLOURS = {
+    ChangeKind.APPEARED: "green", ChangeKind.DISAPPEARED: "red", ChangeKind.REPLACED: "yellow",
+    ChangeKind.MOVING: "cyan",
+}
+_MOST_ROWS = 40
+
+
+class ChangeMethod(StrEnum):
+    """How a frame is compared with the map."""
+
+    ROBUST = "robust"
+    THESIS = "thesis"
+
+
+def compare(
+    inputs: Annotated[list[Path], typer.Argument(help="Videos, folders of photos, or photos of a later flight.")],
+    site: Annotated[Path, typer.Option(help="Folder of the map that an earlier flight made.")],
+    telemetry: Annotated[Path | None, typer.Option(help="The flight's log, if not beside the video.")] = None,
+    camera: Annotated[str, typer.Option(help="Calibration file, preset name or EXIF code, or aov=DEG.")] = "",
+    area: Annotated[
+        Path | None, typer.Option(help="Outline outside of which frames are not used: GeoJSON, KML, KMZ.")
+    ] = None,
+    method: Annotated[ChangeMethod, typer.Option(help="robust: ours. thesis: the baseline.")] = ChangeMethod.ROBUST,
+    views_per_second: Annotated[
+        float, typer.Option(help="Frames compared a second of a video; the others show the same again.")
+    ] = 5.0,
+    votes: Annotated[int, typer.Option(help="Views that must show a change ...")] = 3,
+    voters: Annotated[int, typer.Option(help="... among the last so many that saw the ground.")] = 5,
+    offset: Annotated[float | None, typer.Option(help="Telemetry time minus video time, s.")] = None,
+    ground_elevation: Annotated[
+        float | None, typer.Option(help="Of the ground, m, in telemetry's own height reference.")
+    ] = None,
+    masks: Annotated[bool, typer.Option("--masks", help="Write each frame's change mask and boxes, too.")] = False,
+    steps: Annotated[
+        Path | None, typer.Option(help="Folder for method thesis's intermediate pictures (its Figure 3.14).")
+    ] = None,
+    update: Annotated[
+        bool, typer.Option("--update/--no-update", help="Bring the map up to date where the ground changed or is new.")
+    ] = True,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Find what appeared, disappeared or moves since the map in the site folder was made, and update the map.
+
+    Example: sorvolo compare DJI_0057.MP4 --site field
+
+    Example: sorvolo compare photos/ --site field --masks --json
+    """
+    settings = CompareSettings(
+        method.value, views_per_second, votes, voters, offset, ground_elevation, updates_map=update, writes_masks=masks,
+    )
+    results = compare_and_read_results(
+        inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area, steps=steps
+    )
+    if as_json:
+        typer.echo(json.dumps({"site": str(site), "flights": results}, indent=1))
+    else:
+        show_results(results, site, Console())
+
+
+def compare_and_read_results(
+    inputs: Sequence[Path], site: Path, settings: CompareSettings, *, telemetry: Path | None = None,
+    camera: str | None = None, area: Path | None = None, steps: Path | None = None,
+) -> list[dict[str, Any]]:
+    """Compare with a bar and each change as it is announced on stderr; report and changes of each flight, in order."""
+    before = newest_version(site)
+    comparing = compare_flights(
+        inputs, site, settings, telemetry=telemetry, camera=camera, area=area, steps=steps
+    )
+    # closed even when the bar is stopped: then the site is as it was
+    with closing(comparing) as updates:
+        _show_progress(updates, Console(stderr=True))
+    with Archive.open(site, write=False) as archive:
+        compared = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
+        return [_result(archive.flight_folder(flight_id)) for flight_id in compared]
+
+
+def show_results(results: Sequence[Mapping[str, Any]], site: Path, console: Console) -> None:
+    """Tell what changed, what could not be compared, and where the files are."""
+    for result in results:
+        _show_result(result, console)
+        folder = site / "flights" / result["flight"]
+        tell_path("page", folder / "changes.html", console)
+        tell_path("GeoJSON", folder / "changes.geojson", console)
+    tell_path("map", site / "preview.png", console)
+
+
+def _show_progress(updates: Any, console: Console) -> None:
+    columns = (
+        SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=30),
+        TextColumn("{task.fields[told]}"), TimeRemainingColumn(),
+    )
+    number = 0
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task("opening", total=None, told="")
+        update: CompareUpdate
+        for update in updates:
+            for change in update.announced:
+                number += 1
+                console.print(_words_of(change), highlight=False)
+            rate = f"{update.frames_read / update.seconds:.1f} frames/s, " if update.seconds > 0 else ""
+            progress.update(
+                task, description="comparing",
+                told=f"{rate}{update.compared} of {update.views} compared, {number} changes",
+                total=max(update.frames_expected, update.frames_read), completed=update.frames_read,
+            )
+
+
+def _words_of(change: Change) -> str:
+    colour = _COLOURS[change.kind]
+    centre_m = change.outline_m.mean(axis=0)
+    return (
+        f"[{colour}]{change.kind.value:>11}[/{colour}]  {change.length_m:.1f} m long, {centre_m[0]:+.1f} m east "
+        f"{centre_m[1]:+.1f} m north of the site's origin, within {change.sigma_m:.2f} m"
+    )
+
+
+def _result(folder: Path) -> dict[str, Any]:
+    report = read_json(folder / "report.json")
+    changes = read_json(folder / "changes.geojson")
+    return {
+        "flight": report["flight"], "method": report["method"], "comparison": report["comparison"],
+        "frames": report["frames"], "seconds": report["seconds"]["total"], "peak_memory_mb": report["peak_memory_mb"],
+        "warnings": report["warnings"], "notices": report["notices"], "changes": changes,
+    }
+
+
+def _show_result(result: Mapping[str, Any], console: Console) -> None:
+    comparison = result["comparison"]
+    console.print(f"Flight {escape(result['flight'])}: {len(result['changes']['features'])} changes", style="bold")
+    table = Table("id", "kind", "size m", "area m2", "longitude", "latitude", "within m", "views", "score")
+    for feature in result["changes"]["features"][:_MOST_ROWS]:
+        each = feature["properties"]
+        longitude, latitude = _middle(feature["geometry"]["coordinates"][0])
+        table.add_row(
+            escape(each["id"]), each["kind"], f"{each['length_m']:.2f}", f"{each['area_m2']:.2f}", f"{longitude:.6f}",
+            f"{latitude:.6f}", f"{each['sigma_m']:.2f}", str(each["views"]), f"{each['score']:.2f}",
+        )
+    if table.row_count:
+        console.print(table)
+    if len(result["changes"]["features"]) > _MOST_ROWS:
+        console.print(f"and {len(result['changes']['features']) - _MOST_ROWS} more in changes.geojson")
+    views = comparison["views"]
+    console.print(
+        f"{views['compared']} of {sum(views.values())} views compared over {comparison['compared_area_m2']:.0f} m2, "
+        f"in {result['seconds']:.1f} s, {result['peak_memory_mb']:.0f} MB at most"
+    )
+    for reason, count in list(comparison["reasons"].items())[:6]:
+        console.print(f"  {count} x {escape(reason)}", highlight=False)
+    for warning in result["warnings"]:
+        console.print(f"[yellow]warning[/yellow]  {escape(warning)}")
+
+
+def _middle(ring: Sequence[Sequence[float]]) -> tuple[float, float]:
+    points = ring[:-1]
+    return sum(each[0] for each in points) / len(points), sum(each[1] for each in points) / len(points)

@@ -1,0 +1,87 @@
+"""Mode 1, later flights: sources against the map in a site folder, frame by frame."""
+
+import time
+from collections.abc import Generator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from sorvolo.capture.areas import read_area
+from sorvolo.capture.source import Source, open_sources
+from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.missions.compare_run import CompareRun
+from sorvolo.missions.flight_setup import known_flights, prepare
+from sorvolo.missions.settings import CompareSettings
+from sorvolo.mosaic.selection import every
+from sorvolo.store.archive import Archive
+from sorvolo.survey.area import Area
+from sorvolo.survey.findings import CompareUpdate, ViewStatus
+from sorvolo.survey.flight import Frame, PosedFrame
+
+
+def compare_flights(
+    inputs: Sequence[Path], site: Path, settings: CompareSettings = CompareSettings(), *,  # noqa: B008 (frozen)
+    telemetry: Path | None = None, camera: Path | str | None = None, area: Path | None = None,
+    steps: Path | None = None,
+) -> Generator[CompareUpdate]:
+    """Compare one or more later flights with the map in the site folder, yielding an update for each frame compared.
+
+    `inputs`, `telemetry`, `camera` and `area` are those of `map_flights`. An update carries the changes that its
+    frame made sure of. `steps` is a folder for the intermediate pictures of method thesis (its Figure 3.14). The
+    flights' findings and the new version of the map are part of the site when a flight's last update was yielded.
+    Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
+    to stop early: the flight that is being compared is left out, those before it are in.
+    """
+    if steps is not None and settings.method != "thesis":
+        raise SettingsError("the steps are those of the thesis's method: give --method thesis as well")
+    wanted = None if area is None else read_area(area)
+    with Archive.open(site, write=False) as archive:
+        if not archive.tiles():
+            raise StoreError(f"{site} holds no map yet; make one of an earlier flight: sorvolo map INPUT --site {site}")
+    sources = open_sources(inputs, telemetry, camera, known_flights(site))
+    with Archive.open(site, write=True) as archive:
+        for source in sources:
+            yield from _compare_one(source, archive, settings, wanted, steps, telemetry_named=telemetry is not None)
+
+
+def _compare_one(
+    source: Source, archive: Archive, settings: CompareSettings, area: Area | None, steps: Path | None, *,
+    telemetry_named: bool,
+) -> Generator[CompareUpdate]:
+    started_s = time.monotonic()
+    setup = prepare(source, settings.mapping, archive.site(), telemetry_named=telemetry_named, finds_itself=True)
+    inside = setup.inside(area)
+    step_s = 0.0 if source.kind == "photos" else 1.0 / settings.views_per_second
+    base, is_newest = _base_version(archive, source)
+    if not is_newest:
+        settings = replace(settings, updates_map=False)  # what later flights painted stays
+    with CompareRun(setup, archive, settings, base, steps) as run:
+        read = 0
+        for each in source.frames(every(step_s)):
+            read = each.index + 1
+            if isinstance(each, Frame):
+                posed = PosedFrame(each, setup.prior(each, first=False))
+                if not inside(posed):
+                    continue
+                outcome, announced = run.add(posed)
+                status, reason, residual_px = outcome.status, outcome.reason, outcome.residual_px
+            else:
+                run.lose(each)
+                status, reason, residual_px, announced = ViewStatus.LOST, each.reason, float("nan"), ()
+            yield CompareUpdate(
+                each.name, setup.utc_ns(each.time_ns), status, reason, residual_px, announced, read, source.frame_count,
+                run.views, run.compared, time.monotonic() - started_s,
+            )
+        run.finish(source.notices(), started_s)
+
+
+def _base_version(archive: Archive, source: Source) -> tuple[int, bool]:
+    """The version to compare with, and whether the flight may paint: the newest, or the one before its own."""
+    complete = [version for version in archive.versions() if version.complete]
+    own = next((version for version in reversed(complete) if version.flight_id == source.name), None)
+    if own is None:
+        return complete[-1].id, True
+    if own.parent_id == 0:
+        raise InputError(
+            f"the map of the site is flight {source.name}'s own; compare a later flight, or map an earlier one first"
+        )
+    return own.parent_id, own.id == complete[-1].id

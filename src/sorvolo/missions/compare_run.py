@@ -1,0 +1,251 @@
+"""One later flight on its way into a site: views to evidence, evidence to changes, changes into the map."""
+
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import cv2
+import numpy as np
+
+from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
+from sorvolo.change.outlines import KnownPlace
+from sorvolo.change.reference import ReferenceMap
+from sorvolo.change.thesis import thesis_steps
+from sorvolo.change.updating import patched
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import PointsM
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.missions.compare_views import ViewMaker, ViewOutcome, as_bgr
+from sorvolo.missions.earlier_pictures import EarlierPictures
+from sorvolo.missions.flight_report import FlightLog, Stage, build_report
+from sorvolo.missions.flight_setup import FlightSetup
+from sorvolo.missions.map_planar import PlanarRun
+from sorvolo.missions.settings import CompareSettings
+from sorvolo.mosaic.placing import rejected
+from sorvolo.store.archive import Archive, FlightWriter
+from sorvolo.store.changes import write_pictures
+from sorvolo.store.exports import picture
+from sorvolo.store.report_page import report_page
+from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Verdict, ViewStatus
+from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
+from sorvolo.survey.mosaic import PlacedFrame, Status
+
+_NEW_GROUND = 0.05  # share of a frame beyond the map: with less it is not worth a place in it
+_EXTENSION_OVERLAP = 0.7
+_CELL_M = 1.0  # of the record of what was compared
+
+
+class CompareRun:
+    """A later flight on its way into a site. A context manager: leaving without `finish` leaves the site as it was."""
+
+    def __init__(
+        self, setup: FlightSetup, archive: Archive, settings: CompareSettings, base_version: int, steps: Path | None
+    ) -> None:
+        self._setup, self._archive, self._settings, self._steps = setup, archive, settings, steps
+        self._base_version = base_version
+        source, site_grid = setup.source, archive.site_grid()
+        self._writer: FlightWriter = archive.begin_flight(
+            source.name, source.fingerprint, {**vars(settings), "method": f"compare-{settings.method}"}
+        )
+        self._views = ViewMaker(
+            setup, ReferenceMap(archive.tiles(base_version), site_grid.grid), site_grid, settings,
+            EarlierPictures(archive, [source.name]) if settings.method == "robust" else None,
+        )
+        self._evidence = EvidenceMap(
+            site_grid.grid.m_per_px, EvidenceSettings(k=settings.votes, n=settings.voters), source.name,
+            [
+                KnownPlace(each.outline_m, each.kind) for each in archive.reviews()
+                if each.verdict is Verdict.REJECTED and each.flight_id != source.name
+            ],
+        )
+        self._log = FlightLog()
+        self._extension: PlanarRun | None = None
+        self._last_outline_m: PointsM | None = None
+        self._announced_ns: dict[str, int] = {}
+        self._placed: dict[int, PlacedFrame] = {}
+        self._statuses: Counter[ViewStatus] = Counter()
+        self._reasons: Counter[str] = Counter()
+        self._residuals_px: list[float] = []
+        self._unknown: list[float] = []
+        self._ground: set[tuple[int, int]] = set()
+        sigmas_m = np.array([each.sigma_m for each in archive.keyframes()])
+        self._map_sigma_m = float(np.nanmedian(sigmas_m)) if np.isfinite(sigmas_m).any() else 0.0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.__exit__(kind, error, trace)
+
+    @property
+    def views(self) -> int:
+        """Frames looked at so far, lost ones included."""
+        return self._statuses.total()
+
+    @property
+    def compared(self) -> int:
+        """Frames compared so far."""
+        return self._statuses[ViewStatus.COMPARED]
+
+    def lose(self, lost: LostFrame) -> None:
+        """A frame that cannot be used."""
+        self._end(ViewStatus.LOST, lost.reason)
+        camera = self._setup.source.camera.camera
+        time_ns = self._setup.utc_ns(lost.time_ns)
+        self._placed[lost.index] = rejected(lost.index, lost.name, time_ns, lost.reason, camera)
+
+    def add(self, posed: PosedFrame) -> tuple[ViewOutcome, tuple[Change, ...]]:
+        """Compare one frame; how that ended, and the changes that it was the last missing witness of."""
+        with self._log.stage(Stage.COMPARE):
+            outcome = self._views.look(posed)
+        self._end(outcome.status, outcome.reason)
+        if np.isfinite(outcome.residual_px):
+            self._residuals_px.append(outcome.residual_px)
+        self._placed[posed.frame.index] = self._views.placed(posed, outcome, self._map_sigma_m)
+        announced: tuple[Change, ...] = ()
+        if outcome.view is not None:
+            with self._log.stage(Stage.EVIDENCE):
+                announced = self._evidence.add(outcome.view)
+            self._announced_ns.update((each.id, outcome.view.time_ns) for each in announced)
+            self._note_ground(outcome.view)
+            with self._log.stage(Stage.STORE):
+                self._write_masks(outcome.view)
+        if outcome.status is ViewStatus.OUTSIDE or (outcome.view is not None and outcome.known < 1 - _NEW_GROUND):
+            self._extend(posed, outcome)
+        return outcome, announced
+
+    def finish(self, notices: Sequence[Notice], started_s: float) -> None:
+        """Conclude the evidence, bring the map up to date, and make the flight part of the site.
+
+        `started_s` is when the comparison began, by the monotonic clock.
+        """
+        if not self.compared and (self._extension is None or not self._extension.images):
+            reason = self._reasons.most_common(1)[0][0] if self._reasons else "there is none"
+            raise InputError(
+                f"no frame of {self._setup.source.name} fits the map: {reason}; is it another place, another season, "
+                "or night? `sorvolo inspect` tells what the flight holds"
+            )
+        with self._log.stage(Stage.EVIDENCE):
+            changes = [
+                replace(each, announced_ns=self._announced_ns.get(each.id, -1)) for each in self._evidence.conclude()
+            ]
+        images: Mapping[int, str] = {}
+        if self._extension is not None and self._settings.updates_map:
+            for each in self._extension.complete():
+                if each.status is not Status.REJECTED:
+                    self._placed[each.index] = each
+            images = self._extension.images
+        with self._log.stage(Stage.PAINT):
+            if self._settings.updates_map:
+                self._paint(changes)
+        placed = [self._placed[index] for index in sorted(self._placed)]
+        with self._log.stage(Stage.REPORT):
+            shown = picture(self._writer.tiles, 1600).rgba
+        report = build_report(
+            self._setup, self._settings.mapping, self._log, placed, self._archive.site(), None, None,
+            self._setup.source.camera.camera, self._writer.tiles, [*self._setup.notices, *notices],
+            time.monotonic() - started_s, spread=float("nan"),
+        )
+        report |= {"method": f"compare-{self._settings.method}", "comparison": self._summary(changes)}
+        self._writer.commit(placed, images, report, report_page(report, shown), changes=changes)
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _end(self, status: ViewStatus, reason: str) -> None:
+        self._statuses[status] += 1
+        if reason:
+            self._reasons[reason] += 1
+
+    def _extend(self, posed: PosedFrame, outcome: ViewOutcome) -> None:
+        """Frames that show new ground go on to be mapped, as a first flight's would."""
+        if not self._settings.updates_map or self._setup.track is None:
+            return
+        outline_m = self._outline_m(posed, outcome)
+        last_m = self._last_outline_m if self._setup.source.kind == "video" else None
+        if outline_m is not None and last_m is not None and _overlap(last_m, outline_m) > _EXTENSION_OVERLAP:
+            return
+        self._last_outline_m = outline_m
+        if self._extension is None:
+            self._extension = PlanarRun(self._setup, self._archive, self._settings.mapping, writer=self._writer)
+        with self._log.stage(Stage.REGISTER):
+            self._extension.add(posed)
+
+    def _outline_m(self, posed: PosedFrame, outcome: ViewOutcome) -> PointsM | None:
+        if outcome.site_from_image is not None:
+            outline_m = self._views.outline_m(outcome.site_from_image)
+        elif posed.prior.knows_place:
+            outline_m = self._views.told_outline_m(posed.prior)
+        else:
+            return None
+        return outline_m if np.isfinite(outline_m).all() else None
+
+    def _note_ground(self, view: ComparedView) -> None:
+        """Count the ground that was compared, and how much under the frame was not known."""
+        height, width = view.valid.shape
+        self._unknown.append(1.0 - float(view.valid.mean()))
+        ys, xs = np.mgrid[8:height:16, 8:width:16]
+        seen = view.valid[ys, xs]
+        points_m = apply_homography(view.site_from_image, np.column_stack([xs[seen], ys[seen]]).astype(float))
+        cells = np.unique(np.floor(points_m / _CELL_M).astype(np.int64), axis=0)
+        self._ground.update(map(tuple, cells.tolist()))
+
+    def _write_masks(self, view: ComparedView) -> None:
+        if self._settings.writes_masks:
+            changed, valid = self._views.masks_of_frame(view)
+            self._writer.save_masks(view.name, changed, valid, self._views.boxes_of_frame(view))
+        if self._steps is not None:
+            steps = thesis_steps(as_bgr(view.reference), as_bgr(view.image), view.valid)
+            write_pictures(self._steps / view.name, steps.pictures())
+
+    def _paint(self, changes: Sequence[Change]) -> None:
+        """Paint what changed into the map: only the tiles that it touches become new."""
+        site_grid, tiles = self._archive.site_grid(), self._writer.tiles
+        for change in changes:
+            if change.kind is ChangeKind.MOVING:
+                continue
+            grid_from_site = site_grid.grid_from_site_affine(change.outline_m.mean(axis=0), 50.0)
+            height, width = change.patch.changed.shape
+            corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]]) - 0.5
+            outline = apply_homography(grid_from_site @ change.patch.site_from_patch, corners)
+            for index in sorted(site_grid.grid.tiles_touched(outline)):
+                if index in tiles:
+                    old = tiles[index]
+                    new = patched(old, site_grid.grid.tile_window(index), grid_from_site, change.patch)
+                    if new is not old:
+                        tiles[index] = new
+
+    def _summary(self, changes: Sequence[Change]) -> dict[str, Any]:
+        """The report's part on the comparison; specified in docs/formats.md."""
+        kinds = Counter(each.kind for each in changes)
+        residuals = np.array(self._residuals_px)
+        return {
+            "against_version": self._base_version,
+            "method": self._settings.method,
+            "views": {status.value: self._statuses[status] for status in ViewStatus},
+            "reasons": dict(self._reasons.most_common()),
+            "residual_px": {
+                "median": float(np.median(residuals)) if len(residuals) else None,
+                "p95": float(np.percentile(residuals, 95)) if len(residuals) else None,
+            },
+            "changes": {kind.value: kinds[kind] for kind in ChangeKind},
+            "suppressed": self._evidence.suppressed,
+            "compared_area_m2": len(self._ground) * _CELL_M**2,
+            "unknown_share": float(np.mean(self._unknown)) if self._unknown else None,
+            "votes": self._settings.votes, "voters": self._settings.voters,
+            "chosen": self._views.chosen(),
+            "map_updated": self._settings.updates_map,
+        }
+
+
+def _overlap(a_m: PointsM, b_m: PointsM) -> float:
+    """The share of outline b, convex, that outline a covers."""
+    centre = b_m.mean(axis=0)
+    a, b = (a_m - centre).astype(np.float32), (b_m - centre).astype(np.float32)
+    area, _ = cv2.intersectConvexConvex(a, b)
+    return float(area / max(cv2.contourArea(b), 1e-6))

@@ -1,0 +1,305 @@
+"""A later flight against the map: from files to changes, and a map brought up to date."""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.geometry.geodesy import Geodetic
+from sorvolo.missions.compare_flights import compare_flights
+from sorvolo.missions.evaluate_changes import evaluate_changes
+from sorvolo.missions.map_flight import map_flights
+from sorvolo.missions.settings import CompareSettings
+from sorvolo.missions.simulate_site import simulate_site
+from sorvolo.simulation.settings import (
+    ImagingSettings,
+    LaterSettings,
+    OutputSettings,
+    PathSettings,
+    SceneSettings,
+    SensorSettings,
+    SimulationSettings,
+)
+from sorvolo.store.archive import Archive
+from sorvolo.survey.findings import CompareUpdate, Verdict, ViewStatus
+
+_PAIR = SimulationSettings(
+    seed=41, flights=2,
+    scene=SceneSettings(people=0, cars=1, small_objects=3, has_scenery=False),
+    path=PathSettings(height_m=18, speed_m_s=5, length_m=36, strips=2, strip_spacing_m=7),
+    imaging=ImagingSettings(width_px=640, height_px=360, fps=5),
+    sensor=SensorSettings(noise_m=(0.2, 0.2, 0.2)),
+    later=LaterSettings(people=0, cars=1, small_objects=3, removed=2, moved=0),
+    output=OutputSettings(truth_step=2),
+)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two flights over one site, the second finding other objects and other light; with the truth."""
+    folder = tmp_path_factory.mktemp("pair") / "flown"
+    for _ in simulate_site(folder, _PAIR):
+        pass
+    return folder
+
+
+@pytest.fixture(scope="module")
+def mapped(flown: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first flight's map; copied by those who change it."""
+    site = tmp_path_factory.mktemp("pair") / "site"
+    for _ in map_flights([flown / "flight1"], site, camera=flown / "camera.xml"):
+        pass
+    return site
+
+
+@pytest.fixture
+def site(mapped: Path, tmp_path: Path) -> Path:
+    shutil.copytree(mapped, tmp_path / "site")
+    return tmp_path / "site"
+
+
+@pytest.fixture(scope="module")
+def compared(flown: Path, mapped: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[CompareUpdate]]:
+    site = tmp_path_factory.mktemp("pair") / "compared"
+    shutil.copytree(mapped, site)
+    return site, compare(flown, site, CompareSettings(writes_masks=True))
+
+
+def compare(flown: Path, site: Path, settings: CompareSettings | None = None) -> list[CompareUpdate]:
+    wanted = settings or CompareSettings()
+    return list(compare_flights([flown / "flight2"], site, wanted, camera=flown / "camera.xml"))
+
+
+def features(site: Path, flight: str = "flight2") -> list[dict]:
+    return json.loads((site / "flights" / flight / "changes.geojson").read_text())["features"]
+
+
+def report(site: Path, flight: str = "flight2") -> dict:
+    return json.loads((site / "flights" / flight / "report.json").read_text())
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_most_changes_are_found_and_few_are_false(compared, flown):
+    measured = evaluate_changes(compared[0], truth=flown)
+    events = measured[0].events
+    assert events.found >= 0.7 * events.must_find
+    assert events.false <= 2
+    assert events.twice == 0
+
+
+def test_changes_are_announced_once_while_the_flight_lasts(compared):
+    site, updates = compared
+    announced = [change.id for update in updates for change in update.announced]
+    assert len(announced) == len(set(announced)) > 0
+    assert {each["properties"]["id"] for each in features(site)} & set(announced)
+    assert all(update.status is ViewStatus.COMPARED for update in updates)
+    assert any(update.announced for update in updates[:-1])
+
+
+def test_the_files_tell_what_was_found(compared):
+    site, updates = compared
+    folder = site / "flights" / "flight2"
+    for each in features(site):
+        own = each["properties"]
+        assert own["kind"] in ("appeared", "disappeared", "replaced", "moving")
+        assert own["first_seen"] <= own["last_seen"]
+        assert own["sigma_m"] > 0
+        for side in ("before", "after"):
+            assert cv2.imdecode(
+                np.frombuffer((folder / "changes" / f"{own['id']}-{side}.png").read_bytes(), np.uint8), cv2.IMREAD_COLOR
+            ) is not None
+    told = report(site)["comparison"]
+    assert told["views"]["compared"] == len(updates)
+    assert told["compared_area_m2"] > 200
+    assert "changes.html" in {path.name for path in folder.iterdir()}
+
+
+def test_masks_have_the_frames_own_pixels(compared):
+    site, updates = compared
+    masks = site / "flights" / "flight2" / "masks"
+    mask = cv2.imdecode(np.frombuffer((masks / "0.png").read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert mask.shape == (360, 640)
+    assert set(np.unique(mask)) <= {0, 128, 255}
+    assert len(list(masks.glob("*.png"))) == len(updates)
+    boxes = json.loads((masks / "boxes.json").read_text())
+    assert any(boxes.values())
+
+
+def test_the_map_is_painted_where_the_ground_changed_and_nowhere_else(compared, mapped):
+    site, _ = compared
+    with Archive.open(mapped, write=False) as archive:
+        before = dict(archive.tiles())
+    with Archive.open(site, write=False) as archive:
+        after = dict(archive.tiles())
+        grid, frame = archive.site_grid(), archive.site().frame
+        outlines = [change.outline_m for change in archive.changes()]
+    touched = np.zeros(0)
+    centres = grid.grid_from_site(np.array([outline.mean(axis=0) for outline in outlines]))
+    reach = max(np.ptp(outline, axis=0).max() for outline in outlines) / grid.grid.m_per_px + 20
+    assert frame is not None
+    changed = 0
+    for index, tile in before.items():
+        ys, xs = np.nonzero((tile != after[index]).any(axis=-1) & (tile[..., 3] == 255))
+        if len(xs):
+            points = np.column_stack([xs, ys]) + np.array(index) * grid.grid.tile_px
+            touched = np.linalg.norm(points[:, None] - centres[None], axis=2).min(axis=1)
+            assert touched.max() < reach
+            changed += len(xs)
+    assert changed > 0
+
+
+def test_the_same_flight_again_gives_the_same_and_doubles_nothing(compared, flown, tmp_path):
+    shutil.copytree(compared[0], tmp_path / "again")
+    first = files(compared[0] / "flights" / "flight2" / "changes")
+    compare(flown, tmp_path / "again", CompareSettings(writes_masks=True))
+    assert files(tmp_path / "again" / "flights" / "flight2" / "changes") == first
+    assert features(tmp_path / "again") == features(compared[0])
+    with Archive.open(tmp_path / "again", write=False) as archive:
+        assert [each.id for each in archive.flights()] == ["flight1", "flight2"]
+        again = dict(archive.tiles())
+    with Archive.open(compared[0], write=False) as archive:
+        once = dict(archive.tiles())
+    assert once.keys() == again.keys()
+    assert all(np.array_equal(once[index], again[index]) for index in once)
+
+
+def test_stopping_half_way_leaves_the_site_as_it_was(flown, site):
+    with Archive.open(site, write=False) as archive:
+        before = [each.id for each in archive.versions()]
+    updates = compare_flights([flown / "flight2"], site, camera=flown / "camera.xml")
+    for _ in range(5):
+        next(updates)
+    updates.close()
+    with Archive.open(site, write=False) as archive:
+        assert [each.id for each in archive.versions()] == before
+        assert [each.id for each in archive.flights()] == ["flight1"]
+    assert not (site / "flights" / "flight2").exists()
+
+
+def test_a_rejected_change_does_not_come_back_with_the_next_flight(flown, site, tmp_path):
+    compare(flown, site, CompareSettings(updates_map=False))
+    (rejected, *others) = features(site)
+    with Archive.open(site, write=True) as archive:
+        archive.review(rejected["id"], Verdict.REJECTED)
+    compare(flown, site, CompareSettings(updates_map=False))
+    assert [each["geometry"] for each in features(site)] == [each["geometry"] for each in (rejected, *others)]
+    assert features(site)[0]["properties"]["review"] == "rejected"
+    for suffix in (".mp4", ".csv"):
+        shutil.copy(flown / "flight2" / f"flight2{suffix}", tmp_path / f"next{suffix}")
+    unchanged = CompareSettings(updates_map=False)
+    list(compare_flights([tmp_path / "next.mp4"], site, unchanged, camera=flown / "camera.xml"))
+    assert [each["geometry"] for each in features(site, "next")] == [each["geometry"] for each in others]
+    assert report(site, "next")["comparison"]["suppressed"] == 1
+
+
+def test_without_update_the_map_stays(flown, site):
+    with Archive.open(site, write=False) as archive:
+        before = dict(archive.tiles())
+    compare(flown, site, CompareSettings(updates_map=False))
+    with Archive.open(site, write=False) as archive:
+        after = dict(archive.tiles())
+    assert before.keys() == after.keys()
+    assert all(np.array_equal(before[index], after[index]) for index in before)
+    assert features(site)
+
+
+def test_a_flight_without_telemetry_finds_itself(flown, site, tmp_path):
+    shutil.copy(flown / "flight2" / "flight2.mp4", tmp_path / "silent.mp4")
+    updates = list(compare_flights([tmp_path / "silent.mp4"], site, camera=flown / "camera.xml"))
+    assert sum(each.status is ViewStatus.COMPARED for each in updates) >= 0.8 * len(updates)
+    assert features(site, "silent")
+
+
+def test_the_thesis_method_compares_too_and_shows_its_steps(flown, site, tmp_path):
+    updates = list(compare_flights(
+        [flown / "flight2"], site, CompareSettings(method="thesis"), camera=flown / "camera.xml",
+        steps=tmp_path / "steps",
+    ))
+    assert report(site)["comparison"]["method"] == "thesis"
+    pictures = list((tmp_path / "steps").rglob("*.png"))
+    assert len(pictures) >= 7 * len(updates)
+
+
+@pytest.mark.parametrize(("arguments", "match"), [
+    ({"settings": CompareSettings(), "steps": Path("steps")}, "--method thesis"),
+])
+def test_wrong_wishes_are_told(flown, site, arguments, match):
+    with pytest.raises(SettingsError, match=match):
+        list(compare_flights([flown / "flight2"], site, camera=flown / "camera.xml", **arguments))
+
+
+@pytest.mark.parametrize("make", [
+    lambda: CompareSettings(votes=4, voters=3), lambda: CompareSettings(views_per_second=0.0),
+    lambda: CompareSettings(method="best"),
+])
+def test_settings_are_checked(make: Callable[[], object]):
+    with pytest.raises(SettingsError):
+        make()
+
+
+def test_a_site_without_a_map_says_how_to_make_one(flown, tmp_path):
+    with pytest.raises(StoreError, match="sorvolo map"):
+        list(compare_flights([flown / "flight2"], tmp_path / "none", camera=flown / "camera.xml"))
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_first_flight_cannot_be_compared_with_its_own_map(flown, site):
+    with pytest.raises(InputError, match="flight1"):
+        list(compare_flights([flown / "flight1"], site, camera=flown / "camera.xml"))
+
+
+def elsewhere(tmp_path: Path, metres_east: float) -> Iterator[Path]:
+    moved = replace(_PAIR, flights=1, scene=replace(
+        _PAIR.scene, origin=Geodetic(41.8923127, 12.6035418 + metres_east / 83_000, 83.3)
+    ), seed=77)
+    for _ in simulate_site(tmp_path / "elsewhere", moved):
+        pass
+    yield tmp_path / "elsewhere"
+
+
+def test_a_flight_over_another_place_is_refused(site, tmp_path):
+    folder = next(elsewhere(tmp_path, 60_000))
+    with pytest.raises(InputError, match="km from the site"):
+        list(compare_flights([folder / "flight1"], site, camera=folder / "camera.xml"))
+
+
+def test_other_ground_in_the_same_place_is_refused_and_leaves_no_trace(flown, site, tmp_path):
+    folder = next(elsewhere(tmp_path, 0))
+    with pytest.raises(InputError, match="no frame of flight1-2 fits the map"):
+        list(compare_flights([folder / "flight1"], site, camera=folder / "camera.xml"))
+    assert not (site / "flights" / "flight1-2").exists()
+
+
+def test_ground_beside_the_map_extends_it(flown, tmp_path):
+    """The map is made of the frames over the western half alone; the second flight goes over all of it."""
+    frames = json.loads((flown / "truth" / "frames.geojson").read_text())["features"]
+    first = np.array([
+        [each["properties"]["camera_longitude_deg"], each["properties"]["camera_latitude_deg"]]
+        for each in frames if each["properties"]["flight"] == "flight1"
+    ])
+    (west, south), (east, north) = first.min(axis=0) - 1e-4, np.median(first, axis=0)
+    north = first[:, 1].max() + 1e-4
+    ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+    (tmp_path / "west.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    for _ in map_flights(
+        [flown / "flight1"], tmp_path / "site", camera=flown / "camera.xml", area=tmp_path / "west.geojson"
+    ):
+        pass
+    with Archive.open(tmp_path / "site", write=False) as archive:
+        before = dict(archive.tiles())
+    compare(flown, tmp_path / "site")
+    with Archive.open(tmp_path / "site", write=False) as archive:
+        after = dict(archive.tiles())
+    area = {version: sum(int(np.count_nonzero(tile[..., 3])) for tile in tiles.values())
+            for version, tiles in (("before", before), ("after", after))}
+    assert area["after"] > 1.3 * area["before"]
+    assert features(tmp_path / "site")
