@@ -171,6 +171,11 @@ def test_photos_tell_what_most_of_the_few_that_saw_it_show():
     assert change.kind == ChangeKind.APPEARED
 
 
+def test_photos_of_the_same_second_taken_elsewhere_count():
+    photos = [view_of(i, 0.0, (-3 + 3 * i, 0, CAMERA_HEIGHT_M), [Thing(0, 0)]) for i in range(3)]
+    assert collect(photos)[0].conclude()[0].views == 3
+
+
 def test_a_single_view_is_believed_only_if_very_sure_and_at_half_the_score():
     thing = Thing(0, 0)
     sure = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [thing], score=0.95)

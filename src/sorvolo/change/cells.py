@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Anything, ImageGray, Mask, Matrix3, PointsM
+from sorvolo.geometry.arrays import Anything, Floats, ImageGray, Mask, Matrix3, PointsM
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import ComparedView
 
@@ -37,6 +37,24 @@ class CellWindow:
         return CellWindow(
             min(self.x0, other.x0), min(self.y0, other.y0), max(self.x1, other.x1), max(self.y1, other.y1)
         )
+
+    def part(self, part: tuple[slice, slice]) -> "CellWindow":
+        """The window of a part, rows and columns, of this window's raster."""
+        rows, columns = part
+        return CellWindow(
+            self.x0 + columns.start, self.y0 + rows.start, self.x0 + columns.stop, self.y0 + rows.stop
+        )
+
+    def within(self, outer: "CellWindow") -> tuple[slice, slice]:
+        """Where this window lies in the raster of another; what sticks out is cut off."""
+        return (
+            slice(max(self.y0 - outer.y0, 0), max(self.y1 - outer.y0, 0)),
+            slice(max(self.x0 - outer.x0, 0), max(self.x1 - outer.x0, 0)),
+        )
+
+    def box_m(self, cell_m: float) -> tuple[Floats, Floats]:
+        """South-west and north-east corner, (2,) each, in site metres."""
+        return np.array([self.x0, -self.y1]) * cell_m, np.array([self.x1, -self.y0]) * cell_m
 
     def site_from_cell(self, cell_m: float) -> Matrix3:
         """(3, 3) affine map from a raster of this window, (0, 0) the centre of its first cell, to site metres."""
@@ -112,6 +130,26 @@ def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask) -> LaidVie
     flagged = (laid(changed, cv2.INTER_LINEAR) >= 128) & seen
     keeps_out = laid(keep_out, cv2.INTER_NEAREST) > 0 if held.any() else np.zeros_like(seen)
     return LaidView(window, flagged, seen, np.where(flagged, laid(score, cv2.INTER_NEAREST), 0), keeps_out)
+
+
+def pieces(cells: Mask, gap: int) -> Iterator[tuple[Mask, tuple[slice, slice]]]:
+    """The connected pieces of cells, gaps of up to `gap` cells closed: each with the raster's part that holds it."""
+    side = 2 * ((gap + 1) // 2) + 1  # odd: an even one would shift the cells
+    closed = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_CLOSE, np.ones((side, side), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+    for label in range(1, count):
+        x, y, w, h = (int(each) for each in stats[label, :4])
+        part = (slice(y, y + h), slice(x, x + w))
+        yield labels[part] == label, part
+
+
+def cut_off_pieces(laid: LaidView) -> Mask:
+    """The flagged pieces of a view that end at unknown ground or at the view's rim."""
+    unseen = cv2.copyMakeBorder((~laid.seen).view(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
+    beside = cv2.dilate(unseen, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
+    _, labels = cv2.connectedComponents(laid.flagged.view(np.uint8), connectivity=8)
+    cut = np.unique(labels[beside & laid.flagged])
+    return np.isin(labels, cut) if len(cut) else np.zeros_like(laid.flagged)
 
 
 def scale_m_per_px(view: ComparedView) -> float:

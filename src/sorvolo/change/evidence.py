@@ -6,14 +6,22 @@ them gathers k votes out of n in the same cell. Unknown ground says nothing, nei
 """
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.cells import CellEvidence, CellGrid, CellWindow, LaidView, lay, scale_m_per_px
+from sorvolo.change.cells import (
+    CellEvidence,
+    CellGrid,
+    CellWindow,
+    LaidView,
+    cut_off_pieces,
+    lay,
+    pieces,
+    scale_m_per_px,
+)
 from sorvolo.change.gathering import GatheredChange, upright_weight
 from sorvolo.change.moving import BlobTracker, MovingSettings, Track
 from sorvolo.change.outlines import KnownPlace, is_known, measures, outline_of
@@ -40,7 +48,7 @@ class EvidenceSettings:
     n: int = 5  # ... of the last ones that saw its ground
     least_views: int = 2  # where fewer than n ever see it
     least_views_apart_s: float = 0.1  # frames nearer in time see the same thing and say nothing new
-    least_share: float = 0.45  # of all views of its ground must show it, those from above counting most
+    least_share: float = 0.4  # of all views of its ground must show it, those from above counting most
     least_score: float = 0.2  # less sure, it is kept but not told
     least_area_m2: float = 0.02
     join_m: float = 0.3  # a smaller gap does not make two things of one
@@ -89,6 +97,7 @@ class EvidenceMap:
         self._site_m_per_px = site_m_per_px
         self._cell_m = max(_LEAST_CELL_M, _CELL_PX * site_m_per_px)
         self._join_m = max(settings.join_m, 3 * self._cell_m) if settings.join_m else 0.0
+        self._gap = int(np.ceil(self._join_m / self._cell_m))
         self._grid = CellGrid(settings.n)
         self._tracker = BlobTracker(settings.moving)
         self._found: dict[int, GatheredChange] = {}  # by number, in order
@@ -98,14 +107,14 @@ class EvidenceMap:
         self._seeds: list[GatheredChange] = []
         self._recent: deque[_Witness] = deque(maxlen=settings.n)
         self._number = 0
-        self._last_ns: int | None = None
+        self._last: tuple[int, int, Floats] | None = None  # index, time, camera of the last view that counted
         self._tallied_at_m: Floats | None = None
 
     def add(self, view: ComparedView) -> tuple[Change, ...]:
         """Take in one view; the changes that it makes certain enough to be told, each once in a flight."""
-        if self._last_ns is not None and (view.time_ns - self._last_ns) * 1e-9 < self._settings.least_views_apart_s:
+        if self._is_repeat(view):
             return ()
-        self._last_ns = view.time_ns
+        self._last = (view.index, view.time_ns, view.camera_m)
         known = int(np.count_nonzero(view.valid))
         may_follow = np.count_nonzero(view.changed) < _ALL_CHANGED * known
         followed = self._tracker.follow(view if may_follow else replace(
@@ -124,7 +133,7 @@ class EvidenceMap:
         budget = [_PICTURES_A_VIEW]
         new = self._gather(view, witness, earlier, evidence, budget)
         shown = self._update(view, witness, evidence.owner, {each.number for each in new}, budget)
-        announced = [self._change(each) for each in shown if self._tell(each, view.time_ns)]
+        announced = [self._told(each, view.time_ns) for each in shown]
         announced += self._tell_movers(view, followed.movers)
         self._keep_seeds(view, laid, evidence, budget)
         return tuple(each for each in announced if each is not None)
@@ -146,10 +155,19 @@ class EvidenceMap:
         self._seeds = []
         for change in self._found.values():
             if not change.is_told:
-                self._tell(change, -1)
+                self._told(change, -1)
             elif change.share < settings.least_share or change.score < settings.least_score:
                 change.is_hidden = True
         return self.changes()
+
+    def _is_repeat(self, view: ComparedView) -> bool:
+        if self._last is None:
+            return False
+        index, time_ns, camera_m = self._last
+        # photos may carry whole seconds only: what was taken elsewhere is no repeat, whatever its time
+        has_moved = np.linalg.norm(view.camera_m - camera_m) >= 2 * _MOVED_HEIGHTS * float(view.camera_m[2])
+        is_too_soon = (view.time_ns - time_ns) * 1e-9 < self._settings.least_views_apart_s
+        return view.index == index or (is_too_soon and not bool(has_moved))
 
     def _is_new_place(self, view: ComparedView) -> bool:
         last = self._tallied_at_m
@@ -175,7 +193,7 @@ class EvidenceMap:
         new = []
         cut_off: Mask | None = None
         least_cells = max(2, settings.least_area_m2 / self._cell_m**2)
-        for piece, part in self._pieces(sure | (evidence.owner > 0)):
+        for piece, part in pieces(sure | (evidence.owner > 0), self._gap):
             cells = sure[part] & piece
             owner = evidence.owner[part]
             owners = sorted({self._current(int(each)) for each in np.unique(owner[piece & (owner > 0)])})
@@ -185,7 +203,7 @@ class EvidenceMap:
                 if np.count_nonzero(cells) < least_cells or np.mean(laid.held[part][cells]) > 0.5:
                     continue
                 if cut_off is None:
-                    cut_off = _cut_off(laid)
+                    cut_off = cut_off_pieces(laid)
                 if (cells & cut_off[part]).any() and int(evidence.votes[part][cells].max()) < settings.n:
                     continue  # more of it will come into view soon
                 known = self._known_at(laid.window, part, cells)
@@ -196,7 +214,7 @@ class EvidenceMap:
                 change = self._found[owners[0]]
                 for younger in owners[1:]:
                     self._merge(change, self._found[younger])
-            window = _sub_window(laid.window, part)
+            window = laid.window.part(part)
             change.cells = window if change.cells is None else change.cells.joined(window)
             self._grid.own(window, cells, change.number)
             owner[cells] = change.number
@@ -207,9 +225,9 @@ class EvidenceMap:
         cells: Mask, budget: list[int],
     ) -> GatheredChange:
         change = GatheredChange(self._next_number(), view.time_ns)
-        change.cells = _sub_window(witness.laid.window, part)
+        change.cells = witness.laid.window.part(part)
         self._found[change.number] = change
-        box = _box_m(change.cells, self._cell_m)
+        box = change.cells.box_m(self._cell_m)
         change.show(view, *box, self._site_m_per_px)
         budget[0] -= 1
         for each in earlier:
@@ -222,19 +240,19 @@ class EvidenceMap:
                 change.miss(self._weight(each, change.cells))
         return change
 
-    def _tell(self, change: GatheredChange, now_ns: int) -> bool:
-        """Whether a change is to be told now for the first time: sure enough, and nobody said no to it before."""
+    def _told(self, change: GatheredChange, now_ns: int) -> Change | None:
+        """The change if it is to be told now for the first time: sure enough, and nobody said no to it before."""
         settings = self._settings
         is_sure = change.score >= settings.least_score and change.share >= settings.least_share
-        if change.is_told or change.is_hidden or not is_sure:
-            return False
-        record = self._change(change)
+        record = None if change.is_told or change.is_hidden or not is_sure else self._change(change)
         if record is None:
-            return False
-        change.is_hidden = is_known(record.outline_m, record.kind, self._rejected)
-        self.suppressed += change.is_hidden
-        change.is_told, change.announced_ns = not change.is_hidden, now_ns
-        return change.is_told
+            return None
+        if is_known(record.outline_m, record.kind, self._rejected):
+            self.suppressed += 1
+            change.is_hidden = True
+            return None
+        change.is_told, change.announced_ns = True, now_ns
+        return replace(record, announced_ns=now_ns)
 
     def _answer(self, laid: LaidView, window: CellWindow, cells: Mask) -> tuple[float, float, float, Floats]:
         """What a view says of some cells: the shares of them it saw and flagged, how sure, where the flagged lie."""
@@ -244,7 +262,7 @@ class EvidenceMap:
         )
         if 0 in inner.shape:
             return 0.0, 0.0, 0.0, np.zeros(2)
-        here, there = _slices(inner, window), _slices(inner, laid.window)
+        here, there = inner.within(window), inner.within(laid.window)
         mine, total = cells[here], max(int(np.count_nonzero(cells)), 1)
         flagged = mine & laid.flagged[there]
         seen = np.count_nonzero(mine & laid.seen[there]) / total
@@ -281,13 +299,13 @@ class EvidenceMap:
             if change.still_votes and number not in new:
                 change.vote(view.site_from_image, view.changed, view.valid)
             shown.append(change)
-            wishes.append((change.wants(*_box_m(change.cells, self._cell_m), view), -number))
+            wishes.append((change.wants(*change.cells.box_m(self._cell_m), view), -number))
         for gain, minus_number in sorted(wishes, reverse=True):
             if gain <= 1.15 or budget[0] <= 0:
                 break
             change = self._found[-minus_number]
             if change.cells is not None:
-                change.show(view, *_box_m(change.cells, self._cell_m), self._site_m_per_px)
+                change.show(view, *change.cells.box_m(self._cell_m), self._site_m_per_px)
                 budget[0] -= 1
         for number in new:
             change = self._found[number]
@@ -296,7 +314,7 @@ class EvidenceMap:
 
     def _weight(self, witness: _Witness, window: CellWindow) -> float:
         """What a view counts in a change's share; nothing if the camera stands where it stood before."""
-        return upright_weight(witness.camera_m, np.mean(_box_m(window, self._cell_m), axis=0)) * witness.counts
+        return upright_weight(witness.camera_m, np.mean(window.box_m(self._cell_m), axis=0)) * witness.counts
 
     def _merge(self, older: GatheredChange, younger: GatheredChange) -> None:
         if younger.cells is not None:
@@ -312,7 +330,7 @@ class EvidenceMap:
 
     def _known_at(self, window: CellWindow, part: tuple[slice, slice], cells: Mask) -> int:
         """The change already told here whose cells were forgotten since; 0 if there is none."""
-        here = _sub_window(window, part)
+        here = window.part(part)
         rows, columns = np.nonzero(cells)
         x, y = int(columns.mean()) + here.x0, int(rows.mean()) + here.y0
         for number, change in self._found.items():
@@ -326,18 +344,6 @@ class EvidenceMap:
             return np.zeros((1, 1), bool)
         return self._grid.read(change.cells).owner == change.number
 
-    def _pieces(self, cells: Mask) -> Iterator[tuple[Mask, tuple[slice, slice]]]:
-        """The connected pieces of cells, small gaps closed: each with the window, as slices, that holds it."""
-        gap = int(np.ceil(self._join_m / self._cell_m))
-        side = 2 * ((gap + 1) // 2) + 1  # odd: an even one would shift the cells
-        kernel = np.ones((side, side), np.uint8)
-        closed = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_CLOSE, kernel)
-        count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
-        for label in range(1, count):
-            x, y, w, h = (int(each) for each in stats[label, :4])
-            part = (slice(y, y + h), slice(x, x + w))
-            yield labels[part] == label, part
-
     def _change(self, change: GatheredChange) -> Change | None:
         cells = self._cells_of(change)
         outline_m = change.outline_m(cells, self._cell_m, self._join_m)
@@ -350,26 +356,26 @@ class EvidenceMap:
         for seed in self._seeds:
             if seed.cells is None:
                 continue
-            here = _slices(seed.cells, laid.window)
+            here = seed.cells.within(laid.window)
             votes, owner = evidence.votes[here], evidence.owner[here]
             if not votes.size:
                 kept.append(seed)
             elif (votes > 0).any() and not (owner > 0).any():
                 kept.append(seed)
-                weak[_slices(seed.cells, laid.window)] = False
+                weak[seed.cells.within(laid.window)] = False
         self._seeds = kept
         if budget[0] <= 0 or not weak.any():
             return
         least_cells = max(2, self._settings.least_area_m2 / self._cell_m**2)
-        pieces = [
-            (float(laid.score[part][piece & weak[part]].max(initial=0)) / 255, _sub_window(laid.window, part))
-            for piece, part in self._pieces(weak)
+        candidates = [
+            (float(laid.score[part][piece & weak[part]].max(initial=0)) / 255, laid.window.part(part))
+            for piece, part in pieces(weak, self._gap)
             if np.count_nonzero(piece & weak[part]) >= least_cells
         ]
-        for score, window in sorted(pieces, key=lambda each: -each[0])[: budget[0]]:
+        for score, window in sorted(candidates, key=lambda each: -each[0])[: budget[0]]:
             seed = GatheredChange(0, view.time_ns)
             seed.cells = window
-            seed.show(view, *_box_m(window, self._cell_m), self._site_m_per_px)
+            seed.show(view, *window.box_m(self._cell_m), self._site_m_per_px)
             seed.see(view.time_ns, score, None, view, 1.0)
             seed.from_camera(view.camera_m)
             seed.vote(view.site_from_image, view.changed, view.valid)
@@ -394,7 +400,7 @@ class EvidenceMap:
             cells, views, asked, seed.weakness = single, 1, 1, 0.5
         else:
             return
-        gap = int(np.ceil(self._join_m / self._cell_m)) + 1
+        gap = self._gap + 1
         around = CellWindow(
             seed.cells.x0 - gap, seed.cells.y0 - gap, seed.cells.x1 + gap, seed.cells.y1 + gap
         )
@@ -461,34 +467,5 @@ def _number_of(change: Change) -> int:
     return int(change.id.rsplit("-", 1)[1])
 
 
-def _cut_off(laid: LaidView) -> Mask:
-    """The flagged pieces of a view that end at unknown ground or at the view's rim."""
-    unseen = cv2.copyMakeBorder((~laid.seen).view(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
-    beside = cv2.dilate(unseen, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
-    _, labels = cv2.connectedComponents(laid.flagged.view(np.uint8), connectivity=8)
-    cut = np.unique(labels[beside & laid.flagged])
-    return np.isin(labels, cut) if len(cut) else np.zeros_like(laid.flagged)
-
-
 def _square(place_m: Floats, side_m: float) -> PointsM:
     return place_m + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side_m / 2
-
-
-def _sub_window(window: CellWindow, part: tuple[slice, slice]) -> CellWindow:
-    rows, columns = part
-    return CellWindow(
-        window.x0 + columns.start, window.y0 + rows.start, window.x0 + columns.stop, window.y0 + rows.stop
-    )
-
-
-def _slices(inner: CellWindow, outer: CellWindow) -> tuple[slice, slice]:
-    """Where a window lies in the raster of another; what sticks out is cut off."""
-    return (
-        slice(max(inner.y0 - outer.y0, 0), max(inner.y1 - outer.y0, 0)),
-        slice(max(inner.x0 - outer.x0, 0), max(inner.x1 - outer.x0, 0)),
-    )
-
-
-def _box_m(window: CellWindow, cell_m: float) -> tuple[Floats, Floats]:
-    """South-west and north-east corner, (2,) each, in site metres."""
-    return np.array([window.x0, -window.y1]) * cell_m, np.array([window.x1, -window.y0]) * cell_m
