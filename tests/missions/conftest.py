@@ -40,3 +40,13 @@ def photographed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for _ in simulate_site(folder, replace(_SMALL, output=OutputSettings(photos=True))):
         pass
     return folder
+
+
+@pytest.fixture(scope="session")
+def oblique(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same video by a camera that looks 45 degrees down, with telemetry in every format."""
+    folder = tmp_path_factory.mktemp("flights") / "oblique"
+    motion = replace(_SMALL.motion, camera_pitch_deg=-45.0)
+    for _ in simulate_site(folder, replace(_SMALL, motion=motion, output=OutputSettings(telemetry="all"))):
+        pass
+    return folder

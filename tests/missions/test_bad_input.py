@@ -170,6 +170,31 @@ def test_half_written_telemetry_with_lost_jumping_and_backward_fixes(
     assert report["frames"]["vision"] == report["frames"]["selected"] > 8
 
 
+def test_telemetry_of_another_path_at_the_same_time(film: Path, filmed: Path, tmp_path: Path) -> None:
+    """A map without a reference cannot tell place from place, but the motion does not fit, and the report says so."""
+    lines = (filmed / "flight1" / "other" / "flight1.nmea").read_text().splitlines()
+    places = [line.split(",") for line in lines]
+
+    def reverse(fix: int, fields: list[str]) -> None:
+        other = places[len(places) - 2 - 2 * fix + (fields[0] == "GPRMC")]
+        at = _latitude(fields)
+        fields[at:at + 4] = other[at:at + 4]
+
+    telemetry = tmp_path / "reversed.nmea"
+    telemetry.write_text(_nmea(filmed, reverse))
+    camera = ("--camera", filmed / "camera.xml")
+    alone = mapped(tmp_path / "alone", film, "--telemetry", telemetry, *camera)
+    assert any("telemetry of this flight" in words for words in alone["warnings"])
+    right = mapped(tmp_path / "site", film, *camera)
+    assert not right["warnings"]
+    again = shutil.copy(film, tmp_path / "again.mp4")  # over ground that is known the pictures decide
+    command = ["map", again, "--telemetry", telemetry, *camera, "--site", tmp_path / "site"]
+    assert cli.main([*map(str, command)]) == 0
+    report = json.loads((tmp_path / "site" / "flights" / "again" / "report.json").read_text())
+    assert any("disagree by" in words for words in report["warnings"])
+    assert report["frames"]["vision"] == report["frames"]["selected"]
+
+
 def test_a_height_of_zero_is_told_and_not_used(film: Path, filmed: Path, tmp_path: Path) -> None:
     rows = [line.split(",") for line in (filmed / "flight1" / "flight1.csv").read_text().splitlines()]
     zeroed = [k for k, name in enumerate(rows[0]) if "alt" in name.lower() or "height" in name.lower()]
@@ -237,6 +262,28 @@ def test_photos_of_every_bad_kind_among_good_ones(photos: Path, photographed: Pa
     assert ended["ZCOPY.jpg"] == ("rejected", f"duplicate of {files[9].name}")
     assert all("corrupt" in ended[files[number].name][1] for number in (7, 8))
     assert report["frames"]["vision"] == 10 and report["frames"]["rejected"] == 3
+
+
+def test_teleporting_fixes_among_photos(photos: Path, photographed: Path, tmp_path: Path) -> None:
+    for number in (3, 8):
+        path = sorted(photos.iterdir())[number]
+        with Image.open(path) as image:
+            exif, xmp = image.getexif(), image.info["xmp"]
+            gps = exif.get_ifd(_GPS_IFD)
+            degrees, minutes, seconds = (float(each) for each in gps[2])
+            gps[2] = (degrees, minutes + 1.0, seconds)  # 1.9 km to the north
+            start = xmp.index(b'Latitude="') + len(b'Latitude="')
+            end = xmp.index(b'"', start)
+            moved = b"%.*f" % (end - start - 3, float(xmp[start:end]) + 1 / 60)
+            image.save(path, exif=exif, quality=95, xmp=xmp[:start] + moved + xmp[end:])
+    report = mapped(tmp_path / "site", photos, "--camera", photographed / "camera.xml")
+    assert "jump" in " ".join(each["text"] for each in report["notices"])
+    assert report["frames"]["vision"] == 12 and report["gps_residual_m"]["median"] < 0.3
+    places = [
+        (each["properties"]["camera_latitude_deg"], each["geometry"]["coordinates"][0][0][1])
+        for each in json.loads(next(tmp_path.glob("site/flights/*/frames.geojson")).read_text())["features"]
+    ]
+    assert np.ptp(np.array(places)) * 111_000 < 100  # metres: all together
 
 
 def test_yaw_that_is_half_a_turn_wrong(photos: Path, photographed: Path, tmp_path: Path) -> None:
@@ -413,3 +460,20 @@ def test_a_stop_by_the_keyboard_leaves_no_traceback(photos: Path, photographed: 
     assert process.returncode == 130 and "Traceback" not in told and "stopped" in told
     with Archive.open(site, write=False) as archive:
         assert not archive.flights() and not archive.tiles() and not archive.has_site
+
+
+def test_a_stop_by_the_keyboard_keeps_the_flights_before(photos: Path, photographed: Path, tmp_path: Path) -> None:
+    site, second = tmp_path / "site", tmp_path / "second"
+    shutil.copytree(photos, second)
+    command = _command(photos, photographed / "camera.xml", site)
+    command.insert(command.index(str(photos)) + 1, str(second))
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+        while process.poll() is None and not any(site.glob("flights/second/keyframes/*/*")):
+            time.sleep(0.005)
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=60)
+    assert process.returncode == 130 and "Traceback" not in told and "stopped" in told
+    assert (site / "mosaic.tif").is_file() and not (site / "flights" / "second").exists()
+    with Archive.open(site, write=False) as archive:
+        assert [flight.id for flight in archive.flights()] == ["photos"] and len(archive.keyframes()) == 12
+        assert [version.complete for version in archive.versions()][-1] and archive.tiles()

@@ -91,6 +91,18 @@ def test_a_video_with_telemetry_of_each_format(filmed: Path, tmp_path: Path, nam
     assert absolute_m < 0.6  # 1 Hz formats interpolate a fix from two that are 5 m apart, turns included
 
 
+def test_a_video_that_looks_ahead_by_half_a_right_angle(oblique: Path, tmp_path: Path) -> None:
+    site, flight = tmp_path / "site", oblique / "flight1"
+    run_map(site, flight / "flight1.mp4", "--camera", oblique / "camera.xml")
+    report = report_of(site, "flight1")
+    assert report["frames"]["vision"] == report["frames"]["selected"] > 8 and not report["warnings"]
+    absolute_m, shape_m = corner_errors_m(site, "flight1", oblique / "truth")
+    assert shape_m < 2 * _M_PER_PX and absolute_m < 0.4  # metres; the far corners lie 60 m off
+    run_map(tmp_path / "blind", flight / "flight1.mp4", "--telemetry", flight / "other" / "flight1.gpx")
+    (warning,) = (each for each in report_of(tmp_path / "blind", "flight1")["warnings"] if "straight down" in each)
+    assert "4" in warning and "angles" in warning  # some 45 degrees
+
+
 def test_the_report_counts_every_second_up_to_itself(filmed: Path, tmp_path: Path) -> None:
     site = tmp_path / "site"
     run_map(site, _film(filmed), "--camera", filmed / "camera.xml")
@@ -202,14 +214,23 @@ def test_another_crs_for_the_map(photographed: Path, tmp_path: Path, crs: str, e
         assert next(mosaic.sample([(x, y)]))[3] == 255
 
 
-def test_frames_outside_the_area_are_not_used(photographed: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("form", ["geojson", "kml", "txt"])
+def test_frames_outside_the_area_are_not_used(photographed: Path, tmp_path: Path, form: str) -> None:
     true = json.loads((photographed / "truth" / "frames.geojson").read_text())
     longitude = {each["properties"]["frame"]: each["properties"]["camera_longitude_deg"] for each in true["features"]}
     latitude = [each["properties"]["camera_latitude_deg"] for each in true["features"]]
     middle, low, high = float(np.median(list(longitude.values()))), min(latitude) - 1e-3, max(latitude) + 1e-3
     ring = [[middle, low], [middle + 1e-2, low], [middle + 1e-2, high], [middle, high], [middle, low]]
-    area = tmp_path / "area.geojson"
-    area.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    area = tmp_path / f"area.{form}"
+    area.write_text({
+        "geojson": json.dumps({"type": "Polygon", "coordinates": [ring]}),
+        "kml": (
+            '<kml xmlns="http://www.opengis.net/kml/2.2"><Placemark><Polygon><outerBoundaryIs><LinearRing><coordinates>'
+            + " ".join(f"{x!r},{y!r},0" for x, y in ring)
+            + "</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark></kml>"
+        ),
+        "txt": "\n".join(f"{y!r} {x!r}" for x, y in ring),  # the thesis's list
+    }[form])
     site = tmp_path / "site"
     run_map(site, photographed / "flight1" / "photos", "--camera", photographed / "camera.xml", "--area", area)
     used = {

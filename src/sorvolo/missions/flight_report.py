@@ -25,6 +25,8 @@ from sorvolo.mosaic.pose_graph import GraphReport
 from sorvolo.survey.flight import Notice, Site
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
+_OBLIQUE_DEG = 35.0  # pictures that look to opposite sides share too little to be linked
+
 
 class Stage(StrEnum):
     """What time is spent on; reading is what the other stages leave."""
@@ -208,6 +210,13 @@ def _warnings(
             )
     if np.isfinite(residuals).any() and float(np.nanmedian(residuals)) > 3.0:
         warnings.append("pictures fit each other badly: high trees or houses, a wrong camera, or a rolling shutter")
+    axes_up = [each.site_from_camera.rotation[2, 2] for each in seen if each.site_from_camera is not None]
+    tilt_deg = float(np.degrees(np.arccos(np.clip(-np.median(axes_up), -1, 1)))) if axes_up else 0.0
+    if setup.track is not None and setup.track.attitude == "none" and tilt_deg > _OBLIQUE_DEG:
+        warnings.append(
+            f"the camera looks {tilt_deg:.0f} deg away from straight down and telemetry does not say where to: strips "
+            "flown in opposite directions may not fit each other; give telemetry with the camera's angles"
+        )
     if setup.source.camera.focal_sigma > 0.1:
         warnings.append(f"the camera is a guess ({setup.source.camera.origin}); give --camera for a true scale")
     return warnings
