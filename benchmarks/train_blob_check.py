@@ -28,24 +28,37 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[2] / "shared" / "data")
     parser.add_argument("--count", type=int, default=120, help="pairs of each suite")
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--rows", type=Path, help="where collected regions are kept (.npz), or taken from if it exists")
     parser.add_argument("--output", type=Path, default=TARGET)
     options = parser.parse_args()
-    places = [each for each in grounds(options.data, "dev") if each.source == "caliterra"]
-    is_real = bool(places)
+    if options.rows and options.rows.exists():
+        kept = np.load(options.rows)
+        rows, answers, suites, sources = kept["rows"], kept["answers"], kept["suites"], kept["sources"].tolist()
+    else:
+        rows, answers, suites, sources = collect_all(options.data, options.count, options.jobs)
+        if options.rows:
+            np.savez_compressed(options.rows, rows=rows, answers=answers, suites=suites, sources=sources)
+    trees = train(rows, answers)
+    print(f"{len(rows)} regions, {int(answers.sum())} of them changes")
+    trees["trained"] = {
+        "regions": len(rows), "changes": int(answers.sum()), "pairs_of_each_suite": options.count, "seed": SEED,
+        "suites": len(np.unique(suites)), "sources": sources, "command": f"train_blob_check.py --count {options.count}",
+    }
+    options.output.write_text(json.dumps(trees) + "\n")
+
+
+def collect_all(data: Path, count: int, jobs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
+    """Features (N, F), answers (N,) and suites (N,) of all regions, and the grounds' sources."""
+    places = [each for each in grounds(data, "dev") if each.source == "caliterra"]
+    names = [name for name in SUITES if places or name != "real"]
     places += [Ground("procedural", f"{kind.value} {500 + n}") for kind in GroundKind for n in range(3)]
-    names = [name for name in SUITES if is_real or name != "real"]
-    tasks = [(name, SEED + part, EACH, places) for name in names for part in range(-(-options.count // EACH))]
-    with ProcessPoolExecutor(options.jobs) as pool:
+    tasks = [(name, SEED + part, EACH, places) for name in names for part in range(-(-count // EACH))]
+    with ProcessPoolExecutor(jobs) as pool:
         collected = list(pool.map(collect, *zip(*tasks)))
     rows = np.concatenate([rows for rows, _ in collected])
     answers = np.concatenate([answers for _, answers in collected])
-    trees = train(rows, answers)
-    print(f"{len(rows)} regions, {int(answers.sum())} of them changes, from {len(tasks) * EACH} pairs")
-    trees["trained"] = {
-        "regions": len(rows), "changes": int(answers.sum()), "pairs": len(tasks) * EACH, "seed": SEED,
-        "sources": sorted({each.source for each in places}), "command": f"train_blob_check.py --count {options.count}",
-    }
-    options.output.write_text(json.dumps(trees) + "\n")
+    suites = np.concatenate([[task[0]] * len(part) for task, (_, part) in zip(tasks, collected)])
+    return rows, answers, suites, sorted({each.source for each in places})
 
 
 def collect(suite: str, seed: int, count: int, places: list[Ground]) -> tuple[np.ndarray, np.ndarray]:

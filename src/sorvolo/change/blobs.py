@@ -49,6 +49,7 @@ class Regions:
     """Regions 1 .. N of `labels` (h, w) int32: `boxes` (N, 4) int32 x, y, w, h and `features` (N, len(FEATURES)).
 
     `weak` (h, w) uint8 is 255 wherever the pictures differ at all, `noise` the 95 % quantile of small differences.
+    Outside of `known` (h, w), None where everything is, nothing is found.
     """
 
     labels: NDArray[np.int32]
@@ -56,6 +57,7 @@ class Regions:
     features: Floats
     weak: Image
     noise: float
+    known: Mask | None
 
 
 def find_regions(
@@ -84,7 +86,7 @@ def find_regions(
         settings.least_area_px, MOST_REGIONS,
     )
     if len(boxes) == 0:
-        return Regions(labels, boxes, np.zeros((0, len(FEATURES))), weak, noise)
+        return Regions(labels, boxes, np.zeros((0, len(FEATURES))), weak, noise, known)
     logs = [cv2.LUT(cv2.extractChannel(each, 0), _LOG) for each in (before, after)]
     # a shadow takes from all colours alike: red over blue stays
     reds, blues = ([cv2.LUT(cv2.extractChannel(each, band), _LOG) for each in (reference, query)] for band in (2, 0))
@@ -94,7 +96,7 @@ def find_regions(
     )
     frame = np.array([noise, rest_px, unevenness, np.log1p(len(boxes))])
     channels = [difference, chroma, activity, cv2.extractChannel(after, 0), came, went, tint, *logs]
-    return Regions(labels, boxes, _measured(labels, boxes, channels, frame), weak, noise)
+    return Regions(labels, boxes, _measured(labels, boxes, channels, frame), weak, noise, known)
 
 
 def _outside(values: Image, others: Image, settings: RegionSettings) -> tuple[Image, Image]:

@@ -14,6 +14,8 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
 
 LEAST_SIDE_PX = 32
+CLOSES_PX = 9
+LEAST_CONVEXITY = 0.5
 RIM_PX = 4  # around the unknown, in half size pixels: resampling mixes the unknown into it
 
 
@@ -139,7 +141,10 @@ def _result(
 
 
 def _filled(half_mask: ImageGray, regions: Regions) -> ImageGray:
-    """The accepted regions with what weakly differs around their cores, less a rim of blur, and without holes."""
+    """The accepted regions with what weakly differs around their cores, less a rim of blur, and without gaps.
+
+    Where a thing has the ground's own colour nothing differs: what is nearly convex is taken to be so.
+    """
     window = np.ones((5, 5), np.uint8)  # two blurs of 3 px reach two pixels out
     count, parts = cv2.connectedComponents(regions.weak, connectivity=8)
     held = np.zeros(count, bool)
@@ -147,5 +152,12 @@ def _filled(half_mask: ImageGray, regions: Regions) -> ImageGray:
     held[0] = False
     around = np.asarray(cv2.erode(held[parts].astype(np.uint8) * 255, window), np.uint8)
     around[regions.labels > 0] = 0
-    whole = cv2.max(half_mask, around)
-    return np.asarray(cv2.morphologyEx(whole, cv2.MORPH_CLOSE, window), np.uint8)
+    whole = cv2.morphologyEx(cv2.max(half_mask, around), cv2.MORPH_CLOSE, np.ones((CLOSES_PX, CLOSES_PX), np.uint8))
+    outlines, _ = cv2.findContours(whole, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    for outline in outlines:
+        hull = cv2.convexHull(outline)
+        is_full = cv2.contourArea(outline) > LEAST_CONVEXITY * cv2.contourArea(hull)
+        cv2.drawContours(whole, [hull if is_full else outline], -1, 255.0, cv2.FILLED)
+    if regions.known is not None:
+        whole[~regions.known] = 0
+    return np.asarray(whole, np.uint8)
