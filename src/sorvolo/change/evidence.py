@@ -33,7 +33,7 @@ from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 _CELL_PX = 3
 _LEAST_CELL_M = 0.05
 _LASTING = 0.3  # share of all views that must flag a cell
-_SHOWS = 0.12  # share of a change's cells that a view must flag: a person from above covers little of what its sides did
+_SHOWS = 0.12  # share of a change's cells that a view must flag: from above a person covers few of them
 _PICTURES_A_VIEW = 6  # cut anew at most, which bounds the time a view takes
 _MOST_SEEDS = 256
 _MOVED_HEIGHTS = 0.01  # the camera's way, in flying heights, after which a view is a new witness
