@@ -78,24 +78,34 @@ def main() -> None:
                     if "failure" not in measured:
                         measured |= accuracy(site, simulation)
                     runs.append({"preset": name, "seed": seed, "method": method, **measured})
-    summary = {
-        name: {method: summarise([run for run in runs if (run["preset"], run["method"]) == (name, method)])
-               for method in options.methods}
-        for name in presets
-    }
-    summary["all"] = {
-        method: summarise([run for run in runs if run["method"] == method]) for method in options.methods
-    }
-    output = options.output or RESULTS / ("change_speed_video.json" if options.speed else "change_events.json")
-    output.parent.mkdir(exist_ok=True)
-    output.write_text(json.dumps({
-        "benchmark": "change_events", "presets": list(presets), "length_m": options.length, "seeds": options.seeds,
-        "least_px": LEAST_PX, "machine": machine(), "commit": commit(), "summary": summary, "runs": runs,
-    }, indent=1) + "\n")
+                    save(runs, presets, options)
+    summary = summarised(runs, presets, options.methods)
     show(summary)
     for run in runs:
         if "failure" in run:
             print(f"{run['preset']}, seed {run['seed']}, {run['method']}: {run['failure']}")
+
+
+def save(runs: list[dict], presets: list[str], options: argparse.Namespace) -> None:
+    """Write what is known so far: a long benchmark that is stopped leaves its figures."""
+    output = options.output or RESULTS / ("change_speed_video.json" if options.speed else "change_events.json")
+    output.parent.mkdir(exist_ok=True)
+    output.write_text(json.dumps({
+        "benchmark": "change_events", "presets": list(presets), "length_m": options.length, "seeds": options.seeds,
+        "least_px": LEAST_PX, "machine": machine(), "commit": commit(),
+        "summary": summarised(runs, presets, options.methods), "runs": runs,
+    }, indent=1) + "\n")
+
+
+def summarised(runs: list[dict], presets: list[str], methods: list[str]) -> dict[str, dict[str, dict]]:
+    """The figures by preset and method, and of all presets together."""
+    return {
+        name: {
+            method: summarise([run for run in runs if run["method"] == method and name in (run["preset"], "all")])
+            for method in methods
+        }
+        for name in [*presets, "all"]
+    }
 
 
 def simulate(folder: Path, name: str, seed: int, length_m: float | None, *, is_speed: bool) -> tuple[Path, Path]:

@@ -254,8 +254,9 @@ def _evaluate(
         remarks.append("no frame of the map is known to the truth: events are compared as they lie")
     ground = compared_ground(*([row.outline_m for _, row in flights.placed(names)] for names in ([flight], makers)))
     is_photos = any(not row.name.isdecimal() for row in flights.mine[flight])
-    settings = EventSettings(views=PHOTO_VIEWS if is_photos else VIDEO_VIEWS)
-    true = _read_true(true_folder / "events.geojson", described, map_from_truth, ground, settings.views)
+    settings = EventSettings(views=VIDEO_VIEWS)
+    least_views = PHOTO_VIEWS if is_photos else VIDEO_VIEWS
+    true = _read_true(true_folder / "events.geojson", described, map_from_truth, ground, least_views)
     found = _read_found(site / "flights" / flight / "changes.geojson", described, flights.clock(flight))
     match = match_events(found, true, settings)
     scores = score_events(match, ground.area_m2, settings)
