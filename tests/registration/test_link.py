@@ -5,7 +5,7 @@ import pytest
 from pictured import HEIGHT, WIDTH, ground, keyframe, photographed, placed
 
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.registration.link import LinkCache, LinkPrediction, LinkSettings, link
+from sorvolo.registration.link import Effort, LinkCache, LinkPrediction, LinkSettings, link, refine
 from sorvolo.survey.mosaic import Link, NoLink
 
 SCENE = ground(1)
@@ -43,6 +43,25 @@ def test_pairs_are_spread_over_the_overlap():
     found = linked(photographed(SCENE, NEW, seed=1), photographed(SCENE, OLD, seed=2))
     cells = {(int(x // 120), int(y // 120)) for x, y in found.new_px}
     assert len(cells) >= 8
+
+
+def test_a_faint_ghost_in_other_ground_is_no_link():
+    """Dirt on the lens or the drone's own legs stand still in every picture: what is followed must also look alike."""
+    picture = photographed(SCENE, OLD, seed=1)
+    ghost = picture * 0.15 + photographed(ground(12), OLD, seed=4) * 0.85
+    new, old = keyframe(7, picture), keyframe(3, np.clip(ghost, 0, 255).astype(np.uint8))
+    careless = LinkSettings(min_correlation=-1.0)
+    assert isinstance(refine(new, old, np.eye(3), careless, LinkCache(careless.features)), Link)
+    assert isinstance(refine(new, old, np.eye(3), LinkSettings(), LinkCache(careless.features)), str)
+
+
+def test_asked_cheaply_nobody_pays_for_sift():
+    settings, old = LinkSettings(), keyframe(3, photographed(SCENE, OLD, seed=2))
+    cache = LinkCache(settings.features)
+    assert isinstance(link(keyframe(8, photographed(ground(20), NEW)), old, None, settings, cache, Effort.CHEAP), NoLink)
+    assert not cache._sift
+    found = link(keyframe(7, photographed(SCENE, NEW, seed=1)), old, None, settings, cache, Effort.DEAR)
+    assert isinstance(found, Link) and cache._sift
 
 
 @pytest.mark.parametrize("turn_deg", [90, 180, -90])
