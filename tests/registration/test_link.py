@@ -58,7 +58,8 @@ def test_a_faint_ghost_in_other_ground_is_no_link():
 def test_asked_cheaply_nobody_pays_for_sift():
     settings, old = LinkSettings(), keyframe(3, photographed(SCENE, OLD, seed=2))
     cache = LinkCache(settings.features)
-    assert isinstance(link(keyframe(8, photographed(ground(20), NEW)), old, None, settings, cache, Effort.CHEAP), NoLink)
+    other = keyframe(8, photographed(ground(20), NEW))
+    assert isinstance(link(other, old, None, settings, cache, Effort.CHEAP), NoLink)
     assert not cache._sift
     found = link(keyframe(7, photographed(SCENE, NEW, seed=1)), old, None, settings, cache, Effort.DEAR)
     assert isinstance(found, Link) and cache._sift
