@@ -84,8 +84,9 @@ def test_regions_and_their_histograms_agree(seed: int, size: tuple[int, int], sh
     boxes = reference.region_boxes(mask)
     np.testing.assert_array_equal(kernels.region_boxes(mask), boxes)
     image, tables = picture(seed, size), rng.integers(0, 256, (3, 256), np.uint8)
-    expected = reference.gray_histograms(image, tables, boxes)
-    np.testing.assert_array_equal(kernels.gray_histograms(image, tables, boxes), expected)
+    for known in (None, some(seed, size)):
+        expected = reference.gray_histograms(image, tables, boxes, known)
+        np.testing.assert_array_equal(kernels.gray_histograms(image, tables, boxes, known), expected)
 
 
 def test_regions_are_those_of_opencv() -> None:
