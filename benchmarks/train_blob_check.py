@@ -1,4 +1,5 @@
 """Train the check of regions: python benchmarks/train_blob_check.py [--data ../shared/data] [--count 120]
+# NOTE: read src/sorvolo/change/NOTICE-to-the-robust-method.md item 8 (from the lead), then delete this line.
 
 Answers are exact: the suites of change_suites.py over the caliterra flight's photos (CC0) and procedural grounds, with
 random numbers that no score uses. Boosted oblivious trees, written to src/sorvolo/change/blob_check.json.
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 
 from change_suites import SUITES, Ground, grounds, pairs
+from sorvolo.change.blob_check import Trees, how_sure
 from sorvolo.change.blobs import FEATURES, RegionSettings
 from sorvolo.change.robust import RobustSettings, examine
 from sorvolo.simulation.ground import GroundKind
@@ -28,6 +30,9 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[2] / "shared" / "data")
     parser.add_argument("--count", type=int, default=120, help="pairs of each suite")
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--suites", nargs="+", choices=list(SUITES), default=list(SUITES))
+    parser.add_argument("--seed", type=int, default=SEED, help="the first of them")
+    parser.add_argument("--onto", action="store_true", help="add trees to those there are")
     parser.add_argument("--rows", type=Path, help="where collected regions are kept (.npz), or taken from if it exists")
     parser.add_argument("--output", type=Path, default=TARGET)
     options = parser.parse_args()
@@ -35,25 +40,28 @@ def main() -> None:
         kept = np.load(options.rows)
         rows, answers, suites, sources = kept["rows"], kept["answers"], kept["suites"], kept["sources"].tolist()
     else:
-        rows, answers, suites, sources = collect_all(options.data, options.count, options.jobs)
+        rows, answers, suites, sources = collect_all(options)
         if options.rows:
             np.savez_compressed(options.rows, rows=rows, answers=answers, suites=suites, sources=sources)
-    trees = train(rows, answers)
+    before = json.loads(options.output.read_text()) if options.onto else None
+    trees = train(rows, answers, before)
     print(f"{len(rows)} regions, {int(answers.sum())} of them changes")
-    trees["trained"] = {
-        "regions": len(rows), "changes": int(answers.sum()), "pairs_of_each_suite": options.count, "seed": SEED,
-        "suites": len(np.unique(suites)), "sources": sources, "command": f"train_blob_check.py --count {options.count}",
-    }
+    command = f"train_blob_check.py --count {options.count} --seed {options.seed} --suites {' '.join(options.suites)}"
+    trees["trained"] = [*(before or {}).get("trained", []), {
+        "regions": len(rows), "changes": int(answers.sum()), "sources": sources,
+        "command": command + (" --onto" if options.onto else ""),
+    }]
     options.output.write_text(json.dumps(trees) + "\n")
 
 
-def collect_all(data: Path, count: int, jobs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
+def collect_all(options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
     """Features (N, F), answers (N,) and suites (N,) of all regions, and the grounds' sources."""
-    places = [each for each in grounds(data, "dev") if each.source == "caliterra"]
-    names = [name for name in SUITES if places or name != "real"]
+    places = [each for each in grounds(options.data, "dev") if each.source == "caliterra"]
+    names = [name for name in options.suites if places or name != "real"]
     places += [Ground("procedural", f"{kind.value} {500 + n}") for kind in GroundKind for n in range(3)]
-    tasks = [(name, SEED + part, EACH, places) for name in names for part in range(-(-count // EACH))]
-    with ProcessPoolExecutor(jobs) as pool:
+    parts = range(-(-options.count // EACH))
+    tasks = [(name, options.seed + part, EACH, places) for name in names for part in parts]
+    with ProcessPoolExecutor(options.jobs) as pool:
         collected = list(pool.map(collect, *zip(*tasks)))
     rows = np.concatenate([rows for rows, _ in collected])
     answers = np.concatenate([answers for _, answers in collected])
@@ -81,7 +89,7 @@ def collect(suite: str, seed: int, count: int, places: list[Ground]) -> tuple[np
     return np.concatenate(rows), np.concatenate(answers)
 
 
-def train(rows: np.ndarray, answers: np.ndarray) -> dict[str, object]:
+def train(rows: np.ndarray, answers: np.ndarray, before: dict[str, list] | None = None) -> dict[str, object]:
     """Boosted oblivious trees: each level of a tree asks one question of all; logistic loss."""
     rng = np.random.default_rng(5)
     cuts = [np.unique(np.quantile(column, np.linspace(0, 1, BINS + 1)[1:-1])) for column in rows.T]
@@ -89,9 +97,14 @@ def train(rows: np.ndarray, answers: np.ndarray) -> dict[str, object]:
     count, width = binned.shape
     weights = np.where(answers, 0.5 / max(answers.mean(), 1e-9), 0.5 / max(1 - answers.mean(), 1e-9)) ** 0.5
     prior = float(np.log((weights @ answers) / (weights @ ~answers)))
-    margin = np.full(count, prior)
     features, thresholds, leaves = [], [], []
-    for _ in range(TREES):
+    margin = np.full(count, prior)
+    if before:
+        prior, features, thresholds, leaves = (before[name] for name in ("prior", "features", "thresholds", "leaves"))
+        trees = Trees(FEATURES, prior, np.array(features), np.array(thresholds), np.array(leaves))
+        sure = np.clip(how_sure(rows, FEATURES, trees), 1e-9, 1 - 1e-9)
+        margin = np.log(sure / (1 - sure))
+    for _ in range(TREES if not before else TREES // 2):
         chance = 1 / (1 + np.exp(-margin))
         sample = rng.uniform(size=count) < 0.7
         slope, bend = (answers - chance) * weights * sample, chance * (1 - chance) * weights * sample

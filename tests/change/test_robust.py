@@ -176,7 +176,7 @@ def test_matches_agree(rng: np.random.Generator, height: int, width: int, reach:
 @given(pictures, st.integers(1, 50), st.integers(1, 50), st.integers(1, 12), st.integers(0, 5))
 def test_measures_agree(rng: np.random.Generator, height: int, width: int, channels: int, margin: int) -> None:
     labels = rng.integers(0, 4, (height, width)).astype(np.int32)
-    stack = rng.integers(0, 256, (height, width, channels), dtype=np.uint8)
+    stack = list(rng.integers(0, 256, (channels, height, width), dtype=np.uint8))
     corner = rng.integers(0, [width, height], (3, 2))
     boxes = np.hstack([corner, rng.integers(1, np.array([width, height]) - corner + 1)]).astype(np.int32)
     np.testing.assert_array_equal(

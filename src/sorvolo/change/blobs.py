@@ -1,4 +1,5 @@
 """Where two pictures in the same light differ: regions, and what is measured of each to tell changes from the rest."""
+# NOTE: read NOTICE-to-the-robust-method.md item 8 beside this file (from the lead), then delete this line.
 
 from dataclasses import dataclass
 
@@ -11,6 +12,8 @@ from sorvolo.kernels import core_regions, match_regions, measure_regions
 
 RING_PX = 4
 SPECK_PX = 9
+NEAR_PX = 31
+WEAK_PART = 0.1  # of the largest difference near: what is weaker belongs to clouds and shadows, not to the thing
 MOST_SPECK = 48.0
 MATCH_MARGIN_PX = 3
 MATCH_REACH_PX = 6
@@ -49,7 +52,8 @@ class Regions:
     """Regions 1 .. N of `labels` (h, w) int32: `boxes` (N, 4) int32 x, y, w, h and `features` (N, len(FEATURES)).
 
     `weak` (h, w) uint8 is 255 wherever the pictures differ at all, `noise` the 95 % quantile of small differences.
-    Outside of `known` (h, w), None where everything is, nothing is found.
+    Outside of `known` (h, w), None where everything is, nothing is found. `came` (N,) is positive where the query shows
+    a thing on the reference's ground, negative where it is the other way round.
     """
 
     labels: NDArray[np.int32]
@@ -58,6 +62,7 @@ class Regions:
     weak: Image
     noise: float
     known: Mask | None
+    came: Floats
 
 
 def find_regions(
@@ -80,13 +85,15 @@ def find_regions(
     activity = cv2.blur(cv2.threshold(specks, MOST_SPECK, MOST_SPECK, cv2.THRESH_TRUNC)[1], (41, 41))
     base = settings.least_difference + settings.noise_factor * max(noise, settings.least_noise)
     threshold = cv2.addWeighted(activity, settings.activity_factor, activity, 0.0, base)
-    weak = np.asarray(cv2.compare(smooth, threshold, cv2.CMP_GT), np.uint8)
+    near = np.ones((NEAR_PX, NEAR_PX), np.uint8)
+    low = cv2.addWeighted(cv2.dilate(smooth, near), WEAK_PART, smooth, 0.0, 0.0)
+    weak = np.asarray(cv2.compare(smooth, cv2.max(threshold, low), cv2.CMP_GT), np.uint8)
     labels, boxes = core_regions(
         np.asarray(smooth, np.uint8), np.asarray(threshold, np.uint8), settings.strong_factor, settings.core,
         settings.least_area_px, MOST_REGIONS,
     )
     if len(boxes) == 0:
-        return Regions(labels, boxes, np.zeros((0, len(FEATURES))), weak, noise, known)
+        return Regions(labels, boxes, np.zeros((0, len(FEATURES))), weak, noise, known, np.zeros(0))
     logs = [cv2.LUT(cv2.extractChannel(each, 0), _LOG) for each in (before, after)]
     # a shadow takes from all colours alike: red over blue stays
     reds, blues = ([cv2.LUT(cv2.extractChannel(each, band), _LOG) for each in (reference, query)] for band in (2, 0))
@@ -96,7 +103,8 @@ def find_regions(
     )
     frame = np.array([noise, rest_px, unevenness, np.log1p(len(boxes))])
     channels = [difference, chroma, activity, cv2.extractChannel(after, 0), came, went, tint, *logs]
-    return Regions(labels, boxes, _measured(labels, boxes, channels, frame), weak, noise, known)
+    features = _measured(labels, boxes, channels, frame)
+    return Regions(labels, boxes, features, weak, noise, known, _came(labels, came, went))
 
 
 def _outside(values: Image, others: Image, settings: RegionSettings) -> tuple[Image, Image]:
@@ -106,6 +114,14 @@ def _outside(values: Image, others: Image, settings: RegionSettings) -> tuple[Im
     luma, red, blue = cv2.split(cv2.max(over, under))
     chroma = cv2.add(red, blue)
     return np.asarray(cv2.addWeighted(luma, 1.0, chroma, float(settings.chroma_weight), 0.0), np.uint8), chroma
+
+
+def _came(labels: NDArray[np.int32], came: Image, went: Image) -> Floats:
+    """Whether things came: along its outline a thing's values are new, while the ground's are still to be seen near."""
+    things = (labels > 0).astype(np.uint8)
+    rim = np.flatnonzero(cv2.subtract(things, cv2.erode(things, np.ones((5, 5), np.uint8))))
+    balance = came.ravel()[rim].astype(np.float64) - went.ravel()[rim]
+    return np.asarray(np.bincount(labels.ravel()[rim], balance, minlength=int(labels.max()) + 1)[1:], np.float64)
 
 
 def _measured(
@@ -118,9 +134,7 @@ def _measured(
     edges_after = cv2.morphologyEx(log_after, cv2.MORPH_GRADIENT, window)
     edges_before = cv2.morphologyEx(log_before, cv2.MORPH_GRADIENT, window)
     detail = cv2.absdiff(detail_after, detail_before)
-    stack: Anything = cv2.merge(
-        [difference, chroma, activity, level, ratio, edges_after, edges_before, detail, came, went, tint]
-    )
+    stack = [difference, chroma, activity, level, ratio, edges_after, edges_before, detail, came, went, tint]
     sums = measure_regions(labels, boxes, stack, RING_PX).astype(np.float64)
     count = np.maximum(sums[:, :, :1], 1)
     means = sums[:, :, 1:12] / count

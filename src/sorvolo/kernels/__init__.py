@@ -5,6 +5,7 @@ computes. Both give the same numbers. Where nothing was compiled the slow ones a
 """
 
 import warnings
+from collections.abc import Sequence
 from types import ModuleType
 
 import numpy as np
@@ -123,14 +124,15 @@ def core_regions(
 
 
 def measure_regions(
-    labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: NDArray[np.uint8], margin: int
+    labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: Sequence[NDArray[np.uint8]], margin: int
 ) -> NDArray[np.int64]:
     """Sums over regions and over what is around them, (N, 2, 2 C + 1): see reference_robust."""
-    if labels.shape != channels.shape[:2] or channels.ndim != 3:
-        raise ValueError(f"measure_regions: labels {labels.shape} and channels {channels.shape} do not fit")
+    shapes = {each.shape for each in channels}
+    if shapes != {labels.shape} or labels.ndim != 2:
+        raise ValueError(f"measure_regions: labels {labels.shape} and channels {shapes} do not fit")
     sums: NDArray[np.int64] = _robust.measure_regions(
         np.ascontiguousarray(labels, np.int32), np.ascontiguousarray(boxes, np.int32).reshape(-1, 4),
-        np.ascontiguousarray(channels, np.uint8), margin,
+        [np.ascontiguousarray(each, np.uint8) for each in channels], margin,
     )
     return sums
 

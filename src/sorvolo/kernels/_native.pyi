@@ -1,5 +1,7 @@
 """What the compiled module offers; reference.py and reference_robust.py say what it does."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +22,7 @@ def core_regions(
     values: NDArray[np.uint8], thresholds: NDArray[np.uint8], strong: float, core: float, least_area: int, most: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]: ...
 def measure_regions(
-    labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: NDArray[np.uint8], margin: int
+    labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: Sequence[NDArray[np.uint8]], margin: int
 ) -> NDArray[np.int64]: ...
 def match_regions(
     query: NDArray[np.uint8], reference: NDArray[np.uint8], boxes: NDArray[np.int32], reach: int

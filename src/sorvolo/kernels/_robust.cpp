@@ -5,6 +5,8 @@
 // NumPy in reference_robust.py, let __init__.py hand it on, and test that both agree. Then `pip install --no-deps -e .`.
 #include "_native.hpp"
 
+#include <pybind11/stl.h>
+
 #include <cmath>
 #include <cstdlib>
 
@@ -126,13 +128,15 @@ pybind11::tuple core_regions(const Bytes &values, const Bytes &thresholds, doubl
     return pybind11::make_tuple(labels, boxes);
 }
 
-Integers64 measure_regions(const Integers32 &labels, const Integers32 &boxes, const Bytes &channels, int margin) {
+Integers64 measure_regions(const Integers32 &labels, const Integers32 &boxes, const std::vector<Bytes> &channels,
+                           int margin) {
     const int height = static_cast<int>(labels.shape(0)), width = static_cast<int>(labels.shape(1));
-    const int count = static_cast<int>(channels.shape(2)), fields = 2 * count + 1;
+    const int count = static_cast<int>(channels.size()), fields = 2 * count + 1;
     const pybind11::ssize_t regions = boxes.shape(0);
     Integers64 sums({regions, pybind11::ssize_t(2), pybind11::ssize_t(fields)});
     const std::int32_t *label = labels.data(), *box = boxes.data();
-    const std::uint8_t *values = channels.data();
+    std::vector<const std::uint8_t *> values;
+    for (const Bytes &each : channels) values.push_back(each.data());
     std::int64_t *to = sums.mutable_data();
     pybind11::gil_scoped_release released;
     std::fill(to, to + regions * 2 * fields, 0);
@@ -145,11 +149,11 @@ Integers64 measure_regions(const Integers32 &labels, const Integers32 &boxes, co
                 const std::int32_t here = label[at];
                 if (here != 0 && here != region + 1) continue;
                 std::int64_t *row = here == 0 ? to + fields : to;
-                const std::uint8_t *value = values + at * count;
                 ++row[0];
                 for (int channel = 0; channel < count; ++channel) {
-                    row[1 + channel] += value[channel];
-                    row[1 + count + channel] += static_cast<std::int32_t>(value[channel]) * value[channel];
+                    const std::int32_t value = values[channel][at];
+                    row[1 + channel] += value;
+                    row[1 + count + channel] += value * value;
                 }
             }
         }
@@ -230,7 +234,7 @@ void bind_robust(pybind11::module_ &module) {
     module.def("core_regions", &core_regions, arg("values").noconvert(), arg("thresholds").noconvert(), arg("strong"),
                arg("core"), arg("least_area"), arg("most"));
     module.def("measure_regions", &measure_regions, arg("labels").noconvert(), arg("boxes").noconvert(),
-               arg("channels").noconvert(), arg("margin"));
+               arg("channels"), arg("margin"));
     module.def("match_regions", &match_regions, arg("query").noconvert(), arg("reference").noconvert(),
                arg("boxes").noconvert(), arg("reach"));
 }

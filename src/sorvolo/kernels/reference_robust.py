@@ -1,5 +1,7 @@
 """The kernels of the robust change method in NumPy: the specification of the compiled ones."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -60,19 +62,20 @@ def _parts(mask: NDArray[np.bool_]) -> list[tuple[NDArray[np.int64], NDArray[np.
 
 
 def measure_regions(
-    labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: NDArray[np.uint8], margin: int
+    labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: Sequence[NDArray[np.uint8]], margin: int
 ) -> NDArray[np.int64]:
-    """(N, 2, 2 C + 1) count, C sums and C sums of squares of `channels` (h, w, C) for each region 1 .. N of `labels`.
+    """(N, 2, 2 C + 1) count, C sums and C sums of squares of `channels` (h, w), for each region 1 .. N of `labels`.
 
     First over the region's pixels, then over those of no region in its box `boxes` (N, 4) x, y, w, h grown by `margin`.
     """
     height, width = labels.shape
-    sums = np.zeros((len(boxes), 2, 2 * channels.shape[2] + 1), np.int64)
+    stack = np.dstack(channels)
+    sums = np.zeros((len(boxes), 2, 2 * len(channels) + 1), np.int64)
     for region, (x, y, wide, high) in enumerate(boxes.tolist()):
         rows = slice(max(y - margin, 0), min(y + high + margin, height))
         window = rows, slice(max(x - margin, 0), min(x + wide + margin, width))
         for part, label in enumerate((region + 1, 0)):
-            values = channels[window][labels[window] == label].astype(np.int64)
+            values = stack[window][labels[window] == label].astype(np.int64)
             sums[region, part] = np.concatenate([[len(values)], values.sum(axis=0), (values * values).sum(axis=0)])
     return sums
 
