@@ -117,6 +117,9 @@ def _result(
     size: tuple[int, int],
 ) -> RobustResult:
     sure = scores >= settings.least_score
+    if not sure.any():
+        nothing = np.zeros(size[::-1], np.uint8), np.zeros((0, 4), np.int64), np.zeros(0)
+        return RobustResult(*nothing, light, settling, regions.noise, known)
     _, parts = cv2.connectedComponents(regions.weak, connectivity=8)
     went = _went(regions, parts)
     half = regions.labels.shape[::-1]
@@ -130,10 +133,8 @@ def _result(
         middle = boxes_px[:, :2] + boxes_px[:, 2:] / 2
         moved = np.column_stack([middle, np.ones(len(middle))]) @ settling.reference_from_query.T
         boxes_px[went, :2] += (moved[:, :2] / moved[:, 2:] - middle)[went]
-    mask = np.zeros(size[::-1], np.uint8)
-    if sure.any():
-        larger = cv2.resize(half_mask, size, interpolation=cv2.INTER_LINEAR)
-        mask = np.asarray(cv2.threshold(larger, 127, 255, cv2.THRESH_BINARY)[1], np.uint8)
+    larger = cv2.resize(half_mask, size, interpolation=cv2.INTER_LINEAR)
+    mask = np.asarray(cv2.threshold(larger, 127, 255, cv2.THRESH_BINARY)[1], np.uint8)
     factor = np.array([size[0] / half[0], size[1] / half[1]])
     corners = np.clip(np.rint(boxes_px[sure, :2] * factor), 0, np.array(size) - 1).astype(np.int64)
     sides = np.rint(boxes_px[sure, 2:] * factor).astype(np.int64)
@@ -156,8 +157,6 @@ def _filled(chosen: Mask, regions: Regions, parts: Anything) -> ImageGray:
     Where a thing has the ground's own colour nothing differs: what is nearly convex is taken to be so.
     """
     cores = np.concatenate([[False], chosen])[regions.labels].astype(np.uint8) * 255
-    if not chosen.any():
-        return np.asarray(cores, np.uint8)
     window = np.ones((5, 5), np.uint8)  # two blurs of 3 px reach two pixels out
     held = np.zeros(int(parts.max()) + 1, bool)
     held[parts[cores > 0]] = True
