@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.change.cells import scale_m_per_px
+from sorvolo.change.shadows import shadow_of_arrival, thing_of
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.geometry.homography import apply_homography
@@ -23,6 +24,7 @@ _UNLIKELY_PARALLAX = 0.5  # no thing that came is a third as high as the camera 
 _POINTS = 12  # of a track, that its velocity is fitted to
 _MOST_BOXES = 64
 _RIM_PX = 2
+_AROUND_PX = 4
 _RIGID_POINTS, _RIGID_LENGTHS, _RIGID_LENGTH_M = 5, 2.0, 2.5
 _LOST_FOR_S = 10.0  # a thing that moves steadily is known again after so long
 
@@ -289,7 +291,13 @@ def _is_still_there(first: TrackPoint, view: ComparedView) -> bool:
     height, width = view.changed.shape
     if not np.isfinite(pixel).all() or not (0 <= pixel[0] < width - 1 and 0 <= pixel[1] < height - 1):
         return False
-    return bool(view.changed[round(pixel[1]), round(pixel[0])])
+    x, y = round(pixel[0]), round(pixel[1])
+    reach = 2 * _AROUND_PX
+    window = slice(max(y - reach, 0), y + reach), slice(max(x - reach, 0), x + reach)
+    changed = view.changed[window] > 0
+    dark = shadow_of_arrival(view.reference[window], view.image[window], changed)
+    # the shadow of what walked on may lie where it set out
+    return bool((changed & ~dark)[y - window[0].start, x - window[1].start])
 
 
 def _alike(a: Blob, b: Blob) -> bool:
@@ -340,7 +348,15 @@ def _blobs(view: ComparedView) -> list[Blob]:
             continue
         if w * h > 0.15 * width * height or not _is_known_around(view.valid, x, y, w, h):
             continue
-        part = view.changed[y : y + h, x : x + w]
+        window = slice(max(y - _AROUND_PX, 0), y + h + _AROUND_PX), slice(max(x - _AROUND_PX, 0), x + w + _AROUND_PX)
+        changed = view.changed[window] > 0
+        thing = thing_of(changed, shadow_of_arrival(view.reference[window], view.image[window], changed))
+        ys, xs = np.nonzero(thing)
+        if not len(xs):
+            continue
+        x, y = window[1].start + int(xs.min()), window[0].start + int(ys.min())
+        w, h = int(np.ptp(xs)) + 1, int(np.ptp(ys)) + 1
+        part = thing[ys.min():ys.max() + 1, xs.min():xs.max() + 1].view(np.uint8) * np.uint8(255)
         moments = cv2.moments(part, binaryImage=True)
         if moments["m00"] <= 0:
             continue

@@ -14,8 +14,9 @@ import numpy as np
 from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
 from sorvolo.change.outlines import KnownPlace
 from sorvolo.change.reference import ReferenceMap
+from sorvolo.change.shadows import without_shadow
 from sorvolo.change.thesis import thesis_steps
-from sorvolo.change.updating import patched
+from sorvolo.change.updating import is_painted, patched
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.homography import apply_homography
@@ -65,7 +66,6 @@ class CompareRun:
         self._log = FlightLog()
         self._extension: PlanarRun | None = None
         self._last_outline_m: PointsM | None = None
-        self._announced_ns: dict[str, int] = {}
         self._placed: dict[int, PlacedFrame] = {}
         self._statuses: Counter[ViewStatus] = Counter()
         self._reasons: Counter[str] = Counter()
@@ -111,8 +111,7 @@ class CompareRun:
         announced: tuple[Change, ...] = ()
         if outcome.view is not None:
             with self._log.stage(Stage.EVIDENCE):
-                announced = self._evidence.add(outcome.view)
-            self._announced_ns.update((each.id, outcome.view.time_ns) for each in announced)
+                announced = tuple(self._finished(each) for each in self._evidence.add(outcome.view))
             self._note_ground(outcome.view)
             with self._log.stage(Stage.STORE):
                 self._write_masks(outcome.view)
@@ -132,9 +131,7 @@ class CompareRun:
                 "or night? `sorvolo inspect` tells what the flight holds"
             )
         with self._log.stage(Stage.EVIDENCE):
-            changes = [
-                replace(each, announced_ns=self._announced_ns.get(each.id, -1)) for each in self._evidence.conclude()
-            ]
+            changes = [self._finished(each) for each in self._evidence.conclude()]
         images: Mapping[int, str] = {}
         if self._extension is not None and self._settings.updates_map:
             for each in self._extension.complete():
@@ -156,6 +153,11 @@ class CompareRun:
         self._writer.commit(placed, images, report, report_page(report, shown), changes=changes)
 
     # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _finished(self, change: Change) -> Change:
+        """The change around the thing alone, its place as uncertain as the map's own is."""
+        change = without_shadow(change)
+        return replace(change, sigma_m=float(np.hypot(change.sigma_m, self._map_sigma_m)))
 
     def _end(self, status: ViewStatus, reason: str) -> None:
         self._statuses[status] += 1
@@ -207,7 +209,7 @@ class CompareRun:
         """Paint what changed into the map: only the tiles that it touches become new."""
         site_grid, tiles = self._archive.site_grid(), self._writer.tiles
         for change in changes:
-            if change.kind is ChangeKind.MOVING:
+            if not is_painted(change):
                 continue
             grid_from_site = site_grid.grid_from_site_affine(change.outline_m.mean(axis=0), 50.0)
             height, width = change.patch.changed.shape

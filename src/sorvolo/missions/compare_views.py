@@ -10,6 +10,7 @@ from sorvolo.change.alignment import Aligned, Aligner
 from sorvolo.change.reference import ReferenceMap
 from sorvolo.change.robust import compare_robust
 from sorvolo.change.thesis import compare_thesis
+from sorvolo.change.tuning import FlightTuning
 from sorvolo.geometry.arrays import Anything, Boxes, Floats, ImageGray, ImageRGB, Mask, Matrix3, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
@@ -69,8 +70,7 @@ class ViewMaker:
         self._lens_sees: Mask = np.ones(size[::-1], bool) if seen is None else seen
         self._pictures = pictures
         self._aligner = Aligner(reference, site_grid)
-        self._numbers: list[tuple[float, ...]] = []
-        self._difference = self._robust if settings.method == "robust" else _thesis
+        self._tuning = FlightTuning() if settings.method == "robust" else None
         self._frame_maps: tuple[Anything, Anything] | None = None
 
     def look(self, posed: PosedFrame) -> ViewOutcome:
@@ -93,7 +93,7 @@ class ViewMaker:
             reason = f"only {share:.0%} of it lies on the map"
             return ViewOutcome(ViewStatus.OUTSIDE, reason, residual_px, share, site_from_full)
         query = as_bgr(image)
-        found = self._difference(as_bgr(reference), query, valid)
+        found = self._difference(as_bgr(reference), query, valid, learns=True)
         if self._pictures is not None and len(found.boxes):
             found = self._attested(found, aligned, query, valid)
         changed = np.count_nonzero(found.mask) / max(1, int(np.count_nonzero(valid)))
@@ -161,11 +161,8 @@ class ViewMaker:
         return np.array(result, np.int64).reshape(-1, 4)
 
     def chosen(self) -> dict[str, Any]:
-        """What the robust method's parameters set themselves to on this flight, medians over its views."""
-        if not self._numbers:
-            return {}
-        middle = np.median(np.array(self._numbers), axis=0)
-        return dict(zip(("brightness", "unevenness_octaves", "moved_px", "rest_px", "noise_p95"), map(float, middle)))
+        """What the robust method's parameters set themselves to on this flight; nothing for method thesis."""
+        return {} if self._tuning is None else self._tuning.chosen()
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
@@ -192,7 +189,7 @@ class ViewMaker:
             aligned.site_from_image, aligned.camera_m, width, height, _WITNESSES
         ):
             sees &= self._lens_sees
-            other = self._difference(as_bgr(picture), query, sees)
+            other = self._difference(as_bgr(picture), query, sees, learns=False)
             near = cv2.dilate(other.mask, np.ones((_NEAR_PX, _NEAR_PX), np.uint8))
             for k in np.flatnonzero(keep):
                 x, y, w, h = found.boxes[k]
@@ -207,18 +204,14 @@ class ViewMaker:
             mask[y:y + h, x:x + w] = 0
         return Difference(mask, found.boxes[keep], found.scores[keep])
 
-    def _robust(self, reference: Anything, query: Anything, valid: Mask) -> Difference:
-        found = compare_robust(reference, query, valid)
-        self._numbers.append((
-            float(np.mean(found.light.brightness)), found.light.unevenness, found.settling.moved_px,
-            found.settling.rest_px, found.noise,
-        ))
+    def _difference(self, reference: Anything, query: Anything, valid: Mask, *, learns: bool) -> Difference:
+        if self._tuning is None:
+            thesis = compare_thesis(reference, query, valid)
+            return Difference(thesis.mask, thesis.boxes, np.full(len(thesis.boxes), 0.5))
+        found = compare_robust(reference, query, valid, self._tuning.settings())
+        if learns:
+            self._tuning.observe(found)
         return Difference(found.mask, found.boxes, found.scores)
-
-
-def _thesis(reference: Anything, query: Anything, valid: Mask) -> Difference:
-    found = compare_thesis(reference, query, valid)
-    return Difference(found.mask, found.boxes, np.full(len(found.boxes), 0.5))
 
 
 def as_bgr(image: ImageRGB) -> Anything:

@@ -1,0 +1,70 @@
+"""Things told from the shadows they throw: a shadow is part of what changed, but not where the thing is."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from sorvolo.change.outlines import measures, outline_of
+from sorvolo.geometry.arrays import Anything, ImageRGB, Mask
+from sorvolo.survey.findings import Change, ChangeKind, Patch
+
+_DARK = 1.08  # of the light before: what is no brighter and of the same colour is a shadow or its rim, or dark itself
+_ALIKE = 0.22  # a shadow takes about the same share of each colour
+_LEAST_SHARE = 0.02  # of the change: if less is no shadow, all of it is a dark thing
+_LEAST_PX = 6
+_TOLERANCE_PX = 0.7
+
+
+def without_shadow(change: Change) -> Change:
+    """The change with its outline, area and length drawn around the thing alone; the same change where nothing tells.
+
+    The outline is what the convex hull of the pixels that are no shadow holds of the change, so that a dark thing with
+    a few bright parts stays whole. The patch keeps the shadow: it belongs into the map.
+    """
+    patch = change.patch
+    thing = thing_of(patch.changed, _shadow(patch, change.kind))
+    if thing is patch.changed:
+        return change
+    outline_m = outline_of(thing, patch.site_from_patch, _TOLERANCE_PX, 3.0)
+    if outline_m is None:
+        return change
+    size = measures(outline_m)
+    return replace(change, outline_m=outline_m, area_m2=size.area_m2, length_m=size.length_m)
+
+
+def thing_of(changed: Mask, shadow: Mask) -> Mask:
+    """The part of the change that is the thing, not its shadow; `changed` itself where hardly anything would stay."""
+    lit = changed & ~shadow
+    opened: Anything = cv2.morphologyEx(lit.view(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    if np.count_nonzero(opened) < max(_LEAST_PX, _LEAST_SHARE * np.count_nonzero(changed)):
+        return changed
+    hull = np.zeros(lit.shape, np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(cv2.findNonZero(opened)), (1,))
+    return (cv2.dilate(hull, np.ones((3, 3), np.uint8)) > 0) & changed
+
+
+def shadow_of_arrival(before: ImageRGB, after: ImageRGB, changed: Mask) -> Mask:
+    """Where what came is dark as its shadow is, in a piece of two aligned pictures of about the same light."""
+    ratio = (after.astype(np.float32) + 8) / (before.astype(np.float32) + 8)
+    if not changed.all():
+        ratio = ratio / np.median(ratio[~changed], axis=0)
+    return _is_dark(ratio)
+
+
+def _shadow(patch: Patch, kind: ChangeKind) -> Mask:
+    """Where the change is dark as a shadow is: on the later date where something came, on the earlier where it went."""
+    known = (patch.before[..., 3] == 255) & (patch.after[..., 3] == 255)
+    around = known & ~patch.changed
+    before, after = (each[..., :3].astype(np.float32) + 8 for each in (patch.before, patch.after))
+    if np.count_nonzero(around) >= _LEAST_PX:
+        before = before * np.median(after[around] / before[around], axis=0)
+    nothing = np.zeros(patch.changed.shape, bool)
+    came = _is_dark(after / before) if kind is not ChangeKind.DISAPPEARED else nothing
+    went = _is_dark(before / after) if kind in (ChangeKind.DISAPPEARED, ChangeKind.REPLACED) else nothing
+    return (came | went) & known
+
+
+def _is_dark(ratio: Anything) -> Mask:
+    most, least = ratio.max(axis=-1), ratio.min(axis=-1)
+    return (most < _DARK) & (most - least < _ALIKE)
