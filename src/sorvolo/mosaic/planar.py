@@ -26,6 +26,7 @@ class PlanarSettings:
     registration_side_px: int = 1024  # longest side of the image that is registered
     previous: int = 2  # keyframes before, always tried
     spatial: int = 2  # further ones under the predicted view: they close loops between strips
+    wanted_links: int = 2  # with fewer, pictures that refused are asked again with SIFT
     least_overlap: float = 0.2  # of a view, for a spatial neighbour
     recovery: int = 30  # keyframes tried for a frame that is lost and has no GPS
     links: LinkSettings = field(default_factory=LinkSettings)
@@ -199,17 +200,16 @@ class PlanarMapper:
     def _tie(self, new: Keyframe) -> tuple[list[Link], Pose | None, str]:
         """The links of a new keyframe, where it stands by them or by telemetry, and what failed.
 
-        All candidates are asked the cheap way first. Only where all of them say no they are asked with SIFT and
-        correlation, up to the first that says yes: then it is known where the others lie, and cheap is enough.
+        All candidates are asked the cheap way first. Only where at most one of them says yes those that refused are
+        asked with SIFT and correlation, until two do: one link alone lets tall trees bend the strip.
         """
         previous = self._own[::-1][: self._settings.previous]
         tie = _Tie(new, self._guess_by_telemetry(new))
         if previous:
             self._ask(tie, previous[0], self._loose_prediction(new, previous[0], tie.guess), Effort.CHEAP)
         self._ask_under(tie, previous)
-        if not tie.links:
+        if len(tie.links) < self._settings.wanted_links:
             self._ask_dearly(tie)
-        if tie.links and tie.refusals:
             self._ask_under(tie, previous)
         if not tie.links and not new.prior.knows_place:
             for each in [*self._own[::-1][1:10], *self._own[:: max(1, len(self._own) // 20)]]:
@@ -245,10 +245,10 @@ class PlanarMapper:
     def _ask_dearly(self, tie: _Tie) -> None:
         for other, refusal in list(tie.refusals.items()):
             self._ask(tie, other, refusal.prediction, Effort.DEAR)
-            if not tie.links and refusal.prediction is not None:
+            if not tie.links and other in tie.refusals and refusal.prediction is not None:
                 # telemetry may be plainly wrong (pictures turned by half a turn, a compass that hangs): ask them alone
                 self._ask(tie, other, None, Effort.ALL)
-            if tie.links:
+            if len(tie.links) >= self._settings.wanted_links:
                 return
 
     def _guess_by_telemetry(self, new: Keyframe) -> Pose | None:
