@@ -14,7 +14,7 @@ LEAST_KNOWN = 0.05  # share of a frame that must be known for its measures to co
 class TuningLimits:
     """What the measures of unchanged ground decide; lengths in px of the half size pictures that are compared."""
 
-    calm_px: float = 0.15  # rest of the flow below: values count as known one pixel around
+    calm_px: float = 0.12  # rest of the flow below: values count as known one pixel around
     restless_px: float = 0.9  # rest of the flow above: three pixels around
     frames_to_settle: int = 10  # frames that must agree before less is tolerated than at first
 
