@@ -1,7 +1,7 @@
-"""Pairs from simulated flights: a later flight's frame and the earlier flight's nearest ones laid over it, with the answer.
+"""Pairs from simulated flights: a later flight's frame and one of the earlier flight laid over it, with the answer.
 
-Unlike pasted composites they have what real flights have together: another sun with its shadows, leaning trees and houses,
-the lens and the exposure of each frame, things of every size that came, went or move.
+Unlike pasted composites they have what real flights have together: another sun with its shadows, leaning trees and
+houses, the lens and the exposure of each frame, things of every size that came, went or move.
 """
 
 from collections.abc import Iterator
@@ -15,7 +15,6 @@ from sorvolo.geometry.homography import apply_homography, site_from_image_homogr
 from sorvolo.mosaic.lens import Undistorter
 from sorvolo.simulation.flight import SimulatedFlight, simulate_flights
 from sorvolo.simulation.presets import preset
-from sorvolo.simulation.settings import ImagingSettings
 from sorvolo.simulation.truth import change_mask
 
 GROUNDS = ("countryside", "urban", "dirt", "sand")
@@ -36,8 +35,7 @@ def simulated_pairs(seed: int, count: int, ground: str | None = None) -> Iterato
         ),
         path=replace(settings.path, height_m=height_m, speed_m_s=height_m / 4, length_m=height_m * 2.2,
                      strip_spacing_m=height_m * 0.5),
-        imaging=replace(settings.imaging, fps=5.0) if isinstance(settings.imaging, ImagingSettings) else settings.imaging,
-        later=later,
+        imaging=replace(settings.imaging, fps=5.0), later=later,
     )
     first, second = list(simulate_flights(settings))[:2]
     for index in rng.choice(len(second), size=min(count, len(second)), replace=False):

@@ -1,8 +1,8 @@
 """Train the check of regions: python benchmarks/train_blob_check.py [--data ../shared/data] [--count 120]
-# NOTE: read src/sorvolo/change/NOTICE-to-the-robust-method.md item 8 (from the lead), then delete this line.
 
-Answers are exact: the suites of change_suites.py over the caliterra flight's photos (CC0) and procedural grounds, with
-random numbers that no score uses. Boosted oblivious trees, written to src/sorvolo/change/blob_check.json.
+Answers are exact: the suites of change_suites.py over the caliterra flight's photos (CC0) and procedural grounds, and
+simulated flights (simulated_pairs.py), with random numbers that no score uses. Boosted oblivious trees, written to
+src/sorvolo/change/blob_check.json.
 """
 
 import argparse
@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from change_suites import SUITES, Ground, grounds, pairs
+from simulated_pairs import simulated_pairs
 from sorvolo.change.blob_check import Trees, how_sure
 from sorvolo.change.blobs import FEATURES, RegionSettings
 from sorvolo.change.robust import RobustSettings, examine
@@ -21,6 +22,7 @@ from sorvolo.simulation.ground import GroundKind
 
 TARGET = Path(__file__).parents[1] / "src" / "sorvolo" / "change" / "blob_check.json"
 SPLIT, SEED, EACH = "train", 9000, 20
+SITE_SEED, PAIRS_OF_A_SITE = 1000, 14
 TREES, DEPTH, RATE, BINS = 200, 4, 0.1, 48
 
 
@@ -29,6 +31,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[2] / "shared" / "data")
     parser.add_argument("--count", type=int, default=120, help="pairs of each suite")
+    parser.add_argument("--sites", type=int, default=40, help="simulated sites, each of another seed")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--suites", nargs="+", choices=list(SUITES), default=list(SUITES))
     parser.add_argument("--seed", type=int, default=SEED, help="the first of them")
@@ -46,7 +49,8 @@ def main() -> None:
     before = json.loads(options.output.read_text()) if options.onto else None
     trees = train(rows, answers, before)
     print(f"{len(rows)} regions, {int(answers.sum())} of them changes")
-    command = f"train_blob_check.py --count {options.count} --seed {options.seed} --suites {' '.join(options.suites)}"
+    command = f"train_blob_check.py --count {options.count} --sites {options.sites} --seed {options.seed}"
+    command += f" --suites {' '.join(options.suites)}"
     trees["trained"] = [*(before or {}).get("trained", []), {
         "regions": len(rows), "changes": int(answers.sum()), "sources": sources,
         "command": command + (" --onto" if options.onto else ""),
@@ -60,13 +64,15 @@ def collect_all(options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray, np
     names = [name for name in options.suites if places or name != "real"]
     places += [Ground("procedural", f"{kind.value} {500 + n}") for kind in GroundKind for n in range(3)]
     parts = range(-(-options.count // EACH))
-    tasks = [(name, options.seed + part, EACH, places) for name in names for part in parts]
+    tasks = [("simulated", SITE_SEED + site, PAIRS_OF_A_SITE, []) for site in range(options.sites)]
+    tasks += [(name, options.seed + part, EACH, places) for name in names for part in parts]
     with ProcessPoolExecutor(options.jobs) as pool:
         collected = list(pool.map(collect, *zip(*tasks)))
     rows = np.concatenate([rows for rows, _ in collected])
     answers = np.concatenate([answers for _, answers in collected])
     suites = np.concatenate([[task[0]] * len(part) for task, (_, part) in zip(tasks, collected)])
-    return rows, answers, suites, sorted({each.source for each in places})
+    sources = {each.source for each in places} | ({"simulation"} if options.sites else set())
+    return rows, answers, suites, sorted(sources)
 
 
 def collect(suite: str, seed: int, count: int, places: list[Ground]) -> tuple[np.ndarray, np.ndarray]:
@@ -74,7 +80,8 @@ def collect(suite: str, seed: int, count: int, places: list[Ground]) -> tuple[np
     cv2.setNumThreads(1)
     rows, answers = [], []
     settings = RobustSettings(regions=RegionSettings())
-    for pair in pairs(suite, seed, count, places, SPLIT):
+    found = simulated_pairs(seed, count) if suite == "simulated" else pairs(suite, seed, count, places, SPLIT)
+    for pair in found:
         regions, *_ = examine(pair.reference, pair.query, pair.valid, settings)
         size = regions.labels.shape[::-1]
         total = np.bincount(regions.labels.ravel(), minlength=len(regions.boxes) + 1)[1:]

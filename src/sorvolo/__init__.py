@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sorvolo.capture.areas import read_area
     from sorvolo.change.compare import Comparison, compare_images
+    from sorvolo.change.robust import RobustSettings
     from sorvolo.change.thesis import ThesisSettings, prepare_reference, thesis_steps
     from sorvolo.errors import GeometryError, InputError, SettingsError, SorvoloError, StoreError
     from sorvolo.missions.calibrate_camera import (
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
         parse_board,
         write_calibration,
     )
+    from sorvolo.missions.compare_flights import compare_flights
+    from sorvolo.missions.evaluate_changes import evaluate_changes
     from sorvolo.missions.evaluate_mosaic import evaluate_mosaic
     from sorvolo.missions.inspect_input import inspect_input
     from sorvolo.missions.map_flight import map_flights
@@ -28,31 +31,37 @@ if TYPE_CHECKING:
         plan_over,
         write_plan,
     )
-    from sorvolo.missions.settings import MapSettings
+    from sorvolo.missions.settings import CompareSettings, MapSettings
     from sorvolo.missions.simulate_site import simulate_site
     from sorvolo.simulation.presets import preset, preset_names
     from sorvolo.simulation.settings import SimulationSettings
     from sorvolo.store.archive import Archive
+    from sorvolo.survey.findings import Verdict
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Archive",
+    "CompareSettings",
     "Comparison",
     "GeometryError",
     "InputError",
     "MapSettings",
     "PlanSettings",
+    "RobustSettings",
     "SettingsError",
     "SimulationSettings",
     "SorvoloError",
     "StoreError",
     "ThesisSettings",
+    "Verdict",
     "__version__",
     "answer_questions",
     "calibrate_camera",
     "camera_to_plan_with",
+    "compare_flights",
     "compare_images",
+    "evaluate_changes",
     "evaluate_mosaic",
     "find_views",
     "inspect_input",
@@ -72,20 +81,24 @@ __all__ = [
 _HOMES = {
     "capture.areas": ("read_area",),
     "change.compare": ("Comparison", "compare_images"),
+    "change.robust": ("RobustSettings",),
     "change.thesis": ("ThesisSettings", "prepare_reference", "thesis_steps"),
     "errors": ("GeometryError", "InputError", "SettingsError", "SorvoloError", "StoreError"),
     "missions.calibrate_camera": ("calibrate_camera", "find_views", "parse_board", "write_calibration"),
+    "missions.compare_flights": ("compare_flights",),
+    "missions.evaluate_changes": ("evaluate_changes",),
     "missions.evaluate_mosaic": ("evaluate_mosaic",),
     "missions.inspect_input": ("inspect_input",),
     "missions.map_flight": ("map_flights",),
     "missions.plan_flight": (
         "PlanSettings", "answer_questions", "camera_to_plan_with", "plan_over", "write_plan",
     ),
-    "missions.settings": ("MapSettings",),
+    "missions.settings": ("CompareSettings", "MapSettings"),
     "missions.simulate_site": ("simulate_site",),
     "simulation.presets": ("preset", "preset_names"),
     "simulation.settings": ("SimulationSettings",),
     "store.archive": ("Archive",),
+    "survey.findings": ("Verdict",),
 }
 
 

@@ -1,4 +1,4 @@
-"""`sorvolo demo`: from nothing to a map, with two simulated flights."""
+"""`sorvolo demo`: from nothing to a map and its changes, with two simulated flights."""
 
 import json
 from dataclasses import asdict
@@ -10,9 +10,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from sorvolo import __version__
+from sorvolo.cli.compare import compare_and_read_results, show_results
 from sorvolo.cli.map import map_and_read_reports, show_reports
+from sorvolo.missions.evaluate_changes import evaluate_changes
 from sorvolo.missions.evaluate_mosaic import evaluate_mosaic
-from sorvolo.missions.settings import MapSettings
+from sorvolo.missions.settings import CompareSettings, MapSettings
 from sorvolo.missions.simulate_site import MARK, simulate_site
 from sorvolo.simulation.presets import preset
 from sorvolo.simulation.settings import SimulationSettings
@@ -28,7 +30,7 @@ def demo(
         Path, typer.Argument(help="Folder to make; the demo's own files in it are replaced.")
     ] = _DEFAULT_FOLDER,
 ) -> None:
-    """Simulate two flights over a field, map the first, and measure the map against the truth.
+    """Simulate two flights over a field, map the first, compare the second, and measure both against the truth.
 
     Example: sorvolo demo
     """
@@ -55,10 +57,20 @@ def demo(
             f"whole, they are {corners.shape.rms_m:.3f} m off."
         )
     later, camera = simulation / _LATER_FLIGHT, simulation / "camera.xml"
-    console.print("Next, look at the second flight, or map one of your own:")
+    console.print("comparing the second flight with the map")
+    results = compare_and_read_results([later], site, CompareSettings(), camera=str(camera))
+    show_results(results, site, console)
+    for measured in evaluate_changes(site, simulation):
+        if measured.events is not None:
+            events = measured.events
+            console.print(
+                f"Against the truth, {events.found} of {events.must_find} changes that had to be found were found; "
+                f"{events.false} false ones were told."
+            )
+    console.print("Next, judge the changes, or map a flight of your own:")
     for command in (
-        f"sorvolo inspect {later} --camera {camera}",
-        f"sorvolo evaluate mosaic {site} --truth {simulation}",
+        f"sorvolo review {site}",
+        f"sorvolo history {site}",
         "sorvolo map MY_VIDEO.MP4 --site my-site",
     ):
         console.print(f"  {command}", soft_wrap=True, highlight=False, markup=False)
