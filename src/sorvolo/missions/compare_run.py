@@ -143,7 +143,7 @@ class CompareRun:
                 self._paint(changes)
         placed = [self._placed[index] for index in sorted(self._placed)]
         with self._log.stage(Stage.REPORT):
-            shown = picture(self._writer.tiles, 1600).rgba
+            shown = picture(self._writer.tiles, 800).rgba  # a day without change should cost little
         report = build_report(
             self._setup, self._settings.mapping, self._log, placed, self._archive.site(), None, None,
             self._setup.source.camera.camera, self._writer.tiles, [*self._setup.notices, *notices],
