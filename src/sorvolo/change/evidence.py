@@ -23,8 +23,8 @@ from sorvolo.change.cells import (
     scale_m_per_px,
 )
 from sorvolo.change.gathering import GatheredChange, upright_weight
-from sorvolo.change.moving import BlobTracker, MovingSettings, Track
-from sorvolo.change.outlines import KnownPlace, is_known, measures, outline_of
+from sorvolo.change.moving import BlobTracker, MovingSettings, Track, standing_outline_m
+from sorvolo.change.outlines import KnownPlace, is_known, measures
 from sorvolo.change.patches import PatchWindow, cut, patch_of
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageGray, Mask, Matrix3, PointsM
@@ -444,11 +444,8 @@ class EvidenceMap:
 
     def _moving(self, view: ComparedView, track: Track, change_id: str) -> Change:
         """A moving thing as this view shows it."""
-        x, y, w, h = (int(each) for each in view.boxes[track.last.blob.box])
-        part = view.changed[y : y + h, x : x + w] > 0
-        site_from_part = view.site_from_image @ np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
         m_per_px = scale_m_per_px(view)
-        outline_m = outline_of(part, site_from_part, 0.5 * self._cell_m / m_per_px, self._join_m / m_per_px)
+        outline_m = standing_outline_m(view, track.last.blob)
         if outline_m is None:
             outline_m = _square(track.last.blob.place_m, self._cell_m)
         window = PatchWindow.around(outline_m.min(axis=0), outline_m.max(axis=0), self._site_m_per_px, 512)

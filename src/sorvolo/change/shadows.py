@@ -13,6 +13,7 @@ _DARK = 1.08  # of the light before: what is no brighter and of the same colour 
 _ALIKE = 0.22  # a shadow takes about the same share of each colour
 _LEAST_SHARE = 0.02  # of the change: if less is no shadow, all of it is a dark thing
 _LEAST_PX = 6
+_LEAST_PIECE = 0.15  # of the largest lit piece: smaller ones are specks of the shadow's rim
 _TOLERANCE_PX = 0.7
 
 
@@ -39,8 +40,12 @@ def thing_of(changed: Mask, shadow: Mask) -> Mask:
     opened: Anything = cv2.morphologyEx(lit.view(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     if np.count_nonzero(opened) < max(_LEAST_PX, _LEAST_SHARE * np.count_nonzero(changed)):
         return changed
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
+    areas = stats[:, cv2.CC_STAT_AREA].copy()
+    areas[0] = 0  # the ground
+    kept = (areas >= _LEAST_PIECE * areas.max())[labels].view(np.uint8)
     hull = np.zeros(lit.shape, np.uint8)
-    cv2.fillConvexPoly(hull, cv2.convexHull(cv2.findNonZero(opened)), (1,))
+    cv2.fillConvexPoly(hull, cv2.convexHull(cv2.findNonZero(kept)), (1,))
     return (cv2.dilate(hull, np.ones((3, 3), np.uint8)) > 0) & changed
 
 
