@@ -15,7 +15,6 @@ import numpy as np
 
 from change_suites import SUITES, Ground, grounds, pairs
 from simulated_pairs import simulated_pairs
-from sorvolo.change.blob_check import Trees, how_sure
 from sorvolo.change.blobs import FEATURES, RegionSettings
 from sorvolo.change.robust import RobustSettings, examine
 from sorvolo.simulation.ground import GroundKind
@@ -23,7 +22,7 @@ from sorvolo.simulation.ground import GroundKind
 TARGET = Path(__file__).parents[1] / "src" / "sorvolo" / "change" / "blob_check.json"
 SPLIT, SEED, EACH = "train", 9000, 20
 SITE_SEED, PAIRS_OF_A_SITE = 1000, 14
-TREES, DEPTH, RATE, BINS = 200, 4, 0.1, 48
+TREES, DEPTH, RATE, BINS = 300, 4, 0.1, 48
 
 
 def main() -> None:
@@ -35,26 +34,25 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--suites", nargs="+", choices=list(SUITES), default=list(SUITES))
     parser.add_argument("--seed", type=int, default=SEED, help="the first of them")
-    parser.add_argument("--onto", action="store_true", help="add trees to those there are")
-    parser.add_argument("--rows", type=Path, help="where collected regions are kept (.npz), or taken from if it exists")
+    parser.add_argument("--collect", type=Path, help="only collect regions, into this .npz")
+    parser.add_argument("--rows", type=Path, nargs="+", help="train on regions collected before, joined")
     parser.add_argument("--output", type=Path, default=TARGET)
     options = parser.parse_args()
-    if options.rows and options.rows.exists():
-        kept = np.load(options.rows)
-        rows, answers, suites, sources = kept["rows"], kept["answers"], kept["suites"], kept["sources"].tolist()
+    if options.rows:
+        kept = [dict(np.load(path)) for path in options.rows]
+        names = "rows", "answers", "suites"
+        rows, answers, suites = (np.concatenate([each[name] for each in kept]) for name in names)
+        told = [str(each["told"]) for each in kept]
     else:
         rows, answers, suites, sources = collect_all(options)
-        if options.rows:
-            np.savez_compressed(options.rows, rows=rows, answers=answers, suites=suites, sources=sources)
-    before = json.loads(options.output.read_text()) if options.onto else None
-    trees = train(rows, answers, before)
+        command = f"--count {options.count} --sites {options.sites} --seed {options.seed}"
+        told = [f"{command}: {len(rows)} regions of {', '.join(sources)}"]
+        if options.collect:
+            np.savez_compressed(options.collect, rows=rows, answers=answers, suites=suites, told=told[0])
+            return
+    trees = train(rows, answers, suites == "simulated")
     print(f"{len(rows)} regions, {int(answers.sum())} of them changes")
-    command = f"train_blob_check.py --count {options.count} --sites {options.sites} --seed {options.seed}"
-    command += f" --suites {' '.join(options.suites)}"
-    trees["trained"] = [*(before or {}).get("trained", []), {
-        "regions": len(rows), "changes": int(answers.sum()), "sources": sources,
-        "command": command + (" --onto" if options.onto else ""),
-    }]
+    trees["trained"] = {"regions": len(rows), "changes": int(answers.sum()), "collected": told}
     options.output.write_text(json.dumps(trees) + "\n")
 
 
@@ -96,22 +94,22 @@ def collect(suite: str, seed: int, count: int, places: list[Ground]) -> tuple[np
     return np.concatenate(rows), np.concatenate(answers)
 
 
-def train(rows: np.ndarray, answers: np.ndarray, before: dict[str, list] | None = None) -> dict[str, object]:
-    """Boosted oblivious trees: each level of a tree asks one question of all; logistic loss."""
+def train(rows: np.ndarray, answers: np.ndarray, simulated: np.ndarray) -> dict[str, object]:
+    """Boosted oblivious trees: each level of a tree asks one question of all; logistic loss.
+
+    `simulated` (N,) tells regions of simulated flights; as a whole they weigh as much as all others.
+    """
     rng = np.random.default_rng(5)
     cuts = [np.unique(np.quantile(column, np.linspace(0, 1, BINS + 1)[1:-1])) for column in rows.T]
     binned = np.column_stack([np.searchsorted(cut, column, "left") for cut, column in zip(cuts, rows.T)])
     count, width = binned.shape
     weights = np.where(answers, 0.5 / max(answers.mean(), 1e-9), 0.5 / max(1 - answers.mean(), 1e-9)) ** 0.5
+    if simulated.any() and not simulated.all():
+        weights = weights * np.where(simulated, 0.5 * count / simulated.sum(), 0.5 * count / (~simulated).sum())
     prior = float(np.log((weights @ answers) / (weights @ ~answers)))
     features, thresholds, leaves = [], [], []
     margin = np.full(count, prior)
-    if before:
-        prior, features, thresholds, leaves = (before[name] for name in ("prior", "features", "thresholds", "leaves"))
-        trees = Trees(FEATURES, prior, np.array(features), np.array(thresholds), np.array(leaves))
-        sure = np.clip(how_sure(rows, FEATURES, trees), 1e-9, 1 - 1e-9)
-        margin = np.log(sure / (1 - sure))
-    for _ in range(TREES if not before else TREES // 2):
+    for _ in range(TREES):
         chance = 1 / (1 + np.exp(-margin))
         sample = rng.uniform(size=count) < 0.7
         slope, bend = (answers - chance) * weights * sample, chance * (1 - chance) * weights * sample
