@@ -1,5 +1,4 @@
 """Where two pictures in the same light differ: regions, and what is measured of each to tell changes from the rest."""
-# NOTE: read NOTICE-to-the-robust-method.md item 8 beside this file (from the lead), then delete this line.
 
 from dataclasses import dataclass
 
@@ -7,8 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sorvolo.change.scratch import Scratch
 from sorvolo.geometry.arrays import Anything, Floats, Mask
-from sorvolo.kernels import core_regions, match_regions, measure_regions
+from sorvolo.kernels import core_regions, differences, match_regions, measure_regions, rim_balance, tint
 
 RING_PX = 4
 SPECK_PX = 9
@@ -28,6 +28,7 @@ FEATURES = (
 )
 
 _LOG = np.clip(np.rint(np.log2((np.arange(256) + 8) / 8) * 50), 0, 255).astype(np.uint8)
+_SCRATCH = Scratch()
 Image = Anything
 """uint8, (h, w) or (h, w, 3)."""
 
@@ -69,83 +70,66 @@ def find_regions(
     reference: Image, query: Image, known: Mask | None, settings: RegionSettings, rest_px: float, unevenness: float
 ) -> Regions:
     """Regions that differ between two pictures (h, w, 3) uint8 BGR in the same light; none where not `known`."""
-    before = cv2.cvtColor(cv2.blur(reference, (3, 3)), cv2.COLOR_BGR2YCrCb)
-    after = cv2.cvtColor(cv2.blur(query, (3, 3)), cv2.COLOR_BGR2YCrCb)
-    came, came_chroma = _outside(after, before, settings)
-    went, went_chroma = _outside(before, after, settings)
-    difference, chroma = cv2.max(came, went), cv2.max(came_chroma, went_chroma)
-    if known is not None:
-        difference[~known] = 0
+    size = reference.shape[0], reference.shape[1]
+    planes = differences(
+        reference, query, known, settings.reach_px, settings.chroma_weight, _SCRATCH.stack("planes", size, 6)
+    )
+    difference, chroma, came, went, light_before, light_after = planes
+    spare, specks, smooth, threshold = _SCRATCH.stack("thresholds", size, 4)
     # a large thing's inside is no clutter: only what is small among the differences raises the thresholds around it
     window = np.ones((SPECK_PX, SPECK_PX), np.uint8)
-    specks = cv2.subtract(difference, cv2.morphologyEx(difference, cv2.MORPH_OPEN, window))
+    cv2.subtract(difference, cv2.morphologyEx(difference, cv2.MORPH_OPEN, window, dst=spare), dst=specks)
     counts = np.bincount(specks[::4, ::4].ravel(), minlength=256).cumsum()
     noise = float(np.searchsorted(counts, 0.95 * counts[-1]))
-    smooth = cv2.blur(difference, (3, 3))
-    activity = cv2.blur(cv2.threshold(specks, MOST_SPECK, MOST_SPECK, cv2.THRESH_TRUNC)[1], (41, 41))
+    cv2.blur(difference, (3, 3), dst=smooth)
+    cv2.threshold(specks, MOST_SPECK, MOST_SPECK, cv2.THRESH_TRUNC, dst=specks)
+    activity = cv2.blur(specks, (41, 41), dst=spare)
     base = settings.least_difference + settings.noise_factor * max(noise, settings.least_noise)
-    threshold = cv2.addWeighted(activity, settings.activity_factor, activity, 0.0, base)
+    cv2.addWeighted(activity, settings.activity_factor, activity, 0.0, base, dst=threshold)
     near = np.ones((NEAR_PX, NEAR_PX), np.uint8)
-    low = cv2.addWeighted(cv2.dilate(smooth, near), WEAK_PART, smooth, 0.0, 0.0)
-    weak = np.asarray(cv2.compare(smooth, cv2.max(threshold, low), cv2.CMP_GT), np.uint8)
+    low = cv2.addWeighted(cv2.dilate(smooth, near, dst=specks), WEAK_PART, smooth, 0.0, 0.0, dst=specks)
+    weak = np.asarray(cv2.compare(smooth, cv2.max(threshold, low, dst=low), cv2.CMP_GT), np.uint8)
     labels, boxes = core_regions(
-        np.asarray(smooth, np.uint8), np.asarray(threshold, np.uint8), settings.strong_factor, settings.core,
-        settings.least_area_px, MOST_REGIONS,
+        smooth, threshold, settings.strong_factor, settings.core, settings.least_area_px, MOST_REGIONS
     )
     if len(boxes) == 0:
         return Regions(labels, boxes, np.zeros((0, len(FEATURES))), weak, noise, known, np.zeros(0))
-    logs = [cv2.LUT(cv2.extractChannel(each, 0), _LOG) for each in (before, after)]
     # a shadow takes from all colours alike: red over blue stays
-    reds, blues = ([cv2.LUT(cv2.extractChannel(each, band), _LOG) for each in (reference, query)] for band in (2, 0))
-    tint = cv2.addWeighted(
-        cv2.addWeighted(reds[1], 0.25, reds[0], -0.25, 64.0), 1.0,
-        cv2.addWeighted(blues[1], -0.25, blues[0], 0.25, 64.0), 1.0, 0.0,
-    )
+    colour = tint(reference, query, _LOG, boxes, RING_PX, _SCRATCH.take("tint", size))
+    log_before, log_after = _SCRATCH.stack("logarithms", size, 2)
+    cv2.LUT(light_before, _LOG, dst=log_before)
+    cv2.LUT(light_after, _LOG, dst=log_after)
     frame = np.array([noise, rest_px, unevenness, np.log1p(len(boxes))])
-    channels = [difference, chroma, activity, cv2.extractChannel(after, 0), came, went, tint, *logs]
+    channels = [difference, chroma, activity, light_after, came, went, colour, log_before, log_after]
     features = _measured(labels, boxes, channels, frame)
-    return Regions(labels, boxes, features, weak, noise, known, _came(labels, came, went))
-
-
-def _outside(values: Image, others: Image, settings: RegionSettings) -> tuple[Image, Image]:
-    """How far each value lies outside the other picture's range of values around it: light with colour, and colour."""
-    window = np.ones((2 * settings.reach_px + 1,) * 2, np.uint8)
-    over, under = cv2.subtract(values, cv2.dilate(others, window)), cv2.subtract(cv2.erode(others, window), values)
-    luma, red, blue = cv2.split(cv2.max(over, under))
-    chroma = cv2.add(red, blue)
-    return np.asarray(cv2.addWeighted(luma, 1.0, chroma, float(settings.chroma_weight), 0.0), np.uint8), chroma
-
-
-def _came(labels: NDArray[np.int32], came: Image, went: Image) -> Floats:
-    """Whether things came: along its outline a thing's values are new, while the ground's are still to be seen near."""
-    things = (labels > 0).astype(np.uint8)
-    rim = np.flatnonzero(cv2.subtract(things, cv2.erode(things, np.ones((5, 5), np.uint8))))
-    balance = came.ravel()[rim].astype(np.float64) - went.ravel()[rim]
-    return np.asarray(np.bincount(labels.ravel()[rim], balance, minlength=int(labels.max()) + 1)[1:], np.float64)
+    # along its outline a thing's values are new, while the ground's are still to be seen near
+    balance = rim_balance(labels, boxes, came, went).astype(np.float64)
+    return Regions(labels, boxes, features, weak, noise, known, balance)
 
 
 def _measured(
     labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: list[Image], frame: NDArray[np.float64]
 ) -> Floats:
-    difference, chroma, activity, level, came, went, tint, log_before, log_after = channels
-    detail_before, detail_after = _details(log_before), _details(log_after)
+    difference, chroma, activity, level, came, went, colour, log_before, log_after = channels
+    size = labels.shape[0], labels.shape[1]
+    detail_before, detail_after, ratio, edges_after, edges_before, detail = _SCRATCH.stack("measured", size, 6)
+    _details(log_before, detail_before)
+    _details(log_after, detail_after)
     window = np.ones((3, 3), np.uint8)
-    ratio = cv2.addWeighted(log_after, 0.5, log_before, -0.5, 128)
-    edges_after = cv2.morphologyEx(log_after, cv2.MORPH_GRADIENT, window)
-    edges_before = cv2.morphologyEx(log_before, cv2.MORPH_GRADIENT, window)
-    detail = cv2.absdiff(detail_after, detail_before)
-    stack = [difference, chroma, activity, level, ratio, edges_after, edges_before, detail, came, went, tint]
+    cv2.addWeighted(log_after, 0.5, log_before, -0.5, 128, dst=ratio)
+    cv2.morphologyEx(log_after, cv2.MORPH_GRADIENT, window, dst=edges_after)
+    cv2.morphologyEx(log_before, cv2.MORPH_GRADIENT, window, dst=edges_before)
+    cv2.absdiff(detail_after, detail_before, dst=detail)
+    stack = [difference, chroma, activity, level, ratio, edges_after, edges_before, detail, came, went, colour]
     sums = measure_regions(labels, boxes, stack, RING_PX).astype(np.float64)
     count = np.maximum(sums[:, :, :1], 1)
     means = sums[:, :, 1:12] / count
     spreads = np.sqrt(np.maximum(sums[:, :, 12:] / count - means**2, 0))
     within, around = means[:, 0], means[:, 1]
     reach = MATCH_REACH_PX
-    matched = match_regions(
-        detail_after,
-        np.asarray(cv2.copyMakeBorder(detail_before, reach, reach, reach, reach, cv2.BORDER_REFLECT), np.uint8),
-        _grown(boxes, labels.shape), reach,
-    )
+    searched = _SCRATCH.take("searched", size, margin_px=reach)
+    cv2.copyMakeBorder(detail_before, reach, reach, reach, reach, cv2.BORDER_REFLECT, dst=searched)
+    matched = match_regions(detail_after, searched, _grown(boxes, labels.shape), reach)
     area, long, short = sums[:, 0, 0], boxes[:, 2:].max(axis=1), boxes[:, 2:].min(axis=1)
     difference_in, noise = within[:, 0], frame[0]
     columns = [
@@ -162,8 +146,9 @@ def _measured(
     return np.column_stack(columns + [np.full(len(boxes), value) for value in frame])
 
 
-def _details(logarithm: Image) -> Image:
-    return np.asarray(cv2.addWeighted(logarithm, 1, cv2.blur(logarithm, (11, 11)), -1, 128), np.uint8)
+def _details(logarithm: Image, to: Image) -> None:
+    cv2.blur(logarithm, (11, 11), dst=to)
+    cv2.addWeighted(logarithm, 1, to, -1, 128, dst=to)
 
 
 def _grown(boxes: NDArray[np.int32], shape: tuple[int, ...]) -> NDArray[np.int32]:

@@ -12,6 +12,7 @@ from sorvolo.geometry.arrays import Anything, Mask, Matrix3
 LARGEST_PX = 6.0  # at the pictures' corners, in their own pixels; what says more has lost its way
 SMALLEST_PX = 0.12  # a resampling costs more than this is worth
 GRID = (28, 16)
+LEAST_FLOW_PX = 32  # OpenCV's flow crashes on pictures that are wide and less high than four of its patches
 
 _LOG = np.clip(np.rint(np.log2((np.arange(256) + 8) / 8) * 50), 0, 255).astype(np.uint8)
 
@@ -35,7 +36,7 @@ def settle(reference: NDArray[np.uint8], query: NDArray[np.uint8], known: Mask |
     small = max(16, width // 2), max(16, height // 2)
     scale = np.array([width / small[0], height / small[1]])
     details = [_details(cv2.resize(image, small, interpolation=cv2.INTER_AREA)) for image in (reference, query)]
-    if min(small) < 24:
+    if min(small) < LEAST_FLOW_PX:
         return Settling(np.eye(3), 0.0, 0.0)
     start: Any = None
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(details[1], details[0], start)

@@ -31,6 +31,9 @@ COMPILED = _native is not None
 LARGEST_WINDOW_PX = 127
 """The longest side of a window that the kernels take."""
 
+MOST_REACH_PX = 32
+"""How far `differences` looks around at most."""
+
 _thesis = reference if _native is None else _native
 
 Bytes = NDArray[np.uint8]
@@ -110,6 +113,63 @@ def relight(image: NDArray[np.uint8], curves: NDArray[np.int32], gains: NDArray[
     return lit
 
 
+def differences(
+    before: NDArray[np.uint8], after: NDArray[np.uint8], known: NDArray[np.bool_] | None, reach: int, weight: int,
+    out: NDArray[np.uint8] | None = None,
+) -> NDArray[np.uint8]:
+    """How far each value of two pictures (h, w, 3) lies outside the other's, planes (6, h, w): see reference_robust.
+
+    `out` (6, h, w) is written over where it is given, and returned.
+    """
+    height, width = before.shape[:2]
+    if before.shape != (height, width, 3) or after.shape != before.shape or min(height, width) < 2:
+        raise ValueError(f"differences: pictures {before.shape} and {after.shape} do not fit")
+    if known is not None and known.shape != (height, width):
+        raise ValueError(f"differences: known {known.shape} does not fit pictures {before.shape}")
+    if not (0 <= reach <= MOST_REACH_PX and 0 <= weight <= 255):
+        raise ValueError(f"differences: reach {reach} or weight {weight} out of 0 .. {MOST_REACH_PX} and 0 .. 255")
+    out = _target(out, (6, height, width))
+    marked = None if known is None else np.ascontiguousarray(known, np.bool_).view(np.uint8)
+    _robust.differences(
+        np.ascontiguousarray(before, np.uint8), np.ascontiguousarray(after, np.uint8), marked, reach, weight, out
+    )
+    return out
+
+
+def tint(
+    before: NDArray[np.uint8], after: NDArray[np.uint8], logs: NDArray[np.uint8], boxes: NDArray[np.int32], margin: int,
+    out: NDArray[np.uint8] | None = None,
+) -> NDArray[np.uint8]:
+    """How much redder than blue a picture became, (h, w), in boxes and `margin` around only: see reference_robust.
+
+    `out` (h, w) is written over there where it is given, and returned; elsewhere it keeps what it held.
+    """
+    if before.shape != after.shape or before.shape[2:] != (3,) or logs.shape != (256,):
+        raise ValueError(f"tint: pictures {before.shape}, {after.shape} and logs {logs.shape} do not fit")
+    boxes = np.ascontiguousarray(boxes, np.int32).reshape(-1, 4)
+    out = _target(out, before.shape[:2])
+    _robust.tint(
+        np.ascontiguousarray(before, np.uint8), np.ascontiguousarray(after, np.uint8),
+        np.ascontiguousarray(logs, np.uint8), boxes, margin, out,
+    )
+    return out
+
+
+def rim_balance(
+    labels: NDArray[np.int32], boxes: NDArray[np.int32], came: NDArray[np.uint8], went: NDArray[np.uint8]
+) -> NDArray[np.int64]:
+    """By how much `came` exceeds `went` along the rims of regions, (N,): see reference_robust."""
+    boxes = np.ascontiguousarray(boxes, np.int32).reshape(-1, 4)
+    _check_boxes("rim_balance", boxes, labels.shape)
+    if not labels.shape == came.shape == went.shape or labels.ndim != 2:
+        raise ValueError(f"rim_balance: labels {labels.shape}, came {came.shape}, went {went.shape} do not fit")
+    balance: NDArray[np.int64] = _robust.rim_balance(
+        np.ascontiguousarray(labels, np.int32), boxes, np.ascontiguousarray(came, np.uint8),
+        np.ascontiguousarray(went, np.uint8),
+    )
+    return balance
+
+
 def core_regions(
     values: NDArray[np.uint8], thresholds: NDArray[np.uint8], strong: float, core: float, least_area: int, most: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -145,13 +205,26 @@ def match_regions(
     height, width = query.shape
     if searched.shape != (height + 2 * reach, width + 2 * reach):
         raise ValueError(f"match_regions: searched {searched.shape}, query {query.shape}, reach {reach} do not fit")
-    ends = boxes[:, :2] + boxes[:, 2:]
-    if (boxes[:, :2] < 0).any() or (boxes[:, 2:] < 1).any() or (ends > [width, height]).any():
-        raise ValueError(f"match_regions: boxes outside of the {width} x {height} px picture")
+    _check_boxes("match_regions", boxes, query.shape)
     found: NDArray[np.float64] = _robust.match_regions(
         np.ascontiguousarray(query, np.uint8), np.ascontiguousarray(searched, np.uint8), boxes, reach
     )
     return found
+
+
+def _target(out: NDArray[np.uint8] | None, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    if out is None:
+        return np.empty(shape, np.uint8)
+    if out.shape != shape or out.dtype != np.uint8 or not (out.flags.c_contiguous and out.flags.writeable):
+        raise ValueError(f"out: found {out.dtype} of shape {out.shape}; give writeable uint8 in C order, {shape}")
+    return out
+
+
+def _check_boxes(name: str, boxes: NDArray[np.int32], shape: tuple[int, ...]) -> None:
+    height, width = shape[:2]
+    ends = boxes[:, :2] + boxes[:, 2:]
+    if (boxes[:, :2] < 0).any() or (boxes[:, 2:] < 1).any() or (ends > [width, height]).any():
+        raise ValueError(f"{name}: boxes outside of the {width} x {height} px picture")
 
 
 def _bytes(array: Bytes) -> Bytes:

@@ -9,6 +9,7 @@
 
 #include <cmath>
 #include <cstdlib>
+#include <optional>
 
 // Compiled twice, the better one chosen when the module is loaded.
 #if defined(__x86_64__) && defined(__linux__) && defined(__GNUC__)
@@ -48,21 +49,251 @@ Bytes relight(const Bytes &image, const Integers32 &curves, const Words &gains) 
     return lit;
 }
 
-// Collects the 8-connected parts of `from`, where it is `wanted`, and hands each to `take`, in order of first pixels.
-template <typename Wanted, typename Take>
-void collect_parts(int width, int height, std::vector<std::uint8_t> &seen, Wanted wanted, Take take) {
+ROBUST_CLONES
+void split_row(const std::uint8_t *bgr, std::uint8_t *blue, std::uint8_t *green, std::uint8_t *red, int columns) {
+    for (int x = 0; x < columns; ++x) blue[x] = bgr[3 * x], green[x] = bgr[3 * x + 1], red[x] = bgr[3 * x + 2];
+}
+
+// The mean of 3 x 3; `sums` has one place before and one after the row.
+ROBUST_CLONES
+void blur_row(const std::uint8_t *above, const std::uint8_t *here, const std::uint8_t *below, std::uint16_t *sums,
+              std::uint8_t *to, int columns) {
+    for (int x = 0; x < columns; ++x) sums[x + 1] = static_cast<std::uint16_t>(above[x] + here[x] + below[x]);
+    sums[0] = sums[2], sums[columns + 1] = sums[columns - 1];
+    for (int x = 0; x < columns; ++x) {
+        const std::uint16_t sum = static_cast<std::uint16_t>(sums[x] + sums[x + 1] + sums[x + 2] + 4);
+        to[x] = static_cast<std::uint8_t>((static_cast<std::uint32_t>(sum) * 7282u) >> 16);  // by nine
+    }
+}
+
+// Blue, green and red become luma, red difference and blue difference, as OpenCV rounds them.
+ROBUST_CLONES
+void luma_row(std::uint8_t *first, std::uint8_t *second, std::uint8_t *third, int columns) {
+    for (int x = 0; x < columns; ++x) {
+        const std::int32_t blue = first[x], green = second[x], red = third[x];
+        const std::int32_t luma = (blue * 1868 + green * 9617 + red * 4899 + 8192) >> 14;
+        const std::int32_t to_red = ((red - luma) * 11682 + (128 << 14) + 8192) >> 14;
+        const std::int32_t to_blue = ((blue - luma) * 9241 + (128 << 14) + 8192) >> 14;
+        first[x] = static_cast<std::uint8_t>(luma);
+        second[x] = static_cast<std::uint8_t>(std::clamp(to_red, 0, 255));
+        third[x] = static_cast<std::uint8_t>(std::clamp(to_blue, 0, 255));
+    }
+}
+
+// The largest and the smallest of `window` neighbours, from rows that are padded by zeros and by 255.
+ROBUST_CLONES
+void extremes_row(const std::uint8_t *low, const std::uint8_t *high, int window, std::uint8_t *most,
+                  std::uint8_t *least, int columns) {
+    std::memcpy(most, low, columns), std::memcpy(least, high, columns);
+    for (int by = 1; by < window; ++by) {
+        for (int x = 0; x < columns; ++x) {
+            most[x] = std::max(most[x], low[x + by]);
+            least[x] = std::min(least[x], high[x + by]);
+        }
+    }
+}
+
+ROBUST_CLONES
+void extremes_rows(const std::uint8_t *most, const std::uint8_t *least, std::uint8_t *all_most,
+                   std::uint8_t *all_least, int columns) {
+    for (int x = 0; x < columns; ++x) {
+        all_most[x] = std::max(all_most[x], most[x]);
+        all_least[x] = std::min(all_least[x], least[x]);
+    }
+}
+
+ROBUST_CLONES
+void beyond_row(const std::uint8_t *values, const std::uint8_t *most, const std::uint8_t *least, std::uint8_t *to,
+                int columns) {
+    for (int x = 0; x < columns; ++x) {
+        const std::uint8_t over = static_cast<std::uint8_t>(std::max(values[x], most[x]) - most[x]);
+        const std::uint8_t under = static_cast<std::uint8_t>(least[x] - std::min(values[x], least[x]));
+        to[x] = std::max(over, under);
+    }
+}
+
+ROBUST_CLONES
+void weigh_row(const std::uint8_t *luma, const std::uint8_t *red, const std::uint8_t *blue, int weight,
+               std::uint8_t *outside, std::uint8_t *chroma, int columns) {
+    const std::uint16_t by = static_cast<std::uint16_t>(weight);
+    for (int x = 0; x < columns; ++x) {
+        const std::uint8_t colour = static_cast<std::uint8_t>(red[x] + std::min<std::uint8_t>(blue[x], 255 - red[x]));
+        const std::uint16_t more = std::min<std::uint16_t>(static_cast<std::uint16_t>(colour * by), 255);
+        chroma[x] = colour;
+        const std::uint16_t total = static_cast<std::uint16_t>(more + luma[x]);
+        outside[x] = static_cast<std::uint8_t>(std::min<std::uint16_t>(total, 255));
+    }
+}
+
+ROBUST_CLONES
+void join_row(const std::uint8_t *a, const std::uint8_t *b, std::uint8_t *to, int columns) {
+    for (int x = 0; x < columns; ++x) to[x] = std::max(a[x], b[x]);
+}
+
+ROBUST_CLONES
+void mask_row(const std::uint8_t *known, std::uint8_t *to, int columns) {
+    for (int x = 0; x < columns; ++x) to[x] = known[x] ? to[x] : 0;
+}
+
+// One picture's rows while they pass: split, then blurred and in luma, then their extremes along the row.
+struct Passing {
+    const std::uint8_t *image;
+    int rows, columns, reach, depth;
+    std::vector<std::uint8_t> split, values, most, least, low, high;
+    std::vector<std::uint16_t> sums;
+
+    Passing(const std::uint8_t *pixels, int height, int width, int reach_px)
+        : image(pixels), rows(height), columns(width), reach(reach_px), depth(2 * reach_px + 1),
+          split(9 * width), values(3 * depth * width), most(3 * depth * width), least(3 * depth * width),
+          low(width + 2 * reach_px, 0), high(width + 2 * reach_px, 255), sums(width + 2) {
+        split_at(0), split_at(1);
+    }
+    std::uint8_t *plane(std::vector<std::uint8_t> &ring, int row, int band) {
+        return ring.data() + (static_cast<std::size_t>(row % depth) * 3 + band) * columns;
+    }
+    std::uint8_t *split_plane(int row, int band) {
+        return split.data() + (static_cast<std::size_t>(row % 3) * 3 + band) * columns;
+    }
+    void split_at(int row) {
+        split_row(image + static_cast<std::size_t>(row) * columns * 3, split_plane(row, 0), split_plane(row, 1),
+                  split_plane(row, 2), columns);
+    }
+    void take(int row) {
+        if (row >= 1 && row + 1 < rows) split_at(row + 1);
+        const int above = mirrored(row - 1, rows), below = mirrored(row + 1, rows);
+        for (int band = 0; band < 3; ++band)
+            blur_row(split_plane(above, band), split_plane(row, band), split_plane(below, band), sums.data(),
+                     plane(values, row, band), columns);
+        luma_row(plane(values, row, 0), plane(values, row, 1), plane(values, row, 2), columns);
+        for (int band = 0; band < 3; ++band) {
+            std::memcpy(low.data() + reach, plane(values, row, band), columns);
+            std::memcpy(high.data() + reach, plane(values, row, band), columns);
+            extremes_row(low.data(), high.data(), depth, plane(most, row, band), plane(least, row, band), columns);
+        }
+    }
+    // The extremes of rows row - reach .. row + reach.
+    void around(int row, int band, std::uint8_t *all_most, std::uint8_t *all_least) {
+        const int first = std::max(row - reach, 0), last = std::min(row + reach, rows - 1);
+        std::memcpy(all_most, plane(most, first, band), columns);
+        std::memcpy(all_least, plane(least, first, band), columns);
+        for (int each = first + 1; each <= last; ++each)
+            extremes_rows(plane(most, each, band), plane(least, each, band), all_most, all_least, columns);
+    }
+};
+
+void differences(const Bytes &reference, const Bytes &query, const std::optional<Bytes> &known, int reach, int weight,
+                 Bytes &out) {
+    const int rows = static_cast<int>(reference.shape(0)), columns = static_cast<int>(reference.shape(1));
+    const std::uint8_t *pixels[2] = {reference.data(), query.data()};
+    const std::uint8_t *compared = known ? known->data() : nullptr;
+    std::uint8_t *to = out.mutable_data();
+    pybind11::gil_scoped_release released;
+    Passing before(pixels[0], rows, columns, reach), after(pixels[1], rows, columns, reach);
+    std::vector<std::uint8_t> work(6 * static_cast<std::size_t>(columns));
+    std::uint8_t *most = work.data(), *least = most + columns, *beyond = least + columns;
+    std::uint8_t *went_chroma = beyond + 3 * columns;
+    const std::size_t plane = static_cast<std::size_t>(rows) * columns;
+    for (int row = 0; row < std::min(reach, rows); ++row) before.take(row), after.take(row);
+    for (int row = 0; row < rows; ++row) {
+        if (row + reach < rows) before.take(row + reach), after.take(row + reach);
+        std::uint8_t *line = to + static_cast<std::size_t>(row) * columns;
+        const auto outside = [&](Passing &values, Passing &others, std::uint8_t *total, std::uint8_t *chroma) {
+            for (int band = 0; band < 3; ++band) {
+                others.around(row, band, most, least);
+                beyond_row(values.plane(values.values, row, band), most, least, beyond + band * columns, columns);
+            }
+            weigh_row(beyond, beyond + columns, beyond + 2 * columns, weight, total, chroma, columns);
+        };
+        outside(after, before, line + 2 * plane, line + plane);
+        outside(before, after, line + 3 * plane, went_chroma);
+        join_row(line + plane, went_chroma, line + plane, columns);
+        join_row(line + 2 * plane, line + 3 * plane, line, columns);
+        if (compared) mask_row(compared + static_cast<std::size_t>(row) * columns, line, columns);
+        std::memcpy(line + 4 * plane, before.plane(before.values, row, 0), columns);
+        std::memcpy(line + 5 * plane, after.plane(after.values, row, 0), columns);
+    }
+}
+
+// How much redder than blue the query is against the reference, in quarter steps of `logs`, rounded to even, 128 alike.
+void tint(const Bytes &reference, const Bytes &query, const Bytes &logs, const Integers32 &boxes, int margin,
+          Bytes &out) {
+    const int height = static_cast<int>(out.shape(0)), width = static_cast<int>(out.shape(1));
+    const std::uint8_t *before = reference.data(), *after = query.data(), *log = logs.data();
+    const std::int32_t *box = boxes.data();
+    std::uint8_t *to = out.mutable_data();
+    pybind11::gil_scoped_release released;
+    std::int32_t quarter[511];
+    for (int step = -255; step <= 255; ++step)
+        quarter[step + 255] = static_cast<std::int32_t>(std::nearbyint(64.0 + step / 4.0));
+    for (pybind11::ssize_t region = 0; region < boxes.shape(0); ++region, box += 4) {
+        const int left = std::max(box[0] - margin, 0), right = std::min(box[0] + box[2] + margin, width);
+        const int top = std::max(box[1] - margin, 0), bottom = std::min(box[1] + box[3] + margin, height);
+        for (int y = top; y < bottom; ++y) {
+            for (std::int64_t at = static_cast<std::int64_t>(y) * width + left,
+                              end = static_cast<std::int64_t>(y) * width + right;
+                 at < end; ++at) {
+                const std::uint8_t *a = before + 3 * at, *b = after + 3 * at;
+                to[at] = static_cast<std::uint8_t>(std::min(
+                    quarter[log[b[2]] - log[a[2]] + 255] + quarter[log[a[0]] - log[b[0]] + 255], 255));
+            }
+        }
+    }
+}
+
+// Along each region's rim, two pixels wide: the sum of `came` less that of `went`.
+Integers64 rim_balance(const Integers32 &labels, const Integers32 &boxes, const Bytes &came, const Bytes &went) {
+    const int height = static_cast<int>(labels.shape(0)), width = static_cast<int>(labels.shape(1));
+    Integers64 balance({boxes.shape(0)});
+    const std::int32_t *label = labels.data(), *box = boxes.data();
+    const std::uint8_t *plus = came.data(), *minus = went.data();
+    std::int64_t *to = balance.mutable_data();
+    pybind11::gil_scoped_release released;
+    for (pybind11::ssize_t region = 0; region < boxes.shape(0); ++region, box += 4) {
+        std::int64_t sum = 0;
+        for (int y = box[1]; y < box[1] + box[3]; ++y) {
+            for (int x = box[0]; x < box[0] + box[2]; ++x) {
+                const std::int64_t at = static_cast<std::int64_t>(y) * width + x;
+                if (label[at] != region + 1) continue;
+                bool is_rim = false;
+                for (int ny = std::max(y - 2, 0); ny <= std::min(y + 2, height - 1) && !is_rim; ++ny)
+                    for (int nx = std::max(x - 2, 0); nx <= std::min(x + 2, width - 1); ++nx)
+                        is_rim |= label[static_cast<std::int64_t>(ny) * width + nx] == 0;
+                if (is_rim) sum += static_cast<std::int64_t>(plus[at]) - minus[at];
+            }
+        }
+        to[region] = sum;
+    }
+    return balance;
+}
+
+// Which values lie over their thresholds, 1 or 0.
+ROBUST_CLONES
+void mark_over(const std::uint8_t *value, const std::uint8_t *threshold, std::uint8_t *to, std::int64_t pixels) {
+    for (std::int64_t at = 0; at < pixels; ++at) to[at] = value[at] > threshold[at];
+}
+
+// Hands each 8-connected part of `left`, whose pixels are 1 or 0, to `take`, in order of first pixels; clears it.
+template <typename Take>
+void collect_parts(int width, int height, std::vector<std::uint8_t> &left, Take take) {
     std::vector<std::int32_t> part;
-    for (std::int32_t start = 0; start < width * height; ++start) {
-        if (seen[start] || !wanted(start)) continue;
+    const std::int32_t pixels = width * height;
+    for (std::int32_t start = 0; start < pixels; ++start) {
+        std::uint64_t eight;
+        for (; start + 8 <= pixels; start += 8) {
+            std::memcpy(&eight, left.data() + start, 8);
+            if (eight) break;
+        }
+        while (start < pixels && !left[start]) ++start;
+        if (start == pixels) break;
         part.assign(1, start);
-        seen[start] = 1;
+        left[start] = 0;
         for (std::size_t next = 0; next < part.size(); ++next) {
             const int x = part[next] % width, y = part[next] / width;
             for (int ny = std::max(y - 1, 0); ny <= std::min(y + 1, height - 1); ++ny) {
                 for (int nx = std::max(x - 1, 0); nx <= std::min(x + 1, width - 1); ++nx) {
                     const std::int32_t near = ny * width + nx;
-                    if (seen[near] || !wanted(near)) continue;
-                    seen[near] = 1;
+                    if (!left[near]) continue;
+                    left[near] = 0;
                     part.push_back(near);
                 }
             }
@@ -87,10 +318,9 @@ pybind11::tuple core_regions(const Bytes &values, const Bytes &thresholds, doubl
         pybind11::gil_scoped_release released;
         const std::int64_t pixels = static_cast<std::int64_t>(width) * height;
         std::fill(label, label + pixels, 0);
-        std::vector<std::uint8_t> seen(pixels, 0), inside(pixels, 0), taken(pixels, 0);
-        std::vector<std::int32_t> kept;
-        const auto weak = [&](std::int32_t at) { return value[at] > threshold[at]; };
-        collect_parts(width, height, seen, weak, [&](const std::vector<std::int32_t> &part) {
+        std::vector<std::uint8_t> weak(pixels), inside(pixels, 0);
+        mark_over(value, threshold, weak.data(), pixels);
+        collect_parts(width, height, weak, [&](const std::vector<std::int32_t> &part) {
             std::int64_t total = 0, squares = 0;
             int strong_ones = 0;
             for (const std::int32_t at : part) {
@@ -102,13 +332,12 @@ pybind11::tuple core_regions(const Bytes &values, const Bytes &thresholds, doubl
             for (const std::int32_t at : part)
                 if (static_cast<double>(value[at]) > least) inside[at] = 1;
         });
-        collect_parts(width, height, taken, [&](std::int32_t at) { return inside[at] != 0; },
-                      [&](const std::vector<std::int32_t> &part) {
-                          if (static_cast<int>(part.size()) < least_area) return;
-                          std::int64_t total = 0;
-                          for (const std::int32_t at : part) total += value[at];
-                          cores.push_back({total, part});
-                      });
+        collect_parts(width, height, inside, [&](const std::vector<std::int32_t> &part) {
+            if (static_cast<int>(part.size()) < least_area) return;
+            std::int64_t total = 0;
+            for (const std::int32_t at : part) total += value[at];
+            cores.push_back({total, part});
+        });
         std::stable_sort(cores.begin(), cores.end(), [](const Core &a, const Core &b) { return a.total > b.total; });
         if (static_cast<int>(cores.size()) > most) cores.resize(most);
         for (std::size_t each = 0; each < cores.size(); ++each)
@@ -173,27 +402,20 @@ double correlation(const Sums &s) {
            (std::sqrt(static_cast<double>(spread_q)) * std::sqrt(static_cast<double>(spread_t)));
 }
 
-// `query` points at the window's first value, `reference` at the one it is laid over; rows and columns in steps.
+// The sums of a window that the shift changes; both windows lie in steps of one, `query` without gaps between its rows.
 ROBUST_CLONES
-void sum_window(const std::uint8_t *query, std::int64_t query_row, const std::uint8_t *reference,
-                std::int64_t reference_row, int wide, int high, int step, Sums *total) {
-    for (int y = 0; y < high; y += step) {
-        const std::uint8_t *a = query + y * query_row, *b = reference + y * reference_row;
-        std::int32_t n = 0, q = 0, qq = 0, t = 0, tt = 0, qt = 0, apart = 0;
-        if (step == 1) {
-            for (int x = 0; x < wide; ++x) {
-                const std::int32_t u = a[x], v = b[x];
-                q += u, t += v, qq += u * u, tt += v * v, qt += u * v, apart += std::abs(u - v);
-            }
-            n = wide;
-        } else {
-            for (int x = 0; x < wide; x += step) {
-                const std::int32_t u = a[x], v = b[x];
-                ++n, q += u, t += v, qq += u * u, tt += v * v, qt += u * v, apart += std::abs(u - v);
-            }
+void sum_window(const std::uint8_t *query, const std::int16_t *query_words, const std::uint8_t *reference,
+                const std::int16_t *reference_words, std::int64_t reference_row, int wide, int high, Sums *total) {
+    for (int y = 0; y < high; ++y) {
+        const std::int64_t row = static_cast<std::int64_t>(y) * wide;
+        const std::uint8_t *a = query + row, *b = reference + y * reference_row;
+        const std::int16_t *u = query_words + row, *v = reference_words + y * reference_row;
+        std::int32_t qt = 0, t = 0, tt = 0, apart = 0;
+        for (int x = 0; x < wide; ++x) {
+            qt += u[x] * v[x], tt += v[x] * v[x], t += b[x];
+            apart += std::abs(static_cast<int>(a[x]) - static_cast<int>(b[x]));
         }
-        total->n += n, total->q += q, total->qq += qq, total->t += t, total->tt += tt, total->qt += qt;
-        total->apart += apart;
+        total->t += t, total->tt += tt, total->qt += qt, total->apart += apart;
     }
 }
 
@@ -205,19 +427,45 @@ Doubles match_regions(const Bytes &query, const Bytes &reference, const Integers
     double *to = found.mutable_data();
     const std::uint8_t *q0 = query.data(), *t0 = reference.data();
     pybind11::gil_scoped_release released;
+    std::vector<std::uint8_t> asked, searched;
+    std::vector<std::int16_t> asked_words, searched_words;
     for (pybind11::ssize_t region = 0; region < regions; ++region, box += 4, to += 6) {
         const int step = std::max(1, std::max(box[2], box[3]) / 32);
+        const int wide = (box[2] + step - 1) / step, high = (box[3] + step - 1) / step;
+        Sums in_query;
+        asked.clear();
+        for (int y = 0; y < box[3]; y += step) {
+            for (int x = 0; x < box[2]; x += step) {
+                const std::int64_t value = q0[(box[1] + y) * width + box[0] + x];
+                asked.push_back(static_cast<std::uint8_t>(value));
+                in_query.q += value, in_query.qq += value * value;
+            }
+        }
+        in_query.n = static_cast<std::int64_t>(wide) * high;
+        asked_words.assign(asked.begin(), asked.end());
+        // every step-th row and column belong together: the searched window falls into step x step pictures
+        const int across = wide + (2 * reach) / step + 1, down = high + (2 * reach) / step + 1;
+        const std::size_t phase_size = static_cast<std::size_t>(across) * down;
+        searched.assign(phase_size * step * step, 0);
+        const int rows = box[3] + 2 * reach, columns = box[2] + 2 * reach;
+        for (int y = 0; y < rows; ++y) {
+            const std::uint8_t *line = t0 + (box[1] + y) * padded + box[0];
+            if (y / step >= down) break;
+            for (int x = 0; x < columns && x / step < across; ++x)
+                searched[((y % step) * step + x % step) * phase_size + (y / step) * across + x / step] = line[x];
+        }
+        searched_words.assign(searched.begin(), searched.end());
         double best = -2.0, least = 256.0;
-        for (int dy = -reach; dy <= reach; ++dy) {
-            for (int dx = -reach; dx <= reach; ++dx) {
-                Sums sums;
-                sum_window(q0 + box[1] * width + box[0], width,
-                           t0 + (box[1] + reach + dy) * padded + box[0] + reach + dx, padded, box[2], box[3], step,
-                           &sums);
+        for (int dy = 0; dy <= 2 * reach; ++dy) {
+            for (int dx = 0; dx <= 2 * reach; ++dx) {
+                Sums sums = in_query;
+                const std::size_t at = ((dy % step) * step + dx % step) * phase_size + (dy / step) * across + dx / step;
+                sum_window(asked.data(), asked_words.data(), searched.data() + at, searched_words.data() + at, across,
+                           wide, high, &sums);
                 const double alike = correlation(sums);
                 const double apart = static_cast<double>(sums.apart) / static_cast<double>(sums.n);
-                if (dx == 0 && dy == 0) to[0] = alike, to[4] = apart;
-                if (alike > best) best = alike, to[2] = dx, to[3] = dy;
+                if (dx == reach && dy == reach) to[0] = alike, to[4] = apart;
+                if (alike > best) best = alike, to[2] = dx - reach, to[3] = dy - reach;
                 least = std::min(least, apart);
             }
         }
@@ -231,6 +479,12 @@ Doubles match_regions(const Bytes &query, const Bytes &reference, const Integers
 void bind_robust(pybind11::module_ &module) {
     using pybind11::arg;
     module.def("relight", &relight, arg("image").noconvert(), arg("curves").noconvert(), arg("gains").noconvert());
+    module.def("differences", &differences, arg("reference").noconvert(), arg("query").noconvert(),
+               arg("known").noconvert(), arg("reach"), arg("weight"), arg("out").noconvert());
+    module.def("tint", &tint, arg("reference").noconvert(), arg("query").noconvert(), arg("logs").noconvert(),
+               arg("boxes").noconvert(), arg("margin"), arg("out").noconvert());
+    module.def("rim_balance", &rim_balance, arg("labels").noconvert(), arg("boxes").noconvert(),
+               arg("came").noconvert(), arg("went").noconvert());
     module.def("core_regions", &core_regions, arg("values").noconvert(), arg("thresholds").noconvert(), arg("strong"),
                arg("core"), arg("least_area"), arg("most"));
     module.def("measure_regions", &measure_regions, arg("labels").noconvert(), arg("boxes").noconvert(),

@@ -18,6 +18,76 @@ def relight(
     return np.asarray(np.clip(((product + (1 << 15)) >> 16) - 8, 0, 255), np.uint8)
 
 
+def differences(
+    reference: NDArray[np.uint8], query: NDArray[np.uint8], known: NDArray[np.uint8] | None, reach: int, weight: int,
+    out: NDArray[np.uint8],
+) -> None:
+    """Fills `out` (6, h, w) from two BGR pictures (h, w, 3), blurred by 3 x 3 and taken apart into light and colour.
+
+    A value lies outside as far as it is beyond the other picture's smallest and largest within `reach` px around.
+    Planes: difference, the larger of came and went, 0 where not `known`; its colour alone, red and blue together; what
+    came, light plus `weight` times colour of the query outside the reference; what went, the other way round; the
+    reference's light; the query's light. Sums end at 255.
+    """
+    before, after = _light_and_colour(reference), _light_and_colour(query)
+    (came, came_colour), (went, went_colour) = (
+        _outside(values, others, reach, weight) for values, others in ((after, before), (before, after))
+    )
+    difference = np.maximum(came, went)
+    if known is not None:
+        difference[known == 0] = 0
+    out[:] = difference, np.maximum(came_colour, went_colour), came, went, before[..., 0], after[..., 0]
+
+
+def _light_and_colour(image: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """BT.601 luma, red and blue difference of a picture blurred by 3 x 3 with a mirrored rim, rounded as in OpenCV."""
+    near = np.pad(image.astype(np.int64), ((1, 1), (1, 1), (0, 0)), mode="reflect")
+    height, width = image.shape[:2]
+    total = sum(near[y : y + height, x : x + width] for y in range(3) for x in range(3))
+    blue, green, red = np.moveaxis((np.asarray(total) + 4) // 9, 2, 0)
+    half = 1 << 13
+    luma = (blue * 1868 + green * 9617 + red * 4899 + half) >> 14
+    colours = ((red - luma) * 11682, (blue - luma) * 9241)
+    return np.stack([luma, *(np.clip((each + (128 << 14) + half) >> 14, 0, 255) for each in colours)], axis=-1)
+
+
+def _outside(
+    values: NDArray[np.int64], others: NDArray[np.int64], reach: int, weight: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    window, axes = (2 * reach + 1, 2 * reach + 1), (0, 1)
+    rim = ((reach, reach), (reach, reach), (0, 0))
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(others, rim, mode="edge"), window, axes)
+    most, least = around.max(axis=(-2, -1)), around.min(axis=(-2, -1))
+    luma, red, blue = np.moveaxis(np.maximum(np.maximum(values - most, least - values), 0), 2, 0)
+    colour = np.minimum(red + blue, 255)
+    return np.minimum(luma + weight * colour, 255), colour
+
+
+def tint(
+    reference: NDArray[np.uint8], query: NDArray[np.uint8], logs: NDArray[np.uint8], boxes: NDArray[np.int32],
+    margin: int, out: NDArray[np.uint8],
+) -> None:
+    """Fills `out` (h, w) in `boxes` (N, 4) grown by `margin`: how much redder against blue `query` is, 128 where alike.
+
+    A quarter of the steps of `logs` (256,), red and blue each rounded to the nearest whole number, halves to the even.
+    """
+    before, after = (logs[image].astype(np.float64) for image in (reference, query))
+    steps = np.rint(64 + (after - before) / 4)[..., 2] + np.rint(64 - (after - before) / 4)[..., 0]
+    for x, y, wide, high in boxes.tolist():
+        window = slice(max(y - margin, 0), y + high + margin), slice(max(x - margin, 0), x + wide + margin)
+        out[window] = np.minimum(steps[window], 255)
+
+
+def rim_balance(
+    labels: NDArray[np.int32], boxes: NDArray[np.int32], came: NDArray[np.uint8], went: NDArray[np.uint8]
+) -> NDArray[np.int64]:
+    """(N,) sums of `came` - `went` over the pixels of regions 1 .. N of `labels` (h, w) with a 0 within 2 px around."""
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(labels, 2, mode="edge"), (5, 5))
+    rim = (labels > 0) & (around == 0).any(axis=(-2, -1))
+    balance = came.astype(np.int64) - went
+    return np.array([balance[rim & (labels == region + 1)].sum() for region in range(len(boxes))], np.int64)
+
+
 def core_regions(
     values: NDArray[np.uint8], thresholds: NDArray[np.uint8], strong: float, core: float, least_area: int, most: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

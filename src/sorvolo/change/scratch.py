@@ -1,0 +1,43 @@
+"""Arrays that are written over with every pair of pictures: asking the system for memory costs more than the sums."""
+
+import threading
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from sorvolo.geometry.arrays import Anything
+
+MOST_KEPT_PX = 1 << 20  # of a picture: what is larger is given back
+
+
+class Scratch(threading.local):
+    """Arrays by name, for one size of pictures at a time; each thread has its own.
+
+    What is in them lasts until the same name is asked for again: nothing that is handed out may live in one.
+    """
+
+    def __init__(self) -> None:
+        self._size: tuple[int, int] = (0, 0)
+        self._kept: dict[tuple[str, tuple[int, ...], str], Anything] = {}
+
+    def take(
+        self, name: str, size: tuple[int, int], bands: tuple[int, ...] = (), dtype: DTypeLike = np.uint8,
+        margin_px: int = 0,
+    ) -> Anything:
+        """The array `name` for pictures of `size` (h, w), grown by a margin on each side; with `bands` (h, w, ...)."""
+        return self._taken(name, size, (size[0] + 2 * margin_px, size[1] + 2 * margin_px, *bands), dtype)
+
+    def stack(self, name: str, size: tuple[int, int], planes: int) -> Anything:
+        """The uint8 array `name` of shape (planes, h, w), holding anything."""
+        return self._taken(name, size, (planes, *size), np.uint8)
+
+    def _taken(self, name: str, size: tuple[int, int], shape: tuple[int, ...], dtype: DTypeLike) -> Anything:
+        if size[0] * size[1] > MOST_KEPT_PX:
+            return np.empty(shape, dtype)
+        if size != self._size:
+            self._kept.clear()
+            self._size = size
+        key = name, shape, np.dtype(dtype).char
+        if key not in self._kept:
+            self._kept[key] = np.empty(shape, dtype)
+        return self._kept[key]
