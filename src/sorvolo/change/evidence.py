@@ -102,6 +102,7 @@ class EvidenceMap:
         self._tracker = BlobTracker(settings.moving)
         self._found: dict[int, GatheredChange] = {}  # by number, in order
         self._merged: dict[int, int] = {}
+        self._parted: dict[int, list[Change]] = {}  # what turned out to be several things, by number
         self._movers: dict[int, Change] = {}  # by the tracker's number
         self._unwanted_movers: set[int] = set()
         self._seeds: list[GatheredChange] = []
@@ -140,14 +141,20 @@ class EvidenceMap:
 
     def changes(self) -> tuple[Change, ...]:
         """All changes told so far as they are known now, in the order of their numbers."""
-        found = [self._change(each) for each in self._found.values() if each.is_told and not each.is_hidden]
-        return tuple(sorted([each for each in found if each is not None] + list(self._movers.values()), key=_number_of))
+        found = [
+            self._change(each) for each in self._found.values()
+            if each.is_told and not each.is_hidden and each.number not in self._parted
+        ]
+        parts = [each for several in self._parted.values() for each in several]
+        known = [each for each in found if each is not None] + parts + list(self._movers.values())
+        return tuple(sorted(known, key=_number_of))
 
     def conclude(self) -> tuple[Change, ...]:
         """The last word, after the last view: all changes, with those that fewer than n views could see.
 
         A change that too small a share of all views of its ground showed is taken back. A change that only one view
-        saw, and no other could, is told if that view was very sure, with half the score.
+        saw, and no other could, is told if that view was very sure, with half the score. Neighbours that were one
+        change so far, joined by a shadow, become two: the larger one keeps the id.
         """
         settings = self._settings
         for seed in self._seeds:
@@ -158,7 +165,24 @@ class EvidenceMap:
                 self._told(change, -1)
             elif change.share < settings.least_share or change.score < settings.least_score:
                 change.is_hidden = True
+        self._part()
         return self.changes()
+
+    def _part(self) -> None:
+        self._parted = {}
+        for change in list(self._found.values()):
+            whole = self._change(change) if change.is_told and not change.is_hidden else None
+            if whole is None:
+                continue
+            parts = change.parted(whole, self._cells_of(change), self._cell_m, self._join_m)
+            if len(parts) < 2:
+                continue
+            numbered = [
+                replace(each, id=f"{self._prefix}-{self._next_number()}", announced_ns=-1) for each in parts[1:]
+            ]
+            wanted = [each for each in numbered if not is_known(each.outline_m, each.kind, self._rejected)]
+            self.suppressed += len(numbered) - len(wanted)
+            self._parted[change.number] = [parts[0], *wanted]
 
     def _is_repeat(self, view: ComparedView) -> bool:
         if self._last is None:

@@ -1,5 +1,7 @@
 """One change while views of it come in: its pictures, its outline by majority, and how sure it is by now."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +10,7 @@ from sorvolo.change.cells import CellWindow, scale_m_per_px
 from sorvolo.change.kinds import kind_of
 from sorvolo.change.outlines import measures, outline_of
 from sorvolo.change.patches import Cut, PatchWindow, cut, moved, patch_of
+from sorvolo.change.shadows import things_of
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Floats, Mask, Matrix3, PointsM
 from sorvolo.geometry.homography import apply_homography
@@ -156,19 +159,49 @@ class GatheredChange:
         nothing. `cells` is the raster of its own cells in its window."""
         if self.cells is None:
             return None
-        site_from_cells = self.cells.site_from_cell(cell_m)
-        if self._window is not None and self._votes:
+        majority = self._majority(cells, cell_m)
+        if majority is not None and self._window is not None:
             window = self._window
-            padded = cv2.copyMakeBorder(cells.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
-            grown = cv2.dilate(padded, np.ones((3, 3), np.uint8))
-            cells_from_padded = np.array([[1, 0, -1], [0, 1, -1], [0, 0, 1.0]])
-            patch_from_cells = np.linalg.inv(window.site_from_patch) @ site_from_cells @ cells_from_padded
-            near = cv2.warpAffine(grown, patch_from_cells[:2], window.size_px, flags=cv2.INTER_NEAREST) > 0
-            majority = (2 * self._yes.astype(np.int16) > self._asked_px) & near
-            if np.count_nonzero(majority) * window.m_per_px**2 >= 0.3 * np.count_nonzero(cells) * cell_m**2:
-                tolerance_px = max(0.5 * cell_m / window.m_per_px, 0.5)
-                return outline_of(majority, window.site_from_patch, tolerance_px, join_m / window.m_per_px)
-        return outline_of(cells, site_from_cells, 0.5, join_m / cell_m)
+            tolerance_px = max(0.5 * cell_m / window.m_per_px, 0.5)
+            return outline_of(majority, window.site_from_patch, tolerance_px, join_m / window.m_per_px)
+        return outline_of(cells, self.cells.site_from_cell(cell_m), 0.5, join_m / cell_m)
+
+    def _majority(self, cells: Mask, cell_m: float) -> Mask | None:
+        """What most masks call changed, on or beside its cells, in its pictures; None if that is hardly anything."""
+        window = self._window
+        if self.cells is None or window is None or not self._votes:
+            return None
+        padded = cv2.copyMakeBorder(cells.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+        grown = cv2.dilate(padded, np.ones((3, 3), np.uint8))
+        cells_from_padded = np.array([[1, 0, -1], [0, 1, -1], [0, 0, 1.0]])
+        site_from_cells = self.cells.site_from_cell(cell_m)
+        patch_from_cells = np.linalg.inv(window.site_from_patch) @ site_from_cells @ cells_from_padded
+        near = cv2.warpAffine(grown, patch_from_cells[:2], window.size_px, flags=cv2.INTER_NEAREST) > 0
+        majority = np.asarray((2 * self._yes.astype(np.int16) > self._asked_px) & near)
+        is_enough = np.count_nonzero(majority) * window.m_per_px**2 >= 0.3 * np.count_nonzero(cells) * cell_m**2
+        return majority if is_enough else None
+
+    def parted(self, whole: Change, cells: Mask, cell_m: float, join_m: float) -> list[Change]:
+        """The records of the things that `whole` holds, the largest first, all under its id; `whole` if it is one."""
+        majority = self._majority(cells, cell_m)
+        old, pictures = self._window, self._pictures
+        if majority is None or old is None or pictures is None:
+            return [whole]
+        masks = things_of(whole.patch, whole.kind, majority)
+        tolerance_px = max(0.5 * cell_m / old.m_per_px, 0.5)
+        outlines = [outline_of(each, old.site_from_patch, tolerance_px, join_m / old.m_per_px) for each in masks]
+        parts = []
+        for outline_m in outlines:
+            if len(masks) < 2 or outline_m is None:
+                return [whole]
+            window = PatchWindow.around(outline_m.min(axis=0), outline_m.max(axis=0), old.m_per_px, _MOST_PX)
+            near = Cut(moved(pictures.before, window, old), moved(pictures.after, window, old))
+            patch, size = patch_of(window, near, outline_m), measures(outline_m)
+            parts.append(replace(
+                whole, kind=kind_of(patch), outline_m=outline_m, area_m2=size.area_m2, length_m=size.length_m,
+                patch=patch,
+            ))
+        return parts
 
     def change(self, id_prefix: str, outline_m: PointsM, cell_m: float) -> Change:
         """The record of what is known of it.

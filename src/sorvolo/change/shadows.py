@@ -15,6 +15,9 @@ _LEAST_SHARE = 0.02  # of the change: if less is no shadow, all of it is a dark 
 _LEAST_PX = 6
 _LEAST_PIECE = 0.15  # of the largest lit piece: smaller ones are specks of the shadow's rim
 _TOLERANCE_PX = 0.7
+_APART_M = 0.5  # things so far from each other are two ...
+_LEAST_THING_M2 = 0.06  # ... if each is as large as a football at least ...
+_COMPACT, _CAR_M = 0.8, (1.2, 6.0)  # ... and both together do not fill what may be one dark car with bright parts
 
 
 def without_shadow(change: Change) -> Change:
@@ -47,6 +50,35 @@ def thing_of(changed: Mask, shadow: Mask) -> Mask:
     hull = np.zeros(lit.shape, np.uint8)
     cv2.fillConvexPoly(hull, cv2.convexHull(cv2.findNonZero(kept)), (1,))
     return (cv2.dilate(hull, np.ones((3, 3), np.uint8)) > 0) & changed
+
+
+def things_of(patch: Patch, kind: ChangeKind, changed: Mask) -> list[Mask]:
+    """The things in a change, each with the part of `changed` that lies nearest to it, the largest first.
+
+    They are told apart by the ground or the shadow between them; `changed` alone where it is but one thing. A dark car
+    has bright parts far from each other: what fills a rectangle of about its size stays whole.
+    """
+    lit = (changed & ~_shadow(patch, kind)).view(np.uint8)
+    lit = np.asarray(cv2.morphologyEx(lit, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), np.uint8)
+    reach = 2 * round(_APART_M / 2 / patch.m_per_px) + 1
+    padded = cv2.copyMakeBorder(lit, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0)
+    joined = cv2.dilate(padded, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+    count, labels = cv2.connectedComponents(joined[reach:-reach, reach:-reach], connectivity=8)
+    areas_m2 = np.bincount(labels[lit > 0], minlength=count) * patch.m_per_px**2
+    large = [label for label in np.argsort(-areas_m2) if areas_m2[label] >= max(_LEAST_THING_M2, 1e-9)]
+    if len(large) < 2 or _may_be_a_car(changed, patch.m_per_px):
+        return [changed]
+    things = [(labels == each) & (lit > 0) for each in large]
+    distances = [cv2.distanceTransform((~each).view(np.uint8), cv2.DIST_L2, 5) for each in things]
+    nearest = np.argmin(distances, axis=0)
+    return [changed & (nearest == index) for index in range(len(large))]
+
+
+def _may_be_a_car(changed: Mask, m_per_px: float) -> bool:
+    hull = cv2.convexHull(cv2.findNonZero(changed.view(np.uint8)))
+    short_m, long_m = sorted(float(each) * m_per_px for each in cv2.minAreaRect(hull)[1])
+    is_compact = np.count_nonzero(changed) >= _COMPACT * cv2.contourArea(hull)
+    return short_m >= _CAR_M[0] and long_m <= _CAR_M[1] and bool(is_compact)
 
 
 def shadow_of_arrival(before: ImageRGB, after: ImageRGB, changed: Mask) -> Mask:
