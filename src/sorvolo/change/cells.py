@@ -38,6 +38,10 @@ class CellWindow:
             min(self.x0, other.x0), min(self.y0, other.y0), max(self.x1, other.x1), max(self.y1, other.y1)
         )
 
+    def grown(self, cells: int) -> "CellWindow":
+        """The window with so many cells more on each side."""
+        return CellWindow(self.x0 - cells, self.y0 - cells, self.x1 + cells, self.y1 + cells)
+
     def part(self, part: tuple[slice, slice]) -> "CellWindow":
         """The window of a part, rows and columns, of this window's raster."""
         rows, columns = part

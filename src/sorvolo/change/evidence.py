@@ -419,22 +419,22 @@ class EvidenceMap:
         single = free & (changed == 1) & (seen == 1)
         least_cells = max(2, settings.least_area_m2 / self._cell_m**2)
         if np.count_nonzero(late) >= least_cells:
-            cells, views, asked = late, int(changed[late].max()), int(seen[late].max())
+            cells = late
         elif np.count_nonzero(single) >= least_cells and seed.score * 1.5 >= settings.single_view_score:
-            cells, views, asked, seed.weakness = single, 1, 1, 0.5
+            cells, seed.weakness = single, 0.5
         else:
             return
-        gap = self._gap + 1
-        around = CellWindow(
-            seed.cells.x0 - gap, seed.cells.y0 - gap, seed.cells.x1 + gap, seed.cells.y1 + gap
-        )
-        beside = self._grid.read(around).owner
-        if beside.any():
-            change = self._found[self._current(int(beside[beside > 0].min()))]
-            if change.cells is not None:
-                self._grid.own(seed.cells, cells, change.number)
-                change.cells = change.cells.joined(seed.cells)
+        for piece, part in pieces(cells, self._gap):
+            window = seed.cells.part(part)
+            beside = self._grid.read(window.grown(self._gap + 1)).owner
+            change = self._found[self._current(int(beside[beside > 0].min()))] if beside.any() else None
+            if change is not None and change.cells is not None:
+                self._grid.own(window, piece & cells[part], change.number)
+                change.cells = change.cells.joined(window)
+                cells[part] &= ~piece
+        if np.count_nonzero(cells) < least_cells:
             return
+        views, asked = int(changed[cells].max()), int(seen[cells].max())
         seed.number = self._next_number()
         for _ in range(views - seed.views):
             seed.see(seed.last_seen_ns, seed.score, None, None, 1.0)
