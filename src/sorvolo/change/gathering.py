@@ -187,19 +187,19 @@ class GatheredChange:
         old, pictures = self._window, self._pictures
         if majority is None or old is None or pictures is None:
             return [whole]
-        masks = things_of(whole.patch, whole.kind, majority)
+        things = things_of(whole.patch, whole.kind, majority)
         tolerance_px = max(0.5 * cell_m / old.m_per_px, 0.5)
-        outlines = [outline_of(each, old.site_from_patch, tolerance_px, join_m / old.m_per_px) for each in masks]
         parts = []
-        for outline_m in outlines:
-            if len(masks) < 2 or outline_m is None:
+        for mask, kind in things:
+            outline_m = outline_of(mask, old.site_from_patch, tolerance_px, join_m / old.m_per_px)
+            if len(things) < 2 or outline_m is None:
                 return [whole]
             window = PatchWindow.around(outline_m.min(axis=0), outline_m.max(axis=0), old.m_per_px, _MOST_PX)
             near = Cut(moved(pictures.before, window, old), moved(pictures.after, window, old))
-            patch, size = patch_of(window, near, outline_m), measures(outline_m)
+            size = measures(outline_m)
             parts.append(replace(
-                whole, kind=kind_of(patch), outline_m=outline_m, area_m2=size.area_m2, length_m=size.length_m,
-                patch=patch,
+                whole, kind=kind, outline_m=outline_m, area_m2=size.area_m2, length_m=size.length_m,
+                patch=patch_of(window, near, outline_m),
             ))
         return parts
 

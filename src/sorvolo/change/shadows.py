@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from sorvolo.change.kinds import kind_of
 from sorvolo.change.outlines import measures, outline_of
 from sorvolo.geometry.arrays import Anything, ImageRGB, Mask
 from sorvolo.survey.findings import Change, ChangeKind, Patch
@@ -18,6 +19,7 @@ _TOLERANCE_PX = 0.7
 _APART_M = 0.5  # things so far from each other are two ...
 _LEAST_THING_M2 = 0.06  # ... if each is as large as a football at least ...
 _COMPACT, _CAR_M = 0.8, (1.2, 6.0)  # ... and both together do not fill what may be one dark car with bright parts
+_CONTRARY = {ChangeKind.APPEARED: ChangeKind.DISAPPEARED, ChangeKind.DISAPPEARED: ChangeKind.APPEARED}
 
 
 def without_shadow(change: Change) -> Change:
@@ -47,18 +49,18 @@ def thing_of(changed: Mask, shadow: Mask) -> Mask:
     areas = stats[:, cv2.CC_STAT_AREA].copy()
     areas[0] = 0  # the ground
     kept = (areas >= _LEAST_PIECE * areas.max())[labels].view(np.uint8)
-    hull = np.zeros(lit.shape, np.uint8)
-    cv2.fillConvexPoly(hull, cv2.convexHull(cv2.findNonZero(kept)), (1,))
-    return (cv2.dilate(hull, np.ones((3, 3), np.uint8)) > 0) & changed
+    return np.asarray((cv2.dilate(_hull(kept).view(np.uint8), np.ones((3, 3), np.uint8)) > 0) & changed)
 
 
-def things_of(patch: Patch, kind: ChangeKind, changed: Mask) -> list[Mask]:
-    """The things in a change, each with the part of `changed` that lies nearest to it, the largest first.
+def things_of(patch: Patch, kind: ChangeKind, changed: Mask) -> list[tuple[Mask, ChangeKind]]:
+    """The things in a change, each with its own kind and the part of `changed` that lies nearest to it, the largest
+    first; the shadow of what came does not go to what left.
 
     They are told apart by the ground or the shadow between them; `changed` alone where it is but one thing. A dark car
     has bright parts far from each other: what fills a rectangle of about its size stays whole.
     """
-    lit = (changed & ~_shadow(patch, kind)).view(np.uint8)
+    shadow = changed & _shadow(patch, kind)
+    lit = (changed & ~shadow).view(np.uint8)
     lit = np.asarray(cv2.morphologyEx(lit, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), np.uint8)
     reach = 2 * round(_APART_M / 2 / patch.m_per_px) + 1
     padded = cv2.copyMakeBorder(lit, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0)
@@ -67,11 +69,21 @@ def things_of(patch: Patch, kind: ChangeKind, changed: Mask) -> list[Mask]:
     areas_m2 = np.bincount(labels[lit > 0], minlength=count) * patch.m_per_px**2
     large = [label for label in np.argsort(-areas_m2) if areas_m2[label] >= max(_LEAST_THING_M2, 1e-9)]
     if len(large) < 2 or _may_be_a_car(changed, patch.m_per_px):
-        return [changed]
+        return [(changed, kind)]
     things = [(labels == each) & (lit > 0) for each in large]
     distances = [cv2.distanceTransform((~each).view(np.uint8), cv2.DIST_L2, 5) for each in things]
+    contrary = _CONTRARY.get(kind)
+    kinds = [kind_of(replace(patch, changed=_hull(each) & changed)) for each in things]
+    if contrary is not None and any(each is not contrary for each in kinds):
+        distances = [np.where(shadow & (own is contrary), np.inf, each) for own, each in zip(kinds, distances)]
     nearest = np.argmin(distances, axis=0)
-    return [changed & (nearest == index) for index in range(len(large))]
+    return [(changed & (nearest == index), own) for index, own in enumerate(kinds)]
+
+
+def _hull(mask: Anything) -> Mask:
+    hull = np.zeros(mask.shape, np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(cv2.findNonZero(mask.view(np.uint8))), (1,))
+    return hull.view(bool)
 
 
 def _may_be_a_car(changed: Mask, m_per_px: float) -> bool:
