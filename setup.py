@@ -12,7 +12,7 @@ FOLDER = "src/sorvolo/kernels"
 
 native = Pybind11Extension(
     "sorvolo.kernels._native",
-    [f"{FOLDER}/_native.cpp", f"{FOLDER}/_regions.cpp", f"{FOLDER}/_robust.cpp"],
+    [f"{FOLDER}/{name}.cpp" for name in ("_native", "_regions", "_robust", "_differences")],
     depends=[f"{FOLDER}/_native.hpp", "setup.py"],
     cxx_std=17,
     extra_compile_args=OPTIONS,

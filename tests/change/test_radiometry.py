@@ -66,6 +66,6 @@ def test_relighting_agrees(seed: int, height: int, width: int) -> None:
     image = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
     curves = rng.integers(0, 16384, (3, 256)).astype(np.int32)
     gains = rng.integers(0, 65536, (height, width, 3)).astype(np.uint16)
-    np.testing.assert_array_equal(
-        kernels.relight(image, curves, gains), reference_robust.relight(image, curves, gains)
-    )
+    plain = np.empty_like(image)
+    reference_robust.relight(image, curves, gains, plain)
+    np.testing.assert_array_equal(kernels.relight(image, curves, gains), plain)

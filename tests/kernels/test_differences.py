@@ -1,5 +1,7 @@
 """What two pictures differ by, their tint and the rims of regions: compiled kernels against their NumPy twins."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,6 +9,7 @@ from hypothesis import strategies as st
 
 from sorvolo import kernels
 from sorvolo.change.blobs import RegionSettings, find_regions
+from sorvolo.change.robust import compare_robust
 from sorvolo.change.scratch import MOST_KEPT_PX, Scratch
 from sorvolo.kernels import reference_robust
 
@@ -61,6 +64,32 @@ def test_the_same_target_is_written_over_and_returned() -> None:
     out = np.full((6, 20, 24), 99, np.uint8)
     assert kernels.differences(before, after, None, 2, 2, out) is out
     assert np.array_equal(out, kernels.differences(before, after, None, 2, 2))
+
+
+def test_labels_are_looked_up_and_strangers_refused() -> None:
+    labels = np.random.default_rng(3).integers(0, 5, (7, 9)).astype(np.int32)
+    table, plain = np.uint8([0, 255, 3, 0, 9]), np.empty((7, 9), np.uint8)
+    reference_robust.looked_up(labels, table, plain)
+    assert np.array_equal(kernels.looked_up(labels, table), plain)
+    with pytest.raises(ValueError, match="out of 0"):
+        kernels.looked_up(labels, table[:3])
+    with pytest.raises(ValueError, match="out of 0"):
+        kernels.looked_up(labels - 9, table)
+
+
+def test_two_threads_do_not_share_their_working_arrays() -> None:
+    pairs = [pictures(90, 120, seed) for seed in range(6)]
+    alone = [compare_robust(*pair) for pair in pairs]
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(lambda pair: compare_robust(*pair), pairs * 4))
+    for one, other in zip(alone * 4, together, strict=True):
+        assert np.array_equal(one.mask, other.mask) and np.array_equal(one.scores, other.scores)
+        assert one.noise == other.noise and one.settling.rest_px == other.settling.rest_px
+
+
+def test_wide_low_pictures_are_compared_without_settling() -> None:
+    before, after = pictures(100, 400, 5)
+    assert compare_robust(before, after).settling.moved_px == 0  # OpenCV's flow crashes on such
 
 
 def test_what_does_not_fit_is_refused() -> None:

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sorvolo.change.scratch import Scratch
 from sorvolo.geometry.arrays import Anything, Floats, Mask
 from sorvolo.kernels import relight
 
@@ -24,6 +25,7 @@ STEPS_PER_OCTAVE = 48.0
 GAIN_ONE = 4096
 CURVE_ONE = 16
 
+_SCRATCH = Scratch()
 _LOG = (np.log2(np.arange(256) + BLACK_LEVEL) * 48).astype(np.float32)
 
 
@@ -72,14 +74,15 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     return Light(exponents, offsets, np.exp2(octaves).astype(np.float32), unevenness)
 
 
-def relit(image: Bgr, light: Light) -> Bgr:
-    """`image`, of the reference, in the query's light."""
+def relit(image: Bgr, light: Light, out: Bgr | None = None) -> Bgr:
+    """`image`, of the reference, in the query's light; written to `out` (h, w, 3) where it is given."""
     levels = np.log2(np.arange(256) + BLACK_LEVEL)
     curves = 2.0 ** (light.exponents[:, None] * levels + light.offsets[:, None])
     table = np.clip(np.rint(curves * CURVE_ONE), 0, 16383).astype(np.int32)
     coarse = np.clip(np.rint(light.gains * GAIN_ONE), 0, 65535).astype(np.uint16)
-    gains = cv2.resize(coarse, image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-    return relight(image, table, np.asarray(gains, np.uint16))
+    gains = _SCRATCH.take("gains", (image.shape[0], image.shape[1]), (3,), np.uint16)
+    cv2.resize(coarse, image.shape[1::-1], dst=gains, interpolation=cv2.INTER_LINEAR)
+    return relight(image, table, gains, out)
 
 
 def _sameness(reference: Bgr, query: Bgr, size: tuple[int, int]) -> NDArray[np.float32]:
@@ -121,6 +124,15 @@ def _smaller(image: NDArray[Any], size: tuple[int, int]) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
+def middle(values: NDArray[Any]) -> Any:
+    """The median of values (N,), N > 0, in their own type, without the care that np.median takes."""
+    half = len(values) // 2
+    if len(values) % 2:
+        return np.partition(values, half)[half]
+    low, high = np.partition(values, (half - 1, half))[half - 1 : half + 1]
+    return (low + high) / values.dtype.type(2)
+
+
 def _exponent(before: NDArray[np.float32], after: NDArray[np.float32]) -> float:
     """The slope of `after` over `before` by re-weighted least squares, drawn to one where there is little to see."""
     weights: Anything = np.ones_like(before)
@@ -130,6 +142,6 @@ def _exponent(before: NDArray[np.float32], after: NDArray[np.float32]) -> float:
         weighted = weights * before
         slope = float((weighted @ after + prior) / (weighted @ before + prior))
         rest = after - np.float32(slope) * before
-        scale = max(1.5 * float(np.median(np.abs(rest))), 0.01)
+        scale = max(1.5 * float(middle(np.abs(rest))), 0.01)
         weights = 1 / (1 + (rest / np.float32(scale)) ** 2)
     return float(np.clip(slope, 0.5, 2.0))

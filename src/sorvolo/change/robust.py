@@ -1,5 +1,4 @@
 """The robust change method: two aligned pictures -> what changed, whatever the light, leaves and leaning trees do."""
-# NOTE: read NOTICE-to-the-robust-method.md item 8 beside this file (from the lead), then delete this line.
 
 from dataclasses import dataclass, field
 
@@ -10,15 +9,21 @@ from numpy.typing import NDArray
 from sorvolo.change.blob_check import how_sure
 from sorvolo.change.blobs import FEATURES, Regions, RegionSettings, find_regions
 from sorvolo.change.radiometry import Light, fit_light, relit
+from sorvolo.change.scratch import Scratch
 from sorvolo.change.settling import Settling, settle
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Anything, Boxes, Floats, ImageGray, Mask
+from sorvolo.kernels import looked_up
 
 LEAST_SIDE_PX = 32
 CLOSES_PX = 9
 LEAST_CONVEXITY = 0.5
 SAME_PLACE_PX = 0.6  # half size pixels
+ALL_KNOWN = 0x0101  # two True side by side
 RIM_PX = 4  # around the unknown, in half size pixels: resampling mixes the unknown into it
+
+
+_SCRATCH = Scratch()
 
 
 @dataclass(frozen=True)
@@ -69,23 +74,31 @@ def examine(
     """The regions that differ at half size, before anything is said about them; and what the pair set itself."""
     height, width = query.shape[:2]
     half = width // 2, height // 2
-    before = np.asarray(cv2.resize(reference, half, interpolation=cv2.INTER_AREA), np.uint8)
-    after = np.asarray(cv2.resize(query, half, interpolation=cv2.INTER_AREA), np.uint8)
+    size = half[::-1]
+    before, after, spare = (_SCRATCH.take(name, size, (3,)) for name in ("before", "after", "spare"))
+    cv2.resize(reference, half, dst=before, interpolation=cv2.INTER_AREA)
+    cv2.resize(query, half, dst=after, interpolation=cv2.INTER_AREA)
     known = _half_known(valid, half)
     if known is not None:
-        before[~known] = after[~known]
+        cv2.copyTo(after, np.logical_not(known).view(np.uint8), before)
     settling = Settling(np.eye(3), 0.0, 0.0)
     if settings.settles:
-        grays = [np.asarray(cv2.cvtColor(each, cv2.COLOR_BGR2GRAY), np.uint8) for each in (before, after)]
+        grays = _SCRATCH.stack("grays", size, 2)
+        for image, gray in zip((before, after), grays, strict=True):
+            cv2.cvtColor(image, cv2.COLOR_BGR2GRAY, dst=gray)
         settling = settle(grays[0], grays[1], known)
     if settling.moved_px > 0:
-        how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        before = np.asarray(cv2.warpPerspective(
-            before, settling.reference_from_query, half, flags=how, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        cv2.warpPerspective(
+            before, settling.reference_from_query, half, dst=spare, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        before, spare = spare, before
     light = fit_light(before, after, known)
     rim = None if known is None else _without_rim(known, RIM_PX + int(np.ceil(settling.moved_px)))
-    regions = find_regions(relit(before, light), after, rim, settings.regions, settling.rest_px, light.unevenness)
-    return regions, light, settling, 1.0 if rim is None else float(rim.mean())
+    lit = relit(before, light, spare)
+    regions = find_regions(lit, after, rim, settings.regions, settling.rest_px, light.unevenness)
+    share = 1.0 if rim is None else cv2.countNonZero(rim.view(np.uint8)) / rim.size
+    return regions, light, settling, share
 
 
 def _check(reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask | None) -> None:
@@ -104,6 +117,10 @@ def _check(reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask |
 def _half_known(valid: Mask | None, half: tuple[int, int]) -> Mask | None:
     if valid is None or valid.all():
         return None
+    height, width = valid.shape
+    if height % 2 == 0 and width % 2 == 0:
+        pairs = np.ascontiguousarray(valid).view(np.uint16) == ALL_KNOWN
+        return np.logical_and(pairs[::2], pairs[1::2])
     return np.asarray(cv2.resize(valid.astype(np.uint8) * 255, half, interpolation=cv2.INTER_AREA) == 255)
 
 
@@ -134,7 +151,7 @@ def _result(
         moved = np.column_stack([middle, np.ones(len(middle))]) @ settling.reference_from_query.T
         boxes_px[went, :2] += (moved[:, :2] / moved[:, 2:] - middle)[went]
     larger = cv2.resize(half_mask, size, interpolation=cv2.INTER_LINEAR)
-    mask = np.asarray(cv2.threshold(larger, 127, 255, cv2.THRESH_BINARY)[1], np.uint8)
+    mask = np.asarray(cv2.threshold(larger, 127, 255, cv2.THRESH_BINARY, dst=larger)[1], np.uint8)
     factor = np.array([size[0] / half[0], size[1] / half[1]])
     corners = np.clip(np.rint(boxes_px[sure, :2] * factor), 0, np.array(size) - 1).astype(np.int64)
     sides = np.rint(boxes_px[sure, 2:] * factor).astype(np.int64)
@@ -156,14 +173,18 @@ def _filled(chosen: Mask, regions: Regions, parts: Anything) -> ImageGray:
 
     Where a thing has the ground's own colour nothing differs: what is nearly convex is taken to be so.
     """
-    cores = np.concatenate([[False], chosen])[regions.labels].astype(np.uint8) * 255
+    size = regions.labels.shape[0], regions.labels.shape[1]
+    cores, around, whole = _SCRATCH.stack("filled", size, 3)
+    looked_up(regions.labels, np.concatenate([[0], chosen * np.uint8(255)]).astype(np.uint8), cores)
     window = np.ones((5, 5), np.uint8)  # two blurs of 3 px reach two pixels out
     held = np.zeros(int(parts.max()) + 1, bool)
-    held[parts[cores > 0]] = True
+    held[parts.ravel()[np.flatnonzero(cores)]] = True
     held[0] = False
-    around = np.asarray(cv2.erode(held[parts].astype(np.uint8) * 255, window), np.uint8)
-    around[regions.labels > 0] = 0
-    whole = cv2.morphologyEx(cv2.max(cores, around), cv2.MORPH_CLOSE, np.ones((CLOSES_PX, CLOSES_PX), np.uint8))
+    looked_up(parts, held.astype(np.uint8) * np.uint8(255), whole)
+    cv2.erode(whole, window, dst=around)
+    np.multiply(around, regions.labels == 0, out=around)
+    cv2.max(cores, around, dst=around)
+    cv2.morphologyEx(around, cv2.MORPH_CLOSE, np.ones((CLOSES_PX, CLOSES_PX), np.uint8), dst=whole)
     outlines, _ = cv2.findContours(whole, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     for outline in outlines:
         hull = cv2.convexHull(outline)
@@ -171,4 +192,4 @@ def _filled(chosen: Mask, regions: Regions, parts: Anything) -> ImageGray:
         cv2.drawContours(whole, [hull if is_full else outline], -1, 255.0, cv2.FILLED)
     if regions.known is not None:
         whole[~regions.known] = 0
-    return np.asarray(whole, np.uint8)
+    return np.array(whole, np.uint8)

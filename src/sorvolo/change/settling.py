@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sorvolo.change.radiometry import middle
 from sorvolo.geometry.arrays import Anything, Mask, Matrix3
 
 LARGEST_PX = 6.0  # at the pictures' corners, in their own pixels; what says more has lost its way
@@ -75,12 +76,13 @@ def _near_homography(
     solution = np.zeros(8)
     rest_px = np.zeros(len(x))
     for _ in range(4):
-        normal = (rows_x * weights[:, None]).T @ rows_x + (rows_y * weights[:, None]).T @ rows_y
-        right = (rows_x * weights[:, None]).T @ moves[:, 0] + (rows_y * weights[:, None]).T @ moves[:, 1]
+        weighted_x, weighted_y = (rows_x * weights[:, None]).T, (rows_y * weights[:, None]).T
+        normal = weighted_x @ rows_x + weighted_y @ rows_y
+        right = weighted_x @ moves[:, 0] + weighted_y @ moves[:, 1]
         solution = np.linalg.solve(normal + 1e-4 * weights.sum() * np.diag([0, 0.01, 0.01, 0, 0.01, 0.01, 1, 1]), right)
         rest = moves - np.column_stack([rows_x @ solution, rows_y @ solution])
         rest_px = np.hypot(rest[:, 0] * size_px[0], rest[:, 1] * size_px[1])
-        scale = max(1.5 * float(np.median(rest_px[trust > 0])), 0.05)
+        scale = max(1.5 * float(middle(rest_px[trust > 0])), 0.05)
         weights = trust / (1 + (rest_px / scale) ** 2)
     a = solution
     near = np.array([[1 + a[1], a[2], a[0]], [a[4], 1 + a[5], a[3]], [-a[6], -a[7], 1.0]])

@@ -102,15 +102,38 @@ def gray_histograms(
 _robust = reference_robust if _native is None else _native
 
 
-def relight(image: NDArray[np.uint8], curves: NDArray[np.int32], gains: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """A picture (h, w, 3) through curves (3, 256) and times gains (h, w, 3): see reference_robust."""
+def relight(
+    image: NDArray[np.uint8], curves: NDArray[np.int32], gains: NDArray[np.uint16], out: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
+    """A picture (h, w, 3) through curves (3, 256) and times gains (h, w, 3): see reference_robust.
+
+    `out` (h, w, 3) is written over where it is given, and returned.
+    """
     if image.shape != gains.shape or image.ndim != 3 or image.shape[2] != 3 or curves.shape != (3, 256):
         raise ValueError(f"relight: image {image.shape}, gains {gains.shape}, curves {curves.shape} do not fit")
-    lit: NDArray[np.uint8] = _robust.relight(
+    out = _target(out, image.shape)
+    _robust.relight(
         np.ascontiguousarray(image, np.uint8), np.ascontiguousarray(curves, np.int32),
-        np.ascontiguousarray(gains, np.uint16),
+        np.ascontiguousarray(gains, np.uint16), out,
     )
-    return lit
+    return out
+
+
+def looked_up(
+    labels: NDArray[np.int32], table: NDArray[np.uint8], out: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
+    """The values (h, w) of labels (h, w), all of 0 .. len(table) - 1, in a table: see reference_robust.
+
+    `out` (h, w) is written over where it is given, and returned.
+    """
+    if labels.ndim != 2 or table.ndim != 1:
+        raise ValueError(f"looked_up: labels {labels.shape} and table {table.shape} do not fit")
+    labels = np.ascontiguousarray(labels, np.int32)
+    if labels.size and not (labels.min() >= 0 and labels.max() < len(table)):
+        raise ValueError(f"looked_up: labels out of 0 .. {len(table) - 1}")
+    out = _target(out, labels.shape)
+    _robust.looked_up(labels, np.ascontiguousarray(table, np.uint8), out)
+    return out
 
 
 def differences(

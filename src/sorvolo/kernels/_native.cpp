@@ -425,4 +425,5 @@ PYBIND11_MODULE(_native, module) {
                py::arg("width"), py::arg("height"), py::arg("most"), py::arg("threads"));
     bind_regions(module);
     bind_robust(module);
+    bind_differences(module);
 }

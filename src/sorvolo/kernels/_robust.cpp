@@ -1,15 +1,15 @@
 // Kernels of the robust change method.
 //
 // To add one: write it here in namespace sorvolo, SORVOLO_CLONES before the function with the hot loop, and bind it
-// below with a pybind11::gil_scoped_release around that loop; declare it in _native.pyi, write the same function in
-// NumPy in reference_robust.py, let __init__.py hand it on, and test that both agree. Then `pip install --no-deps -e .`.
+// below with a pybind11::gil_scoped_release around that loop; declare it in _native.pyi, write the same in
+// NumPy in reference_robust.py, let __init__.py hand it on, test that both agree. Then `pip install --no-deps -e .`.
 #include "_native.hpp"
 
 #include <pybind11/stl.h>
 
 #include <cmath>
+#include <cstddef>
 #include <cstdlib>
-#include <optional>
 
 // Compiled twice, the better one chosen when the module is loaded.
 #if defined(__x86_64__) && defined(__linux__) && defined(__GNUC__)
@@ -37,8 +37,7 @@ void relight_pixels(const std::uint8_t *from, const std::int32_t *curves, const 
     }
 }
 
-Bytes relight(const Bytes &image, const Integers32 &curves, const Words &gains) {
-    Bytes lit({image.shape(0), image.shape(1), pybind11::ssize_t(3)});
+void relight(const Bytes &image, const Integers32 &curves, const Words &gains, Bytes &lit) {
     const std::uint8_t *from = image.data();
     const std::int32_t *curve = curves.data();
     const std::uint16_t *gain = gains.data();
@@ -46,172 +45,6 @@ Bytes relight(const Bytes &image, const Integers32 &curves, const Words &gains) 
     const std::int64_t pixels = image.shape(0) * image.shape(1);
     pybind11::gil_scoped_release released;
     relight_pixels(from, curve, gain, to, pixels);
-    return lit;
-}
-
-ROBUST_CLONES
-void split_row(const std::uint8_t *bgr, std::uint8_t *blue, std::uint8_t *green, std::uint8_t *red, int columns) {
-    for (int x = 0; x < columns; ++x) blue[x] = bgr[3 * x], green[x] = bgr[3 * x + 1], red[x] = bgr[3 * x + 2];
-}
-
-// The mean of 3 x 3; `sums` has one place before and one after the row.
-ROBUST_CLONES
-void blur_row(const std::uint8_t *above, const std::uint8_t *here, const std::uint8_t *below, std::uint16_t *sums,
-              std::uint8_t *to, int columns) {
-    for (int x = 0; x < columns; ++x) sums[x + 1] = static_cast<std::uint16_t>(above[x] + here[x] + below[x]);
-    sums[0] = sums[2], sums[columns + 1] = sums[columns - 1];
-    for (int x = 0; x < columns; ++x) {
-        const std::uint16_t sum = static_cast<std::uint16_t>(sums[x] + sums[x + 1] + sums[x + 2] + 4);
-        to[x] = static_cast<std::uint8_t>((static_cast<std::uint32_t>(sum) * 7282u) >> 16);  // by nine
-    }
-}
-
-// Blue, green and red become luma, red difference and blue difference, as OpenCV rounds them.
-ROBUST_CLONES
-void luma_row(std::uint8_t *first, std::uint8_t *second, std::uint8_t *third, int columns) {
-    for (int x = 0; x < columns; ++x) {
-        const std::int32_t blue = first[x], green = second[x], red = third[x];
-        const std::int32_t luma = (blue * 1868 + green * 9617 + red * 4899 + 8192) >> 14;
-        const std::int32_t to_red = ((red - luma) * 11682 + (128 << 14) + 8192) >> 14;
-        const std::int32_t to_blue = ((blue - luma) * 9241 + (128 << 14) + 8192) >> 14;
-        first[x] = static_cast<std::uint8_t>(luma);
-        second[x] = static_cast<std::uint8_t>(std::clamp(to_red, 0, 255));
-        third[x] = static_cast<std::uint8_t>(std::clamp(to_blue, 0, 255));
-    }
-}
-
-// The largest and the smallest of `window` neighbours, from rows that are padded by zeros and by 255.
-ROBUST_CLONES
-void extremes_row(const std::uint8_t *low, const std::uint8_t *high, int window, std::uint8_t *most,
-                  std::uint8_t *least, int columns) {
-    std::memcpy(most, low, columns), std::memcpy(least, high, columns);
-    for (int by = 1; by < window; ++by) {
-        for (int x = 0; x < columns; ++x) {
-            most[x] = std::max(most[x], low[x + by]);
-            least[x] = std::min(least[x], high[x + by]);
-        }
-    }
-}
-
-ROBUST_CLONES
-void extremes_rows(const std::uint8_t *most, const std::uint8_t *least, std::uint8_t *all_most,
-                   std::uint8_t *all_least, int columns) {
-    for (int x = 0; x < columns; ++x) {
-        all_most[x] = std::max(all_most[x], most[x]);
-        all_least[x] = std::min(all_least[x], least[x]);
-    }
-}
-
-ROBUST_CLONES
-void beyond_row(const std::uint8_t *values, const std::uint8_t *most, const std::uint8_t *least, std::uint8_t *to,
-                int columns) {
-    for (int x = 0; x < columns; ++x) {
-        const std::uint8_t over = static_cast<std::uint8_t>(std::max(values[x], most[x]) - most[x]);
-        const std::uint8_t under = static_cast<std::uint8_t>(least[x] - std::min(values[x], least[x]));
-        to[x] = std::max(over, under);
-    }
-}
-
-ROBUST_CLONES
-void weigh_row(const std::uint8_t *luma, const std::uint8_t *red, const std::uint8_t *blue, int weight,
-               std::uint8_t *outside, std::uint8_t *chroma, int columns) {
-    const std::uint16_t by = static_cast<std::uint16_t>(weight);
-    for (int x = 0; x < columns; ++x) {
-        const std::uint8_t colour = static_cast<std::uint8_t>(red[x] + std::min<std::uint8_t>(blue[x], 255 - red[x]));
-        const std::uint16_t more = std::min<std::uint16_t>(static_cast<std::uint16_t>(colour * by), 255);
-        chroma[x] = colour;
-        const std::uint16_t total = static_cast<std::uint16_t>(more + luma[x]);
-        outside[x] = static_cast<std::uint8_t>(std::min<std::uint16_t>(total, 255));
-    }
-}
-
-ROBUST_CLONES
-void join_row(const std::uint8_t *a, const std::uint8_t *b, std::uint8_t *to, int columns) {
-    for (int x = 0; x < columns; ++x) to[x] = std::max(a[x], b[x]);
-}
-
-ROBUST_CLONES
-void mask_row(const std::uint8_t *known, std::uint8_t *to, int columns) {
-    for (int x = 0; x < columns; ++x) to[x] = known[x] ? to[x] : 0;
-}
-
-// One picture's rows while they pass: split, then blurred and in luma, then their extremes along the row.
-struct Passing {
-    const std::uint8_t *image;
-    int rows, columns, reach, depth;
-    std::vector<std::uint8_t> split, values, most, least, low, high;
-    std::vector<std::uint16_t> sums;
-
-    Passing(const std::uint8_t *pixels, int height, int width, int reach_px)
-        : image(pixels), rows(height), columns(width), reach(reach_px), depth(2 * reach_px + 1),
-          split(9 * width), values(3 * depth * width), most(3 * depth * width), least(3 * depth * width),
-          low(width + 2 * reach_px, 0), high(width + 2 * reach_px, 255), sums(width + 2) {
-        split_at(0), split_at(1);
-    }
-    std::uint8_t *plane(std::vector<std::uint8_t> &ring, int row, int band) {
-        return ring.data() + (static_cast<std::size_t>(row % depth) * 3 + band) * columns;
-    }
-    std::uint8_t *split_plane(int row, int band) {
-        return split.data() + (static_cast<std::size_t>(row % 3) * 3 + band) * columns;
-    }
-    void split_at(int row) {
-        split_row(image + static_cast<std::size_t>(row) * columns * 3, split_plane(row, 0), split_plane(row, 1),
-                  split_plane(row, 2), columns);
-    }
-    void take(int row) {
-        if (row >= 1 && row + 1 < rows) split_at(row + 1);
-        const int above = mirrored(row - 1, rows), below = mirrored(row + 1, rows);
-        for (int band = 0; band < 3; ++band)
-            blur_row(split_plane(above, band), split_plane(row, band), split_plane(below, band), sums.data(),
-                     plane(values, row, band), columns);
-        luma_row(plane(values, row, 0), plane(values, row, 1), plane(values, row, 2), columns);
-        for (int band = 0; band < 3; ++band) {
-            std::memcpy(low.data() + reach, plane(values, row, band), columns);
-            std::memcpy(high.data() + reach, plane(values, row, band), columns);
-            extremes_row(low.data(), high.data(), depth, plane(most, row, band), plane(least, row, band), columns);
-        }
-    }
-    // The extremes of rows row - reach .. row + reach.
-    void around(int row, int band, std::uint8_t *all_most, std::uint8_t *all_least) {
-        const int first = std::max(row - reach, 0), last = std::min(row + reach, rows - 1);
-        std::memcpy(all_most, plane(most, first, band), columns);
-        std::memcpy(all_least, plane(least, first, band), columns);
-        for (int each = first + 1; each <= last; ++each)
-            extremes_rows(plane(most, each, band), plane(least, each, band), all_most, all_least, columns);
-    }
-};
-
-void differences(const Bytes &reference, const Bytes &query, const std::optional<Bytes> &known, int reach, int weight,
-                 Bytes &out) {
-    const int rows = static_cast<int>(reference.shape(0)), columns = static_cast<int>(reference.shape(1));
-    const std::uint8_t *pixels[2] = {reference.data(), query.data()};
-    const std::uint8_t *compared = known ? known->data() : nullptr;
-    std::uint8_t *to = out.mutable_data();
-    pybind11::gil_scoped_release released;
-    Passing before(pixels[0], rows, columns, reach), after(pixels[1], rows, columns, reach);
-    std::vector<std::uint8_t> work(6 * static_cast<std::size_t>(columns));
-    std::uint8_t *most = work.data(), *least = most + columns, *beyond = least + columns;
-    std::uint8_t *went_chroma = beyond + 3 * columns;
-    const std::size_t plane = static_cast<std::size_t>(rows) * columns;
-    for (int row = 0; row < std::min(reach, rows); ++row) before.take(row), after.take(row);
-    for (int row = 0; row < rows; ++row) {
-        if (row + reach < rows) before.take(row + reach), after.take(row + reach);
-        std::uint8_t *line = to + static_cast<std::size_t>(row) * columns;
-        const auto outside = [&](Passing &values, Passing &others, std::uint8_t *total, std::uint8_t *chroma) {
-            for (int band = 0; band < 3; ++band) {
-                others.around(row, band, most, least);
-                beyond_row(values.plane(values.values, row, band), most, least, beyond + band * columns, columns);
-            }
-            weigh_row(beyond, beyond + columns, beyond + 2 * columns, weight, total, chroma, columns);
-        };
-        outside(after, before, line + 2 * plane, line + plane);
-        outside(before, after, line + 3 * plane, went_chroma);
-        join_row(line + plane, went_chroma, line + plane, columns);
-        join_row(line + 2 * plane, line + 3 * plane, line, columns);
-        if (compared) mask_row(compared + static_cast<std::size_t>(row) * columns, line, columns);
-        std::memcpy(line + 4 * plane, before.plane(before.values, row, 0), columns);
-        std::memcpy(line + 5 * plane, after.plane(after.values, row, 0), columns);
-    }
 }
 
 // How much redder than blue the query is against the reference, in quarter steps of `logs`, rounded to even, 128 alike.
@@ -264,6 +97,15 @@ Integers64 rim_balance(const Integers32 &labels, const Integers32 &boxes, const 
         to[region] = sum;
     }
     return balance;
+}
+
+void looked_up(const Integers32 &labels, const Bytes &table, Bytes &out) {
+    const std::int64_t pixels = labels.shape(0) * labels.shape(1);
+    const std::int32_t *label = labels.data();
+    const std::uint8_t *value = table.data();
+    std::uint8_t *to = out.mutable_data();
+    pybind11::gil_scoped_release released;
+    for (std::int64_t at = 0; at < pixels; ++at) to[at] = value[label[at]];
 }
 
 // Which values lie over their thresholds, 1 or 0.
@@ -411,7 +253,7 @@ void sum_window(const std::uint8_t *query, const std::int16_t *query_words, cons
         const std::uint8_t *a = query + row, *b = reference + y * reference_row;
         const std::int16_t *u = query_words + row, *v = reference_words + y * reference_row;
         std::int32_t qt = 0, t = 0, tt = 0, apart = 0;
-        for (int x = 0; x < wide; ++x) {
+        for (std::ptrdiff_t x = 0; x < wide; ++x) {
             qt += u[x] * v[x], tt += v[x] * v[x], t += b[x];
             apart += std::abs(static_cast<int>(a[x]) - static_cast<int>(b[x]));
         }
@@ -478,9 +320,9 @@ Doubles match_regions(const Bytes &query, const Bytes &reference, const Integers
 
 void bind_robust(pybind11::module_ &module) {
     using pybind11::arg;
-    module.def("relight", &relight, arg("image").noconvert(), arg("curves").noconvert(), arg("gains").noconvert());
-    module.def("differences", &differences, arg("reference").noconvert(), arg("query").noconvert(),
-               arg("known").noconvert(), arg("reach"), arg("weight"), arg("out").noconvert());
+    module.def("relight", &relight, arg("image").noconvert(), arg("curves").noconvert(), arg("gains").noconvert(),
+               arg("out").noconvert());
+    module.def("looked_up", &looked_up, arg("labels").noconvert(), arg("table").noconvert(), arg("out").noconvert());
     module.def("tint", &tint, arg("reference").noconvert(), arg("query").noconvert(), arg("logs").noconvert(),
                arg("boxes").noconvert(), arg("margin"), arg("out").noconvert());
     module.def("rim_balance", &rim_balance, arg("labels").noconvert(), arg("boxes").noconvert(),

@@ -7,15 +7,21 @@ from numpy.typing import NDArray
 
 
 def relight(
-    image: NDArray[np.uint8], curves: NDArray[np.int32], gains: NDArray[np.uint16]
-) -> NDArray[np.uint8]:
-    """`image` (h, w, 3) through `curves` (3, 256), 16 a grey level and 8 levels up, times `gains` (h, w, 3), 4096 one.
+    image: NDArray[np.uint8], curves: NDArray[np.int32], gains: NDArray[np.uint16], out: NDArray[np.uint8]
+) -> None:
+    """Fills `out` with `image` (h, w, 3) through `curves` (3, 256) and times `gains` (h, w, 3), 4096 one.
 
-    The result is rounded, taken 8 levels down again and clipped to 0 .. 255. Curves below 2**14 leave 32 bits enough.
+    Curves give 16 a grey level, 8 levels up. The result is rounded, taken 8 levels down again and clipped to 0 .. 255.
+    Curves below 2**14 leave 32 bits enough.
     """
     lifted = np.stack([curves[channel][image[..., channel]] for channel in range(3)], axis=-1)
     product = lifted.astype(np.int64) * gains
-    return np.asarray(np.clip(((product + (1 << 15)) >> 16) - 8, 0, 255), np.uint8)
+    out[:] = np.clip(((product + (1 << 15)) >> 16) - 8, 0, 255)
+
+
+def looked_up(labels: NDArray[np.int32], table: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
+    """Fills `out` (h, w) with the values of `labels` (h, w) in `table` (N,)."""
+    out[:] = table[labels]
 
 
 def differences(
