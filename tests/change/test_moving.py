@@ -121,3 +121,13 @@ def test_settings_are_checked():
         MovingSettings(least_views=2)
     with pytest.raises(SettingsError):
         MovingSettings(forget_s=0)
+
+
+@pytest.mark.parametrize("north_m", [-3.5, -3])
+def test_a_walker_seen_from_aside_is_told_where_the_feet_are(north_m):
+    thing = Thing(-2, north_m, (0.5, 0.5), height_m=1.7, velocity_m_s=(1.2, 0.1))
+    _, (change,), _ = events(flight([thing], seconds=4))
+    assert change.kind == ChangeKind.MOVING
+    feet_m = thing.outline_m((change.last_seen_ns - flight_start_ns()) * 1e-9).mean(axis=0)
+    assert np.hypot(*(change.outline_m.mean(axis=0) - feet_m)) < 0.12
+    assert change.length_m < 1.0

@@ -413,7 +413,7 @@ def _foot_m(thing_m: PointsM, changed_m: PointsM, camera_m: Floats, m_per_px: fl
     thing, changed = ((each - camera_m[:2]) @ site_from_lean.T for each in (thing_m, changed_m))
     (_, left), (far, right) = thing.min(axis=0), thing.max(axis=0)
     width_m = right - left + m_per_px
-    nearest = far * (1 - _PERSON_M / max(float(camera_m[2]), 2 * _PERSON_M))
+    nearest = far * (1 - _PERSON_M / max(float(camera_m[2]), 2 * _PERSON_M)) - width_m
     behind = changed[(changed[:, 1] >= left) & (changed[:, 1] <= right) & (changed[:, 0] >= nearest), 0]
     near = float(behind.min(initial=far))
     if width_m > _UPRIGHT_M or far - near <= width_m:

@@ -1,0 +1,67 @@
+"""Things told from the shadows they throw, and from neighbours that a shadow joins to them."""
+
+import numpy as np
+import pytest
+from blob_world import M_PER_PX, Thing, flight
+
+from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
+from sorvolo.change.shadows import thing_of, things_of
+from sorvolo.survey.findings import ChangeKind, Patch
+
+SHADOW = (58, 58, 58)  # of ground as bright as 110
+
+
+def patch_with(*painted: tuple[slice, slice, tuple[int, int, int]]) -> Patch:
+    """100 x 200 pixels of 0.05 m with rectangles that came; all of them changed."""
+    before = np.full((100, 200, 4), (110, 110, 110, 255), np.uint8)
+    after, changed = before.copy(), np.zeros((100, 200), bool)
+    for rows, columns, colour in painted:
+        after[rows, columns, :3], changed[rows, columns] = colour, True
+    return Patch(0.0, 0.0, M_PER_PX, before, after, changed)
+
+
+def test_specks_at_the_rim_of_a_shadow_do_not_stretch_the_thing():
+    changed = np.zeros((60, 20), bool)
+    changed[5:55, 5:15] = True
+    shadow = changed.copy()
+    shadow[5:15] = False
+    clean = thing_of(changed, shadow)
+    shadow[50:52, 13:15] = False
+    assert np.array_equal(thing_of(changed, shadow), clean)
+    assert 100 <= np.count_nonzero(clean) <= 130
+
+
+def test_two_things_joined_by_a_shadow_are_two_with_kinds_of_their_own():
+    patch = patch_with(
+        (np.s_[40:50], np.s_[60:100], SHADOW), (np.s_[40:50], np.s_[50:60], (220, 40, 40)),
+        (np.s_[38:52], np.s_[100:112], (40, 60, 230)),
+    )
+    patch.before[38:52, 100:112, :3], patch.after[38:52, 100:112, :3] = (40, 60, 230), 110
+    things = things_of(patch, ChangeKind.APPEARED, patch.changed)
+    assert [kind for _, kind in things] == [ChangeKind.DISAPPEARED, ChangeKind.APPEARED]
+    left, came = (mask for mask, _ in things)
+    assert left[45, 105] and not left[45, 90]  # the shadow belongs to what came
+    assert came[45, 55] and came[45, 90]
+    assert np.array_equal(left | came, patch.changed)
+
+
+def test_a_dark_car_with_bright_ends_is_one_thing():
+    dark = (np.s_[30:66], np.s_[50:138], SHADOW)
+    ends = [(np.s_[32:64], np.s_[x : x + 6], (230, 60, 60)) for x in (51, 131)]
+    patch = patch_with(dark, *ends)
+    assert len(things_of(patch, ChangeKind.APPEARED, patch.changed)) == 1
+
+
+@pytest.mark.parametrize("gap_m", [1.2, 2.0])
+def test_neighbours_in_a_shadow_are_told_as_two_and_the_announced_one_keeps_its_id(gap_m):
+    things = [
+        Thing(0.5 + gap_m / 2, 0, (gap_m, 0.4), colour=SHADOW), Thing(0.2, 0, (0.6, 0.6)),
+        Thing(1.05 + gap_m, 0, (0.5, 0.5), colour=(40, 60, 230)),
+    ]
+    evidence = EvidenceMap(M_PER_PX, EvidenceSettings(), "f")
+    told = [change for view in flight(things) for change in evidence.add(view)]
+    final = evidence.conclude()
+    assert len(told) == 1 and len(final) == 2
+    assert told[0].id == final[0].id and final[0].id != final[1].id
+    assert evidence.changes() == final
+    assert final[0].announced_ns > 0 and final[1].announced_ns == -1
