@@ -126,3 +126,14 @@ def test_scratch_keeps_one_size_and_nothing_large() -> None:
     assert scratch.stack("a", (10, 20), 3) is not first
     large = (MOST_KEPT_PX, 2)
     assert scratch.stack("c", large, 1) is not scratch.stack("c", large, 1)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 140), st.integers(1, 100), st.integers(0, 9), st.integers(0, 2**32 - 1))
+def test_narrow_wide_and_stepped_windows_are_matched_as_specified(wide: int, high: int, reach: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    query = rng.integers(0, 256, (high + 3, wide + 5), dtype=np.uint8)
+    searched = rng.integers(0, 256, (high + 3 + 2 * reach, wide + 5 + 2 * reach), dtype=np.uint8)
+    boxes = np.int32([[5, 3, wide, high], [0, 0, wide, high]])
+    found = kernels.match_regions(query, searched, boxes, reach)
+    assert np.array_equal(found, reference_robust.match_regions(query, searched, boxes, reach))

@@ -66,7 +66,8 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     detail_after = (after - cv2.blur(after, window))[sure][::2]
     exponents = np.array([_exponent(detail_before[:, channel], detail_after[:, channel]) for channel in range(3)])
     offset = after - exponents.astype(np.float32) * before
-    offsets = np.median(offset[sure], axis=0)
+    kept = offset[sure]
+    offsets = np.array([middle(kept[:, channel]) for channel in range(3)])
     local = np.clip(np.rint((offset - offsets.astype(np.float32)) * STEPS_PER_OCTAVE + 128), 0, 255).astype(np.uint8)
     same = np.where(sure, _sameness(reference, query, size), np.float32(0))
     octaves = _spread(cv2.medianBlur(local, MEDIAN_CELLS).astype(np.float32) - 128, same) / STEPS_PER_OCTAVE

@@ -178,7 +178,10 @@ def _filled(chosen: Mask, regions: Regions, parts: Anything) -> ImageGray:
     looked_up(regions.labels, np.concatenate([[0], chosen * np.uint8(255)]).astype(np.uint8), cores)
     window = np.ones((5, 5), np.uint8)  # two blurs of 3 px reach two pixels out
     held = np.zeros(int(parts.max()) + 1, bool)
-    held[parts.ravel()[np.flatnonzero(cores)]] = True
+    for region in np.flatnonzero(chosen):
+        x, y, wide, high = regions.boxes[region]
+        place = slice(y, y + high), slice(x, x + wide)
+        held[parts[place][regions.labels[place] == region + 1]] = True
     held[0] = False
     looked_up(parts, held.astype(np.uint8) * np.uint8(255), whole)
     cv2.erode(whole, window, dst=around)

@@ -1,6 +1,7 @@
 """The last pixels of alignment: a homography close to identity from dense flow, and what no homography explains."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -49,8 +50,7 @@ def settle(reference: NDArray[np.uint8], query: NDArray[np.uint8], known: Mask |
         trust *= cv2.resize(known.astype(np.float32), GRID, interpolation=cv2.INTER_AREA).ravel() > 0.99
     if np.count_nonzero(trust) < 30:
         return Settling(np.eye(3), 0.0, 0.0)
-    x, y = (each.ravel() for each in np.meshgrid(*[(np.arange(n) + 0.5) / n - 0.5 for n in GRID]))
-    matrix, rest_px = _near_homography(x, y, flow_px / (width, height), trust, (width, height))
+    matrix, rest_px = _near_homography(flow_px / (width, height), trust, (width, height))
     corners = np.array([[0.0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]]) @ matrix.T
     moved_px = float(np.abs(corners[:, :2] / corners[:, 2:] - [[0, 0], [width, 0], [0, height], [width, height]]).max())
     if not SMALLEST_PX <= moved_px <= LARGEST_PX:
@@ -64,17 +64,24 @@ def _details(gray: Anything) -> NDArray[np.uint8]:
     return np.asarray(cv2.addWeighted(logarithm, 2, cv2.blur(logarithm, (15, 15)), -2, 128), np.uint8)
 
 
-def _near_homography(
-    x: NDArray[np.float64], y: NDArray[np.float64], moves: NDArray[np.float64], trust: NDArray[np.float64],
-    size_px: tuple[int, int],
-) -> tuple[Matrix3, float]:
-    """Homography in pixels, to first order, from displacements at x, y (all as parts of the size); median rest, px."""
+@lru_cache(maxsize=1)
+def _rows() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What a homography near identity moves the grid's places by, per parameter: (N, 8) in x and in y."""
+    x, y = (each.ravel() for each in np.meshgrid(*[(np.arange(n) + 0.5) / n - 0.5 for n in GRID]))
     zero, one = np.zeros_like(x), np.ones_like(x)
     rows_x = np.column_stack([one, x, y, zero, zero, zero, x * x, x * y])
-    rows_y = np.column_stack([zero, zero, zero, one, x, y, x * y, y * y])
+    return rows_x, np.column_stack([zero, zero, zero, one, x, y, x * y, y * y])
+
+
+def _near_homography(
+    moves: NDArray[np.float64], trust: NDArray[np.float64], size_px: tuple[int, int]
+) -> tuple[Matrix3, float]:
+    """Homography in pixels, to first order, from displacements of the grid (as parts of the size); median rest, px."""
+    rows_x, rows_y = _rows()
     weights = trust.copy()
     solution = np.zeros(8)
-    rest_px = np.zeros(len(x))
+    rest_px = np.zeros(len(trust))
+    trusted = trust > 0
     for _ in range(4):
         weighted_x, weighted_y = (rows_x * weights[:, None]).T, (rows_y * weights[:, None]).T
         normal = weighted_x @ rows_x + weighted_y @ rows_y
@@ -82,11 +89,11 @@ def _near_homography(
         solution = np.linalg.solve(normal + 1e-4 * weights.sum() * np.diag([0, 0.01, 0.01, 0, 0.01, 0.01, 1, 1]), right)
         rest = moves - np.column_stack([rows_x @ solution, rows_y @ solution])
         rest_px = np.hypot(rest[:, 0] * size_px[0], rest[:, 1] * size_px[1])
-        scale = max(1.5 * float(middle(rest_px[trust > 0])), 0.05)
+        scale = max(1.5 * float(middle(rest_px[trusted])), 0.05)
         weights = trust / (1 + (rest_px / scale) ** 2)
     a = solution
     near = np.array([[1 + a[1], a[2], a[0]], [a[4], 1 + a[5], a[3]], [-a[6], -a[7], 1.0]])
     parts_from_px = np.array([[1 / size_px[0], 0, 0.5 / size_px[0] - 0.5], [0, 1 / size_px[1], 0.5 / size_px[1] - 0.5],
                               [0, 0, 1.0]])
     matrix = np.linalg.inv(parts_from_px) @ near @ parts_from_px
-    return np.asarray(matrix / matrix[2, 2]), float(np.median(rest_px[trust > 0]))
+    return np.asarray(matrix / matrix[2, 2]), float(middle(rest_px[trusted]))

@@ -87,10 +87,13 @@ Integers64 rim_balance(const Integers32 &labels, const Integers32 &boxes, const 
             for (int x = box[0]; x < box[0] + box[2]; ++x) {
                 const std::int64_t at = static_cast<std::int64_t>(y) * width + x;
                 if (label[at] != region + 1) continue;
+                const int first = std::max(x - 2, 0), last = std::min(x + 2, width - 1);
                 bool is_rim = false;
-                for (int ny = std::max(y - 2, 0); ny <= std::min(y + 2, height - 1) && !is_rim; ++ny)
-                    for (int nx = std::max(x - 2, 0); nx <= std::min(x + 2, width - 1); ++nx)
-                        is_rim |= label[static_cast<std::int64_t>(ny) * width + nx] == 0;
+                for (int ny = std::max(y - 2, 0); ny <= std::min(y + 2, height - 1) && !is_rim; ++ny) {
+                    const std::int32_t *row = label + static_cast<std::int64_t>(ny) * width;
+                    is_rim = row[first] == 0 || row[last] == 0 || row[x] == 0 || row[std::min(first + 1, last)] == 0 ||
+                             row[std::max(last - 1, first)] == 0;
+                }
                 if (is_rim) sum += static_cast<std::int64_t>(plus[at]) - minus[at];
             }
         }
@@ -261,6 +264,37 @@ void sum_window(const std::uint8_t *query, const std::int16_t *query_words, cons
     }
 }
 
+constexpr int MOST_AT_ONCE_PX = 64;
+constexpr int LANES = 16;  // shifts along x that are summed at once
+
+// As above for the shifts 0 .. LANES - 1 along x: narrow windows leave a processor's lanes empty, shifts do not.
+ROBUST_CLONES
+void sum_shifts(const std::uint8_t *query, const std::uint8_t *reference, std::int64_t reference_row, int wide,
+                int high, Sums *totals) {
+    std::int32_t qt[LANES] = {}, tt[LANES] = {}, t[LANES] = {}, apart[LANES] = {};
+    for (int y = 0; y < high; ++y) {
+        const std::uint8_t *a = query + static_cast<std::int64_t>(y) * wide, *b = reference + y * reference_row;
+        std::uint16_t row_t[LANES] = {}, row_apart[LANES] = {};
+        for (std::ptrdiff_t x = 0; x < wide; ++x) {
+            const std::int16_t u = a[x];
+            for (int lane = 0; lane < LANES; ++lane) {
+                const std::int16_t v = b[x + lane];
+                const std::int16_t step = static_cast<std::int16_t>(u - v);
+                const std::uint16_t square = static_cast<std::uint16_t>(v * v);
+                const std::uint16_t product = static_cast<std::uint16_t>(u * v);
+                row_t[lane] = static_cast<std::uint16_t>(row_t[lane] + v);
+                row_apart[lane] = static_cast<std::uint16_t>(row_apart[lane] + std::max<std::int16_t>(step, -step));
+                qt[lane] += product, tt[lane] += square;
+            }
+        }
+        for (int lane = 0; lane < LANES; ++lane) t[lane] += row_t[lane], apart[lane] += row_apart[lane];
+    }
+    for (int lane = 0; lane < LANES; ++lane) {
+        totals[lane].t = t[lane], totals[lane].tt = tt[lane];
+        totals[lane].qt = qt[lane], totals[lane].apart = apart[lane];
+    }
+}
+
 Doubles match_regions(const Bytes &query, const Bytes &reference, const Integers32 &boxes, int reach) {
     const std::int64_t width = query.shape(1), padded = reference.shape(1);
     const pybind11::ssize_t regions = boxes.shape(0);
@@ -271,6 +305,7 @@ Doubles match_regions(const Bytes &query, const Bytes &reference, const Integers
     pybind11::gil_scoped_release released;
     std::vector<std::uint8_t> asked, searched;
     std::vector<std::int16_t> asked_words, searched_words;
+    std::vector<Sums> lanes;
     for (pybind11::ssize_t region = 0; region < regions; ++region, box += 4, to += 6) {
         const int step = std::max(1, std::max(box[2], box[3]) / 32);
         const int wide = (box[2] + step - 1) / step, high = (box[3] + step - 1) / step;
@@ -288,7 +323,7 @@ Doubles match_regions(const Bytes &query, const Bytes &reference, const Integers
         // every step-th row and column belong together: the searched window falls into step x step pictures
         const int across = wide + (2 * reach) / step + 1, down = high + (2 * reach) / step + 1;
         const std::size_t phase_size = static_cast<std::size_t>(across) * down;
-        searched.assign(phase_size * step * step, 0);
+        searched.assign(phase_size * step * step + LANES, 0);  // lanes may look past the last row
         const int rows = box[3] + 2 * reach, columns = box[2] + 2 * reach;
         for (int y = 0; y < rows; ++y) {
             const std::uint8_t *line = t0 + (box[1] + y) * padded + box[0];
@@ -296,14 +331,22 @@ Doubles match_regions(const Bytes &query, const Bytes &reference, const Integers
             for (int x = 0; x < columns && x / step < across; ++x)
                 searched[((y % step) * step + x % step) * phase_size + (y / step) * across + x / step] = line[x];
         }
+        const bool at_once = step == 1 && wide < MOST_AT_ONCE_PX;
         searched_words.assign(searched.begin(), searched.end());
         double best = -2.0, least = 256.0;
         for (int dy = 0; dy <= 2 * reach; ++dy) {
             for (int dx = 0; dx <= 2 * reach; ++dx) {
                 Sums sums = in_query;
+                if (at_once && dx % LANES == 0) {
+                    lanes.assign(LANES, in_query);
+                    sum_shifts(asked.data(), searched.data() + static_cast<std::size_t>(dy) * across + dx, across, wide,
+                               high, lanes.data());
+                }
+                if (at_once) sums = lanes[dx % LANES];
                 const std::size_t at = ((dy % step) * step + dx % step) * phase_size + (dy / step) * across + dx / step;
-                sum_window(asked.data(), asked_words.data(), searched.data() + at, searched_words.data() + at, across,
-                           wide, high, &sums);
+                if (!at_once)
+                    sum_window(asked.data(), asked_words.data(), searched.data() + at,
+                               searched_words.data() + at, across, wide, high, &sums);
                 const double alike = correlation(sums);
                 const double apart = static_cast<double>(sums.apart) / static_cast<double>(sums.n);
                 if (dx == reach && dy == reach) to[0] = alike, to[4] = apart;
