@@ -2,6 +2,9 @@
 
 import json
 import shutil
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.missions.compare_flights import compare_flights
@@ -303,3 +307,30 @@ def test_ground_beside_the_map_extends_it(flown, tmp_path):
             for version, tiles in (("before", before), ("after", after))}
     assert area["after"] > 1.3 * area["before"]
     assert features(tmp_path / "site")
+
+
+def test_the_command_tells_the_changes_as_json(flown, site, capsys):
+    camera = str(flown / "camera.xml")
+    assert main(["compare", str(flown / "flight2"), "--site", str(site), "--camera", camera, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["flights"][0]
+    assert told["flight"] == "flight2"
+    assert len(told["changes"]["features"]) == sum(told["comparison"]["changes"].values()) > 0
+
+
+def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(compared, flown, site):
+    command = [
+        sys.executable, "-m", "sorvolo", "compare", str(flown / "flight2"), "--site", str(site),
+        "--camera", str(flown / "camera.xml"), "--masks",
+    ]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        started = time.monotonic()
+        while not list(site.glob("flights/flight2/staged/*/masks/*.png")) and process.poll() is None:
+            assert time.monotonic() - started < 120
+            time.sleep(0.02)
+        process.kill()
+    with Archive.open(site, write=False) as archive:
+        assert [each.flight_id for each in archive.versions() if each.complete] == ["flight1"]
+        assert archive.changes() == []
+    compare(flown, site, CompareSettings(writes_masks=True))
+    assert features(site) == features(compared[0])
+    assert not list(site.glob("flights/flight2/staged"))

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
-from sorvolo.change.outlines import KnownPlace
+from sorvolo.change.outlines import KnownPlace, is_known
 from sorvolo.change.reference import ReferenceMap
 from sorvolo.change.shadows import without_shadow
 from sorvolo.change.thesis import thesis_steps
@@ -57,12 +57,12 @@ class CompareRun:
             EarlierPictures(archive, [source.name]) if settings.method == "robust" else None,
         )
         self._evidence = EvidenceMap(
-            site_grid.grid.m_per_px, EvidenceSettings(k=settings.votes, n=settings.voters), source.name,
-            [
-                KnownPlace(each.outline_m, each.kind) for each in archive.reviews()
-                if each.verdict is Verdict.REJECTED and each.flight_id != source.name
-            ],
+            site_grid.grid.m_per_px, EvidenceSettings(k=settings.votes, n=settings.voters), source.name
         )
+        self._rejected = [
+            KnownPlace(each.outline_m, each.kind) for each in archive.reviews()
+            if each.verdict is Verdict.REJECTED and each.flight_id != source.name
+        ]
         self._log = FlightLog()
         self._extension: PlanarRun | None = None
         self._last_outline_m: PointsM | None = None
@@ -72,7 +72,7 @@ class CompareRun:
         self._residuals_px: list[float] = []
         self._unknown: list[float] = []
         self._ground: set[tuple[int, int]] = set()
-        sigmas_m = np.array([each.sigma_m for each in archive.keyframes()])
+        sigmas_m = np.array([each.sigma_m for each in archive.keyframes() if each.flight_id != source.name])
         self._map_sigma_m = float(np.nanmedian(sigmas_m)) if np.isfinite(sigmas_m).any() else 0.0
 
     def __enter__(self) -> Self:
@@ -111,7 +111,7 @@ class CompareRun:
         announced: tuple[Change, ...] = ()
         if outcome.view is not None:
             with self._log.stage(Stage.EVIDENCE):
-                announced = tuple(self._finished(each) for each in self._evidence.add(outcome.view))
+                announced = tuple(self._told(self._evidence.add(outcome.view)))
             self._note_ground(outcome.view)
             with self._log.stage(Stage.STORE):
                 self._write_masks(outcome.view)
@@ -131,7 +131,8 @@ class CompareRun:
                 "or night? `sorvolo inspect` tells what the flight holds"
             )
         with self._log.stage(Stage.EVIDENCE):
-            changes = [self._finished(each) for each in self._evidence.conclude()]
+            found = self._evidence.conclude()
+            changes = self._told(found)
         images: Mapping[int, str] = {}
         if self._extension is not None and self._settings.updates_map:
             for each in self._extension.complete():
@@ -149,15 +150,20 @@ class CompareRun:
             self._setup.source.camera.camera, self._writer.tiles, [*self._setup.notices, *notices],
             time.monotonic() - started_s, spread=float("nan"),
         )
-        report |= {"method": f"compare-{self._settings.method}", "comparison": self._summary(changes)}
+        comparison = self._summary(changes, suppressed=len(found) - len(changes))
+        report |= {"method": f"compare-{self._settings.method}", "comparison": comparison}
         self._writer.commit(placed, images, report, report_page(report, shown), changes=changes)
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
-    def _finished(self, change: Change) -> Change:
-        """The change around the thing alone, its place as uncertain as the map's own is."""
-        change = without_shadow(change)
-        return replace(change, sigma_m=float(np.hypot(change.sigma_m, self._map_sigma_m)))
+    def _told(self, changes: Sequence[Change]) -> list[Change]:
+        """The changes around the things alone, their places as uncertain as the map's own; not those that a person
+        rejected on an earlier flight."""
+        finished = [without_shadow(each) for each in changes]
+        return [
+            replace(each, sigma_m=float(np.hypot(each.sigma_m, self._map_sigma_m))) for each in finished
+            if not is_known(each.outline_m, each.kind, self._rejected)
+        ]
 
     def _end(self, status: ViewStatus, reason: str) -> None:
         self._statuses[status] += 1
@@ -222,7 +228,7 @@ class CompareRun:
                     if new is not old:
                         tiles[index] = new
 
-    def _summary(self, changes: Sequence[Change]) -> dict[str, Any]:
+    def _summary(self, changes: Sequence[Change], *, suppressed: int) -> dict[str, Any]:
         """The report's part on the comparison; specified in docs/formats.md."""
         kinds = Counter(each.kind for each in changes)
         residuals = np.array(self._residuals_px)
@@ -236,7 +242,7 @@ class CompareRun:
                 "p95": float(np.percentile(residuals, 95)) if len(residuals) else None,
             },
             "changes": {kind.value: kinds[kind] for kind in ChangeKind},
-            "suppressed": self._evidence.suppressed,
+            "suppressed": suppressed,
             "compared_area_m2": len(self._ground) * _CELL_M**2,
             "unknown_share": float(np.mean(self._unknown)) if self._unknown else None,
             "votes": self._settings.votes, "voters": self._settings.voters,
