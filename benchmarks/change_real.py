@@ -22,12 +22,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from sorvolo.missions.compare_flights import compare_flights
 
 from mosaic_methods import commit, machine
 from sorvolo.change.compared_ground import ComparedGround, compared_ground
 from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.polygons import points_inside
+from sorvolo.missions.compare_flights import compare_flights
 from sorvolo.missions.frame_rows import map_frames, site_points
 from sorvolo.missions.map_flight import map_flights
 from sorvolo.missions.settings import CompareSettings
