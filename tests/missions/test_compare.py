@@ -334,3 +334,11 @@ def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(com
     compare(flown, site, CompareSettings(writes_masks=True))
     assert features(site) == features(compared[0])
     assert not list(site.glob("flights/flight2/staged"))
+
+
+def test_a_flight_in_the_dark_is_told_to_show_less(site, tmp_path):
+    later = replace(_PAIR.later, weather=replace(_PAIR.later.weather, brightness=0.2))
+    for _ in simulate_site(tmp_path / "dark", replace(_PAIR, later=later)):
+        pass
+    compare(tmp_path / "dark", site)
+    assert any("times as bright as the map" in warning for warning in report(site)["warnings"])

@@ -74,5 +74,10 @@ class FlightTuning:
             "least_score": settings.least_score,
         }
 
+    @property
+    def brightness(self) -> float:
+        """How many times as bright as the reference a middle grey is on this flight; NaN while nothing was seen."""
+        return float(median(float(each.light.brightness.mean()) for each in self._seen)) if self._seen else float("nan")
+
     def _noise(self) -> float:
         return float(median(each.noise for each in self._seen))

@@ -37,6 +37,7 @@ from sorvolo.survey.mosaic import PlacedFrame, Status
 
 _NEW_GROUND = 0.05  # share of a frame beyond the map: with less it is not worth a place in it
 _EXTENSION_OVERLAP = 0.7
+_DARK = 0.4  # times the map's brightness: less hides things
 _CELL_M = 1.0  # of the record of what was compared
 
 
@@ -150,6 +151,7 @@ class CompareRun:
             self._setup.source.camera.camera, self._writer.tiles, [*self._setup.notices, *notices],
             time.monotonic() - started_s, spread=float("nan"),
         )
+        report["warnings"] = [*report["warnings"], *self._warnings()]
         comparison = self._summary(changes, suppressed=len(found) - len(changes))
         report |= {"method": f"compare-{self._settings.method}", "comparison": comparison}
         self._writer.commit(placed, images, report, report_page(report, shown), changes=changes)
@@ -227,6 +229,26 @@ class CompareRun:
                     new = patched(old, site_grid.grid.tile_window(index), grid_from_site, change.patch)
                     if new is not old:
                         tiles[index] = new
+
+    def _warnings(self) -> list[str]:
+        """What makes this comparison say less than a user would expect of it."""
+        warnings = []
+        views, brightness = max(1, self.views), self._views.brightness
+        if brightness < _DARK or brightness > 1 / _DARK:
+            warnings.append(
+                f"the flight is {brightness:.2f} times as bright as the map: what is small, dark or of the ground's "
+                "colour is missed; compare flights by daylight"
+            )
+        lost = self._statuses[ViewStatus.NOT_ALIGNED] + self._statuses[ViewStatus.LOST]
+        if lost > 0.3 * views:
+            warnings.append(f"{lost} of {views} views do not fit the map and told nothing; `reasons` says why")
+        all_changed = self._statuses[ViewStatus.ALL_CHANGED]
+        if all_changed > 0.1 * views:
+            warnings.append(
+                f"{all_changed} of {views} views look changed all over (snow, a flood?) and were left out: "
+                "map the site anew"
+            )
+        return warnings
 
     def _summary(self, changes: Sequence[Change], *, suppressed: int) -> dict[str, Any]:
         """The report's part on the comparison; specified in docs/formats.md."""

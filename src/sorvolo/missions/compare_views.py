@@ -164,6 +164,11 @@ class ViewMaker:
         """What the robust method's parameters set themselves to on this flight; nothing for method thesis."""
         return {} if self._tuning is None else self._tuning.chosen()
 
+    @property
+    def brightness(self) -> float:
+        """How many times as bright as the map the flight is; NaN where that is not known."""
+        return float("nan") if self._tuning is None else self._tuning.brightness
+
     # ---- inside -----------------------------------------------------------------------------------------------
 
     def _undistorted(self, image: ImageRGB) -> ImageRGB:

@@ -26,7 +26,7 @@ class PlanarSettings:
     registration_side_px: int = 1024  # longest side of the image that is registered
     previous: int = 2  # keyframes before, always tried
     spatial: int = 2  # further ones under the predicted view: they close loops between strips
-    wanted_links: int = 2  # with fewer, pictures that refused are asked again with SIFT
+    wanted_links: int = 4  # with fewer, pictures that refused are asked again with SIFT
     least_overlap: float = 0.2  # of a view, for a spatial neighbour
     recovery: int = 30  # keyframes tried for a frame that is lost and has no GPS
     links: LinkSettings = field(default_factory=LinkSettings)
@@ -200,8 +200,8 @@ class PlanarMapper:
     def _tie(self, new: Keyframe) -> tuple[list[Link], Pose | None, str]:
         """The links of a new keyframe, where it stands by them or by telemetry, and what failed.
 
-        All candidates are asked the cheap way first. Only where at most one of them says yes those that refused are
-        asked with SIFT and correlation, until two do: one link alone lets tall trees bend the strip.
+        All candidates are asked the cheap way first. Only where few of them say yes those that refused are
+        asked with SIFT and correlation, until enough do: few links let tall trees bend a strip.
         """
         previous = self._own[::-1][: self._settings.previous]
         tie = _Tie(new, self._guess_by_telemetry(new))
