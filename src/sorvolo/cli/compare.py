@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
@@ -148,13 +149,15 @@ def _result(folder: Path) -> dict[str, Any]:
 def _show_result(result: Mapping[str, Any], console: Console) -> None:
     comparison = result["comparison"]
     console.print(f"Flight {escape(result['flight'])}: {len(result['changes']['features'])} changes", style="bold")
-    table = Table("id", "kind", "size m", "area m2", "longitude", "latitude", "within m", "views", "score")
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in ("id", "kind", "long m", "latitude, longitude", "within m", "views", "score"):
+        table.add_column(name, no_wrap=True)
     for feature in result["changes"]["features"][:_MOST_ROWS]:
         each = feature["properties"]
         longitude, latitude = _middle(feature["geometry"]["coordinates"][0])
         table.add_row(
-            escape(each["id"]), each["kind"], f"{each['length_m']:.2f}", f"{each['area_m2']:.2f}", f"{longitude:.6f}",
-            f"{latitude:.6f}", f"{each['sigma_m']:.2f}", str(each["views"]), f"{each['score']:.2f}",
+            escape(each["id"]), each["kind"], f"{each['length_m']:.2f}", f"{latitude:.6f}, {longitude:.6f}",
+            f"{each['sigma_m']:.2f}", str(each["views"]), f"{each['score']:.2f}",
         )
     if table.row_count:
         console.print(table)
