@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+TRAINS := $(VENV)/.trains
 SEEDS ?= 101 102 103
 
 .PHONY: demo test check bench
@@ -10,10 +11,10 @@ SEEDS ?= 101 102 103
 demo: $(READY)
 	$(BIN)/sorvolo demo demo-site
 
-test: check
+test: check $(TRAINS)
 	$(BIN)/python -m pytest -n 2
 
-check: $(READY)
+check: $(TRAINS)
 	$(BIN)/ruff check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
@@ -25,4 +26,8 @@ $(READY): requirements.lock pyproject.toml setup.py $(wildcard src/sorvolo/kerne
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -e .
+	touch $@
+
+$(TRAINS): $(READY) requirements-training.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock -r requirements-training.lock
 	touch $@

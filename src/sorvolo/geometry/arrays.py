@@ -35,6 +35,10 @@ Mask: TypeAlias = NDArray[np.bool_]
 Boxes: TypeAlias = NDArray[np.int64]
 """(N, 4) whole-pixel boxes: x and y of the top-left pixel, width, height."""
 
+BoxesPx: TypeAlias = NDArray[np.float32]
+"""(N, 4) left, top, right, bottom edges, px, counted from the picture's top-left corner as label files do: the whole
+picture is (0, 0, width, height). An edge minus one half is an image point (PointsPx)."""
+
 TimesNs: TypeAlias = NDArray[np.int64]
 """(N,) UTC time in nanoseconds since 1970-01-01."""
 

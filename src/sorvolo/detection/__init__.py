@@ -1,0 +1,1 @@
+"""Boxes from pixels, through ONNX Runtime; no torch."""

@@ -1,0 +1,1 @@
+"""Detections over time: objects with a place, each counted once."""
