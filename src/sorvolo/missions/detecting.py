@@ -1,0 +1,25 @@
+"""What missions ask of a detector, so that a test's own or a plug-in's can stand in for Sorvolo's."""
+
+from collections.abc import Sequence
+from typing import Literal, Protocol
+
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.survey.objects import Detections
+
+
+class Detects(Protocol):
+    """Something that finds objects in pictures; `detection.detector.Detector` is one."""
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """The names of what it tells apart, in the order of its labels."""
+
+    def detect(
+        self, image: ImageRGB, *, tiles: Literal["auto"] | int | None = None, m_per_px: float | None = None,
+        least_score: float | None = None, classes: Sequence[str] | None = None,
+    ) -> Detections:
+        """The objects in one picture, (H, W, 3), best first.
+
+        `tiles` cuts a large picture: "auto" by `m_per_px` (the ground's sampling distance), a number of pixels a side,
+        or None for the picture as a whole. None for `least_score` means each class's own; for `classes`, all.
+        """
