@@ -1,0 +1,144 @@
+"""Cursor on Target: what an event says, and that it arrives over real sockets."""
+
+import socket
+import time
+from dataclasses import replace
+from datetime import datetime
+from typing import Any
+from xml.etree.ElementTree import fromstring
+
+import numpy as np
+import pytest
+
+from sorvolo.errors import SettingsError
+from sorvolo.geometry.geodesy import Geodetic
+from sorvolo.store.cursor_on_target import CotPlace, CotSender, cot_event, cot_place
+from sorvolo.survey.flight import Site
+from sorvolo.survey.objects import Sighting, Track
+
+_NOW_NS = 1_780_000_000_123_456_789
+_SITE = Site("field", Geodetic(41.9, 12.6, 131.6), "EPSG:32633", 0.02, height_reference="ellipsoidal")
+
+
+def _track(**changes: Any) -> Track:
+    sighting = Sighting(
+        3, "3", _NOW_NS, "person", 0.8, np.array([10, 20, 30, 60], np.float32), np.array([100.0, 200.0]), np.eye(2),
+        np.array([1.0, 0.5]),
+    )
+    track = Track(
+        7, "person", 0.82, True, False, _NOW_NS - 10**9, _NOW_NS, 5, 1, np.array([100.0, 200.0]),
+        np.diag([4.0, 1.0]), np.zeros(2), np.array([1.0, 0.5]), sighting, np.array([[100.0, 200.0]]),
+        np.array([_NOW_NS]),
+    )
+    return replace(track, **changes)
+
+
+def test_an_event_says_where_what_and_how_long() -> None:
+    event = fromstring(cot_event(_track(), _SITE, uid="sorvolo.f.7", now_ns=_NOW_NS, stale_s=120))
+    assert event.tag == "event" and event.get("version") == "2.0"
+    assert (event.get("uid"), event.get("type"), event.get("how")) == ("sorvolo.f.7", "a-u-G", "m-g")
+    time_, start, stale = (datetime.fromisoformat(event.get(name, "")) for name in ("time", "start", "stale"))
+    assert time_ == start and (stale - time_).total_seconds() == pytest.approx(120)
+    assert event.get("time") == "2026-05-28T20:26:40.123Z"
+    point = event.find("point")
+    assert point is not None
+    east_m, north_m, _ = _SITE.frame.site_from_wgs84(
+        np.array([float(point.get("lat", ""))]), np.array([float(point.get("lon", ""))]), np.array([131.6])
+    )[0]
+    assert (east_m, north_m) == pytest.approx((100.0, 200.0), abs=0.02)
+    # one sigma along the worst direction, and the ground's own height
+    assert (point.get("ce"), point.get("hae"), point.get("le")) == ("2.0", "131.6", "9999999.0")
+    callsign, remarks = event.find("detail/contact"), event.find("detail/remarks")
+    assert callsign is not None and callsign.get("callsign") == "person 7"
+    assert remarks is not None and "score 0.82" in str(remarks.text)
+    assert event.find("detail/track") is None
+
+
+def test_what_moves_has_course_and_speed() -> None:
+    moving = _track(moving=True, velocity_m_s=np.array([-3.0, 0.0]), label="car")
+    event = fromstring(cot_event(moving, _SITE, uid="u", now_ns=_NOW_NS, stale_s=9))
+    track = event.find("detail/track")
+    assert track is not None and (track.get("course"), track.get("speed")) == ("270", "3.0")
+    assert event.get("type") == "a-u-G-E-V-C"
+
+
+def test_names_from_elsewhere_stay_xml() -> None:
+    odd = _track(label='<"&\x00\x1bdog>')
+    site = replace(_SITE, height_reference="above ground")
+    event = fromstring(cot_event(odd, site, uid="u", now_ns=_NOW_NS, stale_s=9, types={"person": "x"}))
+    contact, point = event.find("detail/contact"), event.find("point")
+    assert contact is not None and contact.get("callsign") == '<"&dog> 7'
+    assert point is not None and point.get("hae") == "9999999.0"
+
+
+def test_longitude_beyond_the_antimeridian_comes_back() -> None:
+    site = replace(_SITE, origin=Geodetic(-17.0, 179.9999, 0.0))
+    point = fromstring(cot_event(_track(), site, uid="u", now_ns=_NOW_NS, stale_s=9)).find("point")
+    assert point is not None and -180 <= float(point.get("lon", "")) < -179.99
+
+
+@pytest.mark.parametrize(
+    ("url", "place"),
+    [
+        ("udp://239.2.3.1:6969", CotPlace("udp", "239.2.3.1", 6969)),
+        ("udp://tak.local", CotPlace("udp", "tak.local", 6969)),
+        ("tcp://[::1]:9000", CotPlace("tcp", "::1", 9000)),
+        ("tcp://tak.local", CotPlace("tcp", "tak.local", 8087)),
+    ],
+)
+def test_places(url: str, place: CotPlace) -> None:
+    assert cot_place(url) == place
+
+
+@pytest.mark.parametrize("url", ["", "tak.local:4242", "http://tak.local", "udp://:99", "udp://h:77777", "udp://h:0"])
+def test_what_is_no_place(url: str) -> None:
+    with pytest.raises(SettingsError, match="udp://host:port"):
+        cot_place(url)
+
+
+def test_udp_arrives_and_a_dead_receiver_is_an_error_that_passes() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5)
+        port = receiver.getsockname()[1]
+        sender = CotSender(CotPlace("udp", "127.0.0.1", port))
+        sender.send(b"<event/>")
+        assert receiver.recv(100) == b"<event/>"
+    failed = 0
+    for _ in range(2):
+        try:
+            sender.send(b"<event/>")
+        except OSError:
+            failed += 1
+    assert failed == 1
+    sender.send(b"<event/>")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as again:
+        again.bind(("127.0.0.1", port))
+        again.settimeout(5)
+        with pytest.raises(ConnectionRefusedError):  # tells of the datagram before
+            sender.send(b"<event n='2'/>")
+        assert again.recv(100) == b"<event n='2'/>"
+    sender.close()
+
+
+def test_tcp_is_connected_again_after_the_server_went_away() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(5)
+        port = server.getsockname()[1]
+        sender = CotSender(CotPlace("tcp", "127.0.0.1", port))
+        sender.send(b"<a/>")
+        first, _ = server.accept()
+        assert first.recv(100) == b"<a/>"
+        first.sendall(b"<event>what servers send back</event>")
+        sender.send(b"<b/>")
+        assert first.recv(100) == b"<b/>"
+        first.close()
+        time.sleep(0.05)
+        sender.send(b"<c/>")
+        second, _ = server.accept()
+        assert second.recv(100) == b"<c/>"
+        second.close()
+    time.sleep(0.05)
+    with pytest.raises(OSError):
+        sender.send(b"<d/>")
+    sender.close()
