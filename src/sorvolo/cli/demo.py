@@ -15,7 +15,8 @@ from sorvolo.cli.map import map_and_read_reports, show_reports
 from sorvolo.missions.evaluate_changes import evaluate_changes
 from sorvolo.missions.evaluate_mosaic import evaluate_mosaic
 from sorvolo.missions.settings import CompareSettings, MapSettings
-from sorvolo.missions.simulate_site import MARK, simulate_site
+from sorvolo.missions.simulate_site import simulate_site
+from sorvolo.missions.simulation_folder import MARK
 from sorvolo.simulation.presets import preset
 from sorvolo.simulation.settings import SimulationSettings
 from sorvolo.store.exports import plain_json

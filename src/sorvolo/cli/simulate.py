@@ -18,10 +18,16 @@ from rich.progress import (
 )
 
 from sorvolo.errors import SettingsError
+from sorvolo.missions.simulate_pictures import simulate_pictures
 from sorvolo.missions.simulate_site import SimulationProgress, simulate_site
 from sorvolo.simulation.ground import GroundKind
+from sorvolo.simulation.pictures import PictureSettings
 from sorvolo.simulation.presets import preset, preset_names
 from sorvolo.simulation.settings import SimulationSettings
+
+_COLUMNS = (
+    TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
+)
 
 
 def simulate(
@@ -54,6 +60,11 @@ def simulate(
     photos: Annotated[
         bool, typer.Option("--photos", help="Write geo-tagged JPEG photos instead of a video.")
     ] = False,
+    pictures: Annotated[
+        int | None,
+        typer.Option(help="Instead of flights: so many single pictures, each of a site of its own, with COCO boxes."),
+    ] = None,
+    thermal: Annotated[float, typer.Option(help="With --pictures: the share of thermal pictures, 0 to 1.")] = 0.0,
     list_presets: Annotated[bool, typer.Option("--list-presets", help="Name the presets and stop.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object a step.")] = False,
 ) -> None:
@@ -62,12 +73,22 @@ def simulate(
     Example: sorvolo simulate demo-site --preset demo
 
     Example: sorvolo simulate town --preset survey --ground urban --photos --gps-noise 0.5 --telemetry all
+
+    Example: sorvolo simulate labelled --pictures 500 --thermal 0.3 --seed 7
     """
     if list_presets:
         typer.echo("\n".join(preset_names()))
         return
-    settings = preset(preset_name)
     ground_file = None if not ground or ground in list(GroundKind) else Path(ground)
+    if pictures is not None:
+        wanted = PictureSettings(
+            pictures, 1 if seed is None else seed, ground if ground_file is None else "orthophoto", thermal
+        )
+        if height is not None:
+            wanted = replace(wanted, height_m=(height, height))
+        _picture_folder(folder, wanted, ground_file, ground_gsd, as_json)
+        return
+    settings = preset(preset_name)
     if ground:
         kind = ground if ground_file is None else "orthophoto"
         settings = replace(settings, scene=replace(settings.scene, ground=kind))
@@ -93,6 +114,21 @@ def simulate(
         _show(steps, folder)
 
 
+def _picture_folder(
+    folder: Path, settings: PictureSettings, ground_file: Path | None, ground_gsd: float | None, as_json: bool
+) -> None:
+    last = None
+    console = Console(stderr=as_json)
+    with Progress(*_COLUMNS, console=console) as progress:
+        bar = progress.add_task("pictures", total=settings.pictures)
+        for last in simulate_pictures(folder, settings, ground_file, ground_gsd):
+            progress.update(bar, completed=last.pictures_done)
+    if last is not None and as_json:
+        typer.echo(json.dumps(asdict(last)))
+    elif last is not None:
+        console.print(f"{last.pictures_done} pictures with {last.boxes} boxes in {last.seconds:.0f} s: {folder}")
+
+
 def _with_options(
     settings: SimulationSettings, top: dict[str, object], **parts: dict[str, object]
 ) -> SimulationSettings:
@@ -114,10 +150,8 @@ def _size(text: str) -> dict[str, object]:
 
 def _show(steps: Iterator[SimulationProgress], folder: Path) -> None:
     console = Console()
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-               TimeRemainingColumn())
     last = None
-    with Progress(*columns, console=console) as progress:
+    with Progress(*_COLUMNS, console=console) as progress:
         bars: dict[str, int] = {}
         for last in steps:
             if last.stage == "frames":

@@ -1,8 +1,6 @@
 """Make a folder of simulated flights with everything that drones leave behind, and the truth beside it."""
 
 import os
-import platform
-import shutil
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -11,14 +9,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import av
-import cv2
-import numpy as np
-
-from sorvolo import __version__
-from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import utm_epsg
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.missions.simulation_folder import MARK, simulation_description, simulation_folder
 from sorvolo.simulation.events import event_features
 from sorvolo.simulation.flight import SimulatedFlight, simulate_flights
 from sorvolo.simulation.ground import orthophoto_ground
@@ -44,9 +37,6 @@ from sorvolo.store.flight_files import (
 )
 from sorvolo.store.geotiff import write_cog
 from sorvolo.survey.flight import Frame
-
-MARK = "simulation.json"
-"""The file that says that a folder is a simulation, and may be replaced by another."""
 
 _SUFFIXES = {"csv": ".csv", "srt": ".srt", "nmea": ".nmea", "gpx": ".gpx"}
 
@@ -75,35 +65,28 @@ def simulate_site(
     StoreError for a full disk.
     """
     started = time.monotonic()
-    folder = folder.resolve()
-    _demand_free(folder)
     ground = (
         None if ground_file is None else orthophoto_ground(*read_orthophoto(ground_file, ground_m_per_px))
     )
-    partial = folder.with_name(f".{folder.name}.partial")
-    with writing(folder):
-        _remove_ours(partial)
-        partial.mkdir(parents=True)
-    write_json(partial / MARK, _description(settings))
     features: list[dict[str, Any]] = []
-    yield SimulationProgress("site", "", 0, 0, time.monotonic() - started)
-    for flight in simulate_flights(settings, ground):
-        for done in _write_flight(flight, partial / flight.name):
-            yield SimulationProgress("frames", flight.name, done, len(flight), time.monotonic() - started)
-        yield SimulationProgress("truth", flight.name, len(flight), len(flight), time.monotonic() - started)
-        features += frame_features(flight)
-        _write_truth(flight, partial / "truth")
-        if flight.settings.imaging != settings.imaging:
-            write_camera(partial / flight.name / "camera.xml", flight.camera)
-        if flight.number == 1:
-            write_camera(partial / "camera.xml", flight.camera)
-            _write_ground(flight, partial / "truth" / "ground.tif")
-        write_json(partial / "truth" / "frames.geojson", feature_collection(features, flight.site))
-        write_json(
-            partial / "truth" / "objects.geojson",
-            feature_collection(object_features(flight.world, flight.site), flight.site),
-        )
-    _put_in_place(partial, folder)
+    with simulation_folder(folder, MARK, simulation_description(asdict(settings))) as partial:
+        yield SimulationProgress("site", "", 0, 0, time.monotonic() - started)
+        for flight in simulate_flights(settings, ground):
+            for done in _write_flight(flight, partial / flight.name):
+                yield SimulationProgress("frames", flight.name, done, len(flight), time.monotonic() - started)
+            yield SimulationProgress("truth", flight.name, len(flight), len(flight), time.monotonic() - started)
+            features += frame_features(flight)
+            _write_truth(flight, partial / "truth")
+            if flight.settings.imaging != settings.imaging:
+                write_camera(partial / flight.name / "camera.xml", flight.camera)
+            if flight.number == 1:
+                write_camera(partial / "camera.xml", flight.camera)
+                _write_ground(flight, partial / "truth" / "ground.tif")
+            write_json(partial / "truth" / "frames.geojson", feature_collection(features, flight.site))
+            write_json(
+                partial / "truth" / "objects.geojson",
+                feature_collection(object_features(flight.world, flight.site), flight.site),
+            )
     yield SimulationProgress("done", "", len(features), len(features), time.monotonic() - started)
 
 
@@ -190,47 +173,3 @@ def _write_ground(flight: SimulatedFlight, path: Path) -> None:
     site_grid = SiteGrid.at(origin, round(flight.settings.m_per_px, 4), crs)
     ground = orthophoto(flight.day).resampled(flight.settings.m_per_px)
     write_cog(map_tiles(ground, site_grid), site_grid, path)
-
-
-def _description(settings: SimulationSettings) -> dict[str, Any]:
-    return {
-        "made_by": "sorvolo simulate",
-        "versions": {
-            "sorvolo": __version__, "python": platform.python_version(), "numpy": np.__version__,
-            "opencv": cv2.__version__, "av": av.__version__,
-        },
-        "settings": asdict(settings),
-    }
-
-
-def _is_ours(folder: Path) -> bool:
-    try:
-        return '"made_by":"sorvolo simulate"' in (folder / MARK).read_text()
-    except (OSError, UnicodeDecodeError):
-        return False
-
-
-def _demand_free(folder: Path) -> None:
-    if folder.exists() and not folder.is_dir():
-        raise SettingsError(f"{folder} is a file; choose a folder for the simulation")
-    if folder.is_dir() and any(folder.iterdir()) and not _is_ours(folder):
-        raise SettingsError(
-            f"{folder} is not empty and holds no earlier simulation; choose another folder, or empty it"
-        )
-
-
-def _remove_ours(folder: Path) -> None:
-    """Delete what a killed simulation left; it wrote its mark first."""
-    if folder.is_dir() and (_is_ours(folder) or not any(folder.iterdir())):
-        shutil.rmtree(folder)
-
-
-def _put_in_place(partial: Path, folder: Path) -> None:
-    """Rename the finished folder to its place; an earlier simulation steps aside first and goes last."""
-    old = folder.with_name(f".{folder.name}.old")
-    with writing(folder):
-        _remove_ours(old)
-        if folder.exists():
-            os.replace(folder, old)
-        os.replace(partial, folder)
-        shutil.rmtree(old, ignore_errors=True)

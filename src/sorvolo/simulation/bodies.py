@@ -5,7 +5,7 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, ImageRGBA
 from sorvolo.simulation.noise import fractal
-from sorvolo.simulation.objects import Body, Label, Light, Standing, Thing
+from sorvolo.simulation.objects import LYING, Body, Label, Light, Standing, Thing
 from sorvolo.simulation.view import Patch, cut_out, opaque
 
 _BOTH_SIDES = np.zeros(3)
@@ -95,13 +95,15 @@ def _box_walls(length_m: float, width_m: float, height_m: float, texel_m: float,
 
 
 def _person(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Patch | Standing]:
-    height = thing.size_m[2]
+    is_lying = thing.kind == LYING
+    height = thing.size_m[0 if is_lying else 2]
     shirt, trousers = _CLOTHES[rng.integers(len(_CLOTHES))], rng.uniform(25, 90) * np.array([0.9, 0.95, 1.15])
     skin, hair = (
         np.array([205.0, 160, 130]) * rng.uniform(0.55, 1.05),
         np.array([60.0, 44, 32]) * rng.uniform(0.4, 2.2),
     )
-    rows = max(6, _texels(height, 2.0 * texel_m))
+    # an upright body is seen from above, foreshortened
+    rows = max(6, _texels(height, texel_m if is_lying else 2.0 * texel_m))
     columns = max(4, _texels(0.5, texel_m))
     z = (1 - (np.arange(rows) + 0.5) / rows)[:, None]
     x = np.abs((np.arange(columns) + 0.5) / columns * 2 - 1)[None, :] * 0.25  # metres from the middle
@@ -109,6 +111,11 @@ def _person(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator
     silhouette = np.clip((half - x) / (0.5 / columns) + 0.5, 0, 1).astype(np.float32)
     colour = np.where((z > 0.87)[..., None], skin, np.where((z > 0.48)[..., None], shirt, trousers))
     body = np.broadcast_to(colour * 0.8, (rows, columns, 3)).astype(np.uint8)
+    if is_lying:  # the head forward; the light falls on it from above
+        bright = np.clip(colour * light.shade(_UP), 0, 255)
+        flat = cut_out(np.broadcast_to(bright, (rows, columns, 3)).astype(np.uint8), silhouette)
+        rotated = np.ascontiguousarray(np.rot90(flat, -1))
+        return [_level((0.0, 0, share * thing.size_m[2]), (height, 0.5), rotated) for share in (0.3, 1.0)]
     arms = _disc((0.26, 0.52), texel_m, shirt, light.shade(_UP))
     head = _disc((0.2, 0.17), texel_m, hair, light.shade(_UP))
     feet = _disc((0.3, 0.3), texel_m, trousers, 0.8)

@@ -196,7 +196,7 @@ class SimulatedFlight:
         moved = end - start
         if np.hypot(*moved) < 0.3:
             return image
-        return np.asarray(cv2.filter2D(image, -1, _line_kernel(moved)), np.uint8)
+        return np.asarray(cv2.filter2D(image, -1, line_kernel(moved)), np.uint8)
 
     def _cloud_light(self, index: int) -> NDArray[np.float32]:
         """(height, width) how much light clouds leave on the ground at each pixel."""
@@ -288,7 +288,7 @@ def _set_up(settings: SimulationSettings, path: FlownPath, rng: np.random.Genera
     )
 
 
-def _line_kernel(moved_px: Floats) -> NDArray[np.float32]:
+def line_kernel(moved_px: Floats) -> NDArray[np.float32]:
     """The blur of a point that moves evenly along `moved_px`, (2,), symmetric about its middle."""
     steps = max(8, int(8 * np.hypot(*moved_px)))
     half = int(np.ceil(np.abs(moved_px).max() / 2)) + 1

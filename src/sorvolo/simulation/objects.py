@@ -34,6 +34,9 @@ class Label(StrEnum):
 SMALL_KINDS = ("box", "big box", "suitcase", "metal suitcase", "bag", "tyre", "gas bottle")
 """The small objects of the thesis's Table 2.4."""
 
+LYING = "lying person"
+"""The kind of a person who lies on the ground: whom search teams look for."""
+
 _SMALL_SIZES_M = {  # length, width, height
     "box": (0.45, 0.35, 0.32), "big box": (0.95, 0.75, 0.7), "suitcase": (0.72, 0.48, 0.28),
     "metal suitcase": (0.55, 0.4, 0.2), "bag": (0.6, 0.36, 0.3), "tyre": (0.66, 0.66, 0.2),
@@ -147,7 +150,7 @@ def new_size(label: Label, kind: str, rng: np.random.Generator) -> tuple[float, 
     """A likely length, width and height in metres."""
     if label is Label.PERSON:
         height = float(rng.uniform(1.6, 1.88))
-        return 0.34, 0.52, height
+        return (height, 0.5, 0.24) if kind == LYING else (0.34, 0.52, height)
     if label is Label.CAR:
         return _CAR_SIZES_M[kind]
     if label is Label.SMALL:

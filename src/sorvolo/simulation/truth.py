@@ -1,7 +1,7 @@
 """The answers: where every frame lies, what stands where, and which pixels show it; plain values for
 files."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -16,7 +16,7 @@ from sorvolo.geometry.pose import gimbal_angles_from_rotation
 from sorvolo.simulation.canvas import GroundRaster
 from sorvolo.simulation.flight import SimulatedFlight, has_changed
 from sorvolo.simulation.objects import Label, Thing
-from sorvolo.simulation.rendering import render_labels
+from sorvolo.simulation.rendering import Labels, render_labels
 from sorvolo.simulation.world import World
 
 CATEGORIES = (Label.PERSON, Label.CAR, Label.SMALL)
@@ -104,7 +104,6 @@ def coco_boxes(flight: SimulatedFlight, frames: Iterable[int]) -> dict[str, Any]
     share of the object that nothing hides within the picture, `area` its visible pixels."""
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
-    kinds = {thing.id: thing for thing in flight.day.things if thing.label.is_target}
     for index in frames:
         images.append({
             "id": index, "file_name": _picture_name(flight, index), "width": flight.camera.width_px,
@@ -114,31 +113,39 @@ def coco_boxes(flight: SimulatedFlight, frames: Iterable[int]) -> dict[str, Any]
             flight.day.things, flight.day.bodies, flight.view(index), flight.true_poses[index],
             float(flight.from_middle_s[index]),
         )
-        for thing_id in np.unique(labels):
-            thing = kinds.get(int(thing_id))
-            if thing is None:
-                continue
-            rows, columns = np.nonzero(labels == thing_id)
-            if len(rows) < _FEWEST_PX:
-                continue
-            left, top = int(columns.min()), int(rows.min())
-            annotations.append(
-                {
-                    "id": len(annotations) + 1,
-                    "image_id": index,
-                    "category_id": CATEGORIES.index(thing.label) + 1,
-                    "bbox": [left, top, int(columns.max()) - left + 1, int(rows.max()) - top + 1],
-                    "area": len(rows),
-                    "iscrowd": 0,
-                    "object_id": thing.id,
-                    "visibility": round(len(rows) / totals[thing.id], 4),
-                }
-            )
+        annotations += box_rows(flight.day.things, labels, totals, index, len(annotations) + 1)
     return {
-        "info": {"description": f"simulated {flight.name}"},
-        "categories": [{"id": i, "name": str(label)} for i, label in enumerate(CATEGORIES, start=1)],
+        "info": {"description": f"simulated {flight.name}"}, "categories": coco_categories(),
         "images": images, "annotations": annotations,
     }
+
+
+def coco_categories() -> list[dict[str, Any]]:
+    """COCO's rows of the classes."""
+    return [{"id": i, "name": str(label)} for i, label in enumerate(CATEGORIES, start=1)]
+
+
+def box_rows(
+    things: Iterable[Thing], labels: Labels, totals: Mapping[int, int], image_id: int, first_id: int
+) -> list[dict[str, Any]]:
+    """COCO's annotations of one picture whose `labels` and `totals` are those of `render_labels`."""
+    rows: list[dict[str, Any]] = []
+    targets = {thing.id: thing for thing in things if thing.label.is_target}
+    for thing_id in np.unique(labels):
+        thing = targets.get(int(thing_id))
+        if thing is None:
+            continue
+        y, x = np.nonzero(labels == thing_id)
+        if len(y) < _FEWEST_PX:
+            continue
+        left, top = int(x.min()), int(y.min())
+        rows.append({
+            "id": first_id + len(rows), "image_id": image_id, "category_id": CATEGORIES.index(thing.label) + 1,
+            "bbox": [left, top, int(x.max()) - left + 1, int(y.max()) - top + 1],
+            "area": len(y), "iscrowd": 0, "object_id": thing.id,
+            "visibility": round(len(y) / totals[thing.id], 4),
+        })
+    return rows
 
 
 def change_mask(flight: SimulatedFlight, index: int) -> ImageGray:

@@ -142,31 +142,33 @@ def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px:
     return Day(ground, things, bodies, shadows, light, gains, cloud_shade)
 
 
+def scenery(ground: str, layout: Layout, rng: np.random.Generator) -> tuple[Thing, ...]:
+    """The houses, trees and bushes of a layout, ids from 1; towns have flat roofs."""
+    roof = "flat roof" if ground == GroundKind.URBAN else "gable roof"
+    things: list[Thing] = []
+    for kind, label, places in (
+        (roof, Label.HOUSE, layout.houses), ("tree", Label.TREE, layout.trees), ("bush", Label.TREE, layout.bushes),
+    ):
+        for east, north, yaw in places:
+            size = new_size(label, kind, rng)
+            seed = int(rng.integers(2**31))
+            things.append(Thing(len(things) + 1, label, kind, float(east), float(north), float(yaw), size, seed))
+    return tuple(things)
+
+
+def is_free(thing: Thing, others: Sequence[Thing]) -> bool:
+    """Whether a thing can stand where it is beside the others, a little air between them."""
+    return all(
+        np.hypot(thing.east_m - other.east_m, thing.north_m - other.north_m)
+        > thing.reach_m * 0.8 + other.reach_m * (0.9 if other.label is not Label.HOUSE else 1.05) + 0.6
+        for other in others
+    )
+
+
 def _furnish(scene: SceneSettings, layout: Layout, waypoints_m: Floats, settings: SimulationSettings,
              rng: np.random.Generator) -> tuple[Thing, ...]:
     """The things of the first flight: scenery first, then targets."""
-    things: list[Thing] = []
-    if scene.has_scenery:
-        roof = "flat roof" if scene.ground == GroundKind.URBAN else "gable roof"
-        for kind, label, places in (
-            (roof, Label.HOUSE, layout.houses),
-            ("tree", Label.TREE, layout.trees),
-            ("bush", Label.TREE, layout.bushes),
-        ):
-            for east, north, yaw in places:
-                size = new_size(label, kind, rng)
-                things.append(
-                    Thing(
-                        len(things) + 1,
-                        label,
-                        kind,
-                        float(east),
-                        float(north),
-                        float(yaw),
-                        size,
-                        int(rng.integers(2**31)),
-                    )
-                )
+    things = list(scenery(scene.ground, layout, rng)) if scene.has_scenery else []
     wanted = [Label.PERSON] * scene.people + [Label.CAR] * scene.cars + [Label.SMALL] * scene.small_objects
     for label in wanted:
         things.append(_place(label, len(things) + 1, things, layout, waypoints_m, settings, rng))
@@ -222,17 +224,9 @@ def _place(label: Label, thing_id: int, others: list[Thing], layout: Layout, way
             east, north = along + rng.uniform(-half_strip_m, half_strip_m, 2)
             yaw = rng.uniform(0, 360)
         thing = replace(thing, east_m=float(east), north_m=float(north), yaw_deg=float(yaw))
-        if _is_free(thing, others):
+        if is_free(thing, others):
             break
     return thing  # on a crowded site the last try stands: two boxes may touch
-
-
-def _is_free(thing: Thing, others: list[Thing]) -> bool:
-    return all(
-        np.hypot(thing.east_m - other.east_m, thing.north_m - other.north_m)
-        > thing.reach_m * 0.8 + other.reach_m * (0.9 if other.label is not Label.HOUSE else 1.05) + 0.6
-        for other in others
-    )
 
 
 def _set_off(thing: Thing, others: list[Thing], rng: np.random.Generator) -> Thing:

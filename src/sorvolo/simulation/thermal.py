@@ -1,0 +1,97 @@
+"""A site as a thermal camera sees it: warmth in grey levels in place of colour, white hot or black hot."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from sorvolo.geometry.arrays import Floats, ImageRGB, ImageRGBA
+from sorvolo.simulation.canvas import GroundRaster
+from sorvolo.simulation.noise import layer
+from sorvolo.simulation.objects import Body, Label, Standing, Thing
+from sorvolo.simulation.photographed import recompressed
+from sorvolo.simulation.view import Patch, cut_out
+from sorvolo.simulation.world import Day
+
+_GROUND = 90.0
+_UP_SIDES = np.zeros(3)
+# how much warmer than the ground, in grey levels of the span that `_GROUND` leaves; people always stand out
+_WARMTH = {
+    Label.PERSON: (35.0, 140.0), Label.CAR: (-45.0, 55.0), Label.SMALL: (-35.0, 40.0), Label.TREE: (-15.0, 25.0),
+    Label.HOUSE: (-30.0, 45.0),
+}
+_LEAST_CONTRAST = 12.0  # of targets: what is as warm as the ground cannot be seen, nor be asked for
+
+
+def warm_day(day: Day, bare: GroundRaster, rng: np.random.Generator) -> Day:
+    """The day with warmth for colour, the same in its three channels; `bare` is its ground without shadows.
+
+    By day the sun's shadows are cool; by night they are gone. Two cars in three have a warm engine.
+    """
+    has_sun = rng.uniform() < 0.4
+    raster = day.ground if has_sun else bare.resampled(day.ground.m_per_px[0])
+    spread, turn = rng.uniform(0.1, 0.5), 1.0 if has_sun else rng.choice((-1.0, 1.0))
+    grey = cv2.GaussianBlur(raster.rgb.mean(axis=2).astype(np.float32), (0, 0), 1.2)
+    warmth = _GROUND + np.float32(spread * turn) * (grey - grey.mean())
+    warmth += np.float32(rng.uniform(2, 9)) * layer(rng, warmth.shape[:2], 4.0 / raster.m_per_px[0])
+    ground = replace(raster, rgb=np.dstack([np.clip(warmth, 0, 255).astype(np.uint8)] * 3))
+    bodies = {thing.id: _warm_body(thing, day.bodies[thing.id], rng) for thing in day.things}
+    return replace(day, ground=ground, bodies=bodies)
+
+
+def heat_picture(image: ImageRGB, rng: np.random.Generator) -> ImageRGB:
+    """The rendered warmth as a thermal camera shows it: soft, noisy, striped, stretched to its own range."""
+    warmth = image[..., 0].astype(np.float32)
+    warmth = np.asarray(cv2.GaussianBlur(warmth, (0, 0), rng.uniform(0.5, 1.3)), np.float32)
+    warmth = warmth + np.float32(rng.uniform(0.5, 3.0)) * rng.standard_normal(warmth.shape, dtype=np.float32)
+    stripes = rng.standard_normal(warmth.shape[1], dtype=np.float32)
+    warmth += np.float32(rng.uniform(0, 1.5)) * stripes
+    low, high = np.percentile(warmth, (0.5, 99.8))
+    room = max(float(high - low), 40.0)
+    shown = np.clip((warmth - low + rng.uniform(0, 0.3) * room) / (room * rng.uniform(1.0, 1.5)), 0, 1)
+    if rng.uniform() < 0.35:  # black hot
+        shown = 1 - shown
+    return recompressed(np.dstack([np.round(255 * shown).astype(np.uint8)] * 3), rng)
+
+
+def _warm_body(thing: Thing, body: Body, rng: np.random.Generator) -> Body:
+    low, high = _WARMTH[thing.label]
+    warmth = float(rng.uniform(low, high))
+    if thing.label.is_target and abs(warmth) < _LEAST_CONTRAST:
+        warmth = float(np.copysign(_LEAST_CONTRAST, warmth))
+    detail = float(rng.uniform(0.3, 0.8) if thing.label is Label.TREE else rng.uniform(0.05, 0.25))
+    mean = _mean_grey([part.texture for part in body.parts])
+    parts: list[Patch | Standing] = [
+        replace(part, texture=_warmed(part.texture, _GROUND + warmth, detail, mean)) for part in body.parts
+    ]
+    if thing.label is Label.PERSON and len(parts) > 2:  # feet and clothes are cooler than the head
+        parts[0] = replace(parts[0], texture=_warmed(body.parts[0].texture, _GROUND + 0.6 * warmth, detail, mean))
+        parts[-1] = replace(parts[-1], texture=_warmed(body.parts[-1].texture, _GROUND + 1.2 * warmth, detail, mean))
+    if thing.label is Label.CAR and rng.uniform() < 0.65:
+        parts.insert(5, _engine(thing, _GROUND + float(rng.uniform(30, 140))))  # above the bonnet, below the cabin
+    return Body(tuple(parts))
+
+
+def _engine(thing: Thing, warmth: float) -> Patch:
+    """A soft warm spot on the bonnet."""
+    length, width, height = thing.size_m
+    y, x = np.mgrid[-1:1:16j, -1:1:16j]
+    alpha = np.clip(1.2 * (1 - np.hypot(x, y)), 0, 1).astype(np.float32)
+    texture = cut_out(np.full((16, 16, 3), np.clip(warmth, 0, 255), np.uint8), alpha)
+    z = 0.6 * height
+    back, front, side = 0.16 * length, 0.48 * length, 0.42 * width
+    corners: Floats = np.array([[back, side, z], [front, side, z], [front, -side, z], [back, -side, z]])
+    return Patch.spanned(corners, texture, _UP_SIDES)
+
+
+def _mean_grey(textures: list[ImageRGBA]) -> float:
+    weight = sum(float(texture[..., 3].sum(dtype=np.int64)) for texture in textures) / 255
+    return sum(float(texture[..., :3].sum(dtype=np.int64)) for texture in textures) / (3 * max(weight, 1.0))
+
+
+def _warmed(texture: ImageRGBA, warmth: float, detail: float, mean: float) -> ImageRGBA:
+    """The texture at this warmth, what was brighter than `mean` a little warmer."""
+    alpha = texture[..., 3].astype(np.float32) / 255
+    grey = texture[..., :3].mean(axis=2)  # already multiplied by alpha
+    value = np.clip((warmth - detail * mean) * alpha + detail * grey, 0, 255 * alpha)
+    return np.dstack([value, value, value, texture[..., 3]]).round().astype(np.uint8)
