@@ -1,0 +1,120 @@
+"""Pictures with what was found drawn in, and a video of them."""
+
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import av
+import cv2
+import numpy as np
+
+from sorvolo.geometry.arrays import BoxesPx, ImageRGB
+from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes, sync_file, writing
+from sorvolo.store.images import jpeg_from_image
+
+_COLOURS = ((255, 196, 0), (0, 200, 255), (255, 90, 160), (120, 230, 80), (190, 140, 255), (255, 140, 60))
+_VIDEO_SIDE_PX = 1920  # of the longer side: larger videos help no one on a screen and take long
+_TICKS_PER_S = 90_000
+
+
+def annotated(
+    image: ImageRGB, boxes_px: BoxesPx, labels: Sequence[int], words: Sequence[str], counted: Sequence[bool],
+    headline: str = "",
+) -> ImageRGB:
+    """A copy of the picture (H, W, 3) with boxes (N, 4), each in its class's colour with its words above.
+
+    Boxes that are `counted` (of confirmed tracks) are drawn strong, the others thin. The headline stands top left.
+    """
+    drawn = image.copy()
+    size = max(image.shape[:2]) / 1280
+    strong, letters = max(2, round(2 * size)), max(0.4, 0.5 * size)
+    # the strong ones last, so that nothing hides them
+    for row in sorted(range(len(boxes_px)), key=lambda each: counted[each]):
+        colour = _COLOURS[labels[row] % len(_COLOURS)]
+        left, top, right, bottom = (round(float(edge)) for edge in boxes_px[row])
+        cv2.rectangle(drawn, (left, top), (right, bottom), colour, strong if counted[row] else 1, cv2.LINE_AA)
+        if words[row]:
+            _write(drawn, words[row], (left, max(top - 4, round(24 * letters))), letters, colour)
+    if headline:
+        _write(drawn, headline, (8, round(32 * letters) + 6), 1.2 * letters, (255, 255, 255))
+    return drawn
+
+
+def write_annotated(folder: Path, name: str, picture: ImageRGB) -> None:
+    """Write an annotated picture `<name>.jpg` into the folder, which is made. Raises StoreError on a full disk."""
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    atomic_write_bytes(folder / f"{name}.jpg", jpeg_from_image(picture), durable=False)
+
+
+class AnnotatedVideo:
+    """An H.264 video that takes pictures at their own times; its file appears when it is closed.
+
+    It is written in fragments, so that what a killed run left (a name beginning with `.tmp-`) can be played all the
+    same. Pictures of more than 1920 px are made smaller. Raises StoreError on a full disk.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._temporary = path.with_name(f"{TEMPORARY_PREFIX}{path.name}")
+        self._container: av.container.OutputContainer | None = None
+        self._stream: av.VideoStream | None = None
+        self._first_ns, self._last_tick = 0, -1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def add(self, picture: ImageRGB, time_ns: int) -> None:
+        """Append one picture; times rise."""
+        with writing(self._path):
+            if self._container is None or self._stream is None:
+                self._begin(picture, time_ns)
+            assert self._container is not None and self._stream is not None
+            size = (self._stream.width, self._stream.height)
+            if picture.shape[1::-1] != size:
+                picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            tick = max((time_ns - self._first_ns) * _TICKS_PER_S // 1_000_000_000, self._last_tick + 1)
+            frame.pts, frame.time_base = tick, Fraction(1, _TICKS_PER_S)
+            self._last_tick = tick
+            self._container.mux(self._stream.encode(frame))
+
+    def close(self) -> None:
+        """Put the video in its place; nothing where no picture came."""
+        container, self._container = self._container, None
+        if container is None or self._stream is None:
+            return
+        with writing(self._path):
+            container.mux(self._stream.encode())
+            container.close()
+            sync_file(self._temporary)
+            self._temporary.replace(self._path)
+
+    def _begin(self, picture: ImageRGB, time_ns: int) -> None:
+        height, width = picture.shape[:2]
+        scale = min(1.0, _VIDEO_SIDE_PX / max(height, width))
+        self._container = av.open(
+            str(self._temporary), "w", format="mp4",
+            container_options={"movflags": "+frag_keyframe+empty_moov+default_base_moof"},
+        )
+        stream = self._container.add_stream("libx264", rate=30)
+        stream.width, stream.height = (max(2, round(side * scale) // 2 * 2) for side in (width, height))
+        stream.pix_fmt = "yuv420p"
+        stream.codec_context.time_base = Fraction(1, _TICKS_PER_S)
+        stream.options = {"crf": "23", "preset": "veryfast", "g": "60"}
+        self._stream, self._first_ns = stream, time_ns
+
+
+def _write(picture: ImageRGB, words: str, corner: tuple[int, int], size: float, colour: tuple[int, int, int]) -> None:
+    """Words with a dark rim, readable on any ground; OpenCV's letters are ASCII."""
+    plain = words.encode("ascii", "replace").decode()
+    thick = max(1, round(2 * size))
+    for tone, width in (((0, 0, 0), thick + 2), (colour, thick)):
+        cv2.putText(picture, plain, corner, cv2.FONT_HERSHEY_SIMPLEX, size, tone, width, cv2.LINE_AA)

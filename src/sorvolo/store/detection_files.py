@@ -1,0 +1,218 @@
+"""The folder of a watch: a line for each detection as it is made, places and tracks as GeoJSON, crops of tracks."""
+
+import json
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from sorvolo.errors import StoreError
+from sorvolo.geometry.arrays import Floats, ImageRGB, TimesNs
+from sorvolo.store.atomic import atomic_path, atomic_write_bytes, remove_leftovers, writing
+from sorvolo.store.exports import geojson_bytes, json_bytes, longitude_latitude, plain_json, rounded, utc_text
+from sorvolo.store.images import jpeg_from_image
+from sorvolo.survey.flight import Frame, Site
+from sorvolo.survey.objects import Sighting, Track
+
+MARK = "watch.json"
+"""The file that says that a folder is a watch's, and of which source."""
+
+LINES, DETECTIONS, TRACKS, CROPS = "detections.jsonl", "detections.geojson", "tracks.geojson", "objects"
+ANNOTATED_VIDEO, ANNOTATED_PICTURES, LABELS = "annotated.mp4", "annotated", "labels"
+
+_OURS = (
+    LINES, DETECTIONS, TRACKS, CROPS, ANNOTATED_VIDEO, ANNOTATED_PICTURES, LABELS, "report.json", "report.html",
+)
+_MADE_BY = "sorvolo watch"
+
+
+def claim_folder(folder: Path, source: str, fingerprint: str, *, replaces: bool = True) -> None:
+    """Make the folder, or empty it of an earlier watch of the very same source, and mark it.
+
+    Other files in it stay. Raises StoreError for a folder with anything but such a watch; without `replaces` (a live
+    stream is never the same twice) for one with any watch.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise StoreError(f"{folder} is a file; give a folder with --out")
+    if folder.is_dir() and any(folder.iterdir()):
+        earlier = _mark_of(folder)
+        if earlier is None:
+            raise StoreError(f"{folder} is not empty and holds no earlier watch; give another folder with --out")
+        if not replaces or (earlier.get("source"), earlier.get("fingerprint")) != (source, fingerprint):
+            raise StoreError(
+                f"{folder} holds a watch of {earlier.get('source')}, which stays; give another folder with --out"
+            )
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        remove_leftovers([folder])
+        for name in _OURS:
+            if (folder / name).is_dir():
+                shutil.rmtree(folder / name)
+            else:
+                (folder / name).unlink(missing_ok=True)
+    atomic_write_bytes(
+        folder / MARK, json_bytes({"made_by": _MADE_BY, "source": source, "fingerprint": fingerprint})
+    )
+
+
+class DetectionLines:
+    """`detections.jsonl`, a JSON object a line; all that was appended can be read, even after a kill."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / LINES
+        with writing(self._path):
+            self._file = self._path.open("wb")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def append(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Write rows and hand them to the operating system. Raises StoreError on a full disk."""
+        lines = [json.dumps(plain_json(row), ensure_ascii=False, allow_nan=False) + "\n" for row in rows]
+        if lines:
+            with writing(self._path):
+                self._file.write("".join(lines).encode())
+                self._file.flush()
+
+
+def detection_row(
+    frame: Frame, time_ns: int, name: str, score: float, box_px: Sequence[float], sighting: Sighting | None,
+    track_id: int | None, site: Site,
+) -> dict[str, Any]:
+    """One detection for `detections.jsonl` (docs/formats.md); without a sighting it has no place on the ground."""
+    row: dict[str, Any] = {
+        "frame": frame.name, "time": utc_text(time_ns), "class": name, "score": rounded(score, 4),
+        "box_px": [rounded(edge, 1) for edge in box_px], "track": track_id,
+    }
+    if sighting is not None:
+        row |= _place(sighting.position_m, site)
+        row |= {"sigma_m": rounded(sighting.sigma_m, 3), "size_m": [rounded(side, 3) for side in sighting.size_m]}
+    return row
+
+
+def write_detections_geojson(folder: Path, site: Site) -> int:
+    """Make `detections.geojson` of the lines written so far; how many there are.
+
+    One point for each detection, without geometry where it has no place on the ground. For a local site coordinates
+    are pixels of the first frame and "crs" is null.
+    """
+    head: dict[str, Any] = {"type": "FeatureCollection", "name": "detections"}
+    if site.is_local:
+        head["crs"] = None
+    count = 0
+    with (
+        (folder / LINES).open(encoding="utf-8") as lines,
+        atomic_path(folder / DETECTIONS) as path,
+        path.open("w", encoding="utf-8") as file,
+    ):
+        file.write(json.dumps(head)[:-1] + ', "features": [\n')
+        for line in lines:
+            row = json.loads(line)
+            feature = {"type": "Feature", "geometry": _point(row), "properties": row}
+            file.write((",\n" if count else "") + json.dumps(feature, ensure_ascii=False))
+            count += 1
+        file.write("\n]}\n")
+    return count
+
+
+def track_properties(track: Track, site: Site) -> dict[str, Any]:
+    """What is told of a track: its properties in tracks.geojson, the body of an alert."""
+    east, north = track.velocity_m_s
+    return {
+        "id": track.id, "class": track.label, "score": rounded(track.score, 4),
+        **_place(track.position_m, site),
+        "sigma_m": rounded(track.sigma_m, 3), "size_m": [rounded(side, 3) for side in track.size_m],
+        "first_seen": utc_text(track.first_seen_ns), "last_seen": utc_text(track.last_seen_ns),
+        "views": track.views, "passes": track.passes, "moving": track.moving,
+        "velocity_m_s": [rounded(east, 3), rounded(north, 3)] if track.moving else None,
+        "class_scores": {name: rounded(share, 4) for name, share in track.class_scores.items()},
+        "best_frame": track.best.frame_name, "best_box_px": [rounded(float(edge), 1) for edge in track.best.box_px],
+    }
+
+
+def tracks_geojson(tracks: Iterable[Track], site: Site, crops: Mapping[int, str]) -> dict[str, Any]:
+    """Confirmed tracks as a GeoJSON FeatureCollection: a point each, its path as a property (docs/formats.md).
+
+    `crops` are the crops' file names by track. For a local site coordinates are pixels of the first frame and "crs"
+    is null.
+    """
+    collection: dict[str, Any] = {"type": "FeatureCollection", "name": "tracks"}
+    if site.is_local:
+        collection["crs"] = None
+    features = []
+    for track in tracks:
+        properties = track_properties(track, site)
+        features.append({
+            "type": "Feature", "id": track.id, "geometry": _point(properties),
+            "properties": {**properties, "crop": crops.get(track.id), "path": _path(track.path_m, track.path_ns, site)},
+        })
+    collection["features"] = features
+    return collection
+
+
+def write_tracks(folder: Path, tracks: Iterable[Track], site: Site, crops: Mapping[int, str]) -> None:
+    """Replace `tracks.geojson`: readers see the old one or the new one."""
+    atomic_write_bytes(folder / TRACKS, geojson_bytes(tracks_geojson(tracks, site, crops)), durable=False)
+
+
+def crop_around(image: ImageRGB, box_px: Floats | Sequence[float], *, margin: float = 0.6) -> ImageRGB:
+    """The part of the picture around a box (BoxesPx), wider by `margin` of its longer side, at least 24 px a side."""
+    left, top, right, bottom = (float(edge) for edge in box_px)
+    reach_px = max((0.5 + margin) * max(right - left, bottom - top), 12.0)
+    x, y = (left + right) / 2, (top + bottom) / 2
+    height, width = image.shape[:2]
+    columns = slice(int(max(0, np.floor(x - reach_px))), int(min(width, np.ceil(x + reach_px))))
+    rows = slice(int(max(0, np.floor(y - reach_px))), int(min(height, np.ceil(y + reach_px))))
+    return image[rows, columns].copy()
+
+
+def write_crop(folder: Path, track_id: int, crop: ImageRGB) -> str:
+    """Write a track's crop; its file's name within the folder."""
+    name = f"{CROPS}/{track_id}.jpg"
+    with writing(folder / CROPS):
+        (folder / CROPS).mkdir(exist_ok=True)
+    atomic_write_bytes(folder / name, jpeg_from_image(crop), durable=False)
+    return name
+
+
+def _mark_of(folder: Path) -> dict[str, Any] | None:
+    """What the folder's mark says; None where it has none of ours."""
+    try:
+        mark = json.loads((folder / MARK).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return mark if isinstance(mark, dict) and mark.get("made_by") == _MADE_BY else None
+
+
+def _place(position_m: Floats, site: Site) -> dict[str, Any]:
+    if site.is_local:
+        return {"x_px": rounded(position_m[0], 2), "y_px": rounded(position_m[1], 2)}
+    longitude, latitude = longitude_latitude(position_m[None], site)
+    return {
+        "latitude": rounded(latitude[0], 8), "longitude": rounded(longitude[0], 8),
+        "east_m": rounded(position_m[0], 3), "north_m": rounded(position_m[1], 3),
+    }
+
+
+def _point(row: Mapping[str, Any]) -> dict[str, Any] | None:
+    keys = ("longitude", "latitude") if "longitude" in row else ("x_px", "y_px")
+    coordinates = [row.get(key) for key in keys]
+    return None if None in coordinates else {"type": "Point", "coordinates": coordinates}
+
+
+def _path(path_m: Floats, path_ns: TimesNs, site: Site) -> dict[str, Any]:
+    points = np.asarray(path_m, dtype=np.float64).reshape(-1, 2)
+    if not site.is_local:
+        points = np.column_stack(longitude_latitude(points, site))
+    return {
+        "coordinates": [[round(float(x), 8), round(float(y), 8)] for x, y in points],
+        "times": [utc_text(int(time_ns)) for time_ns in path_ns],
+    }
