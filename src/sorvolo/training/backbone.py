@@ -1,0 +1,108 @@
+"""Pictures to features: EfficientNet-Lite0 (Tan and Le 2019, without squeeze and swish), its layers named as its
+published weights name them."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+_EPSILON = 1e-3
+_BLOCKS = (  # repeats, kernel, stride, growth, out channels
+    (1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112), (4, 5, 2, 6, 192),
+    (1, 3, 1, 6, 320),
+)
+
+
+class SamePadded(nn.Conv2d):
+    """A convolution padded as TensorFlow's "same": what is odd goes to the right and bottom."""
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(N, C, H, W) -> (N, D, ceil(H / stride), ceil(W / stride)), for sides that the stride divides."""
+        total = self.kernel_size[0] - self.stride[0]
+        before = total // 2
+        after = total - before
+        if before == after:
+            return functional.conv2d(features, self.weight, self.bias, self.stride, before, groups=self.groups)
+        padded = functional.pad(features, (before, after, before, after))
+        return functional.conv2d(padded, self.weight, self.bias, self.stride, groups=self.groups)
+
+
+class _Block(nn.Module):
+    """Inverted residual: widen, filter each channel by itself, narrow."""
+
+    def __init__(self, channels: int, out: int, kernel: int, stride: int, growth: int) -> None:
+        super().__init__()
+        wide = channels * growth
+        if growth > 1:
+            self._expand_conv = SamePadded(channels, wide, 1)
+        self._depthwise_conv = SamePadded(wide, wide, kernel, stride, groups=wide)
+        self._project_conv = SamePadded(wide, out, 1)
+        self._is_residual = stride == 1 and channels == out
+
+    def forward(self, features: Tensor) -> Tensor:
+        x = features
+        if hasattr(self, "_expand_conv"):
+            x = functional.relu6(self._expand_conv(x))
+        x = functional.relu6(self._depthwise_conv(x))
+        x = self._project_conv(x)
+        return x + features if self._is_residual else x
+
+
+class EfficientNetLite0(nn.Module):
+    """Features of strides 4, 8 and 16 (24, 40 and 112 channels), of 32 too (320) if `deep`.
+
+    Its batch norms, which would stay as ImageNet left them, are folded into the convolutions; the layers up to stride 4
+    are frozen unless `thaw_all`. Input: (N, 3, H, W) floats 0 to 255, sides multiples of the last stride.
+    """
+
+    def __init__(self, *, deep: bool = False, thaw_all: bool = False) -> None:
+        super().__init__()
+        self._conv_stem = SamePadded(3, 32, 3, 2)
+        blocks: list[_Block] = []
+        channels = 32
+        for repeats, kernel, stride, growth, out in _BLOCKS if deep else _BLOCKS[:5]:
+            for repeat in range(repeats):
+                blocks.append(_Block(channels, out, kernel, stride if repeat == 0 else 1, growth))
+                channels = out
+        self._blocks = nn.ModuleList(blocks)
+        self._taps = (2, 4, 10, 15) if deep else (2, 4, 10)
+        self.channels = (24, 40, 112, 320) if deep else (24, 40, 112)
+        self.strides = (4, 8, 16, 32) if deep else (4, 8, 16)
+        if not thaw_all:
+            for module in (self._conv_stem, *self._blocks[:3]):
+                for weight in module.parameters():
+                    weight.requires_grad = False
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        """One tensor (N, channels, H / stride, W / stride) per stride."""
+        x = functional.relu6(self._conv_stem((images - 127.0) / 128.0))
+        levels = []
+        for index, block in enumerate(self._blocks):
+            x = block(x)
+            if index in self._taps:
+                levels.append(x)
+        return levels
+
+    def load_imagenet(self, weights: dict[str, Tensor]) -> None:
+        """Take the published weights; layers that this net does not have are left out.
+
+        Raises KeyError when a layer of this net is missing there.
+        """
+        norms = {"_conv_stem": "_bn0", "_expand_conv": "_bn0", "_depthwise_conv": "_bn1", "_project_conv": "_bn2"}
+        folded = {}
+        for name in self.state_dict():
+            layer, kind = name.rsplit(".", 1)
+            place, own = layer.rpartition(".")[0], layer.rpartition(".")[2]
+            norm = f"{place}.{norms[own]}".lstrip(".")
+            gain = weights[f"{norm}.weight"] / torch.sqrt(weights[f"{norm}.running_var"] + _EPSILON)
+            if kind == "weight":
+                folded[name] = weights[name] * gain[:, None, None, None]
+            else:
+                folded[name] = weights[f"{norm}.bias"] - weights[f"{norm}.running_mean"] * gain
+        self.load_state_dict(folded)
+
+
+def frozen_share(model: nn.Module) -> float:
+    """The share of a model's weights that training leaves as they are."""
+    sizes = torch.tensor([weight.numel() for weight in model.parameters()], dtype=torch.float64)
+    fixed = torch.tensor([not weight.requires_grad for weight in model.parameters()])
+    return float(sizes[fixed].sum() / sizes.sum())

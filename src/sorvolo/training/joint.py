@@ -1,0 +1,153 @@
+"""The joint schedule: proposal network and head learn together, end to end."""
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sorvolo.training.faster_rcnn import FasterRCNN
+from sorvolo.training.losses import Answer, joint_proposal_loss, match_boxes, region_loss, sample
+from sorvolo.training.proposals import propose
+from sorvolo.training.samples import Sample
+
+
+@dataclass(frozen=True)
+class JointSettings:
+    """How long and how fast it learns."""
+
+    steps: int = 8000
+    batch: int = 4
+    rate: float = 1e-3  # of AdamW for the new parts, at its height
+    backbone_rate: float = 2e-4
+    decay: float = 0.02
+    warm_steps: int = 200
+    regions: int = 96  # per picture for the head, a third of them positives at most
+    averaging: float = 0.998  # of the weights that are kept in the end (an exponential mean)
+    mixed_precision: bool = True  # on a GPU
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where training stands after a step; the losses are this step's."""
+
+    step: int
+    steps: int
+    proposal_score: float
+    proposal_box: float
+    region_score: float
+    region_box: float
+    seconds: float
+
+    @property
+    def loss(self) -> float:
+        """The sum that is minimised."""
+        return self.proposal_score + self.proposal_box + self.region_score + self.region_box
+
+
+class JointTraining:
+    """A model on its way, with its optimiser and the mean of its weights. Only `learn` changes it."""
+
+    def __init__(self, model: FasterRCNN, settings: JointSettings, seed: int, device: str = "cpu") -> None:
+        self.model, self.settings, self.device = model.to(device), settings, device
+        self.average = deepcopy(model).eval()
+        self.step = 0
+        self.generator = torch.Generator().manual_seed(seed)
+        backbone = [each for each in model.backbone.parameters() if each.requires_grad]
+        own = {id(each) for each in model.backbone.parameters()}
+        others = [each for each in model.parameters() if id(each) not in own]
+        self.optimiser = torch.optim.AdamW(
+            [{"params": others, "rate": settings.rate}, {"params": backbone, "rate": settings.backbone_rate}],
+            lr=settings.rate, weight_decay=settings.decay,
+        )
+        self._scaler = torch.amp.GradScaler(device, enabled=settings.mixed_precision and device != "cpu")
+        self._started_s = time.monotonic()
+
+    def learn(self, batch: Sequence[Sample]) -> Progress:
+        """One step on a batch of samples of one size."""
+        self.model.train()
+        share = self._share_of_rate()
+        for group in self.optimiser.param_groups:
+            group["lr"] = group["rate"] * share
+        images, answers = collate(batch, self.device)
+        with torch.autocast(self.device, torch.bfloat16, enabled=self._scaler.is_enabled()):
+            levels = self.model.features(images)
+        levels = [level.float() for level in levels]
+        parts = self._losses(levels, answers)
+        self.optimiser.zero_grad(set_to_none=True)
+        self._scaler.scale(sum(parts, torch.zeros((), device=self.device))).backward()
+        self._scaler.unscale_(self.optimiser)
+        torch.nn.utils.clip_grad_norm_(self.model.parameters(), 10.0)
+        self._scaler.step(self.optimiser)
+        self._scaler.update()
+        self.step += 1
+        self._average()
+        values = [float(part.detach()) for part in parts]
+        return Progress(
+            self.step, self.settings.steps, values[0], values[1], values[2], values[3],
+            time.monotonic() - self._started_s,
+        )
+
+    def _losses(self, levels: list[Tensor], answers: Sequence[Answer]) -> list[Tensor]:
+        proposed = self.model.proposals(levels)
+        proposal_score, proposal_box = joint_proposal_loss(proposed, answers)
+        height, width = (levels[0].shape[axis] * self.model.proposals.strides[0] for axis in (2, 3))
+        regions, matches, batch = [], [], []
+        for index, answer in enumerate(answers):
+            with torch.no_grad():
+                found, _ = propose(proposed, index, (height, width), before=500, after=200)
+                found = torch.cat([found, answer.boxes])
+                match = match_boxes(found, answer, over=0.5, under=0.5, best_too=False)
+                chosen = sample(match, self.settings.regions, 1 / 3, self.generator)
+            regions.append(found[chosen])
+            matches.append(type(match)(match.target[chosen]))
+            batch.append(torch.full((len(chosen),), index, dtype=torch.int64, device=found.device))
+        scores, offsets = self.model.classify(levels, torch.cat(regions), torch.cat(batch))
+        score_sum, box_sum = scores.new_zeros(()), scores.new_zeros(())
+        start, positives = 0, 0
+        for answer, match, own in zip(answers, matches, regions):
+            rows = slice(start, start + len(own))
+            score, box = region_loss(scores[rows], offsets[rows], own, match, answer, overlap=True)
+            score_sum, box_sum = score_sum + score, box_sum + box
+            start, positives = start + len(own), positives + int(match.positive.sum())
+        return [proposal_score, proposal_box, score_sum / max(1, start) * 2, box_sum / max(1, positives)]
+
+    def _share_of_rate(self) -> float:
+        """Up in a straight line, then down half a cosine."""
+        s = self.settings
+        if self.step < s.warm_steps:
+            return (self.step + 1) / s.warm_steps
+        done = min(1.0, (self.step - s.warm_steps) / max(1, s.steps - s.warm_steps))
+        return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done))
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        keep = min(self.settings.averaging, (1 + self.step) / (10 + self.step))
+        for mean, value in zip(self.average.state_dict().values(), self.model.state_dict().values()):
+            if mean.dtype.is_floating_point:
+                mean.lerp_(value, 1 - keep)
+            else:
+                mean.copy_(value)
+
+
+def collate(batch: Sequence[Sample], device: str) -> tuple[Tensor, list[Answer]]:
+    """Samples as the picture tensor (N, 3, H, W) and their answers."""
+    images = torch.from_numpy(np.stack([each.image.transpose(2, 0, 1) for each in batch])).to(device)
+    answers = [
+        Answer(
+            torch.from_numpy(each.boxes.astype(np.float32)).to(device), torch.from_numpy(each.labels).to(device),
+            torch.from_numpy(each.ignored.astype(np.float32)).to(device), torch.from_numpy(each.known).to(device),
+        )
+        for each in batch
+    ]
+    return images, answers
+
+
+def batches(samples: Iterator[Sample], size: int) -> Iterator[list[Sample]]:
+    """The samples, `size` at a time."""
+    while True:
+        yield [next(samples) for _ in range(size)]
