@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Literal, Protocol
 
+from sorvolo.detection.contract import ModelInfo
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.survey.objects import Detections
 
@@ -13,6 +14,10 @@ class Detects(Protocol):
     @property
     def classes(self) -> tuple[str, ...]:
         """The names of what it tells apart, in the order of its labels."""
+
+    @property
+    def info(self) -> ModelInfo:
+        """What the model says of itself."""
 
     def detect(
         self, image: ImageRGB, *, tiles: Literal["auto"] | int | None = None, m_per_px: float | None = None,

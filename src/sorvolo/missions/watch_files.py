@@ -1,0 +1,165 @@
+"""What a watch writes while it runs: lines, crops, annotated frames and labels, in a thread beside the detector."""
+
+import queue
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.missions.watch_settings import WatchOutputs
+from sorvolo.store.annotated import AnnotatedVideo, annotated, write_annotated
+from sorvolo.store.detection_files import (
+    ANNOTATED_PICTURES,
+    ANNOTATED_VIDEO,
+    DetectionLines,
+    crop_around,
+    detection_row,
+    write_crop,
+    write_tracks,
+)
+from sorvolo.survey.flight import Frame, Site
+from sorvolo.survey.objects import Detections, Sighting, Track
+
+_MOST_WAITING = 4  # frames; a disk that is slower than the detector slows the watch, it does not fill the memory
+_TRACKS_EVERY_S = 5.0
+_CROPS_BYTES = 96_000_000  # of the latest sightings, one of which may become a track's best
+
+
+@dataclass(frozen=True, eq=False)
+class SeenFrame:
+    """One searched frame: what was seen, where, and by which track it was taken (0: by none)."""
+
+    frame: Frame
+    time_ns: int
+    detections: Detections
+    sightings: Sequence[Sighting | None]  # one for each detection
+    track_ids: Sequence[int]  # one for each detection
+    confirmed: frozenset[int]
+    headline: str
+
+
+class WatchFiles:
+    """The folder of one watch while it grows. A context manager; leaving it closes every file."""
+
+    def __init__(self, folder: Path, outputs: WatchOutputs, site: Site) -> None:
+        self.folder = folder
+        self._outputs, self._site = outputs, site
+        self._crops: OrderedDict[tuple[int, bytes], ImageRGB] = OrderedDict()
+        self._crops_bytes = 0
+        self._best: dict[int, Sighting] = {}
+        self.crop_names: dict[int, str] = {}
+        self._told_s = time.monotonic()
+        self._queue: queue.Queue[SeenFrame | None] = queue.Queue(_MOST_WAITING)
+        self._error: BaseException | None = None
+        self._stack = ExitStack()
+        self._lines = self._stack.enter_context(DetectionLines(folder))
+        self._video = (
+            self._stack.enter_context(AnnotatedVideo(folder / ANNOTATED_VIDEO)) if outputs.save == "video" else None
+        )
+        self.seconds = 0.0
+        self._thread = threading.Thread(target=self._run, name="watch files", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def add(self, seen: SeenFrame) -> None:
+        """Write one frame's part soon. Raises what went wrong with an earlier one (StoreError on a full disk)."""
+        self._raise_earlier()
+        for sighting in seen.sightings:
+            if sighting is not None:
+                self._keep_crop(sighting, crop_around(seen.frame.image, sighting.box_px))
+        self._queue.put(seen)
+
+    def crop_of(self, track: Track) -> str | None:
+        """Write the crop of the track's best view if that is new; its file's name within the folder."""
+        if self._best.get(track.id) is not track.best:
+            crop = self._crops.get(_key(track.best))
+            if crop is not None:
+                self.crop_names[track.id] = write_crop(self.folder, track.id, crop)
+                self._best[track.id] = track.best
+        return self.crop_names.get(track.id)
+
+    def show(self, tracks: Iterable[Track]) -> None:
+        """Bring `tracks.geojson` up to date, unless that was done within the last seconds."""
+        if time.monotonic() - self._told_s >= _TRACKS_EVERY_S:
+            self._told_s = time.monotonic()
+            write_tracks(self.folder, tracks, self._site, self.crop_names)
+
+    def close(self) -> None:
+        """Write what waits and close the files. Raises what went wrong with it."""
+        if self._thread.is_alive():
+            self._queue.put(None)
+            self._thread.join()
+        self._stack.close()
+        self._raise_earlier()
+
+    # ---- in the thread ----------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while (seen := self._queue.get()) is not None:
+            if self._error is not None:
+                continue  # the queue is emptied, so that nobody waits for it
+            started_s = time.monotonic()
+            try:
+                self._write(seen)
+            except Exception as error:  # told by the next `add`, or by `close`
+                self._error = error
+            self.seconds += time.monotonic() - started_s
+
+    def _write(self, seen: SeenFrame) -> None:
+        self._lines.append(_rows(seen, self._site))
+        if self._video is not None:
+            self._video.add(_drawn(seen), seen.time_ns)
+        elif self._outputs.save == "pictures" and len(seen.detections):
+            write_annotated(self.folder / ANNOTATED_PICTURES, Path(seen.frame.name).stem, _drawn(seen))
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _raise_earlier(self) -> None:
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+
+    def _keep_crop(self, sighting: Sighting, crop: ImageRGB) -> None:
+        self._crops[_key(sighting)] = crop
+        self._crops_bytes += crop.nbytes
+        while self._crops_bytes > _CROPS_BYTES and len(self._crops) > 1:
+            _, dropped = self._crops.popitem(last=False)
+            self._crops_bytes -= dropped.nbytes
+
+
+def _key(sighting: Sighting) -> tuple[int, bytes]:
+    return sighting.frame_index, sighting.box_px.tobytes()
+
+
+def _rows(seen: SeenFrame, site: Site) -> list[dict[str, Any]]:
+    found = seen.detections
+    return [
+        detection_row(
+            seen.frame, seen.time_ns, found.names[row], float(found.scores[row]), found.boxes_px[row].tolist(),
+            seen.sightings[row], seen.track_ids[row] or None, site,
+        )
+        for row in range(len(found))
+    ]
+
+
+def _drawn(seen: SeenFrame) -> ImageRGB:
+    found = seen.detections
+    counted = [track_id in seen.confirmed for track_id in seen.track_ids]
+    words = [
+        f"{name} {track_id} {score:.2f}" if is_counted else ""
+        for name, track_id, score, is_counted in zip(found.names, seen.track_ids, found.scores, counted)
+    ]
+    return annotated(seen.frame.image, found.boxes_px, found.labels.tolist(), words, counted, seen.headline)
