@@ -108,7 +108,7 @@ class AnnotatedVideo:
         stream.width, stream.height = (max(2, round(side * scale) // 2 * 2) for side in (width, height))
         stream.pix_fmt = "yuv420p"
         stream.codec_context.time_base = Fraction(1, _TICKS_PER_S)
-        stream.options = {"crf": "23", "preset": "veryfast", "g": "60"}
+        stream.options = {"crf": "23", "preset": "veryfast", "g": "60", "bf": "0"}
         self._stream, self._first_ns = stream, time_ns
 
 

@@ -1,0 +1,128 @@
+"""Alerts: a real script, a real web server, and that slow or dead ones hold nothing up."""
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+
+from sorvolo.errors import SettingsError, StoreError
+from sorvolo.missions.alerts import Outbox, Pace, alert_command, alert_url
+
+_ALERT = {"id": 3, "class": "small object", "score": 0.9, "latitude": 41.9, "longitude": None, "crop": "/a b/3.jpg"}
+
+
+class _Receiver(BaseHTTPRequestHandler):
+    got: ClassVar[list[dict[str, object]]] = []
+
+    def do_POST(self) -> None:
+        body = self.rfile.read(int(self.headers["Content-Length"]))
+        self.got.append(json.loads(body))
+        self.send_response(500 if self.path == "/broken" else 204)
+        self.end_headers()
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server() -> Iterator[str]:
+    _Receiver.got.clear()
+    with HTTPServer(("127.0.0.1", 0), _Receiver) as made:
+        thread = threading.Thread(target=made.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{made.server_port}"
+        made.shutdown()
+        thread.join()
+
+
+def _script(folder: Path, body: str) -> str:
+    path = folder / "told me.py"
+    path.write_text(body)
+    return f"{sys.executable} '{path}'"
+
+
+def test_a_command_gets_words_and_json(tmp_path: Path) -> None:
+    script = _script(
+        tmp_path, "import json, sys\nopen(sys.argv[1], 'w').write(json.dumps([sys.argv[2:], json.load(sys.stdin)]))"
+    )
+    out = tmp_path / "out.json"
+    run = alert_command(f"{script} '{out}' {{id}} '{{class}} at {{latitude}} {{longitude}}' {{crop}} ';|$HOME'")
+    run(_ALERT)
+    words, body = json.loads(out.read_text())
+    assert words == ["3", "small object at 41.9 ", "/a b/3.jpg", ";|$HOME"]  # no shell reads them
+    assert body == _ALERT
+
+
+def test_what_a_command_does_wrong_is_told(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="code 3: no such number"):
+        alert_command(_script(tmp_path, "import sys\nprint('no such number', file=sys.stderr); sys.exit(3)"))(_ALERT)
+    began_s = time.monotonic()
+    with pytest.raises(StoreError, match=r"longer than 0.3 s"):
+        alert_command("sh -c 'sleep 30 & sleep 30'", limit_s=0.3)(_ALERT)
+    assert time.monotonic() - began_s < 5
+
+
+@pytest.mark.parametrize(
+    ("template", "words"),
+    [
+        ("", "empty"), ("echo {name}", "no placeholder {name}"), ("echo {id.__class__}", "no placeholder"),
+        ("echo {}", "no placeholder"), ("echo {id", "cannot be read"), ("echo 'a", "cannot be read"),
+        ("no-such-program {id}", "no program"),
+    ],
+)
+def test_commands_that_cannot_be(template: str, words: str) -> None:
+    with pytest.raises(SettingsError, match=words):
+        alert_command(template)
+
+
+def test_a_url_gets_json(server: str) -> None:
+    alert_url(f"{server}/hook")(_ALERT)
+    assert _Receiver.got == [_ALERT]
+    with pytest.raises(OSError, match="500"):
+        alert_url(f"{server}/broken")(_ALERT)
+    for url in ("ftp://host/x", "hook", "file:///etc/passwd", "http://"):
+        with pytest.raises(SettingsError, match="web address"):
+            alert_url(url)
+
+
+def test_an_outbox_goes_on_after_failures(server: str) -> None:
+    outbox = Outbox(alert_url(f"{server}/broken"), code="alert_url", what="the alert")
+    outbox.put(_ALERT)
+    outbox.put(_ALERT)
+    outbox.close(10)
+    (told,) = outbox.notices()
+    assert (told.code, told.count, outbox.sent, len(_Receiver.got)) == ("alert_url_failed", 2, 0, 2)
+    assert "500" in told.text
+
+
+def test_a_slow_receiver_holds_nothing_up() -> None:
+    gate = threading.Event()
+
+    def slow(_: int) -> None:
+        gate.wait(10)
+
+    outbox = Outbox(slow, code="slow", what="it")
+    began_s = time.monotonic()
+    for number in range(1200):
+        outbox.put(number)
+    outbox.close(0.1)
+    assert time.monotonic() - began_s < 2
+    gate.set()
+    (told,) = outbox.notices()
+    assert told.code == "slow_dropped" and 1190 <= told.count <= 1200
+
+
+def test_a_track_is_told_at_once_then_at_its_pace() -> None:
+    now_s = 100.0
+    pace = Pace(3.0, lambda: now_s)
+    assert pace.allows(1) and pace.allows(2) and not pace.allows(1)
+    now_s = 102.9
+    assert not pace.allows(1)
+    now_s = 103.0
+    assert pace.allows(1) and not pace.allows(1)
