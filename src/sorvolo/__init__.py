@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from sorvolo.change.compare import Comparison, compare_images
     from sorvolo.change.robust import RobustSettings
     from sorvolo.change.thesis import ThesisSettings, prepare_reference, thesis_steps
+    from sorvolo.detection.detector import Detector
     from sorvolo.errors import GeometryError, InputError, SettingsError, SorvoloError, StoreError
     from sorvolo.missions.calibrate_camera import (
         calibrate_camera,
@@ -44,6 +45,7 @@ __all__ = [
     "Archive",
     "CompareSettings",
     "Comparison",
+    "Detector",
     "GeometryError",
     "InputError",
     "MapSettings",
@@ -83,6 +85,7 @@ _HOMES = {
     "change.compare": ("Comparison", "compare_images"),
     "change.robust": ("RobustSettings",),
     "change.thesis": ("ThesisSettings", "prepare_reference", "thesis_steps"),
+    "detection.detector": ("Detector",),
     "errors": ("GeometryError", "InputError", "SettingsError", "SorvoloError", "StoreError"),
     "missions.calibrate_camera": ("calibrate_camera", "find_views", "parse_board", "write_calibration"),
     "missions.compare_flights": ("compare_flights",),

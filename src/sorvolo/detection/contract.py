@@ -1,0 +1,102 @@
+"""What a model file says of itself: the metadata that `sorvolo` writes into its ONNX files, checked."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+from sorvolo.errors import InputError
+
+METADATA_KEY = "sorvolo"
+"""The key among an ONNX file's `metadata_props` under which the JSON lies."""
+
+FORMAT = 1
+"""The newest contract that this version reads; docs/detector.md lists its fields."""
+
+_FALLBACK_STRIDE = 32
+_NEEDED = ("name", "classes", "thresholds", "best_px")
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """One model, as its file tells it.
+
+    `thresholds` says from which score on each class is reported; `best_px` from which to which longer side, in
+    pixels, the model finds a class well. `stride`: the sides of its input are multiples of it. `thermal`: it was
+    trained on thermal frames too, not on daylight alone. `precision` is float32 or int8.
+    """
+
+    name: str
+    classes: tuple[str, ...]
+    thresholds: Mapping[str, float]
+    best_px: Mapping[str, tuple[float, float]]
+    stride: int = _FALLBACK_STRIDE
+    thermal: bool = False
+    preset: str = ""
+    version: str = ""
+    precision: str = "float32"
+    licence: str = ""
+    trained_on: str = ""
+    created: str = ""
+
+
+def info_from_metadata(metadata: Mapping[str, str], where: str) -> ModelInfo:
+    """Read the metadata of the model file `where`.
+
+    Raises InputError where it is no model of ours, is of a newer contract, or contradicts itself.
+    """
+    text = metadata.get(METADATA_KEY)
+    if text is None:
+        raise InputError(
+            f"{where} is an ONNX model, but none of Sorvolo's: it has no '{METADATA_KEY}' metadata that names its "
+            "classes; train and export one with `sorvolo train`, or add the metadata as docs/detector.md shows"
+        )
+    try:
+        told = json.loads(text)
+        if not isinstance(told, dict):
+            raise ValueError("not an object")
+        if int(told["format"]) > FORMAT:
+            raise InputError(
+                f"{where} follows contract {told['format']}, this version reads up to {FORMAT}: update sorvolo"
+            )
+        return _info(told)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{where}: its '{METADATA_KEY}' metadata cannot be used ({_reason(error)}); export the model again"
+        ) from error
+
+
+def _info(told: dict[str, Any]) -> ModelInfo:
+    if missing := [name for name in _NEEDED if name not in told]:
+        raise ValueError(f"it lacks {', '.join(missing)}")
+    classes = tuple(str(each) for each in told["classes"])
+    if not classes or len(set(classes)) != len(classes):
+        raise ValueError(f"its classes must be one or more different names, not {list(classes)}")
+    thresholds = {each: float(told["thresholds"][each]) for each in classes}
+    if not all(0 <= each <= 1 for each in thresholds.values()):
+        raise ValueError(f"its thresholds must lie in 0 to 1, not {thresholds}")
+    best_px = {each: (float(told["best_px"][each][0]), float(told["best_px"][each][1])) for each in classes}
+    if not all(0 < least < most for least, most in best_px.values()):
+        raise ValueError(f"its best_px must be smallest and largest side, not {best_px}")
+    stride = int(told.get("stride", _FALLBACK_STRIDE))
+    if not 1 <= stride <= 256:
+        raise ValueError(f"its stride must lie in 1 to 256, not {stride}")
+    texts = {
+        each: _words(told[each]) for each in ("preset", "version", "precision", "licence", "trained_on", "created")
+        if each in told
+    }
+    return ModelInfo(
+        str(told["name"]), classes, MappingProxyType(thresholds), MappingProxyType(best_px), stride,
+        bool(told.get("thermal", False)), **texts,
+    )
+
+
+def _words(told: object) -> str:
+    return ", ".join(map(str, told)) if isinstance(told, list) else str(told)
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, KeyError):
+        return f"it says nothing of {error}"
+    return str(error)

@@ -1,0 +1,158 @@
+"""The detector: any picture in, people, cars and small objects out."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import overload
+
+import numpy as np
+
+from sorvolo.detection.contract import ModelInfo
+from sorvolo.detection.light import is_thermal, rgb_from_picture
+from sorvolo.detection.models import find_model, thermal_model
+from sorvolo.detection.session import Provider, Seen, Session
+from sorvolo.detection.suppression import SeenTile, merge_tiles
+from sorvolo.detection.tiling import Tiles, plan_tiles
+from sorvolo.errors import SettingsError
+from sorvolo.geometry.arrays import Anything, ImageRGB
+from sorvolo.survey.flight import Notice
+from sorvolo.survey.objects import Detections
+
+
+class Detector:
+    """A model that is ready to look at pictures. `load` opens one; only `detect` is called after."""
+
+    def __init__(self, session: Session, *, provider: Provider = "auto", threads: int | None = None) -> None:
+        self._session, self._wanted_provider, self._threads = session, provider, threads
+        self._at_night: Session | None = None
+        self._night_was_sought = False
+        self._thermal_frames = 0
+
+    @classmethod
+    def load(
+        cls, name_or_path: str | Path = "default", *, provider: Provider = "auto", threads: int | None = None
+    ) -> "Detector":
+        """Open an installed model by its name (`sorvolo models list`), or a model file.
+
+        `provider` "auto" takes CUDA where there is one, else OpenVINO where it is installed, else the CPU; `threads`
+        None takes as many as the process may use. Raises InputError for a name that is not installed and for a file
+        that is missing, damaged or no model of Sorvolo's, SettingsError for a provider that is not there.
+        """
+        return cls(Session(find_model(name_or_path), provider, threads), provider=provider, threads=threads)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """The names of what it tells apart, in the order of its labels."""
+        return self._session.info.classes
+
+    @property
+    def info(self) -> ModelInfo:
+        """What the model file says of itself."""
+        return self._session.info
+
+    @property
+    def provider(self) -> str:
+        """Where it runs, in words."""
+        return self._session.provider
+
+    @property
+    def notices(self) -> tuple[Notice, ...]:
+        """What a user should know of the pictures seen so far: thermal frames, and who looked at them."""
+        if not self._thermal_frames:
+            return ()
+        count, own = self._thermal_frames, self.info.name
+        if self._at_night is not None:
+            night = self._at_night.info.name
+            text = f"{count} thermal frames were seen by the model '{night}', since '{own}' knows only daylight"
+            return (Notice("thermal_model", count, text),)
+        text = (
+            f"{count} frames are thermal, but the model '{own}' was trained on daylight and no installed one on "
+            "thermal frames: little of what it says of them holds"
+        )
+        return (Notice("thermal_untrained", count, text),)
+
+    @overload
+    def detect(
+        self, image: Anything, *, tiles: Tiles = None, m_per_px: float | None = None,
+        least_score: float | None = None, classes: Sequence[str] | None = None,
+    ) -> Detections: ...
+
+    @overload
+    def detect(
+        self, image: Sequence[Anything], *, tiles: Tiles = None, m_per_px: float | None = None,
+        least_score: float | None = None, classes: Sequence[str] | None = None,
+    ) -> list[Detections]: ...
+
+    def detect(
+        self, image: Anything | Sequence[Anything], *, tiles: Tiles = None, m_per_px: float | None = None,
+        least_score: float | None = None, classes: Sequence[str] | None = None,
+    ) -> Detections | list[Detections]:
+        """The objects in a picture, best first; for a sequence of pictures, or an array (N, H, W, C), a list of them.
+
+        A picture is uint8 RGB (H, W, 3), grey (H, W) or (H, W, 1), RGBA (its alpha is dropped), or uint16 of these
+        (grey is stretched as a thermal camera's). `tiles` cuts a large one: "auto" by `m_per_px` (the ground's
+        sampling distance), a number of its pixels a side, or None for the picture as a whole; docs/detector.md gives
+        the rule. `least_score` None means each class's own threshold; `classes` None means all. Raises InputError
+        for anything that is no picture, SettingsError for a class, score or tile that cannot be.
+        """
+        wanted = self._wanted(classes)
+        least = self._least_scores(wanted, least_score)
+        sampling = math.nan if m_per_px is None else float(m_per_px)
+        if not isinstance(image, Sequence) and getattr(image, "ndim", 0) != 4:
+            return self._seen(image, tiles, sampling, wanted, least)
+        return [self._seen(each, tiles, sampling, wanted, least) for each in image]
+
+    def _wanted(self, classes: Sequence[str] | None) -> tuple[str, ...]:
+        if classes is None:
+            return self.classes
+        if isinstance(classes, str):
+            classes = (classes,)
+        if not classes or (unknown := [name for name in classes if name not in self.classes]):
+            named = ", ".join(map(repr, unknown)) if classes else "no class"
+            there = ", ".join(self.classes)
+            raise SettingsError(f"{named} cannot be asked of the model '{self.info.name}'; it tells apart {there}")
+        return tuple(name for name in self.classes if name in classes)
+
+    def _least_scores(self, wanted: Sequence[str], least_score: float | None) -> Anything:
+        """(classes,) the score from which on each class is told; what is not wanted never."""
+        if least_score is not None and not 0 <= least_score <= 1:
+            raise SettingsError(f"the least score must lie in 0 to 1, not {least_score}")
+        least = [self.info.thresholds[name] if least_score is None else least_score for name in self.classes]
+        return np.where([name in wanted for name in self.classes], least, np.inf)
+
+    def _seen(
+        self, picture: Anything, tiles: Tiles, m_per_px: float, wanted: Sequence[str], least: Anything
+    ) -> Detections:
+        session = self._session_for(picture)
+        rgb = rgb_from_picture(picture)
+        size_px = rgb.shape[0], rgb.shape[1]
+        asked = [name for name in wanted if name in session.info.classes]
+        plan = plan_tiles(
+            size_px, session.info, asked, tiles=tiles, m_per_px=m_per_px, fixed_px=session.fixed_px
+        )
+        looks = [SeenTile(place, _look(session, rgb, place, plan.scale)) for place in plan.places_px]
+        seen = looks[0].seen if len(looks) == 1 else merge_tiles(looks, size_px)
+        labels = seen.labels
+        if session is not self._session:
+            own = np.array([self.classes.index(name) if name in self.classes else -1 for name in session.info.classes])
+            labels = own[labels]
+        told = (labels >= 0) & (seen.scores >= least[labels])
+        return Detections(seen.boxes_px[told], seen.scores[told], labels[told], self.classes)
+
+    def _session_for(self, picture: Anything) -> Session:
+        """This model, or for a thermal frame that it was not trained on, an installed one that was."""
+        if self.info.thermal or not is_thermal(picture):
+            return self._session
+        self._thermal_frames += 1
+        if not self._night_was_sought:
+            self._night_was_sought = True
+            found = thermal_model(self.classes)
+            self._at_night = None if found is None else Session(found, self._wanted_provider, self._threads)
+        return self._at_night or self._session
+
+
+def _look(session: Session, rgb: ImageRGB, place_px: tuple[int, int, int, int], scale: float) -> Seen:
+    """What the model sees in one tile, in the picture's pixels."""
+    left, top, right, bottom = place_px
+    seen = session.see(rgb[top:bottom, left:right], scale)
+    return Seen(seen.boxes_px + np.array([left, top, left, top], np.float32), seen.scores, seen.labels)

@@ -1,0 +1,125 @@
+"""Which models there are: the packaged one and the user's, their files, and the hashes that vouch for them."""
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from sorvolo.detection.session import read_info, read_model
+from sorvolo.errors import InputError
+
+FOLDER_VARIABLE = "SORVOLO_MODELS"
+"""Names the folder of the user's models in place of the usual one."""
+
+HASH_KEY = "sha256"
+"""In the card, NAME.json beside NAME.onnx: the file's SHA-256 in hexadecimal."""
+
+
+@dataclass(frozen=True)
+class InstalledModel:
+    """A model by name, and its file; what is known of it stands in its card, the .json of the same name beside it."""
+
+    name: str
+    path: Path
+    is_packaged: bool
+
+
+class Integrity(StrEnum):
+    """What a model file's hash says."""
+
+    GOOD = "good"
+    CHANGED = "changed"
+    NOT_RECORDED = "not recorded"
+
+
+def models_folder() -> Path:
+    """Where the user's models lie: $SORVOLO_MODELS, else sorvolo/models in the system's folder for a user's data."""
+    if chosen := os.environ.get(FOLDER_VARIABLE):
+        return Path(chosen).expanduser()
+    if data := os.environ.get("XDG_DATA_HOME") or os.environ.get("LOCALAPPDATA"):
+        return Path(data) / "sorvolo" / "models"
+    return Path.home() / ".local" / "share" / "sorvolo" / "models"
+
+
+def installed_models() -> list[InstalledModel]:
+    """All models, the packaged ones first, then the user's by name; a packaged name is never replaced."""
+    packaged = _models_in(Path(str(files("sorvolo.detection"))) / "data", is_packaged=True)
+    names = {each.name for each in packaged}
+    return packaged + [each for each in _models_in(models_folder(), is_packaged=False) if each.name not in names]
+
+
+def find_model(name_or_path: str | Path) -> Path:
+    """The file of an installed model, or the path that was given.
+
+    Raises InputError for a name that is not installed, with those that are.
+    """
+    if isinstance(name_or_path, Path) or name_or_path.lower().endswith(".onnx") or os.sep in name_or_path:
+        return Path(name_or_path).expanduser()
+    return installed_model(name_or_path).path
+
+
+def installed_model(name: str) -> InstalledModel:
+    """The installed model of this name; raises InputError where there is none, with those that are."""
+    there = installed_models()
+    for each in there:
+        if each.name == name:
+            return each
+    names = ", ".join(each.name for each in there) or "none"
+    raise InputError(
+        f"there is no model {name!r}; installed are: {names} (own ones lie in {models_folder()}); give one of them, a "
+        ".onnx file, or fetch one with `sorvolo models fetch`"
+    )
+
+
+def thermal_model(classes: Sequence[str]) -> Path | None:
+    """An installed model that was trained on thermal frames and knows one of `classes`, None where there is none.
+
+    Files that cannot be used are passed over: `sorvolo models list` tells of them.
+    """
+    for each in installed_models():
+        try:
+            info = read_info(each.path)
+        except InputError:
+            continue
+        if info.thermal and set(info.classes) & set(classes):
+            return each.path
+    return None
+
+
+def read_card(model: InstalledModel) -> dict[str, Any]:
+    """What the model's card says; empty where it has none. Raises InputError where it is damaged."""
+    path = model.path.with_suffix(".json")
+    if not path.is_file():
+        return {}
+    try:
+        card = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"the model card {path} cannot be read ({error}); write it again or remove it") from error
+    if not isinstance(card, dict):
+        raise InputError(f"the model card {path} holds no JSON object; write it again or remove it")
+    return card
+
+
+def integrity(model: InstalledModel) -> Integrity:
+    """Whether the file is still what its card says. Raises InputError where one of them cannot be read."""
+    recorded = str(read_card(model).get(HASH_KEY, "")).lower()
+    if not recorded:
+        return Integrity.NOT_RECORDED
+    return Integrity.GOOD if file_sha256(model.path) == recorded else Integrity.CHANGED
+
+
+def file_sha256(path: Path) -> str:
+    """The SHA-256 of a model file, in hexadecimal. Raises InputError where it cannot be read."""
+    return hashlib.sha256(read_model(path)).hexdigest()
+
+
+def _models_in(folder: Path, *, is_packaged: bool) -> list[InstalledModel]:
+    if not folder.is_dir():
+        return []
+    paths = sorted(each for each in folder.glob("*.onnx") if not each.name.startswith("."))
+    return [InstalledModel(each.stem, each, is_packaged) for each in paths]

@@ -1,0 +1,121 @@
+"""How large a picture is shown to the detector and in which tiles, from the ground that a pixel covers."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sorvolo.detection.contract import ModelInfo
+from sorvolo.errors import SettingsError
+from sorvolo.geometry.planning import BOTTOM_CRITICAL_M, Task, required_px_per_m
+from sorvolo.survey.objects import TYPICAL_SIZE_M
+
+Tiles = Literal["auto"] | int | None
+"""How a picture is cut: "auto", tiles of so many of its pixels a side, or not at all."""
+
+MOST_WHOLE_PX = 2_400_000
+"""Up to so many pixels "auto" shows a picture at once: 1920 x 1080 and a little more."""
+
+MOST_AT_ONCE_PX = 17_000_000
+"""A larger picture is cut into tiles even if it was asked for whole: its features would not fit into memory."""
+
+TASK = Task.RECOGNITION
+"""What a person must at least be shown for (Johnson's criteria): 6 px over the critical dimension."""
+
+_SIDE_PX = 1280  # of a tile as the network sees it
+_MOST_LARGER = 3.0  # magnified further, a picture is only blurred more
+_LEAST_OVERLAP_PX, _SPARE = 64, 1.15
+_LEAST_SIDE_PX = 64
+
+
+@dataclass(frozen=True)
+class TilePlan:
+    """Tiles of a picture, left, top, right, bottom in its pixels, each shown `scale` times as large."""
+
+    scale: float
+    places_px: tuple[tuple[int, int, int, int], ...]
+
+
+def scale_for(info: ModelInfo, m_per_px: float, wanted: Sequence[str]) -> float:
+    """How many times larger the model should see a picture whose pixel covers `m_per_px` of ground.
+
+    A person from straight above must be as large as Johnson's criteria ask (`TASK`, the same numbers as `sorvolo
+    plan`) and as the model needs, `best_px`; else the picture is magnified, at most three times. A person's whole
+    length, as seen aslant, must not be larger than the model knows; else the picture is made smaller. Between the two
+    it stays as it is. Where no person is `wanted`, the smallest wanted class of known size takes its place; where
+    there is none, the scale is 1.
+    """
+    known = [name for name in wanted if name in TYPICAL_SIZE_M]
+    if not known:
+        return 1.0
+    name = "person" if "person" in known else min(known, key=lambda each: TYPICAL_SIZE_M[each][0])
+    length_m, width_m, height_m = TYPICAL_SIZE_M[name]
+    critical_m = BOTTOM_CRITICAL_M if name == "person" else width_m
+    least_px, most_px = info.best_px[name]
+    least = m_per_px * max(required_px_per_m(TASK, critical_m), least_px / length_m)
+    most = m_per_px * most_px / max(length_m, height_m)
+    if least > 1:
+        return min(least, _MOST_LARGER)
+    return min(1.0, max(least, most))
+
+
+def plan_tiles(
+    size_px: tuple[int, int], info: ModelInfo, wanted: Sequence[str], *, tiles: Tiles = "auto",
+    m_per_px: float = math.nan, fixed_px: tuple[int, int] | None = None,
+) -> TilePlan:
+    """The tiles of a picture of (height, width) `size_px`.
+
+    `tiles` "auto": the scale comes from `m_per_px` (NaN: unknown, then 1), and a picture that is still small is one
+    tile; else tiles of about 1280 px as the model sees them. A number: tiles of so many of the picture's pixels a
+    side, not scaled. None: the picture as it is. Tiles overlap by the longest object that is wanted, as far as its
+    size is known, at most by half. A model of one input size, `fixed_px`, gets tiles of that size from "auto".
+    Raises SettingsError for a tile size or a sampling distance that cannot be.
+    """
+    height, width = size_px
+    if m_per_px <= 0 or math.isinf(m_per_px):
+        raise SettingsError(f"the ground sampling distance must be positive, not {m_per_px} m/px")
+    if tiles is None:
+        if fixed_px is not None or height * width <= MOST_AT_ONCE_PX:
+            return TilePlan(1.0, ((0, 0, width, height),))
+        m_per_px = math.nan
+    elif tiles != "auto" and (not isinstance(tiles, int) or tiles < _LEAST_SIDE_PX):
+        raise SettingsError(f"tiles must be 'auto' or at least {_LEAST_SIDE_PX} px a side, not {tiles!r}")
+    scale = 1.0
+    if isinstance(tiles, int):
+        sides = float(tiles), float(tiles)
+    else:
+        scale = 1.0 if math.isnan(m_per_px) else scale_for(info, m_per_px, wanted)
+        if fixed_px is None and height * width * scale**2 <= MOST_WHOLE_PX:
+            return TilePlan(scale, ((0, 0, width, height),))
+        sides = (
+            (_SIDE_PX / scale, _SIDE_PX / scale) if fixed_px is None else (fixed_px[0] / scale, fixed_px[1] / scale)
+        )
+    overlap_px = _overlap_px(info, wanted, m_per_px, scale)
+    rows = _spans(height, sides[0], overlap_px, info.stride / scale)
+    columns = _spans(width, sides[1], overlap_px, info.stride / scale)
+    return TilePlan(scale, tuple((left, top, right, bottom) for top, bottom in rows for left, right in columns))
+
+
+def _overlap_px(info: ModelInfo, wanted: Sequence[str], m_per_px: float, scale: float) -> float:
+    """How far tiles overlap, in the picture's pixels: so far that the longest wanted object is whole in one."""
+    lengths = [
+        _SPARE * math.hypot(*TYPICAL_SIZE_M[name][:2]) / m_per_px
+        for name in wanted if name in TYPICAL_SIZE_M and not math.isnan(m_per_px)
+    ]
+    if not lengths:
+        lengths = [info.best_px[name][1] / scale for name in wanted]
+    return max(_LEAST_OVERLAP_PX / scale, *lengths)
+
+
+def _spans(length: int, side: float, overlap: float, step: float) -> list[tuple[int, int]]:
+    """(start, end) of evenly laid spans no longer than `side`, as short as that many allow in whole `step`s."""
+    if length <= side:
+        return [(0, length)]
+    overlap = min(overlap, side / 2)
+    count = math.ceil((length - overlap) / (side - overlap) - 1e-9)
+    short = math.ceil((length + (count - 1) * overlap) / count / step - 1e-9) * step
+    whole = max(1, min(math.floor(side), math.floor(short), length))
+    starts = np.rint(np.linspace(0, length - whole, count)).astype(int).tolist()
+    return [(start, start + whole) for start in starts]

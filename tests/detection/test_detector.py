@@ -1,0 +1,157 @@
+"""The detector on pictures of every kind, with a model that finds bright rectangles exactly."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy_models import CLASSES, draw, rectangle_model
+
+import sorvolo
+from sorvolo.detection.detector import Detector
+from sorvolo.errors import InputError, SettingsError
+
+_BOXES = [(10, 20, 50, 80), (170, 60, 200, 90), (60, 100, 90, 120)]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return rectangle_model(tmp_path_factory.mktemp("models") / "toy.onnx")
+
+
+@pytest.fixture(scope="module")
+def detector(model: Path) -> Detector:
+    return Detector.load(model, provider="cpu", threads=1)
+
+
+@pytest.fixture
+def picture() -> np.ndarray:
+    return draw((120, 200), _BOXES, labels=[0, 1, 2], scores=[250, 200, 225])
+
+
+@pytest.mark.parametrize("provider", ["cpu", "openvino", "auto"])
+def test_finds_what_is_there(model: Path, picture: np.ndarray, provider: str) -> None:
+    if provider == "openvino":
+        pytest.importorskip("openvino")
+    detections = sorvolo.Detector.load(str(model), provider=provider, threads=1).detect(picture)
+    assert detections.names == ["person", "small object", "car"], "best first"
+    np.testing.assert_allclose(detections.boxes_px, [_BOXES[0], _BOXES[2], _BOXES[1]])
+    np.testing.assert_allclose(detections.scores, np.array([250, 225, 200]) / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (31, 33), (64, 32), (257, 300)])
+def test_any_size_is_padded_and_boxes_end_at_the_picture(detector: Detector, size: tuple[int, int]) -> None:
+    height, width = size
+    picture = draw(size, [(width // 2, height // 2, width, height)])
+    np.testing.assert_allclose(detector.detect(picture).boxes_px, [(width // 2, height // 2, width, height)])
+    assert len(detector.detect(np.zeros(size, np.uint8))) == 0
+
+
+def test_grey_transparent_and_deep_pictures_look_the_same(detector: Detector, picture: np.ndarray) -> None:
+    expected = detector.detect(picture)
+    alpha = np.concatenate([picture, np.zeros_like(picture[:, :, :1])], axis=2)
+    deep = picture.astype(np.uint16) * 257
+    for other in (alpha, deep, np.asfortranarray(picture), np.repeat(picture, 2, axis=1)[:, ::2]):
+        found = detector.detect(other)
+        np.testing.assert_array_equal(found.boxes_px, expected.boxes_px)
+        np.testing.assert_array_equal(found.labels, expected.labels)
+    # grey: green is red, and so all are of the class of 200 to 255
+    grey = detector.detect(picture[:, :, 0], classes=CLASSES[2])
+    assert len(grey) == 3 and set(grey.names) == {"small object"}
+    np.testing.assert_array_equal(grey.boxes_px, detector.detect(picture[:, :, :1]).boxes_px)
+
+
+def test_raw_thermal_frames_are_stretched(detector: Detector) -> None:
+    heat = np.full((120, 200), 7300, np.uint16)
+    heat[20:80, 10:50] = 7800
+    np.testing.assert_allclose(detector.detect(heat, least_score=0.9).boxes_px, [_BOXES[0]])
+    assert len(detector.detect(np.full((120, 200), 7300, np.uint16) + np.arange(200, dtype=np.uint16) % 3)) <= 1
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (np.zeros((4, 4)), "255 \\*"),
+        (np.zeros((4, 4, 2), np.uint8), "\\(4, 4, 2\\)"),
+        (np.zeros((3, 40, 40), np.uint8), "transpose"),
+        (np.zeros((0, 4, 3), np.uint8), "no picture"),
+        (np.zeros(7, np.uint8), "no picture"),
+        (np.zeros((4, 4, 3), bool), "bool"),
+        (None, "NoneType"),
+        (["a.jpg"], "str"),
+    ],
+)
+def test_what_is_no_picture_is_said(detector: Detector, wrong: object, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        detector.detect(wrong)  # type: ignore[arg-type]
+
+
+def test_several_pictures_of_different_sizes(detector: Detector, picture: np.ndarray) -> None:
+    alone = detector.detect(picture)
+    for several in ([picture, picture[:50]], (picture, picture), np.stack([picture, picture])):
+        found = detector.detect(several)
+        assert isinstance(found, list) and len(found) == 2
+        np.testing.assert_array_equal(found[0].boxes_px, alone.boxes_px)
+    assert detector.detect([]) == []
+
+
+def test_each_class_has_its_own_threshold(detector: Detector) -> None:
+    picture = draw((120, 200), _BOXES, labels=[0, 1, 2], scores=[130, 130, 130])
+    told = detector.detect(picture)
+    assert told.names == ["person", "car"], "0.51 lies above the thresholds of people and cars, below small objects'"
+    assert len(detector.detect(picture, least_score=0.5)) == 3
+    assert len(detector.detect(picture, least_score=0.52)) == 0
+    assert detector.detect(picture, classes=["car"]).names == ["car"]
+
+
+@pytest.mark.parametrize(
+    "wish",
+    [{"classes": ["horse"]}, {"classes": []}, {"least_score": 2.0}, {"tiles": 3}, {"tiles": "some"}, {"m_per_px": 0}],
+)
+def test_wishes_that_cannot_be(detector: Detector, picture: np.ndarray, wish: dict[str, object]) -> None:
+    with pytest.raises(SettingsError):
+        detector.detect(picture, **({"tiles": "auto"} | wish))  # type: ignore[arg-type]
+
+
+def test_a_model_of_one_size_sees_any_picture(tmp_path: Path) -> None:
+    fixed = Detector.load(rectangle_model(tmp_path / "fixed.onnx", fixed=(64, 96)), provider="cpu", threads=1)
+    np.testing.assert_allclose(fixed.detect(draw((40, 50), [(10, 5, 30, 25)])).boxes_px, [(10, 5, 30, 25)])
+    large = draw((256, 256), [(64, 128, 128, 192)])
+    np.testing.assert_allclose(fixed.detect(large).boxes_px, [(64, 128, 128, 192)], atol=4)
+    np.testing.assert_allclose(fixed.detect(large, tiles="auto").boxes_px, [(64, 128, 128, 192)], atol=1e-3)
+
+
+def test_says_where_it_runs_and_what_it_is(detector: Detector) -> None:
+    assert detector.provider == "ONNX Runtime on the CPU, 1 thread"
+    assert detector.classes == CLASSES
+    assert (detector.info.name, detector.info.stride, detector.info.best_px["car"]) == ("toy", 32, (16.0, 200.0))
+
+
+class TestThermalFramesAndDaylightModels:
+    """A model that knows daylight alone hands thermal frames to one that knows both, and says so."""
+
+    @pytest.fixture(autouse=True)
+    def _folder(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder = tmp_path / "models"
+        self.folder.mkdir()
+        monkeypatch.setenv("SORVOLO_MODELS", str(self.folder))
+        day = rectangle_model(tmp_path / "day.onnx", name="day", thermal=False)
+        self.day = Detector.load(day, provider="cpu", threads=1)
+
+    def test_an_installed_thermal_model_is_used(self, picture: np.ndarray) -> None:
+        # its class 2 is the daylight model's 0, so that its labels must be translated
+        order = ["small object", "car", "person"]
+        rectangle_model(self.folder / "night.onnx", name="night", classes=order)
+        (self.folder / "broken.onnx").write_bytes(b"no model")
+        assert self.day.detect(picture).names == ["person", "small object", "car"]
+        assert self.day.notices == ()
+        grey = np.repeat(picture[:, :, :1], 3, axis=2)
+        found = self.day.detect(grey)
+        assert set(found.names) == {"person"} and found.classes == CLASSES
+        (notice,) = self.day.notices
+        assert (notice.code, notice.count) == ("thermal_model", 1) and "night" in notice.text
+
+    def test_without_one_it_is_said(self, picture: np.ndarray) -> None:
+        for polarity in (picture[:, :, 0], 255 - picture[:, :, 0]):
+            self.day.detect(polarity)
+        (notice,) = self.day.notices
+        assert (notice.code, notice.count) == ("thermal_untrained", 2)
