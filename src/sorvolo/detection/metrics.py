@@ -1,0 +1,371 @@
+"""How good detections are: COCO's measures, the thesis's, recall by size, confusions; pure functions of boxes.
+
+Matching and average precision are pycocotools' own (COCOeval: boxes best first, each takes the label of its class that
+it overlaps most; IoU 0.50 to 0.95 in steps of 0.05; at most 100 boxes a class and picture). What COCO does not tell
+follows from its matches at IoU 0.5.
+"""
+
+import io
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
+
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, TimesNs
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
+from sorvolo.survey.objects import Detections
+
+IOUS: Floats = np.linspace(0.5, 0.95, 10)
+"""The overlaps at which COCO counts a box as right."""
+
+SIZES_PX = (0.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, np.inf)
+"""Edges of the bins of an object's longer side in the picture, px."""
+
+SIZES_M = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, np.inf)
+"""Edges of the bins of an object's longer side on the ground, m."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClassMatch:
+    """One class's detections in a set of pictures, best first, against its labels.
+
+    Of D detections: `scores` (D,), `pictures` (D,) the picture's index, `boxes_px` (D, 4), `right` and `ignored`
+    (10, D) at each of IOUS, `found` (D,) the row of the label found at IoU 0.5, else -1. Of G labels: `true_pictures`
+    (G,), `true_boxes_px` (G, 4), `true_scores` (G,) the score of what found it at IoU 0.5, NaN where nothing did.
+    """
+
+    label: str
+    scores: Floats
+    pictures: TimesNs
+    boxes_px: BoxesPx
+    right: Anything
+    ignored: Anything
+    found: TimesNs
+    true_pictures: TimesNs
+    true_boxes_px: BoxesPx
+    true_scores: Floats
+
+
+@dataclass(frozen=True)
+class CocoNumbers:
+    """COCO's averages over IoU and recall; NaN where there is no label. Areas: below 32^2, to 96^2, above, px."""
+
+    ap: float
+    ap50: float
+    ap75: float
+    ap_small: float
+    ap_medium: float
+    ap_large: float
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """Reporting a class from `score` on gives this precision, recall and F1 (IoU 0.5)."""
+
+    score: float
+    precision: float
+    recall: float
+    f1: float
+
+
+@dataclass(frozen=True)
+class SizeRow:
+    """Labels whose longer side is `low` or more and below `high`: how many were reported, or had any candidate."""
+
+    low: float
+    high: float
+    count: int
+    reported: int
+    candidates: int
+
+    @property
+    def recall(self) -> float:
+        """The share that was reported; NaN of none."""
+        return self.reported / self.count if self.count else float("nan")
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """One mistake: `kind` is "false alarm", "miss" or "confusion"; boxes as (left, top, right, bottom), px.
+
+    `overlap` is the best IoU of a false alarm with any label: 0.1 to 0.5 is a box badly placed rather than an
+    invention.
+    """
+
+    kind: str
+    picture: int
+    box_px: tuple[float, float, float, float]
+    label: str
+    score: float
+    true_label: str = ""
+    overlap: float = 0.0
+
+
+def judged_classes(labelled: LabelledSet, classes: Sequence[str]) -> tuple[str, ...]:
+    """The detector's classes that the set labels, in the detector's order; the others are neither right nor wrong.
+
+    Raises InputError when there is none.
+    """
+    judged = tuple(name for name in classes if name in labelled.classes and name not in labelled.unlabelled)
+    if not judged:
+        raise InputError(
+            f"{labelled.name}: labels {', '.join(labelled.classes) or 'nothing'}"
+            + (f" (not labelled: {', '.join(sorted(labelled.unlabelled))})" if labelled.unlabelled else "")
+            + f", but the model finds {', '.join(classes)}; map the set's names to the model's with --classes"
+        )
+    return judged
+
+
+def match_pictures(
+    labelled: LabelledSet, found: Sequence[Detections], judged: Sequence[str]
+) -> tuple[tuple[ClassMatch, ...], CocoNumbers, dict[str, CocoNumbers]]:
+    """Match one Detections a picture with the set's labels: each judged class, COCO's numbers of all and of each.
+
+    A detection within an ignored region (COCO's crowd) is neither right nor wrong. Raises InputError when the numbers
+    of pictures differ.
+    """
+    if len(found) != len(labelled):
+        raise InputError(f"{labelled.name}: {len(labelled)} pictures, but detections in {len(found)}")
+    truth, truth_rows = _truth(labelled, judged)
+    with redirect_stdout(io.StringIO()):  # pycocotools prints as it goes
+        judge = COCOeval(_indexed(truth), _indexed(truth | {"annotations": _candidates(found, judged)}), "bbox")
+        judge.evaluate()
+        judge.accumulate()
+    precision = np.asarray(judge.eval["precision"])[..., -1]  # IoU, recall, class, area
+    pictures = len(labelled)
+    areas = len(judge.params.areaRng)
+    matches = tuple(
+        _class_match(name, judge.evalImgs[k * areas * pictures:(k * areas + 1) * pictures], judge, truth_rows)
+        for k, name in enumerate(judged)
+    )
+    each = {name: _numbers(precision[:, :, k:k + 1]) for k, name in enumerate(judged)}
+    return matches, _numbers(precision), each
+
+
+def counts_at(match: ClassMatch, score: float) -> tuple[int, int, int]:
+    """True positives, false positives and misses of what scores at least this, at IoU 0.5."""
+    reported = match.scores >= score
+    right = int((reported & match.right[0]).sum())
+    wrong = int((reported & ~match.right[0] & ~match.ignored[0]).sum())
+    return right, wrong, len(match.true_scores) - right
+
+
+def thesis_ap(match: ClassMatch, score: float) -> float:
+    """The thesis's AP of a class (eq. 4.3): TP / (TP + FP) of what is reported at this score.
+
+    It is precision at one threshold, not the area under a curve, and says nothing of what was missed. 0 where labels
+    exist and nothing was reported; NaN without labels.
+    """
+    right, wrong, _ = counts_at(match, score)
+    if not len(match.true_scores):
+        return float("nan")
+    return right / (right + wrong) if right + wrong else 0.0
+
+
+def thesis_map(matches: Sequence[ClassMatch], thresholds: Mapping[str, float]) -> float:
+    """The thesis's mAP (eq. 4.4): the mean of eq. 4.3 over the classes that have labels."""
+    values = [thesis_ap(match, thresholds[match.label]) for match in matches]
+    known = [value for value in values if not np.isnan(value)]
+    return float(np.mean(known)) if known else float("nan")
+
+
+def precision_recall(match: ClassMatch) -> tuple[Floats, Floats, Floats]:
+    """Score, precision and recall (N,) after each detection that counts, best first, at IoU 0.5."""
+    counted = ~match.ignored[0]
+    right = np.cumsum(match.right[0][counted])
+    total = np.arange(1, len(right) + 1)
+    return match.scores[counted], right / total, right / max(len(match.true_scores), 1)
+
+
+def best_threshold(match: ClassMatch) -> Threshold:
+    """The score from which on F1 is highest; NaN without labels or detections.
+
+    It is chosen on the very pictures that it is told of, so it flatters a little.
+    """
+    scores, precision, recall = precision_recall(match)
+    if not len(scores) or not len(match.true_scores):
+        return Threshold(*[float("nan")] * 4)
+    f1 = 2 * precision * recall / np.maximum(precision + recall, 1e-12)
+    f1[:-1][scores[:-1] == scores[1:]] = 0.0  # a threshold cannot part equal scores
+    best = int(np.argmax(f1))
+    return Threshold(*(float(each[best]) for each in (scores, precision, recall, f1)))
+
+
+def recall_by_size(
+    matches: Sequence[ClassMatch], thresholds: Mapping[str, float], scale: Floats, edges: Sequence[float]
+) -> dict[str, tuple[SizeRow, ...]]:
+    """Each class's recall by the longer side of its labels, in units of `scale` (P,) per pixel of each picture.
+
+    Labels in pictures whose scale is NaN are left out; bins without labels as well.
+    """
+    table: dict[str, tuple[SizeRow, ...]] = {}
+    for match in matches:
+        sides = (match.true_boxes_px[:, 2:] - match.true_boxes_px[:, :2]).max(axis=1) * scale[match.true_pictures]
+        reported = match.true_scores >= thresholds[match.label]
+        rows = []
+        for low, high in pairwise(edges):
+            inside = (sides >= low) & (sides < high)
+            if inside.any():
+                counts = (inside, inside & reported, inside & np.isfinite(match.true_scores))
+                rows.append(SizeRow(float(low), float(high), *(int(each.sum()) for each in counts)))
+        table[match.label] = tuple(rows)
+    return table
+
+
+def confusion(
+    matches: Sequence[ClassMatch], thresholds: Mapping[str, float]
+) -> tuple[TimesNs, tuple[Mistake, ...]]:
+    """(C + 1, C + 1) true class by reported class, the last row and column being background; and every mistake.
+
+    First each class's own matches at IoU 0.5; then what is left, best first, takes what is left of other classes at IoU
+    0.5 or more. The rest of the reported are false alarms (last row), the rest of the labels are missed (last column).
+    """
+    size = len(matches)
+    table: TimesNs = np.zeros((size + 1, size + 1), np.int64)
+    wrong: list[tuple[float, int, int]] = []  # score, class, detection
+    missed: dict[int, list[tuple[int, int]]] = {}  # picture -> class, label
+    for k, match in enumerate(matches):
+        reported = match.scores >= thresholds[match.label]
+        table[k, k] = int((reported & match.right[0]).sum())
+        wrong += [
+            (float(match.scores[d]), k, d)
+            for d in np.flatnonzero(reported & ~match.right[0] & ~match.ignored[0]).tolist()
+        ]
+        for g in np.flatnonzero(~(match.true_scores >= thresholds[match.label])).tolist():
+            missed.setdefault(int(match.true_pictures[g]), []).append((k, g))
+    mistakes = []
+    for score, k, d in sorted(wrong, key=lambda row: (-row[0], row[1], row[2])):
+        match, picture = matches[k], int(matches[k].pictures[d])
+        box = match.boxes_px[d]
+        left = [row for row in missed.get(picture, []) if row[0] != k]
+        overlaps = _overlaps(box, np.array([matches[c].true_boxes_px[g] for c, g in left]))
+        if len(left) and overlaps.max() >= IOUS[0]:
+            c, g = left[int(np.argmax(overlaps))]
+            missed[picture].remove((c, g))
+            table[c, k] += 1
+            mistakes.append(Mistake("confusion", picture, _tuple(box), match.label, score, matches[c].label))
+        else:
+            table[size, k] += 1
+            near = max((_best_overlap(box, each, picture) for each in matches), default=0.0)
+            mistakes.append(Mistake("false alarm", picture, _tuple(box), match.label, score, overlap=near))
+    for picture, rows in missed.items():
+        for c, g in rows:
+            table[c, size] += 1
+            box, score = matches[c].true_boxes_px[g], float(np.nan_to_num(matches[c].true_scores[g]))
+            mistakes.append(Mistake("miss", picture, _tuple(box), "", score, matches[c].label))
+    return table, tuple(mistakes)
+
+
+def _truth(labelled: LabelledSet, judged: Sequence[str]) -> tuple[dict[str, Any], dict[int, tuple[int, BoxesPx]]]:
+    """COCO's records of the labels, and of each label that counts its picture and box by id."""
+    annotations: list[dict[str, Any]] = []
+    rows: dict[int, tuple[int, BoxesPx]] = {}
+    category = {labelled.classes.index(name): k for k, name in enumerate(judged)}
+    for index, picture in enumerate(labelled.pictures):
+        for box, label in zip(picture.boxes_px, picture.labels.tolist()):
+            if label in category:
+                rows[len(annotations) + 1] = index, box
+                annotations.append(_annotation(len(annotations) + 1, index, category[label], box))
+        for region in picture.ignored_px:
+            annotations += [
+                _annotation(len(annotations) + 1 + k, index, k, region) | {"iscrowd": 1} for k in range(len(judged))
+            ]
+    return {
+        "info": {}, "images": [_image(index, each) for index, each in enumerate(labelled.pictures)],
+        "categories": [{"id": k, "name": name} for k, name in enumerate(judged)], "annotations": annotations,
+    }, rows
+
+
+def _candidates(found: Sequence[Detections], judged: Sequence[str]) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    for index, detections in enumerate(found):
+        for box, score, name in zip(detections.boxes_px, detections.scores.tolist(), detections.names):
+            if name in judged:
+                rows.append(_annotation(len(rows) + 1, index, judged.index(name), box) | {"score": score})
+    return rows
+
+
+def _annotation(row_id: int, picture: int, category: int, box: BoxesPx) -> dict[str, Any]:
+    left, top, right, bottom = (float(edge) for edge in box)
+    return {
+        "id": row_id, "image_id": picture, "category_id": category, "iscrowd": 0,
+        "bbox": [left, top, right - left, bottom - top], "area": (right - left) * (bottom - top),
+    }
+
+
+def _image(index: int, picture: LabelledPicture) -> dict[str, Any]:
+    return {"id": index, "width": picture.width_px, "height": picture.height_px, "file_name": picture.path}
+
+
+def _indexed(dataset: dict[str, Any]) -> COCO:
+    records = COCO()
+    records.dataset = dataset
+    records.createIndex()
+    return records
+
+
+def _numbers(precision: Anything) -> CocoNumbers:
+    """COCO's averages of (IoU, recall, class, area); -1 stands where there is no label."""
+    def mean(part: Anything) -> float:
+        known = part[part > -1]
+        return float(known.mean()) if known.size else float("nan")
+    every = precision[..., 0]
+    sizes = (mean(precision[..., area]) for area in (1, 2, 3))
+    return CocoNumbers(mean(every), mean(every[0]), mean(every[5]), *sizes)
+
+
+def _class_match(
+    name: str, rows: Sequence[dict[str, Any] | None], judge: COCOeval, truth_rows: Mapping[int, tuple[int, BoxesPx]]
+) -> ClassMatch:
+    """The class's pictures of COCO's evaluation (all areas) as columns."""
+    seen = [row for row in rows if row is not None]
+    true_ids = [
+        gt for row in seen for gt, ignored in zip(row["gtIds"], np.asarray(row["gtIgnore"])) if not ignored
+    ]
+    row_of = {gt: k for k, gt in enumerate(true_ids)}
+    scores = np.array([score for row in seen for score in row["dtScores"]], np.float64)
+    order = np.argsort(-scores, kind="mergesort")
+    pictures = np.array([row["image_id"] for row in seen for _ in row["dtIds"]], np.int64)
+    ids = [dt for row in seen for dt in row["dtIds"]]
+    boxes = np.array([_edges(judge.cocoDt.anns[dt]["bbox"]) for dt in ids], np.float32).reshape(-1, 4)
+    shape = (len(IOUS), -1)
+    matched = np.concatenate([np.zeros((len(IOUS), 0))] + [row["dtMatches"].reshape(shape) for row in seen], axis=1)
+    ignored = np.concatenate([np.zeros((len(IOUS), 0))] + [row["dtIgnore"].reshape(shape) for row in seen], axis=1) > 0
+    right = (matched > 0) & ~ignored
+    found = np.array([row_of.get(int(gt), -1) for gt in matched[0]], np.int64)
+    true_scores = np.full(len(true_ids), np.nan)
+    true_scores[found[found >= 0]] = scores[found >= 0]
+    return ClassMatch(
+        name, scores[order], pictures[order], boxes[order], right[:, order], ignored[:, order], found[order],
+        np.array([truth_rows[gt][0] for gt in true_ids], np.int64),
+        np.array([truth_rows[gt][1] for gt in true_ids], np.float32).reshape(-1, 4), true_scores,
+    )
+
+
+def _edges(bbox: Sequence[float]) -> tuple[float, float, float, float]:
+    return bbox[0], bbox[1], bbox[0] + bbox[2], bbox[1] + bbox[3]
+
+
+def _tuple(box: BoxesPx) -> tuple[float, float, float, float]:
+    left, top, right, bottom = (float(edge) for edge in box)
+    return left, top, right, bottom
+
+
+def _overlaps(box: BoxesPx, others: Anything) -> Floats:
+    """(N,) intersection over union of one box with others, (N, 4)."""
+    if not len(others):
+        return np.zeros(0)
+    inner = np.clip(np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2]), 0, None).prod(axis=1)
+    areas = (others[:, 2:] - others[:, :2]).prod(axis=1) + (box[2:] - box[:2]).prod()
+    return np.asarray(inner / np.maximum(areas - inner, 1e-9), np.float64)
+
+
+def _best_overlap(box: BoxesPx, match: ClassMatch, picture: int) -> float:
+    overlaps = _overlaps(box, match.true_boxes_px[match.true_pictures == picture])
+    return float(overlaps.max()) if len(overlaps) else 0.0
