@@ -1,23 +1,30 @@
 """The detector's ready-made shapes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
+
+import torch
 
 from sorvolo.training.backbone import EfficientNetLite0
 from sorvolo.training.faster_rcnn import FasterRCNN, Reach
-from sorvolo.training.heads import TwoLayerHead
+from sorvolo.training.heads import StageHead, TwoLayerHead
 from sorvolo.training.inception import Stem
 from sorvolo.training.proposals import AnchorSettings, ProposalNetwork
 from sorvolo.training.pyramid import Pyramid
+from sorvolo.training.resnet import ResNet50, load_stage, resnet_stage
+from sorvolo.training.weights import ImageNetWeights, Net
 
-Preset = Literal["fast", "accurate", "thesis", "tiny"]
+Preset = Literal["fast", "accurate", "thesis"]
 
 _FAST_ANCHORS = (AnchorSettings((7, 11, 17)), AnchorSettings((25, 37, 54)), AnchorSettings((80, 120, 190)))
 _FAST_WIDTH = 64
+_RATIOS = (0.5, 1.0, 2.0)
+_ACCURATE_ANCHORS = tuple(AnchorSettings(sizes, _RATIOS) for sizes in ((10, 16), (25, 40), (63, 100), (160, 250)))
+_THESIS_ANCHORS = (AnchorSettings((16, 32, 64, 128, 256), _RATIOS),)  # of Faster R-CNN, an octave finer on either side
 
 
 def fast(classes: Sequence[str], rpn: Stem = "extended-residual", *, thaw_all: bool = False) -> FasterRCNN:
-    """For a laptop without a GPU: EfficientNet-Lite0 up to stride 16, a light pyramid down to stride 4, a slim stack."""
+    """For a laptop without a GPU: EfficientNet-Lite0 up to stride 16, a light pyramid down to stride 4, slim stacks."""
     backbone = EfficientNetLite0(thaw_all=thaw_all)
     neck = Pyramid(backbone.channels, _FAST_WIDTH, light=True)
     proposals = ProposalNetwork(
@@ -25,3 +32,55 @@ def fast(classes: Sequence[str], rpn: Stem = "extended-residual", *, thaw_all: b
     )
     head = TwoLayerHead(_FAST_WIDTH, 160, len(classes))
     return FasterRCNN(backbone, neck, proposals, head, Reach())
+
+
+def accurate(
+    classes: Sequence[str], rpn: Stem = "extended-residual", *, original: bool = False, frozen: bool = True
+) -> FasterRCNN:
+    """For a GPU: ResNet-50 with a pyramid of strides 4 to 32 (P2 to P5), a stack on each, two fully connected layers.
+
+    `original`: where ResNet's strides sit (`resnet.ResNet50`); it follows from the weights that are to be loaded.
+    `frozen`: its batch norms and first layers stay as loaded.
+    """
+    backbone = ResNet50(deep=True, original=original, frozen_norms=frozen, thaw_all=not frozen)
+    neck = Pyramid(backbone.channels, 256, light=False)
+    proposals = ProposalNetwork(neck.channels, backbone.strides, _ACCURATE_ANCHORS, rpn, 256, light=False)
+    head = TwoLayerHead(256, 1024, len(classes))
+    return FasterRCNN(backbone, neck, proposals, head, Reach(before=2000, regions=500))
+
+
+def thesis(
+    classes: Sequence[str], rpn: Stem = "extended", *, original: bool = False, frozen: bool = True
+) -> FasterRCNN:
+    """The thesis's own (its 3.3.2): ResNet-50 up to res4, proposals through Table 3.2's nine modules, res5 as head.
+
+    `original` and `frozen` as for `accurate`.
+    """
+    backbone = ResNet50(original=original, frozen_norms=frozen, thaw_all=not frozen)
+    proposals = ProposalNetwork(backbone.channels, backbone.strides, _THESIS_ANCHORS, rpn, 512, light=False)
+    head = StageHead(resnet_stage(4, original=original, frozen_norms=frozen), 2048, len(classes))
+    return FasterRCNN(backbone, torch.nn.Identity(), proposals, head, Reach(before=2000))
+
+
+NETS: Mapping[Preset, Net] = {"fast": "lite0", "accurate": "resnet50", "thesis": "resnet50"}
+"""The backbone whose ImageNet weights a preset starts from."""
+
+_RESNETS: Mapping[str, Callable[..., FasterRCNN]] = {"accurate": accurate, "thesis": thesis}
+
+
+def build(
+    preset: Preset, classes: Sequence[str], rpn: Stem, weights: ImageNetWeights | None, *, original: bool = False
+) -> FasterRCNN:
+    """The preset's network, its backbone (and the thesis's head) with `weights`; without, as chance has it.
+
+    Without weights everything is learnt from nothing: no layer is frozen then, and `original` may be chosen.
+    """
+    if weights is None:
+        if preset == "fast":
+            return fast(classes, rpn, thaw_all=True)
+        return _RESNETS[preset](classes, rpn, original=original, frozen=False)
+    model = fast(classes, rpn) if preset == "fast" else _RESNETS[preset](classes, rpn, original=weights.original)
+    model.backbone.load_imagenet(dict(weights.layers))  # type: ignore[operator]
+    if isinstance(model.head, StageHead):
+        load_stage(model.head.stage, 4, weights.layers)  # type: ignore[arg-type]
+    return model

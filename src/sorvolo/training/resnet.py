@@ -71,7 +71,11 @@ def resnet_stage(index: int, *, original: bool, frozen_norms: bool = True) -> nn
         stride = 2 if block == 0 and index > 1 else 1
         rows.append(_Bottleneck(channels, inner, stride, original=original, frozen_norms=frozen_norms))
         channels = inner * _GROWTH
-    return nn.Sequential(*rows)
+    stage = nn.Sequential(*rows)
+    for module in stage.modules():
+        if isinstance(module, nn.Conv2d):
+            nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+    return stage
 
 
 class ResNet50(nn.Module):
@@ -94,9 +98,7 @@ class ResNet50(nn.Module):
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN) * 255)
         for index in range(1, 5 if deep else 4):
             self.add_module(f"layer{index}", resnet_stage(index, original=original, frozen_norms=frozen_norms))
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+        nn.init.kaiming_normal_(self.conv1.weight, mode="fan_out", nonlinearity="relu")
         with torch.no_grad():  # what torchvision does to its input: (value / 255 - mean) / std
             self.conv1.weight /= torch.tensor(IMAGENET_STD)[None, :, None, None] * 255
         self.channels = (256, 512, 1024, 2048) if deep else (1024,)
