@@ -8,11 +8,11 @@ import numpy as np
 from sorvolo.detection.session import Seen
 from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, Mask
 
-SAME_IOU = 0.5
+SAME_IOU = 0.4
 """Two tiles' boxes of a class are one object if they overlap this much in what both tiles show."""
 
 _COVERED = 0.7  # so much of a cut piece within a box that another tile saw whole: the piece says nothing new
-_TOUCH_SHARE, _TOUCH_PX = 0.1, 2.0  # a box that ends so near its tile's border may go on beyond
+_TOUCH_SHARE, _TOUCH_PX = 0.2, 2.0  # a box that ends so near its tile's border may go on beyond; boxes are imprecise
 _MORE = 1.1
 
 

@@ -80,7 +80,7 @@ def plan_tiles(
         if fixed_px is not None or height * width <= MOST_AT_ONCE_PX:
             return TilePlan(1.0, ((0, 0, width, height),))
         m_per_px = math.nan
-    elif tiles != "auto" and (not isinstance(tiles, int) or tiles < _LEAST_SIDE_PX):
+    elif tiles != "auto" and (type(tiles) is not int or tiles < _LEAST_SIDE_PX):
         raise SettingsError(f"tiles must be 'auto' or at least {_LEAST_SIDE_PX} px a side, not {tiles!r}")
     scale = 1.0
     if isinstance(tiles, int):
