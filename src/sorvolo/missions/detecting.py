@@ -5,6 +5,7 @@ from typing import Literal, Protocol
 
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.survey.flight import Notice
 from sorvolo.survey.objects import Detections
 
 
@@ -18,6 +19,14 @@ class Detects(Protocol):
     @property
     def info(self) -> ModelInfo:
         """What the model says of itself."""
+
+    @property
+    def provider(self) -> str:
+        """Where it runs, in words."""
+
+    @property
+    def notices(self) -> tuple[Notice, ...]:
+        """What a user should know of the pictures seen so far."""
 
     def detect(
         self, image: ImageRGB, *, tiles: Literal["auto"] | int | None = None, m_per_px: float | None = None,

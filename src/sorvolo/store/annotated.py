@@ -36,9 +36,9 @@ def annotated(
         left, top, right, bottom = (round(float(edge)) for edge in boxes_px[row])
         cv2.rectangle(drawn, (left, top), (right, bottom), colour, strong if counted[row] else 1, cv2.LINE_AA)
         if words[row]:
-            _write(drawn, words[row], (left, max(top - 4, round(24 * letters))), letters, colour)
+            _write(drawn, words[row], (left, top - strong - 6), letters, colour)
     if headline:
-        _write(drawn, headline, (8, round(32 * letters) + 6), 1.2 * letters, (255, 255, 255))
+        _write(drawn, headline, (0, 0), 1.2 * letters, (255, 255, 255))
     return drawn
 
 
@@ -113,8 +113,10 @@ class AnnotatedVideo:
 
 
 def _write(picture: ImageRGB, words: str, corner: tuple[int, int], size: float, colour: tuple[int, int, int]) -> None:
-    """Words with a dark rim, readable on any ground; OpenCV's letters are ASCII."""
+    """Words on a dark bar, readable on any ground and within the picture; OpenCV's letters are ASCII."""
     plain = words.encode("ascii", "replace").decode()
-    thick = max(1, round(2 * size))
-    for tone, width in (((0, 0, 0), thick + 2), (colour, thick)):
-        cv2.putText(picture, plain, corner, cv2.FONT_HERSHEY_SIMPLEX, size, tone, width, cv2.LINE_AA)
+    (width, height), below = cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+    x = max(0, min(corner[0], picture.shape[1] - width - 2))
+    y = max(height + 2, corner[1])
+    cv2.rectangle(picture, (x, y - height - 2), (x + width + 2, y + below), (20, 20, 20), cv2.FILLED)
+    cv2.putText(picture, plain, (x + 1, y), cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
