@@ -140,6 +140,15 @@ def decode_photo(data: bytes, name: str) -> ImageRGB:
         raise InputError(f"{name} is damaged or cut ({error})") from error
 
 
+def read_picture(path: Path) -> ImageRGB:
+    """A picture's pixels as its EXIF orientation wants them shown, 8 bits, RGB.
+
+    Raises InputError when it is missing or damaged.
+    """
+    orientation = read_photo_metadata(path).orientation
+    return np.ascontiguousarray(_turn(decode_photo(path.read_bytes(), path.name), orientation))
+
+
 def read_album(paths: Sequence[Path]) -> Album:
     """Read every photo's metadata and put the photos in order of time; takes milliseconds a photo.
 

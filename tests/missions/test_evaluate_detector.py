@@ -1,0 +1,154 @@
+"""A detector measured on labelled pictures: by itself, beside others, and what is written of it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sorvolo.errors import InputError
+from sorvolo.missions.evaluate_detector import (
+    FOUND,
+    NUMBERS,
+    PAGE,
+    EvaluationSettings,
+    evaluate_detector,
+    evaluation_numbers,
+    write_evaluation,
+)
+from sorvolo.store.detector_files import FoundSets, read_found, write_found
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
+from sorvolo.survey.objects import CLASSES, Detections
+
+QUICK = EvaluationSettings(draws=50)
+THRESHOLDS = dict.fromkeys(CLASSES, 0.5)
+
+
+@pytest.fixture(scope="session")
+def toy(tmp_path_factory):
+    """A real model that finds bright rectangles: red is the score, green the class."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parents[1] / "detection"))
+        import toy_models
+    return toy_models.rectangle_model(tmp_path_factory.mktemp("models") / "toy.onnx")
+
+
+def paint(path, rectangles):
+    """A dark picture of 96x64 with a rectangle (box, class, score of 255) each."""
+    image = np.full((64, 96, 3), 20, np.uint8)
+    for (left, top, right, bottom), label, score in rectangles:
+        image[top:bottom, left:right] = (score, 100 * label, 60)
+    Image.fromarray(image).save(path)
+
+
+@pytest.fixture(scope="session")
+def labelled(tmp_path_factory):
+    """Four pictures of two videos: all is found but a person called a car, a missed car and an invented person."""
+    folder = tmp_path_factory.mktemp("set")
+    person, car = ((8, 8, 16, 20), 0, 200), ((30, 30, 60, 50), 1, 220)
+    painted = [[person, car], [person], [((8, 8, 16, 20), 1, 240)], [((70, 10, 80, 20), 0, 250)]]
+    truth = [[person, car], [person, ((70, 40, 90, 50), 1, 0)], [person], []]
+    pictures = []
+    for index, (shown, true) in enumerate(zip(painted, truth)):
+        path = folder / f"{index}.png"
+        paint(path, shown)
+        pictures.append(LabelledPicture(
+            str(path), 96, 64, f"video{index // 2}", np.array([row[0] for row in true], float).reshape(-1, 4),
+            np.array([row[1] for row in true], int), np.zeros((0, 4)), 0.1,
+        ))
+    return LabelledSet("painted", CLASSES, tuple(pictures), frozenset({"small object"}))
+
+
+def test_a_model_is_measured_and_its_report_stands_alone(toy, labelled, tmp_path):
+    steps = []
+    evaluation = evaluate_detector([[str(toy)]], [labelled], QUICK, steps.append)
+    assert [step.pictures_done for step in steps] == [1, 2, 3, 4]
+    (scores,) = evaluation.sets
+    person, car = scores.classes
+    assert scores.left_out == ("small object",) and scores.groups == 2
+    assert (person.labels, car.labels) == (3, 2)
+    # persons by score: the invention, two right, one never: precision 1/2 at recall 1/3 and 2/3 at 2/3
+    assert person.coco.ap50 == pytest.approx(67 * (2 / 3) / 101)
+    # cars by score: the person called a car, one right, one missed: precision 1/2 at recall 1/2
+    assert car.coco.ap50 == pytest.approx(51 * 0.5 / 101)
+    assert scores.thesis_map == pytest.approx((2 / 3 + 1 / 2) / 2)
+    assert scores.confusion.tolist() == [[2, 1, 0], [0, 1, 1], [1, 0, 0]]
+    assert {row.kind for row in scores.mistakes} == {"false alarm", "miss", "confusion"}
+    assert [(row.low, row.count) for row in scores.by_size_m["car"]] == [(2.0, 2)]
+    write_evaluation(evaluation, tmp_path / "out", {"data": "painted"})
+    page = (tmp_path / "out" / PAGE).read_text()
+    assert page.count("data:image/jpeg;base64,") == 3 and "http" not in page.replace("http://www.w3.org", "")
+    assert "person reported as car" in page and "car missed" in page
+    numbers = json.loads((tmp_path / "out" / NUMBERS).read_text())
+    assert numbers["sets"][0]["mistakes"] == {"false alarm": 1, "miss": 1, "confusion": 1}
+    assert numbers["sets"][0]["thesis_map"] == pytest.approx(scores.thesis_map)
+    assert numbers["sets"][0]["classes"][0]["coco"]["ap_large"] is None
+    again = evaluate_detector([[str(tmp_path / "out" / FOUND)]], [labelled], QUICK)
+    mine, its = (evaluation_numbers(each, {}) for each in (evaluation, again))
+    assert mine["sets"][0]["coco"]["ap"] == pytest.approx(its["sets"][0]["coco"]["ap"])
+    assert its["seconds_per_picture"] != its["seconds_per_picture"]  # unknown: nothing was run
+
+
+def random_arm(folder, name, labelled, skill, seed):
+    """detections.json of a detector that finds each label with this chance."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for picture in labelled.pictures:
+        hit = rng.uniform(size=len(picture.labels)) < skill
+        boxes = np.vstack([picture.boxes_px[hit], rng.uniform(0, 20, (1, 4)) + np.array([0, 0, 30, 30])])
+        scores = np.append(rng.uniform(0.5, 1, hit.sum()), 0.4)
+        found.append(Detections(boxes, scores, np.append(picture.labels[hit], 0), CLASSES))
+    names = tuple(Path(each.path).name for each in labelled.pictures)
+    path = folder / f"{name}{seed}.json"
+    write_found(path, FoundSets(name, CLASSES, THRESHOLDS, {labelled.name: (names, tuple(found))}))
+    return str(path)
+
+
+@pytest.fixture(scope="session")
+def many(tmp_path_factory):
+    """Sixty small pictures of twelve videos, their labels at random."""
+    folder, rng = tmp_path_factory.mktemp("many"), np.random.default_rng(3)
+    pictures = []
+    for index in range(60):
+        paint(folder / f"{index}.png", [])
+        corners = rng.uniform(0, 40, (5, 2))
+        boxes = np.hstack([corners, corners + rng.uniform(5, 20, (5, 2))])
+        pictures.append(LabelledPicture(
+            str(folder / f"{index}.png"), 96, 64, f"v{index % 12}", boxes, rng.integers(0, 2, 5), np.zeros((0, 4))
+        ))
+    return LabelledSet("many", CLASSES, tuple(pictures), frozenset({"small object"}))
+
+
+def test_arms_of_several_seeds_side_by_side(many, tmp_path):
+    standard = [random_arm(tmp_path, "standard", many, 0.5, seed) for seed in (1, 2, 3)]
+    extended = [random_arm(tmp_path, "extended", many, 0.8, seed) for seed in (1, 2, 3)]
+    evaluation = evaluate_detector([standard, extended], [many], QUICK)
+    (told,) = evaluation.comparisons
+    assert [arm.seeds for arm in told.arms] == [3, 3] and told.groups == 12
+    assert told.arms[0].lowest["AP50"] < told.arms[0].mean["AP50"] < told.arms[0].highest["AP50"]
+    better = told.differences[0]["AP50"]
+    assert better.value == pytest.approx(told.arms[1].mean["AP50"] - told.arms[0].mean["AP50"])
+    assert better.is_clear and 0.1 < better.low < better.value < better.high
+    write_evaluation(evaluation, tmp_path / "out", {})
+    page = (tmp_path / "out" / PAGE).read_text()
+    assert "Side by side: many" in page and "extended and 2 more seeds less standard and 2 more seeds" in page
+
+
+def test_detections_of_other_pictures_are_refused(many, labelled, tmp_path):
+    mine = random_arm(tmp_path, "mine", many, 0.5, 1)
+    with pytest.raises(InputError, match="holds detections of many, none of painted"):
+        evaluate_detector([[mine]], [labelled], QUICK)
+    fewer = LabelledSet(many.name, many.classes, many.pictures[5:10], many.unlabelled)
+    assert evaluate_detector([[mine]], [fewer], QUICK).sets[0].pictures == 5
+    found = read_found(Path(mine))
+    names, detections = found.sets["many"]
+    half = FoundSets(found.name, CLASSES, THRESHOLDS, {"many": (names[:9], detections[:9])})
+    write_found(tmp_path / "half.json", half)
+    with pytest.raises(InputError, match=r"51 are missing, such as 9\.png"):
+        evaluate_detector([[str(tmp_path / "half.json")]], [many], QUICK)
+    (tmp_path / "other.json").write_text('{"type": "FeatureCollection"}')
+    with pytest.raises(InputError, match=r"not detections\.json"):
+        evaluate_detector([[str(tmp_path / "other.json")]], [many], QUICK)
+    with pytest.raises(InputError, match="two data sets have one name"):
+        evaluate_detector([[mine]], [many, many], QUICK)
