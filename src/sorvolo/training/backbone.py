@@ -12,6 +12,26 @@ _BLOCKS = (  # repeats, kernel, stride, growth, out channels
 )
 
 
+class _OneNode(torch.autograd.Function):
+    """A convolution padded unevenly as a single node of the exported graph; torch itself needs two."""
+
+    @staticmethod
+    def forward(
+        ctx: object, features: Tensor, weight: Tensor, bias: Tensor, stride: int, pads: tuple[int, int], groups: int
+    ) -> Tensor:
+        before, after = pads
+        padded = functional.pad(features, (before, after, before, after))
+        return functional.conv2d(padded, weight, bias, stride, groups=groups)
+
+    @staticmethod
+    def symbolic(g, features, weight, bias, stride: int, pads: tuple[int, int], groups: int):  # type: ignore[no-untyped-def]
+        before, after = pads
+        return g.op(
+            "Conv", features, weight, bias, strides_i=[stride, stride], pads_i=[before, before, after, after],
+            group_i=groups,
+        )
+
+
 class SamePadded(nn.Conv2d):
     """A convolution padded as TensorFlow's "same": what is odd goes to the right and bottom."""
 
@@ -22,6 +42,10 @@ class SamePadded(nn.Conv2d):
         after = total - before
         if before == after:
             return functional.conv2d(features, self.weight, self.bias, self.stride, before, groups=self.groups)
+        if torch.onnx.is_in_onnx_export():
+            return _OneNode.apply(  # type: ignore[no-untyped-call]
+                features, self.weight, self.bias, self.stride[0], (before, after), self.groups
+            )
         padded = functional.pad(features, (before, after, before, after))
         return functional.conv2d(padded, self.weight, self.bias, self.stride, groups=self.groups)
 
@@ -50,7 +74,7 @@ class _Block(nn.Module):
 class EfficientNetLite0(nn.Module):
     """Features of strides 4, 8 and 16 (24, 40 and 112 channels), of 32 too (320) if `deep`.
 
-    Its batch norms, which would stay as ImageNet left them, are folded into the convolutions; the layers up to stride 4
+    Its batch norms, which would stay as ImageNet left them, are folded into the convolutions; the layers up to stride 8
     are frozen unless `thaw_all`. Input: (N, 3, H, W) floats 0 to 255, sides multiples of the last stride.
     """
 
@@ -68,7 +92,7 @@ class EfficientNetLite0(nn.Module):
         self.channels = (24, 40, 112, 320) if deep else (24, 40, 112)
         self.strides = (4, 8, 16, 32) if deep else (4, 8, 16)
         if not thaw_all:
-            for module in (self._conv_stem, *self._blocks[:3]):
+            for module in (self._conv_stem, *self._blocks[:5]):
                 for weight in module.parameters():
                     weight.requires_grad = False
 

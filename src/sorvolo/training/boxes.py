@@ -1,4 +1,4 @@
-"""Boxes in tensors: overlap, offsets from anchors and back, and suppression; the same in training and in the exported graph."""
+"""Boxes in tensors: overlap, offsets from anchors and back, suppression; alike in training and in the exported graph."""
 
 import numpy as np
 import torch
@@ -23,10 +23,8 @@ def cover_matrix(a: Tensor, b: Tensor) -> Tensor:
 
 def _shared(a: Tensor, b: Tensor) -> Tensor:
     a, b = a.detach(), b.detach()
-    sides = [
-        torch.minimum(a[:, None, axis + 2], b[None, :, axis + 2]).sub_(torch.maximum(a[:, None, axis], b[None, :, axis]))
-        for axis in (0, 1)
-    ]
+    far = [torch.minimum(a[:, None, axis], b[None, :, axis]) for axis in (2, 3)]
+    sides = [side.sub_(torch.maximum(a[:, None, axis], b[None, :, axis])) for side, axis in zip(far, (0, 1))]
     return sides[0].clamp_(min=0).mul_(sides[1].clamp_(min=0))
 
 
@@ -55,7 +53,7 @@ def clipped(boxes: Tensor, height_px: Tensor | int, width_px: Tensor | int) -> T
     """The boxes (N, 4) cut at the picture's edges."""
     x = boxes[:, 0::2].clamp(min=0)
     y = boxes[:, 1::2].clamp(min=0)
-    x, y = torch.clamp(x, max=width_px), torch.clamp(y, max=height_px)  # type: ignore[arg-type]
+    x, y = torch.clamp(x, max=width_px), torch.clamp(y, max=height_px)
     return torch.stack([x[:, 0], y[:, 0], x[:, 1], y[:, 1]], 1)
 
 
@@ -111,7 +109,7 @@ class _Suppress(torch.autograd.Function):
 
 def suppress(boxes: Tensor, scores: Tensor, most: int, iou: float, least_score: float) -> Tensor:
     """(K, 2) class and index of what is kept of boxes (N, 4) with scores (C, N), class by class."""
-    return _Suppress.apply(boxes, scores, most, iou, least_score)[:, 1:]
+    return _Suppress.apply(boxes, scores, most, iou, least_score)[:, 1:]  # type: ignore[no-untyped-call]
 
 def at_most(most: int, values: Tensor) -> int:
     """`most`, or how many values there are if fewer: for a topk that the exported graph can do with any picture."""

@@ -29,7 +29,7 @@ class FasterRCNN(nn.Module):
 
     def __init__(
         self, backbone: nn.Module, neck: nn.Module, proposals: ProposalNetwork, head: TwoLayerHead | StageHead,
-        reach: Reach = Reach(),  # noqa: B008 (frozen)
+        reach: Reach = Reach(),
     ) -> None:
         super().__init__()
         self.backbone, self.neck, self.proposals, self.head, self.reach = backbone, neck, proposals, head, reach

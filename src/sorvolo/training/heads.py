@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-_CANONICAL_PX = 56.0  # a box of this size is looked at on the level of stride 8, as Lin et al. 2017, eq. 1, at our scale
+_CANONICAL_PX = 56.0  # a box of this size is looked at on the level of stride 8 (Lin et al. 2017, eq. 1)
 _SAMPLES = 2
 
 
@@ -36,7 +36,7 @@ def roi_align(features: Tensor, boxes: Tensor, batch: Tensor, stride: int, side:
     As ONNX's RoiAlign: bilinear, half-pixel centres, two by two samples a cell (He et al. 2017, Mask R-CNN).
     """
     if torch.onnx.is_in_onnx_export():
-        return _RoiAlign.apply(features, boxes, 1.0 / stride, side)
+        return _RoiAlign.apply(features, boxes, 1.0 / stride, side)  # type: ignore[no-untyped-call]
     return _sampled(features, boxes, batch, 1.0 / stride, side)
 
 
@@ -78,14 +78,12 @@ def pooled_levels(
             rows = (wanted == float(stride.bit_length() - 1)).nonzero()[:, 0]
             out = out.index_copy(0, rows, roi_align(level, boxes[rows], batch[rows], stride, side))
         return out
-    # a graph without branches: every level is asked, and all but the right answer weigh nothing
-    total: Tensor | None = None
-    for level, stride in zip(levels, strides):
-        here = (wanted == float(stride.bit_length() - 1)).to(boxes.dtype)
-        part = roi_align(level, boxes, batch, stride, side) * here[:, None, None, None]
-        total = part if total is None else total + part
-    assert total is not None
-    return total
+    places = [(wanted == float(stride.bit_length() - 1)).nonzero()[:, 0] for stride in strides]
+    parts = [
+        roi_align(level, boxes[rows], batch, stride, side) for level, stride, rows in zip(levels, strides, places)
+    ]
+    # the exporter has no index_copy: put together, then back in order
+    return torch.cat(parts)[torch.cat(places).argsort()]
 
 
 class TwoLayerHead(nn.Module):
@@ -111,7 +109,7 @@ class TwoLayerHead(nn.Module):
 
 
 class StageHead(nn.Module):
-    """A network's last stage as the head, as in Faster R-CNN on ResNet's C4: `stage` maps (R, C, 14, 14) to features."""
+    """A network's last stage as the head, as Faster R-CNN has on ResNet's C4: `stage` takes (R, C, 14, 14)."""
 
     def __init__(self, stage: nn.Module, channels: int, classes: int, *, side: int = 14) -> None:
         super().__init__()

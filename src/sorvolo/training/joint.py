@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,7 +29,7 @@ class JointSettings:
     warm_steps: int = 200
     regions: int = 96  # per picture for the head, a third of them positives at most
     averaging: float = 0.998  # of the weights that are kept in the end (an exponential mean)
-    mixed_precision: bool = True  # on a GPU
+    mixed_precision: bool = True  # bfloat16 in the convolutions
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,6 @@ class JointTraining:
             [{"params": others, "rate": settings.rate}, {"params": backbone, "rate": settings.backbone_rate}],
             lr=settings.rate, weight_decay=settings.decay,
         )
-        self._scaler = torch.amp.GradScaler(device, enabled=settings.mixed_precision and device != "cpu")
         self._started_s = time.monotonic()
 
     def learn(self, batch: Sequence[Sample]) -> Progress:
@@ -74,16 +74,15 @@ class JointTraining:
         for group in self.optimiser.param_groups:
             group["lr"] = group["rate"] * share
         images, answers = collate(batch, self.device)
-        with torch.autocast(self.device, torch.bfloat16, enabled=self._scaler.is_enabled()):
+        # half precision where it pays, in the convolutions; on CPUs without it torch is only slower
+        with torch.autocast(self.device, torch.bfloat16, enabled=self.settings.mixed_precision):
             levels = self.model.features(images)
         levels = [level.float() for level in levels]
         parts = self._losses(levels, answers)
         self.optimiser.zero_grad(set_to_none=True)
-        self._scaler.scale(sum(parts, torch.zeros((), device=self.device))).backward()
-        self._scaler.unscale_(self.optimiser)
+        torch.stack(parts).sum().backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), 10.0)
-        self._scaler.step(self.optimiser)
-        self._scaler.update()
+        self.optimiser.step()
         self.step += 1
         self._average()
         values = [float(part.detach()) for part in parts]
@@ -91,6 +90,21 @@ class JointTraining:
             self.step, self.settings.steps, values[0], values[1], values[2], values[3],
             time.monotonic() - self._started_s,
         )
+
+    def state(self) -> dict[str, object]:
+        """All that is needed to go on: tensors, numbers and text only."""
+        return {
+            "model": self.model.state_dict(), "average": self.average.state_dict(), "step": self.step,
+            "optimiser": self.optimiser.state_dict(), "generator": self.generator.get_state(),
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on from what `state` gave."""
+        self.model.load_state_dict(state["model"])
+        self.average.load_state_dict(state["average"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.generator.set_state(state["generator"])
+        self.step = int(state["step"])
 
     def _losses(self, levels: list[Tensor], answers: Sequence[Answer]) -> list[Tensor]:
         proposed = self.model.proposals(levels)
@@ -136,7 +150,7 @@ class JointTraining:
 
 def collate(batch: Sequence[Sample], device: str) -> tuple[Tensor, list[Answer]]:
     """Samples as the picture tensor (N, 3, H, W) and their answers."""
-    images = torch.from_numpy(np.stack([each.image.transpose(2, 0, 1) for each in batch])).to(device)
+    images = torch.from_numpy(np.stack([each.image for each in batch])).permute(0, 3, 1, 2).to(device)
     answers = [
         Answer(
             torch.from_numpy(each.boxes.astype(np.float32)).to(device), torch.from_numpy(each.labels).to(device),

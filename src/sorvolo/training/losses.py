@@ -16,8 +16,8 @@ _FOCAL_ALPHA, _FOCAL_GAMMA = 0.25, 2.0
 
 @dataclass(frozen=True)
 class Answer:
-    """The truth of one picture, in its pixels: `boxes` (N, 4), `labels` (N,), `ignored` regions (M, 4), and which of the
-    C classes the picture has labels for, `known` (C,) bool: of the others nothing is learnt there."""
+    """The truth of one picture, in its pixels: `boxes` (N, 4), `labels` (N,), `ignored` regions (M, 4), and which of
+    the C classes the picture has labels for, `known` (C,) bool: of the others nothing is learnt there."""
 
     boxes: Tensor
     labels: Tensor
@@ -64,27 +64,21 @@ def joint_proposal_loss(proposed: Proposed, answers: Sequence[Answer]) -> tuple[
 
     Where a class goes unlabelled, background teaches nothing: what is there may be of that class.
     """
-    score_loss = proposed.scores.new_zeros(())
-    box_loss = proposed.scores.new_zeros(())
-    positives = 0
-    for index, answer in enumerate(answers):
-        match = match_boxes(proposed.anchors, answer, over=0.5, under=0.4, best_too=True)
-        counts = match.target != -2
-        positive = match.positive
-        scores = proposed.scores[index][counts]
-        wanted = positive[counts].to(scores.dtype)
-        each = functional.binary_cross_entropy_with_logits(scores, wanted, reduction="none")
-        sure = torch.where(wanted > 0, scores, -scores).sigmoid()
-        alpha = torch.where(wanted > 0, _FOCAL_ALPHA, 1 - _FOCAL_ALPHA)
-        weight = alpha * (1 - sure) ** _FOCAL_GAMMA
-        if not bool(answer.known.all()):
-            weight = torch.where(wanted > 0, weight, 0.1 * weight)
-        score_loss = score_loss + (weight * each).sum()
-        if bool(positive.any()):
-            shifted = boxes_from_offsets(proposed.offsets[index][positive], proposed.anchors[positive])
-            box_loss = box_loss + giou_loss(shifted, answer.boxes[match.target[positive]]).sum()
-            positives += int(positive.sum())
-    return score_loss / max(1, positives), box_loss / max(1, positives)
+    matches = [match_boxes(proposed.anchors, each, over=0.5, under=0.4, best_too=True) for each in answers]
+    target = torch.stack([each.target for each in matches])
+    wanted = (target >= 0).to(proposed.scores.dtype)
+    trust = torch.tensor([1.0 if bool(each.known.all()) else 0.1 for each in answers], device=target.device)
+    weight = torch.where(target >= 0, _FOCAL_ALPHA, (1 - _FOCAL_ALPHA) * trust[:, None]) * (target != -2)
+    wrong = torch.sigmoid(proposed.scores.detach()).sub_(wanted).abs_()
+    each = functional.binary_cross_entropy_with_logits(proposed.scores, wanted, reduction="none")
+    score_loss = (weight * wrong**_FOCAL_GAMMA * each).sum()
+    picture, anchor = (target >= 0).nonzero(as_tuple=True)
+    if not len(picture):
+        return score_loss, proposed.offsets.sum() * 0
+    goals = torch.cat([own.boxes[match.target[match.positive]] for own, match in zip(answers, matches)])
+    offsets = proposed.offsets.flatten(0, 1).index_select(0, picture * target.shape[1] + anchor)
+    box_loss = giou_loss(boxes_from_offsets(offsets, proposed.anchors[anchor]), goals).sum()
+    return score_loss / len(picture), box_loss / len(picture)
 
 
 def thesis_proposal_loss(
@@ -101,15 +95,16 @@ def thesis_proposal_loss(
         wanted = match.positive[chosen].to(proposed.scores.dtype)
         score_losses.append(functional.binary_cross_entropy_with_logits(proposed.scores[index][chosen], wanted))
         rows = chosen[match.positive[chosen]]
-        box_losses.append(_smooth_l1(proposed.offsets[index][rows], proposed.anchors[rows], match, rows, answer, sampled))
+        offsets = proposed.offsets[index][rows]
+        box_losses.append(_smooth_l1(offsets, proposed.anchors[rows], match, rows, answer, sampled))
     return torch.stack(score_losses).mean(), torch.stack(box_losses).mean()
 
 
 def region_loss(
     scores: Tensor, offsets: Tensor, regions: Tensor, match: Match, answer: Answer, *, overlap: bool
 ) -> tuple[Tensor, Tensor]:
-    """Log loss over classes and background of one picture's regions, and of the positives' boxes: by overlap, or smooth L1
-    (eq. 4.2). Scores (R, C + 1), offsets (R, 4), regions (R, 4); `match` is of these very regions.
+    """Log loss over classes and background of one picture's regions, and of the positives' boxes: by overlap, or
+    smooth L1 (eq. 4.2). Scores (R, C + 1), offsets (R, 4), regions (R, 4); `match` is of these very regions.
 
     A class without labels in this picture is left out of its softmax.
     """

@@ -28,8 +28,8 @@ class AnchorSettings:
 
 @dataclass(frozen=True)
 class Proposed:
-    """What the proposal network says of every anchor of a batch: `scores` (N, K) before the sigmoid, `offsets` (N, K, 4),
-    `anchors` (K, 4) px."""
+    """What the proposal network says of every anchor of a batch: `scores` (N, K) before the sigmoid, `offsets`
+    (N, K, 4), `anchors` (K, 4) px."""
 
     scores: Tensor
     offsets: Tensor
@@ -50,12 +50,9 @@ class ProposalNetwork(nn.Module):
         for index, (own, each) in enumerate(zip(self.stems, anchors)):
             shapes = each.shapes()
             self.register_buffer(f"shapes_{index}", shapes, persistent=False)
-            self.scores.append(nn.Conv2d(own.channels, len(shapes), 1))  # type: ignore[arg-type]
-            self.offsets.append(nn.Conv2d(own.channels, 4 * len(shapes), 1))  # type: ignore[arg-type]
-            nn.init.normal_(self.scores[-1].weight, std=0.01)
-            nn.init.constant_(self.scores[-1].bias, -4.0)  # objects are rare (Lin et al. 2017, Focal Loss, 4.1)
-            nn.init.normal_(self.offsets[-1].weight, std=0.001)
-            nn.init.zeros_(self.offsets[-1].bias)
+            out: int = own.channels  # type: ignore[assignment]
+            self.scores.append(_predictor(out, len(shapes), 0.01, -4.0))  # rare objects (Focal Loss, 4.1)
+            self.offsets.append(_predictor(out, 4 * len(shapes), 0.001, 0.0))
 
     def forward(self, levels: Sequence[Tensor]) -> Proposed:
         """Features (N, C, H, W) of each level -> every anchor's score and offsets, fine levels first."""
@@ -83,6 +80,13 @@ def propose(
     boxes = clipped(boxes, *size_px)
     kept = suppress(boxes.detach(), best.detach()[None], after, iou, 0.0)[:, 1]
     return boxes[kept], best[kept]
+
+
+def _predictor(channels: int, out: int, spread: float, bias: float) -> nn.Conv2d:
+    layer = nn.Conv2d(channels, out, 1)
+    nn.init.normal_(layer.weight, std=spread)
+    nn.init.constant_(layer.bias, bias)  # type: ignore[arg-type]
+    return layer
 
 
 def _anchors(shapes: Tensor, level: Tensor, stride: int) -> Tensor:

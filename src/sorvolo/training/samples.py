@@ -16,8 +16,8 @@ _LEAST_PX = 3.0  # longer side of an object; smaller ones are ignored
 
 @dataclass(frozen=True)
 class Share:
-    """A labelled set, and how often it is drawn from; `scale` the range of magnifications; `pastes` the class name under
-    which small objects are composed onto its ground, "" for none; `grey` its pictures are thermal: polarity may turn."""
+    """A labelled set, and how often it is drawn from; `scale` the range of magnifications; `pastes` the class name
+    under which small objects are composed onto its ground, "" for none; `thermal`: its polarity may turn."""
 
     labelled: LabelledSet
     weight: float
@@ -129,7 +129,7 @@ def _warped(image: ImageRGB, crop_from_picture: Matrix3, side: int) -> tuple[Ima
     source, to_source = image, np.eye(3)
     if scale < 0.7:  # made smaller by areas first, or edges would break up
         factor = max(scale * 1.2, 0.05)
-        source = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+        source = np.asarray(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
         to_source = np.diag([source.shape[1] / image.shape[1], source.shape[0] / image.shape[0], 1.0])
     corner = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # edges to pixel centres and back
     matrix = np.linalg.inv(corner) @ crop_from_picture @ np.linalg.inv(to_source) @ corner
@@ -174,10 +174,10 @@ def _weathered(image: ImageRGB, how: Augmentation, rng: np.random.Generator, *, 
             kernel = np.zeros((length, length), np.float32)
             kernel[length // 2] = 1 / length
             turn = cv2.getRotationMatrix2D(((length - 1) / 2, (length - 1) / 2), rng.uniform(0, 180), 1)
-            kernel = cv2.warpAffine(kernel, turn, (length, length))
-            x = cv2.filter2D(x, -1, kernel / max(float(kernel.sum()), 1e-3))
+            kernel = np.asarray(cv2.warpAffine(kernel, turn, (length, length)), np.float32)
+            x = np.asarray(cv2.filter2D(x, -1, kernel / max(float(kernel.sum()), 1e-3)), np.float32)
         else:
-            x = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.4, 1.3))
+            x = np.asarray(cv2.GaussianBlur(x, (0, 0), rng.uniform(0.4, 1.3)), np.float32)
     if rng.random() < how.noise:
         x = x + rng.normal(0, rng.uniform(2, 10), x.shape).astype(np.float32)
     return np.clip(x, 0, 255).astype(np.uint8)

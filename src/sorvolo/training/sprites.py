@@ -1,9 +1,15 @@
 """Small objects drawn onto real ground: no real labelled pictures of them can be had, so training composes them."""
 
+from typing import Any, TypeAlias
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, ImageRGB
+
+Pixels: TypeAlias = NDArray[np.floating[Any]]
+"""(height, width, 3) or (height, width) of float32 while a picture is worked on."""
 
 _MOST = 5
 _FINE = 4  # sub-pixels a side while drawing
@@ -36,7 +42,7 @@ def paste_small_objects(image: ImageRGB, taken: Floats, rng: np.random.Generator
 
 
 def _draw(
-    out: "np.typing.NDArray[np.float32]", centre: Floats, size: float, ratio: float, sun: float, long: float,
+    out: Pixels, centre: Floats, size: float, ratio: float, sun: float, long: float,
     rng: np.random.Generator,
 ) -> Floats:
     """Draw one object and its shadow into `out`; its box (4,)."""
@@ -62,7 +68,8 @@ def _draw(
     drawn = cv2.GaussianBlur(drawn, (0, 0), soft) if size > 10 else drawn
     blend = cv2.GaussianBlur(np.maximum(mask, dark), (0, 0), 1.0)[..., None]
     _put(out, x0, y0, ground * (1 - blend) + drawn * blend)
-    low, high = local.min(0) + (x0, y0), local.max(0) + (x0, y0)
+    corner = np.array([x0, y0])
+    low, high = local.min(0) + corner, local.max(0) + corner
     height, width = out.shape[:2]
     return np.clip(np.array([*low, *high]), 0, [width, height, width, height])
 
@@ -81,7 +88,7 @@ def _outline(size: float, ratio: float, rng: np.random.Generator) -> Floats:
     return scaled @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
 
 
-def _filled(shapes: list[Floats], side: int) -> "np.typing.NDArray[np.float32]":
+def _filled(shapes: list[Floats], side: int) -> Pixels:
     """(side, side) 0 to 1: how much of each pixel the hull of the shapes covers."""
     fine = np.zeros((side * _FINE, side * _FINE), np.uint8)
     hull = cv2.convexHull((np.vstack(shapes) * _FINE).astype(np.float32))
@@ -89,13 +96,13 @@ def _filled(shapes: list[Floats], side: int) -> "np.typing.NDArray[np.float32]":
     return np.asarray(cv2.resize(fine, (side, side), interpolation=cv2.INTER_AREA), np.float32) / 255
 
 
-def _window(out: "np.typing.NDArray[np.float32]", x0: int, y0: int, side: int) -> "np.typing.NDArray[np.float32]":
+def _window(out: Pixels, x0: int, y0: int, side: int) -> Pixels:
     rows = np.clip(np.arange(y0, y0 + side), 0, out.shape[0] - 1)
     columns = np.clip(np.arange(x0, x0 + side), 0, out.shape[1] - 1)
     return out[rows[:, None], columns[None]]
 
 
-def _put(out: "np.typing.NDArray[np.float32]", x0: int, y0: int, patch: "np.typing.NDArray[np.float32]") -> None:
+def _put(out: Pixels, x0: int, y0: int, patch: Pixels) -> None:
     height, width = out.shape[:2]
     left, top = max(0, -x0), max(0, -y0)
     right, bottom = min(patch.shape[1], width - x0), min(patch.shape[0], height - y0)

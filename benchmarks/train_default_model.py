@@ -1,0 +1,133 @@
+"""Train the default model: python benchmarks/train_default_model.py DATA OUT --weights LITE0 (`make model`).
+
+DATA is a folder with the labelled sets that detection_data.py names and two flights of photos as ground for composed
+small objects; simulated pictures are made first, into OUT. Held-out parts are never read here. A run that was stopped
+goes on from its last checkpoint.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from sorvolo.store.datasets import read_dataset
+
+from detection_data import SMALL, aerial_cars, hituav, in_order, mannequin, tinyperson
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.missions.simulate_pictures import simulate_pictures
+from sorvolo.simulation.pictures import PictureSettings
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
+from sorvolo.survey.objects import CLASSES
+from sorvolo.training.joint import JointSettings, JointTraining, batches
+from sorvolo.training.presets import fast
+from sorvolo.training.samples import Augmentation, Share, samples
+
+SIMULATED_SEED, SIMULATED_PICTURES = 1, 700
+
+
+def main() -> None:
+    """Train and leave weights and the log in OUT."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--weights", type=Path, required=True, help="EfficientNet-Lite0's published weights")
+    parser.add_argument("--steps", type=int, default=6000)
+    parser.add_argument("--batch", type=int, default=4)
+    parser.add_argument("--side", type=int, default=384)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--device", default="cpu")
+    wishes = parser.parse_args()
+    torch.set_num_threads(wishes.threads)
+    torch.set_flush_denormal(True)
+    torch.manual_seed(wishes.seed)
+    wishes.out.mkdir(parents=True, exist_ok=True)
+
+    shares = training_shares(wishes.data, wishes.out)
+    for share in shares:
+        boxes = sum(len(each.labels) for each in share.labelled.pictures)
+        name, pictures = share.labelled.name, len(share.labelled)
+        print(f"{name}: {pictures} pictures, {boxes} boxes, weight {share.weight}", flush=True)
+    model = fast(CLASSES)
+    model.backbone.load_imagenet(torch.load(wishes.weights, weights_only=True))
+    model = model.to(memory_format=torch.channels_last)
+    settings = JointSettings(steps=wishes.steps, batch=wishes.batch)
+    training = JointTraining(model, settings, wishes.seed, wishes.device)
+    checkpoint = wishes.out / "checkpoint.pt"
+    if checkpoint.is_file():
+        training.load_state(torch.load(checkpoint, weights_only=True))
+        print(f"going on from step {training.step}", flush=True)
+    stream = batches(
+        samples(shares, CLASSES, reader(), Augmentation(side_px=wishes.side), wishes.seed + training.step),
+        wishes.batch,
+    )
+    recent: list[list[float]] = []
+    started_s = time.monotonic()
+    with (wishes.out / "log.jsonl").open("a") as log:
+        while training.step < wishes.steps:
+            done = training.learn(next(stream))
+            recent.append([done.proposal_score, done.proposal_box, done.region_score, done.region_box])
+            if done.step % 50 == 0:
+                means = [round(float(each), 4) for each in np.mean(recent, axis=0)]
+                recent = []
+                row = {"step": done.step, "losses": means, "seconds": round(time.monotonic() - started_s, 1)}
+                log.write(json.dumps(row) + "\n")
+                log.flush()
+                print(row, flush=True)
+            if done.step % 250 == 0 or done.step == wishes.steps:
+                partial = checkpoint.with_suffix(".partial")
+                torch.save(training.state(), partial)
+                partial.replace(checkpoint)
+                torch.save(training.average.state_dict(), wishes.out / "weights.pt")
+
+
+def training_shares(data: Path, out: Path) -> list[Share]:
+    """What is learnt from, and how often each."""
+    simulated = out / "simulated"
+    if not (simulated / "boxes.json").is_file():
+        settings = PictureSettings(pictures=SIMULATED_PICTURES, seed=SIMULATED_SEED, thermal_share=0.2)
+        for _ in simulate_pictures(simulated, settings):
+            pass
+    made = in_order(read_dataset(simulated))
+    return [
+        Share(hituav(data)["train"], 4.0, (0.7, 1.7), thermal=True),
+        Share(tinyperson(data)["train"], 1.3, (0.8, 2.2), pastes=SMALL),
+        Share(mannequin(data)["train"], 0.25, (0.3, 1.2), pastes=SMALL),
+        Share(aerial_cars(data)["train"], 1.6, (0.25, 1.2), pastes=SMALL),
+        Share(made, 2.6, (0.6, 1.6)),
+        Share(_ground(data), 0.5, (0.12, 0.5), pastes=SMALL),
+    ]
+
+
+def _ground(data: Path) -> LabelledSet:
+    """Photos without labels as ground for small objects: whether people or cars are in them is not known."""
+    pictures = []
+    folder = data.parent / "flights"
+    paths = sorted([*folder.glob("brighton_beach/**/*.JPG"), *folder.glob("caliterra/**/*.[jJ][pP]*")])
+    for path in paths:
+        height, width = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_REDUCED_COLOR_8).shape[:2]
+        none = np.zeros((0, 4), np.float32)
+        pictures.append(LabelledPicture(str(path), width * 8, height * 8, path.parent.name, none, np.zeros(0), none))
+    return LabelledSet("ground", CLASSES, tuple(pictures), frozenset(CLASSES[:2]))
+
+
+def reader() -> Callable[[str], ImageRGB]:
+    """Reads pictures, keeping their files' bytes."""
+    @lru_cache(maxsize=4000)
+    def content(path: str) -> bytes:
+        return Path(path).read_bytes()
+
+    def read(path: str) -> ImageRGB:
+        picture = cv2.imdecode(np.frombuffer(content(path), np.uint8), cv2.IMREAD_COLOR)
+        return np.asarray(picture[..., ::-1], np.uint8)
+
+    return read
+
+
+if __name__ == "__main__":
+    main()

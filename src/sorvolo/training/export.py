@@ -1,0 +1,97 @@
+"""A trained model as one ONNX file that `detection` runs without torch, checked against what torch says."""
+
+import io
+import json
+import warnings
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+
+from sorvolo.errors import SettingsError
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.training.faster_rcnn import FasterRCNN
+
+OPSET = 17
+_TRACED_PX = (256, 320)
+
+
+@dataclass(frozen=True)
+class ExportCheck:
+    """How far the exported graph is from torch: over the detections of all pictures, and how many found no partner."""
+
+    box_px: float
+    score: float
+    unmatched: int
+    detections: int
+
+    @property
+    def is_good(self) -> bool:
+        """Boxes within half a pixel, scores within a thousandth, none without a partner."""
+        return self.box_px <= 0.5 and self.score <= 1e-3 and self.unmatched == 0
+
+
+def export_onnx(model: FasterRCNN, info: dict[str, Any]) -> bytes:
+    """The model as an ONNX file's bytes, with `info` as its "sorvolo" metadata (docs/detector.md has the fields).
+
+    Raises SettingsError when `info` names no classes.
+    """
+    if not info.get("classes"):
+        raise SettingsError("an exported model needs the names of its classes")
+    own = deepcopy(model).eval().cpu()
+    for weight in own.parameters():
+        weight.data = weight.data.contiguous()
+    picture = torch.randint(0, 255, (1, 3, *_TRACED_PX), dtype=torch.uint8)
+    buffer = io.BytesIO()
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            own, (picture,), buffer, dynamo=False,  # type: ignore[arg-type]
+            opset_version=OPSET, input_names=["image"],
+            output_names=["boxes", "scores", "labels"],
+            dynamic_axes={
+                "image": {2: "height", 3: "width"}, "boxes": {0: "count"}, "scores": {0: "count"},
+                "labels": {0: "count"},
+            },
+        )
+    graph = onnx.load_model_from_string(buffer.getvalue())
+    for output in graph.graph.output:  # rows vary, whatever the traced picture had
+        output.type.tensor_type.shape.dim[0].dim_param = "count"
+    full = {"format": 1, "stride": model.stride, "least_score": model.reach.least_score, **info}
+    entry = graph.metadata_props.add()
+    entry.key, entry.value = "sorvolo", json.dumps(full)
+    onnx.checker.check_model(graph)
+    return graph.SerializeToString()
+
+
+def check_export(model: FasterRCNN, exported: bytes, pictures: Sequence[ImageRGB]) -> ExportCheck:
+    """Run torch and the exported file on pictures (H, W, 3), cut to multiples of the model's stride, and compare."""
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(exported, providers=["CPUExecutionProvider"])
+    worst_px, worst_score, alone, count = 0.0, 0.0, 0, 0
+    for picture in pictures:
+        height, width = (side // model.stride * model.stride for side in picture.shape[:2])
+        planes = np.ascontiguousarray(picture[:height, :width].transpose(2, 0, 1))[None]
+        with torch.no_grad():
+            boxes, scores, labels = (each.numpy() for each in model.eval()(torch.from_numpy(planes)))
+        other_boxes, other_scores, other_labels = session.run(None, {"image": planes})
+        count += len(scores)
+        for box, score, label in zip(boxes, scores, labels):
+            same = other_labels == label
+            if not same.any():
+                alone += 1
+                continue
+            off_px = np.abs(other_boxes[same] - box).max(1)
+            # of a graph's many alike boxes the one whose score is nearest as well
+            best = int(np.argmin(off_px + 100 * np.abs(other_scores[same] - score)))
+            # at the lowest score that is told a rounding decides
+            if off_px[best] > 4 and score < model.reach.least_score + 1e-3:
+                continue
+            worst_px = max(worst_px, float(off_px[best]))
+            worst_score = max(worst_score, float(abs(other_scores[same][best] - score)))
+    return ExportCheck(worst_px, worst_score, alone, count)
