@@ -1,0 +1,48 @@
+"""The one door to labelled pictures of any form: `read_dataset`. Each form has a file of its own."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.store.datasets.checking import labelled_set
+from sorvolo.store.datasets.coco import coco_files, read_coco
+from sorvolo.store.datasets.groups import compiled
+from sorvolo.store.datasets.naming import naming
+from sorvolo.store.datasets.parsed import Findings, Reader
+from sorvolo.store.datasets.yolo import read_yolo
+from sorvolo.survey.labels import LabelledSet
+
+READERS: Mapping[str, Reader] = {"coco": read_coco, "yolo": read_yolo}
+"""Every form by the name that a user gives it."""
+
+
+def read_dataset(
+    place: Path | str, *, form: str | None = None, classes: Mapping[str, str] | None = None,
+    ignore: Iterable[str] = (), unlabelled: Iterable[str] = (), group_pattern: str | None = None,
+) -> LabelledSet:
+    """Labelled pictures from a file or folder, in our classes (docs/datasets.md).
+
+    `form` is one of `READERS`; without it the form is told from the files. `classes` maps the set's names to ours,
+    such as {"Pedestrian": "person"}, letters' case aside; without it common names are known. Boxes of names in
+    `ignore` become ignored regions; those of any other name are left out and counted in a notice. `unlabelled` names
+    classes of ours that may be in the pictures without a label. `group_pattern` is a regular expression whose one
+    group is the video's name within the picture's path.
+
+    Raises InputError when there is nothing to read, none of the names stands for a class, or labels and pictures do not
+    belong together; SettingsError for an unknown form or a broken pattern.
+    """
+    place = Path(place)
+    if form is not None and form not in READERS:
+        raise SettingsError(f"unknown form {form!r} of labels; choose one of {', '.join(READERS)}")
+    pattern = None if group_pattern is None else compiled(group_pattern)
+    if not place.exists():
+        raise InputError(f"{place} does not exist; give a folder of labelled pictures, or its label file")
+    findings = Findings()
+    parsed = READERS[form or _form(place)](place, findings)
+    return labelled_set(parsed, place, naming(classes, ignore), unlabelled, pattern, findings)
+
+
+def _form(place: Path) -> str:
+    if place.is_file():
+        return "coco" if place.suffix.lower() == ".json" else "yolo"
+    return "coco" if coco_files(place) else "yolo"

@@ -1,0 +1,143 @@
+"""Parsed labels made into records: our classes, boxes within the picture, groups; what is wrong is counted."""
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Floats
+from sorvolo.store.datasets.groups import group_of
+from sorvolo.store.datasets.naming import Naming, nothing_maps, of_one_unnamed
+from sorvolo.store.datasets.parsed import SHARES, Findings, ParsedPicture, ParsedSet
+from sorvolo.store.datasets.pictures import shown_size_px
+from sorvolo.survey.flight import Notice
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
+
+_SAME_SHAPE = 0.01  # of the aspect: thumbnails and halved frames are rounded to whole pixels
+_CLIPPED_PX = 1.0  # less is rounding
+_LEAST_LEFT = 0.1  # share of a box's area within the picture below which it shows nothing of the object
+
+
+def labelled_set(
+    parsed: ParsedSet, place: Path, names: Naming, unlabelled: Iterable[str], pattern: re.Pattern[str] | None,
+    findings: Findings,
+) -> LabelledSet:
+    """The set in our classes. Raises InputError when no name maps, or no picture can be opened."""
+    counts = Counter(box.name for picture in parsed.pictures for box in picture.boxes if not box.is_ignored)
+    every = dict.fromkeys([*counts, *parsed.declared])
+    if list(every) == ["0"] and not parsed.declared:
+        names = of_one_unnamed(names)
+    classes = names.classes(every)
+    if not classes:
+        raise nothing_maps(str(place), {name: counts[name] for name in every}, names.targets)
+    made = (_labelled(picture, place, names, classes, pattern, findings) for picture in parsed.pictures)
+    pictures = tuple(picture for picture in made if picture is not None)
+    if not pictures:
+        raise InputError(
+            f"{place}: none of its {len(parsed.pictures)} pictures can be used: "
+            + "; ".join(each.text for each in findings.notices())
+        )
+    notices = (*findings.notices(), *_left_out(counts, names))
+    return LabelledSet(place.stem if place.is_file() else place.name, classes, pictures, frozenset(unlabelled), notices)
+
+
+def _labelled(
+    parsed: ParsedPicture, place: Path, names: Naming, classes: tuple[str, ...], pattern: re.Pattern[str] | None,
+    findings: Findings,
+) -> LabelledPicture | None:
+    name = parsed.path.name
+    try:
+        width_px, height_px, orientation = shown_size_px(parsed.path)
+    except InputError:
+        findings.add("unreadable_pictures", name)
+        return None
+    edges = np.array([box[1:5] for box in parsed.boxes], np.float64).reshape(-1, 4)
+    fitted = _in_picture_px(edges, parsed.labelled_size, (width_px, height_px), orientation, name, findings)
+    if fitted is None:
+        return None
+    inside, keep = _clipped(fitted, width_px, height_px, name, findings)
+    boxes, labels, ignored = [], [], []
+    for box, edge_px, is_kept in zip(parsed.boxes, inside, keep):
+        if not is_kept:
+            continue
+        if box.is_ignored or names.is_ignored(box.name):
+            ignored.append(edge_px)
+        elif names.is_target(box.name):
+            boxes.append(edge_px)
+            labels.append(classes.index(names.target(box.name)))
+    group = group_of(parsed.path, place, pattern) if pattern or not parsed.group else parsed.group
+    return LabelledPicture(
+        str(parsed.path), width_px, height_px, group, np.array(boxes, np.float32), np.array(labels, np.int64),
+        np.array(ignored, np.float32), parsed.m_per_px,
+    )
+
+
+def _in_picture_px(
+    edges: Floats, labelled: tuple[float, float] | None, shown_px: tuple[int, int], orientation: int, name: str,
+    findings: Findings,
+) -> Floats | None:
+    """Edges, (N, 4), in pixels of the picture as it is shown; None when the labels are of another shape.
+
+    Labels drawn on a picture as stored, before its EXIF orientation, are turned with it.
+    """
+    if labelled is None or labelled == shown_px:
+        return edges
+    if labelled != SHARES:
+        if _same_shape(labelled, shown_px):
+            findings.add("scaled_labels", name)
+        elif orientation >= 5 and _same_shape(labelled, shown_px[::-1]):
+            return _in_picture_px(
+                turned(edges, labelled, orientation), labelled[::-1], shown_px, 1, name, findings
+            )
+        else:
+            findings.add("other_size", name)
+            return None
+    return edges * np.tile(np.divide(shown_px, labelled), 2)
+
+
+def turned(edges: Floats, stored_size: tuple[float, float], orientation: int) -> Floats:
+    """Edges, (N, 4), in a picture as stored, as they lie once its EXIF orientation (5 to 8) is applied."""
+    left, top, right, bottom = edges.T
+    width, height = stored_size
+    columns = {
+        5: (top, left, bottom, right),
+        6: (height - bottom, left, height - top, right),
+        7: (height - bottom, width - right, height - top, width - left),
+        8: (top, width - right, bottom, width - left),
+    }[orientation]
+    return np.column_stack(columns)
+
+
+def _same_shape(size: tuple[float, float], other: tuple[float, float]) -> bool:
+    return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= _SAME_SHAPE
+
+
+def _clipped(
+    edges_px: Floats, width_px: int, height_px: int, name: str, findings: Findings
+) -> tuple[Floats, list[bool]]:
+    """Edges within the picture, and which boxes are worth keeping."""
+    sides = edges_px[:, 2:] - edges_px[:, :2]
+    limits = np.array([width_px, height_px] * 2, np.float64)
+    inside = np.clip(edges_px, 0, limits)
+    left = inside[:, 2:] - inside[:, :2]
+    empty = (sides <= 0).any(axis=1)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        outside = ~empty & ((left <= 0).any(axis=1) | ((left / sides).prod(axis=1) < _LEAST_LEFT))
+    moved = np.abs(inside - edges_px).max(axis=1, initial=0) > _CLIPPED_PX
+    findings.add("empty_boxes", name, int(empty.sum()))
+    findings.add("outside_boxes", name, int(outside.sum()))
+    findings.add("clipped_boxes", name, int((moved & ~empty & ~outside).sum()))
+    return inside, list(~empty & ~outside)
+
+
+def _left_out(counts: Counter[str], names: Naming) -> tuple[Notice, ...]:
+    rest = {name: count for name, count in counts.items() if not names.is_target(name) and not names.is_ignored(name)}
+    if not rest:
+        return ()
+    found = ", ".join(f"{name} {count}" for name, count in rest.items())
+    total = sum(rest.values())
+    text = f"{total} boxes of classes that stand for none of ours left out: {found}"
+    return (Notice("unmapped_classes", total, text),)

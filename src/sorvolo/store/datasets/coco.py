@@ -1,0 +1,182 @@
+"""COCO: one JSON file with pictures, categories and boxes; the simulator's own truth is of this form."""
+
+import json
+from collections.abc import Iterator, Mapping
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from sorvolo.errors import InputError
+from sorvolo.store.datasets.parsed import Findings, ParsedBox, ParsedPicture, ParsedSet, joined
+from sorvolo.store.datasets.pictures import PICTURE_ENDINGS, pictures_below
+from sorvolo.store.datasets.text_files import read_text
+
+FORM = "COCO"
+_VIDEO_FIELDS = ("video_id", "video", "flight", "sequence", "seq_id", "clip")
+_VIDEO_ENDINGS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".ts"})
+
+
+def read_coco(place: Path, findings: Findings) -> ParsedSet:
+    """The JSON file, or a folder (or its `annotations/`) with exactly one of this form.
+
+    `iscrowd` and `ignore` make a box a region to ignore. Pictures are looked for beside the file, in `images/`,
+    in a folder named like the file, and for a simulated flight's truth in the flight's folder. Raises InputError when
+    it is no COCO file, or none of its pictures is there.
+    """
+    path = coco_file(place)
+    whole = _loaded(path)
+    categories = {row.get("id"): str(row.get("name", row.get("id"))) for row in _rows(whole, "categories", path)}
+    images = {}
+    for row in _rows(whole, "images", path):
+        if row.get("id") in images:
+            raise InputError(f"{path}: two images have the id {row.get('id')}; each needs its own")
+        images[row.get("id")] = row
+    boxes: dict[Any, list[ParsedBox]] = {}
+    for row in _rows(whole, "annotations", path):
+        box = _box(row, categories)
+        if box is None:
+            findings.add("malformed_labels", f"annotation {row.get('id')}")
+        elif row.get("image_id") not in images:
+            findings.add("labels_without_picture", f"annotation {row.get('id')}")
+        else:
+            boxes.setdefault(row["image_id"], []).append(box)
+    pictures = list(_pictures(path, images, boxes, findings))
+    if not pictures:
+        raise _no_picture(path, images)
+    return ParsedSet(FORM, joined(pictures, findings), tuple(dict.fromkeys(categories.values())))
+
+
+def coco_file(place: Path) -> Path:
+    """The folder's one COCO file, or the file itself. Raises InputError for none and for several."""
+    if place.is_file():
+        return place
+    found = coco_files(place)
+    if not found:
+        raise InputError(f"{place} holds no COCO file (JSON with images, annotations and categories)")
+    if len(found) > 1:
+        names = ", ".join(str(path.relative_to(place)) for path in found[:5])
+        raise InputError(f"{place} holds {len(found)} COCO files ({names}); name the one to read")
+    return found[0]
+
+
+def coco_files(folder: Path) -> list[Path]:
+    """COCO files in the folder, else in its `annotations/`, else one folder below."""
+    for pattern in ("*.json", "annotations/*.json", "*/*.json"):
+        found = [path for path in sorted(folder.glob(pattern)) if path.is_file() and _looks_like_coco(path)]
+        if found:
+            return found
+    return []
+
+
+def _looks_like_coco(path: Path) -> bool:
+    try:
+        whole = json.loads(read_text(path))
+    except (ValueError, RecursionError, InputError):
+        return False
+    return isinstance(whole, dict) and isinstance(whole.get("images"), list)
+
+
+def _loaded(path: Path) -> dict[str, Any]:
+    try:
+        whole = json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is no JSON ({error}); COCO labels are one JSON file") from error
+    missing = [key for key in ("images", "annotations", "categories") if key not in whole] if isinstance(
+        whole, dict
+    ) else ["images", "annotations", "categories"]
+    if missing:
+        raise InputError(f"{path} is no COCO file: it has no {', '.join(missing)}")
+    return whole
+
+
+def _rows(whole: Mapping[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
+    rows = whole[key]
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise InputError(f"{path}: COCO's {key} must be a list of objects")
+    if any(isinstance(row.get(field), (list, dict)) for row in rows for field in ("id", "image_id", "category_id")):
+        raise InputError(f"{path}: an id in COCO's {key} is a list or an object; ids are numbers or texts")
+    return rows
+
+
+def _box(row: Mapping[str, Any], categories: Mapping[Any, str]) -> ParsedBox | None:
+    """The annotation's box, else the one around its polygons; None when it has none."""
+    numbers = _finite(row.get("bbox"))
+    if len(numbers) != 4:
+        points = row.get("segmentation")
+        flat = [_finite(ring) for ring in points] if isinstance(points, list) else []
+        xs = [x for ring in flat for x in ring[0::2]]
+        ys = [y for ring in flat for y in ring[1::2]]
+        if len(xs) < 2 or len(xs) != len(ys):
+            return None
+        left, top, right, bottom = min(xs), min(ys), max(xs), max(ys)
+    else:
+        left, top, width, height = numbers
+        right, bottom = left + width, top + height
+    is_ignored = bool(row.get("iscrowd")) or bool(row.get("ignore"))
+    category = row.get("category_id")
+    return ParsedBox(categories.get(category, str(category)), left, top, right, bottom, is_ignored)
+
+
+def _finite(value: Any) -> list[float]:
+    try:
+        numbers = [float(number) for number in value]
+    except (TypeError, ValueError, OverflowError):
+        return []
+    return numbers if all(isfinite(number) for number in numbers) else []
+
+
+def _pictures(
+    path: Path, images: Mapping[Any, Mapping[str, Any]], boxes: Mapping[Any, list[ParsedBox]], findings: Findings
+) -> Iterator[ParsedPicture]:
+    folders = _folders(path)
+    by_name: dict[str, list[Path]] | None = None
+    for image_id, row in images.items():
+        name = str(row.get("file_name", "")).replace("\\", "/")
+        found = next((folder / name for folder in folders if name and (folder / name).is_file()), None)
+        if found is None and name:
+            by_name = _by_name(path.parent) if by_name is None else by_name
+            same = by_name.get(Path(name).name, [])
+            found = same[0] if len(same) == 1 else None
+        if found is None:
+            findings.add("labels_without_picture", name or f"image {image_id} without file_name")
+            continue
+        group = next((str(row[field]) for field in _VIDEO_FIELDS if row.get(field) not in (None, "")), "")
+        size = _finite([row.get("width"), row.get("height")])
+        yield ParsedPicture(
+            found, tuple(boxes.get(image_id, ())), (size[0], size[1]) if size and min(size) > 0 else None, group,
+            next(iter(_finite([row.get("m_per_px")])), float("nan")),
+        )
+
+
+def _folders(path: Path) -> list[Path]:
+    part = path.stem.removeprefix("instances_")
+    flight = path.parent.parent.parent / path.parent.name  # a simulation's truth/flight1/boxes.json
+    places = [path.parent / each for each in ("", "images", part, f"images/{part}")]
+    places += [path.parent.parent / each for each in ("", "images", part, f"images/{part}")]
+    places += [flight / "photos", flight]
+    return [place for place in places if place.is_dir()]
+
+
+def _by_name(folder: Path) -> dict[str, list[Path]]:
+    found: dict[str, list[Path]] = {}
+    for path in pictures_below(folder):
+        found.setdefault(path.name, []).append(path)
+    return found
+
+
+def _no_picture(path: Path, images: Mapping[Any, Mapping[str, Any]]) -> InputError:
+    names = [str(row.get("file_name", "")) for row in images.values()]
+    for folder in _folders(path):
+        videos = [each for each in sorted(folder.iterdir()) if each.suffix.lower() in _VIDEO_ENDINGS]
+        if videos:
+            return InputError(
+                f"{path} labels frames of a video ({videos[0].name}), not pictures; extract its frames first, as "
+                f"{names[0] if names else 'the file_name says'}, into images/ beside the labels"
+            )
+    if not names:
+        return InputError(f"{path} lists no images")
+    endings = ", ".join(sorted(PICTURE_ENDINGS))
+    return InputError(
+        f"{path}: none of its {len(names)} pictures is there (such as {names[0]}; {endings}); put them beside it or "
+        "into images/"
+    )

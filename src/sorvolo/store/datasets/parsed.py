@@ -1,0 +1,98 @@
+"""What a reader of one form hands over: pictures with boxes as their files say, before names and edges are checked."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple, TypeAlias
+
+from sorvolo.survey.flight import Notice
+
+SHARES = (1.0, 1.0)
+"""The labelled size of boxes whose edges are shares of the picture's width and height."""
+
+
+class ParsedBox(NamedTuple):
+    """One box by the set's own name of its class; edges as in BoxesPx, in units of the picture's labelled size."""
+
+    name: str
+    left: float
+    top: float
+    right: float
+    bottom: float
+    is_ignored: bool = False
+
+
+@dataclass(frozen=True)
+class ParsedPicture:
+    """One picture's labels. `labelled_size` is the picture's width and height in units of the boxes: None for the
+    picture's own pixels. `group` is empty where the form does not tell videos apart.
+    """
+
+    path: Path
+    boxes: tuple[ParsedBox, ...]
+    labelled_size: tuple[float, float] | None = None
+    group: str = ""
+    m_per_px: float = float("nan")
+
+
+@dataclass
+class Findings:
+    """What was found wrong while reading and could be left out: counts by code, with the first place each."""
+
+    counts: dict[str, int] = field(default_factory=dict)
+    first: dict[str, str] = field(default_factory=dict)
+
+    def add(self, code: str, place: str, count: int = 1) -> None:
+        """Count something of `FINDINGS`."""
+        if count:
+            self.counts[code] = self.counts.get(code, 0) + count
+            self.first.setdefault(code, place)
+
+    def notices(self) -> tuple[Notice, ...]:
+        """One notice a code, in words."""
+        return tuple(
+            Notice(code, count, f"{count} {FINDINGS[code]}, the first: {self.first[code]}")
+            for code, count in self.counts.items()
+        )
+
+
+FINDINGS: Mapping[str, str] = {
+    "malformed_labels": "labels could not be read and were left out",
+    "labels_without_picture": "label files or records belong to no picture that is there",
+    "pictures_without_labels": "pictures have no label file and count as pictures of nothing",
+    "unreadable_pictures": "pictures could not be opened and were left out",
+    "other_size": "pictures have another shape than their labels say and were left out",
+    "scaled_labels": "pictures have another size than their labels say; boxes were scaled",
+    "clipped_boxes": "boxes reached beyond the picture and were clipped",
+    "outside_boxes": "boxes lay outside their picture and were left out",
+    "empty_boxes": "boxes were empty or inverted and were left out",
+    "duplicate_pictures": "pictures were listed twice; their boxes were joined",
+    "counted_from_zero": "files count pixels from 0, not from 1 as the VOC devkit does, and were read so",
+    "no_boxes_for_frame": "frames show objects at places that nothing tells; they are ignored as a whole",
+}
+
+
+@dataclass(frozen=True)
+class ParsedSet:
+    """All of one place. `declared` are the names that the set's own list has, if any, in its order."""
+
+    form: str
+    pictures: tuple[ParsedPicture, ...]
+    declared: tuple[str, ...] = ()
+
+
+Reader: TypeAlias = Callable[[Path, Findings], ParsedSet]
+"""Reads one form from a file or folder; raises InputError when it is not of that form."""
+
+
+def joined(pictures: Iterable[ParsedPicture], findings: Findings) -> tuple[ParsedPicture, ...]:
+    """Each file once: of one that is listed twice the boxes are joined."""
+    by_path: dict[Path, ParsedPicture] = {}
+    for each in pictures:
+        earlier = by_path.get(each.path)
+        if earlier is not None:
+            findings.add("duplicate_pictures", each.path.name)
+            boxes = tuple(dict.fromkeys(earlier.boxes + each.boxes))
+            each = ParsedPicture(each.path, boxes, earlier.labelled_size, earlier.group, earlier.m_per_px)
+        by_path[each.path] = each
+    return tuple(by_path.values())

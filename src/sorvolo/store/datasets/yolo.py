@@ -1,0 +1,167 @@
+"""YOLO: a text file for each picture, a line for each box: class number, then centre and size as shares."""
+
+import re
+from collections.abc import Iterator
+from math import isfinite
+from pathlib import Path
+
+from sorvolo.errors import InputError
+from sorvolo.store.datasets.parsed import SHARES, Findings, ParsedBox, ParsedPicture, ParsedSet
+from sorvolo.store.datasets.pictures import PICTURE_ENDINGS, files_below, pictures_below
+from sorvolo.store.datasets.text_files import read_text
+
+FORM = "YOLO"
+_NAME_FILES = ("data.yaml", "dataset.yaml", "data.yml", "classes.txt", "obj.names", "_darknet.labels")
+_NOT_LABELS = frozenset({"classes.txt", "train.txt", "val.txt", "valid.txt", "test.txt", "readme.txt", "license.txt",
+                         "requirements.txt", "readme.dataset.txt", "readme.roboflow.txt", "predefined_classes.txt"})
+_PARTS = frozenset({"images", "labels", "train", "training", "val", "valid", "validation", "test"})
+_FARTHEST_SHARE = 2.0  # an edge farther out is no slip of a labelling tool: the file holds pixels
+
+
+def read_yolo(place: Path, findings: Findings) -> ParsedSet:
+    """A folder with `images/` and `labels/`, with both mixed, or with such folders for each part; or its data.yaml.
+
+    Lines with a class and at least three corners (segments, turned boxes) give the box around them. Class names come
+    from data.yaml, classes.txt or *.names there or above a part; else the class numbers are the names. Raises
+    InputError when there are no pictures, no label files, or the numbers are no shares of the picture.
+    """
+    folder = place if place.is_dir() else place.parent
+    names = _names(place, folder)
+    pictures = pictures_below(folder)
+    labels = {path: found for path in pictures if (found := _label_file(path)) is not None}
+    _demand_both(folder, pictures, labels)
+    _count_lonely(folder, pictures, labels, findings)
+    result, far, total = [], 0, 0
+    for path in pictures:
+        boxes: list[ParsedBox] = []
+        if path in labels:
+            boxes = list(_boxes(labels[path], names, findings))
+            total += len(boxes)
+            far += sum(max(abs(edge) for edge in box[1:5]) > _FARTHEST_SHARE for box in boxes)
+        else:
+            findings.add("pictures_without_labels", path.name)
+        result.append(ParsedPicture(path, tuple(boxes), SHARES))
+    if far > total / 2:
+        raise InputError(
+            f"{folder}: {far} of {total} boxes have numbers beyond 1, as pixels would; YOLO labels are shares of the "
+            "picture's width and height: centre x, centre y, width, height"
+        )
+    if not total and findings.counts.get("malformed_labels"):
+        raise InputError(
+            f"{folder}: no line of its label files is YOLO (class, centre x, centre y, width, height; first failure in "
+            f"{findings.first['malformed_labels']}); if it is another form, name it"
+        )
+    return ParsedSet(FORM, tuple(result), tuple(names))
+
+
+def looks_like_yolo(line: str) -> bool:
+    """Whether a line is a class number and at least four numbers with spaces between, none of them far beyond 1."""
+    numbers = _numbers(line)
+    return len(numbers) >= 5 and numbers[0] == int(numbers[0]) >= 0 and max(map(abs, numbers[1:5])) <= _FARTHEST_SHARE
+
+
+def _names(place: Path, folder: Path) -> list[str]:
+    if place.is_file() and place.suffix.lower() in (".yaml", ".yml"):
+        return names_in_yaml(read_text(place))
+    above = [folder]
+    while above[-1].name.lower() in _PARTS and above[-1] != above[-1].parent:
+        above.append(above[-1].parent)
+    for each in above:
+        candidates = [each / name for name in _NAME_FILES]
+        candidates += sorted(each.glob("*.names")) + sorted(each.glob("*.yaml")) + [each / "labels" / "classes.txt"]
+        for path in candidates:
+            if path.is_file():
+                text = read_text(path)
+                is_yaml = path.suffix.lower() in (".yaml", ".yml")
+                names = names_in_yaml(text) if is_yaml else [line.strip() for line in text.splitlines() if line.strip()]
+                if names:
+                    return names
+    return []
+
+
+def names_in_yaml(text: str) -> list[str]:
+    """The `names` of a data.yaml: a list in brackets or with hyphens, or numbers with names, each over one or more
+    lines. Gaps in the numbers are filled with the numbers as text. Empty where there is no `names`.
+    """
+    match = re.search(r"^names[ \t]*:[ \t]*(.*(?:\n(?:[ \t\-\]}].*)?)*)", text, re.MULTILINE)
+    if not match:
+        return []
+    body = re.sub(r"(^|\s)#.*", "", match.group(1)).strip()
+    if body.startswith(("[", "{")):
+        items = [item.strip() for item in body.strip("[]{} \n").replace("\n", " ").split(",")]
+    else:
+        items = [line.strip().removeprefix("- ").strip() for line in body.splitlines()]
+    named: dict[int, str] = {}
+    for index, item in enumerate(item for item in items if item):
+        numbered = re.fullmatch(r"['\"]?(\d{1,6})['\"]?\s*:\s*(.*)", item)
+        number, name = (int(numbered[1]), numbered[2]) if numbered else (index, item)
+        named[number] = name.strip().strip("'\"")
+    if not named or max(named) > 100_000:
+        return []
+    return [named.get(number, str(number)) for number in range(max(named) + 1)]
+
+
+def _label_file(picture: Path) -> Path | None:
+    """The picture's text file: beside it, or in the `labels` folder that mirrors the last `images` one."""
+    beside = picture.with_suffix(".txt")
+    parts = list(picture.parts)
+    for index in reversed(range(len(parts) - 1)):
+        if parts[index].lower() in ("images", "jpegimages"):
+            mirrored = Path(*parts[:index], "labels", *parts[index + 1:]).with_suffix(".txt")
+            if mirrored.is_file():
+                return mirrored
+            break
+    return beside if beside.is_file() and beside.name.lower() not in _NOT_LABELS else None
+
+
+def _demand_both(folder: Path, pictures: list[Path], labels: dict[Path, Path]) -> None:
+    if not pictures:
+        endings = ", ".join(sorted(PICTURE_ENDINGS))
+        raise InputError(f"{folder} holds no pictures ({endings}); YOLO needs images/ and labels/")
+    if not labels:
+        raise InputError(
+            f"{folder}: none of its {len(pictures)} pictures has a label file of the same name, beside it or in a "
+            f"folder labels/ beside images/ (such as labels/{pictures[0].stem}.txt)"
+        )
+
+
+def _count_lonely(folder: Path, pictures: list[Path], labels: dict[Path, Path], findings: Findings) -> None:
+    used = set(labels.values())
+    for path in files_below(folder, ".txt"):
+        if path not in used and path.name.lower() not in _NOT_LABELS and _is_label_place(path, folder):
+            findings.add("labels_without_picture", path.name)
+
+
+def _is_label_place(path: Path, folder: Path) -> bool:
+    inside = [part.lower() for part in path.relative_to(folder).parts[:-1]]
+    if "labels" in inside:
+        return True
+    first = next((line for line in read_text(path).splitlines() if line.strip()), "")
+    return looks_like_yolo(first)
+
+
+def _boxes(path: Path, names: list[str], findings: Findings) -> Iterator[ParsedBox]:
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        if not line.strip():
+            continue
+        numbers = _numbers(line)
+        if len(numbers) < 5 or numbers[0] != int(numbers[0]) or numbers[0] < 0:
+            findings.add("malformed_labels", f"{path.name}, line {number}")
+            continue
+        label = int(numbers[0])
+        name = names[label] if label < len(names) else str(label)
+        if len(numbers) >= 7 and len(numbers) % 2:
+            xs, ys = numbers[1::2], numbers[2::2]
+            yield ParsedBox(name, min(xs), min(ys), max(xs), max(ys))
+        else:  # a sixth number is a score or a track
+            x, y, width, height = numbers[1:5]
+            yield ParsedBox(name, x - width / 2, y - height / 2, x + width / 2, y + height / 2)
+
+
+def _numbers(line: str) -> list[float]:
+    """The line's numbers; none if anything in it is no finite number."""
+    try:
+        numbers = [float(word) for word in line.split()]
+    except ValueError:
+        return []
+    return numbers if all(isfinite(number) for number in numbers) else []
