@@ -1,0 +1,161 @@
+"""Boxes in a picture laid on the ground: where each detected object stands, and how well that is known."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sorvolo.errors import SettingsError
+from sorvolo.geometry.arrays import Floats, PointsM, PointsPx
+from sorvolo.geometry.camera import Camera
+from sorvolo.survey.flight import CameraPrior
+from sorvolo.survey.objects import TYPICAL_SIZE_M, Detections, Sighting
+
+GroundHeight = Callable[[PointsM], Floats]
+"""Heights (N,) of the ground above the site's level plane, m, at east, north (N, 2); NaN where it is not known."""
+
+_OTHER_HEIGHT_M = 1.0  # of a class that nothing is known of
+_GROUND_STEPS = 12
+_GROUND_SETTLED_M = 0.3
+
+
+@dataclass(frozen=True)
+class LocateSettings:
+    """How well the parts of a place are known, and what is too little to call it a place."""
+
+    box_sigma_share: float = 0.08  # of a box's side: how far its middle is off the object's
+    least_box_sigma_px: float = 1.0
+    height_sigma_share: float = 0.35  # of half an object's height: people sit and lie, cars are vans
+    ground_sigma_m: float = 0.0  # of the ground's height, beside what is in the camera's own height
+    most_sigma_m: float = 50.0  # a place known no better is none
+    farthest_m: float = 5000.0  # along the ground
+
+    def __post_init__(self) -> None:
+        if min(self.box_sigma_share, self.least_box_sigma_px, self.height_sigma_share, self.ground_sigma_m) < 0:
+            raise SettingsError("the sigmas of a place must not be negative")
+        if min(self.most_sigma_m, self.farthest_m) <= 0:
+            raise SettingsError("most_sigma_m and farthest_m must be positive")
+
+
+def locate(
+    found: Detections, frame_index: int, frame_name: str, time_ns: int, camera: Camera, prior: CameraPrior, *,
+    focal_sigma: float = 0.0, ground_height_m: float | GroundHeight = 0.0,
+    settings: LocateSettings | None = None,
+) -> tuple[list[Sighting | None], Counter[str]]:
+    """Each detection's place on the ground, None for those without; and why they have none, in words, counted.
+
+    The ray through a box's middle meets the level plane that lies half the object's usual height above the ground.
+    The covariance is propagated to first order from the camera's place, attitude (about its own axes) and focal
+    length (`focal_sigma`, relative), the box's middle and the object's height. An unknown heading leaves a circle
+    about the point below the camera: its radius is then the sigma.
+    """
+    settings = settings or LocateSettings()
+    sightings: list[Sighting | None] = [None] * len(found)
+    unlocated: Counter[str] = Counter()
+    if not len(found):
+        return sightings, unlocated
+    if (why_not := _unplaced(prior)) is not None:
+        return sightings, Counter({why_not: len(found)})
+    boxes = found.boxes_px.astype(np.float64)
+    sides_px = boxes[:, 2:] - boxes[:, :2]
+    rays, slopes = _rays_with_slopes(camera, (boxes[:, :2] + boxes[:, 2:]) / 2 - 0.5)
+    rays_site = rays @ prior.rotation.T
+    heights = np.array([TYPICAL_SIZE_M[name][2] if name in TYPICAL_SIZE_M else _OTHER_HEIGHT_M for name in found.names])
+    reach, plane_m = _reach(rays_site, prior.position_m, heights / 2, ground_height_m)
+    known = np.isfinite(plane_m)
+    downward = rays_site[:, 2] < 0
+    meets = downward & known & (reach > 0)
+    reach = np.where(meets, reach, 1.0)
+    places_m = prior.position_m[:2] + reach[:, None] * rays_site[:, :2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away = np.where(meets[:, None], rays_site[:, :2] / rays_site[:, 2:], 0.0)
+    # a small step of the ray's end in space, seen along the ray on the plane
+    onto = np.concatenate([np.broadcast_to(np.eye(2), (len(found), 2, 2)), -away[:, :, None]], axis=2)
+    shared, own = np.zeros((len(found), 2, 2)), np.zeros((len(found), 2, 2))
+    shared += onto @ np.diag(prior.position_sigma_m**2) @ onto.transpose(0, 2, 1)
+    along = reach[:, None, None] * onto @ prior.rotation
+    shared += _attitude_part(along, rays, prior.attitude_sigma_deg, reach[:, None] * rays_site[:, :2])
+    focal = along[:, :, :2] @ rays[:, :2, None] * focal_sigma
+    shared += focal @ focal.transpose(0, 2, 1)
+    shared += (settings.ground_sigma_m**2) * away[:, :, None] @ away[:, None, :]
+    per_px = along @ slopes  # (N, 2, 2) metres on the ground per pixel
+    sigma_px = np.maximum(settings.box_sigma_share * sides_px, settings.least_box_sigma_px)
+    own += per_px @ (sigma_px[:, :, None] ** 2 * np.eye(2)) @ per_px.transpose(0, 2, 1)
+    own += ((settings.height_sigma_share * heights / 2) ** 2)[:, None, None] * away[:, :, None] @ away[:, None, :]
+    covariances = shared + own
+    sizes_m = np.sort(np.linalg.norm(per_px * sides_px[:, None, :], axis=1), axis=1)[:, ::-1]
+    sigmas = np.sqrt(np.trace(covariances, axis1=1, axis2=2) / 2)
+    shared_sigmas = np.sqrt(np.trace(shared, axis1=1, axis2=2) / 2)
+    distances = np.linalg.norm(places_m - prior.position_m[:2], axis=1)
+    for row, label in enumerate(found.names):
+        if not downward[row]:
+            unlocated["at or above the horizon"] += 1
+        elif not known[row]:
+            unlocated["the height model says nothing of the ground there"] += 1
+        elif not meets[row]:
+            unlocated["by the telemetry the camera is not above the ground"] += 1
+        elif distances[row] > settings.farthest_m:
+            unlocated[f"farther than {settings.farthest_m:g} m"] += 1
+        elif not sigmas[row] <= settings.most_sigma_m:
+            unlocated[f"the place is known no better than {settings.most_sigma_m:g} m"] += 1
+        else:
+            sightings[row] = Sighting(
+                frame_index, frame_name, time_ns, label, float(found.scores[row]), found.boxes_px[row], places_m[row],
+                covariances[row], sizes_m[row], float(shared_sigmas[row]),
+            )
+    return sightings, unlocated
+
+
+def _unplaced(prior: CameraPrior) -> str | None:
+    """Why a camera places nothing at all; None where it may."""
+    if not prior.knows_place:
+        return "no fix for the frame"
+    if not np.isfinite(prior.position_sigma_m[2]):
+        return "the camera's height is not known"
+    if not np.isfinite(prior.attitude_sigma_deg[:2]).all():
+        return "the camera's tilt is not known"
+    return None
+
+
+def _rays_with_slopes(camera: Camera, middles_px: PointsPx) -> tuple[PointsM, Floats]:
+    """(N, 3) camera rays of image points, and (N, 3, 2) how they turn per pixel to the right and down."""
+    steps_px = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
+    points_px = (middles_px + steps_px[:, None, :]).reshape(-1, 2)
+    rays, right, left, below, above = camera.rays_from_pixels(points_px).reshape(5, -1, 3)
+    return rays, np.stack([right - left, below - above], axis=2)
+
+
+def _reach(
+    rays_site: PointsM, camera_m: Floats, above_ground_m: Floats, ground_height_m: float | GroundHeight
+) -> tuple[Floats, Floats]:
+    """(N,) how many rays' lengths lead to the plane of each object, and that plane's height; NaN where it is unknown.
+
+    On a height model the plane is found by going there and looking at the height again.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if not callable(ground_height_m):
+            plane_m = ground_height_m + above_ground_m
+            return (plane_m - camera_m[2]) / rays_site[:, 2], plane_m
+        plane_m = ground_height_m(np.repeat(camera_m[None, :2], len(rays_site), axis=0)) + above_ground_m
+        change = np.zeros(len(rays_site))
+        for _ in range(_GROUND_STEPS):
+            reach = (plane_m - camera_m[2]) / rays_site[:, 2]
+            places_m = camera_m[:2] + np.nan_to_num(reach)[:, None] * np.nan_to_num(rays_site[:, :2])
+            higher = ground_height_m(places_m) + above_ground_m
+            change = np.abs(higher - plane_m)
+            # half steps settle on slopes towards the camera as well, where full ones would swing about
+            plane_m = plane_m + 0.5 * (higher - plane_m)
+        plane_m = np.where(change <= _GROUND_SETTLED_M, plane_m, np.nan)
+        return (plane_m - camera_m[2]) / rays_site[:, 2], plane_m
+
+
+def _attitude_part(along: Floats, rays: PointsM, sigma_deg: Floats, from_nadir_m: PointsM) -> Floats:
+    """(N, 2, 2) what turning the camera about its own axes does on the ground; `along` (N, 2, 3) from camera axes."""
+    sigma_rad = np.radians(np.where(np.isfinite(sigma_deg), sigma_deg, 0.0))
+    turned = np.cross(np.eye(3)[None, :, :], rays[:, None, :]).transpose(0, 2, 1) * sigma_rad  # columns: about x, y, z
+    moved = along @ turned
+    part = moved @ moved.transpose(0, 2, 1)
+    if not np.isfinite(sigma_deg[2]):
+        part = part + (from_nadir_m**2).sum(axis=1)[:, None, None] * np.eye(2)
+    return np.asarray(part)
