@@ -87,6 +87,14 @@ def test_ignored_regions_and_unlabelled_classes_judge_nothing():
         judged_classes(foreign, CLASSES)
 
 
+def test_more_than_a_hundred_objects_of_a_picture_are_all_judged():
+    boxes = [square(12 * (k % 16), 12 * (k // 16)) for k in range(150)]
+    crowd = LabelledPicture("crowd.jpg", 200, 200, "g", np.array(boxes, float), np.zeros(150, int), np.zeros((0, 4)))
+    found = seen(*((box, 0, 0.9) for box in boxes))
+    (match, _), numbers, _ = match_pictures(LabelledSet("crowd", CLASSES, (crowd,)), [found], CLASSES)
+    assert numbers.ap50 == pytest.approx(1.0) and counts_at(match, 0.5) == (150, 0, 0)
+
+
 def test_no_detection_and_no_label_are_answers():
     labelled = LabelledSet("few", CLASSES, (picture([square(0, 0)], [0]), picture([], [])))
     nothing = seen()

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sorvolo.errors import InputError
+from sorvolo.cli.main import main
+from sorvolo.errors import InputError, SettingsError
 from sorvolo.missions.evaluate_detector import (
     FOUND,
     NUMBERS,
@@ -15,6 +16,7 @@ from sorvolo.missions.evaluate_detector import (
     EvaluationSettings,
     evaluate_detector,
     evaluation_numbers,
+    read_sets,
     write_evaluation,
 )
 from sorvolo.store.detector_files import FoundSets, read_found, write_found
@@ -152,3 +154,50 @@ def test_detections_of_other_pictures_are_refused(many, labelled, tmp_path):
         evaluate_detector([[str(tmp_path / "other.json")]], [many], QUICK)
     with pytest.raises(InputError, match="two data sets have one name"):
         evaluate_detector([[mine]], [many, many], QUICK)
+
+
+@pytest.fixture(scope="session")
+def coco(labelled, tmp_path_factory):
+    """The painted set as a COCO folder, in the set's own names."""
+    folder = tmp_path_factory.mktemp("coco")
+    images, annotations = [], []
+    for index, picture in enumerate(labelled.pictures):
+        name = Path(picture.path).name
+        (folder / name).write_bytes(Path(picture.path).read_bytes())
+        images.append({"id": index, "file_name": name, "width": 96, "height": 64, "flight": picture.group,
+                       "m_per_px": 0.1})
+        for box, label in zip(picture.boxes_px.tolist(), picture.labels.tolist()):
+            annotations.append({
+                "id": len(annotations) + 1, "image_id": index, "category_id": label + 1, "iscrowd": 0,
+                "bbox": [box[0], box[1], box[2] - box[0], box[3] - box[1]], "area": 1,
+            })
+    (folder / "labels.json").write_text(json.dumps({
+        "images": images, "annotations": annotations,
+        "categories": [{"id": 1, "name": "Walker"}, {"id": 2, "name": "Truck"}],
+    }))
+    return folder
+
+
+def test_the_command_reads_labels_tells_numbers_and_writes_the_report(toy, coco, tmp_path, capsys):
+    told = ["--classes", "Walker=person,Truck=car", "--unlabelled", "small object", "--draws", "20"]
+    assert main(["evaluate", "detector", str(toy), str(coco), *told, "--out", str(tmp_path / "out"), "--json"]) == 0
+    numbers = json.loads(capsys.readouterr().out)
+    assert numbers["sets"][0]["confusion"] == [[2, 1, 0], [0, 1, 1], [1, 0, 0]]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted([PAGE, NUMBERS, FOUND])
+    found = str(tmp_path / "out" / FOUND)
+    assert main(["evaluate", "detector", str(toy), str(coco), *told, "--compare", found]) == 0
+    shown = capsys.readouterr().out
+    assert "side by side" in shown and "thesis_map" in shown
+    assert main(["evaluate", "detector", str(toy), str(coco), "--classes", "Walker"]) == 1
+    assert "pairs look like" in capsys.readouterr().err
+    assert main(["evaluate", "detector", "no-such-model", str(coco), *told]) == 1
+
+
+def test_videos_choose_pictures(coco):
+    names = {"Walker": "person", "Truck": "car"}
+    (chosen,) = read_sets([coco], classes=names, videos="video1")
+    assert [picture.group for picture in chosen.pictures] == ["video1", "video1"]
+    with pytest.raises(InputError, match="no video or flight fits 'night'; there are video0, video1"):
+        read_sets([coco], classes=names, videos="night")
+    with pytest.raises(SettingsError, match="no regular expression"):
+        read_sets([coco], classes=names, videos="(")

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from sorvolo.change.metrics import EventScores
+from sorvolo.cli.evaluate_detector import detector
 from sorvolo.missions.evaluate_changes import FlightChanges, evaluate_changes
 from sorvolo.missions.evaluate_changes import as_json as measures_as_json
 from sorvolo.missions.evaluate_mosaic import MosaicEvaluation, evaluate_mosaic
@@ -17,6 +18,7 @@ from sorvolo.mosaic.quality import Spread
 from sorvolo.store.exports import plain_json
 
 evaluate_app = typer.Typer(no_args_is_help=True)
+evaluate_app.command()(detector)
 
 
 @evaluate_app.callback()

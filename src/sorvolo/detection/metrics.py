@@ -1,8 +1,9 @@
 """How good detections are: COCO's measures, the thesis's, recall by size, confusions; pure functions of boxes.
 
 Matching and average precision are pycocotools' own (COCOeval: boxes best first, each takes the label of its class that
-it overlaps most; IoU 0.50 to 0.95 in steps of 0.05; at most 100 boxes a class and picture). What COCO does not tell
-follows from its matches at IoU 0.5.
+it overlaps most; IoU 0.50 to 0.95 in steps of 0.05) but for one number: up to 300 boxes a class and picture are looked
+at where COCO stops at 100, because a beach from above holds more. What COCO does not tell follows from its matches at
+IoU 0.5.
 """
 
 import io
@@ -23,6 +24,9 @@ from sorvolo.survey.objects import Detections
 
 IOUS: Floats = np.linspace(0.5, 0.95, 10)
 """The overlaps at which COCO counts a box as right."""
+
+MOST_BOXES = 300
+"""Of a class and picture, best first; more are not looked at."""
 
 SIZES_PX = (0.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, np.inf)
 """Edges of the bins of an object's longer side in the picture, px."""
@@ -135,6 +139,7 @@ def match_pictures(
     truth, truth_rows = _truth(labelled, judged)
     with redirect_stdout(io.StringIO()):  # pycocotools prints as it goes
         judge = COCOeval(_indexed(truth), _indexed(truth | {"annotations": _candidates(found, judged)}), "bbox")
+        judge.params.maxDets = [1, 10, MOST_BOXES]
         judge.evaluate()
         judge.accumulate()
     precision = np.asarray(judge.eval["precision"])[..., -1]  # IoU, recall, class, area

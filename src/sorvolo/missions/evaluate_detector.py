@@ -1,5 +1,6 @@
 """Measure detectors on labelled pictures, each by itself and side by side: Table 4.6 of the thesis and more."""
 
+import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -13,9 +14,10 @@ from sorvolo.detection.detector import Detector
 from sorvolo.detection.intervals import DRAWS
 from sorvolo.detection.metrics import Mistake, judged_classes
 from sorvolo.detection.scores import Arm, SetComparison, SetScores, compare_arms, score_set
-from sorvolo.errors import InputError
+from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import BoxesPx, ImageRGB
 from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.datasets import read_dataset
 from sorvolo.store.detector_files import FoundSets, mistake_picture, read_found, write_found
 from sorvolo.store.detector_page import detector_page
 from sorvolo.store.exports import json_bytes
@@ -61,6 +63,32 @@ class DetectorEvaluation:
     sets: tuple[SetScores, ...]
     comparisons: tuple[SetComparison, ...]
     worst: Mapping[str, tuple[tuple[Mistake, str, ImageRGB], ...]]
+
+
+def read_sets(
+    places: Sequence[Path], *, form: str | None = None, classes: Mapping[str, str] | None = None,
+    ignore: Iterable[str] = (), unlabelled: Iterable[str] = (), group_pattern: str | None = None, videos: str = "",
+) -> tuple[LabelledSet, ...]:
+    """The labelled sets in these files and folders, all read with the same options (those of `read_dataset`).
+
+    `videos` is a regular expression: only pictures whose video or flight it fits (from its start) are kept. Raises
+    InputError as `read_dataset`, and for a set of which none is kept; SettingsError for a broken expression.
+    """
+    try:
+        kept = re.compile(videos)
+    except re.error as error:
+        raise SettingsError(f"--videos {videos!r} is no regular expression: {error}") from error
+    sets = []
+    for place in places:
+        whole = read_dataset(
+            place, form=form, classes=classes, ignore=ignore, unlabelled=unlabelled, group_pattern=group_pattern
+        )
+        chosen = whole.only([each for each in whole.pictures if kept.match(each.group)])
+        if not len(chosen):
+            groups = sorted({each.group for each in whole.pictures})
+            raise InputError(f"{place}: no video or flight fits {videos!r}; there are {', '.join(groups[:8])}")
+        sets.append(chosen)
+    return tuple(sets)
 
 
 def evaluate_detector(

@@ -1,0 +1,159 @@
+"""`sorvolo evaluate detector`: how good a detector is on labelled pictures, and which of several is better."""
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from sorvolo import __version__
+from sorvolo.detection.intervals import Interval
+from sorvolo.detection.scores import SetComparison, SetScores
+from sorvolo.errors import SettingsError
+from sorvolo.missions.evaluate_detector import (
+    PAGE,
+    EvaluationSettings,
+    evaluate_detector,
+    evaluation_numbers,
+    read_sets,
+    write_evaluation,
+)
+from sorvolo.store.exports import plain_json
+
+
+def detector(
+    model: Annotated[
+        str, typer.Argument(help="A model's name or file, or detections.json; several seeds with commas between.")
+    ],
+    data: Annotated[list[Path], typer.Argument(help="Labelled pictures: folders or label files.")],
+    compare: Annotated[
+        list[str] | None, typer.Option(help="Another model, beside the first on the same pictures; may be repeated.")
+    ] = None,
+    form: Annotated[
+        str | None, typer.Option(help="The labels' form (coco, yolo, voc ...); else told from them.")
+    ] = None,
+    classes: Annotated[
+        str, typer.Option(help="The set's names as ours, such as 'Pedestrian=person,Van=car'.")
+    ] = "",
+    ignore: Annotated[str, typer.Option(help="Names whose boxes are regions to ignore.")] = "",
+    unlabelled: Annotated[str, typer.Option(help="Our classes that may be there without a label.")] = "",
+    group_pattern: Annotated[
+        str | None, typer.Option(help="Regular expression whose one group is the video within a picture's path.")
+    ] = None,
+    videos: Annotated[str, typer.Option(help="Regular expression: only pictures of videos that it fits.")] = "",
+    tiles: Annotated[
+        str, typer.Option(help="none, auto (by the ground's sampling distance), or pixels a side.")
+    ] = "none",
+    out: Annotated[Path | None, typer.Option(help="Folder for detector.html, detector.json, detections.json.")] = None,
+    draws: Annotated[int, typer.Option(min=20, help="Of the bootstrap behind the intervals.")] = 1000,
+    seed: Annotated[int, typer.Option(help="Of the bootstrap.")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print detector.json.")] = False,
+) -> None:
+    """Detectors on labelled pictures: COCO's AP, the thesis's mAP, recall by size, confusions, worst mistakes.
+
+    Example: sorvolo evaluate detector default labelled --out measured
+
+    Example: sorvolo evaluate detector ours.onnx hituav --classes Person=person,Car=car --ignore DontCare,Bicycle
+
+    Example: sorvolo evaluate detector a1.onnx,a2.onnx data --compare b1.onnx,b2.onnx --out side-by-side
+    """
+    settings = EvaluationSettings(_tiles(tiles), draws, seed)
+    labelled = read_sets(
+        data, form=form, classes=_pairs(classes) or None, ignore=_names(ignore), unlabelled=_names(unlabelled),
+        group_pattern=group_pattern, videos=videos,
+    )
+    arms = [_names(each) for each in (model, *(compare or ()))]
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        bar = progress.add_task("looking", total=None)
+        measured = evaluate_detector(
+            arms, labelled, settings,
+            lambda step: progress.update(
+                bar, description=f"{step.model}: {step.set_name}", completed=step.pictures_done,
+                total=step.pictures_total,
+            ),
+        )
+    description = {
+        "sorvolo": __version__, "data": ", ".join(map(str, data)), "arms": "; ".join(", ".join(arm) for arm in arms),
+        "videos": videos or "all", "tiles": tiles, "draws": draws, "seed": seed,
+        "notices": "; ".join((*(note.text for each in labelled for note in each.notices), *measured.found.notices)),
+    }
+    if out is not None:
+        write_evaluation(measured, out, description)
+    if as_json:
+        typer.echo(json.dumps(plain_json(evaluation_numbers(measured, description)), indent=1))
+        return
+    console = Console()
+    for scores in measured.sets:
+        _show(console, scores)
+    for side_by_side in measured.comparisons:
+        _show_comparison(console, side_by_side)
+    if out is not None:
+        console.print(f"the whole report: {out / PAGE}")
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _pairs(text: str) -> dict[str, str]:
+    pairs = [name.partition("=") for name in _names(text)]
+    if any(not (theirs.strip() and ours.strip()) for theirs, _, ours in pairs):
+        raise SettingsError(f"--classes {text!r}: pairs look like Pedestrian=person,Van=car")
+    return {theirs.strip(): ours.strip() for theirs, _, ours in pairs}
+
+
+def _tiles(text: str) -> Literal["auto"] | int | None:
+    if text.isdecimal():
+        return int(text)
+    if text == "auto":
+        return "auto"
+    if text == "none":
+        return None
+    raise SettingsError(f"--tiles {text!r}: choose none, auto, or a number of pixels a side")
+
+
+def _show(console: Console, scores: SetScores) -> None:
+    table = Table("class", "labels", "AP", "AP50", "precision", "recall", "from", "thesis AP", title=scores.name)
+    for row in scores.classes:
+        table.add_row(
+            row.label, str(row.labels), _between(scores.intervals[f"AP {row.label}"]),
+            _between(scores.intervals[f"AP50 {row.label}"]), _share(row.reported.precision),
+            _share(row.reported.recall), f"{row.reported.score:.2f}", _share(row.thesis_ap),
+        )
+    table.add_section()
+    table.add_row(
+        "mean", "", _between(scores.intervals["AP"]), _between(scores.intervals["AP50"]), "", "", "",
+        _share(scores.thesis_map),
+    )
+    console.print(table)
+    if scores.groups > 1:
+        console.print(f"{scores.pictures} pictures of {scores.groups} videos or flights; intervals of 95 % over these")
+    for remark in scores.remarks:
+        console.print(f"{scores.name}: {remark}")
+
+
+def _show_comparison(console: Console, each: SetComparison) -> None:
+    first = each.arms[0].name
+    head = [arm.name for arm in each.arms] + [f"{arm.name} less {first}" for arm in each.arms[1:]]
+    table = Table("measure", *head, title=f"side by side: {each.name}")
+    for name in each.arms[0].mean:
+        cells = [_share(arm.mean[name]) for arm in each.arms]
+        for found in each.differences:
+            told = found[name]
+            bounds = f" ({told.low:+.1%} to {told.high:+.1%})" if math.isfinite(told.low) else ""
+            cells.append(f"{told.value:+.1%}{bounds}" if math.isfinite(told.value) else "-")
+        table.add_row(name, *cells)
+    console.print(table)
+
+
+def _between(told: Interval) -> str:
+    bounds = f" ({told.low:.1%} to {told.high:.1%})" if math.isfinite(told.low) else ""
+    return _share(told.value) + bounds
+
+
+def _share(value: float) -> str:
+    return f"{value:.1%}" if math.isfinite(value) else "-"
