@@ -5,14 +5,22 @@ from pathlib import Path
 
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.store.datasets.checking import labelled_set
-from sorvolo.store.datasets.coco import coco_files, read_coco
+from sorvolo.store.datasets.coco import read_coco
 from sorvolo.store.datasets.groups import compiled
 from sorvolo.store.datasets.naming import naming
-from sorvolo.store.datasets.parsed import Findings, Reader
+from sorvolo.store.datasets.okutama import read_okutama
+from sorvolo.store.datasets.parsed import Findings, ParsedSet, Reader
+from sorvolo.store.datasets.recognising import form_of
+from sorvolo.store.datasets.umcd import read_umcd
+from sorvolo.store.datasets.visdrone import read_visdrone
+from sorvolo.store.datasets.voc import read_voc
 from sorvolo.store.datasets.yolo import read_yolo
 from sorvolo.survey.labels import LabelledSet
 
-READERS: Mapping[str, Reader] = {"coco": read_coco, "yolo": read_yolo}
+READERS: Mapping[str, Reader] = {
+    "coco": read_coco, "yolo": read_yolo, "voc": read_voc, "visdrone": read_visdrone, "okutama": read_okutama,
+    "umcd": read_umcd,
+}
 """Every form by the name that a user gives it."""
 
 
@@ -38,11 +46,19 @@ def read_dataset(
     if not place.exists():
         raise InputError(f"{place} does not exist; give a folder of labelled pictures, or its label file")
     findings = Findings()
-    parsed = READERS[form or _form(place)](place, findings)
+    parsed = _parsed(place, form, findings)
     return labelled_set(parsed, place, naming(classes, ignore), unlabelled, pattern, findings)
 
 
-def _form(place: Path) -> str:
-    if place.is_file():
-        return "coco" if place.suffix.lower() == ".json" else "yolo"
-    return "coco" if coco_files(place) else "yolo"
+def _parsed(place: Path, form: str | None, findings: Findings) -> ParsedSet:
+    """What the form's reader finds; an error of a form that was asked for says what it looks like instead."""
+    recognised = form_of(place)
+    chosen = form or recognised or "yolo"
+    try:
+        return READERS[chosen](place, findings)
+    except InputError as error:
+        if recognised is None:
+            raise InputError(f"{error} (labels of no known form were recognised: {', '.join(READERS)})") from error
+        if recognised == chosen:
+            raise
+        raise InputError(f"{error}; it looks like {recognised}: read it as that, or leave the form out") from error

@@ -59,19 +59,20 @@ def _labelled(
     if fitted is None:
         return None
     inside, keep = _clipped(fitted, width_px, height_px, name, findings)
-    boxes, labels, ignored = [], [], []
+    boxes, labels = [], []
+    ignored = [(0.0, 0.0, float(width_px), float(height_px))] if parsed.is_ignored else []
     for box, edge_px, is_kept in zip(parsed.boxes, inside, keep):
         if not is_kept:
             continue
         if box.is_ignored or names.is_ignored(box.name):
-            ignored.append(edge_px)
+            ignored.append(tuple(edge_px.tolist()))
         elif names.is_target(box.name):
             boxes.append(edge_px)
             labels.append(classes.index(names.target(box.name)))
     group = group_of(parsed.path, place, pattern) if pattern or not parsed.group else parsed.group
     return LabelledPicture(
         str(parsed.path), width_px, height_px, group, np.array(boxes, np.float32), np.array(labels, np.int64),
-        np.array(ignored, np.float32), parsed.m_per_px,
+        np.array(list(dict.fromkeys(ignored)), np.float32), parsed.m_per_px,
     )
 
 

@@ -4,8 +4,8 @@ import re
 from pathlib import Path, PurePath
 
 from sorvolo.errors import SettingsError
+from sorvolo.survey.splits import stem_of
 
-_EXPORTED = re.compile(r"[_.](jpe?g|png|bmp|tiff?)(\.rf\.[0-9a-z]+)?$", re.IGNORECASE)  # as Roboflow renames
 _NUMBERED = re.compile(
     r"(?P<video>.*?)[ _.\-]*(?:(?<![a-z])(?:frames?|img|image|picture|[if]))?[ _.\-]*\(?\d+\)?[ _.\-]*", re.IGNORECASE
 )
@@ -38,17 +38,11 @@ def group_of(path: Path, place: Path, pattern: re.Pattern[str] | None = None) ->
     below = _below(path, place)
     if pattern is not None and (match := pattern.search(below.as_posix())) and match.group(1):
         return match.group(1)
-    stem = _EXPORTED.sub("", below.stem)
+    stem = stem_of(below.name)
     numbered = _NUMBERED.fullmatch(stem)
     folders = [part for part in below.parts[:-1] if part.lower() not in _PLAIN_FOLDERS and part != ".."]
     video = numbered["video"] if numbered else stem
     return "/".join([*folders, video] if video else folders) or place.name
-
-
-def frame_number(path: str) -> int | None:
-    """The last number in a picture's name, by which neighbours in time are told; None without one."""
-    numbers = re.findall(r"\d+", _EXPORTED.sub("", PurePath(path).stem))
-    return int(numbers[-1]) if numbers else None
 
 
 def _below(path: Path, place: Path) -> PurePath:

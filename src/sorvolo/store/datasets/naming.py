@@ -26,7 +26,8 @@ DEFAULT_CLASSES: Mapping[str, str] = {
 DEFAULT_IGNORED = frozenset({
     "ignored regions", "ignored", "ignore", "dontcare", "dont care", "others", "crowd",
     "truck", "lorry", "bus", "othervehicle", "other vehicle",
-    "biker", "bicyclist", "cyclist", "rider", "motorcyclist", "skater",
+    "biker", "bicyclist", "cyclist", "rider", "motorcyclist", "skater", "bicycle", "bike", "motor", "motorcycle",
+    "motorbike", "scooter", "tricycle", "awning tricycle", "cart",
 })
 """Names that become regions where nothing counts: what a set ignores itself, and what looks like a class of ours but
 is none (calling a truck a car, or a cyclist a person, is neither right nor wrong)."""

@@ -1,7 +1,7 @@
 """What a reader of one form hands over: pictures with boxes as their files say, before names and edges are checked."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -25,7 +25,8 @@ class ParsedBox(NamedTuple):
 @dataclass(frozen=True)
 class ParsedPicture:
     """One picture's labels. `labelled_size` is the picture's width and height in units of the boxes: None for the
-    picture's own pixels. `group` is empty where the form does not tell videos apart.
+    picture's own pixels. `group` is empty where the form does not tell videos apart. `is_ignored`: nothing but its
+    boxes is known of the picture, so the rest of it is a region to ignore.
     """
 
     path: Path
@@ -33,6 +34,7 @@ class ParsedPicture:
     labelled_size: tuple[float, float] | None = None
     group: str = ""
     m_per_px: float = float("nan")
+    is_ignored: bool = False
 
 
 @dataclass
@@ -93,6 +95,6 @@ def joined(pictures: Iterable[ParsedPicture], findings: Findings) -> tuple[Parse
         if earlier is not None:
             findings.add("duplicate_pictures", each.path.name)
             boxes = tuple(dict.fromkeys(earlier.boxes + each.boxes))
-            each = ParsedPicture(each.path, boxes, earlier.labelled_size, earlier.group, earlier.m_per_px)
+            each = replace(earlier, boxes=boxes)
         by_path[each.path] = each
     return tuple(by_path.values())

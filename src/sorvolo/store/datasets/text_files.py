@@ -4,6 +4,10 @@ from pathlib import Path
 
 from sorvolo.errors import InputError
 
+_NOT_LABELS = frozenset({
+    "classes.txt", "predefined_classes.txt", "train.txt", "val.txt", "valid.txt", "test.txt", "readme.txt",
+    "license.txt", "requirements.txt", "readme.dataset.txt", "readme.roboflow.txt",
+})
 _MOST_BYTES = 2_000_000_000  # COCO's own train2017 is half a gigabyte
 
 
@@ -21,3 +25,8 @@ def read_text(path: Path) -> str:
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         return data.decode("utf-16", "replace")
     return data.decode("utf-8-sig", "replace")
+
+
+def is_label_file(path: Path) -> bool:
+    """Whether a text file may hold labels: names of classes, lists of pictures and notes do not."""
+    return path.name.lower() not in _NOT_LABELS

@@ -8,12 +8,10 @@ from pathlib import Path
 from sorvolo.errors import InputError
 from sorvolo.store.datasets.parsed import SHARES, Findings, ParsedBox, ParsedPicture, ParsedSet
 from sorvolo.store.datasets.pictures import PICTURE_ENDINGS, files_below, pictures_below
-from sorvolo.store.datasets.text_files import read_text
+from sorvolo.store.datasets.text_files import is_label_file, read_text
 
 FORM = "YOLO"
 _NAME_FILES = ("data.yaml", "dataset.yaml", "data.yml", "classes.txt", "obj.names", "_darknet.labels")
-_NOT_LABELS = frozenset({"classes.txt", "train.txt", "val.txt", "valid.txt", "test.txt", "readme.txt", "license.txt",
-                         "requirements.txt", "readme.dataset.txt", "readme.roboflow.txt", "predefined_classes.txt"})
 _PARTS = frozenset({"images", "labels", "train", "training", "val", "valid", "validation", "test"})
 _FARTHEST_SHARE = 2.0  # an edge farther out is no slip of a labelling tool: the file holds pixels
 
@@ -111,7 +109,7 @@ def _label_file(picture: Path) -> Path | None:
             if mirrored.is_file():
                 return mirrored
             break
-    return beside if beside.is_file() and beside.name.lower() not in _NOT_LABELS else None
+    return beside if beside.is_file() and is_label_file(beside) else None
 
 
 def _demand_both(folder: Path, pictures: list[Path], labels: dict[Path, Path]) -> None:
@@ -128,7 +126,7 @@ def _demand_both(folder: Path, pictures: list[Path], labels: dict[Path, Path]) -
 def _count_lonely(folder: Path, pictures: list[Path], labels: dict[Path, Path], findings: Findings) -> None:
     used = set(labels.values())
     for path in files_below(folder, ".txt"):
-        if path not in used and path.name.lower() not in _NOT_LABELS and _is_label_place(path, folder):
+        if path not in used and is_label_file(path) and _is_label_place(path, folder):
             findings.add("labels_without_picture", path.name)
 
 

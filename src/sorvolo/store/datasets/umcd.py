@@ -1,0 +1,138 @@
+"""UMCD: a metadata text file for each video, a block for each object: what it is and when it is in view."""
+
+import re
+from dataclasses import dataclass, field
+from math import inf
+from pathlib import Path
+
+from sorvolo.errors import InputError
+from sorvolo.store.datasets.pairing import frames_by_video, no_frames, pictures_around
+from sorvolo.store.datasets.parsed import Findings, ParsedBox, ParsedPicture, ParsedSet
+from sorvolo.store.datasets.pictures import files_below
+from sorvolo.store.datasets.text_files import read_text
+
+FORM = "UMCD"
+_FIELD = re.compile(r"\s*[-*]?\s*(?P<key>[A-Za-z][A-Za-z ]*?)\s*[:=]\s*(?P<value>.*?)\s*;?\s*")
+_OBJECT = re.compile(r"\s*object\b\s*#?\s*\d*\s*[:.]?\s*(?P<type>[^:=]*?)\s*;?\s*", re.IGNORECASE)
+_KNOWN = frozenset({"type", "shape", "dimension", "dimensions", "size", "color", "colour", "movement", "appearance"})
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
+_ROUNDED_S = 1.0  # times of appearance are whole seconds, rounded one way or the other
+
+
+@dataclass
+class _Object:
+    """One block while it is read; `boxes` by frame are left, top, width, height in pixels."""
+
+    name: str = ""
+    keys: set[str] = field(default_factory=set)
+    from_s: float = -inf
+    until_s: float = inf
+    boxes: dict[int, tuple[float, ...]] = field(default_factory=dict)
+
+
+@dataclass
+class _Video:
+    fps: float = 0.0
+    objects: list[_Object] = field(default_factory=list)
+
+
+def read_umcd(place: Path, findings: Findings) -> ParsedSet:
+    """A folder with metadata files (`path1.txt`) and frames in folders of the videos' names (`path1/000123.jpg`).
+
+    The thesis (section 2.2) says what such a file holds of each object: type, shape, dimension in cm, colour, movement;
+    Table 2.4 adds from which second to which it is in view. It gives no places in the picture. So a frame in which
+    no object is in view is a picture of nothing; one with an object whose place nothing tells is ignored as a whole.
+    Lines `Box: FRAME LEFT TOP WIDTH HEIGHT` in an object's block (ours, in pixels) tell its places. Raises InputError
+    when nothing is of this form, times are given without `Fps:`, or no frame is there or of use.
+    """
+    files = [place] if place.is_file() else [path for path in files_below(place, ".txt") if looks_like_umcd(path)]
+    videos = {path: _parsed(path, findings) for path in files}
+    videos = {path: video for path, video in videos.items() if video.objects}
+    if not videos:
+        raise InputError(f"{place}: no text file describes objects as {FORM}'s do (Type:, Shape:, Dimension:, ...)")
+    frames = frames_by_video(pictures_around(place, FORM), [path.stem for path in videos])
+    if not any(frames.values()):
+        raise no_frames(place, FORM, frames)
+    result = []
+    for path, video in videos.items():
+        _demand_times(path, video)
+        for number, picture in sorted(frames[path.stem].items()):
+            boxes = [_box(each, number) for each in video.objects if number in each.boxes]
+            unplaced = any(_is_in_view(each, number, video.fps) for each in video.objects if number not in each.boxes)
+            if unplaced:
+                findings.add("no_boxes_for_frame", picture.name)
+            result.append(ParsedPicture(picture, tuple(boxes), None, path.stem, is_ignored=unplaced))
+    if all(each.is_ignored and not each.boxes for each in result):
+        raise InputError(
+            f"{place}: {FORM} metadata says what is in its videos but not where in the frames, so nothing can be "
+            "learnt from them; add lines 'Box: FRAME LEFT TOP WIDTH HEIGHT' to the objects, or label the frames anew"
+        )
+    return ParsedSet(FORM, tuple(result), tuple(dict.fromkeys(e.name for v in videos.values() for e in v.objects)))
+
+
+def looks_like_umcd(path: Path) -> bool:
+    """Whether a text file has a type and at least one more field that this form has."""
+    found = {match["key"].lower() for line in read_text(path).splitlines() if (match := _FIELD.fullmatch(line))}
+    named = any(match["type"] for line in read_text(path).splitlines() if (match := _OBJECT.fullmatch(line)))
+    return ("type" in found or named) and len(found & _KNOWN) >= 2
+
+
+def _parsed(path: Path, findings: Findings) -> _Video:
+    video = _Video()
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        match = _FIELD.fullmatch(line)
+        key = match["key"].lower() if match else ""
+        if match is None or key == "object":
+            if (begun := _OBJECT.fullmatch(line)) or key == "object":
+                name = begun["type"] if begun else match["value"] if match else ""
+                video.objects.append(_Object(name))
+            elif line.strip():
+                findings.add("malformed_labels", f"{path.name}, line {number}")
+            continue
+        numbers = [float(each) for each in _NUMBER.findall(match["value"])]
+        if key in ("fps", "frequency", "frequency fps"):
+            video.fps = numbers[0] if numbers else 0.0
+        elif not _told(video, key, match["value"], numbers):
+            findings.add("malformed_labels", f"{path.name}, line {number}")
+    video.objects = [each for each in video.objects if each.name]
+    return video
+
+
+def _told(video: _Video, key: str, value: str, numbers: list[float]) -> bool:
+    """Add one field to the last object, or to a new one where the last has it already; whether it was understood."""
+    if key == "type" and (not video.objects or "type" in video.objects[-1].keys):
+        video.objects.append(_Object())
+    if not video.objects:
+        return key not in _KNOWN and key != "box"  # what comes before the first object is about the video
+    last = video.objects[-1]
+    last.keys.add(key)
+    if key == "type":
+        last.name = value or last.name
+    elif key == "appearance":
+        if len(numbers) != 2 or numbers[1] < numbers[0]:
+            return False
+        last.from_s, last.until_s = numbers
+    elif key == "box":
+        if len(numbers) != 5:
+            return False
+        last.boxes[int(numbers[0])] = tuple(numbers[1:])
+    return True
+
+
+def _demand_times(path: Path, video: _Video) -> None:
+    if not video.fps > 0 and any(each.from_s > -inf for each in video.objects):
+        raise InputError(
+            f"{path} says at which second objects are in view but not how many frames make a second; add a line such "
+            "as 'Fps: 25' before the first object"
+        )
+
+
+def _is_in_view(each: _Object, frame: int, fps: float) -> bool:
+    if each.from_s == -inf:
+        return True
+    return each.from_s - _ROUNDED_S <= frame / fps <= each.until_s + _ROUNDED_S
+
+
+def _box(each: _Object, frame: int) -> ParsedBox:
+    left, top, width, height = each.boxes[frame]
+    return ParsedBox(each.name, left, top, left + width, top + height)

@@ -1,0 +1,98 @@
+"""VisDrone: a text file for each picture (DET) or each video (VID), a line of numbers with commas for each box."""
+
+import re
+from pathlib import Path
+
+from sorvolo.errors import InputError
+from sorvolo.store.datasets.pairing import frames_by_video, labels_of_pictures, no_frames, pictures_around
+from sorvolo.store.datasets.parsed import Findings, ParsedBox, ParsedPicture, ParsedSet
+from sorvolo.store.datasets.pictures import files_below
+from sorvolo.store.datasets.text_files import is_label_file, read_text
+
+FORM = "VisDrone"
+NAMES = (
+    "ignored regions", "pedestrian", "people", "bicycle", "car", "van", "truck", "tricycle", "awning-tricycle", "bus",
+    "motor", "others",
+)
+"""Categories 0 to 11 of the VisDrone toolkits; 0 and 11 are ignored."""
+
+_IGNORED = {0, len(NAMES) - 1}
+_DET, _VID = 8, 10  # numbers a line
+_LINE = re.compile(r"\s*-?\d+\s*(,\s*-?\d+\s*){7}(,\s*-?\d+\s*,\s*-?\d+\s*)?,?\s*")
+
+
+def read_visdrone(place: Path, findings: Findings) -> ParsedSet:
+    """A folder with `annotations/` and `images/` (DET) or `sequences/` (VID), or one text file beside its pictures.
+
+    A line of DET is left, top, width, height, score, category, truncation, occlusion; of VID the frame (from 1) and the
+    target come first. Score 0 and the categories "ignored regions" and "others" are ignored; truncated and occluded
+    objects count. Raises InputError when no line is of either form.
+    """
+    files = [place] if place.is_file() else [path for path in files_below(place, ".txt") if is_label_file(path)]
+    rows = {path: _rows(path, findings) for path in files}
+    rows = {path: found for path, found in rows.items() if found or not read_text(path).strip()}
+    lengths = {len(row) for found in rows.values() for row in found}
+    if len(lengths) != 1:
+        raise InputError(
+            f"{place}: " + ("no line is a VisDrone label (8 or 10 whole numbers with commas)" if not lengths else
+                            "lines of 8 and of 10 numbers; read pictures (DET) and videos (VID) one by one")
+        )
+    pictures = pictures_around(place, FORM)
+    if lengths == {_VID}:
+        return ParsedSet(FORM, _video_frames(place, rows, pictures, findings), NAMES)
+    label_of = labels_of_pictures(pictures, rows)
+    for path in sorted(set(rows) - set(label_of.values())):
+        findings.add("labels_without_picture", path.name)
+    if not label_of:
+        raise InputError(f"{place}: none of its {len(rows)} {FORM} files has a picture of the same name")
+    result = []
+    for path in pictures:
+        if path not in label_of:
+            findings.add("pictures_without_labels", path.name)
+        found = rows[label_of[path]] if path in label_of else []
+        sequence = re.fullmatch(r"(\d{7})_\d+_d_\d+", path.stem)  # the video it was taken from comes first
+        result.append(ParsedPicture(path, tuple(map(_box, found)), None, sequence[1] if sequence else ""))
+    return ParsedSet(FORM, tuple(result), NAMES)
+
+
+def looks_like_visdrone(line: str) -> bool:
+    """Whether a line is 8 or 10 whole numbers with commas between."""
+    return _LINE.fullmatch(line) is not None
+
+
+def _rows(path: Path, findings: Findings) -> list[list[int]]:
+    rows = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        if looks_like_visdrone(line) and len(line) < 300:
+            rows.append([int(word) for word in line.strip().strip(",").split(",")])
+        elif line.strip():
+            findings.add("malformed_labels", f"{path.name}, line {number}")
+    return rows
+
+
+def _box(row: list[int]) -> ParsedBox:
+    left, top, width, height, score, category = row[-_DET:-2]
+    name = NAMES[category] if 0 <= category < len(NAMES) else str(category)
+    return ParsedBox(name, left, top, left + width, top + height, score == 0 or category in _IGNORED)
+
+
+def _video_frames(
+    place: Path, rows: dict[Path, list[list[int]]], pictures: list[Path], findings: Findings
+) -> tuple[ParsedPicture, ...]:
+    frames = frames_by_video(pictures, [path.stem for path in rows])
+    if not any(frames.values()):
+        raise no_frames(place, FORM, frames)
+    result = []
+    for path, found in rows.items():
+        boxes: dict[int, list[ParsedBox]] = {number: [] for number in frames[path.stem]}
+        lonely = set()
+        for row in found:
+            if row[0] in boxes:
+                boxes[row[0]].append(_box(row))
+            else:
+                lonely.add(row[0])
+        findings.add("labels_without_picture", f"{path.stem}, frame {min(lonely, default=0)}", len(lonely))
+        result += [
+            ParsedPicture(frames[path.stem][number], tuple(each), None, path.stem) for number, each in boxes.items()
+        ]
+    return tuple(result)

@@ -1,0 +1,94 @@
+"""Pascal VOC: an XML file for each picture, with boxes in pixels counted from 1."""
+
+from dataclasses import replace
+from math import isfinite, nan
+from pathlib import Path
+from typing import Any
+
+from defusedxml import ElementTree
+from defusedxml.common import DefusedXmlException
+
+from sorvolo.errors import InputError
+from sorvolo.store.datasets.pairing import labels_of_pictures, pictures_around
+from sorvolo.store.datasets.parsed import Findings, ParsedBox, ParsedPicture, ParsedSet
+from sorvolo.store.datasets.pictures import files_below
+from sorvolo.store.datasets.text_files import read_text
+
+FORM = "Pascal VOC"
+
+
+def read_voc(place: Path, findings: Findings) -> ParsedSet:
+    """A folder with XML files (`Annotations/`, or beside the pictures), or one such file; pictures by the same stem.
+
+    Objects marked `difficult` are regions to ignore. The devkit's boxes name their first and last pixel, counted from
+    1; a set with a box that starts at 0 counts edges from 0 instead, and is read so throughout. Raises InputError when
+    no XML file is of this form.
+    """
+    files = [place] if place.is_file() else files_below(place, ".xml")
+    labelled: dict[Path, ParsedPicture] = {}
+    for path in files:
+        picture = _parsed(path, findings)
+        if picture is None:
+            findings.add("malformed_labels", path.name)
+        else:
+            labelled[path] = picture
+    if not labelled:
+        raise InputError(f"{place}: none of its {len(files)} XML files is a {FORM} annotation")
+    if not place.is_dir():
+        pictures = [path for path in pictures_around(place, FORM) if path.stem == place.stem]
+    else:
+        pictures = pictures_around(place, FORM)
+    label_of = labels_of_pictures(pictures, labelled)
+    for path in sorted(set(labelled) - set(label_of.values())):
+        findings.add("labels_without_picture", path.name)
+    if not label_of:
+        raise InputError(f"{place}: none of its {len(labelled)} {FORM} files has a picture of the same name")
+    for path in pictures:
+        if path not in label_of:
+            findings.add("pictures_without_labels", path.name)
+    from_zero = any(min(box.left, box.top) < 0 for each in labelled.values() for box in each.boxes)
+    if from_zero:
+        findings.add("counted_from_zero", str(place), len(labelled))
+    result = []
+    for path in pictures:
+        found = labelled[label_of[path]] if path in label_of else ParsedPicture(path, ())
+        boxes = tuple(
+            box._replace(left=box.left + 1, top=box.top + 1) if from_zero else box for box in found.boxes
+        )
+        result.append(replace(found, path=path, boxes=boxes))
+    return ParsedSet(FORM, tuple(result))
+
+
+def looks_like_voc(path: Path) -> bool:
+    """Whether an XML file begins as an annotation."""
+    return "<annotation" in read_text(path)[:2000]
+
+
+def _parsed(path: Path, findings: Findings) -> ParsedPicture | None:
+    try:
+        root = ElementTree.fromstring(path.read_bytes())
+    except (ElementTree.ParseError, DefusedXmlException, OSError, ValueError, LookupError):
+        return None
+    if root.tag != "annotation":
+        return None
+    boxes = []
+    for each in root.iterfind("object"):
+        left, top, right, bottom = (
+            _number(each, f"bndbox/{name}") for name in ("xmin", "ymin", "xmax", "ymax")
+        )
+        name = (each.findtext("name") or "").strip()
+        if not name or not all(isfinite(edge) for edge in (left, top, right, bottom)):
+            findings.add("malformed_labels", path.name)
+            continue
+        boxes.append(ParsedBox(name, left - 1, top - 1, right, bottom, _number(each, "difficult") == 1))
+    size = _number(root, "size/width"), _number(root, "size/height")
+    return ParsedPicture(path, tuple(boxes), size if size[0] > 0 and size[1] > 0 else None)
+
+
+def _number(element: Any, path: str) -> float:
+    """The number at a path below an element; NaN where there is none."""
+    try:
+        value = float((element.findtext(path) or "").strip())
+    except ValueError:
+        return nan
+    return value if isfinite(value) else nan
