@@ -1,0 +1,66 @@
+"""The heading of a camera whose telemetry does not tell it, on ways that are known."""
+
+import numpy as np
+import pytest
+
+from sorvolo.tracking.heading import Heading, HeadingFromMotion
+
+_M_PER_PX = 0.05
+
+
+def _fly(
+    headings_deg: np.ndarray, way_m: np.ndarray, *, gps_m: float = 0.0, wobble_px: float = 0.0, seed: int = 1
+) -> list[Heading]:
+    """What is told along a way (N, 2) of a camera with these headings, ten frames a second."""
+    rng = np.random.default_rng(seed)
+    drift_m = gps_m * np.cumsum(rng.normal(0, 1, way_m.shape), axis=0) / np.sqrt(len(way_m))
+    finder, told = HeadingFromMotion(), []
+    for number, (heading_deg, place_m) in enumerate(zip(headings_deg, way_m)):
+        turned_deg = 0.0 if number == 0 else -(heading_deg - headings_deg[number - 1])
+        step_m = np.zeros(2) if number == 0 else place_m - way_m[number - 1]
+        heading = np.radians(heading_deg)
+        right = step_m @ [np.cos(heading), -np.sin(heading)]
+        up = step_m @ [np.sin(heading), np.cos(heading)]
+        # what lies under the camera goes the other way in the picture; y is down
+        moved_px = np.array([-right, up]) / _M_PER_PX + rng.normal(0, wobble_px, 2)
+        told.append(finder.add(number / 10, np.radians(turned_deg), moved_px, place_m + drift_m[number]))
+    return told
+
+
+def _apart_deg(one: float, other: float) -> float:
+    return abs((one - other + 180) % 360 - 180)
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 37.0, 90.0, 181.0, 359.0])
+def test_a_straight_way_in_any_direction(heading_deg: float) -> None:
+    way_m = np.outer(np.arange(60) * 0.5, [0.6, -0.8])  # the camera need not look where it flies
+    told = _fly(np.full(60, heading_deg), way_m)
+    assert told[3].sigma_deg == np.inf  # two metres are no way yet
+    assert _apart_deg(told[-1].heading_deg, heading_deg) < 0.01 and told[-1].sigma_deg == 4.0
+
+
+def test_turns_are_followed() -> None:
+    headings_deg = np.concatenate([np.full(80, 90.0), np.linspace(90, 270, 40), np.full(40, 270.0)])
+    steps = np.column_stack([np.sin(np.radians(headings_deg)), np.cos(np.radians(headings_deg))]) * 0.6
+    told = _fly(headings_deg, np.cumsum(steps, axis=0))
+    assert all(_apart_deg(each.heading_deg, true) < 0.1 for each, true in zip(told[40:], headings_deg[40:]))
+
+
+def test_noise_is_within_what_is_told() -> None:
+    misses = []
+    for seed in range(40):
+        headings_deg = 45 + np.cumsum(np.random.default_rng(seed).normal(0, 1, 150))
+        way_m = np.outer(np.arange(150) * 0.6, [np.sin(1.0), np.cos(1.0)])
+        last = _fly(headings_deg, way_m, gps_m=2.0, wobble_px=8.0, seed=seed)[-1]
+        misses.append(_apart_deg(last.heading_deg, headings_deg[-1]) / last.sigma_deg)
+    assert np.mean(np.array(misses) < 2) >= 0.9
+
+
+def test_hovering_tells_nothing_and_a_cut_begins_anew() -> None:
+    told = _fly(np.full(100, 10.0), np.zeros((100, 2)), gps_m=1.0, wobble_px=5.0)
+    assert all(each.sigma_deg == np.inf for each in told)
+    finder = HeadingFromMotion()
+    for number in range(60):
+        finder.add(number / 10, 0.0, np.array([0.0, 10.0]), np.array([0.0, 0.5 * number]))
+    finder.lose()
+    assert finder.add(6.0, 0.0, np.array([0.0, 10.0]), np.array([0.0, 30.0])).sigma_deg == np.inf
