@@ -17,6 +17,7 @@ from sorvolo.cli.evaluate import evaluate_app
 from sorvolo.cli.history import history
 from sorvolo.cli.inspect import inspect
 from sorvolo.cli.map import map_command
+from sorvolo.cli.models import models_app
 from sorvolo.cli.plan import plan
 from sorvolo.cli.review import review
 from sorvolo.cli.simulate import simulate
@@ -33,6 +34,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 for _name, _command in _COMMANDS.items():
     app.command(_name)(_command)
 app.add_typer(evaluate_app, name="evaluate")
+app.add_typer(models_app, name="models")
 
 
 @dataclass

@@ -65,12 +65,20 @@ class Session:
         contract of docs/detector.md.
         """
         height, width = picture.shape[:2]
-        most = self.fixed_px or (math.inf, math.inf)
-        shown = _resized(picture, min(scale, most[0] / height, most[1] / width))
         with self._lock:
+            shown = self._shown(picture, scale)
             boxes, scores, labels = self._run(self._padded(shown))
         back = np.array([width / shown.shape[1], height / shown.shape[0]] * 2, np.float32)
         return self._checked(boxes, scores, labels, back, width, height)
+
+    def input_from(self, picture: ImageRGB) -> Anything:
+        """(1, 3, H, W) what the model is given for a picture, (H, W, 3): a size of its own, padded."""
+        with self._lock:
+            return self._padded(self._shown(picture, 1.0)).copy()
+
+    def _shown(self, picture: ImageRGB, scale: float) -> ImageRGB:
+        most = self.fixed_px or (math.inf, math.inf)
+        return _resized(picture, min(scale, most[0] / picture.shape[0], most[1] / picture.shape[1]))
 
     def _padded(self, picture: ImageRGB) -> Anything:
         """(1, 3, H, W) with the picture in its top-left corner and its last row and column repeated beyond."""
@@ -153,15 +161,15 @@ def _resized(picture: ImageRGB, scale: float) -> ImageRGB:
 
 def _opened(model: bytes, where: str, provider: Provider, threads: int) -> tuple[Any, str, Any]:
     """What runs the model, where in words, and the ONNX Runtime session that describes it."""
-    if provider == "cuda" or (provider == "auto" and _CUDA in onnxruntime.get_available_providers()):
+    if provider in ("auto", "cuda") and _CUDA in onnxruntime.get_available_providers():
         session = _onnx_session(model, where, threads, [_CUDA, "CPUExecutionProvider"])
         if session.get_providers()[0] == _CUDA:
             return _runner(session), "ONNX Runtime on the GPU (CUDA)", session
-        if provider == "cuda":
-            raise SettingsError(
-                "CUDA is not to be had here: install onnxruntime-gpu in place of onnxruntime, with a driver and CUDA "
-                "of its version, or choose the provider cpu"
-            )
+    if provider == "cuda":
+        raise SettingsError(
+            "CUDA is not to be had here: install onnxruntime-gpu in place of onnxruntime, with a driver and CUDA of its "
+            "version, or choose the provider cpu"
+        )
     if provider in ("auto", "openvino"):
         described = _described(model, where)
         try:

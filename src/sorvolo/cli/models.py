@@ -1,0 +1,194 @@
+"""`sorvolo models`: the detection models that are installed, and others by their hash."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from sorvolo.detection.contract import ModelInfo
+from sorvolo.detection.models import (
+    InstalledModel,
+    Integrity,
+    file_sha256,
+    find_model,
+    installed_models,
+    integrity,
+    models_folder,
+    read_card,
+)
+from sorvolo.detection.session import read_info
+from sorvolo.errors import InputError
+from sorvolo.missions.model_files import fetch_model, quantise_model
+
+models_app = typer.Typer(no_args_is_help=True)
+
+
+@models_app.callback()
+def models() -> None:
+    """The detection models that are installed: list, show, fetch by hash, verify, make smaller."""
+
+
+@models_app.command("list")
+def list_models(
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
+) -> None:
+    """List the models that `--model NAME` can name: the packaged one and your own.
+
+    Your own lie in $SORVOLO_MODELS, else in sorvolo/models of your data folder.
+
+    Example: sorvolo models list
+    """
+    rows = [_row(each) for each in installed_models()]
+    if as_json:
+        typer.echo(json.dumps(rows, indent=1))
+        return
+    console = Console()
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in ("name", "preset", "classes", "light", "numbers", "MB", "file"):
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        if "error" in row:
+            table.add_row(escape(row["name"]), "", escape(row["error"]), "", "", "", escape(row["path"]))
+            continue
+        table.add_row(
+            escape(row["name"]), escape(row["preset"]), escape(", ".join(row["classes"])),
+            "day and thermal" if row["thermal"] else "day", row["precision"], f"{row['bytes'] / 1e6:.1f}",
+            "with the package" if row["is_packaged"] else escape(row["path"]),
+        )
+    if rows:
+        console.print(table)
+    else:
+        typer.echo(f"no models are installed; your own belong in {models_folder()}")
+
+
+@models_app.command()
+def show(
+    model: Annotated[str, typer.Argument(help="A model's name, or a .onnx file.")] = "default",
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """What a model is: its classes, from which score and at which sizes it finds them, licence, card.
+
+    Example: sorvolo models show default
+    """
+    path = find_model(model)
+    info, card = read_info(path), read_card(InstalledModel(path.stem, path, False))
+    told = _told(info) | {"path": str(path), "sha256": file_sha256(path), "card": card}
+    if as_json:
+        typer.echo(json.dumps(told, indent=1))
+        return
+    table = Table(title=escape(info.name), show_header=False, title_justify="left")
+    table.add_column()
+    table.add_column(overflow="fold")
+    for name in ("preset", "version", "precision", "licence", "trained_on", "created", "path", "sha256"):
+        table.add_row(name.replace("_", " "), escape(str(told[name])))
+    table.add_row("light", "day and thermal" if info.thermal else "day")
+    for each in info.classes:
+        least_px, most_px = info.best_px[each]
+        words = f"told from score {info.thresholds[each]:.2f}; found well from {least_px:g} to {most_px:g} px"
+        table.add_row(escape(each), words)
+    for key, value in card.items():
+        if key not in told:
+            table.add_row(escape(key), escape(value if isinstance(value, str) else json.dumps(value)))
+    Console().print(table)
+
+
+@models_app.command()
+def fetch(
+    source: Annotated[str, typer.Argument(help="Web address or file of a model, or its name in $SORVOLO_MODELS_URL.")],
+    sha256: Annotated[str, typer.Option(help="The file's SHA-256, as whoever gives it says.")],
+    name: Annotated[str, typer.Option(help="Its name among the installed ones.", show_default="the file's")] = "",
+) -> None:
+    """Install a model if its hash is right; otherwise nothing changes.
+
+    Without a network, bring the file on a disk and give its path.
+
+    Example: sorvolo models fetch https://example.org/coast.onnx --sha256 9f86d081884c7d65...
+
+    Example without network: sorvolo models fetch /media/usb/coast.onnx --sha256 9f86d081884c7d65...
+    """
+    model = fetch_model(source, sha256, name=name)
+    typer.echo(f"{model.name}: installed in {model.path}; use it with --model {model.name}")
+
+
+@models_app.command()
+def verify(
+    model: Annotated[str, typer.Argument(help="A model's name, or a .onnx file; none: all.")] = "",
+    sha256: Annotated[str, typer.Option(help="What its SHA-256 must be.", show_default="its card's")] = "",
+) -> None:
+    """Check that models are whole, unchanged and can be run; exit code 1 where one is not.
+
+    Example: sorvolo models verify
+
+    Example of a file: sorvolo models verify coast.onnx --sha256 9f86d081884c7d65...
+    """
+    if model:
+        path = find_model(model)
+        chosen = [each for each in installed_models() if each.path == path] or [InstalledModel(path.stem, path, False)]
+    else:
+        chosen = installed_models()
+    if sha256 and not model:
+        raise typer.BadParameter("say which model has this hash", param_hint="--sha256")
+    bad = 0
+    for each in chosen:
+        words, is_bad = _verdict(each, sha256.strip().lower())
+        bad += is_bad
+        typer.echo(f"{each.name}: {words}")
+    if not chosen:
+        typer.echo("no models are installed")
+    if bad:
+        raise typer.Exit(1)
+
+
+@models_app.command()
+def quantise(
+    model: Annotated[str, typer.Argument(help="A model's name, or a .onnx file.")],
+    pictures: Annotated[Path, typer.Option(help="Folder of pictures such as it will see, all lights and grounds.")],
+    out: Annotated[Path, typer.Option(help="The .onnx file to write.")],
+    most: Annotated[int, typer.Option(min=8, help="Use at most so many of the pictures.")] = 64,
+) -> None:
+    """Make a model that is smaller and quicker, in whole numbers of eight bits. Measure both before you trust it.
+
+    Needs the package onnx: pip install 'sorvolo[training]'.
+
+    Example: sorvolo models quantise mine.onnx --pictures flights/ --out mine-int8.onnx
+    """
+    made = quantise_model(find_model(model), pictures, out, most=most)
+    typer.echo(
+        f"{out}: {made.convolutions} of {made.of} convolutions in eight bits, {len(made.model) / 1e6:.1f} MB; "
+        "compare it with `sorvolo evaluate detector`"
+    )
+
+
+def _row(model: InstalledModel) -> dict[str, Any]:
+    row: dict[str, Any] = {"name": model.name, "path": str(model.path), "is_packaged": model.is_packaged}
+    try:
+        return row | _told(read_info(model.path)) | {"name": model.name, "bytes": model.path.stat().st_size}
+    except InputError as error:
+        return row | {"error": str(error)}
+
+
+def _told(info: ModelInfo) -> dict[str, Any]:
+    return {key: dict(value) if isinstance(value, Mapping) else value for key, value in vars(info).items()}
+
+
+def _verdict(model: InstalledModel, sha256: str) -> tuple[str, bool]:
+    """What to say of a model, and whether it is bad."""
+    try:
+        if sha256:
+            state = Integrity.GOOD if file_sha256(model.path) == sha256 else Integrity.CHANGED
+        else:
+            state = integrity(model)
+        if state is Integrity.CHANGED:
+            return "CHANGED: its SHA-256 is not the recorded one; do not use it, fetch it again", True
+        read_info(model.path)
+    except InputError as error:
+        return f"BAD: {error}", True
+    if state is Integrity.NOT_RECORDED:
+        return f"can be run, but no hash is recorded; it is {file_sha256(model.path)}", False
+    return "good", False

@@ -1,0 +1,148 @@
+"""A model's convolutions in whole numbers of eight bits, scaled by what real pictures make of them; needs onnx."""
+
+import json
+import logging
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sorvolo.detection.contract import METADATA_KEY
+from sorvolo.detection.session import Session
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import Anything, ImageRGB
+
+LEAST_PICTURES = 8
+"""With fewer pictures the ranges of the numbers are a matter of chance."""
+
+_CARRIERS = frozenset({"Conv", "Relu", "Clip", "Add", "Concat", "MaxPool", "AveragePool", "Resize", "RoiAlign"})
+_FLOAT = frozenset({"RoiAlign"})  # carries features on, but interpolates at places that eight bits cannot name
+
+
+@dataclass(frozen=True)
+class Quantised:
+    """A model in eight bits: the file's bytes, and how many of its convolutions are in whole numbers now."""
+
+    model: bytes
+    convolutions: int
+    of: int
+
+
+def quantise(path: Path, pictures: Iterable[ImageRGB]) -> Quantised:
+    """The model file `path` with its convolutions in int8, by the same contract (its metadata says so).
+
+    `pictures` (H, W, 3) are what it will have to see: all lights and grounds, some dozens. Weights are scaled per
+    channel, activations by the least and the greatest value that occurs (static quantisation, Q and DQ nodes:
+    Jacob et al. 2018). In float remain the last convolutions of each branch, which say how likely and where, and all
+    that handles boxes. Whether it is good enough must be measured: `sorvolo evaluate detector` on both.
+    Raises InputError for a file that is no model of ours or is in eight bits already and for too few pictures,
+    SettingsError where the package onnx is not installed.
+    """
+    try:
+        import onnx
+        from onnxruntime import quantization
+    except ImportError as error:
+        raise SettingsError(
+            "making a model of eight bits needs the package onnx: pip install 'sorvolo[training]'"
+        ) from error
+    session = Session(path, "cpu")
+    if session.info.precision == "int8":
+        raise InputError(f"{path} is in eight bits already; give the model that it was made from")
+    model = onnx.load_model(path)
+    _prepare(model)
+    chosen = _quantisable(model)
+    if not chosen:
+        raise InputError(f"{path} has no convolutions that lead to others: eight bits would gain nothing")
+    samples = _Samples(session, pictures)
+    with tempfile.TemporaryDirectory() as folder, _quiet():
+        out = Path(folder) / "int8.onnx"
+        quantization.quantize_static(
+            model, out, samples, quant_format=quantization.QuantFormat.QDQ, per_channel=True,
+            activation_type=quantization.QuantType.QUInt8, weight_type=quantization.QuantType.QInt8,
+            nodes_to_quantize=chosen, op_types_to_quantize=sorted(_CARRIERS - _FLOAT),
+        )
+        quantised = onnx.load_model(out)
+    if samples.count < LEAST_PICTURES:
+        raise InputError(
+            f"{samples.count} pictures are too few to tell how large a model's numbers become; needed are "
+            f"{LEAST_PICTURES} or more, of all lights and grounds"
+        )
+    metadata = {each.key: each.value for each in model.metadata_props}
+    told = json.loads(metadata[METADATA_KEY])
+    metadata[METADATA_KEY] = json.dumps(told | {"precision": "int8"})
+    onnx.helper.set_model_props(quantised, metadata)
+    convolutions = {node.name for node in model.graph.node if node.op_type == "Conv"}
+    return Quantised(quantised.SerializeToString(), len(convolutions & set(chosen)), len(convolutions))
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """The quantiser advises on the terminal to do what `_prepare` did."""
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(logging.NOTSET)
+
+
+class _Samples:
+    """Pictures as the quantiser asks for them: one input after another, then None."""
+
+    def __init__(self, session: Session, pictures: Iterable[ImageRGB]) -> None:
+        self.count = 0
+        self._inputs: Iterator[Anything] = (session.input_from(each) for each in pictures)
+
+    def get_next(self) -> dict[str, Anything] | None:
+        batch = next(self._inputs, None)
+        if batch is None:
+            return None
+        self.count += 1
+        return {"image": np.array(batch)}
+
+    def set_range(self, start_index: int, end_index: int) -> None:
+        """Not for inputs of different sizes; the quantiser asks only where it may go in strides."""
+
+
+def _prepare(model: Any) -> None:
+    """What the quantiser asks for: weights given directly, not through Identity nodes, and a name for every node."""
+    graph = model.graph
+    weights = {each.name for each in graph.initializer}
+    given: dict[str, str] = {}
+    for node in list(graph.node):
+        if node.op_type == "Identity" and given.get(node.input[0], node.input[0]) in weights:
+            given[node.output[0]] = given.get(node.input[0], node.input[0])
+            graph.node.remove(node)
+    for index, node in enumerate(graph.node):
+        node.name = node.name or f"{node.op_type}_{index}"
+        for place, name in enumerate(node.input):
+            node.input[place] = given.get(name, name)
+
+
+def _quantisable(model: Any) -> list[str]:
+    """Names of the nodes that carry features from one convolution to the next, those convolutions included.
+
+    The last convolution of a branch (its output reaches no other one) is not among them, nor is what works on boxes.
+    """
+    makers = {name: node for node in model.graph.node for name in node.output}
+    carried: set[str] = set()  # tensors that come from a convolution through carriers alone
+    leads_on: set[str] = set()  # tensors from which another convolution is reached so
+    nodes = list(model.graph.node)
+    for node in nodes:
+        if node.op_type == "Conv" or (node.op_type in _CARRIERS and _features_in(node) & carried):
+            carried.update(node.output[:1])
+    for node in reversed(nodes):
+        if node.op_type == "Conv" or (node.op_type in _CARRIERS and node.output[0] in leads_on):
+            leads_on.update(name for name in _features_in(node) if name in makers)
+    return [
+        node.name for node in nodes
+        if node.op_type in _CARRIERS - _FLOAT and node.output[0] in carried and node.output[0] in leads_on
+    ]
+
+
+def _features_in(node: Any) -> set[str]:
+    """The inputs of a node that hold features: all of a sum or a row, the first of the others."""
+    return set(node.input) if node.op_type in ("Add", "Concat") else set(node.input[:1])

@@ -1,0 +1,136 @@
+"""Detection models on disk: fetched by hash, checked, and made smaller."""
+
+import hashlib
+import http.client
+import json
+import os
+import re
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import closing
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO
+
+from sorvolo.capture.photos import PHOTO_SUFFIXES, read_picture
+from sorvolo.detection.models import (
+    HASH_KEY,
+    InstalledModel,
+    installed_model,
+    installed_models,
+    models_folder,
+)
+from sorvolo.detection.quantise import Quantised, quantise
+from sorvolo.detection.session import read_info
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.store.atomic import atomic_path, atomic_write_bytes, writing
+
+MIRROR_VARIABLE = "SORVOLO_MODELS_URL"
+"""A team's own collection: `fetch NAME` asks for NAME.onnx under this address."""
+
+_MOST_BYTES = 1 << 30
+_CHUNK_BYTES = 1 << 20
+_PATIENCE_S = 30.0
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+
+
+def fetch_model(source: str, sha256: str, *, name: str = "") -> InstalledModel:
+    """Install the model at a web address, in a file, or of a name under $SORVOLO_MODELS_URL, if its hash is `sha256`.
+
+    It is written beside its place, and appears there, with a card that records hash and source, only when its hash is
+    the one that was asked for and it is a model of ours. `name` is its name among the installed ones, else the file's.
+    Raises SettingsError for a hash or a name that cannot be, InputError where it cannot be had, is another file, or is
+    no model, StoreError where it cannot be written.
+    """
+    wanted = sha256.strip().lower()
+    if not _SHA256.fullmatch(wanted):
+        raise SettingsError(f"--sha256 {sha256!r}: a SHA-256 has 64 hexadecimal digits; ask whoever gives the model")
+    address = _address_of(source)
+    own = name or re.sub(r"(?i)\.onnx$", "", re.split(r"[/\\]", address.split("?")[0])[-1])
+    if not _NAME.fullmatch(own):
+        raise SettingsError(f"{own!r} cannot be a model's name: use letters, digits, '.', '_' and '-' with --name")
+    if any(each.name == own and each.is_packaged for each in installed_models()):
+        raise SettingsError(f"{own!r} is the packaged model's name; give the new one another with --name")
+    folder = models_folder()
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{own}.onnx"
+    with atomic_path(path) as temporary:
+        found = _copy(address, temporary)
+        if found != wanted:
+            raise InputError(
+                f"{address} is not the file that was asked for: its SHA-256 is {found}, wanted was {wanted}; nothing "
+                "was installed. Ask again for file and hash"
+            )
+        read_info(temporary)
+        card = {HASH_KEY: wanted, "source": address, "fetched": datetime.now(UTC).isoformat(timespec="seconds")}
+        atomic_write_bytes(path.with_suffix(".json"), json.dumps(card, indent=1).encode())
+    return installed_model(own)
+
+
+def quantise_model(model: Path, pictures: Path, out: Path, *, most: int) -> Quantised:
+    """Write `model` in eight bits to `out`, its ranges from at most `most` pictures of a folder, evenly chosen.
+
+    Raises InputError for a folder without pictures and as `quantise` does, StoreError where `out` cannot be written.
+    """
+    if out.suffix.lower() != ".onnx":
+        raise SettingsError(f"--out {out}: a model's file ends in .onnx")
+    if not pictures.is_dir():
+        raise InputError(f"{pictures} is no folder of pictures; give one with what the model will have to see")
+    paths = sorted(path for path in pictures.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES)
+    if not paths:
+        raise InputError(f"there are no pictures in {pictures}; needed are {', '.join(sorted(PHOTO_SUFFIXES))}")
+    count = min(most, len(paths))
+    chosen = [paths[index * len(paths) // count] for index in range(count)]
+    result = quantise(model, _pictures(chosen))
+    atomic_write_bytes(out, result.model)
+    return result
+
+
+def _pictures(paths: list[Path]) -> Iterator[ImageRGB]:
+    for path in paths:
+        yield read_picture(path)
+
+
+def _address_of(source: str) -> str:
+    """Where a model is: an address or a path as given, or that of a name in the team's own collection."""
+    if re.match(r"(?i)https?://", source) or Path(source).expanduser().is_file():
+        return source
+    if "://" in source:
+        raise SettingsError(f"{source}: models are fetched by http or https, or from a file")
+    mirror = os.environ.get(MIRROR_VARIABLE, "")
+    if mirror and _NAME.fullmatch(source):
+        return f"{mirror.rstrip('/')}/{source}.onnx"
+    raise InputError(
+        f"there is no file {source}, and ${MIRROR_VARIABLE} names no collection to ask for a model of this name; give "
+        "its web address or its file"
+    )
+
+
+def _copy(address: str, to: Path) -> str:
+    """Copy what is at an address or a path; returns its SHA-256."""
+    digest, size = hashlib.sha256(), 0
+    try:
+        with closing(_opened(address)) as stream, to.open("wb") as file:
+            while chunk := stream.read(_CHUNK_BYTES):
+                size += len(chunk)
+                if size > _MOST_BYTES:
+                    raise InputError(f"{address} is larger than {_MOST_BYTES >> 30} GB, so no model of ours")
+                digest.update(chunk)
+                file.write(chunk)
+    except (urllib.error.URLError, TimeoutError, ConnectionError, http.client.HTTPException) as error:
+        reason = getattr(error, "reason", None) or error
+        raise InputError(
+            f"{address} cannot be fetched ({reason}). Without a network, bring the file on a disk and give its path: "
+            "sorvolo models fetch FILE --sha256 HASH"
+        ) from error
+    return digest.hexdigest()
+
+
+def _opened(address: str) -> IO[bytes]:
+    if re.match(r"(?i)https?://", address):
+        return urllib.request.urlopen(address, timeout=_PATIENCE_S)
+    return Path(address).expanduser().open("rb")

@@ -1,0 +1,181 @@
+"""Installed models: found by name, fetched by hash or not at all, verified."""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from functools import partial
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import pytest
+from toy_models import rectangle_model, square_model
+
+from sorvolo.cli import main as cli
+from sorvolo.detection.detector import Detector
+from sorvolo.detection.models import Integrity, find_model, installed_models, integrity, models_folder
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.missions.model_files import fetch_model
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("SORVOLO_MODELS", str(tmp_path / "own"))
+    monkeypatch.delenv("SORVOLO_MODELS_URL", raising=False)
+    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    return tmp_path / "own"
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    (tmp_path / "given").mkdir()
+    return rectangle_model(tmp_path / "given" / "coast.onnx", name="coast")
+
+
+def _hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+class _Shelf(BaseHTTPRequestHandler):
+    """Serves one folder; a name with "cut" in it ends in the middle."""
+
+    def __init__(self, folder: Path, *arguments: object) -> None:
+        self.folder = folder
+        super().__init__(*arguments)  # type: ignore[arg-type]
+
+    def do_GET(self) -> None:
+        path = self.folder / self.path.split("?")[0].lstrip("/").replace("cut-", "")
+        if not path.is_file():
+            self.send_error(404)
+            return
+        data = path.read_bytes()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data[: len(data) // 2] if "cut-" in self.path else data)
+
+    def log_message(self, format: str, *arguments: object) -> None:
+        pass
+
+
+@pytest.fixture
+def address(model: Path) -> Iterator[str]:
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Shelf, model.parent))
+    Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    server.server_close()
+
+
+def test_names_and_paths(folder: Path, model: Path) -> None:
+    assert find_model(model) == find_model(str(model)) == model
+    folder.mkdir()
+    own = rectangle_model(folder / "night.onnx", name="night")
+    assert find_model("night") == own
+    assert Detector.load("night", provider="cpu").info.name == "night"
+    with pytest.raises(InputError, match=r"no model 'day'; installed are: .*night"):
+        Detector.load("day")
+
+
+def test_where_own_models_lie(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert models_folder() == folder
+    monkeypatch.delenv("SORVOLO_MODELS")
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    assert models_folder() == tmp_path / "data" / "sorvolo" / "models"
+    assert [each for each in installed_models() if not each.is_packaged] == []
+
+
+def test_fetched_from_the_web_from_a_file_and_by_name(
+    folder: Path, model: Path, address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fetched = fetch_model(f"{address}/coast.onnx?version=2", _hash(model).upper())
+    assert (fetched.name, fetched.path) == ("coast", folder / "coast.onnx")
+    assert fetched.path.read_bytes() == model.read_bytes() and integrity(fetched) is Integrity.GOOD
+    fetch_model(str(model), _hash(model), name="from-disk")
+    monkeypatch.setenv("SORVOLO_MODELS_URL", f"{address}/")
+    fetch_model("coast", _hash(model))
+    assert [each.name for each in installed_models() if not each.is_packaged] == ["coast", "from-disk"]
+
+
+def test_what_is_not_the_file_never_appears(folder: Path, model: Path, address: str, tmp_path: Path) -> None:
+    attempts = [
+        (f"{address}/coast.onnx", "0" * 64, "is not the file"),
+        (f"{address}/cut-coast.onnx", _hash(model), "is not the file|cannot be fetched"),
+        (f"{address}/none.onnx", _hash(model), "cannot be fetched \\(Not Found"),
+        ("http://127.0.0.1:9/x.onnx", _hash(model), "Without a network"),
+        ("coast", _hash(model), "SORVOLO_MODELS_URL"),
+    ]
+    for source, sha256, says in attempts:
+        with pytest.raises(InputError, match=says):
+            fetch_model(source, sha256)
+    text = tmp_path / "page.onnx"
+    text.write_text("<html>")
+    with pytest.raises(InputError, match="cannot be run"):
+        fetch_model(str(text), _hash(text))
+    assert list(folder.iterdir()) == []
+
+
+def test_a_failed_fetch_leaves_the_old_model(folder: Path, model: Path, address: str, tmp_path: Path) -> None:
+    fetch_model(f"{address}/coast.onnx", _hash(model))
+    square_model(model)
+    with pytest.raises(InputError):
+        fetch_model(f"{address}/coast.onnx", "1" * 64)
+    (kept,) = [each for each in installed_models() if not each.is_packaged]
+    assert integrity(kept) is Integrity.GOOD and Detector.load("coast", provider="cpu").info.name == "coast"
+
+
+@pytest.mark.parametrize(
+    ("source", "sha256", "name"),
+    [
+        ("x.onnx", "12ab", ""), ("given", "0" * 64, "../up"), ("given", "0" * 64, ".hidden"),
+        ("ftp://a/b.onnx", "0" * 64, ""),
+    ],
+)
+def test_wishes_of_fetch_that_cannot_be(model: Path, source: str, sha256: str, name: str) -> None:
+    with pytest.raises(SettingsError):
+        fetch_model(str(model) if source == "given" else source, sha256, name=name)
+
+
+def test_the_command(folder: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["models", "fetch", str(model), "--sha256", _hash(model)]) == 0
+    assert cli.main(["models", "verify", "coast"]) == 0
+    assert capsys.readouterr().out.endswith("coast: good\n")
+    assert cli.main(["models", "list", "--json"]) == 0
+    row = next(each for each in json.loads(capsys.readouterr().out) if each["name"] == "coast")
+    assert row["classes"] == ["person", "car", "small object"] and row["thermal"] is True
+    assert cli.main(["models", "list"]) == 0 and "coast" in capsys.readouterr().out
+    assert cli.main(["models", "show", "coast", "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["sha256"] == _hash(model) == shown["card"]["sha256"]
+    assert cli.main(["models", "show", str(model)]) == 0
+    assert "found well from 8 to 120 px" in capsys.readouterr().out
+
+
+def test_verify_finds_changed_damaged_and_unknown_files(
+    folder: Path, model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fetch_model(str(model), _hash(model))
+    path = folder / "coast.onnx"
+    path.write_bytes(square_model(model.with_name("other.onnx")).read_bytes())
+    assert cli.main(["models", "verify", "coast"]) == 1
+    assert "CHANGED" in capsys.readouterr().out
+    assert cli.main(["models", "verify", str(path), "--sha256", _hash(path)]) == 0
+    assert cli.main(["models", "verify", str(path), "--sha256", "0" * 64]) == 1
+    path.with_suffix(".json").unlink()
+    capsys.readouterr()
+    assert cli.main(["models", "verify", "coast"]) == 0
+    assert _hash(path) in capsys.readouterr().out
+    (folder / "broken.onnx").write_bytes(b"nothing")
+    (folder / "broken.json").write_text("{")
+    assert cli.main(["models", "verify", "broken"]) == 1
+    assert cli.main(["models", "list"]) == 0, "a broken file of another model stops nothing"
+    assert "broken" in capsys.readouterr().out
+    assert cli.main(["models", "verify", "none"]) == 1
+
+
+def test_help_of_every_command_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in ("list", "show", "fetch", "verify", "quantise"):
+        assert cli.main(["models", command, "--help"]) == 0
+        example = capsys.readouterr().out.split("Example", 1)[1]
+        assert f"sorvolo models {command}" in " ".join(example.replace("│", " ").split())

@@ -1,0 +1,84 @@
+"""A model in eight bits: the same objects, smaller weights, boxes and their last convolutions in float."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy_models import draw, onnx, rectangle_model, square_model
+
+from sorvolo.detection.detector import Detector
+from sorvolo.detection.quantise import quantise
+from sorvolo.errors import InputError
+from sorvolo.missions.model_files import quantise_model
+from sorvolo.store.images import jpeg_from_image
+
+
+def _pictures(count: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(count)
+    pictures = []
+    for _ in range(count):
+        places = [(x, y, x + 16, y + 16) for x in (20, 80, 140) for y in (12, 60) if rng.random() < 0.7]
+        picture = draw((96, 192), places)
+        for left, top, right, bottom in places:
+            picture[top:bottom, left:right] = rng.integers(190, 256)
+        pictures.append(picture)
+    return pictures
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return square_model(tmp_path_factory.mktemp("models") / "squares.onnx")
+
+
+@pytest.mark.parametrize("provider", ["cpu", "openvino"])
+def test_finds_the_same(model: Path, tmp_path: Path, provider: str) -> None:
+    if provider == "openvino":
+        pytest.importorskip("openvino")
+    made = quantise(model, _pictures(12))
+    assert (made.convolutions, made.of) == (2, 3), "the last convolution says where and stays in float"
+    out = tmp_path / "int8.onnx"
+    out.write_bytes(made.model)
+    whole = Detector.load(model, provider="cpu", threads=1)
+    small = Detector.load(out, provider=provider, threads=1)
+    assert (small.info.precision, small.info.name, whole.info.precision) == ("int8", "squares", "float32")
+    for picture in _pictures(5):
+        expected, found = whole.detect(picture, least_score=0.1), small.detect(picture, least_score=0.1)
+        assert len(expected) == len(found) >= 2
+        order = [np.lexsort(each.boxes_px[:, :2].round().T) for each in (expected, found)]
+        np.testing.assert_allclose(found.boxes_px[order[1]], expected.boxes_px[order[0]], atol=4.01)
+        np.testing.assert_allclose(found.scores[order[1]], expected.scores[order[0]], atol=0.05)
+
+
+def test_weights_are_whole_numbers_and_what_handles_boxes_is_not(model: Path) -> None:
+    made = onnx.load_model_from_string(quantise(model, _pictures(8)).model)
+    kinds = {each.name: each.data_type for each in made.graph.initializer}
+    whole = [name for name, kind in kinds.items() if kind == onnx.TensorProto.INT8 and name.endswith("_quantized")]
+    assert sorted(whole) == ["far_w_quantized", "near_w_quantized"]
+    assert kinds["heat_w"] == onnx.TensorProto.FLOAT
+    into = {node.op_type: list(node.input) for node in made.graph.node}
+    assert into["NonMaxSuppression"][:2] == ["boxes_3", "scores_3"]
+
+
+def test_too_few_pictures_or_nothing_to_gain(model: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="3 pictures are too few"):
+        quantise(model, _pictures(3))
+    with pytest.raises(InputError, match="no convolutions that lead"):
+        quantise(rectangle_model(tmp_path / "toy.onnx"), _pictures(8))
+    (tmp_path / "int8.onnx").write_bytes(quantise(model, _pictures(8)).model)
+    with pytest.raises(InputError, match="already"):
+        quantise(tmp_path / "int8.onnx", _pictures(8))
+
+
+def test_from_a_folder_of_pictures(model: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    for index, picture in enumerate(_pictures(10)):
+        (folder / f"{index}.jpg").write_bytes(jpeg_from_image(picture))
+    out = tmp_path / "small.onnx"
+    assert quantise_model(model, folder, out, most=9).convolutions == 2
+    assert Detector.load(out, provider="cpu").info.precision == "int8"
+    with pytest.raises(InputError, match="no folder"):
+        quantise_model(model, tmp_path / "gone", out, most=9)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="no pictures"):
+        quantise_model(model, tmp_path / "empty", out, most=9)
