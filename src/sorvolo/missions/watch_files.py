@@ -11,23 +11,29 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.missions.watch_settings import WatchOutputs
 from sorvolo.store.annotated import AnnotatedVideo, annotated, write_annotated
+from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.detection_files import (
     ANNOTATED_PICTURES,
     ANNOTATED_VIDEO,
+    LABELS,
     DetectionLines,
     crop_around,
     detection_row,
     write_crop,
     write_tracks,
 )
+from sorvolo.store.images import jpeg_from_image
+from sorvolo.store.label_files import picture_of_detections, write_coco, write_yolo
 from sorvolo.survey.flight import Frame, Site
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections, Sighting, Track
 
 _MOST_WAITING = 4  # frames; a disk that is slower than the detector slows the watch, it does not fill the memory
 _TRACKS_EVERY_S = 5.0
+_LABELS_EVERY_NS = 1_000_000_000  # frames nearer in time show the same again
 _CROPS_BYTES = 96_000_000  # of the latest sightings, one of which may become a track's best
 
 
@@ -55,6 +61,9 @@ class WatchFiles:
         self._best: dict[int, Sighting] = {}
         self.crop_names: dict[int, str] = {}
         self._told_s = time.monotonic()
+        self._labelled: list[tuple[LabelledPicture, Floats]] = []
+        self._classes: tuple[str, ...] = ()
+        self._label_due_ns = -1
         self._queue: queue.Queue[SeenFrame | None] = queue.Queue(_MOST_WAITING)
         self._error: BaseException | None = None
         self._stack = ExitStack()
@@ -104,6 +113,7 @@ class WatchFiles:
             self._thread.join()
         self._stack.close()
         self._raise_earlier()
+        self._write_labels()
 
     # ---- in the thread ----------------------------------------------------------------------------------------
 
@@ -123,7 +133,32 @@ class WatchFiles:
         if self._video is not None:
             self._video.add(_drawn(seen), seen.time_ns)
         elif self._outputs.save == "pictures" and len(seen.detections):
-            write_annotated(self.folder / ANNOTATED_PICTURES, Path(seen.frame.name).stem, _drawn(seen))
+            write_annotated(self.folder / ANNOTATED_PICTURES, _file_name(seen.frame), _drawn(seen))
+        if self._outputs.labels and seen.time_ns >= self._label_due_ns:
+            self._label_due_ns = seen.time_ns + _LABELS_EVERY_NS
+            self._label(seen)
+
+    def _label(self, seen: SeenFrame) -> None:
+        """Keep a frame as a picture, and what was seen in it for the files of labels."""
+        images = self.folder / LABELS / "images"
+        with writing(images):
+            images.mkdir(parents=True, exist_ok=True)
+        name = f"{self._site.name}_{_file_name(seen.frame)}.jpg"
+        atomic_write_bytes(images / name, jpeg_from_image(seen.frame.image), durable=False)
+        height, width = seen.frame.image.shape[:2]
+        picture = picture_of_detections(f"images/{name}", width, height, self._site.name, seen.detections)
+        self._labelled.append((picture, seen.detections.scores))
+        self._classes = seen.detections.classes
+
+    def _write_labels(self) -> None:
+        if not self._labelled:
+            return
+        found = LabelledSet(self._site.name, self._classes, tuple(picture for picture, _ in self._labelled))
+        if "coco" in self._outputs.labels:
+            write_coco(self.folder / LABELS / "coco.json", found, [scores for _, scores in self._labelled])
+        if "yolo" in self._outputs.labels:
+            write_yolo(self.folder / LABELS, found)
+        self._labelled = []
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
@@ -138,6 +173,12 @@ class WatchFiles:
         while self._crops_bytes > _CROPS_BYTES and len(self._crops) > 1:
             _, dropped = self._crops.popitem(last=False)
             self._crops_bytes -= dropped.nbytes
+
+
+def _file_name(frame: Frame) -> str:
+    """The frame's name without ending; a video's frames are numbered, and sort by it."""
+    stem = Path(frame.name).stem
+    return f"{int(stem):06d}" if stem.isdecimal() else stem
 
 
 def _key(sighting: Sighting) -> tuple[int, bytes]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from sorvolo.errors import SettingsError
+from sorvolo.missions import alerts
 from sorvolo.store.cursor_on_target import COT_TYPES, cot_place
 
 DEFAULT_FRAMES_PER_SECOND = 10.0
@@ -65,3 +66,7 @@ class WatchOutputs:
             raise SettingsError("events are sent every 0 s or more, and are stale after more than 0 s")
         if self.cot:
             cot_place(self.cot)
+        if self.alert_command:
+            alerts.alert_command(self.alert_command)
+        if self.alert_url:
+            alerts.alert_url(self.alert_url)
