@@ -155,7 +155,7 @@ def differences(
     drawn = {name: arms[1][name] - arms[0][name] for name in names}
     return {
         name: Difference(
-            float(exact[1][name][0] - exact[0][name][0]), *_bounds(drawn[name]), float(np.nanmean(drawn[name] > 0))
+            float(exact[1][name][0] - exact[0][name][0]), *_bounds(drawn[name]), _share_above(drawn[name])
         )
         for name in names
     }
@@ -191,3 +191,8 @@ def _bounds(values: Floats) -> tuple[float, float]:
         return np.nan, np.nan
     low, high = np.percentile(known, (2.5, 97.5))
     return float(low), float(high)
+
+
+def _share_above(values: Floats) -> float:
+    known = values[~np.isnan(values)]
+    return float((known > 0).mean()) if len(known) else np.nan

@@ -189,12 +189,12 @@ def precision_recall(match: ClassMatch) -> tuple[Floats, Floats, Floats]:
 
 
 def best_threshold(match: ClassMatch) -> Threshold:
-    """The score from which on F1 is highest; NaN without labels or detections.
+    """The score from which on F1 is highest; NaN where nothing is right.
 
     It is chosen on the very pictures that it is told of, so it flatters a little.
     """
     scores, precision, recall = precision_recall(match)
-    if not len(scores) or not len(match.true_scores):
+    if not match.right[0].any():
         return Threshold(*[float("nan")] * 4)
     f1 = 2 * precision * recall / np.maximum(precision + recall, 1e-12)
     f1[:-1][scores[:-1] == scores[1:]] = 0.0  # a threshold cannot part equal scores

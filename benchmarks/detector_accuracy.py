@@ -1,0 +1,150 @@
+"""How well a model finds people, cars and small objects in pictures that it was not trained on, set by set.
+
+python benchmarks/detector_accuracy.py MODEL [--data FOLDER] [--sets hituav cats ...] [--out FOLDER]
+
+FOLDER holds the data sets; their held-out parts are those of detection_data.py (whole flights, videos, or blocks of
+neighbouring frames). "simulated" are frames of simulated flights and "pictures" single simulated pictures, both of
+seeds from 301 on, which no training uses; "pictures_thermal" their thermal kind. Intervals of 95 % by drawing whole
+videos or flights. Written to results/detector_accuracy.json, with a page for each set in the folder of --out.
+"""
+
+import argparse
+import json
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+import detection_data
+from mosaic_methods import commit, machine
+from sorvolo.missions.evaluate_detector import EvaluationSettings, evaluate_detector, write_evaluation
+from sorvolo.missions.simulate_pictures import simulate_pictures
+from sorvolo.simulation.flight import simulate_flight
+from sorvolo.simulation.pictures import LEAST_VISIBLE, SMALLEST_PX, PictureSettings
+from sorvolo.simulation.presets import preset
+from sorvolo.simulation.truth import coco_boxes
+from sorvolo.store.datasets import read_dataset
+from sorvolo.store.exports import plain_json
+from sorvolo.store.images import jpeg_from_image
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
+from sorvolo.survey.objects import CLASSES
+
+RESULTS = Path(__file__).parent / "results" / "detector_accuracy.json"
+REAL = ("hituav", "tinyperson", "aerial_cars", "cats", "sdd")
+FIRST_SEED = 301
+FLIGHTS, FRAMES_OF_ONE, PICTURES = ("compare", "compare-urban", "compare-dirt", "survey", "survey-urban"), 8, 120
+TARGETS = {"people": 16, "cars": 8, "small_objects": 16}
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", help="a model's name or file")
+    parser.add_argument("--data", type=Path, help="folder of the data sets")
+    parser.add_argument("--sets", nargs="+", default=[*REAL, "simulated", "pictures", "pictures_thermal"])
+    parser.add_argument("--seeds", type=int, default=4, help="so many simulated flights of each preset")
+    parser.add_argument("--tiles", default=None, help="auto, or pixels a side; none by default")
+    parser.add_argument("--out", type=Path, help="folder for the pages")
+    options = parser.parse_args()
+    tiles = int(options.tiles) if options.tiles and options.tiles.isdecimal() else options.tiles
+    settings = EvaluationSettings(tiles)
+    runs = {}
+    for name in options.sets:
+        with tempfile.TemporaryDirectory() as folder:
+            labelled = held_out(name, options.data, Path(folder), options.seeds)
+            if labelled is None:
+                print(f"{name}: no such data, left out", flush=True)
+                continue
+            measured = evaluate_detector([[options.model]], [labelled], settings)
+        runs[name] = figures(measured.sets[0]) | {"seconds_per_picture": measured.found.seconds_per_picture}
+        print(name, json.dumps(plain_json(runs[name]["classes"])), flush=True)
+        if options.out is not None:
+            write_evaluation(measured, options.out / name, {"benchmark": "detector_accuracy", "set": name})
+    RESULTS.write_text(json.dumps(plain_json({
+        "benchmark": "detector_accuracy", "machine": machine(), "commit": commit(), "model": Path(options.model).name,
+        "tiles": options.tiles, "draws": settings.draws, "seed": settings.seed, "first_simulated_seed": FIRST_SEED,
+        "sets": runs,
+    }), indent=1) + "\n")
+
+
+def held_out(name: str, data: Path | None, folder: Path, seeds: int) -> LabelledSet | None:
+    """The pictures to be measured on; None where the data is not there. Classes without any label are not judged."""
+    makers: dict[str, Callable[[], LabelledSet]] = {
+        "simulated": lambda: simulated_flights(folder, seeds),
+        "pictures": lambda: simulated_pictures(folder / "pictures", 0.0),
+        "pictures_thermal": lambda: simulated_pictures(folder / "pictures_thermal", 1.0),
+    }
+    if name in makers:
+        labelled = makers[name]()
+    elif data is not None and (data / name).is_dir():
+        labelled = getattr(detection_data, name)(data)["test"]
+    else:
+        return None
+    labels = {labelled.classes[label] for picture in labelled.pictures for label in picture.labels.tolist()}
+    unlabelled = labelled.unlabelled | (set(labelled.classes) - labels)
+    return LabelledSet(name, labelled.classes, labelled.pictures, frozenset(unlabelled))
+
+
+def simulated_pictures(folder: Path, thermal_share: float) -> LabelledSet:
+    """Single pictures, each of a site of its own."""
+    for _ in simulate_pictures(folder, PictureSettings(PICTURES, FIRST_SEED, thermal_share=thermal_share)):
+        pass
+    return read_dataset(folder)
+
+
+def simulated_flights(folder: Path, seeds: int) -> LabelledSet:
+    """A few frames of flights of several presets; what hardly shows is ignored, as in single pictures."""
+    pictures = []
+    for name in FLIGHTS:
+        for seed in range(FIRST_SEED, FIRST_SEED + seeds):
+            settings = replace(preset(name), seed=seed)
+            flight = simulate_flight(replace(settings, scene=replace(settings.scene, **TARGETS)))
+            chosen = np.unique(np.linspace(0, len(flight) - 1, FRAMES_OF_ONE).astype(int)).tolist()
+            truth = coco_boxes(flight, chosen)
+            for index in chosen:
+                path = folder / f"{name}-{seed}-{index:06d}.jpg"
+                path.write_bytes(jpeg_from_image(flight.frame(index).image))
+                boxes, labels, ignored = [], [], []
+                for row in truth["annotations"]:
+                    if row["image_id"] != index:
+                        continue
+                    x, y, width, height = row["bbox"]
+                    box = [x, y, x + width, y + height]
+                    if row["visibility"] < LEAST_VISIBLE or max(width, height) < SMALLEST_PX:
+                        ignored.append(box)
+                    else:
+                        boxes.append(box)
+                        labels.append(row["category_id"] - 1)
+                pictures.append(LabelledPicture(
+                    str(path), flight.camera.width_px, flight.camera.height_px, f"{name}-{seed}",
+                    np.array(boxes, np.float32), np.array(labels, np.int64), np.array(ignored, np.float32),
+                    flight.path.height_m / flight.camera.fx_px,
+                ))
+    return LabelledSet("simulated", CLASSES, tuple(pictures))
+
+
+def figures(scores) -> dict[str, object]:
+    """What the result file keeps of one set."""
+    return {
+        "pictures": scores.pictures, "groups": scores.groups, "ignored_regions": scores.ignored_regions,
+        "AP": asdict(scores.intervals["AP"]), "AP50": asdict(scores.intervals["AP50"]),
+        "thesis_map": asdict(scores.intervals["thesis_map"]),
+        "classes": {
+            row.label: {
+                "labels": row.labels, "AP50": asdict(scores.intervals[f"AP50 {row.label}"]),
+                "AP": asdict(scores.intervals[f"AP {row.label}"]), "reported": asdict(row.reported),
+                "best_f1": asdict(row.best), "by_size_px": [
+                    {**asdict(each), "recall": each.recall} for each in scores.by_size_px[row.label]
+                ],
+                "by_size_m": [{**asdict(each), "recall": each.recall} for each in scores.by_size_m[row.label]],
+            }
+            for row in scores.classes
+        },
+        "remarks": list(scores.remarks),
+    }
+
+
+if __name__ == "__main__":
+    main()
