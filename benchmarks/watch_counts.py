@@ -1,0 +1,144 @@
+"""Simulated patrols with returns: is each object counted once, and does it stand where a watch says?
+
+python benchmarks/watch_counts.py [--seeds 300 301 302 303] [--height 60] [--output FILE]
+
+Each patrol flies three strips that overlap by half, so that most objects come into view two or three times, some of
+them walking or driving. The detector is fed with the truth: it misses 20 % of the objects in each frame, invents one
+box in five frames, and its edges err by 5 %. GPS errs by 1.5 m (rms per axis), most of it slowly. An object counts as
+seen when five frames showed more than half of it. A track is right when it lies within 8 m of an object of its class;
+`inside_95` is the share of right tracks whose place errs by less than 2.45 of its own sigma.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from mosaic_methods import commit, machine
+from sorvolo.geometry.geodesy import LocalFrame
+from sorvolo.missions.simulate_site import simulate_site
+from sorvolo.missions.watch import watch
+from sorvolo.missions.watch_settings import WatchOutputs
+from sorvolo.simulation.settings import (
+    DEFAULT_ORIGIN,
+    ImagingSettings,
+    LaterSettings,
+    OutputSettings,
+    PathSettings,
+    SceneSettings,
+    SensorSettings,
+    SimulationSettings,
+)
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "missions"))
+from truth_detector import TruthDetector
+
+RESULTS = Path(__file__).parent / "results" / "watch_counts.json"
+_FLIGHT = "flight2"  # in which people walk and cars drive
+_REACH_M = 8.0
+
+
+def main() -> None:
+    """Fly the patrols and write the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[300, 301, 302, 303])
+    parser.add_argument("--height", type=float, default=60.0)
+    parser.add_argument("--output", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    patrols = [patrol(seed, options.height) for seed in options.seeds]
+    seen, counted = (sum(each[key] for each in patrols) for key in ("seen", "counted"))
+    errors_m = np.array([error for each in patrols for error in each["errors_m"]])
+    standing_m = np.array([error for each in patrols for error in each["standing_errors_m"]])
+    inside = [each for one in patrols for each in one["inside"]]
+    result: dict[str, Any] = {
+        "benchmark": "watch_counts", "machine": machine(), "commit": commit(), "height_m": options.height,
+        "seen": seen, "counted": counted, "count_error": abs(counted - seen) / seen,
+        "mean_count_error_of_a_patrol": float(np.mean([
+            abs(one["counted"] - one["seen"]) / one["seen"] for one in patrols
+        ])),
+        "missed": sum(each["missed"] for each in patrols), "extra": sum(each["extra"] for each in patrols),
+        "rms_m": _rms(errors_m), "standing_rms_m": _rms(standing_m), "inside_95": float(np.mean(inside)),
+        "patrols": [{key: value for key, value in each.items() if key in _TOLD} for each in patrols],
+    }
+    options.output.parent.mkdir(exist_ok=True)
+    options.output.write_text(json.dumps(result, indent=1) + "\n")
+    print(json.dumps(result, indent=1))
+
+
+_TOLD = ("seed", "seen", "counted", "missed", "extra", "rms_m")
+
+
+def patrol(seed: int, height_m: float) -> dict[str, Any]:
+    """One simulated patrol: what was seen, what was counted, and how far off each right track lies."""
+    settings = SimulationSettings(
+        seed=seed, flights=2,
+        scene=SceneSettings(people=10, cars=6, small_objects=4, has_scenery=False),
+        path=PathSettings(height_m=height_m, speed_m_s=8, length_m=150, strips=3, strip_spacing_m=0.35 * height_m),
+        imaging=ImagingSettings(width_px=960, height_px=540, fps=5),
+        sensor=SensorSettings(noise_m=(0.5, 0.5, 0.5), wander_m=1.4),
+        later=replace(LaterSettings(), removed=0, moved=0),
+        output=OutputSettings(truth_step=1),
+    )
+    with tempfile.TemporaryDirectory() as scratch:
+        simulated = Path(scratch) / "simulated"
+        for _ in simulate_site(simulated, settings):
+            pass
+        detector = TruthDetector(simulated, _FLIGHT, misses=0.2, false_alarms=0.2, seed=seed)
+        folder = Path(scratch) / "watch"
+        for _ in watch(
+            simulated / _FLIGHT / f"{_FLIGHT}.mp4", outputs=WatchOutputs(folder=folder),
+            camera=simulated / "camera.xml", detector=detector,
+        ):
+            pass
+        tracks = [each["properties"] for each in json.loads((folder / "tracks.geojson").read_text())["features"]]
+        report = json.loads((folder / "report.json").read_text())
+        return {"seed": seed, **_compared(tracks, simulated, report)}
+
+
+def _compared(tracks: list[dict[str, Any]], simulated: Path, report: dict[str, Any]) -> dict[str, Any]:
+    boxes = json.loads((simulated / "truth" / _FLIGHT / "boxes.json").read_text())
+    frames: dict[int, list[int]] = {}
+    for each in boxes["annotations"]:
+        if each["visibility"] > 0.5:
+            frames.setdefault(each["object_id"], []).append(each["image_id"])
+    fps, count = 5.0, len(boxes["images"])
+    objects = [
+        each["properties"] for each in json.loads((simulated / "truth" / "objects.geojson").read_text())["features"]
+        if 2 in each["properties"]["flights"] and len(frames.get(each["properties"]["id"], [])) >= 5
+    ]
+    site = LocalFrame(DEFAULT_ORIGIN)
+    cost = np.full((len(tracks), len(objects)), 1e6)
+    for row, track in enumerate(tracks):
+        place = site.site_from_wgs84(
+            np.array([track["latitude"]]), np.array([track["longitude"]]), np.array([DEFAULT_ORIGIN.height_m])
+        )[0][:2]
+        for column, thing in enumerate(objects):
+            # a track's place is where the object was when it was last seen
+            last_s = frames[thing["id"]][-1] / fps - (count - 1) / fps / 2
+            there = np.array([thing["east_m"], thing["north_m"]]) + last_s * np.array(thing["velocity_m_s"])
+            if thing["class"] == track["class"]:
+                cost[row, column] = np.linalg.norm(place - there)
+    rows, columns = linear_sum_assignment(cost)
+    right = [(row, column) for row, column in zip(rows, columns) if cost[row, column] < _REACH_M]
+    errors = np.array([cost[pair] for pair in right])
+    return {
+        "seen": len(objects), "counted": len(tracks), "missed": len(objects) - len(right),
+        "extra": len(tracks) - len(right), "errors_m": errors.tolist(), "rms_m": _rms(errors),
+        "standing_errors_m": [float(cost[pair]) for pair in right if not objects[pair[1]]["moving"]],
+        "inside": [bool(cost[row, column] < 2.45 * tracks[row]["sigma_m"]) for row, column in right],
+        "frames": report["frames"]["detected"],
+    }
+
+
+def _rms(values: Any) -> float | None:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
+
+
+if __name__ == "__main__":
+    main()

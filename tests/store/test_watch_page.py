@@ -1,0 +1,63 @@
+"""The page of a watch: what it says, that it is whole and needs nothing else, and that names stay text."""
+
+from typing import Any
+
+import numpy as np
+from html_checker import checked
+
+from sorvolo.store.watch_page import count_words, watch_page
+
+_REPORT: dict[str, Any] = {
+    "sorvolo": "0.1.0", "flight": "DJI<1>", "georeferenced": True, "first_frame": "2026-05-01T10:00:00Z",
+    "last_frame": "2026-05-01T10:01:00Z", "ended": "the source ended",
+    "objects": {"total": 2, "by_class": {"person": 1, "car": 1}},
+    "frames": {"read": 100, "detected": 50, "with_detections": 20, "skipped": 3, "lost": 1, "reasons": {}},
+    "detections": {"total": 40, "placed": 39, "not_placed": 1}, "latency_s": {"median": 0.05, "max": 0.2},
+    "frames_per_second": 20.0, "seconds": {"total": 5.0, "detect": 4.0},
+    "model": {"name": "fast", "licence": "Apache-2.0 & others", "classes": ["person", "car"]},
+    "camera": {"origin": "guess"}, "telemetry": {"height": "above take-off", "attitude": "gimbal"},
+    "notices": [{"code": "x", "count": 1, "text": "a <notice>"}], "warnings": ["a <warning>"],
+    "settings": {"classes": []}, "versions": {"python": "3.11"},
+}
+
+
+def _track(number: int, **changes: Any) -> dict[str, Any]:
+    track = {
+        "id": number, "class": "person", "score": 0.8, "latitude": 41.9, "longitude": 12.6, "east_m": 10.0 * number,
+        "north_m": 5.0, "sigma_m": 1.2, "velocity_m_s": None, "views": 5, "passes": 2,
+        "first_seen": "2026-05-01T10:00:00Z", "last_seen": "2026-05-01T10:00:09Z", "best_frame": "17",
+    }
+    return track | changes
+
+
+def test_a_page_says_what_where_and_how_sure() -> None:
+    tracks = [_track(1), _track(2, **{"class": "car", "velocity_m_s": [3.0, 4.0]})]
+    way_m = np.column_stack([np.linspace(0, 50, 9), np.zeros(9)])
+    page = checked(watch_page(_REPORT, tracks, {1: b"\xff\xd8picture"}, way_m))
+    text = " ".join(page.text)
+    assert "Found: 1 x person, 1 x car." in text and "person, car" in text
+    assert "41.900000, 12.600000" in text and "1.2 m" in text and "5.0 m/s" in text and "5 in 2" in text
+    assert "a <notice>" in text and "a <warning>" in text and "DJI<1>" in text and "Apache-2.0 & others" in text
+    assert page.names.count("img") == 1 and page.names.count("circle") == 4 and "polyline" in page.names
+    assert all(address.startswith(("data:", "#")) for address in page.addresses)
+    assert "1 more have no picture here" in text
+
+
+def test_nothing_found_and_nothing_known_is_a_page_too() -> None:
+    text = " ".join(checked(watch_page({"flight": "x"}, [], {}, np.zeros((0, 2)))).text)
+    assert "Found: nothing." in text
+    only_way = checked(watch_page(_REPORT, [], {}, np.array([[0.0, 0.0], [40.0, 10.0]])))
+    assert "polyline" in only_way.names and "circle" not in only_way.names
+
+
+def test_a_flight_that_nothing_places_is_drawn_in_pixels() -> None:
+    local = _REPORT | {"georeferenced": False}
+    track = {key: value for key, value in _track(1).items() if key not in ("latitude", "longitude")}
+    page = checked(watch_page(local, [track | {"x_px": 100.0, "y_px": 50.0}], {}, np.zeros((0, 2))))
+    text = " ".join(page.text)
+    assert "100, 50 px" in text and "nothing placed this flight" in text
+
+
+def test_counts_in_words() -> None:
+    assert count_words({"person": 3, "car": 0, "boat": 1}) == "3 x person, 1 x boat"
+    assert count_words({}) == "nothing"
