@@ -29,12 +29,16 @@ _OBLIQUE_DEG = 35.0  # pictures that look to opposite sides share too little to 
 
 
 class Stage(StrEnum):
-    """What time is spent on; reading is what the other stages leave."""
+    """What time is spent on; reading is what the other stages leave.
+
+    The detector works beside them: its stage is what was waited for it, and laying on the ground what it saw.
+    """
 
     UNDISTORT = "undistort"
     REGISTER = "register"
     COMPARE = "compare"
     EVIDENCE = "evidence"
+    DETECT = "detect"
     PAINT = "paint"
     STORE = "store"
     REPORT = "report"

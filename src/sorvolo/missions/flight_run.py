@@ -5,24 +5,28 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Self
 
-from sorvolo.missions.flight_report import FlightLog
+from sorvolo.missions.flight_report import FlightLog, Stage
 from sorvolo.missions.flight_setup import FlightSetup, new_site
+from sorvolo.missions.map_objects import ObjectFinder, search_summary, why_not_searched
 from sorvolo.missions.settings import MapSettings
 from sorvolo.store.archive import Archive, FlightWriter
 from sorvolo.survey.flight import Notice, PosedFrame
-from sorvolo.survey.mosaic import Status
+from sorvolo.survey.map_objects import ObjectSearch
+from sorvolo.survey.mosaic import PlacedFrame, Status
 
 
 class FlightRun(ABC):
     """A flight on its way into a site. A context manager: leaving without `finish` leaves the site as it was.
 
-    `writer` is one that was begun before for this flight; whoever began it ends it.
+    `writer` is one that was begun before for this flight; whoever began it ends it. `finder` looks for objects in the
+    frames; None: nobody does.
     """
 
     def __init__(
-        self, setup: FlightSetup, archive: Archive, settings: MapSettings, writer: FlightWriter | None = None
+        self, setup: FlightSetup, archive: Archive, settings: MapSettings, writer: FlightWriter | None = None,
+        finder: ObjectFinder | None = None,
     ) -> None:
-        self._setup, self._archive, self._settings = setup, archive, settings
+        self._setup, self._archive, self._settings, self._finder = setup, archive, settings, finder
         self._log = FlightLog()
         self._writer = writer
         self._began_writer = False
@@ -33,6 +37,8 @@ class FlightRun(ABC):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._finder is not None:
+            self._finder.close()
         if self._writer is not None and self._began_writer:
             self._writer.__exit__(kind, error, trace)
 
@@ -51,6 +57,12 @@ class FlightRun(ABC):
         self._log.end(index, name, time_ns, Status.REJECTED, reason)
         return Status.REJECTED, reason, 0
 
+    def look(self, posed: PosedFrame) -> None:
+        """Have a selected frame searched for objects while it is being placed."""
+        if self._finder is not None:
+            with self._log.stage(Stage.DETECT):
+                self._finder.look(posed)
+
     @abstractmethod
     def add(self, posed: PosedFrame) -> tuple[Status, str, int]:
         """Place one frame; what became of it, in words if not by vision, and how many tiles were painted meanwhile."""
@@ -62,6 +74,24 @@ class FlightRun(ABC):
         `started_s` is when the flight's mapping began, by the monotonic clock. Raises InputError, and leaves the site
         as it was, when no frame has a place.
         """
+
+    def _search(self, placed: Sequence[PlacedFrame]) -> ObjectSearch | None:
+        """What stands on the ground by the frames' final places; None where nobody looked."""
+        if self._finder is None:
+            return None
+        with self._log.stage(Stage.DETECT):
+            return self._finder.conclude(
+                placed, self._setup.source.name, has_metres=not self._archive.site().is_local
+            )
+
+    def _search_summary(self, search: ObjectSearch | None) -> dict[str, Any]:
+        """The report's part on objects."""
+        seconds = 0.0 if self._finder is None else self._finder.seconds
+        return search_summary(search, seconds, why_not_searched(self._settings.model))
+
+    @property
+    def _detector_notices(self) -> tuple[Notice, ...]:
+        return () if self._finder is None else self._finder.notices
 
     def _make_site(self, m_per_px: float, ground_up_m: float) -> None:
         """Make the site if there is none; see `new_site`."""

@@ -6,8 +6,10 @@ from pathlib import Path
 
 from sorvolo.capture.areas import read_area
 from sorvolo.capture.source import Source, open_sources
+from sorvolo.missions.detecting import Detects
 from sorvolo.missions.flight_run import FlightRun
 from sorvolo.missions.flight_setup import known_flights, prepare
+from sorvolo.missions.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.map_planar import PlanarRun
 from sorvolo.missions.map_thesis import ThesisRun
 from sorvolo.missions.settings import MapSettings
@@ -21,29 +23,34 @@ from sorvolo.survey.mosaic import MosaicUpdate, Status
 def map_flights(
     inputs: Sequence[Path], site: Path, settings: MapSettings = MapSettings(), *,  # noqa: B008 (frozen)
     telemetry: Path | None = None, camera: Path | str | None = None, area: Path | None = None,
+    detector: Detects | None = None,
 ) -> Generator[MosaicUpdate]:
     """Map one or more flights into the site folder, yielding an update for each selected frame.
 
     `inputs` are videos, folders of photos, or photos; `telemetry` a file of the only flight (else what lies beside
     it is used); `camera` a calibration file, a preset's name, "aov=DEG" or "focal_px=PX"; `area` a polygon outside
-    of which frames are not used. Nothing of a flight is part of the site until its last update was yielded.
+    of which frames are not used; `detector` one that looks for objects in place of the model that the settings name.
+    Nothing of a flight is part of the site until its last update was yielded.
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being mapped is left out, those before it are in.
     """
     wanted = None if area is None else read_area(area)
     sources = open_sources(inputs, telemetry, camera, known_flights(site))
+    looks = open_detector(settings.model) if detector is None else detector
     with Archive.open(site, write=True) as archive:
         for source in sources:
-            yield from _map_one(source, archive, settings, wanted, telemetry_named=telemetry is not None)
+            yield from _map_one(source, archive, settings, wanted, looks, telemetry_named=telemetry is not None)
 
 
 def _map_one(
-    source: Source, archive: Archive, settings: MapSettings, area: Area | None, *, telemetry_named: bool
+    source: Source, archive: Archive, settings: MapSettings, area: Area | None, detector: Detects | None, *,
+    telemetry_named: bool,
 ) -> Generator[MosaicUpdate]:
     started_s = time.monotonic()
     setup = prepare(source, settings, archive.site() if archive.has_site else None, telemetry_named=telemetry_named)
     make = ThesisRun if settings.method == "thesis" else PlanarRun
-    with make(setup, archive, settings) as run:
+    finder = None if detector is None else ObjectFinder(detector, source.camera.camera)
+    with make(setup, archive, settings, finder=finder) as run:
         read = 0
 
         def posed() -> Iterator[PosedFrame | LostFrame]:
@@ -74,4 +81,5 @@ def _take(run: FlightRun, each: Selected | LostFrame) -> tuple[Status, str, int]
     if each.reason:
         frame = each.posed.frame
         return run.lose(frame.index, frame.name, frame.time_ns, each.reason)
+    run.look(each.posed)
     return run.add(each.posed)

@@ -16,6 +16,7 @@ from sorvolo.geometry.homography import pose_from_homography, site_from_image_ho
 from sorvolo.missions.flight_report import Stage, build_report, nothing_placed
 from sorvolo.missions.flight_run import FlightRun
 from sorvolo.missions.flight_setup import FlightSetup
+from sorvolo.missions.map_objects import ObjectFinder, crops_of
 from sorvolo.missions.settings import MapSettings
 from sorvolo.mosaic.canvas import Canvas
 from sorvolo.mosaic.canvas_frame import CanvasFrame
@@ -44,9 +45,10 @@ class PlanarRun(FlightRun):
     """A flight placed keyframe by keyframe and painted as it goes; ground that the map shows already stays as it is."""
 
     def __init__(
-        self, setup: FlightSetup, archive: Archive, settings: MapSettings, writer: FlightWriter | None = None
+        self, setup: FlightSetup, archive: Archive, settings: MapSettings, writer: FlightWriter | None = None,
+        finder: ObjectFinder | None = None,
     ) -> None:
-        super().__init__(setup, archive, settings, writer)
+        super().__init__(setup, archive, settings, writer, finder)
         model = setup.source.camera
         self._lens = Undistorter(model.camera)
         self._known = _known_keyframes(archive, setup)
@@ -138,14 +140,18 @@ class PlanarRun(FlightRun):
         if all(each.status is Status.REJECTED for each in placed):
             raise self._nothing_placed()
         writer = self.begin()
+        search = self._search(placed)
         with self._log.stage(Stage.REPORT):
             shown = picture(writer.tiles, 1600).rgba
         report = build_report(
             self._setup, self._settings, self._log, placed, self._archive.site(), self._offset, self._mapper.report(),
-            self._refined(self._setup.source.camera.camera), writer.tiles, [*self._setup.notices, *notices],
+            self._refined(self._setup.source.camera.camera), writer.tiles,
+            [*self._setup.notices, *notices, *self._detector_notices],
             time.monotonic() - started_s, spread=self._exposure.spread,
         )
-        writer.commit(placed, self._images, report, report_page(report, shown), crs=self._settings.crs)
+        report["objects"] = self._search_summary(search)
+        page = report_page(report, shown, crops_of(search))
+        writer.commit(placed, self._images, report, page, crs=self._settings.crs, search=search)
 
     # ---- inside -----------------------------------------------------------------------------------------------
 

@@ -14,6 +14,7 @@ from sorvolo.geometry.homography import apply_homography
 from sorvolo.missions.flight_report import Stage, build_report, nothing_placed
 from sorvolo.missions.flight_run import FlightRun
 from sorvolo.missions.flight_setup import FlightSetup
+from sorvolo.missions.map_objects import ObjectFinder, crops_of
 from sorvolo.missions.settings import MapSettings
 from sorvolo.mosaic.lens import Undistorter
 from sorvolo.mosaic.placing import rejected
@@ -31,8 +32,10 @@ _MIRROR_Y = np.diag([1.0, -1.0, 1.0])
 class ThesisRun(FlightRun):
     """A flight mapped as the thesis does: all of it stitched first, then anchored to its fixes."""
 
-    def __init__(self, setup: FlightSetup, archive: Archive, settings: MapSettings) -> None:
-        super().__init__(setup, archive, settings)
+    def __init__(
+        self, setup: FlightSetup, archive: Archive, settings: MapSettings, finder: ObjectFinder | None = None
+    ) -> None:
+        super().__init__(setup, archive, settings, finder=finder)
         self._lens = Undistorter(setup.source.camera.camera)
         full = self._lens.camera
         scale = min(1.0, _SIDE_PX / max(full.width_px, full.height_px))
@@ -82,11 +85,15 @@ class ThesisRun(FlightRun):
         with self._log.stage(Stage.REPORT):
             placed = self._placed(site_from_mosaic)
             shown = picture(writer.tiles, 1600).rgba
+        search = self._search(placed)
         report = build_report(
             self._setup, self._settings, self._log, placed, site, None, None, self._setup.source.camera.camera,
-            writer.tiles, [*self._setup.notices, *notices], time.monotonic() - started_s, spread=float("nan"),
+            writer.tiles, [*self._setup.notices, *notices, *self._detector_notices], time.monotonic() - started_s,
+            spread=float("nan"),
         )
-        writer.commit(placed, paths, report, report_page(report, shown), crs=self._settings.crs)
+        report["objects"] = self._search_summary(search)
+        page = report_page(report, shown, crops_of(search))
+        writer.commit(placed, paths, report, page, crs=self._settings.crs, search=search)
 
     # ---- inside -----------------------------------------------------------------------------------------------
 

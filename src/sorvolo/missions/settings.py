@@ -19,6 +19,7 @@ class MapSettings:
     crs: str | None = None  # of mosaic.tif; None: the site's UTM zone
     transform: Literal["similarity", "homography"] = "similarity"  # of method thesis (its Figure 3.12)
     live_s: float = 3.0  # how often the growing map is made visible
+    model: str = "default"  # that looks for objects: an installed one's name, a file, or "none"
 
     def __post_init__(self) -> None:
         if self.method not in ("planar", "thesis"):
@@ -46,6 +47,7 @@ class CompareSettings:
     side_px: int = 1280  # longest side at which frames are compared
     updates_map: bool = True  # make a new version of the map where the ground changed or is new
     writes_masks: bool = False
+    model: str = "default"  # that looks for objects: an installed one's name, a file, or "none"
 
     def __post_init__(self) -> None:
         if self.method not in ("robust", "thesis"):
@@ -65,4 +67,6 @@ class CompareSettings:
     @property
     def mapping(self) -> MapSettings:
         """How frames that show new ground are mapped."""
-        return MapSettings(offset_s=self.offset_s, ground_elevation_m=self.ground_elevation_m)
+        return MapSettings(
+            offset_s=self.offset_s, ground_elevation_m=self.ground_elevation_m, model=self.model
+        )

@@ -11,14 +11,24 @@ from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB, ImageRGBA
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.store import catalogue as records
-from sorvolo.store import change_records
+from sorvolo.store import change_records, object_records
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
 from sorvolo.store.catalogue import Catalogue, FlightEntry, OwedFiles, StoredKeyframe, TileDifference, VersionEntry
 from sorvolo.store.change_records import StoredChange, StoredReview
-from sorvolo.store.derived import STAGED, map_is_there, take_staged, write_change_files, write_map_files
+from sorvolo.store.derived import (
+    STAGED,
+    map_is_there,
+    take_staged,
+    write_change_files,
+    write_map_files,
+    write_object_files,
+    write_site_objects,
+)
 from sorvolo.store.exports import plain_json
 from sorvolo.store.flight_writer import FlightWriter
 from sorvolo.store.images import read_keyframe
+from sorvolo.store.object_records import StoredObject
+from sorvolo.store.objects import OBJECTS
 from sorvolo.store.site_folder import CATALOGUE, lock_site_folder, make_site_folder
 from sorvolo.store.tiles import GrowingTiles, TileBlobs, TileView
 from sorvolo.survey.findings import Verdict
@@ -106,6 +116,11 @@ class Archive:
         return self._folder / "mosaic.kmz"
 
     @property
+    def objects_path(self) -> Path:
+        """What stands on the site, as GeoJSON; there is none until a flight was searched for objects."""
+        return self._folder / OBJECTS
+
+    @property
     def live_preview_path(self) -> Path:
         """Where the mission may keep a small PNG of the growing map; removed when the flight is done."""
         return self._folder / "live.png"
@@ -190,6 +205,26 @@ class Archive:
         """Everything that was said of changes, in the order of saying, also of those that were replaced since."""
         with self._catalogue.reading() as connection:
             return change_records.load_reviews(connection)
+
+    @property
+    def is_searched(self) -> bool:
+        """Whether any flight's frames were searched for objects."""
+        with self._catalogue.reading() as connection:
+            return bool(object_records.load_searches(connection))
+
+    def objects(self, flight_id: str | None = None) -> list[StoredObject]:
+        """The objects that complete runs found, by flight rank and number; of one flight."""
+        with self._catalogue.reading() as connection:
+            return object_records.load_objects(connection, flight_id)
+
+    def newest_objects(self, without: str = "") -> list[StoredObject]:
+        """What stands on the site by the newest look at each piece of ground; as if one flight had not been."""
+        with self._catalogue.reading() as connection:
+            found, searches = object_records.load_objects(connection), object_records.load_searches(connection)
+        return object_records.newest_objects(
+            [each for each in found if each.flight_id != without],
+            [each for each in searches if each.flight_id != without],
+        )
 
     def review(self, change_ids: str | Iterable[str], verdict: Verdict, note: str = "") -> None:
         """Say of one change, or of several, that it is real or not; the flights' change files follow.
@@ -276,6 +311,8 @@ class Archive:
             newest = next((v for v in reversed(records.list_versions(connection)) if v.complete), None)
         for files in owed:
             self._write_flight_files(files)
+        if owed or self.is_searched != self.objects_path.is_file():
+            write_site_objects(self)
         if newest is None:
             return
         if not self._looks_like(newest, shown) or (newest.tiles and not map_is_there(self)):
@@ -304,8 +341,10 @@ class Archive:
         take_staged(folder, files.run_id)
         with self._catalogue.reading() as connection:
             is_compared = change_records.is_compared(connection, files.run_id)
+            is_searched = object_records.is_searched(connection, files.run_id)
         version = next((each for each in self.versions() if each.run_id == files.run_id and is_compared), None)
         write_change_files(self, files.flight_id, version)
+        write_object_files(self, files.flight_id, is_searched=is_searched)
 
     def _view(self, version_id: int) -> TileView:
         def hashes() -> Mapping[TileIndex, str]:

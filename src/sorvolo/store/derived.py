@@ -15,6 +15,7 @@ from sorvolo.store.changes_page import changes_page
 from sorvolo.store.exports import geojson_bytes, pictures, write_kmz, write_preview
 from sorvolo.store.geotiff import write_cog
 from sorvolo.store.images import rgba_from_png
+from sorvolo.store.objects import CROPS, OBJECTS, objects_geojson
 
 if TYPE_CHECKING:
     from sorvolo.store.archive import Archive
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 STAGED = "staged"
 """The folder of a flight in which its next run collects pictures until it is committed."""
 
-STAGED_FOLDERS = ("changes", "masks")
+STAGED_FOLDERS = ("changes", "masks", CROPS)
 _PICTURE_PX, _UNCHANGED_PX = 1600, 800  # of the map in changes.html; daily flights without change should cost little
 
 
@@ -91,6 +92,25 @@ def write_change_files(archive: "Archive", flight_id: str, version: VersionEntry
         before_words=_words_of(made.get(version.parent_id)), after_words=_words_of(version),
     )
     atomic_write_bytes(folder / "changes.html", page.encode())
+
+
+def write_object_files(archive: "Archive", flight_id: str, *, is_searched: bool) -> None:
+    """Write objects.geojson of a flight; remove it when the flight's frames were not searched for objects."""
+    path = archive.flight_folder(flight_id) / OBJECTS
+    if not is_searched:
+        path.unlink(missing_ok=True)
+        return
+    found = objects_geojson(archive.objects(flight_id), archive.site(), crops_from_site=False)
+    atomic_write_bytes(path, geojson_bytes(found))
+
+
+def write_site_objects(archive: "Archive") -> None:
+    """Write objects.geojson of the site, the newest of each place; remove it when no flight was ever searched."""
+    if archive.is_searched:
+        found = objects_geojson(archive.newest_objects(), archive.site(), crops_from_site=True)
+        atomic_write_bytes(archive.objects_path, geojson_bytes(found))
+    else:
+        archive.objects_path.unlink(missing_ok=True)
 
 
 def _report(path: Path) -> Mapping[str, Any]:

@@ -12,7 +12,7 @@ from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import Boxes, ImageGray, ImageRGB, ImageRGBA, Mask
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.store import catalogue as records
-from sorvolo.store import change_records
+from sorvolo.store import change_records, object_records
 from sorvolo.store.atomic import atomic_write_bytes, sync_file, writing
 from sorvolo.store.catalogue import StoredKeyframe
 from sorvolo.store.changes import BOXES_FILE, boxes_json, crop_files, mask_name, write_view_masks
@@ -20,8 +20,10 @@ from sorvolo.store.derived import STAGED, STAGED_FOLDERS
 from sorvolo.store.exports import frames_geojson, geojson_bytes, json_bytes
 from sorvolo.store.geotiff import parse_crs
 from sorvolo.store.images import ImageCache, jpeg_from_image, read_keyframe
+from sorvolo.store.objects import CROPS, object_crops
 from sorvolo.store.tiles import GrowingTiles
 from sorvolo.survey.findings import Change
+from sorvolo.survey.map_objects import ObjectSearch
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
 if TYPE_CHECKING:
@@ -125,6 +127,7 @@ class FlightWriter:
         crs: str | None = None,
         notes: Sequence[str] = (),
         changes: Sequence[Change] | None = None,
+        search: ObjectSearch | None = None,
         documents: Mapping[str, bytes] | None = None,
     ) -> int:
         """Make the flight and its map part of the site in one transaction; return the map's version.
@@ -135,8 +138,10 @@ class FlightWriter:
 
         `changes` is None for a flight that was mapped only; with changes, or with () for a comparison that found
         none, changes.geojson, changes.html and the crops are written, too, changes.html from `report`
-        (docs/formats.md). `documents` are further files of the flight's folder by name, not empty. Raises
-        SettingsError for a bad `crs`, StoreError on a full disk, an unknown image path, or an id that two changes have.
+        (docs/formats.md). `search` is what the frames were searched for and what was found, None when they were not:
+        with it objects.geojson and the crops are written, too. `documents` are further files of the flight's folder by
+        name, not empty. Raises SettingsError for a bad `crs`, StoreError on a full disk, an unknown image path, or an
+        id that two changes have.
         """
         archive = self._archive
         if crs is not None:
@@ -155,7 +160,7 @@ class FlightWriter:
         }
         frames = {status.value: sum(frame.status is status for frame in placed) for status in Status}
         self.flush()
-        self._stage(changes or ())
+        self._stage(changes or (), search)
         self._sync()
         with archive._catalogue.changing() as connection:
             records.complete_run(
@@ -163,6 +168,8 @@ class FlightWriter:
             )
             if changes is not None:
                 change_records.add_comparison(connection, self._run_id, self._version_id, found)
+            if search is not None:
+                object_records.add_search(connection, self._run_id, search)
         self._is_open = False
         archive._writer = None
         archive.repair()
@@ -179,7 +186,7 @@ class FlightWriter:
             folder.mkdir(parents=True, exist_ok=True)
         return folder
 
-    def _stage(self, changes: Sequence[Change]) -> None:
+    def _stage(self, changes: Sequence[Change], search: ObjectSearch | None) -> None:
         """Put the pictures where a repair finds them; an empty folder takes away what a former run left."""
         flight_folder = self._archive.flight_folder(self._flight_id)
         for name in STAGED_FOLDERS:
@@ -187,6 +194,8 @@ class FlightWriter:
                 self._make_staged(name)
         for name, data in crop_files(changes).items():
             atomic_write_bytes(self._make_staged("changes") / name, data, durable=False)
+        for name, data in object_crops(search.objects if search is not None else ()).items():
+            atomic_write_bytes(self._make_staged(CROPS) / name, data, durable=False)
         if self._boxes:
             atomic_write_bytes(self._staged / "masks" / BOXES_FILE, json_bytes(self._boxes), durable=False)
 

@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from sorvolo.geometry.arrays import ImageRGBA
+from sorvolo.store.objects_page import OBJECTS_STYLE, objects_section
 from sorvolo.store.page_parts import (
     area_words,
     at,
@@ -45,14 +47,18 @@ _STAGE_WORDS = {
     "undistort": "taking out the lens's distortion",
     "register": "finding where frames lie",
     "paint": "painting the map",
+    "detect": "waiting for the detector, and placing what it saw",
     "store": "saving pictures and tiles",
     "report": "making this report",
 }
 
 
-def report_page(report: Mapping[str, Any], picture: ImageRGBA) -> str:
+def report_page(
+    report: Mapping[str, Any], picture: ImageRGBA, object_crops: Mapping[str, bytes] = MappingProxyType({})
+) -> str:
     """report.html of one flight: `report` as in report.json (docs/formats.md), `picture` the map, (H, W, 4).
 
+    `object_crops` are the JPEG pictures of what stands there, by the objects' ids.
     What is None, NaN or missing in the report is shown as unknown or left out. All text is escaped.
     """
     track = _track(report)
@@ -61,6 +67,7 @@ def report_page(report: Mapping[str, Any], picture: ImageRGBA) -> str:
         _warnings(report),
         _picture(report, picture),
         _key_figures(report),
+        objects_section(report, object_crops),
         _frames(report),
         _plots(report, track),
         _camera_and_telemetry(report),
@@ -69,7 +76,7 @@ def report_page(report: Mapping[str, Any], picture: ImageRGBA) -> str:
         _settings(report),
     ]
     title = f"{escaped(report.get('flight'))} - flight report"
-    return page_of(title, STYLE, body)
+    return page_of(title, STYLE + OBJECTS_STYLE, body)
 
 
 def _header(report: Mapping[str, Any]) -> str:

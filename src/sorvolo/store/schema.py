@@ -23,7 +23,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.pool import QueuePool
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 OLDEST_VERSION = 1
 """The oldest format that is still read, and brought up to date when it is opened to be written."""
 APPLICATION_ID = 0x536F7256  # "SorV", in the file's header
@@ -135,7 +135,21 @@ reviews = Table(
     Column("kind", String, nullable=False),
     Column("outline_m", JSON, nullable=False),
 )
+searches = Table(
+    "searches", metadata,  # a run whose frames were searched for objects, perhaps without finding any
+    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
+    Column("model", String, nullable=False),
+    Column("outlines_m", JSON, nullable=False),  # (N, 4, 2) of the frames that were looked at
+)
+objects = Table(
+    "objects", metadata,
+    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
+    Column("number", Integer, primary_key=True),
+    Column("id", String, nullable=False),
+    Column("properties", JSON, nullable=False),
+)
 _NEW_IN_2 = [leftovers, comparisons, changes, reviews]
+_NEW_IN_3 = [searches, objects]
 
 
 def create_tables(path: Path) -> None:
@@ -154,6 +168,8 @@ def upgrade(connection: Connection, version: int) -> None:
     """Bring a catalogue of an older format up to date, inside the caller's transaction."""
     if version < 2:
         metadata.create_all(connection, tables=_NEW_IN_2)
+    if version < 3:
+        metadata.create_all(connection, tables=_NEW_IN_3)
     connection.exec_driver_sql(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
 

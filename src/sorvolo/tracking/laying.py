@@ -1,0 +1,127 @@
+"""Detections of a placed frame laid on the ground."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, Mask, PointsM, PointsPx
+from sorvolo.geometry.ground import ground_from_pixels
+from sorvolo.geometry.homography import pose_from_homography
+from sorvolo.geometry.pose import Pose
+from sorvolo.survey.mosaic import PlacedFrame, Status
+from sorvolo.survey.objects import TYPICAL_SIZE_M, Detections, Sighting
+
+_BOX_SIGMA = 0.06  # of a box's middle, in shares of its side
+_LEAST_SIGMA_PX = 1.0
+_LEAST_SIGMA_M = 0.03
+_CUT_PX = 1.5  # a box so near the picture's edge may go on beyond it
+_FARTHEST = 6.0  # times the height: beyond it, a pixel's error is many metres
+
+
+@dataclass(frozen=True, eq=False)
+class LaidSighting:
+    """A sighting as fusing needs it.
+
+    `sighting.position_m` is where the object stands if it is as high as its class usually is; `middle_up_m` the height
+    above the ground that its box's middle then has. `lean` (2,) is how far that place moves, east and north, with each
+    metre that the middle lies higher: towards the camera. `own_sigma_m` is the place's error against other frames of
+    the flight, per axis. `axes` (2, 2) are the directions on the ground, a row each, along which the box's width and
+    height are `sides_m` (2,). `is_cut` says that the picture's edge cuts it.
+    """
+
+    sighting: Sighting
+    middle_up_m: float
+    lean: Floats
+    own_sigma_m: float
+    axes: Floats
+    sides_m: Floats
+    is_cut: bool
+
+
+def lay_on_ground(seen: Detections, frame: PlacedFrame, *, has_metres: bool = True) -> list[LaidSighting | None]:
+    """Where each detection of a frame stands on level ground, None where that is at the horizon or unknown.
+
+    A box's middle is taken as the middle of the body, half its class's usual height above the ground (TYPICAL_SIZE_M);
+    without metres it lies on the ground. Boxes are in the frame's own pixels, lens distortion and all.
+    """
+    pose = pose_of(frame)
+    if pose is None or not len(seen):
+        return [None] * len(seen)
+    heights_m = np.array([usual_height_m(name) if has_metres else 0.0 for name in seen.names])
+    boxes = np.asarray(seen.boxes_px, np.float64)
+    size_px = np.array([frame.camera.width_px, frame.camera.height_px])
+    beyond = np.concatenate([boxes[:, :2] <= _CUT_PX, boxes[:, 2:] >= size_px - _CUT_PX], axis=1)
+    cut = np.count_nonzero(beyond, axis=1) > 0
+    result: list[LaidSighting | None] = []
+    for k, name in enumerate(seen.names):
+        up_m = heights_m[k] / 2
+        around_m = ground_from_pixels(frame.camera, pose, _cross(boxes[k:k + 1]), up_m)
+        place_m = around_m[0]
+        reach_m = pose.translation_m[2] - up_m
+        if not np.isfinite(around_m).all() or reach_m <= 0:
+            result.append(None)
+            continue
+        lean = (pose.translation_m[:2] - place_m) / reach_m
+        if float(np.hypot(*lean)) > _FARTHEST:
+            result.append(None)
+            continue
+        spans_m = np.array([around_m[2] - around_m[1], around_m[4] - around_m[3]])
+        sides_m = np.hypot(*spans_m.T)
+        m_per_px = float(np.sqrt(np.prod(sides_m) / max(np.prod(boxes[k, 2:] - boxes[k, :2]), 1e-6)))
+        own_sigma_m = _own_sigma_m(sides_m, m_per_px, frame, is_cut=bool(cut[k]))
+        usual_sigma_m = 0.15 * heights_m[k] * lean
+        sighting = Sighting(
+            frame.index, frame.name, frame.time_ns, name, float(seen.scores[k]), seen.boxes_px[k], place_m,
+            own_sigma_m**2 * np.eye(2) + np.outer(usual_sigma_m, usual_sigma_m), np.sort(sides_m)[::-1],
+        )
+        axes = spans_m / np.maximum(sides_m, 1e-9)[:, None]
+        result.append(LaidSighting(sighting, up_m, lean, own_sigma_m, axes, sides_m, bool(cut[k])))
+    return result
+
+
+def shows(frame: PlacedFrame, places_m: PointsM, up_m: Floats, reach_m: Floats) -> Mask:
+    """(N,) bool: which places (N, 2), at heights `up_m` (N,), lie so well within the frame that something reaching
+    `reach_m` (N,) about each is seen whole."""
+    pose = pose_of(frame)
+    if pose is None:
+        return np.zeros(len(places_m), bool)
+    camera = frame.camera.undistorted()
+    points = np.column_stack([places_m, up_m])
+    rays = (points - pose.translation_m) @ pose.rotation
+    in_front = rays[:, 2] > 1e-6
+    x = camera.fx_px * rays[:, 0] / np.where(in_front, rays[:, 2], 1.0) + camera.cx_px
+    y = camera.fy_px * rays[:, 1] / np.where(in_front, rays[:, 2], 1.0) + camera.cy_px
+    margin_px = reach_m * camera.fx_px / np.where(in_front, rays[:, 2], 1.0) + 2.0
+    inside: Anything = (
+        in_front & (x >= margin_px) & (y >= margin_px)
+        & (x <= camera.width_px - 1 - margin_px) & (y <= camera.height_px - 1 - margin_px)
+    )
+    return inside
+
+
+def pose_of(frame: PlacedFrame) -> Pose | None:
+    """Where the frame's camera was; None for one that has no place, or none over level ground."""
+    if frame.status is Status.REJECTED:
+        return None
+    return frame.site_from_camera or pose_from_homography(frame.site_from_image, frame.camera.undistorted())
+
+
+def usual_height_m(name: str) -> float:
+    """How high a class's members usually are; of classes that are not ours a guess between a thing and a person."""
+    return TYPICAL_SIZE_M[name][2] if name in TYPICAL_SIZE_M else 1.0
+
+
+def _own_sigma_m(sides_m: Floats, m_per_px: float, frame: PlacedFrame, *, is_cut: bool) -> float:
+    side_m = float(sides_m.mean())
+    pose_m = frame.residual_px * m_per_px if np.isfinite(frame.residual_px) else 0.0
+    if frame.status is Status.GPS_ONLY and np.isfinite(frame.sigma_m):
+        pose_m = frame.sigma_m
+    parts = [_LEAST_SIGMA_M, _LEAST_SIGMA_PX * m_per_px, _BOX_SIGMA * side_m, pose_m, 0.4 * side_m if is_cut else 0.0]
+    return float(np.sqrt(np.sum(np.square(parts))))
+
+
+def _cross(box_px: BoxesPx | Floats) -> PointsPx:
+    """(5, 2) image points of one box (1, 4): its middle, the middles of its left, right, top and bottom edges."""
+    left, top, right, bottom = np.asarray(box_px, np.float64)[0] - 0.5
+    x, y = (left + right) / 2, (top + bottom) / 2
+    return np.array([[x, y], [left, y], [right, y], [x, top], [x, bottom]])

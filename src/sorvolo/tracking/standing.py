@@ -1,0 +1,342 @@
+"""What stands on a finished map: the sightings of all its frames fused, so that each object is there once.
+
+Tracking follows objects through time with what telemetry says of each frame. Here all frames have their final places,
+which fit each other far better than telemetry does, so sightings are put together by place alone, whatever the order in
+which the drone came by; only what moves is followed through time (`walking`).
+"""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from sorvolo.geometry.arrays import Anything, Floats
+from sorvolo.survey.mosaic import PlacedFrame
+from sorvolo.survey.objects import TYPICAL_SIZE_M
+from sorvolo.tracking.laying import LaidSighting, shows, usual_height_m
+from sorvolo.tracking.walking import Walk, walks
+
+_GATE = 9.2  # squared distance in sigmas, two axes: 99 in 100 sightings of one object lie nearer
+_OTHER_CLASS = 4.0  # added for a sighting of another class: rather another object, yet classes are mistaken
+_DRIFT_M = 0.12  # by which frames of one map lie beside each other where they were not linked
+_SAME_BOX = 0.55  # overlap of two boxes of one frame from which they show one object, whatever their classes
+_SHARED_FRAMES = 0.25  # of the fewer views: what is seen twice in more frames than these is two objects
+_LEAST_SHARE = 0.3  # of the frames that show its place: what fewer saw does not stand there
+_SURE = 0.5  # score from which one sighting alone is told, where no more than two frames show the place
+_TOP = 0.85  # of a body's height: tops are narrower than feet
+_HEIGHT_SIGMA = 0.3  # of a class's usual height
+_TURNS = np.radians(np.arange(0.0, 180.0, 5.0))
+_SIZE_SIGMA = 0.3  # of a class's usual sides
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """One object; `members` are the indices of its sightings, in order of time, `best` that of its clearest.
+
+    `position_m` (2,) is its foot, where it was last seen if it moves, with `sigma_m`, per axis, against other objects
+    of the same map. `size_m` (2,) are the longer and the shorter side. `velocity_m_s` (2,) is zero unless it moves.
+    `possible_views` counts the frames that show its place and what stands there whole, at least its own.
+    """
+
+    members: tuple[int, ...]
+    best: int
+    label: str
+    score: float
+    class_scores: dict[str, float]
+    position_m: Floats
+    sigma_m: float
+    size_m: Floats
+    possible_views: int
+    velocity_m_s: Floats = field(default_factory=lambda: np.zeros(2))
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moved while it was seen."""
+        return bool(np.any(self.velocity_m_s))
+
+
+@dataclass(frozen=True)
+class Fused:
+    """All objects, and how many sightings belong to none: seen in too few of the frames that show their place."""
+
+    objects: tuple[Standing, ...]
+    dropped: int
+
+
+def fuse(laid: Sequence[LaidSighting], frames: Sequence[PlacedFrame]) -> Fused:
+    """The objects that the sightings of these frames show, each once, the surest first.
+
+    What too few of the frames saw that show its place is dropped, unless several such sightings lie on the way of
+    something that walks or drives: that is told once, as moving.
+    """
+    if not laid:
+        return Fused((), 0)
+    groups = _merged(_gathered(laid), laid)
+    counts = _possible_views(groups, laid, frames)
+    standing, left = [], []
+    for group, possible in zip(groups, counts):
+        if _stands(group, possible, laid):
+            standing.append((group, possible))
+        else:
+            left += group
+    moving = walks([laid[k] for k in left])
+    objects = [_standing(group, laid, possible) for group, possible in standing]
+    objects += [_moving([left[k] for k in walk.members], walk, laid) for walk in moving]
+    used = sum(len(each.members) for each in objects)
+    return Fused(tuple(sorted(objects, key=lambda each: -each.score)), len(laid) - used)
+
+
+def without_twins(laid: Sequence[LaidSighting]) -> list[list[int]]:
+    """The sightings of one frame, those together that are one object under several classes; the surest first."""
+    order = sorted(range(len(laid)), key=lambda k: -laid[k].sighting.score)
+    groups: list[list[int]] = []
+    for k in order:
+        box = laid[k].sighting.box_px
+        for group in groups:
+            first = laid[group[0]].sighting
+            if first.label != laid[k].sighting.label and _overlap(first.box_px, box) > _SAME_BOX:
+                group.append(k)
+                break
+        else:
+            groups.append([k])
+    return groups
+
+
+def fitted_size_m(laid: Sequence[LaidSighting], label: str, height_m: float) -> Floats:
+    """(2,) the longer and the shorter side of a box on the ground that has the sightings' sides.
+
+    A body of length l, width w, turned by a, spans |l cos a| + |w sin a| along an axis, and its height times the lean
+    along it. Classes that Sorvolo knows are held near their usual sides; of others the sides' medians are told.
+    """
+    whole = [each for each in laid if not each.is_cut] or list(laid)
+    sides_m = np.array([each.sides_m for each in whole])
+    if label not in TYPICAL_SIZE_M:
+        return np.sort(np.median(np.sort(sides_m, axis=1), axis=0))[::-1]
+    usual_m = np.array(TYPICAL_SIZE_M[label][:2])
+    axes = np.array([each.axes for each in whole]).reshape(-1, 2)
+    leans = np.repeat(np.array([each.lean for each in whole]), 2, axis=0)
+    spans_m = np.maximum(sides_m.ravel() - _TOP * height_m * np.abs((axes * leans).sum(axis=1)), 0.05)
+    angle = np.arctan2(axes[:, 1], axes[:, 0])
+    weight = 1.0 / (0.05 + 0.08 * spans_m)
+    prior = 1.0 / (_SIZE_SIGMA * usual_m)
+    best, best_cost = usual_m, np.inf
+    for turn in _TURNS:
+        matrix = np.abs(np.column_stack([np.cos(angle - turn), np.sin(angle - turn)]))
+        rows = np.vstack([matrix * weight[:, None], np.diag(prior)])
+        right = np.concatenate([spans_m * weight, usual_m * prior])
+        sides, _, _, _ = np.linalg.lstsq(rows, right, rcond=None)
+        cost = float(((rows @ sides - right) ** 2).sum())
+        if cost < best_cost:
+            best, best_cost = sides, cost
+    return np.sort(np.maximum(best, 0.05))[::-1]
+
+
+# ---- inside ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class _Gathering:
+    """An object while its sightings come together: information (2, 2), and information times place (2,)."""
+
+    members: list[int]
+    information: Floats
+    weighted_m: Floats
+    label_scores: dict[str, float]
+
+    @property
+    def covariance(self) -> Floats:
+        return np.asarray(np.linalg.inv(self.information), np.float64)
+
+    @property
+    def place_m(self) -> Floats:
+        return np.asarray(np.linalg.solve(self.information, self.weighted_m), np.float64)
+
+    @property
+    def label(self) -> str:
+        return max(self.label_scores, key=self.label_scores.__getitem__)
+
+    def take(self, other: "_Gathering") -> None:
+        self.members += other.members
+        self.information = self.information + other.information
+        self.weighted_m = self.weighted_m + other.weighted_m
+        for name, score in other.label_scores.items():
+            self.label_scores[name] = self.label_scores.get(name, 0.0) + score
+
+
+def _gathered(laid: Sequence[LaidSighting]) -> list[_Gathering]:
+    """Sightings frame by frame, each to the nearest object so far, no two of a frame to the same."""
+    by_frame: dict[int, list[int]] = defaultdict(list)
+    for k, each in enumerate(laid):
+        by_frame[each.sighting.frame_index].append(k)
+    objects: list[_Gathering] = []
+    places_m = np.zeros((0, 2))
+    for index in sorted(by_frame, key=lambda frame: laid[by_frame[frame][0]].sighting.time_ns):
+        inside = by_frame[index]
+        new = [_begin([inside[k] for k in group], laid) for group in without_twins([laid[k] for k in inside])]
+        costs = np.full((len(new), len(objects)), _GATE)
+        for row, begun in enumerate(new):
+            for column in np.flatnonzero(np.hypot(*(places_m - begun.place_m).T) < _reach_m(begun, laid)):
+                costs[row, column] = min(_GATE, _distance(begun, objects[column]))
+        matched = {row: column for row, column in zip(*linear_sum_assignment(costs)) if costs[row, column] < _GATE}
+        for row, begun in enumerate(new):
+            if row in matched:
+                objects[matched[row]].take(begun)
+            else:
+                objects.append(begun)
+        places_m = np.array([each.place_m for each in objects])
+    return objects
+
+
+def _begin(members: list[int], laid: Sequence[LaidSighting]) -> _Gathering:
+    """An object of one frame's sightings of it; the surest gives its place."""
+    first = laid[members[0]].sighting
+    information = np.asarray(np.linalg.inv(first.covariance_m2), np.float64)
+    scores: dict[str, float] = {}
+    for k in members:
+        each = laid[k].sighting
+        scores[each.label] = scores.get(each.label, 0.0) + each.score
+    return _Gathering(members, information, information @ first.position_m, scores)
+
+
+def _reach_m(each: _Gathering, laid: Sequence[LaidSighting]) -> float:
+    """Beyond this nothing is asked whether it is the same."""
+    return max(3.0, 2.0 * float(laid[each.members[0]].sighting.size_m[0]), 6.0 * laid[each.members[0]].own_sigma_m)
+
+
+def _distance(one: _Gathering, other: _Gathering) -> float:
+    """Squared, in sigmas; more between classes."""
+    apart_m = one.place_m - other.place_m
+    spread = one.covariance + other.covariance + _DRIFT_M**2 * np.eye(2)
+    penalty = 0.0 if one.label == other.label else _OTHER_CLASS
+    return float(apart_m @ np.linalg.solve(spread, apart_m)) + penalty
+
+
+def _merged(objects: list[_Gathering], laid: Sequence[LaidSighting]) -> list[list[int]]:
+    """What is near enough to be one object and was never, or hardly, seen beside itself; the nearest pairs first."""
+    alive = dict(enumerate(objects))
+    frames = {k: _frames_of(each.members, laid) for k, each in alive.items()}
+    while True:
+        pairs = _near_pairs(alive, frames, laid)
+        if not pairs:
+            return [sorted(each.members, key=lambda k: laid[k].sighting.time_ns) for each in alive.values()]
+        taken: set[int] = set()
+        for _, one, other in sorted(pairs):
+            if not {one, other} & taken:
+                taken |= {one, other}
+                alive[one].take(alive.pop(other))
+                frames[one] |= frames[other]
+
+
+def _near_pairs(
+    alive: dict[int, _Gathering], frames: dict[int, set[int]], laid: Sequence[LaidSighting]
+) -> list[tuple[float, int, int]]:
+    keys = list(alive)
+    places_m = np.array([alive[key].place_m for key in keys])
+    pairs = []
+    for row, one in enumerate(keys):
+        near = np.flatnonzero(np.hypot(*(places_m[row + 1:] - places_m[row]).T) < _reach_m(alive[one], laid))
+        for other in (keys[row + 1 + int(k)] for k in near):
+            shared = len(frames[one] & frames[other])
+            distance = _distance(alive[one], alive[other])
+            if distance < _GATE and shared <= _SHARED_FRAMES * min(len(frames[one]), len(frames[other])):
+                pairs.append((distance, one, other))
+    return pairs
+
+
+def _frames_of(members: Sequence[int], laid: Sequence[LaidSighting]) -> set[int]:
+    return {laid[k].sighting.frame_index for k in members}
+
+
+def _possible_views(
+    groups: Sequence[Sequence[int]], laid: Sequence[LaidSighting], frames: Sequence[PlacedFrame]
+) -> list[int]:
+    """How many frames show each object's place, and it whole; at least those that saw it."""
+    firsts = [[laid[k] for k in group] for group in groups]
+    places_m = np.array([np.median([each.sighting.position_m for each in group], axis=0) for group in firsts])
+    up_m = np.array([np.median([each.middle_up_m for each in group]) for group in firsts])
+    reach_m = np.array([np.median([each.sighting.size_m[0] for each in group]) for group in firsts]) / 2
+    counts = np.zeros(len(groups), int)
+    for frame in frames:
+        counts += shows(frame, places_m, up_m, reach_m).astype(int)
+    return [max(int(count), len(_frames_of(group, laid))) for count, group in zip(counts, groups)]
+
+
+def _stands(group: Sequence[int], possible: int, laid: Sequence[LaidSighting]) -> bool:
+    """Whether enough of the frames that show the place saw it there."""
+    views = len(_frames_of(group, laid))
+    if views == 1:
+        return possible <= 2 and laid[group[0]].sighting.score >= _SURE
+    return views >= _LEAST_SHARE * possible
+
+
+def _named(members: Sequence[int], laid: Sequence[LaidSighting]) -> tuple[str, float, dict[str, float]]:
+    """Class by summed scores, that class's mean score, and each class's share."""
+    scores: dict[str, list[float]] = defaultdict(list)
+    for k in members:
+        scores[laid[k].sighting.label].append(laid[k].sighting.score)
+    sums = {name: sum(each) for name, each in scores.items()}
+    label = max(sums, key=sums.__getitem__)
+    total = max(sum(sums.values()), 1e-9)
+    shares = {name: value / total for name, value in sorted(sums.items(), key=lambda item: -item[1])}
+    return label, float(np.mean(scores[label])), shares
+
+
+def _standing(members: Sequence[int], laid: Sequence[LaidSighting], possible: int) -> Standing:
+    """Place and height together by least squares: what was seen from several sides tells how high its middle lies."""
+    label, score, shares = _named(members, laid)
+    chosen = [laid[k] for k in members]
+    whole = [each for each in chosen if not each.is_cut] or chosen
+    has_metres = any(each.middle_up_m for each in chosen)
+    usual_up_m = usual_height_m(label) / 2 if has_metres else 0.0
+    rows, right = [], []
+    for each in whole:
+        place_m = each.sighting.position_m + each.lean * (usual_up_m - each.middle_up_m)
+        weight = 1.0 / float(np.hypot(each.own_sigma_m, _DRIFT_M))
+        rows.append(np.column_stack([np.eye(2), -each.lean]) * weight)
+        right.append(place_m * weight)
+    rows.append(np.array([[0.0, 0.0, 1.0 / max(_HEIGHT_SIGMA * usual_up_m, 1e-3)]]))
+    right.append(np.zeros(1))
+    normal = (matrix := np.concatenate(rows)).T @ matrix
+    answer = np.asarray(np.linalg.solve(normal, matrix.T @ np.concatenate(right)), np.float64)
+    covariance = np.linalg.inv(normal)[:2, :2]
+    height_m = 2 * max(usual_up_m + float(answer[2]), 0.0)
+    size_m = fitted_size_m(chosen, label, height_m) if has_metres else _median_sides(chosen)
+    return Standing(
+        tuple(members), _best(members, laid, label), label, score, shares, answer[:2],
+        float(np.sqrt(np.trace(covariance) / 2)), size_m, possible,
+    )
+
+
+def _moving(members: Sequence[int], walk: Walk, laid: Sequence[LaidSighting]) -> Standing:
+    label, score, shares = _named(members, laid)
+    chosen = [laid[k] for k in members]
+    size_m = fitted_size_m(chosen, label, usual_height_m(label))
+    return Standing(
+        tuple(members), _best(members, laid, label), label, score, shares, walk.position_m, walk.sigma_m, size_m,
+        walk.possible_views, walk.velocity_m_s,
+    )
+
+
+def _median_sides(chosen: Sequence[LaidSighting]) -> Floats:
+    return np.asarray(np.median([each.sighting.size_m for each in chosen], axis=0), np.float64)
+
+
+def _best(members: Sequence[int], laid: Sequence[LaidSighting], label: str) -> int:
+    """The clearest sighting: sure, large in its picture, and not cut by its edge."""
+    def clearness(k: int) -> float:
+        each = laid[k]
+        left, top, right, bottom = each.sighting.box_px
+        doubt = (1.0 if each.sighting.label == label else 0.5) * (0.3 if each.is_cut else 1.0)
+        return doubt * each.sighting.score * float((right - left) * (bottom - top)) ** 0.25
+
+    return max(members, key=clearness)
+
+
+def _overlap(one: Anything, other: Anything) -> float:
+    """Intersection over union of two boxes."""
+    low, high = np.maximum(one[:2], other[:2]), np.minimum(one[2:], other[2:])
+    shared = float(np.prod(np.clip(high - low, 0, None)))
+    areas = float(np.prod(one[2:] - one[:2]) + np.prod(other[2:] - other[:2]))
+    return shared / max(areas - shared, 1e-9)

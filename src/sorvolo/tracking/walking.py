@@ -1,0 +1,125 @@
+"""What moves on a map whose frames are seconds apart: sightings at changing places that one walker or car explains."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sorvolo.geometry.arrays import Floats, TimesNs
+from sorvolo.tracking.laying import LaidSighting
+
+_MOST_M_S = {"person": 4.0, "car": 20.0}  # a runner; a car in town
+_OTHER_M_S = 4.0
+_LEAST_M_S = 0.25  # slower is a place badly known
+_LONGEST_GAP_S = 6.0
+_LEAST_VIEWS = 3  # two sightings lie on a straight line whatever they are
+_MOST_OFF = 3.0  # sigmas, rms, from even motion along a line
+_WOBBLE_M_S2 = 0.4  # how much walkers turn and change their pace
+
+
+@dataclass(frozen=True, eq=False)
+class Walk:
+    """Something that moved: the indices of its sightings in order of time, and where it was at the last of them."""
+
+    members: tuple[int, ...]
+    position_m: Floats
+    velocity_m_s: Floats
+    sigma_m: float
+    possible_views: int
+
+
+def walks(laid: Sequence[LaidSighting]) -> list[Walk]:
+    """The walks among these sightings, none of which stands; each sighting is in one walk at most.
+
+    A walk needs three sightings of one class on an even way, no faster than its class moves and fast enough to be seen.
+    The longest, then the straightest, are taken first.
+    """
+    times_s = np.array([each.sighting.time_ns for each in laid], np.int64) / 1e9
+    order: TimesNs = np.argsort(times_s, kind="stable")
+    candidates = []
+    for at, first in enumerate(order):
+        for second in order[at + 1:]:
+            gap_s = times_s[second] - times_s[first]
+            if gap_s > _LONGEST_GAP_S:
+                break
+            found = _followed(int(first), int(second), laid, times_s, order)
+            if found is not None:
+                candidates.append(found)
+    candidates.sort(key=lambda found: (-len(found[0]), found[1]))
+    taken: set[int] = set()
+    result = []
+    for members, _ in candidates:
+        if taken.isdisjoint(members):
+            taken.update(members)
+            result.append(_walk(members, laid, times_s))
+    return result
+
+
+def _followed(
+    first: int, second: int, laid: Sequence[LaidSighting], times_s: Floats, order: TimesNs
+) -> tuple[list[int], float] | None:
+    """The sightings on the way that two begin, and how far they lie off it, rms in sigmas; None where it is no way."""
+    one, two = laid[first].sighting, laid[second].sighting
+    gap_s = float(times_s[second] - times_s[first])
+    fastest_m_s = _MOST_M_S.get(one.label, _OTHER_M_S)
+    if one.label != two.label or gap_s <= 0:
+        return None
+    speed_m_s = float(np.hypot(*(two.position_m - one.position_m))) / gap_s
+    if not _LEAST_M_S <= speed_m_s <= fastest_m_s:
+        return None
+    members = [first, second]
+    for k in order[np.searchsorted(times_s[order], times_s[second], side="right"):]:
+        after_s = float(times_s[k] - times_s[members[-1]])
+        if after_s > _LONGEST_GAP_S:
+            break
+        if after_s <= 0 or laid[k].sighting.label != one.label:
+            continue
+        expected_m, _, spread = _line(members, laid, times_s, float(times_s[k]))
+        sigma_m = np.hypot(np.hypot(spread, _sigma_m(laid[k])), 0.5 * _WOBBLE_M_S2 * after_s**2)
+        if np.hypot(*(laid[k].sighting.position_m - expected_m)) < _MOST_OFF * sigma_m:
+            members.append(int(k))
+    if len(members) < _LEAST_VIEWS:
+        return None
+    _, velocity_m_s, _ = _line(members, laid, times_s, float(times_s[members[-1]]))
+    off = _off(members, laid, times_s)
+    if off > _MOST_OFF or not _LEAST_M_S <= np.hypot(*velocity_m_s) <= fastest_m_s:
+        return None
+    return members, off
+
+
+def _line(
+    members: Sequence[int], laid: Sequence[LaidSighting], times_s: Floats, at_s: float
+) -> tuple[Floats, Floats, float]:
+    """Even motion through the last sightings: the place at a time, the velocity, and the place's sigma per axis."""
+    last = members[-4:]  # people turn: what is long ago tells little of where they go
+    since_s = times_s[last] - at_s
+    places_m = np.array([laid[k].sighting.position_m for k in last])
+    weights = 1.0 / np.array([_sigma_m(laid[k]) for k in last])
+    matrix = np.column_stack([np.ones(len(last)), since_s]) * weights[:, None]
+    solution, _, _, _ = np.linalg.lstsq(matrix, places_m * weights[:, None], rcond=None)
+    covariance = np.linalg.pinv(matrix.T @ matrix)
+    return solution[0], solution[1], float(np.sqrt(max(covariance[0, 0], 0.0)))
+
+
+def _off(members: Sequence[int], laid: Sequence[LaidSighting], times_s: Floats) -> float:
+    """How far the sightings lie from even motion through their neighbours in time, rms in sigmas."""
+    squares = []
+    for before, k, after in zip(members, members[1:], members[2:]):
+        share = (times_s[k] - times_s[before]) / (times_s[after] - times_s[before])
+        expected_m = (1 - share) * laid[before].sighting.position_m + share * laid[after].sighting.position_m
+        wobble_m = 0.5 * _WOBBLE_M_S2 * (times_s[after] - times_s[before]) ** 2 / 4
+        sigma_m = np.hypot(1.5 * _sigma_m(laid[k]), wobble_m)
+        squares.append(float(((laid[k].sighting.position_m - expected_m) ** 2).sum()) / sigma_m**2 / 2)
+    return float(np.sqrt(np.mean(squares)))
+
+
+def _walk(members: Sequence[int], laid: Sequence[LaidSighting], times_s: Floats) -> Walk:
+    place_m, velocity_m_s, sigma_m = _line(members, laid, times_s, float(times_s[members[-1]]))
+    last = laid[members[-1]]
+    if last.is_cut:
+        sigma_m = max(sigma_m, last.own_sigma_m)
+    return Walk(tuple(members), place_m, velocity_m_s, sigma_m, len(members))
+
+
+def _sigma_m(each: LaidSighting) -> float:
+    return float(np.hypot(each.sighting.sigma_m, 0.1))
