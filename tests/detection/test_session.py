@@ -131,16 +131,15 @@ def test_providers_and_threads(tmp_path: Path) -> None:
     assert 1 <= usable_cores() <= 4096
 
 
-def test_padding_is_the_edge_repeated(tmp_path: Path) -> None:
+def test_padding_is_what_training_fills_with(tmp_path: Path) -> None:
     opened = Session(rectangle_model(tmp_path / "toy.onnx"), "cpu")
     rng = np.random.default_rng(0)
     for size in ((33, 65), (5, 7), (64, 32)):
         picture = rng.integers(0, 256, (*size, 3)).astype(np.uint8)
         batch = opened.input_from(picture)
         assert batch.shape[2] % 32 == batch.shape[3] % 32 == 0
-        expected = np.pad(
-            picture, ((0, batch.shape[2] - size[0]), (0, batch.shape[3] - size[1]), (0, 0)), mode="edge"
-        )
+        expected = np.full((*batch.shape[2:], 3), 114)
+        expected[: size[0], : size[1]] = picture
         np.testing.assert_array_equal(batch[0], expected.transpose(2, 0, 1))
 
 

@@ -29,7 +29,8 @@ rectangles (uint8[1, 3, {height}, {width}] image) => (float[K, 4] boxes, float[K
   axis = Constant <value_ints = [0]> ()
   axis1 = Constant <value_ints = [1]> ()
   far = Constant <value_float = 1e9> ()
-  dim = Constant <value_float = 100.0> ()
+  dim = Constant <value_float = 120.0> ()
+  hundred = Constant <value_float = 100.0> ()
   all = Constant <value_float = 255.0> ()
   picture = Cast <to = 1> (image)
   plane = Squeeze (picture, axis)
@@ -96,7 +97,7 @@ rectangles (uint8[1, 3, {height}, {width}] image) => (float[K, 4] boxes, float[K
   red_there = GatherND (red, where)
   green_there = GatherND (green, where)
   scores_all = Div (red_there, all)
-  hundreds = Div (green_there, dim)
+  hundreds = Div (green_there, hundred)
   label_float = Floor (hundreds)
   labels_all = Cast <to = 7> (label_float)
   shape = Shape (scores_all)
@@ -108,7 +109,7 @@ rectangles (uint8[1, 3, {height}, {width}] image) => (float[K, 4] boxes, float[K
 
 
 def rectangle_model(path: Path, *, fixed: tuple[int, int] | None = None, **told: Any) -> Path:
-    """Write a model that finds rectangles brighter than 100 in red; `told` changes its metadata."""
+    """Write a model that finds rectangles brighter than 120 in red; `told` changes its metadata."""
     height, width = fixed or ("H", "W")
     model = onnx.parser.parse_model(_RECTANGLES.format(height=height, width=width))
     return write_model(model, path, METADATA | told)

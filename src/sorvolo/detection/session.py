@@ -19,6 +19,7 @@ Provider = Literal["auto", "cpu", "cuda", "openvino"]
 """Where a model runs; "auto" takes CUDA where there is one, else OpenVINO where it is installed, else the CPU."""
 
 _INPUT, _OUTPUTS = "image", ("boxes", "scores", "labels")
+_FILLING = 114
 _OPENVINO_PRECISION = "f32"
 _CUDA = "CUDAExecutionProvider"
 
@@ -81,7 +82,7 @@ class Session:
         return _resized(picture, min(scale, most[0] / picture.shape[0], most[1] / picture.shape[1]))
 
     def _padded(self, picture: ImageRGB) -> Anything:
-        """(1, 3, H, W) with the picture in its top-left corner and its last row and column repeated beyond."""
+        """(1, 3, H, W) with the picture in its top-left corner, and beyond it the grey that training fills with."""
         height, width = picture.shape[:2]
         stride = self.info.stride
         inner = self.fixed_px or (-(-height // stride) * stride, -(-width // stride) * stride)
@@ -90,8 +91,8 @@ class Session:
         planes = self._buffer[0]
         for band in range(3):
             planes[band, :height, :width] = picture[:, :, band]
-        planes[:, :height, width:] = planes[:, :height, width - 1 : width]
-        planes[:, height:] = planes[:, height - 1 : height]
+        planes[:, :height, width:] = _FILLING
+        planes[:, height:] = _FILLING
         return self._buffer
 
     def _checked(
@@ -167,8 +168,8 @@ def _opened(model: bytes, where: str, provider: Provider, threads: int) -> tuple
             return _runner(session), "ONNX Runtime on the GPU (CUDA)", session
     if provider == "cuda":
         raise SettingsError(
-            "CUDA is not to be had here: install onnxruntime-gpu in place of onnxruntime, with a driver and CUDA of its "
-            "version, or choose the provider cpu"
+            "CUDA is not to be had here: install onnxruntime-gpu in place of onnxruntime, with a driver and CUDA of "
+            "its version, or choose the provider cpu"
         )
     if provider in ("auto", "openvino"):
         described = _described(model, where)
