@@ -21,10 +21,11 @@ from sorvolo.cli.models import models_app
 from sorvolo.cli.plan import plan
 from sorvolo.cli.review import review
 from sorvolo.cli.simulate import simulate
+from sorvolo.cli.train import train
 from sorvolo.errors import SorvoloError
 
 _COMMANDS: dict[str, Callable[..., None]] = {
-    "inspect": inspect, "plan": plan, "map": map_command, "compare": compare, "simulate": simulate,
+    "inspect": inspect, "plan": plan, "map": map_command, "compare": compare, "simulate": simulate, "train": train,
     "calibrate": calibrate, "demo": demo, "history": history, "review": review,
 }
 _FAILED, _STOPPED = 1, 130

@@ -1,14 +1,15 @@
 """Which picture each sample is cut from: it follows from the seed and the sample's number, so that a run can go on."""
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
-from sorvolo.errors import SettingsError
+from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.survey.labels import LabelledPicture
 from sorvolo.training.samples import Augmentation, Sample, Share, cut_sample
 
 
@@ -46,19 +47,19 @@ def draws(shares: Sequence[Share], seed: int, start: int = 0) -> Iterator[Draw]:
 def batches_from(
     shares: Sequence[Share], classes: Sequence[str], read: Callable[[str], ImageRGB], augmentation: Augmentation, *,
     seed: int, batch: int, start: int = 0, threads: int = 1,
-) -> Iterator[list[Sample]]:
+) -> Generator[list[Sample], None, None]:
     """Endless batches from number `start` on, the next ones cut on other threads meanwhile.
 
-    Batch k is the same whatever `start` and `threads` are. `read` gives a picture by its path; what it raises comes
-    through here.
+    Batch k is the same whatever `start` and `threads` are. `read` gives a picture by its path; where it raises
+    InputError the set's next picture is taken instead, and where none can be read, that comes through.
     """
     numbered = draws(shares, seed, start * batch)
 
     def cut(draw: Draw) -> Sample:
         share = shares[draw.share]
-        picture = share.labelled.pictures[draw.picture]
+        picture, image = _readable(share, draw.picture, read)
         rng = np.random.default_rng((seed, 1, draw.number))
-        return cut_sample(read(picture.path), picture, share, classes, augmentation, rng)
+        return cut_sample(image, picture, share, classes, augmentation, rng)
 
     executor = ThreadPoolExecutor(threads)
     waiting: deque[Future[Sample]] = deque()
@@ -69,3 +70,14 @@ def batches_from(
             yield [waiting.popleft().result() for _ in range(batch)]
     finally:
         executor.shutdown(cancel_futures=True)
+
+
+def _readable(share: Share, first: int, read: Callable[[str], ImageRGB]) -> tuple[LabelledPicture, ImageRGB]:
+    """The first picture from `first` on, round and round, that is not damaged."""
+    pictures = share.labelled.pictures
+    for picture in (*pictures[first:], *pictures[:first]):
+        try:
+            return picture, read(picture.path)
+        except InputError as error:
+            reason = error
+    raise reason

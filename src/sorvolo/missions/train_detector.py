@@ -1,0 +1,313 @@
+"""Train the detector: labelled pictures and weights in, checkpoints on the way, a model file and a report out."""
+
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.torch
+import torch
+
+from sorvolo import __version__
+from sorvolo.capture.photos import read_picture
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.missions.train_settings import TrainSettings
+from sorvolo.missions.training_checks import Checked, best_sizes_px, check_model
+from sorvolo.missions.training_sets import DataOptions, TrainingSets, read_training_sets, simulate_samples
+from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.exports import json_bytes, plain_json
+from sorvolo.store.training_page import training_page
+from sorvolo.training.checkpoint import checkpoint_bytes, read_checkpoint, restore
+from sorvolo.training.drawing import batches_from
+from sorvolo.training.export import ExportCheck, check_export, export_onnx
+from sorvolo.training.faster_rcnn import FasterRCNN
+from sorvolo.training.four_steps import STEP_NAMES, FourStepSettings, FourStepTraining
+from sorvolo.training.joint import JointSettings, JointTraining, Progress
+from sorvolo.training.presets import NETS, build
+from sorvolo.training.progress import Check, History, Learner, seconds_left
+from sorvolo.training.samples import Augmentation
+from sorvolo.training.weights import ImageNetWeights, load_weights
+
+MODEL, REPORT, PAGE = "model.onnx", "training.json", "training.html"
+CHECKPOINT, BEST, SIMULATED = "checkpoint.pt", "best.safetensors", "simulated"
+"""What a run leaves in its folder; the last only where simulated pictures were asked for."""
+
+_CHECKS, _CHECK_STEPS = 20, 50  # a run is checked so often, evenly over its steps, but not after fewer of them
+_MOST_CHECKED, _MOST_CHECKED_LAST = 150, 1000  # held-out pictures
+_ROWS = 200  # of losses in the report
+_SAVE_S = 60.0  # a kill costs no more than this and the time between two checks
+_KEPT_PICTURES_BYTES = 2 << 30
+_EXPORT_PICTURES, _EXPORT_PX = 4, 1280  # by which the model file is compared with torch
+
+
+@dataclass(frozen=True)
+class TrainingUpdate:
+    """Where a run stands. Before its first step `step` is 0 and `words` says what is done."""
+
+    step: int
+    steps: int
+    words: str
+    losses: Progress | None = None  # of the last step
+    steps_per_s: float = float("nan")
+    left_s: float = float("nan")
+    check: Check | None = None  # the one made just now
+
+
+@dataclass(eq=False)
+class _Run:
+    """A run on its way: `learner` and `history` change with every step."""
+
+    out: Path
+    settings: TrainSettings
+    sets: TrainingSets
+    learner: Learner
+    reader: "_Reader"
+    device: str
+    weights: ImageNetWeights | None
+    history: History = field(default_factory=History)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What a run must share with the one that it goes on from."""
+        settings = {key: value for key, value in asdict(self.settings).items() if key != "patience"}
+        begun = "none" if self.weights is None else f"ImageNet{', original strides' if self.weights.original else ''}"
+        return {**settings, "weights": begun, "classes": list(self.sets.classes), "data": self.sets.fingerprint}
+
+
+def train_detector(
+    places: Sequence[Path], out: Path, settings: TrainSettings, options: DataOptions, *, device: str = "auto",
+    resume: bool = False,
+) -> Iterator[TrainingUpdate]:
+    """Train on the sets at `places` and leave model.onnx, training.html, training.json and checkpoints in `out`.
+
+    Closing the iterator early leaves a checkpoint, from which `resume` goes on. Raises InputError for data or weights
+    that cannot be used, SettingsError for a device that is not there, for an `out` that holds another run, and for
+    resuming with other settings or data; StoreError on a full disk.
+    """
+    device = _device(device)
+    _claim(out, resume)
+    steps = settings.steps
+    if settings.synthetic > 0:
+        samples = round(steps * settings.batch * settings.synthetic)
+        for words in simulate_samples(out / SIMULATED, samples, settings.seed):
+            yield TrainingUpdate(0, steps, words)
+    yield TrainingUpdate(0, steps, "reading the labels")
+    sets = read_training_sets(
+        places, options, synthetic=settings.synthetic, seed=settings.seed, simulated=out / SIMULATED
+    )
+    yield TrainingUpdate(0, steps, f"preparing the network ({settings.preset})")
+    run = _prepared(out, settings, sets, device)
+    if resume:
+        checkpoint = read_checkpoint((out / CHECKPOINT).read_bytes(), str(out / CHECKPOINT))
+        restore(run.learner, checkpoint, run.identity)
+        run.history = checkpoint.history
+    yield from _learn(run)
+    yield TrainingUpdate(run.learner.step, steps, "measuring and writing the model")
+    check = _finish(run)
+    yield TrainingUpdate(run.learner.step, steps, f"{out / MODEL} is ready", check=check)
+
+
+def _device(wanted: str) -> str:
+    if wanted == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if wanted.startswith("cuda") and not torch.cuda.is_available():
+        raise SettingsError(f"device {wanted} asked for, but this torch sees no GPU; use --device cpu")
+    if wanted != "cpu" and not wanted.startswith("cuda"):
+        raise SettingsError(f"device must be auto, cpu or cuda, got {wanted!r}")
+    return wanted
+
+
+def _claim(out: Path, resume: bool) -> None:
+    """Make the folder; raise SettingsError unless it is free, or holds what is to be gone on from."""
+    held = (out / CHECKPOINT).is_file()
+    if resume and not held:
+        raise SettingsError(f"{out} holds no {CHECKPOINT} to go on from; leave --resume out to start there")
+    if held and not resume:
+        raise SettingsError(f"{out} already holds a run; --resume goes on with it, another --out starts anew")
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+
+
+def _prepared(out: Path, settings: TrainSettings, sets: TrainingSets, device: str) -> _Run:
+    torch.set_flush_denormal(True)  # weights that decay to almost nothing cost a hundred times the time
+    torch.manual_seed(settings.seed)
+    weights = load_weights(settings.weights, NETS[settings.preset])
+    model = build(settings.preset, sets.classes, settings.rpn, weights)
+    model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    learner: Learner
+    if settings.schedule == "joint":
+        rate = 1e-3 if settings.preset == "fast" else 2e-4
+        joint = JointSettings(
+            steps=settings.steps, batch=settings.batch, rate=rate,
+            backbone_rate=rate if weights is None else rate / 5, warm_steps=min(200, max(1, settings.steps // 10)),
+            mixed_precision=device != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported(),
+        )
+        learner = JointTraining(model, joint, settings.seed, device)
+    else:
+        learner = FourStepTraining(model, FourStepSettings(steps=settings.steps), settings.seed, device)
+    return _Run(out, settings, sets, learner, _Reader(sets), device, weights)
+
+
+class _Reader:
+    """Reads pictures, keeping as many as a bounded part of the memory holds; `damaged` are those that cannot be."""
+
+    def __init__(self, sets: TrainingSets) -> None:
+        pictures = [picture for share in sets.shares for picture in share.labelled.pictures]
+        size = sum(3 * each.width_px * each.height_px for each in pictures) / len(pictures)
+        self.damaged: dict[str, str] = {}
+        self._kept = lru_cache(maxsize=int(_KEPT_PICTURES_BYTES / size))(self._read)
+
+    def __call__(self, path: str) -> ImageRGB:
+        """The picture's pixels. Raises InputError when it is damaged or gone."""
+        return self._kept(path)
+
+    def _read(self, path: str) -> ImageRGB:
+        try:
+            return read_picture(Path(path))
+        except (InputError, OSError) as error:
+            self.damaged[path] = str(error)
+            raise InputError(f"{path}: {error}") from error
+
+
+def _learn(run: _Run) -> Iterator[TrainingUpdate]:
+    """All steps that are left, with checks and checkpoints; ends early where checks no longer get better."""
+    settings, learner = run.settings, run.learner
+    batches = batches_from(
+        run.sets.shares, run.sets.classes, run.reader, Augmentation(side_px=settings.side_px), seed=settings.seed,
+        batch=settings.batch, start=learner.step, threads=max(1, min(8, (os.cpu_count() or 1) - 1)),
+    )
+    first, before_s, started_s = learner.step, run.history.seconds, time.monotonic()
+    saved_s = started_s
+    try:
+        while learner.step < settings.steps and run.history.is_worth_going_on(settings.patience):
+            progress = learner.learn(next(batches))
+            here_s = time.monotonic() - started_s
+            run.history = run.history.after(progress, before_s + here_s, every=max(1, settings.steps // _ROWS))
+            check = _check(run) if _is_check_due(run) else None
+            if check is not None or time.monotonic() - saved_s > _SAVE_S:
+                _save(run)
+                saved_s = time.monotonic()
+            yield TrainingUpdate(
+                learner.step, settings.steps, _stage(learner), progress, (learner.step - first) / here_s,
+                seconds_left(learner.step, settings.steps, learner.step - first, here_s), check,
+            )
+    except GeneratorExit:
+        _save(run)
+        raise
+    finally:
+        batches.close()
+    _save(run)
+
+
+def _is_check_due(run: _Run) -> bool:
+    """At even distances and in the end; of the four steps only in the last: before, the parts do not fit together."""
+    step, steps = run.learner.step, run.settings.steps
+    if not run.sets.held_out or (isinstance(run.learner, FourStepTraining) and run.learner.stage < 3):
+        return False
+    return step % max(_CHECK_STEPS, steps // _CHECKS) == 0 or step == steps
+
+
+def _check(run: _Run) -> Check:
+    """Look at held-out pictures; the best weights so far are kept."""
+    check = _look(run, run.learner.average, _MOST_CHECKED).check(run.learner.step)
+    run.history = run.history.checked(check)
+    if run.history.best is check:
+        atomic_write_bytes(run.out / BEST, _weights_bytes(run.learner.average))
+    return check
+
+
+def _stage(learner: Learner) -> str:
+    return STEP_NAMES[learner.stage] if isinstance(learner, FourStepTraining) else "learning"
+
+
+def _save(run: _Run) -> None:
+    atomic_write_bytes(run.out / CHECKPOINT, checkpoint_bytes(run.learner, run.identity, run.history))
+
+
+def _weights_bytes(model: FasterRCNN) -> bytes:
+    return safetensors.torch.save({name: value.cpu().contiguous() for name, value in model.state_dict().items()})
+
+
+def _look(run: _Run, model: FasterRCNN, most: int) -> Checked:
+    return check_model(model, run.sets.classes, run.sets.held_out, run.reader, device=run.device, most=most)
+
+
+def _finish(run: _Run) -> Check | None:
+    """The best weights as a model file, checked against torch, with the report."""
+    model, classes, best = run.learner.average, run.sets.classes, run.history.best
+    if best is not None:
+        model.load_state_dict(safetensors.torch.load((run.out / BEST).read_bytes()))
+    checked = _look(run, model, _MOST_CHECKED_LAST) if run.sets.held_out else Checked({}, {})
+    thresholds = checked.thresholds(classes)
+    scores = {name: each.score for name, each in thresholds.items()}
+    learnt = [share.labelled for share in run.sets.shares]
+    info = {
+        "name": run.out.resolve().name or "model", "preset": run.settings.preset, "version": __version__,
+        "classes": list(classes), "thresholds": scores, "best_px": best_sizes_px(checked, scores, learnt, classes),
+        "licence": "as the data that it was trained on", "trained_on": ", ".join(each.name for each in learnt),
+        "thermal": run.sets.is_thermal, "created": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    exported = export_onnx(model, info)
+    agreement = check_export(model.cpu(), exported, _some_pictures(run))
+    atomic_write_bytes(run.out / MODEL, exported)
+    check = checked.check(run.learner.step if best is None else best.step) if run.sets.held_out else None
+    report = _report(run, info, agreement, len(exported), check) | {
+        "reported": {name: asdict(each) for name, each in thresholds.items()}
+    }
+    atomic_write_bytes(run.out / REPORT, json_bytes(report))
+    atomic_write_bytes(run.out / PAGE, training_page(plain_json(report)).encode())
+    return check
+
+
+def _some_pictures(run: _Run) -> list[ImageRGB]:
+    """A few that can be read, held-out ones first, padded where a side is shorter than the network's stride."""
+    sets = (*run.sets.held_out, *(share.labelled for share in run.sets.shares))
+    found: list[ImageRGB] = []
+    for picture in (each for labelled in sets for each in labelled.pictures):
+        if len(found) == _EXPORT_PICTURES:
+            break
+        try:
+            found.append(_at_least(run.reader(picture.path)[:_EXPORT_PX, :_EXPORT_PX], run.learner.model.stride))
+        except InputError:
+            continue
+    return found
+
+
+def _at_least(picture: ImageRGB, side_px: int) -> ImageRGB:
+    """The picture, padded where a side is shorter than the network's stride."""
+    down, right = (max(0, side_px - side) for side in picture.shape[:2])
+    return np.pad(picture, ((0, down), (0, right), (0, 0)), constant_values=114)
+
+
+def _report(
+    run: _Run, info: Mapping[str, Any], agreement: ExportCheck, size_bytes: int, check: Check | None
+) -> dict[str, Any]:
+    """The content of training.json."""
+    notices = list(run.sets.notices)
+    if run.reader.damaged:
+        count, (path, reason) = len(run.reader.damaged), next(iter(run.reader.damaged.items()))
+        notices.append(f"{count} pictures cannot be read and were passed over (first: {path}: {reason})")
+    if not run.sets.held_out:
+        notices.append("nothing was held out: how good the model is, and from which score to report, is not known")
+    if not agreement.is_good:
+        notices.append(
+            f"the exported model differs from torch by {agreement.box_px:.2f} px, {agreement.score:.4f} in score, "
+            f"{agreement.unmatched} of {agreement.detections} detections unmatched"
+        )
+    step, steps, history = run.learner.step, run.settings.steps, run.history
+    return {
+        "made_by": "sorvolo train", "format": 1, "model": dict(info), "settings": asdict(run.settings),
+        "device": run.device, "weights": "none" if run.weights is None else run.weights.origin,
+        "sets": run.sets.described(), "notices": notices,
+        "step": step, "steps": steps, "stopped_early": step < steps, "seconds": history.seconds,
+        "losses": [asdict(row) for row in history.rows], "checks": [asdict(each) for each in history.checks],
+        "best_step": None if history.best is None else history.best.step,
+        "held_out": None if check is None else asdict(check),
+        "export": {**asdict(agreement), "good": agreement.is_good, "bytes": size_bytes},
+    }

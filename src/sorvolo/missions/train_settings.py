@@ -1,0 +1,42 @@
+"""What a person may choose for training the detector; torch is not needed to know it."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from sorvolo.errors import SettingsError
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """How the detector is trained (`sorvolo train`)."""
+
+    preset: Literal["fast", "accurate", "thesis"] = "fast"
+    rpn: Literal["standard", "extended", "extended-residual"] = "extended-residual"
+    schedule: Literal["joint", "four-steps"] = "joint"
+    weights: str = "auto"  # ImageNet weights of the backbone: auto, none, or a file
+    steps: int = 8000  # batches
+    batch: int = 4  # samples a step
+    side_px: int = 416  # of the square samples
+    seed: int = 1
+    synthetic: float = 0.0  # share of the samples that come from simulated pictures
+    patience: int = 8  # checks without a better AP50 before it stops; 0 never does
+
+    def __post_init__(self) -> None:
+        choices = (
+            ("preset", self.preset, ("fast", "accurate", "thesis")),
+            ("rpn", self.rpn, ("standard", "extended", "extended-residual")),
+            ("schedule", self.schedule, ("joint", "four-steps")),
+        )
+        for name, value, known in choices:
+            if value not in known:
+                raise SettingsError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+        for name, number, low, high in (
+            ("steps", self.steps, 1, 10**8), ("batch", self.batch, 1, 1024), ("side_px", self.side_px, 64, 4096),
+            ("seed", self.seed, 0, 2**62), ("patience", self.patience, 0, 10**6),
+        ):
+            if not low <= number <= high:
+                raise SettingsError(f"{name} must lie in {low} to {high}, got {number}")
+        if self.side_px % 32:
+            raise SettingsError(f"side_px must be a multiple of 32, got {self.side_px}")
+        if not 0 <= self.synthetic <= 1:
+            raise SettingsError(f"the share of synthetic samples must lie in 0 to 1, got {self.synthetic}")

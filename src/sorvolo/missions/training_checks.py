@@ -1,0 +1,149 @@
+"""How good a network in training is on the held-out pictures, and what its model file says of itself."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+
+from sorvolo.detection.metrics import ClassMatch, CocoNumbers, Threshold, best_threshold, judged_classes, match_pictures
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
+from sorvolo.survey.objects import Detections
+from sorvolo.training.faster_rcnn import FasterRCNN
+from sorvolo.training.progress import Check
+
+_LONGEST_PX = 1280  # larger pictures are made smaller: they are looked at whole, without tiles
+_FALLBACK_THRESHOLD = 0.5  # where nothing was held out to choose one
+_FEW = 10  # objects found, from which on the range of their sizes says something
+
+
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """One look at the held-out sets: of each class the matches in each set that labels it, and COCO's numbers there."""
+
+    matches: Mapping[str, tuple[ClassMatch, ...]]
+    numbers: Mapping[str, tuple[CocoNumbers, ...]]
+
+    def check(self, step: int) -> Check:
+        """AP50 and AP: of each class the mean over its sets, weighted by labels; over all classes the plain mean."""
+        of50 = {name: self._mean(name, "ap50") for name in self.matches}
+        of_all = {name: self._mean(name, "ap") for name in self.matches}
+        return Check(step, _mean_known(of50.values()), _mean_known(of_all.values()), of50)
+
+    def thresholds(self, classes: Sequence[str]) -> dict[str, Threshold]:
+        """The score from which on each class is best reported (highest F1, all sets together)."""
+        unknown = Threshold(_FALLBACK_THRESHOLD, float("nan"), float("nan"), float("nan"))
+        found = {name: best_threshold(_pooled(self.matches[name])) for name in classes if name in self.matches}
+        return {
+            name: replace(found[name], score=round(found[name].score, 3))
+            if name in found and np.isfinite(found[name].score) else unknown
+            for name in classes
+        }
+
+    def found_sides_px(self, name: str, score: float) -> Floats:
+        """(N,) longer sides of the labels of a class that were found at this score."""
+        sides = [np.zeros(0)]
+        for match in self.matches.get(name, ()):
+            found = match.true_boxes_px[match.true_scores >= score]
+            sides.append(np.asarray((found[:, 2:] - found[:, :2]).max(1, initial=0), float))
+        return np.concatenate(sides)
+
+    def _mean(self, name: str, field: str) -> float:
+        rows = [
+            (getattr(numbers, field), len(match.true_scores))
+            for numbers, match in zip(self.numbers[name], self.matches[name]) if len(match.true_scores)
+        ]
+        return float(np.average([row[0] for row in rows], weights=[row[1] for row in rows])) if rows else float("nan")
+
+
+def check_model(
+    model: FasterRCNN, classes: Sequence[str], held_out: Sequence[LabelledSet], read: Callable[[str], ImageRGB], *,
+    device: str, most: int,
+) -> Checked:
+    """Run the network over at most `most` held-out pictures, spread evenly over each set; damaged ones are left out."""
+    total = sum(len(each) for each in held_out)
+    matches: dict[str, tuple[ClassMatch, ...]] = {}
+    numbers: dict[str, tuple[CocoNumbers, ...]] = {}
+    model.eval()
+    for whole in held_out:
+        count = min(len(whole), max(1, round(most * len(whole) / total)))
+        rows = np.unique(np.linspace(0, len(whole) - 1, count).round().astype(int))
+        seen: list[LabelledPicture] = []
+        found = []
+        for picture in (whole.pictures[row] for row in rows):
+            try:
+                image = read(picture.path)
+            except InputError:
+                continue
+            seen.append(picture)
+            found.append(detect(model, classes, image, device))
+        labelled = whole.only(seen)
+        own, _, by_class = match_pictures(labelled, found, judged_classes(labelled, classes))
+        for match in own:
+            matches[match.label] = (*matches.get(match.label, ()), match)
+            numbers[match.label] = (*numbers.get(match.label, ()), by_class[match.label])
+    return Checked(matches, numbers)
+
+
+@torch.no_grad()
+def detect(model: FasterRCNN, classes: Sequence[str], picture: ImageRGB, device: str = "cpu") -> Detections:
+    """What the network, in evaluation mode, finds in one picture (H, W, 3), padded to its stride."""
+    height, width = picture.shape[:2]
+    scale = min(1.0, _LONGEST_PX / max(height, width))
+    seen = picture
+    if scale < 1:
+        seen = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    down, right = (-side % model.stride for side in seen.shape[:2])
+    padded = np.pad(seen, ((0, down), (0, right), (0, 0)), constant_values=114)
+    planes = torch.from_numpy(np.ascontiguousarray(padded.transpose(2, 0, 1))[None]).to(device)
+    boxes, scores, labels = (each.cpu().numpy() for each in model(planes))
+    boxes = np.clip(boxes / scale, 0, [width, height, width, height])
+    kept = (boxes[:, 2:] > boxes[:, :2]).all(1)
+    return Detections(boxes[kept], scores[kept], labels[kept], tuple(classes))
+
+
+def best_sizes_px(
+    checked: Checked, thresholds: Mapping[str, float], learnt: Sequence[LabelledSet], classes: Sequence[str]
+) -> dict[str, tuple[float, float]]:
+    """Of each class the longer sides between which nine of ten objects lie: of those found where enough were held out,
+    else of those learnt from."""
+    ranges = {}
+    for name in classes:
+        sides = checked.found_sides_px(name, thresholds[name])
+        if len(sides) < _FEW:
+            sides = np.concatenate([np.zeros(0), *(_sides_px(each, name) for each in learnt)])
+        low, high = np.percentile(sides, [5, 95]) if len(sides) else (8.0, 256.0)
+        low = max(1.0, round(float(low), 1))
+        ranges[name] = (low, max(low + 1, round(float(high), 1)))
+    return ranges
+
+
+def _sides_px(labelled: LabelledSet, name: str) -> Floats:
+    if name not in labelled.classes:
+        return np.zeros(0)
+    boxes = [_of_class(picture, labelled.classes.index(name)) for picture in labelled.pictures]
+    return np.concatenate([np.zeros(0), *boxes])
+
+
+def _of_class(picture: LabelledPicture, label: int) -> Floats:
+    boxes = picture.boxes_px[picture.labels == label]
+    return np.asarray((boxes[:, 2:] - boxes[:, :2]).max(1, initial=0), float)
+
+
+def _pooled(matches: Sequence[ClassMatch]) -> ClassMatch:
+    """The matches of several sets as one, best first; which picture each is of is lost."""
+    scores = np.concatenate([each.scores for each in matches])
+    order = np.argsort(-scores, kind="stable")
+    return replace(
+        matches[0], scores=scores[order], right=np.concatenate([each.right for each in matches], 1)[:, order],
+        ignored=np.concatenate([each.ignored for each in matches], 1)[:, order],
+        true_scores=np.concatenate([each.true_scores for each in matches]),
+    )
+
+
+def _mean_known(values: Iterable[float]) -> float:
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.mean(known)) if known else float("nan")

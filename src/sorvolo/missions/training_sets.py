@@ -1,0 +1,223 @@
+"""What a training learns from and is checked on: labelled sets, split by video or flight, and simulated pictures."""
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from sorvolo.capture.photos import read_picture
+from sorvolo.detection.light import is_thermal
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.missions.simulate_pictures import simulate_pictures
+from sorvolo.missions.simulation_folder import PICTURES_MARK
+from sorvolo.simulation.pictures import PictureSettings
+from sorvolo.store.datasets import read_dataset
+from sorvolo.survey.labels import LabelledSet
+from sorvolo.survey.objects import CLASSES
+from sorvolo.survey.splits import shared_groups, split_by_blocks, split_by_group
+from sorvolo.training.samples import Share
+
+_SMALL = CLASSES[2]
+_LOOKED_AT = 9  # pictures of a set by which it is told whether it is thermal
+_SYNTHETIC_PICTURES = (12, 1200)  # made at least and at most
+_SYNTHETIC_THERMAL = 0.2
+_BLOCKS, _GAP = 20, 10  # into which a set of too few videos is cut; frames left out between them, at most
+
+
+@dataclass(frozen=True)
+class DataOptions:
+    """How data sets are read, as `store.datasets.read_dataset` takes it, and what they are checked on.
+
+    `val` is a data set of its own, or the share of pictures that is held out ("0.15"); "0": nothing is checked.
+    """
+
+    val: str = "0.15"
+    form: str | None = None
+    classes: Mapping[str, str] | None = None
+    ignore: tuple[str, ...] = ()
+    unlabelled: tuple[str, ...] = ()
+    group_pattern: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingSets:
+    """`shares` to learn from, `held_out` sets to be checked on, the model's `classes`, and what was remarked."""
+
+    shares: tuple[Share, ...]
+    held_out: tuple[LabelledSet, ...]
+    classes: tuple[str, ...]
+    notices: tuple[str, ...]
+
+    @property
+    def fingerprint(self) -> str:
+        """Changes when pictures, their labels or their order do, wherever the folders lie."""
+        digest = hashlib.sha256()
+        for each in (*(share.labelled for share in self.shares), *self.held_out):
+            digest.update(f"{each.name} {each.classes} {sorted(each.unlabelled)}".encode())
+            for picture in each.pictures:
+                digest.update(Path(picture.path).name.encode())
+                for array in (picture.boxes_px, picture.labels, picture.ignored_px):
+                    digest.update(array.tobytes())
+        return digest.hexdigest()[:16]
+
+    @property
+    def is_thermal(self) -> bool:
+        """Whether thermal pictures are learnt from."""
+        return any(share.thermal for share in self.shares)
+
+    def described(self) -> list[dict[str, Any]]:
+        """Each set for the report: its part, pictures, videos, boxes of each class."""
+        parts = [(share.labelled, "learnt from", share.thermal) for share in self.shares]
+        parts += [(each, "checked on", None) for each in self.held_out]
+        return [
+            {
+                "name": each.name, "part": part, "pictures": len(each),
+                "videos": len({picture.group for picture in each.pictures}), "thermal": thermal,
+                "boxes": {
+                    name: int(sum((picture.labels == label).sum() for picture in each.pictures))
+                    for label, name in enumerate(each.classes)
+                },
+                "unlabelled": sorted(each.unlabelled & set(self.classes)),
+            }
+            for each, part, thermal in parts
+        ]
+
+
+def read_training_sets(
+    places: Sequence[Path], options: DataOptions, *, synthetic: float, seed: int, simulated: Path
+) -> TrainingSets:
+    """Read and split all sets; `simulated` is the folder of `simulate_samples`, from which `synthetic` of all samples
+    come, with small objects composed onto the ground of the sets that have none.
+
+    A class that a set knows nothing of is unlabelled there. Raises InputError where a set cannot be read or holds no
+    object to learn, SettingsError where `val` is neither a data set nor a share.
+    """
+    share = _share_of(options.val)
+    whole = [_read(place, options) for place in places]
+    if not whole and synthetic < 1:
+        raise InputError("no data to learn from; give folders of labelled pictures, or --synthetic 1")
+    notices = [f"{each.name}: {notice.text}" for each in whole for notice in each.notices]
+    if share is None:
+        learnt, held_out = whole, [_read(Path(options.val), options)]
+        notices += [notice.text for each in whole for notice in shared_groups(each, held_out[0])]
+    else:
+        parts = [_split(each, share, seed) for each in whole]
+        learnt, held_out = [each[0] for each in parts], [each[1] for each in parts if len(each[1])]
+        notices += [text for each in parts for text in each[2]]
+    shares = [Share(each, float(len(each)), thermal=_is_thermal(each)) for each in learnt]
+    if synthetic > 0:
+        shares = _mixed(shares, _simulated(simulated), synthetic)
+    classes = _in_order(name for each in shares for name in each.labelled.classes)
+    shares = [replace(each, labelled=_honest(each.labelled, classes)) for each in shares]
+    if synthetic > 0:
+        shares = [replace(each, pastes=_SMALL) if _SMALL in each.labelled.unlabelled else each for each in shares]
+    if not any(len(picture.labels) for each in shares for picture in each.labelled.pictures):
+        raise InputError("none of the pictures to learn from has a labelled object; check the class names")
+    notices += _short_classes(shares, classes)
+    return TrainingSets(
+        tuple(shares), tuple(_honest(each, classes) for each in held_out), classes, tuple(notices)
+    )
+
+
+def simulate_samples(folder: Path, samples: int, seed: int) -> Iterator[str]:
+    """Make pictures for so many simulated samples, telling how far it is; a folder that has them already is kept."""
+    low, high = _SYNTHETIC_PICTURES
+    if not (folder / PICTURES_MARK).is_file():
+        settings = PictureSettings(
+            pictures=min(max(samples, low), high), seed=seed, thermal_share=_SYNTHETIC_THERMAL
+        )
+        for done in simulate_pictures(folder, settings):
+            yield f"simulating pictures: {done.pictures_done} of {done.pictures_total}"
+
+
+def _read(place: Path, options: DataOptions) -> LabelledSet:
+    return read_dataset(
+        place, form=options.form, classes=options.classes, ignore=options.ignore, unlabelled=options.unlabelled,
+        group_pattern=options.group_pattern,
+    )
+
+
+def _split(labelled: LabelledSet, share: float, seed: int) -> tuple[LabelledSet, LabelledSet, list[str]]:
+    """What is learnt from, what is held out, and what is to be said of it; whole videos wherever there are enough."""
+    shares = {"learnt": 1 - share, "held out": share}
+    empty = labelled.only([])
+    if share == 0:
+        return labelled, empty, []
+    try:
+        parts = split_by_group(labelled, shares, seed)
+        if share / 3 <= len(parts["held out"]) / len(labelled) <= min(3 * share, (1 + share) / 2):
+            return parts["learnt"], parts["held out"], []
+    except InputError:
+        pass  # too few videos: told below
+    block = max(1, len(labelled) // _BLOCKS)
+    try:
+        parts = split_by_blocks(labelled, shares, block, min(_GAP, block), seed)
+    except InputError as error:
+        return labelled, empty, [f"nothing of {labelled.name} is held out: {error}"]
+    text = (
+        f"{labelled.name} has too few videos to hold whole ones out: blocks of about {block} neighbouring frames were "
+        "instead; frames of one video look alike, so the score will be too good"
+    )
+    told = [notice.text for each in parts.values() for notice in each.notices]
+    return parts["learnt"], parts["held out"], [text, *(f"{labelled.name}: {each}" for each in told)]
+
+
+def _share_of(val: str) -> float | None:
+    """The share that `val` names; None where it names a data set."""
+    if Path(val).exists():
+        return None
+    try:
+        share = float(val)
+    except ValueError as error:
+        raise SettingsError(f"--val {val} is neither an existing data set nor a share such as 0.15") from error
+    if not 0 <= share < 1:
+        raise SettingsError(f"the share to check on must lie in 0 to below 1, got {val}")
+    return share
+
+
+def _honest(labelled: LabelledSet, classes: Sequence[str]) -> LabelledSet:
+    """The set with all classes that it has no labels for declared unlabelled."""
+    unknown = frozenset(classes) - frozenset(labelled.classes)
+    return replace(labelled, unlabelled=labelled.unlabelled | unknown)
+
+
+def _is_thermal(labelled: LabelledSet) -> bool:
+    """Whether most of a few pictures over the whole set are."""
+    pictures = labelled.pictures[:: max(1, len(labelled) // _LOOKED_AT)][:_LOOKED_AT]
+    seen = [is_thermal(read_picture(Path(picture.path))) for picture in pictures]
+    return sum(seen) * 2 > len(seen)
+
+
+def _simulated(folder: Path) -> tuple[LabelledSet, LabelledSet]:
+    """Simulated pictures by day, and thermal ones."""
+    made = read_dataset(folder, form="coco")
+    night = [is_thermal(read_picture(Path(picture.path))) for picture in made.pictures]
+    by_day = made.only([picture for picture, dark in zip(made.pictures, night) if not dark])
+    thermal = made.only([picture for picture, dark in zip(made.pictures, night) if dark])
+    return replace(by_day, name="simulated"), replace(thermal, name="simulated, thermal")
+
+
+def _mixed(shares: Sequence[Share], made: Sequence[LabelledSet], ratio: float) -> list[Share]:
+    """Weights such that `ratio` of all samples are simulated."""
+    real = sum(share.weight for share in shares) or 1.0
+    pictures = sum(len(each) for each in made)
+    scaled = [replace(share, weight=share.weight / real * (1 - ratio)) for share in shares]
+    return [share for share in scaled if share.weight > 0] + [
+        Share(each, ratio * len(each) / pictures, thermal=index == 1) for index, each in enumerate(made) if len(each)
+    ]
+
+
+def _in_order(names: Iterable[str]) -> tuple[str, ...]:
+    """Each name once: Sorvolo's own first, in their order."""
+    found = set(names)
+    return (*(each for each in CLASSES if each in found), *sorted(found - set(CLASSES)))
+
+
+def _short_classes(shares: Sequence[Share], classes: Sequence[str]) -> list[str]:
+    counts = dict.fromkeys(classes, 0)
+    for share in shares:
+        for picture in share.labelled.pictures:
+            for label in picture.labels:
+                counts[share.labelled.classes[label]] += 1
+    return [f"only {count} boxes of class {name} to learn from" for name, count in counts.items() if count < 50]
