@@ -1,6 +1,7 @@
 """A detector measured on labelled pictures: by itself, beside others, and what is written of it."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from sorvolo.missions.evaluate_detector import (
     read_sets,
     write_evaluation,
 )
+from sorvolo.missions.holding_out import hold_out
 from sorvolo.store.detector_files import FoundSets, read_found, write_found
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES, Detections
@@ -201,3 +203,20 @@ def test_videos_choose_pictures(coco):
         read_sets([coco], classes=names, videos="night")
     with pytest.raises(SettingsError, match="no regular expression"):
         read_sets([coco], classes=names, videos="(")
+
+
+def test_what_a_training_held_out_can_be_measured_alone(many):
+    learnt, kept, remarks = hold_out(many, 0.25, 3)
+    assert {each.group for each in learnt.pictures}.isdisjoint(each.group for each in kept.pictures)
+    assert len(learnt) + len(kept) == 60 and len(kept) == 15 and not remarks
+    one_video = many.only([replace(each, group="v") for each in many.pictures])
+    learnt, kept, remarks = hold_out(one_video, 0.25, 3)
+    assert 5 <= len(kept) <= 20 and "too few videos" in remarks[0]
+    with pytest.raises(SettingsError, match="share to hold out"):
+        hold_out(many, 1.0, 3)
+
+
+def test_the_command_s_held_out_share(coco):
+    names = {"Walker": "person", "Truck": "car"}
+    (kept,) = read_sets([coco], classes=names, held_out=0.5, seed=1)
+    assert len(kept) == 2 and len({each.group for each in kept.pictures}) == 1

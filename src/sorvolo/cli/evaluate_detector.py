@@ -45,12 +45,15 @@ def detector(
         str | None, typer.Option(help="Regular expression whose one group is the video within a picture's path.")
     ] = None,
     videos: Annotated[str, typer.Option(help="Regular expression: only pictures of videos that it fits.")] = "",
+    held_out: Annotated[
+        float, typer.Option(help="Only the share that `sorvolo train --val` of the same share and seed holds out.")
+    ] = 0.0,
     tiles: Annotated[
         str, typer.Option(help="none, auto (by the ground's sampling distance), or pixels a side.")
     ] = "none",
     out: Annotated[Path | None, typer.Option(help="Folder for detector.html, detector.json, detections.json.")] = None,
     draws: Annotated[int, typer.Option(min=20, help="Of the bootstrap behind the intervals.")] = 1000,
-    seed: Annotated[int, typer.Option(help="Of the bootstrap.")] = 0,
+    seed: Annotated[int, typer.Option(help="Of the bootstrap, and of what is held out.")] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print detector.json.")] = False,
 ) -> None:
     """Detectors on labelled pictures: COCO's AP, the thesis's mAP, recall by size, confusions, worst mistakes.
@@ -64,7 +67,7 @@ def detector(
     settings = EvaluationSettings(_tiles(tiles), draws, seed)
     labelled = read_sets(
         data, form=form, classes=_pairs(classes) or None, ignore=_names(ignore), unlabelled=_names(unlabelled),
-        group_pattern=group_pattern, videos=videos,
+        group_pattern=group_pattern, videos=videos, held_out=held_out, seed=seed,
     )
     arms = [_names(each) for each in (model, *(compare or ()))]
     with Progress(console=Console(stderr=True), transient=True) as progress:
@@ -78,7 +81,7 @@ def detector(
         )
     description = {
         "sorvolo": __version__, "data": ", ".join(map(str, data)), "arms": "; ".join(", ".join(arm) for arm in arms),
-        "videos": videos or "all", "tiles": tiles, "draws": draws, "seed": seed,
+        "videos": videos or "all", "held_out": held_out or "all", "tiles": tiles, "draws": draws, "seed": seed,
         "notices": "; ".join((*(note.text for each in labelled for note in each.notices), *measured.found.notices)),
     }
     if out is not None:

@@ -57,8 +57,8 @@ def read_found(path: Path) -> FoundSets:
     """Read what `write_found` wrote. Raises InputError for any other file."""
     try:
         content = json.loads(path.read_bytes())
-        if content["made_by"] != _MADE_BY or content["format"] != 1:
-            raise ValueError(f"made by {content['made_by']!r}, format {content['format']!r}")
+        if content["format"] != 1:
+            raise ValueError(f"format {content['format']!r}")
         classes = tuple(str(name) for name in content["classes"])
         sets = {
             str(name): (tuple(str(row["file"]) for row in rows), tuple(_detections(row, classes) for row in rows))
