@@ -62,6 +62,9 @@ def map_command(
     ] = None,
     crs: Annotated[str, typer.Option(help="CRS of mosaic.tif, such as EPSG:25832; else the UTM zone.")] = "",
     transform: Annotated[Transform, typer.Option(help="Of method thesis.")] = Transform.SIMILARITY,
+    model: Annotated[
+        str, typer.Option(help="Looks for people, cars, objects: a model's name, a file, or none.")
+    ] = "default",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Make a geo-referenced map of one or more flights, or extend the map in the site folder.
@@ -71,7 +74,7 @@ def map_command(
     Example: sorvolo map photos/ --site field --camera phantom.xml --area field.geojson
     """
     settings = MapSettings(
-        method.value, gsd, overlap, offset, ground_elevation, crs or None, transform.value,
+        method.value, gsd, overlap, offset, ground_elevation, crs or None, transform.value, model=model,
     )
     reports = map_and_read_reports(
         inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area
@@ -126,6 +129,7 @@ def _show_report(report: Mapping[str, Any], console: Console) -> None:
             "{:.2f} " + unit + ", one sigma, what all fixes err in common included", report["sigma_m"]
         )),
         ("map", _size(report)),
+        ("objects", _objects(report.get("objects") or {})),
         ("clock offset", _clock_offset(report["time_offset"])),
         ("took", f"{report['seconds']['total']:.1f} s, {report['peak_memory_mb']:.0f} MB at most"),
     ):
@@ -142,6 +146,13 @@ def _size(report: Mapping[str, Any]) -> str:
     if not report["georeferenced"]:
         return "in a frame of its own, without metres and north"
     return f"{report['area_m2']:.0f} m2 at {100 * report['ground_sampling_distance_m']:.2f} cm a pixel"
+
+
+def _objects(told: Mapping[str, Any]) -> str:
+    if told.get("model") is None:
+        return f"not looked for: {told['why_not']}" if told.get("why_not") else ""
+    counts = [f"{count} {escape(name)}" for name, count in told["classes"].items() if count]
+    return (", ".join(counts) or "none found") + f", by the model {escape(told['model'])}"
 
 
 def _clock_offset(offset: Mapping[str, Any]) -> str:
@@ -162,7 +173,7 @@ def tell_path(name: str, path: Path, console: Console) -> None:
 
 
 def _map_files(site: Path) -> dict[str, Path]:
-    named = {"picture": "preview.png", "GeoTIFF": "mosaic.tif", "KMZ": "mosaic.kmz"}
+    named = {"picture": "preview.png", "GeoTIFF": "mosaic.tif", "KMZ": "mosaic.kmz", "objects": "objects.geojson"}
     return {name: site / file for name, file in named.items() if (site / file).is_file()}
 
 
