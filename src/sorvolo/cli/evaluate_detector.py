@@ -143,12 +143,14 @@ def _show_comparison(console: Console, each: SetComparison) -> None:
     first = each.arms[0].name
     head = [arm.name for arm in each.arms] + [f"{arm.name} less {first}" for arm in each.arms[1:]]
     table = Table("measure", *head, title=f"side by side: {each.name}")
-    for name in each.arms[0].mean:
+    for name, value in each.arms[0].mean.items():
+        if not math.isfinite(value):
+            continue
         cells = [_share(arm.mean[name]) for arm in each.arms]
         for found in each.differences:
             told = found[name]
             bounds = f" ({told.low:+.1%} to {told.high:+.1%})" if math.isfinite(told.low) else ""
-            cells.append(f"{told.value:+.1%}{bounds}" if math.isfinite(told.value) else "-")
+            cells.append(f"{told.value:+.1%}{bounds}")
         table.add_row(name, *cells)
     console.print(table)
 

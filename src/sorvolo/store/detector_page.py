@@ -54,12 +54,13 @@ def _header(model: str, sets: Sequence[Any]) -> str:
     told = "; ".join(f"{escape(each.name)}: AP50 {_class_words(each.classes)}" for each in sets)
     return (
         f'<header><p class="over">Detector <b>{escaped(model)}</b></p><h1>{told}</h1>'
-        f"<p>{sum(each.pictures for each in sets)} labelled pictures that it is to be measured on.</p></header>"
+        f"<p>Measured on {sum(each.pictures for each in sets)} labelled pictures of "
+        f"{sum(each.groups for each in sets)} videos or flights. All shares are in per cent.</p></header>"
     )
 
 
 def _class_words(classes: Sequence[Any]) -> str:
-    return ", ".join(f"{_share(row.coco.ap50)} {escape(row.label)}" for row in classes)
+    return ", ".join(f"{escape(row.label)} {_share(row.coco.ap50)}" for row in classes if row.labels) or "unknown"
 
 
 def _overview(sets: Sequence[Any]) -> str:
@@ -89,7 +90,7 @@ def _overview(sets: Sequence[Any]) -> str:
 
 
 def _comparison(each: Any) -> str:
-    names = [name for name in each.arms[0].mean if all(name in arm.mean for arm in each.arms)]
+    names = [name for name, value in each.arms[0].mean.items() if math.isfinite(value)]
     head = ["measure", *(escape(arm.name) for arm in each.arms)]
     head += [f"{escape(arm.name)} less {escape(each.arms[0].name)}" for arm in each.arms[1:]]
     rows = []
