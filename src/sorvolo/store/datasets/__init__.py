@@ -53,6 +53,9 @@ def read_dataset(
 def _parsed(place: Path, form: str | None, findings: Findings) -> ParsedSet:
     """What the form's reader finds; an error of a form that was asked for says what it looks like instead."""
     recognised = form_of(place)
+    if place.is_file() and form is None and recognised is None:
+        known = ", ".join(READERS)
+        raise InputError(f"{place} is no label file of a known form ({known}); give the folder, or its labels")
     chosen = form or recognised or "yolo"
     try:
         return READERS[chosen](place, findings)

@@ -120,13 +120,15 @@ def _clipped(
     edges_px: Floats, width_px: int, height_px: int, name: str, findings: Findings
 ) -> tuple[Floats, list[bool]]:
     """Edges within the picture, and which boxes are worth keeping."""
-    sides = edges_px[:, 2:] - edges_px[:, :2]
+    with np.errstate(invalid="ignore"):
+        sides = edges_px[:, 2:] - edges_px[:, :2]
     limits = np.array([width_px, height_px] * 2, np.float64)
     inside = np.clip(edges_px, 0, limits)
     left = inside[:, 2:] - inside[:, :2]
     empty = (sides <= 0).any(axis=1)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        outside = ~empty & ((left <= 0).any(axis=1) | ((left / sides).prod(axis=1) < _LEAST_LEFT))
+        shows_it = (left > 0).all(axis=1) & ((left / sides).prod(axis=1) >= _LEAST_LEFT)
+    outside = ~empty & ~shows_it
     moved = np.abs(inside - edges_px).max(axis=1, initial=0) > _CLIPPED_PX
     findings.add("empty_boxes", name, int(empty.sum()))
     findings.add("outside_boxes", name, int(outside.sum()))

@@ -1,6 +1,7 @@
 """COCO: one JSON file with pictures, categories and boxes; the simulator's own truth is of this form."""
 
 import json
+import os
 from collections.abc import Iterator, Mapping
 from math import isfinite
 from pathlib import Path
@@ -28,9 +29,9 @@ def read_coco(place: Path, findings: Findings) -> ParsedSet:
     categories = {row.get("id"): str(row.get("name", row.get("id"))) for row in _rows(whole, "categories", path)}
     images = {}
     for row in _rows(whole, "images", path):
-        if row.get("id") in images:
-            raise InputError(f"{path}: two images have the id {row.get('id')}; each needs its own")
-        images[row.get("id")] = row
+        if row.get("id") is None or row["id"] in images:
+            raise InputError(f"{path}: an image has no id, or that of another ({row.get('id')}); each needs its own")
+        images[row["id"]] = row
     boxes: dict[Any, list[ParsedBox]] = {}
     for row in _rows(whole, "annotations", path):
         box = _box(row, categories)
@@ -129,7 +130,7 @@ def _pictures(
     by_name: dict[str, list[Path]] | None = None
     for image_id, row in images.items():
         name = str(row.get("file_name", "")).replace("\\", "/")
-        found = next((folder / name for folder in folders if name and (folder / name).is_file()), None)
+        found = next((folder / name for folder in folders if name and os.path.isfile(folder / name)), None)
         if found is None and name:
             by_name = _by_name(path.parent) if by_name is None else by_name
             same = by_name.get(Path(name).name, [])

@@ -12,10 +12,9 @@ from sorvolo.store.datasets.pictures import files_below
 from sorvolo.store.datasets.text_files import read_text
 
 FORM = "UMCD"
-_FIELD = re.compile(r"\s*[-*]?\s*(?P<key>[A-Za-z][A-Za-z ]*?)\s*[:=]\s*(?P<value>.*?)\s*;?\s*")
-_OBJECT = re.compile(r"\s*object\b\s*#?\s*\d*\s*[:.]?\s*(?P<type>[^:=]*?)\s*;?\s*", re.IGNORECASE)
+_OBJECT = re.compile(r"object\b\s*#?\s*\d*\s*[:.=]?\s*", re.IGNORECASE)
 _KNOWN = frozenset({"type", "shape", "dimension", "dimensions", "size", "color", "colour", "movement", "appearance"})
-_NUMBER = re.compile(r"\d+(?:\.\d+)?")
+_NUMBER = re.compile(r"\d{1,9}(?:\.\d{1,9})?")
 _ROUNDED_S = 1.0  # times of appearance are whole seconds, rounded one way or the other
 
 
@@ -71,28 +70,34 @@ def read_umcd(place: Path, findings: Findings) -> ParsedSet:
 
 
 def looks_like_umcd(path: Path) -> bool:
-    """Whether a text file has a type and at least one more field that this form has."""
-    found = {match["key"].lower() for line in read_text(path).splitlines() if (match := _FIELD.fullmatch(line))}
-    named = any(match["type"] for line in read_text(path).splitlines() if (match := _OBJECT.fullmatch(line)))
-    return ("type" in found or named) and len(found & _KNOWN) >= 2
+    """Whether a text file names an object's type and has at least two of the fields of this form."""
+    fields = [_field(line) for line in read_text(path).splitlines()]
+    keys = {key for key, value in fields if value} & _KNOWN
+    return len(keys) >= 2 and ("type" in keys or any(key == "object" and value for key, value in fields))
+
+
+def _field(line: str) -> tuple[str, str]:
+    """A line's key in lower case and its value, such as ("type", "Person"); the key is empty where there is none.
+
+    "Object 1: Person" has the key "object".
+    """
+    bare = line.strip().strip("-*; ")
+    if begun := _OBJECT.match(bare):
+        return "object", bare[begun.end():]
+    key, mark, value = bare.replace("=", ":", 1).partition(":") if ":" not in bare else bare.partition(":")
+    return (key.strip().lower(), value.strip()) if mark else ("", bare)
 
 
 def _parsed(path: Path, findings: Findings) -> _Video:
     video = _Video()
     for number, line in enumerate(read_text(path).splitlines(), start=1):
-        match = _FIELD.fullmatch(line)
-        key = match["key"].lower() if match else ""
-        if match is None or key == "object":
-            if (begun := _OBJECT.fullmatch(line)) or key == "object":
-                name = begun["type"] if begun else match["value"] if match else ""
-                video.objects.append(_Object(name))
-            elif line.strip():
-                findings.add("malformed_labels", f"{path.name}, line {number}")
-            continue
-        numbers = [float(each) for each in _NUMBER.findall(match["value"])]
-        if key in ("fps", "frequency", "frequency fps"):
+        key, value = _field(line)
+        numbers = [float(each) for each in _NUMBER.findall(value)]
+        if key == "object":
+            video.objects.append(_Object(value))
+        elif key in ("fps", "frequency"):
             video.fps = numbers[0] if numbers else 0.0
-        elif not _told(video, key, match["value"], numbers):
+        elif line.strip() and not (key and _told(video, key, value, numbers)):
             findings.add("malformed_labels", f"{path.name}, line {number}")
     video.objects = [each for each in video.objects if each.name]
     return video
