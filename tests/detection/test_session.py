@@ -131,6 +131,21 @@ def test_providers_and_threads(tmp_path: Path) -> None:
     assert 1 <= usable_cores() <= 4096
 
 
+def test_a_model_that_openvino_refuses_runs_all_the_same(tmp_path: Path) -> None:
+    pytest.importorskip("openvino")
+    text = """m (uint8[1, 3, H, W] image) => (float[K, 4] boxes, float[K] scores, int64[K] labels) {
+      boxes = Constant <value = float[1, 4] {0, 0, 1, 1}> ()
+      half = Constant <value = float[1, 1, 1] {0.5}> ()
+      scores = Det (half)
+      labels = Constant <value_ints = [0]> () }"""
+    path = _identity(tmp_path / "det.onnx", text)
+    with pytest.raises(InputError, match="OpenVINO refuses it"):
+        Session(path, "openvino", 1)
+    opened = Session(path, "auto", 1)
+    assert opened.provider == "ONNX Runtime on the CPU, 1 thread, since OpenVINO refuses the model"
+    assert opened.see(np.zeros((8, 8, 3), np.uint8)).scores.tolist() == [0.5]
+
+
 def test_padding_is_what_training_fills_with(tmp_path: Path) -> None:
     opened = Session(rectangle_model(tmp_path / "toy.onnx"), "cpu")
     rng = np.random.default_rng(0)

@@ -171,6 +171,7 @@ def _opened(model: bytes, where: str, provider: Provider, threads: int) -> tuple
             "CUDA is not to be had here: install onnxruntime-gpu in place of onnxruntime, with a driver and CUDA of "
             "its version, or choose the provider cpu"
         )
+    refused = ""
     if provider in ("auto", "openvino"):
         described = _described(model, where)
         try:
@@ -180,10 +181,15 @@ def _opened(model: bytes, where: str, provider: Provider, threads: int) -> tuple
                 raise SettingsError(
                     "OpenVINO is not installed: pip install 'sorvolo[openvino]', or choose the provider cpu"
                 ) from error
+        except RuntimeError as error:
+            if provider == "openvino":
+                told = " ".join(str(error).split())[:200]
+                raise InputError(f"{where}: OpenVINO refuses it ({told}); choose the provider cpu") from error
+            refused = ", since OpenVINO refuses the model"
         else:
             return run, f"OpenVINO on the CPU, {_count(threads)}", described
     session = _onnx_session(model, where, threads, ["CPUExecutionProvider"])
-    return _runner(session), f"ONNX Runtime on the CPU, {_count(threads)}", session
+    return _runner(session), f"ONNX Runtime on the CPU, {_count(threads)}{refused}", session
 
 
 def _count(threads: int) -> str:
