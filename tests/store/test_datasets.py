@@ -90,6 +90,11 @@ def test_unnamed_classes_are_their_numbers_and_a_single_one_is_the_one_looked_fo
         read_dataset(folder, classes={"person": "person", "auto": "car"})
 
 
+def test_a_yolo_folder_may_hold_pictures_of_nothing_only(tmp_path):
+    labelled = read_dataset(yolo_folder(tmp_path, ""))
+    assert labelled.classes == ("person", "car") and len(labelled.pictures[0].labels) == 0
+
+
 def test_pixels_in_yolo_files_are_refused_and_one_slip_is_not(tmp_path):
     with pytest.raises(InputError, match="shares"):
         read_dataset(yolo_folder(tmp_path / "pixels", "0 90 40 20 20\n"), form="yolo")
@@ -124,8 +129,9 @@ def test_coco_boxes_crowds_groups_and_sampling_distance(tmp_path):
 def test_coco_pictures_are_found_where_tools_put_them(tmp_path, labels, picture):
     put.put_picture(tmp_path / picture)
     path = put.put_coco(tmp_path / labels, ["p.jpg"], [(0, 1, 1, 2, 3, 4, 0)])
-    (found,) = read_dataset(path).pictures
-    assert Path(found.path).samefile(tmp_path / picture)
+    for place in (path, tmp_path):
+        (found,) = read_dataset(place).pictures
+        assert Path(found.path).samefile(tmp_path / picture)
 
 
 def test_coco_of_a_video_asks_for_its_frames(tmp_path):

@@ -52,16 +52,25 @@ def read_dataset(
 
 def _parsed(place: Path, form: str | None, findings: Findings) -> ParsedSet:
     """What the form's reader finds; an error of a form that was asked for says what it looks like instead."""
-    recognised = form_of(place)
-    if place.is_file() and form is None and recognised is None:
-        known = ", ".join(READERS)
-        raise InputError(f"{place} is no label file of a known form ({known}); give the folder, or its labels")
-    chosen = form or recognised or "yolo"
+    if form is None:
+        return _parsed_as_recognised(place, findings)
     try:
-        return READERS[chosen](place, findings)
+        return READERS[form](place, findings)
     except InputError as error:
-        if recognised is None:
-            raise InputError(f"{error} (labels of no known form were recognised: {', '.join(READERS)})") from error
-        if recognised == chosen:
+        recognised = form_of(place)
+        if recognised in (None, form):
             raise
         raise InputError(f"{error}; it looks like {recognised}: read it as that, or leave the form out") from error
+
+
+def _parsed_as_recognised(place: Path, findings: Findings) -> ParsedSet:
+    known = ", ".join(READERS)
+    recognised = form_of(place)
+    if recognised is not None:
+        return READERS[recognised](place, findings)
+    if place.is_file():
+        raise InputError(f"{place} is no label file of a known form ({known}); give the folder, or its labels")
+    try:
+        return read_yolo(place, findings)  # the one form in which every label file may be empty
+    except InputError as error:
+        raise InputError(f"{error} (labels of no known form were recognised: {known})") from error

@@ -61,8 +61,8 @@ def coco_file(place: Path) -> Path:
 
 
 def coco_files(folder: Path) -> list[Path]:
-    """COCO files in the folder, else in its `annotations/`, else one folder below."""
-    for pattern in ("*.json", "annotations/*.json", "*/*.json"):
+    """COCO files in the folder, else in its `annotations/`, else one folder below, else a simulation's truth."""
+    for pattern in ("*.json", "annotations/*.json", "*/*.json", "truth/*/boxes.json"):
         found = [path for path in sorted(folder.glob(pattern)) if path.is_file() and _looks_like_coco(path)]
         if found:
             return found
