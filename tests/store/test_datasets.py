@@ -70,6 +70,16 @@ def test_yolo_folders_and_names_as_tools_lay_them(tmp_path, picture, label, name
     assert labelled.pictures[0].group == "v"
 
 
+def test_linked_folders_count_and_rings_of_links_end(tmp_path):
+    put.put_picture(tmp_path / "elsewhere" / "a_1.jpg")
+    put.put_text(tmp_path / "set" / "labels" / "a_1.txt", "0 0.5 0.5 0.1 0.2\n")
+    put.put_text(tmp_path / "set" / "classes.txt", "car")
+    (tmp_path / "set" / "images").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "back").symlink_to(tmp_path / "set")
+    labelled = read_dataset(tmp_path / "set")
+    assert [len(each.labels) for each in labelled.pictures] == [1] and labelled.notices == ()
+
+
 def test_one_part_of_a_yolo_folder_finds_labels_and_names_above_it(tmp_path):
     for part in ("train", "val"):
         put.put_picture(tmp_path / "images" / part / f"{part}_1.jpg")

@@ -9,11 +9,19 @@ from sorvolo.store.datasets.groups import group_of
 from sorvolo.store.datasets.pictures import PICTURE_ENDINGS, pictures_below
 from sorvolo.survey.splits import frame_number
 
+_PICTURE_FOLDERS = frozenset({"images", "jpegimages", "sequences", "pictures", "frames", "photos"})
+
 
 def pictures_around(place: Path, form: str) -> list[Path]:
-    """Pictures below a folder, or beside it when it holds label files only. Raises InputError when there are none."""
+    """Pictures below a folder; of one with label files only, below the folder for pictures beside it.
+
+    Raises InputError when there are none.
+    """
     folder = place if place.is_dir() else place.parent
-    found = pictures_below(folder) or pictures_below(folder.parent)
+    found = pictures_below(folder)
+    if not found:
+        beside = [each for each in sorted(folder.parent.iterdir()) if each.name.lower() in _PICTURE_FOLDERS]
+        found = [path for each in beside for path in pictures_below(each)]
     if not found:
         endings = ", ".join(sorted(PICTURE_ENDINGS))
         raise InputError(f"{place}: no pictures ({endings}) in it nor beside it; {form} labels need theirs")

@@ -1,5 +1,6 @@
 """Where a set's pictures lie, and how large they are; only headers are read."""
 
+import os
 import warnings
 from pathlib import Path
 
@@ -16,16 +17,24 @@ _BROKEN = (
 
 def pictures_below(folder: Path) -> list[Path]:
     """All pictures of the folder and its sub-folders, hidden ones left out, sorted by path."""
-    return [path for path in files_below(folder) if path.suffix.lower() in PICTURE_ENDINGS]
+    return files_below(folder, *PICTURE_ENDINGS)
 
 
 def files_below(folder: Path, *endings: str) -> list[Path]:
-    """All files of the folder and its sub-folders (with one of the endings), hidden ones left out, sorted."""
-    return sorted(
-        path for path in folder.rglob("*")
-        if (not endings or path.suffix.lower() in endings) and not _is_hidden(path.relative_to(folder))
-        and path.is_file()
-    )
+    """All files of the folder and its sub-folders (with one of the endings), hidden ones left out, sorted.
+
+    Linked folders count, as large sets are often kept elsewhere; each folder once, so that links may form a ring.
+    """
+    found: list[Path] = []
+    seen: set[str] = set()
+    for parent, folders, files in os.walk(folder, followlinks=True):
+        real = os.path.realpath(parent)
+        folders[:] = [] if real in seen else sorted(name for name in folders if not _is_hidden(name))
+        if real not in seen:
+            names = (name for name in files if not _is_hidden(name))
+            found += [Path(parent, name) for name in names if not endings or Path(name).suffix.lower() in endings]
+        seen.add(real)
+    return sorted(found)
 
 
 def shown_size_px(path: Path) -> tuple[int, int, int]:
@@ -54,5 +63,5 @@ def _orientation(picture: Image.Image) -> int:
     return value if 1 <= value <= 8 else 1
 
 
-def _is_hidden(path: Path) -> bool:
-    return any(part.startswith(".") or part == "__MACOSX" for part in path.parts)
+def _is_hidden(name: str) -> bool:
+    return name.startswith(".") or name == "__MACOSX"
