@@ -14,8 +14,10 @@ from toy_models import rectangle_model, square_model
 from sorvolo.cli import main as cli
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import Integrity, find_model, installed_models, integrity, models_folder
+from sorvolo.detection.session import read_info
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.missions.model_files import fetch_model
+from sorvolo.survey.objects import CLASSES
 
 
 @pytest.fixture(autouse=True)
@@ -179,3 +181,14 @@ def test_help_of_every_command_has_an_example(capsys: pytest.CaptureFixture[str]
         assert cli.main(["models", command, "--help"]) == 0
         example = capsys.readouterr().out.split("Example", 1)[1]
         assert f"sorvolo models {command}" in " ".join(example.replace("│", " ").split())
+
+
+def test_packaged_models_are_what_their_cards_say() -> None:
+    packaged = [each for each in installed_models() if each.is_packaged]
+    if not packaged:
+        pytest.skip("no model comes with this copy of the package")
+    assert "default" in [each.name for each in packaged]
+    for each in packaged:
+        assert integrity(each) is Integrity.GOOD
+        assert each.path.stat().st_size <= 40e6
+        assert read_info(each.path).classes == CLASSES

@@ -73,7 +73,7 @@ class TestPlan:
                 assert end - start >= min(longest, 0.5 * sides[0, low] / plan.scale) - 3
 
     def test_whole_means_whole_unless_memory_forbids(self) -> None:
-        assert plan_tiles((3000, 4000), _INFO, CLASSES, tiles=None, m_per_px=0.3).places_px == ((0, 0, 4000, 3000),)
+        assert plan_tiles((2160, 3840), _INFO, CLASSES, tiles=None, m_per_px=0.3).places_px == ((0, 0, 3840, 2160),)
         huge = plan_tiles((9000, 9000), _INFO, CLASSES, tiles=None)
         assert len(huge.places_px) > 1 and huge.scale == 1
         assert MOST_AT_ONCE_PX < 9000**2

@@ -18,8 +18,8 @@ Tiles = Literal["auto"] | int | None
 MOST_WHOLE_PX = 2_400_000
 """Up to so many pixels "auto" shows a picture at once: 1920 x 1080 and a little more."""
 
-MOST_AT_ONCE_PX = 17_000_000
-"""A larger picture is cut into tiles even if it was asked for whole: its features would not fit into memory."""
+MOST_AT_ONCE_PX = 8_400_000
+"""A larger picture than a 4K frame is cut into tiles even if it was asked for whole: it would take gigabytes."""
 
 TASK = Task.RECOGNITION
 """What a person must at least be shown for (Johnson's criteria): 6 px over the critical dimension."""
