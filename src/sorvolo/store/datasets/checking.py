@@ -17,7 +17,7 @@ from sorvolo.survey.flight import Notice
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 
 _SAME_SHAPE = 0.01  # of the aspect: thumbnails and halved frames are rounded to whole pixels
-_CLIPPED_PX = 1.0  # less is rounding
+_CLIPPED_PX = 1.5  # less is rounding, or counting from 1
 _LEAST_LEFT = 0.1  # share of a box's area within the picture below which it shows nothing of the object
 
 
