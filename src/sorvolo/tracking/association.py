@@ -1,0 +1,118 @@
+"""Which sighting of a frame is which track: place, class, size and looks weighed against its being something new."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from sorvolo.geometry.arrays import Anything, Floats, PointsM
+from sorvolo.tracking.common_shift import CommonShift
+from sorvolo.tracking.motion import Motions
+
+_GATE = 11.8  # squared distance in sigmas, two axes: 3 in 1000 of one object's sightings lie beyond
+_NEVER = -1e6
+_SIZE_SIGMA = 0.4  # of the natural logarithm of the longer side
+_LEAST_SIZE = -3.0
+_LOOKS_WEIGHT = 4.0
+_MOST_VOTES = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Rows of tracks and of sightings that belong together, (M,) each, in order of the tracks."""
+
+    tracks: Anything
+    sightings: Anything
+
+    def __len__(self) -> int:
+        return len(self.tracks)
+
+    def joined(self, other: "Pairs") -> "Pairs":
+        """These and others."""
+        tracks = np.concatenate([self.tracks, other.tracks])
+        return Pairs(tracks, np.concatenate([self.sightings, other.sightings]))
+
+
+def place_likelihoods(
+    motions: Motions, places_m: PointsM, covariances_m2: Floats, shift_m: PointsM, shift_m2: Floats
+) -> Floats:
+    """(tracks, sightings) log density of each sighting's place if it is that track's; very low beyond the gate.
+
+    `covariances_m2` (sightings, 2, 2) are the sightings' own; the frame's common shift (2,) is known to (2, 2).
+    """
+    gaps = places_m[None, None] - shift_m - motions.means[:, :, None, :2]  # (N, 2, M, 2)
+    spread = motions.covariances[:, :, None, :2, :2] + (covariances_m2 + shift_m2)[None, None]
+    inverse = _inverse(spread)
+    squared = np.einsum("nkma,nkmab,nkmb->nkm", gaps, inverse, gaps)
+    logs = -0.5 * (squared - np.log(_determinant(inverse))) - np.log(2 * np.pi)
+    logs = np.where(squared <= _GATE, logs + np.log(motions.weights)[:, :, None], _NEVER)
+    return np.logaddexp(logs[:, 0], logs[:, 1])
+
+
+def size_likelihoods(track_sides_m: Floats, seen_sides_m: Floats) -> Floats:
+    """(tracks, sightings) how well longer sides fit, at best 0."""
+    ratio = np.log(np.maximum(seen_sides_m, 1e-3))[None] - np.log(np.maximum(track_sides_m, 1e-3))[:, None]
+    return np.maximum(-0.5 * (ratio / _SIZE_SIGMA) ** 2, _LEAST_SIZE)
+
+
+def looks_likelihoods(track_looks: Floats, seen_looks: Floats) -> Floats:
+    """(tracks, sightings) how well appearance vectors fit, (tracks, D) and (sightings, D), at best 0; NaN says nothing.
+
+    Vectors are histograms or embeddings of any scale; their angle counts.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        a = track_looks / np.linalg.norm(track_looks, axis=1, keepdims=True)
+        b = seen_looks / np.linalg.norm(seen_looks, axis=1, keepdims=True)
+    return np.nan_to_num(_LOOKS_WEIGHT * (a @ b.T - 1.0))
+
+
+def class_likelihoods(shares: Floats, labels: Anything) -> Floats:
+    """(tracks, sightings) log of how likely each sighting's class is, by the tracks' shares (tracks, classes)."""
+    return np.log(0.03 + 0.97 * shares[:, labels])
+
+
+def assigned(gains: Floats) -> Pairs:
+    """The pairs with the largest sum of gains (tracks, sightings); pairs without gain stay apart (Kuhn 1955)."""
+    rows, columns = linear_sum_assignment(np.minimum(-gains, 0.0))
+    keep = gains[rows, columns] > 0
+    return Pairs(rows[keep], columns[keep])
+
+
+def voted_shift(
+    motions: Motions, places_m: PointsM, covariances_m2: Floats, shift: CommonShift, fits: Floats, gains: Floats,
+    new_log_density: float,
+) -> PointsM:
+    """(2,) the frame's common shift under which the pattern of its sightings fits the tracks best.
+
+    Each likely pair votes for the shift that brings it together; a shift's worth is that of all sightings with their
+    best tracks. `fits` (tracks, sightings) is what beside place speaks for pairs, `gains` what all together does.
+    """
+    rows, columns = np.nonzero(gains > 0)
+    if not len(rows):
+        return shift.mean_m
+    best = np.argsort(-gains[rows, columns], kind="stable")[:_MOST_VOTES]
+    tracks_m, track_m2 = motions.places_m, motions.place_covariances_m2
+    shifts = np.concatenate([shift.mean_m[None], places_m[columns[best]] - tracks_m[rows[best]]])
+    near, seen = np.unique(rows), np.unique(columns)
+    gaps = places_m[None, seen] - tracks_m[near][:, None]  # (N, M, 2)
+    spread = track_m2[near][:, None] + covariances_m2[seen][None]
+    inverse = _inverse(spread)
+    base = 0.5 * np.log(_determinant(inverse)) - np.log(2 * np.pi) + fits[np.ix_(near, seen)] - new_log_density
+    x, y = np.moveaxis(gaps[None] - shifts[:, None, None], -1, 0)  # (S, N, M) each
+    squared = inverse[..., 0, 0] * x * x + 2 * inverse[..., 0, 1] * x * y + inverse[..., 1, 1] * y * y
+    worth = np.maximum(base - 0.5 * squared, 0.0).max(axis=1).sum(axis=1) + shift.log_prior(shifts)
+    chosen: PointsM = shifts[int(np.argmax(worth))]
+    return chosen
+
+
+def _inverse(matrices: Floats) -> Floats:
+    """Of (..., 2, 2) symmetric ones; much faster than the general one."""
+    a, b, d = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]
+    turned = np.empty_like(matrices)
+    turned[..., 0, 0], turned[..., 1, 1] = d, a
+    turned[..., 0, 1] = turned[..., 1, 0] = -b
+    return turned / (a * d - b * b)[..., None, None]
+
+
+def _determinant(matrices: Floats) -> Floats:
+    return matrices[..., 0, 0] * matrices[..., 1, 1] - matrices[..., 0, 1] ** 2

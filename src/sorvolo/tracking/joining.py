@@ -1,0 +1,106 @@
+"""When two tracks, or two boxes of one frame, are one object."""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.survey.objects import Sighting
+from sorvolo.tracking.followed import Followed
+from sorvolo.tracking.motion import MOVES, log_density, predicted
+
+_SAME_BOX = 0.6  # overlap of two boxes from which they show one object, whatever their classes
+_FRAMES_APART = 5  # of two neighbours of which each frame sees one
+_TOGETHER_SHARE = 0.15  # of frames with one of them: what is seen together more often is two objects
+_LEAST_CLASS_FIT = 0.1
+_LEAST_VIEWS = 4  # of a mover whose velocity is to be trusted
+
+
+def frame_doubles(sightings: Sequence[Sighting]) -> dict[int, int]:
+    """Rows whose box lies on that of a stronger row: weaker row to stronger row."""
+    if len(sightings) < 2:
+        return {}
+    boxes = np.array([each.box_px for each in sightings], np.float64)
+    low = np.maximum(boxes[:, None, :2], boxes[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
+    common = np.prod(np.maximum(high - low, 0.0), axis=2)
+    areas = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
+    overlap = common / np.maximum(areas[:, None] + areas[None] - common, 1e-9)
+    doubles: dict[int, int] = {}
+    order = np.argsort([-each.score for each in sightings], kind="stable")
+    for place, row in enumerate(order):
+        for stronger in order[:place]:
+            if overlap[row, stronger] > _SAME_BOX and int(stronger) not in doubles:
+                doubles[int(row)] = int(stronger)
+                break
+    return doubles
+
+
+def inward_m(outline_m: PointsM, points_m: PointsM) -> Floats:
+    """(N,) how deep points lie within a convex outline (4, 2), corners in either turn; below 0 outside."""
+    edges = np.roll(outline_m, -1, axis=0) - outline_m
+    lengths = np.maximum(np.linalg.norm(edges, axis=1), 1e-9)
+    away = points_m[:, None] - outline_m[None]
+    side = (edges[None, :, 0] * away[..., 1] - edges[None, :, 1] * away[..., 0]) / lengths
+    middle = outline_m.mean(axis=0) - outline_m
+    turn = np.sign(np.sum(edges[:, 0] * middle[:, 1] - edges[:, 1] * middle[:, 0]))
+    return np.asarray((side * turn).min(axis=1))
+
+
+def neighbours(
+    first: Sequence[Followed], second: Sequence[Followed], reach_m: float
+) -> Iterator[tuple[Followed, Followed]]:
+    """Pairs of different tracks that lie within `reach_m` of each other."""
+    if not first or not second:
+        return
+    a = np.array([each.place_m for each in first])
+    b = np.array([each.place_m for each in second])
+    for row, column in np.argwhere(np.linalg.norm(a[:, None] - b[None], axis=2) < reach_m):
+        if first[row] is not second[column]:
+            yield first[row], second[column]
+
+
+def double_of(followed: Followed, by_id: Mapping[int, Followed], reach_m: float) -> Followed | None:
+    """The track of the same object that ran beside this one: frames see one of both, never both."""
+    for neighbour, frames in followed.apart.items():
+        other = by_id.get(neighbour)
+        if other is None or frames < _FRAMES_APART:
+            continue
+        if followed.together.get(neighbour, 0) > _TOGETHER_SHARE * frames:
+            continue
+        near = float(np.linalg.norm(other.place_m - followed.place_m)) < reach_m
+        if near and _class_fit(followed, other) > _LEAST_CLASS_FIT:
+            return other
+    return None
+
+
+def earlier_mover(followed: Followed, others: Sequence[Followed], new_per_m2: float) -> Followed | None:
+    """The moving track, out of sight since before this one began, whose prediction this one continues best.
+
+    None where it is more likely something new: by the density of places and velocities of unseen movers.
+    """
+    if followed.views < _LEAST_VIEWS:
+        return None
+    best, most = None, 0.0
+    state, spread = followed.motion.means[0, MOVES], followed.motion.covariances[0, MOVES]
+    speed, moving_share = followed.motion.habits[0, 0], followed.motion.habits[0, 2]
+    new = np.log(new_per_m2 * moving_share) + log_density(state[2:], speed**2 * np.eye(2))
+    for other in others:
+        if other is followed or not other.moves or other.last_ns >= followed.first_ns or other.views < _LEAST_VIEWS:
+            continue
+        if other.id in followed.together:
+            continue
+        ahead = predicted(other.motion, np.array([(followed.motion_ns - other.motion_ns) / 1e9]))
+        gap = state - ahead.means[0, MOVES]
+        fit = log_density(gap, spread + ahead.covariances[0, MOVES]) + np.log(max(_class_fit(followed, other), 1e-3))
+        gain = float(fit + np.log(ahead.weights[0, MOVES]) - new)
+        if gain > most:
+            best, most = other, gain
+    return best
+
+
+def _class_fit(first: Followed, second: Followed) -> float:
+    """How alike the classes of two tracks are, 0 to 1."""
+    totals = sum(first.scores.values()) * sum(second.scores.values())
+    common = sum(score * second.scores.get(label, 0.0) for label, score in first.scores.items())
+    return common / max(totals, 1e-12)

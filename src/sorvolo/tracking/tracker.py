@@ -1,0 +1,389 @@
+"""Sightings over time put together to objects, each counted once across frames, passes and returns."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sorvolo.errors import GeometryError, SettingsError
+from sorvolo.geometry.arrays import Anything, Floats, PointsM
+from sorvolo.survey.objects import Sighting, Track
+from sorvolo.tracking.association import (
+    Pairs,
+    assigned,
+    class_likelihoods,
+    looks_likelihoods,
+    place_likelihoods,
+    size_likelihoods,
+    voted_shift,
+)
+from sorvolo.tracking.common_shift import CommonShift
+from sorvolo.tracking.followed import Followed
+from sorvolo.tracking.joining import double_of, earlier_mover, frame_doubles, inward_m, neighbours
+from sorvolo.tracking.motion import MOVES, Motions, begun, corrected, habits_of, predicted
+
+_LEAST_OWN_SHARE = 0.02  # of a sighting's whole variance that is its own
+_UNEVEN = 0.1  # of the shared sigma: turns and tilts do not shift a whole frame evenly
+_USUAL_STEP_S = 0.2  # sightings and gaps closer in time than this say less each
+_FORGOTTEN_S = 120.0  # tentative tracks out of view
+_SURE = 6.0  # evidence beyond this does not count: what leaves must be noticed
+_PENALTY_OF_ENDED = -1.5
+_ASTRAY = 13.8  # squared distance in sigmas from where the common shift is thought: 1 in 1000
+_MOVER_VIEWS = 4  # at least, until one that moves is sure: any two sightings make a mover
+_FIRST_VIEWS = 15  # within which a mover may turn out to be one that was seen before
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """When sightings make an object. `unit_m` is how many metres a unit of the places is, for speeds and distances.
+
+    `evidence` grows with each sighting by its score's log odds plus one, and shrinks by `missed` with each frame that
+    shows the place without the object.
+    """
+
+    sure_score: float = 0.4  # sightings below this only prolong tracks (Zhang et al. 2022, ByteTrack)
+    least_views: int = 2
+    least_evidence: float = 3.5
+    missed: float = 0.7
+    new_per_m2: float = 5e-4  # how densely objects lie that nobody has seen yet
+    neighbour_m: float = 4.0  # within which two tracks may be one object
+    unit_m: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.sure_score <= 1:
+            raise SettingsError(f"sure_score must lie in [0, 1], got {self.sure_score}")
+        if self.least_views < 1 or min(self.least_evidence, self.missed) < 0:
+            raise SettingsError("least_views must be at least 1, evidence must not be negative")
+        if min(self.new_per_m2, self.neighbour_m, self.unit_m) <= 0:
+            raise SettingsError("new_per_m2, neighbour_m and unit_m must be positive")
+
+
+IN_PICTURES = TrackerSettings(unit_m=0.05)
+"""For places in pixels of pictures from usual heights, 5 cm a pixel; within a factor of four it makes no difference."""
+
+
+@dataclass(frozen=True)
+class TrackUpdate:
+    """What a frame brought. `track_ids` has one id per sighting, 0 for one that belongs to no track.
+
+    `new` are ids confirmed by this frame, `updated` all that it saw, `ended` confirmed ones that are not where they
+    should be. `merged` maps ids that turned out to be an object seen before to that object's.
+    """
+
+    track_ids: tuple[int, ...]
+    new: tuple[int, ...]
+    updated: tuple[int, ...]
+    ended: tuple[int, ...]
+    merged: Mapping[int, int]
+
+
+class Tracker:
+    """Follows objects through a flight's frames, in order of time. Only `update` and `finish` change it.
+
+    Places are kept in a map that the sightings make; each frame's common error against it is found from the pattern of
+    all objects (`common_shift`), so that GPS drift neither breaks tracks nor is averaged away as if it were noise.
+    """
+
+    def __init__(self, settings: TrackerSettings | None = None) -> None:
+        self._settings = settings or TrackerSettings()
+        self._shift = CommonShift()
+        self._followed: list[Followed] = []
+        self._next_id = 1
+        self._time_ns: int | None = None
+        self._shared_m = 0.0
+        self._classes: list[str] = []
+
+    def update(
+        self, sightings: Sequence[Sighting], *, time_ns: int, footprint_m: PointsM | None = None,
+        appearance: Floats | None = None,
+    ) -> TrackUpdate:
+        """Take in one frame's sightings; a frame dated before the last one counts as taken with it.
+
+        `footprint_m` (4, 2) is the ground that the frame shows, corners in turn: what should be there and is not seen
+        loses confidence; None when that is unknown. `appearance` (sightings, D) are vectors whose angle tells objects
+        apart, rows of NaN for those without. Raises GeometryError for one of another length.
+        """
+        if appearance is not None and len(appearance) != len(sightings):
+            raise GeometryError(f"{len(sightings)} sightings but {len(appearance)} appearance vectors")
+        time_ns = time_ns if self._time_ns is None else max(time_ns, self._time_ns)
+        elapsed_s = 0.0 if self._time_ns is None else (time_ns - self._time_ns) / 1e9
+        self._time_ns = time_ns
+        seen = _Seen(sightings, appearance)
+        self._classes += sorted(set(seen.labels) - set(self._classes))
+        if len(sightings):
+            self._shared_m = float(np.median([each.shared_sigma_m for each in sightings]))
+        if len(sightings) or self._followed:
+            self._shift.move_on(elapsed_s, self._shared_m)
+        near = self._near(seen, time_ns, footprint_m)
+        motions = _stacked(near, time_ns)
+        pairs, motions = self._matched(near, motions, seen)
+        ids = np.zeros(len(sightings), np.int64)
+        new: list[int] = []
+        for row, column in zip(pairs.tracks, pairs.sightings):
+            followed = near[row]
+            followed.motion, followed.motion_ns = motions.only(slice(row, row + 1)), time_ns
+            if self._record(followed, seen, int(column), min(1.0, (time_ns - followed.last_ns) / 1e9 / _USUAL_STEP_S)):
+                new.append(followed.id)
+            ids[column] = followed.id
+        unmatched = np.setdiff1d(np.arange(len(near)), pairs.tracks)
+        begun_now = self._begin(seen, ids)
+        missing, ended = self._missed(near, motions, unmatched, time_ns, elapsed_s, footprint_m)
+        for row, stronger in seen.doubles.items():
+            if ids[stronger]:
+                ids[row] = ids[stronger]
+        now = [near[row] for row in pairs.tracks] + begun_now
+        merged = self._join(now, missing)
+        ids = np.array([merged.get(each, each) for each in ids.tolist()], np.int64)
+        return TrackUpdate(
+            tuple(ids.tolist()), tuple(each for each in new if each not in merged),
+            tuple(sorted(set(ids.tolist()) - {0})), tuple(each for each in ended if each not in merged), merged,
+        )
+
+    def tracks(self) -> list[Track]:
+        """All tracks as they are known now, tentative ones as well, in order of their ids."""
+        return [each.track() for each in self._followed]
+
+    def finish(self) -> list[Track]:
+        """All confirmed tracks; tentative ones are given up."""
+        self._followed = [each for each in self._followed if each.confirmed]
+        return self.tracks()
+
+    def _near(self, seen: "_Seen", time_ns: int, footprint_m: PointsM | None) -> list[Followed]:
+        """The tracks that the frame may show."""
+        if not self._followed:
+            return []
+        margin_m = 10 / self._settings.unit_m + 4 * self._shared_m
+        outline_m = seen.places_m if footprint_m is None else footprint_m
+        rough = np.array([each.rough for each in self._followed])
+        elapsed_s = (time_ns - rough[:, 4]) / 1e9
+        if not len(outline_m):
+            chosen = elapsed_s < 2.0
+        else:
+            middle_m = (outline_m.min(axis=0) + outline_m.max(axis=0)) / 2
+            reach_m = np.linalg.norm(outline_m - middle_m, axis=1).max() + margin_m
+            places_m = rough[:, :2] + rough[:, 2:4] * elapsed_s[:, None]
+            slack_m = 0.5 * np.linalg.norm(rough[:, 2:4], axis=1) * elapsed_s
+            chosen = np.linalg.norm(places_m - middle_m, axis=1) < reach_m + slack_m
+        return [each for each, is_near in zip(self._followed, chosen) if is_near]
+
+    def _matched(self, near: list[Followed], motions: Motions, seen: "_Seen") -> tuple[Pairs, Motions]:
+        """Which sightings are which tracks, and the tracks' motions with those taken in."""
+        none = Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64))
+        if not near or not len(seen.places_m):
+            return none, motions
+        unseen = np.log(self._settings.new_per_m2 * self._settings.unit_m**2)
+        fits = self._fits(near, seen)
+        fits[:, list(seen.doubles)] = -np.inf
+        sure = seen.scores >= self._settings.sure_score
+        shift = self._shift
+
+        def gains(shift_m: PointsM, shift_m2: Floats) -> Floats:
+            return place_likelihoods(motions, seen.places_m, seen.own_m2, shift_m, shift_m2) + fits - unseen
+
+        def assign(gain: Floats) -> Pairs:
+            first = assigned(np.where(sure, gain, -1.0))
+            gain = gain.copy()
+            gain[first.tracks], gain[:, first.sightings], gain[:, sure] = -1.0, -1.0, -1.0
+            second = assigned(gain)
+            return first.joined(second)
+
+        gain = gains(shift.mean_m, shift.covariance_m2)
+        pairs = assign(gain)
+        settled_m2 = np.median(seen.own_m2, axis=0)
+        open_m2 = np.trace(shift.covariance_m2)
+        puzzled = len(pairs) < min(len(near), int(sure.sum()))
+        if open_m2 > np.trace(settled_m2) or (puzzled and shift.limit_m2 > open_m2):
+            wide = gains(np.zeros(2), shift.limit_m2 * np.eye(2)) if puzzled else gain
+            voted_m = voted_shift(motions, seen.places_m, seen.own_m2, shift, fits, wide, float(unseen))
+            off_m = voted_m - shift.mean_m
+            if off_m @ np.linalg.solve(shift.covariance_m2 + settled_m2, off_m) > _ASTRAY:
+                shift.forget()
+            pairs = assign(gains(voted_m, settled_m2))
+        if len(pairs) > 1:
+            fitted = shift.fit(*_gaps(motions, seen, pairs, shift.limit_m2))
+            pairs = assign(gains(fitted.shift_m, fitted.covariance_m2))
+        if not len(pairs):
+            return none, motions
+        fitted = shift.fit(*_gaps(motions, seen, pairs, shift.limit_m2))
+        better = corrected(
+            motions.only(pairs.tracks), seen.places_m[pairs.sightings] - fitted.of_others_m,
+            seen.own_m2[pairs.sightings] + fitted.of_others_m2,
+        )
+        shift.settle(fitted, len(pairs), self._shared_m)
+        means, covariances, weights = motions.means.copy(), motions.covariances.copy(), motions.weights.copy()
+        means[pairs.tracks], covariances[pairs.tracks] = better.means, better.covariances
+        weights[pairs.tracks] = better.weights
+        return pairs, replace(motions, means=means, covariances=covariances, weights=weights)
+
+    def _fits(self, near: list[Followed], seen: "_Seen") -> Floats:
+        """(tracks, sightings) what beside place speaks for each pair, as logs."""
+        shares = np.array([[each.scores.get(name, 0.0) for name in self._classes] for each in near])
+        shares /= shares.sum(axis=1, keepdims=True)
+        fits = class_likelihoods(shares, np.array([self._classes.index(label) for label in seen.labels]))
+        fits += size_likelihoods(np.array([each.sides_m[0] for each in near]), seen.sides_m)
+        fits += np.array([_PENALTY_OF_ENDED if each.ended else 0.0 for each in near])[:, None]
+        if seen.looks is not None:
+            unknown = np.full(seen.looks.shape[1], np.nan)
+            known = np.array([unknown if each.looks is None else each.looks for each in near])
+            fits += looks_likelihoods(known, seen.looks)
+        return fits
+
+    def _record(self, followed: Followed, seen: "_Seen", column: int, weight: float) -> bool:
+        """Give a track its sighting; whether that confirms it."""
+        settings = self._settings
+        if followed.is_out:
+            followed.passes, followed.is_out = followed.passes + 1, False
+        followed.record(seen.sightings[column], seen.own_m2[column], seen.looks_of(column))
+        for row, stronger in seen.doubles.items():
+            if stronger == column:
+                followed.vote(seen.labels[row], float(seen.scores[row]))
+        followed.evidence = min(followed.evidence + max(weight, 0.3) * _log_odds(seen.scores[column]), _SURE)
+        followed.ended = False
+        least_views = max(settings.least_views, _MOVER_VIEWS if followed.moves else 0)
+        if followed.confirmed or followed.views < least_views or followed.evidence < settings.least_evidence:
+            return False
+        followed.confirmed = True
+        return True
+
+    def _begin(self, seen: "_Seen", ids: Anything) -> list[Followed]:
+        """Tracks for sure sightings that are none of those known; writes their ids."""
+        fresh = [
+            row for row in range(len(ids))
+            if ids[row] == 0 and seen.scores[row] >= self._settings.sure_score and row not in seen.doubles
+        ]
+        if not fresh:
+            return []
+        habits = np.array([habits_of(seen.labels[row], self._settings.unit_m) for row in fresh])
+        motions = begun(
+            seen.places_m[fresh] - self._shift.mean_m, seen.own_m2[fresh] + self._shift.covariance_m2, habits
+        )
+        started = []
+        for index, row in enumerate(fresh):
+            sighting = seen.sightings[row]
+            followed = Followed(
+                self._next_id, motions.only(slice(index, index + 1)), sighting.time_ns, 0.0, sighting.time_ns,
+                sighting.time_ns, sighting,
+            )
+            self._next_id += 1
+            self._record(followed, seen, row, 1.0)
+            started.append(followed)
+            ids[row] = followed.id
+        self._followed += started
+        return started
+
+    def _missed(
+        self, near: list[Followed], motions: Motions, rows: Anything, time_ns: int, elapsed_s: float,
+        footprint_m: PointsM | None,
+    ) -> tuple[list[Followed], list[int]]:
+        """What the frame should show and does not: those tracks, and the ids of the confirmed that end with it."""
+        missing, ended = [], []
+        if len(rows):
+            sigmas = np.sqrt(np.trace(motions.place_covariances_m2[rows], axis1=1, axis2=2) / 2)
+            places_m = motions.places_m[rows] + self._shift.mean_m
+            if footprint_m is None:
+                depth_m = np.array([0.0 if time_ns - near[row].last_ns < 2e9 else -np.inf for row in rows])
+            else:
+                depth_m = inward_m(footprint_m, places_m)
+            sides_m = np.array([near[row].sides_m[0] for row in rows])
+            for row, depth, sigma, side in zip(rows, depth_m, sigmas, sides_m):
+                followed = near[row]
+                if depth < 0:
+                    followed.is_out = True
+                elif depth > 2 * sigma + side / 2 or footprint_m is None:
+                    missing.append(followed)
+                    followed.evidence -= self._settings.missed * min(1.0, max(elapsed_s, 0.02) / _USUAL_STEP_S)
+                    if followed.confirmed and not followed.ended and followed.evidence < 0:
+                        followed.ended = True
+                        ended.append(followed.id)
+        near_ids = {each.id for each in near}
+        for followed in self._followed:
+            followed.is_out |= followed.id not in near_ids and followed.last_ns < time_ns
+        self._followed = [
+            each for each in self._followed
+            if each.confirmed or (each.evidence >= 0 and time_ns - each.last_ns < _FORGOTTEN_S * 1e9)
+        ]
+        return missing, ended
+
+    def _join(self, now: list[Followed], missing: list[Followed]) -> dict[int, int]:
+        """Merge tracks that turn out to be one object; the earlier id stays."""
+        reach_m = self._settings.neighbour_m / self._settings.unit_m
+        for first, second in neighbours(now, now, reach_m):
+            if first.id < second.id:
+                first.together[second.id] = first.together.get(second.id, 0) + 1
+                second.together[first.id] = second.together.get(first.id, 0) + 1
+        for first, second in neighbours(now, missing, reach_m):
+            first.apart[second.id] = first.apart.get(second.id, 0) + 1
+            second.apart[first.id] = second.apart.get(first.id, 0) + 1
+        merged: dict[int, int] = {}
+        by_id = {each.id: each for each in self._followed}
+        for followed in now:
+            if followed.id in merged or followed.id not in by_id:
+                continue
+            other = double_of(followed, by_id, reach_m)
+            if other is None and followed.moves and followed.views <= _FIRST_VIEWS:
+                density = self._settings.new_per_m2 * self._settings.unit_m**2
+                other = earlier_mover(followed, self._followed, density)
+            if other is not None:
+                kept, gone = (other, followed) if other.id < followed.id else (followed, other)
+                kept.join(gone)
+                del by_id[gone.id]
+                merged[gone.id] = kept.id
+        if merged:
+            self._followed = [each for each in self._followed if each.id not in merged]
+        return merged
+
+
+class _Seen:
+    """One frame's sightings as columns."""
+
+    def __init__(self, sightings: Sequence[Sighting], looks: Floats | None) -> None:
+        self.sightings, self.looks = sightings, None if looks is None else np.asarray(looks, np.float64)
+        self.places_m = np.array([each.position_m for each in sightings]).reshape(-1, 2)
+        self.scores = np.array([each.score for each in sightings])
+        self.labels = [each.label for each in sightings]
+        self.sides_m = np.array([each.size_m[0] for each in sightings])
+        self.own_m2 = _own_covariances(sightings)
+        self.doubles = frame_doubles(sightings)
+
+    def looks_of(self, row: int) -> Floats | None:
+        """An appearance vector, if there is one."""
+        if self.looks is None or not np.isfinite(self.looks[row]).all():
+            return None
+        return self.looks[row]
+
+
+def _own_covariances(sightings: Sequence[Sighting]) -> Floats:
+    """(N, 2, 2) what sightings err each for itself."""
+    whole = np.array([each.covariance_m2 for each in sightings]).reshape(-1, 2, 2)
+    shared = np.array([each.shared_sigma_m for each in sightings])
+    values, vectors = np.linalg.eigh(whole)
+    least = np.maximum(_LEAST_OWN_SHARE * values.mean(axis=1), 1e-6)
+    own = np.maximum(values - shared[:, None] ** 2, least[:, None]) + (_UNEVEN * shared[:, None]) ** 2
+    return (vectors * own[:, None, :]) @ vectors.swapaxes(1, 2)
+
+
+def _stacked(near: list[Followed], time_ns: int) -> Motions:
+    """All tracks' motions, moved on to one moment."""
+    if not near:
+        return Motions(np.zeros((0, 2, 4)), np.zeros((0, 2, 4, 4)), np.zeros((0, 2)), np.zeros((0, 3)))
+    motions = [each.motion for each in near]
+    together = Motions(
+        np.concatenate([each.means for each in motions]), np.concatenate([each.covariances for each in motions]),
+        np.concatenate([each.weights for each in motions]), np.concatenate([each.habits for each in motions]),
+    )
+    return predicted(together, np.array([(time_ns - each.motion_ns) / 1e9 for each in near]))
+
+
+def _gaps(motions: Motions, seen: _Seen, pairs: Pairs, loose_m2: float) -> tuple[PointsM, Floats]:
+    """Seen less known places of pairs, (M, 2) with (M, 2, 2)."""
+    matched = motions.only(pairs.tracks)
+    gaps_m = seen.places_m[pairs.sightings] - matched.places_m
+    # a mover knows no place of its own that could hold the map
+    restless_m2 = (matched.weights[:, MOVES] * loose_m2)[:, None, None] * np.eye(2)
+    return gaps_m, seen.own_m2[pairs.sightings] + matched.place_covariances_m2 + restless_m2
+
+
+def _log_odds(score: float) -> float:
+    """How much a sighting of this score speaks for an object."""
+    share = min(max(score, 0.01), 0.99)
+    return float(np.clip(np.log(share / (1 - share)) + 1.0, 0.3, 2.5))

@@ -1,0 +1,160 @@
+"""Objects counted once, on simulated patrols and on cases made by hand."""
+
+import numpy as np
+import pytest
+from patrol import Patrol, fly, things
+
+from sorvolo.errors import GeometryError, SettingsError
+from sorvolo.survey.objects import Sighting
+from sorvolo.tracking.tracker import Tracker, TrackerSettings
+
+ASIDE_M = np.array([500.0, 0.0])
+AROUND_M = np.array([[-40.0, -40.0], [40.0, -40.0], [40.0, 40.0], [-40.0, 40.0]])
+
+
+def sighting(frame, place_m, label="person", score=0.8, own_m=0.2, shared_m=1.5):
+    place_m = np.asarray(place_m, float)
+    middle = place_m * 16 + 640
+    return Sighting(
+        frame, str(frame), int(frame * 2e8), label, score, np.concatenate([middle - 5, middle + 5]), place_m,
+        np.eye(2) * (own_m**2 + shared_m**2), np.array([0.6, 0.5]), shared_m,
+    )
+
+
+def follow(tracker, frames, **more):
+    """Frames five a second, each a list of places."""
+    updates = []
+    for frame, places in enumerate(frames):
+        seen = [sighting(frame, place) for place in places]
+        updates.append(tracker.update(seen, time_ns=int(frame * 2e8), footprint_m=AROUND_M, **more))
+    return updates
+
+
+def test_what_stands_is_one_track_at_its_mean():
+    random = np.random.default_rng(1)
+    tracker = Tracker()
+    places = np.array([3.0, 4.0]) + random.normal(0, 0.2, (20, 2))
+    updates = follow(tracker, [[each] for each in places])
+    (track,) = tracker.finish()
+    assert {update.track_ids for update in updates} == {(track.id,)}
+    assert [update.new for update in updates if update.new] == [(track.id,)]
+    assert not track.moving and track.views == 20 and track.passes == 1
+    assert track.position_m == pytest.approx(places.mean(axis=0))
+    # twenty views within four seconds share their GPS error: its 1.5 m stay
+    assert 1.4 < track.sigma_m < 1.55
+
+
+def test_the_shared_error_is_averaged_only_as_fast_as_it_forgets_itself():
+    tracker = Tracker()
+    for frame in range(5):
+        seen = [sighting(300 * frame, [0.0, 0.0])]
+        tracker.update(seen, time_ns=seen[0].time_ns, footprint_m=AROUND_M)
+    (track,) = tracker.finish()  # five views, a minute apart
+    far = 1.5 * np.sqrt(sum(np.exp(-abs(i - j)) for i in range(5) for j in range(5)) / 25)
+    assert track.sigma_m == pytest.approx(np.hypot(far, 0.25 / np.sqrt(5)), rel=0.03)
+
+
+def test_a_walker_moves_and_keeps_its_id():
+    tracker = Tracker()
+    follow(tracker, [[[0.28 * frame, 5.0], [-10.0, 3.0], [8.0, -20.0]] for frame in range(30)])
+    tracks = sorted(tracker.finish(), key=lambda track: -np.linalg.norm(track.velocity_m_s))
+    assert [track.moving for track in tracks] == [True, False, False]
+    assert tracks[0].velocity_m_s == pytest.approx([1.4, 0.0], abs=0.1)
+    assert tracks[0].path_m[-1][0] - tracks[0].path_m[0][0] > 7.0
+
+
+def test_a_frame_that_lies_aside_takes_no_object_for_its_neighbour():
+    """GPS jumps by the distance of two people: the pattern says who is who."""
+    row = np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 0.0], [6.0, 0.0], [0.0, 9.0], [7.0, -8.0]])
+    tracker, aside_m = Tracker(), np.array([1.9, 0.3])
+    updates = follow(tracker, [row] * 8 + [row + aside_m] * 8)
+    assert updates[-1].track_ids == updates[7].track_ids
+    assert len(tracker.finish()) == 6
+
+
+def test_two_neighbours_stay_two_when_a_frame_sees_both():
+    random = np.random.default_rng(2)
+    both = np.array([[0.0, 0.0], [1.5, 0.0]])
+    frames = [both[random.random(2) > 0.3] + random.normal(0, 0.2, 2) for _ in range(60)]
+    tracker = Tracker()
+    follow(tracker, frames)
+    assert len(tracker.finish()) == 2
+
+
+def test_tracks_that_never_stand_together_become_one():
+    tracker = Tracker()
+    tracker.update([sighting(0, [0.0, 0.0])], time_ns=0, footprint_m=AROUND_M)
+    tracker.update([sighting(1, [0.0, 0.0])], time_ns=int(2e8), footprint_m=AROUND_M)
+    merged = {}
+    for frame in range(2, 30):  # the box slips to another place of the same object, too far for the gate
+        seen = [sighting(frame, [2.8, 0.0], shared_m=0.1)]
+        merged |= tracker.update(seen, time_ns=seen[0].time_ns, footprint_m=AROUND_M).merged
+    (track,) = tracker.finish()
+    assert track.id == 1
+    assert set(merged.values()) <= {1}
+
+
+def test_two_boxes_of_one_object_are_one_and_the_scores_choose_its_class():
+    tracker = Tracker()
+    for frame in range(6):
+        seen = [sighting(frame, [1.0, 1.0], "person", 0.8), sighting(frame, [1.01, 1.0], "small object", 0.5)]
+        update = tracker.update(seen, time_ns=seen[0].time_ns, footprint_m=AROUND_M)
+        assert len(set(update.track_ids)) == 1
+    (track,) = tracker.finish()
+    assert track.label == "person" and track.views == 6
+    assert track.class_scores == pytest.approx({"person": 0.8 / 1.3, "small object": 0.5 / 1.3})
+
+
+def test_what_is_not_seen_where_it_should_be_ends_and_what_is_out_of_view_does_not():
+    tracker = Tracker()
+    follow(tracker, [[[0.0, 0.0]]] * 5)
+    elsewhere = AROUND_M + ASIDE_M
+    for frame in range(5, 60):
+        assert not tracker.update([], time_ns=int(frame * 2e8), footprint_m=elsewhere).ended
+    ended = [tracker.update([], time_ns=int(frame * 2e8), footprint_m=AROUND_M).ended for frame in range(60, 90)]
+    assert [each for each in ended if each] == [(1,)]
+    assert len(tracker.finish()) == 1  # it was there
+
+
+def test_a_glimpse_is_no_object():
+    tracker = Tracker()
+    follow(tracker, [[[0.0, 0.0]]] + [[]] * 10)
+    assert tracker.tracks() == [] and tracker.finish() == []
+
+
+def test_low_scores_prolong_and_do_not_begin():
+    tracker = Tracker()
+    weak = sighting(0, [0.0, 0.0], score=0.2)
+    assert tracker.update([weak], time_ns=0, footprint_m=AROUND_M).track_ids == (0,)
+    tracker.update([sighting(1, [0.0, 0.0])], time_ns=int(2e8), footprint_m=AROUND_M)
+    assert tracker.update([sighting(2, [0.0, 0.0], score=0.2)], time_ns=int(4e8)).track_ids == (1,)
+
+
+def test_appearance_tells_who_came_back():
+    looks = np.eye(4)
+    tracker = Tracker()
+    for frame in range(6):
+        seen = [sighting(frame, [0.0, 0.0]), sighting(frame, [3.0, 0.0])]
+        tracker.update(seen, time_ns=seen[0].time_ns, footprint_m=AROUND_M, appearance=looks[:2])
+    tracker.update([], time_ns=int(20e9), footprint_m=AROUND_M + ASIDE_M)
+    back = [sighting(600, [1.5, 0.0])]  # GPS has wandered: half way between both
+    assert tracker.update(back, time_ns=int(120e9), footprint_m=AROUND_M, appearance=looks[1:2]).track_ids == (2,)
+
+
+def test_the_same_frames_give_the_same_tracks():
+    def ids():
+        patrol = Patrol(seed=9, size_m=(80.0, 80.0))
+        tracker = Tracker()
+        return [
+            tracker.update(frame.sightings, time_ns=int(frame.time_s * 1e9), footprint_m=frame.footprint_m)
+            for frame in fly(patrol, things(patrol))
+        ]
+
+    assert ids() == ids()
+
+
+def test_settings_and_columns_that_do_not_fit_are_refused():
+    with pytest.raises(SettingsError):
+        TrackerSettings(least_views=0)
+    with pytest.raises(GeometryError, match="appearance"):
+        Tracker().update([sighting(0, [0, 0])], time_ns=0, appearance=np.zeros((2, 3)))
