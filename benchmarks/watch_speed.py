@@ -3,8 +3,7 @@
 python benchmarks/watch_speed.py [--model default] [--frames 200] [--save none] [--output FILE]
 
 A simulated flight is watched at 640x640 and at 1280x720: every frame decoded, searched, placed, tracked and written.
-The median of three runs, and their spread; `latency` is from decoding to result, which for a file includes the wait of
-the frames read ahead.
+The median of three runs, and their spread.
 """
 
 import argparse

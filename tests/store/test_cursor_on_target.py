@@ -12,7 +12,7 @@ import pytest
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import Geodetic
-from sorvolo.store.cursor_on_target import CotPlace, CotSender, cot_event, cot_place
+from sorvolo.store.cursor_on_target import CotPlace, CotSender, cot_event, cot_place, cot_removal
 from sorvolo.survey.flight import Site
 from sorvolo.survey.objects import Sighting, Track
 
@@ -69,6 +69,14 @@ def test_names_from_elsewhere_stay_xml() -> None:
     contact, point = event.find("detail/contact"), event.find("point")
     assert contact is not None and contact.get("callsign") == '<"&dog> 7'
     assert point is not None and point.get("hae") == "9999999.0"
+
+
+def test_a_removal_names_what_goes() -> None:
+    event = fromstring(cot_removal("sorvolo.f.7", type_="a-u-G", now_ns=_NOW_NS))
+    link = event.find("detail/link")
+    assert event.get("type") == "t-x-d-d" and event.get("uid") != "sorvolo.f.7"
+    assert link is not None and (link.get("uid"), link.get("type")) == ("sorvolo.f.7", "a-u-G")
+    assert event.find("detail/__forcedelete") is not None
 
 
 def test_longitude_beyond_the_antimeridian_comes_back() -> None:

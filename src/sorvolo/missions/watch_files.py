@@ -100,6 +100,13 @@ class WatchFiles:
                 self._best[track.id] = track.best
         return self.crop_names.get(track.id)
 
+    def forget(self, track_ids: Iterable[int]) -> None:
+        """Remove the crops of tracks that turned out to be others."""
+        for track_id in track_ids:
+            name = self.crop_names.pop(track_id, None)
+            if name is not None:
+                (self.folder / name).unlink(missing_ok=True)
+
     def show(self, tracks: Iterable[Track]) -> None:
         """Bring `tracks.geojson` up to date, unless that was done within the last seconds."""
         if time.monotonic() - self._told_s >= _TRACKS_EVERY_S:

@@ -57,6 +57,11 @@ def cot_place(url: str) -> CotPlace:
     return CotPlace(transport, parts.hostname, port or _DEFAULT_PORTS[transport])
 
 
+def cot_type(label: str, types: Mapping[str, str] = COT_TYPES) -> str:
+    """The event type of a class; something unknown on the ground for one that is not named."""
+    return types.get(label, _OTHER_TYPE)
+
+
 def cot_event(
     track: Track, site: Site, *, uid: str, now_ns: int, stale_s: float, types: Mapping[str, str] = COT_TYPES
 ) -> bytes:
@@ -68,11 +73,10 @@ def cot_event(
     be geo-referenced.
     """
     longitude, latitude = (float(each[0]) for each in longitude_latitude(track.position_m[None], site))
-    now = utc_text(now_ns // 1_000_000 * 1_000_000)[:23] + "Z"
-    stale = utc_text((now_ns + round(stale_s * 1e9)) // 1_000_000 * 1_000_000)[:23] + "Z"
+    now = _milliseconds(now_ns)
     event = Element("event", {
-        "version": "2.0", "uid": uid, "type": types.get(track.label, _OTHER_TYPE), "how": "m-g",
-        "time": now, "start": now, "stale": stale,
+        "version": "2.0", "uid": uid, "type": cot_type(track.label, types), "how": "m-g",
+        "time": now, "start": now, "stale": _milliseconds(now_ns + round(stale_s * 1e9)),
     })
     error_m = float(np.sqrt(np.linalg.eigvalsh(track.covariance_m2)[-1]))
     SubElement(event, "point", {
@@ -91,6 +95,20 @@ def cot_event(
     SubElement(detail, "remarks").text = (
         f"{label}, score {track.score:.2f}, {track.views} views, last seen {seen}, found by Sorvolo"
     )
+    return bytes(tostring(event, encoding="utf-8"))
+
+
+def cot_removal(uid: str, *, type_: str, now_ns: int) -> bytes:
+    """The event that takes another one, of this `uid` and type, off everyone's map: it turned out to be none."""
+    now = _milliseconds(now_ns)
+    event = Element("event", {
+        "version": "2.0", "uid": f"{uid}.removed", "type": "t-x-d-d", "how": "m-g", "time": now, "start": now,
+        "stale": _milliseconds(now_ns + 60_000_000_000),
+    })
+    SubElement(event, "point", {"lat": "0", "lon": "0", "hae": _UNKNOWN_M, "ce": _UNKNOWN_M, "le": _UNKNOWN_M})
+    detail = SubElement(event, "detail")
+    SubElement(detail, "link", {"uid": uid, "relation": "p-p", "type": type_})
+    SubElement(detail, "__forcedelete")
     return bytes(tostring(event, encoding="utf-8"))
 
 
@@ -124,6 +142,10 @@ class CotSender:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+
+
+def _milliseconds(time_ns: int) -> str:
+    return utc_text(time_ns)[:23] + "Z"
 
 
 def _is_open(stream: socket.socket) -> bool:
