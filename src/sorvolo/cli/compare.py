@@ -59,6 +59,9 @@ def compare(
     update: Annotated[
         bool, typer.Option("--update/--no-update", help="Bring the map up to date where the ground changed or is new.")
     ] = True,
+    model: Annotated[
+        str, typer.Option(help="Tells what changed, before and after: a model's name, a file, or none.")
+    ] = "default",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Find what appeared, disappeared or moves since the map in the site folder was made, and update the map.
@@ -69,6 +72,7 @@ def compare(
     """
     settings = CompareSettings(
         method.value, views_per_second, votes, voters, offset, ground_elevation, updates_map=update, writes_masks=masks,
+        model=model,
     )
     results = compare_and_read_results(
         inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area, steps=steps
@@ -130,8 +134,10 @@ def _show_progress(updates: Any, console: Console) -> None:
 def _words_of(change: Change) -> str:
     colour = _COLOURS[change.kind]
     centre_m = change.outline_m.mean(axis=0)
+    named = " to ".join(escape(name) for name in (change.class_before, change.class_after) if name)
+    what = f"{named}, " if named else ""
     return (
-        f"[{colour}]{change.kind.value:>11}[/{colour}]  {change.length_m:.1f} m long, {centre_m[0]:+.1f} m east "
+        f"[{colour}]{change.kind.value:>11}[/{colour}]  {what}{change.length_m:.1f} m long, {centre_m[0]:+.1f} m east "
         f"{centre_m[1]:+.1f} m north of the site's origin, within {change.sigma_m:.2f} m"
     )
 
@@ -156,7 +162,7 @@ def _show_result(result: Mapping[str, Any], console: Console) -> None:
         each = feature["properties"]
         longitude, latitude = _middle(feature["geometry"]["coordinates"][0])
         table.add_row(
-            escape(each["id"]), each["kind"], f"{each['length_m']:.2f}", f"{latitude:.6f}, {longitude:.6f}",
+            escape(each["id"]), _kind_words(each), f"{each['length_m']:.2f}", f"{latitude:.6f}, {longitude:.6f}",
             f"{each['sigma_m']:.2f}", str(each["views"]), f"{each['score']:.2f}",
         )
     if table.row_count:
@@ -172,6 +178,12 @@ def _show_result(result: Mapping[str, Any], console: Console) -> None:
         console.print(f"  {count} x {escape(reason)}", highlight=False)
     for warning in result["warnings"]:
         console.print(f"[yellow]warning[/yellow]  {escape(warning)}")
+
+
+def _kind_words(properties: Mapping[str, Any]) -> str:
+    """The kind of change, and below it what it was and is: side by side they do not fit a terminal of 80 columns."""
+    named = " to ".join(escape(name) for name in (properties["class_before"], properties["class_after"]) if name)
+    return f"{properties['kind']}\n{named}" if named else str(properties["kind"])
 
 
 def _middle(ring: Sequence[Sequence[float]]) -> tuple[float, float]:

@@ -9,7 +9,9 @@ from sorvolo.capture.areas import read_area
 from sorvolo.capture.source import Source, open_sources
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.compare_run import CompareRun
+from sorvolo.missions.detecting import Detects
 from sorvolo.missions.flight_setup import known_flights, prepare
+from sorvolo.missions.map_objects import open_detector
 from sorvolo.missions.settings import CompareSettings
 from sorvolo.mosaic.selection import every
 from sorvolo.store.archive import Archive
@@ -21,13 +23,13 @@ from sorvolo.survey.flight import Frame, PosedFrame
 def compare_flights(
     inputs: Sequence[Path], site: Path, settings: CompareSettings = CompareSettings(), *,  # noqa: B008 (frozen)
     telemetry: Path | None = None, camera: Path | str | None = None, area: Path | None = None,
-    steps: Path | None = None,
+    steps: Path | None = None, detector: Detects | None = None,
 ) -> Generator[CompareUpdate]:
     """Compare one or more later flights with the map in the site folder, yielding an update for each frame compared.
 
-    `inputs`, `telemetry`, `camera` and `area` are those of `map_flights`. An update carries the changes that its
-    frame made sure of. `steps` is a folder for the intermediate pictures of method thesis (its Figure 3.14). The
-    flights' findings and the new version of the map are part of the site when a flight's last update was yielded.
+    `inputs`, `telemetry`, `camera`, `area` and `detector` are those of `map_flights`. An update carries the changes
+    that its frame made sure of. `steps` is a folder for the intermediate pictures of method thesis (its Figure 3.14).
+    The flights' findings and the new version of the map are part of the site when a flight's last update was yielded.
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being compared is left out, those before it are in.
     """
@@ -38,14 +40,17 @@ def compare_flights(
         if not archive.tiles():
             raise StoreError(f"{site} holds no map yet; make one of an earlier flight: sorvolo map INPUT --site {site}")
     sources = open_sources(inputs, telemetry, camera, known_flights(site))
+    looks = open_detector(settings.model) if detector is None else detector
     with Archive.open(site, write=True) as archive:
         for source in sources:
-            yield from _compare_one(source, archive, settings, wanted, steps, telemetry_named=telemetry is not None)
+            yield from _compare_one(
+                source, archive, settings, wanted, steps, looks, telemetry_named=telemetry is not None
+            )
 
 
 def _compare_one(
-    source: Source, archive: Archive, settings: CompareSettings, area: Area | None, steps: Path | None, *,
-    telemetry_named: bool,
+    source: Source, archive: Archive, settings: CompareSettings, area: Area | None, steps: Path | None,
+    detector: Detects | None, *, telemetry_named: bool,
 ) -> Generator[CompareUpdate]:
     started_s = time.monotonic()
     setup = prepare(source, settings.mapping, archive.site(), telemetry_named=telemetry_named, finds_itself=True)
@@ -54,7 +59,7 @@ def _compare_one(
     base, is_newest = _base_version(archive, source)
     if not is_newest:
         settings = replace(settings, updates_map=False)  # what later flights painted stays
-    with CompareRun(setup, archive, settings, base, steps) as run:
+    with CompareRun(setup, archive, settings, base, steps, detector) as run:
         read = 0
         for each in source.frames(every(step_s)):
             read = each.index + 1

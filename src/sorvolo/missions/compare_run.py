@@ -20,10 +20,13 @@ from sorvolo.change.updating import is_painted, patched
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.homography import apply_homography
+from sorvolo.missions.change_classes import ChangeClasses
 from sorvolo.missions.compare_views import ViewMaker, ViewOutcome, as_bgr
+from sorvolo.missions.detecting import Detects
 from sorvolo.missions.earlier_pictures import EarlierPictures
 from sorvolo.missions.flight_report import FlightLog, Stage, build_report
 from sorvolo.missions.flight_setup import FlightSetup
+from sorvolo.missions.map_objects import ObjectFinder, crops_of, search_summary, why_not_searched
 from sorvolo.missions.map_planar import PlanarRun
 from sorvolo.missions.settings import CompareSettings
 from sorvolo.mosaic.placing import rejected
@@ -33,10 +36,12 @@ from sorvolo.store.exports import picture
 from sorvolo.store.report_page import report_page
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Verdict, ViewStatus
 from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
+from sorvolo.survey.map_objects import ObjectSearch
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
 _NEW_GROUND = 0.05  # share of a frame beyond the map: with less it is not worth a place in it
 _EXTENSION_OVERLAP = 0.7
+_LOOK_OVERLAP = 0.75  # of frames that are searched for objects
 _DARK = 0.4  # times the map's brightness: less hides things
 _CELL_M = 1.0  # of the record of what was compared
 
@@ -45,7 +50,8 @@ class CompareRun:
     """A later flight on its way into a site. A context manager: leaving without `finish` leaves the site as it was."""
 
     def __init__(
-        self, setup: FlightSetup, archive: Archive, settings: CompareSettings, base_version: int, steps: Path | None
+        self, setup: FlightSetup, archive: Archive, settings: CompareSettings, base_version: int, steps: Path | None,
+        detector: Detects | None = None,
     ) -> None:
         self._setup, self._archive, self._settings, self._steps = setup, archive, settings, steps
         self._base_version = base_version
@@ -64,6 +70,14 @@ class CompareRun:
             KnownPlace(each.outline_m, each.kind) for each in archive.reviews()
             if each.verdict is Verdict.REJECTED and each.flight_id != source.name
         ]
+        self._classes: ChangeClasses | None = None
+        self._finder: ObjectFinder | None = None
+        self._looked_m: PointsM | None = None
+        if detector is not None:
+            before = {each.flight_id for each in archive.versions() if each.complete and each.id <= base_version}
+            known = archive.newest_objects(before - {source.name})
+            self._classes = ChangeClasses(detector, [each.thing for each in known])
+            self._finder = ObjectFinder(detector, source.camera.camera)
         self._log = FlightLog()
         self._extension: PlanarRun | None = None
         self._last_outline_m: PointsM | None = None
@@ -82,6 +96,8 @@ class CompareRun:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._finder is not None:
+            self._finder.close()
         self._writer.__exit__(kind, error, trace)
 
     @property
@@ -109,10 +125,14 @@ class CompareRun:
         if np.isfinite(outcome.residual_px):
             self._residuals_px.append(outcome.residual_px)
         self._placed[posed.frame.index] = self._views.placed(posed, outcome, self._map_sigma_m)
+        self._look(posed, outcome)
         announced: tuple[Change, ...] = ()
         if outcome.view is not None:
             with self._log.stage(Stage.EVIDENCE):
                 announced = tuple(self._told(self._evidence.add(outcome.view)))
+            if announced and self._classes is not None:
+                with self._log.stage(Stage.DETECT):
+                    announced = tuple(self._classes.at_once(each) for each in announced)
             self._note_ground(outcome.view)
             with self._log.stage(Stage.STORE):
                 self._write_masks(outcome.view)
@@ -144,17 +164,30 @@ class CompareRun:
             if self._settings.updates_map:
                 self._paint(changes)
         placed = [self._placed[index] for index in sorted(self._placed)]
+        search: ObjectSearch | None = None
+        if self._finder is not None and self._classes is not None:
+            with self._log.stage(Stage.DETECT):
+                search = self._finder.conclude(placed, self._setup.source.name, has_metres=True)
+                changes = [
+                    self._classes.finally_named(each, search.objects, self._finder.sightings) for each in changes
+                ]
         with self._log.stage(Stage.REPORT):
             shown = picture(self._writer.tiles, 800).rgba  # a day without change should cost little
         report = build_report(
             self._setup, self._settings.mapping, self._log, placed, self._archive.site(), None, None,
-            self._setup.source.camera.camera, self._writer.tiles, [*self._setup.notices, *notices],
+            self._setup.source.camera.camera, self._writer.tiles,
+            [*self._setup.notices, *notices, *self._detector_notices],
             time.monotonic() - started_s, spread=float("nan"),
         )
         report["warnings"] = [*report["warnings"], *self._warnings()]
         comparison = self._summary(changes, suppressed=len(found) - len(changes))
-        report |= {"method": f"compare-{self._settings.method}", "comparison": comparison}
-        self._writer.commit(placed, images, report, report_page(report, shown), changes=changes)
+        seconds = 0.0 if self._finder is None else self._finder.seconds
+        report |= {
+            "method": f"compare-{self._settings.method}", "comparison": comparison,
+            "objects": search_summary(search, seconds, why_not_searched(self._settings.model)),
+        }
+        page = report_page(report, shown, crops_of(search))
+        self._writer.commit(placed, images, report, page, changes=changes, search=search)
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
@@ -185,6 +218,22 @@ class CompareRun:
             self._extension = PlanarRun(self._setup, self._archive, self._settings.mapping, writer=self._writer)
         with self._log.stage(Stage.REGISTER):
             self._extension.add(posed)
+
+    def _look(self, posed: PosedFrame, outcome: ViewOutcome) -> None:
+        """Have frames that fit the map searched for objects, each stretch of ground in a few of them."""
+        if self._finder is None or outcome.site_from_image is None:
+            return
+        outline_m = self._views.outline_m(outcome.site_from_image)
+        last_m = self._looked_m if self._setup.source.kind == "video" else None
+        if not np.isfinite(outline_m).all() or (last_m is not None and _overlap(last_m, outline_m) > _LOOK_OVERLAP):
+            return
+        self._looked_m = outline_m
+        with self._log.stage(Stage.DETECT):
+            self._finder.look(posed)
+
+    @property
+    def _detector_notices(self) -> tuple[Notice, ...]:
+        return () if self._finder is None else self._finder.notices
 
     def _outline_m(self, posed: PosedFrame, outcome: ViewOutcome) -> PointsM | None:
         if outcome.site_from_image is not None:

@@ -22,7 +22,7 @@ from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.flight import Frame, Notice, PosedFrame
 from sorvolo.survey.map_objects import MapObject, ObjectSearch
 from sorvolo.survey.mosaic import PlacedFrame, Status
-from sorvolo.survey.objects import Detections
+from sorvolo.survey.objects import Detections, Sighting
 from sorvolo.tracking.laying import LaidSighting, lay_on_ground
 from sorvolo.tracking.standing import Standing, fuse
 
@@ -67,6 +67,7 @@ class ObjectFinder:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="detector")
         self._waiting: deque[Future[_Seen]] = deque()
         self._seen: dict[int, _Seen] = {}
+        self._sightings: tuple[Sighting, ...] = ()
 
     def close(self) -> None:
         """End the thread; frames that still wait are not looked at."""
@@ -76,6 +77,11 @@ class ObjectFinder:
     def notices(self) -> tuple[Notice, ...]:
         """What the detector would have a user know of the frames."""
         return self._detector.notices
+
+    @property
+    def sightings(self) -> tuple[Sighting, ...]:
+        """All that was seen, by the frames' final places, once that is concluded."""
+        return self._sightings
 
     @property
     def seconds(self) -> float:
@@ -102,6 +108,7 @@ class ObjectFinder:
                 if each is not None:
                     laid.append(each)
                     crops.append(crop)
+        self._sightings = tuple(each.sighting for each in laid)
         fused = fuse(laid, frames)
         flight_sigma_m = _gps_sigma_m(frames)
         sigmas_m = {each.index: each.sigma_m if math.isfinite(each.sigma_m) else flight_sigma_m for each in frames}

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
@@ -217,13 +217,13 @@ class Archive:
         with self._catalogue.reading() as connection:
             return object_records.load_objects(connection, flight_id)
 
-    def newest_objects(self, without: str = "") -> list[StoredObject]:
-        """What stands on the site by the newest look at each piece of ground; as if one flight had not been."""
+    def newest_objects(self, flights: Collection[str] | None = None) -> list[StoredObject]:
+        """What stands on the site by the newest look at each piece of ground; as far as these flights know."""
         with self._catalogue.reading() as connection:
             found, searches = object_records.load_objects(connection), object_records.load_searches(connection)
         return object_records.newest_objects(
-            [each for each in found if each.flight_id != without],
-            [each for each in searches if each.flight_id != without],
+            [each for each in found if flights is None or each.flight_id in flights],
+            [each for each in searches if flights is None or each.flight_id in flights],
         )
 
     def review(self, change_ids: str | Iterable[str], verdict: Verdict, note: str = "") -> None:

@@ -250,9 +250,9 @@ def _pair(
         ("place known to", _length(change.sigma_m, site)), ("place", _place(change, site)),
         ("first seen", time_words(change.first_seen_ns)), ("last seen", time_words(change.last_seen_ns)),
     ]
-    if change.class_before or change.class_after:
-        was, now = escaped(change.class_before or "nothing known"), escaped(change.class_after or "nothing known")
-        facts.append(("was, is now", f"{was}, {now}"))
+    for name, class_name in (("was", change.class_before), ("is now", change.class_after)):
+        if class_name:
+            facts.append((name, escaped(class_name)))
     if change.kind is ChangeKind.MOVING:
         facts.append(("moves", _velocity(change.velocity_m_s, site)))
     if change.note:
