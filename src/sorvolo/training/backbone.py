@@ -91,6 +91,10 @@ class EfficientNetLite0(nn.Module):
         self._taps = (2, 4, 10, 15) if deep else (2, 4, 10)
         self.channels = (24, 40, 112, 320) if deep else (24, 40, 112)
         self.strides = (4, 8, 16, 32) if deep else (4, 8, 16)
+        for layer in self.modules():
+            if isinstance(layer, nn.Conv2d):  # without norms a net from nothing needs its signals kept at one size
+                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+                nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
         if not thaw_all:
             for module in (self._conv_stem, *self._blocks[:5]):
                 for weight in module.parameters():

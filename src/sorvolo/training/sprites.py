@@ -29,6 +29,7 @@ def paste_small_objects(image: ImageRGB, taken: Floats, rng: np.random.Generator
     for _ in range(int(rng.integers(1, _MOST + 1))):
         size = typical * rng.uniform(0.6, 1.5)
         ratio = rng.uniform(0.45, 1.0)
+        size = min(size, 0.3 * min(width, height))
         centre = rng.uniform(size, np.array([width, height]) - size)
         near = np.array([*(centre - size), *(centre + size)])
         others = np.vstack([taken.reshape(-1, 4), *placed]) if placed else taken.reshape(-1, 4)
