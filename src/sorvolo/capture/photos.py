@@ -63,7 +63,7 @@ class PhotoSource:
     """A flight's photos as frames; fulfils `capture.source.Source`."""
 
     kind = "photos"
-    frame_rate_hz = float("nan")
+    frame_rate_hz = ground_elevation_m = float("nan")
 
     def __init__(
         self, name: str, fingerprint: str, album: Album, camera: CameraModel, telemetry: Telemetry,

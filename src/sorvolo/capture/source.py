@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,12 @@ from typing import Protocol
 import numpy as np
 
 from sorvolo.capture.calibration import camera_from_option, guess_camera
+from sorvolo.capture.live.addresses import FollowedPath, StreamAddress, is_live_address, live_address
+from sorvolo.capture.live.growing_folder import GrowingFolder, open_growing_folder
+from sorvolo.capture.live.klv_telemetry import FileMetadata, camera_of, read_klv_file
+from sorvolo.capture.live.links import LINK_FORMS, is_link
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.capture.live.stream import LiveStream, open_stream
 from sorvolo.capture.photo_metadata import PhotoMetadata
 from sorvolo.capture.photos import PHOTO_SUFFIXES, PhotoSource, read_album
 from sorvolo.capture.telemetry import find_telemetry_beside, read_telemetry
@@ -21,6 +28,9 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry
 
 _HEAD_BYTES = 262_144
+
+LiveSource = LiveStream | GrowingFolder
+"""The sources that grow while they are read: their telemetry does, and frames come when they come."""
 
 
 class Source(Protocol):
@@ -66,6 +76,10 @@ class Source(Protocol):
     def start_origin(self) -> str:
         """Where `start_ns` comes from, in words."""
 
+    @property
+    def ground_elevation_m(self) -> float:
+        """The ground's height in the telemetry's own height reference, where the input states it; else NaN."""
+
     def notices(self) -> tuple[Notice, ...]:
         """What was found so far and survived; complete when `frames` is exhausted. Telemetry has its own."""
 
@@ -74,34 +88,43 @@ class Source(Protocol):
 
 
 def open_sources(
-    inputs: Sequence[Path], telemetry: Path | None = None, camera: Path | str | None = None,
-    known: Mapping[str, str] = MappingProxyType({}),
+    inputs: Sequence[Path | str], telemetry: Path | str | None = None, camera: Path | str | None = None,
+    known: Mapping[str, str] = MappingProxyType({}), *, live: LiveSettings = LiveSettings(),  # noqa: B008 (frozen)
+    until: threading.Event | None = None,
 ) -> list[Source]:
-    """Each video, each folder of photos, and all photos given one by one together, as a flight.
+    """Each video, each folder of photos, all photos given one by one together, and each live source, as a flight.
 
-    `telemetry` belongs to the only flight; without it, a video's is looked for beside it and photos' is in
-    them. `camera` is a calibration file or what else `--camera` takes (capture.calibration). `known` are the site's
-    flights, name to fingerprint: another flight of the same name (cards are numbered anew) gets a name of its own.
+    Live sources are addresses (rtsp://, rtmp://, udp://, tcp:// ...), `webcam:0`, and `follow:PATH` for a video or a
+    folder of photos that is being written; they are read from now on, as `live` says, until they end or `until` is
+    set. `telemetry` belongs to the only flight; without it, a video's is looked for inside and beside it, and photos'
+    is in them; beside a live source it is a link to a receiver (serial:, tcp://, udp://, follow:LOG). `camera` is a
+    calibration file or what else `--camera` takes (capture.calibration). `known` are the site's flights, name to
+    fingerprint: another flight of the same name (cards are numbered anew) gets a name of its own.
     Raises InputError for what cannot be read, naming the file and what to do.
     """
     if not inputs:
-        raise InputError("no input; give a video file, a folder of photos, or photos")
-    videos, albums = _sort_inputs(inputs)
+        raise InputError("no input; give a video file, a folder of photos, photos, or a live stream's address")
+    addresses = [live_address(text) for text in map(str, inputs) if is_live_address(text)]
+    paths = [Path(each) for each in inputs if not is_live_address(str(each))]
+    videos, albums = _sort_inputs(paths)
     names = _distinct_names([*(path.resolve() for path in videos), *(album.place for album in albums)])
-    if telemetry is not None and len(names) > 1:
+    if telemetry is not None and len(names) + len(addresses) > 1:
         raise InputError(
-            f"one telemetry file for {len(names)} flights; map the flights one by one, or put each telemetry "
-            "file beside its video under the same name"
+            f"one telemetry file for {len(names) + len(addresses)} flights; map the flights one by one, or put each "
+            "telemetry file beside its video under the same name"
         )
-    sources: list[VideoSource | PhotoSource] = [
-        _open_video(path, name, telemetry, camera) for path, name in zip(videos, names)
+    log = _telemetry_file(telemetry, is_live=bool(addresses))
+    sources: list[VideoSource | PhotoSource | LiveSource] = [
+        _open_video(path, name, log, camera) for path, name in zip(videos, names)
     ]
     sources += [
-        _open_photos(album, name, telemetry, camera) for album, name in zip(albums, names[len(videos):])
+        _open_photos(album, name, log, camera) for album, name in zip(albums, names[len(videos):])
     ]
+    for address in addresses:
+        sources.append(_open_live(address, telemetry, camera, live, until or threading.Event()))
     taken = dict(known)
     for each in sources:
-        each.name = _free_name(each.name, each.fingerprint, taken)
+        each.name = _free_name(safe_name(each.name), each.fingerprint, taken)
         taken[each.name] = each.fingerprint
     return list(sources)
 
@@ -175,13 +198,51 @@ def _free_name(name: str, fingerprint: str, taken: Mapping[str, str]) -> str:
 
 def _open_video(path: Path, name: str, telemetry: Path | None, camera: Path | str | None) -> VideoSource:
     info = read_video_info(path)
-    found, notices = _video_telemetry(path, telemetry)
+    inside = read_klv_file(path) if info.container == "mpegts" else None
+    found, notices = _video_telemetry(path, telemetry, inside)
+    told = None if inside is None or inside.lens is None else camera_of(inside.lens, info.width_px, info.height_px)
     if camera is None:
-        model = _video_camera(info)
+        model = told or _video_camera(info)
     else:
         model = camera_from_option(str(camera), info.width_px, info.height_px)
-    fingerprint = _fingerprint(path)
-    return VideoSource(name, fingerprint, info, model, found, notices)
+    source = VideoSource(name, _fingerprint(path), info, model, found, notices)
+    if inside is not None and found is inside.telemetry:
+        source.ground_elevation_m = inside.ground_elevation_m
+    return source
+
+
+def _telemetry_file(telemetry: Path | str | None, *, is_live: bool) -> Path | None:
+    """The log that was named; None where none was, or a link beside a live source."""
+    if telemetry is None:
+        return None
+    if is_link(str(telemetry)) != is_live:
+        raise InputError(
+            f"--telemetry {telemetry}: a live source takes its telemetry from a receiver that is on: give {LINK_FORMS}"
+            if is_live else f"--telemetry {telemetry}: a recorded flight's telemetry is a file"
+        )
+    return None if is_live else Path(telemetry)
+
+
+def _open_live(
+    address: StreamAddress | FollowedPath, telemetry: Path | str | None, camera: Path | str | None,
+    settings: LiveSettings, until: threading.Event,
+) -> LiveSource:
+    def chosen(width_px: int, height_px: int) -> CameraModel | None:
+        return None if camera is None else camera_from_option(str(camera), width_px, height_px)
+
+    link = None if telemetry is None else str(telemetry)
+    if isinstance(address, StreamAddress):
+        return open_stream(address, link, chosen, _unknown_camera, settings, until)
+    if address.path.is_dir():
+        if link is not None:
+            raise InputError(f"--telemetry {link}: photos carry their own fixes; leave it out")
+        return open_growing_folder(address.path, chosen, _guess, settings, until)
+    followed = StreamAddress(str(address.path), address.path.name, None, {})
+    return open_stream(followed, link, chosen, _unknown_camera, settings, until, address.path)
+
+
+def _unknown_camera(width_px: int, height_px: int) -> CameraModel:
+    return _guess(width_px, height_px, PhotoMetadata(0, 0))
 
 
 def _open_photos(
@@ -199,11 +260,13 @@ def _open_photos(
 
 
 def _video_telemetry(
-    video: Path, telemetry: Path | None
+    video: Path, telemetry: Path | None, inside: FileMetadata | None
 ) -> tuple[Telemetry, list[Notice]]:
     """The telemetry and what to tell; only a file that was asked for must be readable."""
     if telemetry is not None:
         return read_telemetry(telemetry), []
+    if inside is not None and inside.telemetry.has_fixes:
+        return inside.telemetry, []
     beside = find_telemetry_beside(video)
     if beside is None:
         return no_telemetry(), []

@@ -61,6 +61,7 @@ class VideoSource:
     """A video's frames; fulfils `capture.source.Source`."""
 
     kind = "video"
+    ground_elevation_m = float("nan")
 
     def __init__(
         self, name: str, fingerprint: str, info: VideoInfo, camera: CameraModel, telemetry: Telemetry,

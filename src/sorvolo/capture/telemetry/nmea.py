@@ -30,8 +30,8 @@ _LONGEST_TAIL = 200  # a sentence has at most 82 characters
 
 
 @dataclass
-class _Epoch:
-    """What the sentences of one moment say."""
+class Epoch:
+    """What the sentences of one moment say, as telemetry columns; no `values` where there was no fix."""
 
     time_ns: int
     values: dict[str, float] = field(default_factory=dict)
@@ -53,7 +53,7 @@ def read(data: bytes, name: str) -> Telemetry:
     sentence is usable.
     """
     counts: Counter[str] = Counter()
-    messages = _messages(data, counts)
+    messages = messages_in(data, counts)
     if not messages:
         raise InputError(
             f"{name}: no intact GGA or RMC sentence ({counts['bad_checksum']} with a bad checksum, "
@@ -61,7 +61,7 @@ def read(data: bytes, name: str) -> Telemetry:
             f"{counts['unreadable_line'] + counts['truncated']} unreadable); "
             "record the receiver's output again, checksums included"
         )
-    epochs, dated = _epochs(messages)
+    epochs, dated = epochs_of(messages)
     names = sorted({key for epoch in epochs for key in epoch.values})
     return clean(
         "nmea", name,
@@ -81,7 +81,8 @@ def read(data: bytes, name: str) -> Telemetry:
     )
 
 
-def _messages(data: bytes, counts: Counter[str]) -> list[Any]:
+def messages_in(data: bytes, counts: Counter[str]) -> list[Any]:
+    """The intact GGA and RMC sentences in the bytes that tell a time; what is wrong with others is counted."""
     messages = []
     tail = data[data.rfind(b"$"):]
     is_cut = tail.startswith(b"$") and len(tail) < _LONGEST_TAIL and not _FINISHED.search(tail)
@@ -105,18 +106,18 @@ def _messages(data: bytes, counts: Counter[str]) -> list[Any]:
     return messages
 
 
-def _epochs(messages: list[Any]) -> tuple[list[_Epoch], bool]:
+def epochs_of(messages: list[Any]) -> tuple[list[Epoch], bool]:
     """The sentences by moment, in the file's order, and whether any of them tells the date."""
     dated = [message for message in messages if isinstance(getattr(message, "date", None), date)]
     # a receiver without a fix often invents its date
     trusted = [message for message in dated if message.status == "A"] or dated
     days = {id(message) for message in trusted}
     now_ns = _stamp(trusted[0]) if trusted else _time_of_day_ns(messages[0])
-    epochs: list[_Epoch] = []
+    epochs: list[Epoch] = []
     for message in messages:
-        now_ns = _stamp(message) if id(message) in days else _nearest(_time_of_day_ns(message), now_ns)
+        now_ns = _stamp(message) if id(message) in days else nearest_ns(_time_of_day_ns(message), now_ns)
         if not epochs or epochs[-1].time_ns != now_ns or message.msgID in epochs[-1].kinds:
-            epochs.append(_Epoch(now_ns))
+            epochs.append(Epoch(now_ns))
         epochs[-1].kinds.add(message.msgID)
         _tell(epochs[-1], message)
     for epoch in epochs:
@@ -125,7 +126,7 @@ def _epochs(messages: list[Any]) -> tuple[list[_Epoch], bool]:
     return epochs, bool(trusted)
 
 
-def _tell(epoch: _Epoch, message: Any) -> None:
+def _tell(epoch: Epoch, message: Any) -> None:
     said = {}
     if message.msgID == "GGA":
         epoch.has_fix &= message.quality != 0
@@ -164,7 +165,7 @@ def _stamp(message: Any) -> int:
     return int(days * DAY_NS + _time_of_day_ns(message))
 
 
-def _nearest(time_of_day_ns: int, reference_ns: int) -> int:
+def nearest_ns(time_of_day_ns: int, reference_ns: int) -> int:
     """The moment with this time of day that lies nearest to the reference: right across midnight."""
     ahead_ns = (time_of_day_ns - reference_ns + DAY_NS // 2) % DAY_NS - DAY_NS // 2
     return reference_ns + ahead_ns

@@ -1,0 +1,1 @@
+"""Flights that are still flying: streams, growing files and folders, webcams, and telemetry by wire or radio."""

@@ -1,0 +1,128 @@
+"""What a user writes for a live source, and how FFmpeg is told to open it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from urllib.parse import parse_qsl, urlsplit, urlunsplit
+
+import av
+
+from sorvolo.errors import InputError
+
+STREAM_SCHEMES = ("rtsp", "rtsps", "rtmp", "rtmps", "udp", "rtp", "tcp", "srt", "http", "https")
+"""Addresses of streams, as `scheme://...`."""
+
+_WAITING = frozenset({"udp", "rtp"})  # a sender may begin at any time; nothing has to be dialled
+# live: nothing is held back for a smoother picture, and a damaged packet does not end the stream
+_COMMON = {
+    "fflags": "nobuffer+discardcorrupt", "flags": "low_delay", "analyzeduration": "1000000", "probesize": "5000000",
+}
+_BY_SCHEME: Mapping[str, Mapping[str, str]] = {
+    "rtsp": {"rtsp_transport": "tcp"},
+    "rtsps": {"rtsp_transport": "tcp"},
+    "rtmp": {"rtmp_live": "live"},
+    "http": {"protocol_whitelist": "http,https,tls,tcp"},  # whatever a playlist may name
+    "https": {"protocol_whitelist": "http,https,tls,tcp"},
+    "udp": {"fifo_size": "57344", "overrun_nonfatal": "1"},  # 188-byte packets: 10 MB
+}
+
+
+@dataclass(frozen=True)
+class StreamAddress:
+    """A stream that can be opened. `shown` has no password in it; `waits`: it is listened to rather than called."""
+
+    url: str
+    shown: str
+    container: str | None
+    options: Mapping[str, str]
+    waits: bool = False
+
+
+@dataclass(frozen=True)
+class FollowedPath:
+    """A file or folder that is still being written (`follow:PATH`)."""
+
+    path: Path
+
+
+def is_live_address(text: str) -> bool:
+    """Whether an input is a live source rather than a file or folder."""
+    return _scheme(text) in (*STREAM_SCHEMES, "webcam", "follow") or text.startswith("/dev/video")
+
+
+def live_address(text: str) -> StreamAddress | FollowedPath:
+    """What `rtsp://...`, `udp://:5000`, `webcam:0`, `/dev/video0`, `follow:PATH` and the like name.
+
+    `webcam:0?size=1280x720&rate=30` asks a webcam for a size and rate; what stands behind the `?` of a stream's
+    address is FFmpeg's. Raises InputError for an address that cannot be, or a protocol that this FFmpeg lacks.
+    """
+    scheme, _, rest = text.partition(":")
+    if scheme == "follow":
+        return FollowedPath(_existing(rest, "follow:PATH names a file or folder that is being written"))
+    if text.startswith("/dev/video"):
+        return _webcam(text, "")
+    if scheme == "webcam":
+        number, _, query = rest.partition("?")
+        return _webcam(number if number.startswith("/") else f"/dev/video{number or 0}", query)
+    return _stream(text)
+
+
+def shown_address(url: str) -> str:
+    """The address without the user's name and password."""
+    parts = urlsplit(url)
+    return urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
+
+
+def _stream(text: str) -> StreamAddress:
+    try:
+        parts = urlsplit(text)
+        port = parts.port
+    except ValueError as error:
+        raise InputError(f"{text}: no address ({error}); give for instance rtsp://192.168.1.10:554/live") from error
+    scheme = parts.scheme.lower()
+    if scheme in ("udp", "rtp", "tcp") and port is None:
+        raise InputError(f"{shown_address(text)} has no port; give for instance {scheme}://:5000")
+    if not parts.hostname and scheme not in ("udp", "rtp"):
+        example = f"{scheme}://192.168.1.10:{port or 554}/live"
+        raise InputError(f"{shown_address(text)} has no host; give for instance {example}")
+    if scheme == "srt" and not _has_protocol("srt"):
+        raise InputError(
+            "this PyAV was built without SRT; receive it with another program and pass it on, for instance: "
+            "srt-live-transmit srt://HOST:PORT udp://127.0.0.1:5000, then give udp://:5000"
+        )
+    # without a host FFmpeg listens nowhere: :5000 means every address of this machine
+    url = text if parts.hostname else text.replace("://", "://0.0.0.0", 1).replace("0.0.0.0@", "0.0.0.0", 1)
+    listens = scheme in _WAITING or "listen" in dict(parse_qsl(parts.query, keep_blank_values=True))
+    container = "mpegts" if scheme == "udp" else None
+    return StreamAddress(url, shown_address(text), container, {**_COMMON, **_BY_SCHEME.get(scheme, {})}, listens)
+
+
+def _webcam(device: str, query: str) -> StreamAddress:
+    wanted = dict(parse_qsl(query))
+    if unknown := set(wanted) - {"size", "rate"}:
+        raise InputError(f"webcam option {sorted(unknown)[0]}: give size=1280x720 or rate=30")
+    _existing(device, "no such camera; those there are /dev/video*, and Linux is needed")
+    options = {"video_size": wanted.get("size", ""), "framerate": wanted.get("rate", "")}
+    return StreamAddress(device, device, "v4l2", MappingProxyType({k: v for k, v in options.items() if v}))
+
+
+def _existing(text: str, words: str) -> Path:
+    path = Path(text)
+    if not text or not path.exists():
+        raise InputError(f"no such file or folder: {text or '(nothing)'}; {words}")
+    return path
+
+
+def _has_protocol(name: str) -> bool:
+    try:
+        av.open(f"{name}://127.0.0.1:1?mode=listener", timeout=0.01)
+    except av.error.ProtocolNotFoundError:
+        return False
+    except (av.FFmpegError, OSError):
+        pass
+    return True
+
+
+def _scheme(text: str) -> str:
+    return text.partition(":")[0].lower() if ":" in text else ""

@@ -1,0 +1,39 @@
+"""A video file that is still being written, read as it grows."""
+
+import threading
+import time
+from pathlib import Path
+
+from sorvolo.capture.live.reconnect import LiveSettings, Outages
+
+_POLL_S = 0.1
+
+
+class GrowingFile:
+    """What PyAV reads from: it waits for more at the file's end, until nothing was added for `give_up_s`.
+
+    There is no seeking, so the container must be one that is written front to back: MPEG-TS, fragmented MP4, MKV.
+    """
+
+    def __init__(self, path: Path, settings: LiveSettings, outages: Outages, stop: threading.Event) -> None:
+        self._file = path.open("rb")
+        self._settings, self._outages, self._stop = settings, outages, stop
+
+    def read(self, size: int) -> bytes:
+        """At most so many bytes; none when the file has ended."""
+        began_s = time.monotonic()
+        while not self._stop.is_set():
+            if data := self._file.read(size):
+                self._outages.back()
+                return data
+            quiet_s = time.monotonic() - began_s
+            if quiet_s > self._settings.give_up_s:
+                break
+            if quiet_s > self._settings.silent_s:
+                self._outages.lost(began_s, f"nothing was added for {quiet_s:.1f} s")
+            self._stop.wait(_POLL_S)
+        return b""
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._file.close()

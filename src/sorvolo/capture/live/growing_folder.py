@@ -1,0 +1,196 @@
+"""A folder into which photos come while the drone flies."""
+
+import hashlib
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from math import nan
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.capture.live.telemetry_log import TelemetryLog
+from sorvolo.capture.photo_metadata import PhotoMetadata, read_photo_metadata
+from sorvolo.capture.photos import PHOTO_SUFFIXES, read_picture
+from sorvolo.capture.telemetry.quality import notice
+from sorvolo.errors import InputError
+from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
+
+_POLL_S = 0.25
+_SAME_ASPECT = 0.01
+
+
+class GrowingFolder:
+    """A flight's photos as they are copied in; fulfils `capture.source.Source`. Made by `open_growing_folder`.
+
+    A photo is taken once its size has stood still between two looks, in the order of names among those that came
+    together; none is skipped. The flight has ended when nothing came for `give_up_s`, or when `until` is set.
+    """
+
+    kind = "photos"
+    is_live = True
+    frame_rate_hz = ground_elevation_m = nan
+
+    def __init__(self, folder: Path, settings: LiveSettings, until: threading.Event) -> None:
+        self._folder, self._settings, self._until = folder, settings, until
+        self._closing = threading.Event()
+        self._sizes: dict[Path, int] = {}
+        self._seen: set[Path] = set()
+        self._ready: deque[Path] = deque()
+        self._log = TelemetryLog("exif", folder.name)
+        self._heard_s = time.monotonic()
+        self._count = self._corrupt = self._untimed = 0
+        self._last_ns = -1
+        self.size_px = (0, 0)
+        self.name, self.fingerprint = folder.name, ""
+        self.inputs: tuple[str, ...] = (str(folder),)
+        self.start_ns, self.start_origin = 0, "the first photo's EXIF, else when it came"
+        self.camera: CameraModel = None  # type: ignore[assignment]  # set by `open_growing_folder`
+
+    @property
+    def frame_count(self) -> int:
+        """How many photos came so far."""
+        return self._count
+
+    @property
+    def telemetry(self) -> Telemetry:
+        """What the photos so far say of where they were taken."""
+        return self._log.telemetry()
+
+    @property
+    def telemetry_version(self) -> int:
+        """Grows with every sample."""
+        return self._log.version
+
+    @property
+    def silent_s(self) -> float:
+        """How long ago the last photo came."""
+        return time.monotonic() - self._heard_s
+
+    @property
+    def skipped(self) -> int:
+        """No photo is skipped."""
+        return 0
+
+    def wait_for_first_fixes(self) -> None:
+        """The first photo, which was waited for, has its own."""
+
+    def wait_for_telemetry(self, time_ns: int) -> None:
+        """Each photo carries its own fix."""
+
+    def notices(self) -> tuple[Notice, ...]:
+        """What was found so far and survived."""
+        return (
+            *notice("corrupt_photo", self._corrupt, "damaged photos that could not be decoded: {}"),
+            *notice("photo_without_time", self._untimed, "photos without a time, timed by when they came: {}"),
+        )
+
+    def frames(self, wanted: Callable[[int, int], bool]) -> Iterator[Frame | LostFrame]:
+        """The wanted photos as they come, numbered from 0; see `Source.frames`."""
+        for _, each in self.arrivals(wanted):
+            yield each
+
+    def arrivals(self, wanted: Callable[[int, int], bool]) -> Iterator[tuple[float, Frame | LostFrame]]:
+        """The same as `frames`, each with when it was whole (monotonic clock)."""
+        self._heard_s = time.monotonic()
+        while not self._is_ended:
+            if not self._ready:
+                self._look()
+            if self._ready:
+                self._heard_s = time.monotonic()
+                if (taken := self._take(self._ready.popleft(), wanted)) is not None:
+                    yield self._heard_s, taken
+                continue
+            if self.silent_s > self._settings.give_up_s:
+                return
+            self._closing.wait(_POLL_S)
+
+    def close(self) -> None:
+        """End the flight."""
+        self._closing.set()
+
+    def first(self) -> tuple[Path, PhotoMetadata]:
+        """Wait for the first photo that can be read; it is the first of `frames` as well.
+
+        Raises InputError when none comes in `first_s`.
+        """
+        end_s = time.monotonic() + self._settings.first_s
+        while time.monotonic() < end_s and not self._is_ended:
+            self._look()
+            for path in self._ready:
+                try:
+                    metadata = read_photo_metadata(path)
+                except InputError:
+                    continue
+                self.start_ns = self._time_ns(metadata)
+                self.size_px = metadata.shown_size_px
+                return path, metadata
+            self._closing.wait(_POLL_S)
+        raise InputError(
+            f"{self._folder}: no photo came within {self._settings.first_s:.0f} s; is it the folder that the photos "
+            "are copied into?"
+        )
+
+    @property
+    def _is_ended(self) -> bool:
+        return self._until.is_set() or self._closing.is_set()
+
+    def _look(self) -> None:
+        """Note the photos that are whole by now."""
+        for path in sorted(self._folder.iterdir()):
+            if path.suffix.lower() not in PHOTO_SUFFIXES or path.name[0] == "." or path in self._seen:
+                continue
+            size = path.stat().st_size
+            if size and self._sizes.get(path) == size:
+                self._seen.add(path)
+                self._ready.append(path)
+            self._sizes[path] = size
+
+    def _take(self, path: Path, wanted: Callable[[int, int], bool]) -> Frame | LostFrame | None:
+        index, self._count = self._count, self._count + 1
+        try:
+            metadata = read_photo_metadata(path)
+        except InputError as error:
+            self._corrupt += 1
+            self._last_ns += 1
+            return LostFrame(index, path.name, self._last_ns, f"corrupt: {error}")
+        self._untimed += not (metadata.utc_ns or metadata.local_ns)
+        time_ns = self._last_ns = max(self._time_ns(metadata) if index else self.start_ns, self._last_ns + 1)
+        if metadata.columns:
+            self._log.add(time_ns, metadata.columns)
+        if not wanted(index, time_ns):
+            return None
+        try:
+            image = read_picture(path)
+        except (InputError, OSError) as error:
+            self._corrupt += 1
+            return LostFrame(index, path.name, time_ns, f"corrupt: {error}")
+        width_px, height_px = self.size_px
+        if image.shape[1::-1] != (width_px, height_px):
+            if abs(image.shape[1] * height_px / (image.shape[0] * width_px) - 1) > _SAME_ASPECT:
+                reason = f"size {image.shape[1]}x{image.shape[0]} differs from the flight's {width_px}x{height_px}"
+                return LostFrame(index, path.name, time_ns, reason)
+            image = np.asarray(cv2.resize(image, self.size_px, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        return Frame(index, path.name, time_ns, image)
+
+    def _time_ns(self, metadata: PhotoMetadata) -> int:
+        return metadata.utc_ns or metadata.local_ns or time.time_ns()
+
+
+def open_growing_folder(
+    folder: Path, camera: Callable[[int, int], CameraModel | None],
+    guess: Callable[[int, int, PhotoMetadata], CameraModel], settings: LiveSettings, until: threading.Event,
+) -> GrowingFolder:
+    """The flight whose photos come into the folder; those that are there already are its first.
+
+    `camera(width, height)` is the camera that was asked for, None where none was: then `guess` makes one of the first
+    photo's words. Raises InputError when no photo comes.
+    """
+    source = GrowingFolder(folder.resolve(), settings, until)
+    path, metadata = source.first()
+    source.fingerprint = hashlib.sha256(path.read_bytes()).hexdigest()
+    source.camera = camera(*source.size_px) or guess(*source.size_px, metadata)
+    return source

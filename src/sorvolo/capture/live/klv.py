@@ -1,0 +1,224 @@
+"""MISB ST 0601: the UAS Datalink Local Set inside MPEG-TS, from bytes to numbers and back."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from math import isfinite, nan
+
+from sorvolo.errors import InputError
+
+UNIVERSAL_KEY = bytes.fromhex("060E2B34020B01010E01030101000000")
+"""The 16 bytes that every UAS Datalink Local Set begins with (ST 0601, section 6.1)."""
+
+TIME_TAG, CHECKSUM_TAG, VERSION_TAG = 2, 1, 65
+
+_LONGEST_SET_BYTES = 65_536
+_LONGEST_KEY_BYTES = 4
+
+
+@dataclass(frozen=True)
+class Item:
+    """How one tag's number is written: linearly over its range in `length` bytes (ST 0601, section 8).
+
+    Signed ones span (-highest, highest), their lowest integer meaning "error"; `is_imapb` marks those by ST 1201.
+    """
+
+    name: str
+    lowest: float
+    highest: float
+    length: int
+    is_signed: bool = False
+    is_imapb: bool = False
+
+
+ITEMS: Mapping[int, Item] = {
+    5: Item("platform_heading_deg", 0, 360, 2),
+    6: Item("platform_pitch_deg", -20, 20, 2, is_signed=True),
+    7: Item("platform_roll_deg", -50, 50, 2, is_signed=True),
+    13: Item("sensor_latitude_deg", -90, 90, 4, is_signed=True),
+    14: Item("sensor_longitude_deg", -180, 180, 4, is_signed=True),
+    15: Item("sensor_true_altitude_m", -900, 19_000, 2),
+    16: Item("sensor_horizontal_fov_deg", 0, 180, 2),
+    17: Item("sensor_vertical_fov_deg", 0, 180, 2),
+    18: Item("sensor_relative_azimuth_deg", 0, 360, 4),
+    19: Item("sensor_relative_elevation_deg", -180, 180, 4, is_signed=True),
+    20: Item("sensor_relative_roll_deg", 0, 360, 4),
+    21: Item("slant_range_m", 0, 5_000_000, 4),
+    23: Item("frame_center_latitude_deg", -90, 90, 4, is_signed=True),
+    24: Item("frame_center_longitude_deg", -180, 180, 4, is_signed=True),
+    25: Item("frame_center_elevation_m", -900, 19_000, 2),
+    75: Item("sensor_ellipsoid_height_m", -900, 19_000, 2),
+    78: Item("frame_center_ellipsoid_height_m", -900, 19_000, 2),
+    90: Item("platform_pitch_full_deg", -90, 90, 4, is_signed=True),
+    91: Item("platform_roll_full_deg", -90, 90, 4, is_signed=True),
+    104: Item("sensor_ellipsoid_height_extended_m", -900, 40_000, 3, is_imapb=True),
+}
+"""The tags that are read, by number."""
+
+
+@dataclass(frozen=True)
+class LocalSet:
+    """One packet: its time (UTC, ns; 0 where it has none) and the numbers that it states, by `Item.name`."""
+
+    time_ns: int
+    version: int
+    values: Mapping[str, float]
+
+    def __getitem__(self, name: str) -> float:
+        return self.values.get(name, nan)
+
+
+def local_sets(data: bytes, counts: Counter[str]) -> Iterator[LocalSet]:
+    """Every whole local set in the bytes, in order, whatever stands between them (such as AU headers of ST 1402).
+
+    A set with a wrong or missing checksum is left out and counted as `bad_checksum`; one that is cut, or whose
+    lengths do not add up, as `damaged`. A number that means "error" or lies outside its tag's range is NaN.
+    """
+    start = data.find(UNIVERSAL_KEY)
+    while start >= 0:
+        after = start + len(UNIVERSAL_KEY)
+        try:
+            length, body = _ber_length(data, after)
+            if length > _LONGEST_SET_BYTES or body + length > len(data):
+                raise InputError("a local set that is cut")
+            found = _local_set(data[start: body + length], body - start)
+        except InputError:
+            counts["damaged"] += 1
+        else:
+            after = body + length
+            if found is None:
+                counts["bad_checksum"] += 1
+            else:
+                yield found
+        start = data.find(UNIVERSAL_KEY, after)
+
+
+def encode(time_ns: int, values: Mapping[str, float], version: int = 19) -> bytes:
+    """The local set that states these numbers, by `Item.name`; the inverse of `local_sets` within half a step.
+
+    A value that is not finite is written as "error" where its tag can say so, else left out. Raises InputError for an
+    unknown name or a value outside its tag's range.
+    """
+    numbers = {item.name: tag for tag, item in ITEMS.items()}
+    if unknown := sorted(set(values) - set(numbers)):
+        raise InputError(f"no tag for {unknown[0]}; known are {', '.join(numbers)}")
+    body = _tagged(TIME_TAG, (time_ns // 1000).to_bytes(8, "big"))
+    for name, value in values.items():
+        item = ITEMS[numbers[name]]
+        if isfinite(value) or item.is_signed:
+            body += _tagged(numbers[name], _bytes_of(item, value))
+    body += _tagged(VERSION_TAG, bytes([version]))
+    length = len(body) + 4
+    packet = UNIVERSAL_KEY + _written_length(length) + body + bytes([CHECKSUM_TAG, 2])
+    return packet + checksum(packet).to_bytes(2, "big")
+
+
+def checksum(data: bytes) -> int:
+    """The running 16-bit sum of ST 0601, section 6.3, over all bytes before the checksum's own value."""
+    return (sum(data[0::2]) * 256 + sum(data[1::2])) & 0xFFFF
+
+
+# ---- inside ---------------------------------------------------------------------------------------------------
+
+
+def _local_set(packet: bytes, body: int) -> LocalSet | None:
+    """The set in a packet whose value begins at `body`; None where the checksum does not fit."""
+    time_ns, version, is_sound = 0, 0, False
+    values: dict[str, float] = {}
+    at = body
+    while at < len(packet):
+        tag, at = _ber_oid(packet, at)
+        length, at = _ber_length(packet, at)
+        if at + length > len(packet):
+            raise InputError("an item that is longer than its set")
+        value = packet[at: at + length]
+        if tag == CHECKSUM_TAG:
+            is_sound = length == 2 and int.from_bytes(value, "big") == checksum(packet[:at])
+        elif tag == TIME_TAG and 0 < length <= 8:
+            time_ns = int.from_bytes(value, "big") * 1000
+        elif tag == VERSION_TAG and length:
+            version = int.from_bytes(value[:2], "big")
+        elif tag in ITEMS and 0 < length <= 8:
+            values[ITEMS[tag].name] = _number(ITEMS[tag], value)
+        at += length
+    return LocalSet(time_ns if time_ns < 2**63 else 0, version, values) if is_sound else None
+
+
+def _number(item: Item, value: bytes) -> float:
+    """The number in as many bytes as the sender chose; more bytes are the same range in finer steps."""
+    bits = 8 * len(value)
+    if item.is_imapb:
+        return _from_imapb(item, value)
+    if item.is_signed:
+        whole = int.from_bytes(value, "big", signed=True)
+        return nan if whole == -(1 << (bits - 1)) else item.highest * whole / ((1 << (bits - 1)) - 1)
+    return item.lowest + (item.highest - item.lowest) * int.from_bytes(value, "big") / ((1 << bits) - 1)
+
+
+def _bytes_of(item: Item, value: float) -> bytes:
+    bits = 8 * item.length
+    if not isfinite(value):
+        return (1 << (bits - 1)).to_bytes(item.length, "big")
+    if not item.lowest <= value <= item.highest:
+        raise InputError(f"{item.name} = {value:g} lies outside its tag's {item.lowest:g} to {item.highest:g}")
+    if item.is_imapb:
+        forward, offset = _imapb(item, item.length)
+        return int(forward * (value - item.lowest) + offset).to_bytes(item.length, "big")
+    if item.is_signed:
+        return round(value / item.highest * ((1 << (bits - 1)) - 1)).to_bytes(item.length, "big", signed=True)
+    share = (value - item.lowest) / (item.highest - item.lowest)
+    return round(share * ((1 << bits) - 1)).to_bytes(item.length, "big")
+
+
+def _imapb(item: Item, length: int) -> tuple[float, float]:
+    """Scale and zero offset of ST 1201, section 7.2: steps are a power of two, and zero stays exact."""
+    exponent = _ceil_log2(item.highest - item.lowest)
+    forward = 2.0 ** (8 * length - 1 - exponent)
+    zero = forward * item.lowest
+    return forward, zero - zero // 1 if item.lowest < 0 < item.highest else 0.0
+
+
+def _from_imapb(item: Item, value: bytes) -> float:
+    forward, offset = _imapb(item, len(value))
+    number = (int.from_bytes(value, "big") - offset) / forward + item.lowest
+    # the upper half of the codes are special values (infinity, not a number)
+    return number if item.lowest <= number <= item.highest else nan
+
+
+def _ceil_log2(span: float) -> int:
+    whole = int(span)
+    return (whole - 1).bit_length() if whole == span else whole.bit_length()
+
+
+def _tagged(tag: int, value: bytes) -> bytes:
+    return bytes([tag, len(value)] if tag < 128 else [0x80 | tag >> 7, tag & 0x7F, len(value)]) + value
+
+
+def _written_length(length: int) -> bytes:
+    if length < 128:
+        return bytes([length])
+    size = (length.bit_length() + 7) // 8
+    return bytes([0x80 | size]) + length.to_bytes(size, "big")
+
+
+def _ber_length(data: bytes, at: int) -> tuple[int, int]:
+    """A BER length, short or long form, and where what it measures begins."""
+    if at >= len(data):
+        raise InputError("a length that is cut")
+    first = data[at]
+    if first < 128:
+        return first, at + 1
+    size = first & 0x7F
+    if size == 0 or size > 4 or at + 1 + size > len(data):
+        raise InputError("a length in no definite form")
+    return int.from_bytes(data[at + 1: at + 1 + size], "big"), at + 1 + size
+
+
+def _ber_oid(data: bytes, at: int) -> tuple[int, int]:
+    """A tag in BER-OID: seven bits a byte, the highest bit saying that another follows."""
+    tag = 0
+    for place in range(at, min(at + _LONGEST_KEY_BYTES, len(data))):
+        tag = tag << 7 | data[place] & 0x7F
+        if data[place] < 128:
+            return tag, place + 1
+    raise InputError("a tag that does not end")

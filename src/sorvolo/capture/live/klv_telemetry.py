@@ -1,0 +1,177 @@
+"""What MISB ST 0601 says in Sorvolo's words: telemetry columns, the camera's angles, the ground's height, the lens."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import isfinite, nan, radians, tan
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import av
+
+from sorvolo.capture.live.klv import LocalSet, local_sets
+from sorvolo.capture.telemetry.quality import clean, notice
+from sorvolo.geometry.arrays import Matrix3
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.pose import gimbal_angles_from_rotation, site_from_gimbal_rotation
+from sorvolo.survey.flight import CameraModel, Notice, Telemetry
+
+FORMAT = "klv"
+"""The name that `Telemetry.format` carries."""
+
+_FOV_SIGMA = 0.03  # of a focal length from the field of view: operators round it, and zooms lag behind it
+_LEVEL_FROM_CAMERA = site_from_gimbal_rotation(0.0, 0.0, 0.0)
+
+
+def columns_of(told: LocalSet) -> dict[str, float]:
+    """A local set's numbers as telemetry columns (survey.flight.TELEMETRY_COLUMNS); only those that it states.
+
+    Tag 15 is above mean sea level (orthometric), tags 75 and 104 above the ellipsoid. The camera's angles come from
+    the platform's (5, 6 or 90, 7 or 91) and the sensor's relative to it (18-20); without tag 18 or 19 the aircraft's
+    alone are given. A relative roll that is not said is taken as 0.
+    """
+    full_m = told["sensor_ellipsoid_height_extended_m"]
+    columns = {
+        "latitude_deg": told["sensor_latitude_deg"], "longitude_deg": told["sensor_longitude_deg"],
+        "orthometric_height_m": told["sensor_true_altitude_m"],
+        "ellipsoidal_height_m": full_m if isfinite(full_m) else told["sensor_ellipsoid_height_m"],
+    }
+    heading, pitch, roll = told["platform_heading_deg"], _pitch_of(told), _roll_of(told)
+    columns |= {"body_yaw_deg": heading, "body_pitch_deg": pitch, "body_roll_deg": roll}
+    relative = told["sensor_relative_azimuth_deg"], told["sensor_relative_elevation_deg"]
+    if all(map(isfinite, (heading, pitch, roll, *relative))):
+        own_roll = told["sensor_relative_roll_deg"]
+        rotation = site_from_sensor_rotation(
+            (heading, pitch, roll), (*relative, own_roll if isfinite(own_roll) else 0.0)
+        )
+        columns |= zip(("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg"), gimbal_angles_from_rotation(rotation))
+    return {name: value for name, value in columns.items() if isfinite(value)}
+
+
+def site_from_sensor_rotation(
+    platform_deg: tuple[float, float, float], relative_deg: tuple[float, float, float]
+) -> Matrix3:
+    """site_from_camera rotation from heading, pitch, roll of the platform and azimuth, elevation, roll relative to it.
+
+    ST 0601, tags 5-7 and 18-20: each triple turns about z, y, x in that order, and the second starts from the
+    platform's axes. With level = site_from_camera of a camera that looks level to the north,
+    site_from_platform = turn(platform) level^-1 and the whole is turn(platform) level^-1 turn(relative).
+    """
+    return site_from_gimbal_rotation(*platform_deg) @ _LEVEL_FROM_CAMERA.T @ site_from_gimbal_rotation(*relative_deg)
+
+
+def ground_elevation_m(told: LocalSet) -> float:
+    """The ground's height at the frame's centre in the reference of the sensor's own height; NaN where unknown.
+
+    Tag 25 (mean sea level) belongs to tag 15, tag 78 (ellipsoid) to tags 75 and 104.
+    """
+    if isfinite(told["sensor_true_altitude_m"]):
+        return told["frame_center_elevation_m"]
+    return told["frame_center_ellipsoid_height_m"]
+
+
+def camera_of(told: LocalSet, width_px: int, height_px: int) -> CameraModel | None:
+    """The camera by its field of view (tags 16 and 17), for frames of this size; None where it is not stated.
+
+    A vertical angle that does not fit square pixels within 10 % is of another cut of the sensor and not used.
+    """
+    across_deg, down_deg = told["sensor_horizontal_fov_deg"], told["sensor_vertical_fov_deg"]
+    if not 1 < across_deg < 150:
+        return None
+    camera = Camera.from_angle_of_view(width_px, height_px, across_deg)
+    words = f"the stream's field of view (ST 0601 tag 16): {across_deg:.1f} deg across"
+    if 1 < down_deg < 150:
+        fy_px = 0.5 * height_px / tan(radians(down_deg) / 2)
+        if abs(fy_px / camera.fx_px - 1) < 0.1:
+            camera = Camera(width_px, height_px, camera.fx_px, fy_px, camera.cx_px, camera.cy_px)
+    return CameraModel(camera, words, _FOV_SIGMA)
+
+
+def klv_notices(counts: Mapping[str, int]) -> list[Notice]:
+    """What was wrong with the local sets that `klv.local_sets` counted."""
+    return [
+        *notice("bad_checksum", counts.get("bad_checksum", 0), "{} metadata packets dropped: bad or missing checksum"),
+        *notice("unreadable_line", counts.get("damaged", 0), "{} metadata packets dropped: damaged or cut"),
+        *notice("no_time", counts.get("no_time", 0), "{} metadata packets dropped: no time in them"),
+    ]
+
+
+def klv_streams(container: Any) -> list[Any]:
+    """The KLV streams of a PyAV container; private data that does not say what it is counts as well."""
+    data = (stream for stream in container.streams if stream.type == "data")
+    return [stream for stream in data if _name(stream) in ("klv", "bin_data", "")]
+
+
+@dataclass(frozen=True, eq=False)
+class FileMetadata:
+    """What the metadata inside a video file says; `lens` is a local set with the field of view, if any has it.
+
+    `ground_elevation_m` is the median, in the reference of the sensor's own height; NaN where unknown.
+    """
+
+    telemetry: Telemetry
+    lens: LocalSet | None
+    ground_elevation_m: float
+
+
+def read_klv_file(path: Path) -> FileMetadata | None:
+    """The ST 0601 metadata inside a video file; None where it has none.
+
+    `video_time_ns` counts from the video's first frame. Only the packets are read, nothing is decoded. Raises
+    InputError when there is metadata but no usable sample in it.
+    """
+    counts: Counter[str] = Counter()
+    found: list[tuple[int, LocalSet]] = []
+    first_ns: int | None = None
+    try:
+        with av.open(f"file:{path}", options={"protocol_whitelist": "file"}) as container:
+            streams = klv_streams(container)
+            if not streams or not container.streams.video:
+                return None
+            for packet in container.demux([container.streams.video[0], *streams]):
+                stamp = packet.pts if packet.pts is not None else packet.dts
+                stamp_ns = -1 if stamp is None else round(stamp * packet.time_base * 1_000_000_000)
+                if packet.stream.type == "video":
+                    first_ns = min(stamp_ns, stamp_ns if first_ns is None else first_ns) if stamp_ns >= 0 else first_ns
+                else:
+                    found += [(stamp_ns, each) for each in local_sets(bytes(packet), counts)]
+    except (av.FFmpegError, IndexError):
+        pass  # a damaged place: what came before it is used, and the video's reader counts the damage
+    if not found and not counts:
+        return None
+    told = [(stamp_ns, each) for stamp_ns, each in found if each.time_ns]
+    counts["no_time"] += len(found) - len(told)
+    rows = [columns_of(each) for _, each in told]
+    names = sorted({name for row in rows for name in row})
+    video_ns = [stamp_ns - (first_ns or 0) if stamp_ns >= 0 else -1 for stamp_ns, _ in told]
+    telemetry = clean(
+        FORMAT, path.name, [each.time_ns for _, each in told],
+        {name: [row.get(name, nan) for row in rows] for name in names},
+        # a tie to the video holds for all samples or for none
+        video_ns if min(video_ns, default=-1) >= 0 else None,
+        notices=klv_notices(counts),
+    )
+    lens = next((each for _, each in told if isfinite(each["sensor_horizontal_fov_deg"])), None)
+    grounds_m = [ground_elevation_m(each) for _, each in told]
+    known_m = [each for each in grounds_m if isfinite(each)]
+    return FileMetadata(telemetry, lens, median(known_m) if known_m else nan)
+
+
+# ---- inside ---------------------------------------------------------------------------------------------------
+
+
+def _name(stream: Any) -> str:
+    return str(getattr(stream, "name", "") or "")
+
+
+def _pitch_of(told: LocalSet) -> float:
+    return _first_known(told["platform_pitch_full_deg"], told["platform_pitch_deg"])
+
+
+def _roll_of(told: LocalSet) -> float:
+    return _first_known(told["platform_roll_full_deg"], told["platform_roll_deg"])
+
+
+def _first_known(*values: float) -> float:
+    return next((value for value in values if isfinite(value)), nan)

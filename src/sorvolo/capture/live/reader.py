@@ -1,0 +1,243 @@
+"""The thread that reads a stream: connects, decodes, reads the metadata, and begins anew when nothing comes."""
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import av
+
+from sorvolo.capture.live.addresses import StreamAddress
+from sorvolo.capture.live.klv import LocalSet, local_sets
+from sorvolo.capture.live.klv_telemetry import klv_streams
+from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
+from sorvolo.capture.telemetry.quality import notice
+from sorvolo.capture.video import PIXEL_LIMIT
+from sorvolo.survey.flight import Notice
+
+_SECOND_NS = 1_000_000_000
+_OPEN_S = 6.0  # to be dialled and looked at
+_LISTEN_S = 3.0  # a listener that nobody speaks to is opened anew so often, so that it can be stopped
+_STAMP_JUMP_NS = 10 * _SECOND_NS
+_REFUSED = (
+    av.error.ProtocolNotFoundError, av.error.HTTPUnauthorizedError, av.error.HTTPForbiddenError,
+    av.error.HTTPNotFoundError, av.error.PermissionError,
+)
+_WALLCLOCK_BYTES = 8  # that a producer reference time begins with, us since 1970
+
+
+class Hearer(Protocol):
+    """Who gets what a stream says; called in the reader's thread."""
+
+    def opened(self, facts: "StreamFacts") -> None:
+        """A connection stands; what it says of itself."""
+
+    def frame(self, decoded: av.VideoFrame, stamp_ns: int, arrived_s: float) -> None:
+        """A decoded frame with its time stamp on the stream's own clock."""
+
+    def restarted(self) -> None:
+        """The stream's time stamps begin anew."""
+
+    def ended(self) -> None:
+        """Nothing more comes."""
+
+    def told(self, told: LocalSet, stamp_ns: int) -> None:
+        """A metadata packet with its time stamp on the stream's own clock."""
+
+    def reported(self, stamp_ns: int, utc_ns: int) -> None:
+        """The sender says which UTC a time stamp is."""
+
+
+@dataclass(frozen=True)
+class StreamFacts:
+    """What a stream's header says."""
+
+    codec: str
+    container: str
+    rate_hz: float
+    has_metadata: bool
+
+
+class StreamReader:
+    """Reads one stream, in a thread of its own, until it has ended for good or `stop` is set.
+
+    A connection that gives no packet for `silent_s` is closed and opened anew, with growing pauses where it has to be
+    dialled. The stream has ended when nothing came for `give_up_s`. `refused` then says why, where the other side
+    will not have us (a wrong name or password) and trying again is no use. `file` opens what is read instead of the
+    address: a file that grows.
+    """
+
+    def __init__(
+        self, address: StreamAddress, hearer: Hearer, settings: LiveSettings, stop: threading.Event,
+        file: Callable[[Outages], Any] | None = None,
+    ) -> None:
+        self._address, self._hearer, self._settings = address, hearer, settings
+        self._stop, self._file = stop, file
+        self.outages = Outages(address.shown)
+        self.refused = ""
+        self.failure = ""  # why the last attempt to open it failed
+        self.is_over = threading.Event()
+        self._counts: Counter[str] = Counter()
+        self._heard_s = time.monotonic()
+        self._has_spoken = False
+        self._stamp_ns = -1
+        self._step_ns = _SECOND_NS // 25
+        self._thread = threading.Thread(target=self._run, name=f"reading {address.shown}", daemon=True)
+
+    def start(self) -> None:
+        """Begin to read."""
+        self._heard_s = time.monotonic()
+        self._thread.start()
+
+    def join(self) -> None:
+        """Wait until the reader has ended, which it does within `silent_s` of being stopped."""
+        if self._thread.is_alive():
+            self._thread.join(_OPEN_S + self._settings.silent_s)
+
+    def notices(self) -> list[Notice]:
+        """What was found in the stream so far and survived."""
+        counts = self._counts
+        return [
+            *self.outages.notices(),
+            *notice("decode_error", counts["packet"], "damaged places in the stream, skipped: {}"),
+            *notice("damaged_frame", counts["frame"], "frames damaged in part: {}"),
+            *notice("missing_pts", counts["missing"], "frames without a time stamp, set by the usual step: {}"),
+        ]
+
+    @property
+    def metadata_counts(self) -> Mapping[str, int]:
+        """What was wrong with metadata packets, as `klv.local_sets` counts it."""
+        return self._counts
+
+    # ---- inside, in the thread --------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        backoff = Backoff()
+        try:
+            while not self._stop.is_set() and self._left_s() > 0:
+                if self._listen_once():
+                    backoff.reset()
+                if self.refused or (self._file is not None and self._has_spoken):
+                    return
+                if not self._address.waits and not self._stop.is_set() and self._left_s() > 0:
+                    self._stop.wait(backoff.next_s())
+        finally:
+            self._hearer.ended()
+            self.is_over.set()
+
+    def _left_s(self) -> float:
+        """How long a silent source is still waited for."""
+        limit_s = self._settings.give_up_s if self._has_spoken else self._settings.first_s
+        return limit_s - (time.monotonic() - self._heard_s)
+
+    def _listen_once(self) -> bool:
+        """One connection from opening to its end; whether any frame came."""
+        came = False
+        try:
+            with self._opened() as container:
+                video, metadata = _streams_of(container)
+                self._hearer.opened(_facts_of(container, video, metadata))
+                self._hearer.restarted()
+                self._stamp_ns = -1
+                self._step_ns = round(_SECOND_NS / float(video.average_rate or video.guessed_rate or 25))
+                # frames in threads would hold several back; a stripe each does not
+                video.thread_type = "SLICE"
+                for packet in container.demux([video, *metadata]):
+                    if self._stop.is_set():
+                        return came
+                    if not packet.size:
+                        continue
+                    self._note_heard(is_first=not came)
+                    came |= self._take(packet)
+            self._lost("the sender ended the stream")
+        except (av.FFmpegError, OSError, ValueError, IndexError, MemoryError) as error:
+            self._lost(self._why(error))
+            if isinstance(error, _REFUSED) and not self._has_spoken:
+                self.refused = self.failure
+        return came
+
+    def _opened(self) -> Any:
+        if self._file is not None:
+            return av.open(self._file(self.outages), options=dict(self._address.options))
+        open_s = min(_LISTEN_S if self._address.waits else _OPEN_S, max(0.2, self._left_s()))
+        return av.open(
+            self._address.url, format=self._address.container, options=dict(self._address.options),
+            timeout=(open_s, self._settings.silent_s),
+        )
+
+    def _lost(self, reason: str) -> None:
+        self.failure = reason
+        if self._has_spoken and not self._stop.is_set() and self._file is None:
+            self.outages.lost(self._heard_s, reason)
+
+    def _why(self, error: Exception) -> str:
+        if isinstance(error, av.error.ExitError):
+            return f"silent for {time.monotonic() - self._heard_s:.1f} s"
+        return getattr(error, "strerror", None) or str(error)
+
+    def _note_heard(self, *, is_first: bool) -> None:
+        """Something came; when a read times out, FFmpeg hands over the packet that it had held back as well."""
+        now_s = time.monotonic()
+        if is_first or now_s - self._heard_s < self._settings.silent_s or self._file is not None:
+            self._heard_s = now_s
+            self.outages.back()
+
+    def _take(self, packet: Any) -> bool:
+        """Give on what is in a packet; whether a frame was."""
+        if packet.stream.type == "data":
+            stamp_ns = _stamp_of(packet, packet.time_base)
+            for told in local_sets(bytes(packet), self._counts):
+                self._hearer.told(told, self._stamp_ns if stamp_ns is None else stamp_ns)
+            return False
+        self._note_sender_report(packet)
+        self._counts["packet"] += packet.is_corrupt
+        try:
+            decoded = packet.decode()
+        except (av.FFmpegError, ValueError, MemoryError):
+            self._counts["packet"] += 1
+            return False
+        came = False
+        for frame in decoded:
+            if frame.width * frame.height <= PIXEL_LIMIT:
+                self._counts["frame"] += frame.is_corrupt
+                self._has_spoken = came = True
+                self._hearer.frame(frame, self._next_stamp_ns(frame), time.monotonic())
+        return came
+
+    def _next_stamp_ns(self, frame: av.VideoFrame) -> int:
+        stamp_ns = _stamp_of(frame, frame.time_base)
+        if stamp_ns is None:
+            self._counts["missing"] += 1
+            stamp_ns = self._stamp_ns + self._step_ns
+        elif self._stamp_ns >= 0 and not 0 < stamp_ns - self._stamp_ns < _STAMP_JUMP_NS:
+            self._hearer.restarted()  # the sender began anew, or set its clock
+        self._stamp_ns = stamp_ns
+        return stamp_ns
+
+    def _note_sender_report(self, packet: Any) -> None:
+        """RTP packets carry their sender's clock once an RTCP report came (FFmpeg's producer reference time)."""
+        if not packet.has_sidedata("prft"):
+            return
+        stamp_ns = _stamp_of(packet, packet.time_base)
+        microseconds = int.from_bytes(bytes(packet.get_sidedata("prft"))[:_WALLCLOCK_BYTES], "little", signed=True)
+        if stamp_ns is not None and microseconds > 0:
+            self._hearer.reported(stamp_ns, microseconds * 1000)
+
+
+def _streams_of(container: Any) -> tuple[Any, list[Any]]:
+    if not container.streams.video:
+        raise ValueError("a stream without video")
+    return container.streams.video[0], klv_streams(container)
+
+
+def _facts_of(container: Any, video: Any, metadata: list[Any]) -> StreamFacts:
+    rate = video.average_rate or video.guessed_rate
+    name = container.format.name.split(",")[0]
+    return StreamFacts(video.codec_context.name, name, float(rate) if rate else 25.0, bool(metadata))
+
+
+def _stamp_of(timed: Any, time_base: Any) -> int | None:
+    stamp = timed.pts if timed.pts is not None else timed.dts
+    return None if stamp is None or not time_base else round(stamp * time_base * _SECOND_NS)

@@ -1,0 +1,415 @@
+"""A stream, a webcam or a growing video as a flight that is still going on."""
+
+import hashlib
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from math import isfinite, nan
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import av
+import numpy as np
+
+from sorvolo.capture.live.addresses import StreamAddress
+from sorvolo.capture.live.clock import StreamClock, Tie
+from sorvolo.capture.live.frame_queue import Arrived, FrameQueue
+from sorvolo.capture.live.growing import GrowingFile
+from sorvolo.capture.live.klv import LocalSet
+from sorvolo.capture.live.klv_telemetry import FORMAT, camera_of, columns_of, ground_elevation_m, klv_notices
+from sorvolo.capture.live.links import NmeaLink
+from sorvolo.capture.live.reader import StreamFacts, StreamReader
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.capture.live.telemetry_log import TelemetryLog
+from sorvolo.capture.telemetry.nmea import Epoch
+from sorvolo.capture.telemetry.quality import notice
+from sorvolo.errors import InputError
+from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
+
+_HOLD_S = 0.5  # the first frames of a connection come in a burst: only then is their delay known
+_HOLD_FOR_METADATA_S = 2.0  # where the stream has some, it says when and through which lens frames were taken
+_FIRST_FIXES = 2  # that tell where a flight begins, and how fast
+_FIRST_FIXES_S = 10.0
+_CLOCKS_AGREE_NS = 5_000_000_000
+_DELAYS_KEPT = 60
+_SAME_ASPECT = 0.01
+_ZOOMED = 0.03
+_POLL_S = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class _Held:
+    """A decoded frame whose UTC is not known yet."""
+
+    decoded: av.VideoFrame
+    stamp_ns: int
+    arrived_s: float
+
+
+class LiveStream:
+    """A flight that is going on; fulfils `capture.source.Source`, and what it says grows while it is read.
+
+    A thread reads and decodes from the moment it is opened; what comes before `frames` is asked for is passed over
+    (a growing file waits instead). Close it, or exhaust or close `frames`, to end it. `until`, when set from any
+    thread, ends the frames as the end of the stream would. Made by `open_stream`.
+    """
+
+    kind = "video"
+    is_live = True
+
+    def __init__(
+        self, address: StreamAddress, link: str | None, settings: LiveSettings, until: threading.Event,
+        path: Path | None,
+    ) -> None:
+        self._settings, self._until, self._is_file = settings, until, path is not None
+        self._closing = threading.Event()
+        self._queue = FrameQueue(holds_all=settings.keeps_all, most_bytes=settings.most_bytes, blocks=self._is_file)
+        self._clock = StreamClock()
+        self._log = TelemetryLog("nmea" if link else FORMAT, link or address.shown)
+        self._link = NmeaLink(link, settings, self._fix) if link else None
+        file = None if path is None else lambda outages: GrowingFile(path, settings, outages, self._closing)
+        self._reader = StreamReader(address, self, settings, self._closing, file)
+        self._facts: StreamFacts | None = None
+        self._lock = threading.RLock()
+        self._held: list[_Held] | None = []
+        self._held_told: list[tuple[int, LocalSet]] = []
+        self._held_since: tuple[float, int] | None = None  # the monotonic clock's and the stream's
+        self._held_fixes: list[tuple[int, Epoch]] = []
+        self._delays_ns: deque[int] = deque(maxlen=_DELAYS_KEPT)
+        self._is_ready = threading.Event()
+        self._wanted: Callable[[int, int], bool] | None = None
+        self._is_asked = threading.Event()
+        self._count = self._resized = self._lost = self._zooms = 0
+        self._arrived_s = time.monotonic()
+        self._size_px = (0, 0)
+        self._lens: LocalSet | None = None
+        self._grounds_m: deque[float] = deque(maxlen=1000)
+        self.name, self.fingerprint, self.inputs = "", "", (address.shown, *([link] if link else []))
+        self.start_ns, self.start_origin = 0, ""
+        self.camera: CameraModel = None  # type: ignore[assignment]  # set by `open_stream` once the size is known
+
+    # ---- what a mission asks ----------------------------------------------------------------------------------
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of the frames as delivered: those of the first one."""
+        return self._size_px
+
+    @property
+    def lens(self) -> LocalSet | None:
+        """The first metadata packet that states the field of view."""
+        return self._lens
+
+    @property
+    def facts(self) -> StreamFacts:
+        """What the stream's header says."""
+        assert self._facts is not None  # known before the first frame
+        return self._facts
+
+    @property
+    def frame_rate_hz(self) -> float:
+        """Frames a second, as the stream says."""
+        return self.facts.rate_hz
+
+    @property
+    def frame_count(self) -> int:
+        """0 while the flight goes on, then how many frames came."""
+        return self._count if self._reader.is_over.is_set() else 0
+
+    @property
+    def telemetry(self) -> Telemetry:
+        """What is known so far, its times on the frames' clock."""
+        told = self._link.notices() if self._link else klv_notices(self._reader.metadata_counts)
+        return self._log.telemetry(told)
+
+    @property
+    def telemetry_version(self) -> int:
+        """Grows with every sample: whether `telemetry` has more than before."""
+        return self._log.version
+
+    @property
+    def ground_elevation_m(self) -> float:
+        """The ground's height, as the metadata states it for the frames' centres; NaN where it does not."""
+        with self._lock:
+            return median(self._grounds_m) if self._grounds_m and not self._link else nan
+
+    @property
+    def silent_s(self) -> float:
+        """How long nothing has come now; 0 while frames come."""
+        return self._reader.outages.silent_s
+
+    @property
+    def skipped(self) -> int:
+        """Wanted frames that nobody looked at, because newer ones came or memory ran out."""
+        return self._queue.skipped
+
+    def wait_for_first_fixes(self) -> None:
+        """Wait until telemetry says where the flight begins; not where none is to be expected, nor for ever."""
+        if (self._link or self.facts.has_metadata) and not self._is_file:
+            end_s = time.monotonic() + _FIRST_FIXES_S
+            while not self._is_ended and time.monotonic() < end_s:
+                if self._log.wait_for_fixes(_FIRST_FIXES, min(end_s, time.monotonic() + _POLL_S)):
+                    return
+
+    def wait_for_telemetry(self, time_ns: int) -> None:
+        """Wait for the sample that follows a frame, at most `fix_wait_s` from when the frame came.
+
+        Only where every frame is kept: where the newest wins, what is known so far has to do.
+        """
+        if self._settings.keeps_all and self._log.version:
+            self._log.wait_past(time_ns, self._arrived_s + self._settings.fix_wait_s)
+
+    def notices(self) -> tuple[Notice, ...]:
+        """What was found so far and survived, outages with their lengths among it."""
+        arrival = self._clock.tie is Tie.ARRIVAL and not self._is_file
+        words = f"the stream states no time: frames are timed by {Tie.ARRIVAL.words}"
+        return (
+            *self._reader.notices(),
+            *notice("arrival_times", int(arrival), words),
+            *notice("size_changed", self._resized, "frames of another size, brought to the first one's: {}"),
+            *notice("other_shape", self._lost, "frames of another shape, not used: {}"),
+            *notice("zoom", self._zooms, "metadata packets that state another field of view than the first: {}"),
+            *notice("skipped_frame", self.skipped, "frames that came faster than they could be looked at: {}"),
+        )
+
+    def frames(self, wanted: Callable[[int, int], bool]) -> Iterator[Frame | LostFrame]:
+        """The wanted frames as they come, numbered from 0, until the stream ends for good; see `Source.frames`.
+
+        `wanted` is asked in the reading thread. Where the newest wins, older ones are counted as skipped.
+        """
+        for _, each in self.arrivals(wanted):
+            yield each
+
+    def arrivals(self, wanted: Callable[[int, int], bool]) -> Iterator[tuple[float, Frame | LostFrame]]:
+        """The same as `frames`, each with when it was there (monotonic clock)."""
+        self._wanted = wanted
+        self._is_asked.set()
+        try:
+            while not self._is_ended:
+                arrived = self._queue.take(_POLL_S)
+                if arrived is not None:
+                    self._arrived_s = arrived.arrived_s
+                    yield arrived.arrived_s, self._converted(arrived)
+                elif self._queue.is_over:
+                    return
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """End the stream and let go of the link; harmless when done already."""
+        self._closing.set()
+        self._is_asked.set()
+        self._queue.end()
+        self._reader.join()
+        if self._link is not None:
+            self._link.close()
+
+    # ---- opening ----------------------------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Start to read and wait for the first frame, from which size, clock and lens are known.
+
+        Raises InputError when none comes in `first_s`, or the other side refuses.
+        """
+        if self._link is not None:
+            self._link.start()
+        self._reader.start()
+        shown = self.inputs[0]
+        try:
+            while not self._is_ready.wait(_POLL_S):
+                if self._reader.refused:
+                    raise InputError(f"{shown}: {self._reader.refused}; check the address, the name and the password")
+                if self._reader.is_over.is_set() and not self._is_ready.is_set():
+                    why = self._reader.failure or "nothing came"
+                    raise InputError(
+                        f"{shown}: no picture within {self._settings.first_s:.0f} s ({why}); is the drone sending, to "
+                        "this address and port, and does the network let it through?"
+                    )
+                if self._until.is_set():
+                    raise InputError(f"{shown}: stopped before the first picture came")
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def _is_ended(self) -> bool:
+        return self._until.is_set() or self._closing.is_set()
+
+    # ---- what the reader says, in its thread ------------------------------------------------------------------
+
+    def opened(self, facts: StreamFacts) -> None:
+        """See `reader.Hearer`."""
+        self._facts = facts
+
+    def restarted(self) -> None:
+        """See `reader.Hearer`: frames are held anew until their delay is known."""
+        self._deliver_held()
+        with self._lock:
+            self._clock.restart()
+            self._held, self._held_since = [], None
+
+    def reported(self, stamp_ns: int, utc_ns: int) -> None:
+        """See `reader.Hearer`."""
+        self._clock.stated(Tie.SENDER_REPORT, stamp_ns, utc_ns)
+
+    def told(self, told: LocalSet, stamp_ns: int) -> None:
+        """See `reader.Hearer`."""
+        if told.time_ns:
+            self._clock.stated(Tie.METADATA, stamp_ns, told.time_ns)
+        across_deg = told["sensor_horizontal_fov_deg"]
+        if isfinite(across_deg):
+            self._lens = self._lens or told
+            self._zooms += abs(across_deg / self._lens["sensor_horizontal_fov_deg"] - 1) > _ZOOMED
+        with self._lock:
+            if isfinite(ground_m := ground_elevation_m(told)):
+                self._grounds_m.append(ground_m)
+            if self._held is not None:
+                self._held_told.append((stamp_ns, told))
+            else:
+                self._log_told(stamp_ns, told)
+
+    def frame(self, decoded: av.VideoFrame, stamp_ns: int, arrived_s: float) -> None:
+        """See `reader.Hearer`."""
+        if not self._is_file or self._held_since is None:  # a file is read faster than it was written
+            self._clock.arrived(stamp_ns, time.time_ns())
+        held = _Held(decoded, stamp_ns, arrived_s)
+        if self._held is None:
+            self._deliver(held)
+            return
+        self._held.append(held)
+        if self._held_since is None:
+            self._held_since = arrived_s, stamp_ns
+        if self._has_held_enough(held):
+            self._settle()
+
+    def _has_held_enough(self, newest: _Held) -> bool:
+        assert self._held is not None and self._held_since is not None
+        since_s, since_ns = self._held_since
+        # a file's frames come at once: what counts is how much of the flight was read
+        passed_s = (newest.stamp_ns - since_ns) / 1e9 if self._is_file else newest.arrived_s - since_s
+        held_bytes = len(self._held) * newest.decoded.width * newest.decoded.height * 3 // 2
+        if held_bytes > self._settings.most_bytes // 2:
+            return True
+        expects_more = self.facts.has_metadata and not any(told.time_ns for _, told in self._held_told)
+        return passed_s >= (_HOLD_FOR_METADATA_S if expects_more or self._is_file else _HOLD_S)
+
+    def _settle(self) -> None:
+        """The frames held so far tell how the stream's clock is tied; from here on they are given on as they come."""
+        with self._lock:
+            if not self._held:
+                return
+            first = self._held[0]
+            if not self._is_ready.is_set():
+                self._size_px = first.decoded.width, first.decoded.height
+                tie = self._clock.settle()
+                self.start_ns = self._clock.utc_ns(first.stamp_ns)
+                self.start_origin = tie.words if not (self._is_file and tie is Tie.ARRIVAL) else (
+                    "when reading began: the file states no time"
+                )
+        self._deliver_held()
+
+    def _deliver_held(self) -> None:
+        with self._lock:
+            held, self._held = self._held or [], None
+            if not held:
+                return
+            told, self._held_told = self._held_told, []
+            for stamp_ns, each in told:
+                self._log_told(stamp_ns, each)
+            fixes, self._held_fixes = self._held_fixes, []
+            for arrived_ns, epoch in fixes:
+                self._log_fix(arrived_ns, epoch)
+            self._is_ready.set()
+        for frame in held:
+            self._deliver(frame)
+
+    def _deliver(self, held: _Held) -> None:
+        time_ns = self._clock.frame_utc_ns(held.stamp_ns)
+        if self._is_file:
+            self._is_asked.wait()
+        if self._wanted is None or self._closing.is_set():
+            return  # a stream goes on whether or not it is looked at
+        index, self._count = self._count, self._count + 1
+        if self._wanted(index, time_ns):
+            self._queue.put(Arrived(index, time_ns, held.arrived_s, held.decoded))
+
+    def ended(self) -> None:
+        """See `reader.Hearer`."""
+        self._settle()
+        self._queue.end()
+
+    # ---- telemetry on the frames' clock -----------------------------------------------------------------------
+
+    def _log_told(self, stamp_ns: int, told: LocalSet) -> None:
+        if self._link is not None:
+            return
+        states_time = self._clock.tie is Tie.METADATA and told.time_ns
+        self._log.add(told.time_ns if states_time else self._clock.utc_ns(stamp_ns), columns_of(told))
+
+    def _fix(self, arrived_ns: int, epoch: Epoch) -> None:
+        """A receiver's moment, in the link's thread."""
+        with self._lock:
+            if not self._is_ready.is_set():
+                self._held_fixes.append((arrived_ns, epoch))
+            else:
+                self._log_fix(arrived_ns, epoch)
+
+    def _log_fix(self, arrived_ns: int, epoch: Epoch) -> None:
+        """Sentences tell UTC; where the frames do not know theirs as well, both are tied by when they came."""
+        self._delays_ns.append(arrived_ns - epoch.time_ns)
+        least_ns = min(self._delays_ns)
+        ahead_ns = self._clock.host_from_tie_ns()
+        agree = self._clock.tie is not Tie.ARRIVAL and abs(least_ns - ahead_ns) < _CLOCKS_AGREE_NS
+        self._log.add(epoch.time_ns + (0 if agree else least_ns - ahead_ns), epoch.values)
+
+    # ---- pictures ---------------------------------------------------------------------------------------------
+
+    def _converted(self, arrived: Arrived) -> Frame | LostFrame:
+        index, name, decoded = arrived.index, str(arrived.index), arrived.decoded
+        width_px, height_px = self._size_px
+        fitted: dict[str, Any] = {}
+        if (decoded.width, decoded.height) != (width_px, height_px):
+            # a sender that saves bandwidth shows the same in fewer pixels; another shape is another view
+            if abs(decoded.width * height_px / (decoded.height * width_px) - 1) > _SAME_ASPECT:
+                self._lost += 1
+                reason = f"size {decoded.width}x{decoded.height} differs from the flight's {width_px}x{height_px}"
+                return LostFrame(index, name, arrived.time_ns, reason)
+            self._resized += 1
+            fitted = {"width": width_px, "height": height_px}
+        try:
+            image = decoded.to_ndarray(format="rgb24", **fitted)
+        except (av.FFmpegError, ValueError, MemoryError) as error:
+            return LostFrame(index, name, arrived.time_ns, f"corrupt: {error}")
+        return Frame(index, name, arrived.time_ns, np.ascontiguousarray(image, dtype=np.uint8))
+
+
+def open_stream(
+    address: StreamAddress, link: str | None, camera: Callable[[int, int], CameraModel | None],
+    guess: Callable[[int, int], CameraModel], settings: LiveSettings, until: threading.Event, path: Path | None = None,
+) -> LiveStream:
+    """The flight at an address, or in a video file that is being written (`path`), reading already.
+
+    `link` is where a receiver's NMEA comes from. `camera(width, height)` is the camera that was asked for, None where
+    none was: then the stream's own field of view is used, else `guess`. Raises InputError when no picture comes.
+    """
+    stream = LiveStream(address, link, settings, until, path)
+    stream.begin()
+    try:
+        told = camera_of(stream.lens, *stream.size_px) if stream.lens is not None else None
+        stream.camera = camera(*stream.size_px) or told or guess(*stream.size_px)
+    except BaseException:
+        stream.close()
+        raise
+    if path is not None:
+        stream.name = path.stem
+        with path.open("rb") as file:
+            stream.fingerprint = hashlib.sha256(file.read(4096)).hexdigest()
+    else:
+        began = datetime.fromtimestamp(time.time(), UTC)
+        stream.name = f"{address.shown.partition('://')[2] or address.shown}_{began:%Y%m%dT%H%M%SZ}"
+        stream.fingerprint = hashlib.sha256(f"{address.shown} {stream.start_ns}".encode()).hexdigest()
+    return stream

@@ -1,0 +1,82 @@
+"""Telemetry that grows while a flight goes on."""
+
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sorvolo.capture.telemetry.quality import clean, notice
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Floats
+from sorvolo.survey.flight import TELEMETRY_COLUMNS, Notice, Telemetry, no_telemetry
+
+_FIRST_ROWS = 1024
+_PLACE = TELEMETRY_COLUMNS.index("latitude_deg")
+
+
+class TelemetryLog:
+    """Samples in the order in which they came, on the frames' clock. `add` changes it, from any thread.
+
+    Threads that need the next sample wait for it; whoever asks gets all that is known so far, cleaned as a file's is.
+    """
+
+    def __init__(self, reader: str, name: str) -> None:
+        self._reader, self._name = reader, name
+        self._times_ns = np.zeros(_FIRST_ROWS, np.int64)
+        self._rows: Floats = np.full((_FIRST_ROWS, len(TELEMETRY_COLUMNS)), np.nan)
+        self._count = self._fixes = self._late = 0
+        self._newest_ns = -(2**62)
+        self._came_s = 0.0
+        self._changed = threading.Condition()
+        self._known = no_telemetry()
+        self._known_count = 0
+
+    def add(self, time_ns: int, columns: Mapping[str, float]) -> None:
+        """One more sample (UTC on the frames' clock); one that is not newer than the last is counted and left out."""
+        with self._changed:
+            if time_ns <= self._newest_ns:
+                self._late += 1
+                return
+            if self._count == len(self._times_ns):
+                self._times_ns = np.concatenate([self._times_ns, np.zeros_like(self._times_ns)])
+                self._rows = np.concatenate([self._rows, np.full_like(self._rows, np.nan)])
+            self._times_ns[self._count] = self._newest_ns = time_ns
+            for name, value in columns.items():
+                self._rows[self._count, TELEMETRY_COLUMNS.index(name)] = value
+            self._fixes += bool(np.isfinite(self._rows[self._count, _PLACE]))
+            self._count += 1
+            self._came_s = time.monotonic()
+            self._changed.notify_all()
+
+    @property
+    def version(self) -> int:
+        """How many samples there are: it grows with every one."""
+        return self._count
+
+    def telemetry(self, notices: Sequence[Notice] = ()) -> Telemetry:
+        """What is known so far, with the notices of whoever read it; `no_telemetry()` while nothing is."""
+        with self._changed:
+            count = self._count
+            if count == self._known_count:
+                return self._known
+            times_ns, rows = self._times_ns[:count].copy(), self._rows[:count].copy()
+            late = notice("backward_time", self._late, "{} samples came out of order and are not used")
+        try:
+            columns = {name: rows[:, place] for place, name in enumerate(TELEMETRY_COLUMNS)}
+            found = clean(self._reader, self._name, times_ns, columns, notices=[*notices, *late])
+        except InputError:  # nothing usable yet
+            found = replace(no_telemetry(), notices=tuple(notices))
+        self._known, self._known_count = found, count
+        return found
+
+    def wait_for_fixes(self, count: int, until_s: float) -> bool:
+        """Wait for so many samples with a place, until that moment (monotonic clock) at most; whether they came."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._fixes >= count, max(0.0, until_s - time.monotonic()))
+
+    def wait_past(self, time_ns: int, until_s: float) -> bool:
+        """Wait for a sample at or after a time (UTC), at most until that moment; whether there is one."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._newest_ns >= time_ns, max(0.0, until_s - time.monotonic()))
