@@ -18,7 +18,7 @@ HITUAV_BLOCKS, HITUAV_HELD_OUT, HITUAV_VALIDATION, HITUAV_GAP = 20, (3, 8, 13, 1
 AERIAL_HELD_OUT = ("DJI-00760", "DJI_0762")
 TINYPERSON_HELD_OUT = ("bb_V0014", "bb_V0031", "bb_V0018", "chitube_V0006", "bb_V0002", "bb_V0028")
 TINYPERSON_VALIDATION = ("bb_V0025", "bb_V0008")
-CATS_HELD_OUT = ("1", "Drone2")
+CATS_HELD_OUT = ("1", "4")
 _TINYPERSON_LARGEST_PX = 60.0  # larger boxes of that set are often regions to ignore
 
 
