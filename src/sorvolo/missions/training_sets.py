@@ -20,9 +20,9 @@ from sorvolo.training.samples import Share
 
 _SMALL = CLASSES[2]
 _LOOKED_AT = 9  # pictures of a set by which it is told whether it is thermal
-_SYNTHETIC_PICTURES = (12, 1200)  # made at least and at most
+_SYNTHETIC_PICTURES = (4, 1200)  # made at least and at most
 _SYNTHETIC_THERMAL = 0.2
-_BLOCKS, _GAP = 20, 10  # into which a set of too few videos is cut; frames left out between them, at most
+_BLOCKS, _GAP = 10, 10  # into which a set of too few videos is cut; frames left out between them, at most
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def _split(labelled: LabelledSet, share: float, seed: int) -> tuple[LabelledSet,
         pass  # too few videos: told below
     block = max(1, len(labelled) // _BLOCKS)
     try:
-        parts = split_by_blocks(labelled, shares, block, min(_GAP, block), seed)
+        parts = split_by_blocks(labelled, shares, block, min(_GAP, block // 2), seed)
     except InputError as error:
         return labelled, empty, [f"nothing of {labelled.name} is held out: {error}"]
     text = (
@@ -183,9 +183,14 @@ def _honest(labelled: LabelledSet, classes: Sequence[str]) -> LabelledSet:
 
 
 def _is_thermal(labelled: LabelledSet) -> bool:
-    """Whether most of a few pictures over the whole set are."""
+    """Whether most of a few pictures over the whole set are; damaged ones are asked nothing."""
     pictures = labelled.pictures[:: max(1, len(labelled) // _LOOKED_AT)][:_LOOKED_AT]
-    seen = [is_thermal(read_picture(Path(picture.path))) for picture in pictures]
+    seen = []
+    for picture in pictures:
+        try:
+            seen.append(is_thermal(read_picture(Path(picture.path))))
+        except InputError:
+            continue
     return sum(seen) * 2 > len(seen)
 
 

@@ -1,0 +1,219 @@
+"""`sorvolo train`: a tiny network learns, is stopped, goes on, and is written; bad input is told."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from sorvolo.cli.main import main  # noqa: E402
+from sorvolo.detection.detector import Detector  # noqa: E402
+from sorvolo.errors import InputError, SettingsError  # noqa: E402
+from sorvolo.missions.train_detector import TrainingUpdate, train_detector  # noqa: E402
+from sorvolo.missions.train_settings import TrainSettings  # noqa: E402
+from sorvolo.missions.training_sets import DataOptions, read_training_sets, simulate_samples  # noqa: E402
+from sorvolo.store.training_page import training_page  # noqa: E402
+
+_WIDTH, _HEIGHT = 128, 96
+
+
+def _labelled(folder: Path, videos: int, frames: int, *, names: tuple[str, ...] = ("car",), seed: int = 0) -> Path:
+    """YOLO pictures of bright squares on dark ground, one of each class; the class is its brightness."""
+    rng = np.random.default_rng(seed)
+    for part in ("images", "labels"):
+        (folder / part).mkdir(parents=True)
+    for video in range(videos):
+        for frame in range(frames):
+            image = rng.integers(40, 60, (_HEIGHT, _WIDTH, 3)).astype(np.uint8)
+            rows = []
+            for label in range(len(names)):
+                side = int(rng.integers(22, 32))
+                x, y = int(rng.integers(0, _WIDTH - side)), int(rng.integers(0, _HEIGHT - side))
+                image[y:y + side, x:x + side] = (30, 220, 240) if label == 0 else (240, 60, 40)
+                rows.append(f"{label} {(x + side / 2) / _WIDTH} {(y + side / 2) / _HEIGHT} {side / _WIDTH} "
+                            f"{side / _HEIGHT}")
+            name = f"flight{video}_{frame:04d}"
+            cv2.imwrite(str(folder / "images" / f"{name}.png"), image)
+            (folder / "labels" / f"{name}.txt").write_text("\n".join(rows))
+    (folder / "classes.txt").write_text("\n".join(names))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _labelled(tmp_path_factory.mktemp("data") / "squares", 4, 5)
+
+
+def _settings(**changes: object) -> TrainSettings:
+    return TrainSettings(**({"weights": "none", "steps": 6, "batch": 2, "side_px": 64} | changes))  # type: ignore[arg-type]
+
+
+def _train(data: Path, out: Path, settings: TrainSettings, *, resume: bool = False) -> Iterator[TrainingUpdate]:
+    return train_detector([data], out, settings, DataOptions(val="0.25"), device="cpu", resume=resume)
+
+
+def test_the_command_learns_and_writes_a_model_that_runs(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "my-model"
+    options = ["--weights", "none", "--steps", "40", "--batch", "2", "--side", "64", "--val", "0.25", "--device", "cpu"]
+    assert main(["train", str(data), "--out", str(out), *options, "--json"]) == 0
+
+    report = json.loads((out / "training.json").read_text())
+    assert report["held_out"]["ap50"] > 0.2  # chance finds nothing
+    first, last = ([row["region_score"] for row in report["losses"][part]] for part in (slice(5), slice(-5, None)))
+    assert sum(last) < 0.5 * sum(first)
+    assert report["export"]["good"] and report["export"]["detections"] > 0
+    assert [(each["part"], each["pictures"], each["videos"]) for each in report["sets"]] == [
+        ("learnt from", 15, 3), ("checked on", 5, 1)
+    ]
+    assert (out / "training.html").read_text().count("<svg") == 1
+
+    detector = Detector.load(out / "model.onnx")
+    assert (detector.classes, detector.info.preset, detector.info.thermal) == (("car",), "fast", False)
+    low, high = detector.info.best_px["car"]
+    assert 20 <= low < high <= 34
+    picture = cv2.cvtColor(cv2.imread(str(data / "images" / "flight0_0000.png")), cv2.COLOR_BGR2RGB)
+    assert len(detector.detect(picture, least_score=0.02))
+
+
+def test_a_run_that_was_stopped_ends_as_one_that_was_not(data: Path, tmp_path: Path) -> None:
+    settings = _settings(rpn="standard")
+    whole = [each for each in _train(data, tmp_path / "whole", settings) if each.losses is not None]
+    stopped = _train(data, tmp_path / "stopped", settings)
+    for update in stopped:
+        if update.step == 4:
+            stopped.close()  # type: ignore[attr-defined]
+    assert not (tmp_path / "stopped" / "model.onnx").exists()
+    rest = [each for each in _train(data, tmp_path / "stopped", settings, resume=True) if each.losses is not None]
+    assert [each.step for each in rest] == [5, 6]
+    assert [each.losses.loss for each in rest] == [each.losses.loss for each in whole[4:]]  # type: ignore[union-attr]
+    reports = [json.loads((tmp_path / name / "training.json").read_text()) for name in ("whole", "stopped")]
+    for report in reports:
+        for row in report["losses"]:
+            row.pop("seconds")
+    assert reports[0]["losses"] == reports[1]["losses"] and len(reports[0]["losses"]) == 6
+    assert reports[0]["held_out"] == reports[1]["held_out"]
+
+    with pytest.raises(SettingsError, match="already holds a run; --resume goes on with it"):
+        next(_train(data, tmp_path / "stopped", settings))
+    with pytest.raises(SettingsError, match=r"cannot go on with other settings: .*seed was 1, is 2"):
+        list(_train(data, tmp_path / "stopped", _settings(rpn="standard", seed=2), resume=True))
+
+
+def test_other_labels_are_other_data(tmp_path: Path) -> None:
+    place = _labelled(tmp_path / "squares", 2, 3)
+    run = _train(place, tmp_path / "out", _settings())
+    for update in run:
+        if update.step == 1:
+            run.close()  # type: ignore[attr-defined]
+    (place / "labels" / "flight0_0000.txt").write_text("0 0.5 0.5 0.2 0.2")
+    with pytest.raises(SettingsError, match="cannot go on with other settings: data was"):
+        list(_train(place, tmp_path / "out", _settings(), resume=True))
+
+
+def test_damaged_pictures_are_passed_over_and_told(tmp_path: Path) -> None:
+    place = _labelled(tmp_path / "squares", 2, 3)
+    path = place / "images" / "flight0_0001.png"
+    path.write_bytes(path.read_bytes()[:2000])
+    options = DataOptions(val="0")
+    list(train_detector([place], tmp_path / "out", _settings(steps=2), options, device="cpu"))
+    report = json.loads((tmp_path / "out" / "training.json").read_text())
+    assert any(f"1 pictures cannot be read and were passed over (first: {path}" in each for each in report["notices"])
+    assert any("nothing was held out" in each for each in report["notices"])
+    assert report["held_out"] is None and report["model"]["thresholds"] == {"car": 0.5}
+
+
+def _sets(*places: Path, val: str = "0.25", **options: object):  # type: ignore[no-untyped-def]
+    return read_training_sets(
+        places, DataOptions(val, **options), synthetic=0.0, seed=1, simulated=Path("none")  # type: ignore[arg-type]
+    )
+
+
+def test_whole_videos_are_held_out(data: Path) -> None:
+    sets = _sets(data)
+    learnt = {each.group for share in sets.shares for each in share.labelled.pictures}
+    held = {each.group for labelled in sets.held_out for each in labelled.pictures}
+    assert len(learnt) == 3 and len(held) == 1 and not learnt & held
+
+
+def test_one_video_is_split_by_blocks_and_the_score_called_too_good(tmp_path: Path) -> None:
+    sets = _sets(_labelled(tmp_path / "one", 1, 40))
+    assert 0 < len(sets.held_out[0]) < 20 < len(sets.shares[0].labelled)
+    assert any("frames of one video look alike, so the score will be too good" in each for each in sets.notices)
+
+
+def test_a_video_in_both_parts_is_warned_of(data: Path, tmp_path: Path) -> None:
+    other = _labelled(tmp_path / "other", 2, 2)
+    sets = _sets(data, val=str(other))
+    assert len(sets.shares[0].labelled) == 20 and len(sets.held_out[0]) == 4
+    assert any("lie in both" in each and "flight0" in each for each in sets.notices)
+
+
+def test_classes_that_a_set_knows_nothing_of_are_unlabelled_there(data: Path, tmp_path: Path) -> None:
+    people = _labelled(tmp_path / "people", 4, 2, names=("person", "car"))
+    sets = _sets(data, people)
+    assert sets.classes == ("person", "car")
+    assert [sorted(share.labelled.unlabelled) for share in sets.shares] == [["person"], []]
+    assert any(each == "only 6 boxes of class person to learn from" for each in sets.notices)
+    assert _sets(people, classes={"car": "small object"}).classes == ("small object",)
+
+
+def test_simulated_pictures_are_mixed_in(data: Path, tmp_path: Path) -> None:
+    assert list(simulate_samples(tmp_path / "simulated", 1, seed=1))[-1] == "simulating pictures: 4 of 4"
+    assert not list(simulate_samples(tmp_path / "simulated", 1, seed=1))  # kept for a run that goes on
+    sets = read_training_sets([data], DataOptions(), synthetic=0.4, seed=1, simulated=tmp_path / "simulated")
+    assert sets.classes == ("person", "car", "small object")
+    # small objects are composed onto the ground of the set that has none
+    assert sets.shares[0].pastes == "small object" and not sets.shares[1].pastes
+    weights = {share.labelled.name: share.weight for share in sets.shares}
+    assert weights.pop("squares") == pytest.approx(0.6)
+    assert weights and all(name.startswith("simulated") for name in weights)
+    assert sum(weights.values()) == pytest.approx(0.4)
+
+
+def test_bad_input_is_told(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def words(*arguments: str) -> str:
+        assert main(["train", *arguments, "--out", str(tmp_path / "out")]) == 1
+        return " ".join(capsys.readouterr().err.split())
+
+    place = str(data)
+    assert "neither an existing data set nor a share" in words(place, "--val", "gone")
+    assert "share to check on must lie in 0 to below 1" in words(place, "--val", "1.5")
+    assert "no data to learn from" in words()
+    assert "does not exist" in words(str(tmp_path / "gone"))
+    assert "side_px must be a multiple of 32, got 100" in words(place, "--side", "100")
+    assert "steps must lie in 1" in words(place, "--steps", "0")
+    assert "holds no checkpoint.pt to go on from" in words(place, "--resume")
+    assert "no weights at" in words(place, "--weights", "gone.pth")
+    assert "device must be auto, cpu or cuda, got 'tpu'" in words(place, "--device", "tpu")
+    assert "THEIRS=OURS" in words(place, "--classes", "=car")
+    assert "none of its class names" in words(place, "--classes", "Boat=boat")
+    if not torch.cuda.is_available():
+        assert "sees no GPU; use --device cpu" in words(place, "--device", "cuda")
+
+
+def test_pictures_without_any_object_teach_nothing(tmp_path: Path) -> None:
+    place = _labelled(tmp_path / "squares", 2, 2)
+    for path in (place / "labels").glob("*.txt"):
+        path.write_text("")
+    with pytest.raises(InputError, match="none of the pictures to learn from has a labelled object"):
+        _sets(place)
+
+
+def test_names_in_the_report_are_text() -> None:
+    report = {
+        "model": {"name": "<b>", "best_px": {"<i>": (1, 2)}}, "held_out": {"ap50": 0.5, "classes": {"<i>": 0.5}},
+        "reported": {"<i>": {"score": 0.5, "precision": None, "recall": 0.25}}, "stopped_early": True, "step": 2,
+        "steps": 5, "seconds": 3.0, "device": "cpu", "notices": ["<script>"], "losses": [],
+        "checks": [{"step": k, "ap50": 0.1 * k, "classes": {"<i>": None}} for k in (1, 2)], "best_step": 2,
+        "sets": [{"name": "<s>", "part": "learnt from", "pictures": 1, "videos": 1, "boxes": {"<i>": 3},
+                  "unlabelled": []}],
+        "settings": {"preset": "fast"}, "weights": "none",
+        "export": {"box_px": 0.0, "score": 0.0, "detections": 3, "bytes": 5_000_000},
+    }
+    page = training_page(report)
+    assert "<i>" not in page and "<script>" not in page and "<s>" not in page and "&lt;i&gt;" in page
+    assert "then its checks no longer got better" in page and page.count("<polyline") == 1
