@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     )
     from sorvolo.missions.settings import CompareSettings, MapSettings
     from sorvolo.missions.simulate_site import simulate_site
+    from sorvolo.missions.watch import watch
+    from sorvolo.missions.watch_run import WatchUpdate
+    from sorvolo.missions.watch_settings import WatchOutputs, WatchSettings
     from sorvolo.simulation.presets import preset, preset_names
     from sorvolo.simulation.settings import SimulationSettings
     from sorvolo.store.archive import Archive
@@ -57,6 +60,9 @@ __all__ = [
     "StoreError",
     "ThesisSettings",
     "Verdict",
+    "WatchOutputs",
+    "WatchSettings",
+    "WatchUpdate",
     "__version__",
     "answer_questions",
     "calibrate_camera",
@@ -76,6 +82,7 @@ __all__ = [
     "read_area",
     "simulate_site",
     "thesis_steps",
+    "watch",
     "write_calibration",
     "write_plan",
 ]
@@ -98,6 +105,9 @@ _HOMES = {
     ),
     "missions.settings": ("CompareSettings", "MapSettings"),
     "missions.simulate_site": ("simulate_site",),
+    "missions.watch": ("watch",),
+    "missions.watch_run": ("WatchUpdate",),
+    "missions.watch_settings": ("WatchOutputs", "WatchSettings"),
     "simulation.presets": ("preset", "preset_names"),
     "simulation.settings": ("SimulationSettings",),
     "store.archive": ("Archive",),

@@ -15,16 +15,24 @@ def _fly(
     rng = np.random.default_rng(seed)
     drift_m = gps_m * np.cumsum(rng.normal(0, 1, way_m.shape), axis=0) / np.sqrt(len(way_m))
     finder, told = HeadingFromMotion(), []
-    for number, (heading_deg, place_m) in enumerate(zip(headings_deg, way_m)):
-        turned_deg = 0.0 if number == 0 else -(heading_deg - headings_deg[number - 1])
-        step_m = np.zeros(2) if number == 0 else place_m - way_m[number - 1]
-        heading = np.radians(heading_deg)
-        right = step_m @ [np.cos(heading), -np.sin(heading)]
-        up = step_m @ [np.sin(heading), np.cos(heading)]
-        # what lies under the camera goes the other way in the picture; y is down
-        moved_px = np.array([-right, up]) / _M_PER_PX + rng.normal(0, wobble_px, 2)
-        told.append(finder.add(number / 10, np.radians(turned_deg), moved_px, place_m + drift_m[number]))
+    for number, place_m in enumerate(way_m):
+        outline_px = _outline(headings_deg[number], place_m, headings_deg[0], way_m[0])
+        told.append(finder.add(number / 10, outline_px + rng.normal(0, wobble_px, 2), place_m + drift_m[number]))
     return told
+
+
+def _outline(heading_deg: float, place_m: np.ndarray, first_deg: float, first_m: np.ndarray) -> np.ndarray:
+    """A picture of 400 x 300 px on the ground, in the pixels of the first one."""
+    corners = np.array([[-200.0, 150.0], [200.0, 150.0], [200.0, -150.0], [-200.0, -150.0]]) * _M_PER_PX
+    ground_m = corners @ _north_up(heading_deg).T + place_m
+    seen = (ground_m - first_m) @ _north_up(first_deg) / _M_PER_PX
+    return np.column_stack([200 + seen[:, 0], 150 - seen[:, 1]])
+
+
+def _north_up(heading_deg: float) -> np.ndarray:
+    """East and north of a picture's right and up."""
+    angle = np.radians(heading_deg)
+    return np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
 
 
 def _apart_deg(one: float, other: float) -> float:
@@ -61,6 +69,8 @@ def test_hovering_tells_nothing_and_a_cut_begins_anew() -> None:
     assert all(each.sigma_deg == np.inf for each in told)
     finder = HeadingFromMotion()
     for number in range(60):
-        finder.add(number / 10, 0.0, np.array([0.0, 10.0]), np.array([0.0, 0.5 * number]))
+        place_m = np.array([0.0, 0.5 * number])
+        last = finder.add(number / 10, _outline(0.0, place_m, 0.0, np.zeros(2)), place_m)
+    assert last.sigma_deg < 5
     finder.lose()
-    assert finder.add(6.0, 0.0, np.array([0.0, 10.0]), np.array([0.0, 30.0])).sigma_deg == np.inf
+    assert finder.add(6.0, _outline(0.0, np.zeros(2), 0.0, np.zeros(2)), np.array([0.0, 30.0])).sigma_deg == np.inf

@@ -22,10 +22,12 @@ from sorvolo.cli.plan import plan
 from sorvolo.cli.review import review
 from sorvolo.cli.simulate import simulate
 from sorvolo.cli.train import train
+from sorvolo.cli.watch import watch_command
 from sorvolo.errors import SorvoloError
 
 _COMMANDS: dict[str, Callable[..., None]] = {
-    "inspect": inspect, "plan": plan, "map": map_command, "compare": compare, "simulate": simulate, "train": train,
+    "inspect": inspect, "plan": plan, "map": map_command, "compare": compare, "watch": watch_command,
+    "simulate": simulate, "train": train,
     "calibrate": calibrate, "demo": demo, "history": history, "review": review,
 }
 _FAILED, _STOPPED = 1, 130

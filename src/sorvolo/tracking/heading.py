@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.arrays import Floats, PointsPx
 
 _WINDOW_S = 20.0
 _LEAST_M = 6.0  # of way, rms: less is within the fixes' own errors
@@ -22,28 +22,27 @@ class Heading:
 
 
 class HeadingFromMotion:
-    """A downward camera's heading from its own pictures and the fixes; only `add` changes it.
+    """A downward camera's heading from its own pictures and the fixes; `add` and `lose` change it.
 
-    The pictures tell how the camera turned and moved, all but the direction in which it began; the least-squares turn
-    of that way onto the fixes of the last seconds is this direction (Procrustes in the plane, as complex numbers: real
-    part right or east, imaginary part up or north).
+    `ImageMotion` lays each picture into the first one, which tells how the camera turned and moved since, all but the
+    direction in which it began; the least-squares turn of that way onto the fixes of the last seconds is this direction
+    (Procrustes in the plane, as complex numbers: real part right or east, imaginary part up or north).
     """
 
     def __init__(self) -> None:
-        self._turned_rad = 0.0
-        self._way = 0.0 + 0.0j
+        self._turned_rad = 0.0  # clockwise since the first picture
         self._points: deque[tuple[float, complex, complex]] = deque()
 
-    def add(self, time_s: float, turned_rad: float, moved_px: Floats, place_m: Floats) -> Heading:
-        """Take in one frame and tell its heading.
+    def add(self, time_s: float, outline_px: PointsPx, place_m: Floats) -> Heading:
+        """Take in one picture and tell its heading.
 
-        `turned_rad` is how far the picture's content turned since the frame before, clockwise as seen (y is down);
-        `moved_px` (2,) where the middle's content went, right and down; `place_m` (2,) the fix, east and north.
+        `outline_px` (4, 2) are its corners, from the top-left one clockwise, in the first picture's pixels; `place_m`
+        (2,) the fix, east and north.
         """
-        self._turned_rad -= turned_rad
-        step = complex(-moved_px[0], moved_px[1])
-        self._way += step * np.exp(-1j * self._turned_rad)
-        self._points.append((time_s, self._way, complex(place_m[0], place_m[1])))
+        right, down = outline_px[1] - outline_px[0]
+        self._turned_rad = float(np.arctan2(down, right))
+        x, y = outline_px.mean(axis=0)
+        self._points.append((time_s, complex(x, -y), complex(place_m[0], place_m[1])))
         while time_s - self._points[0][0] > _WINDOW_S:
             self._points.popleft()
         return self._told()

@@ -1,0 +1,237 @@
+"""Where what a watch sees lies and which object it is: on the ground if telemetry allows it, else in the picture."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.ground import footprint
+from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
+from sorvolo.missions.flight_setup import FlightSetup, new_site
+from sorvolo.survey.flight import CameraPrior, Frame, Notice, Site
+from sorvolo.survey.objects import Detections, Sighting, Track
+from sorvolo.tracking.heading import HeadingFromMotion
+from sorvolo.tracking.image_motion import ImageMotion
+from sorvolo.tracking.locate import locate
+from sorvolo.tracking.tracker import IN_PICTURES, Tracker, TrackerSettings, TrackUpdate
+
+_MOST_DRONE_PLACES = 200_000
+
+
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """What became of a frame's detections, each with its sighting, if it has a place, and its track (0: none).
+
+    `merged` are ids of tracks that turned out to be objects seen before.
+    """
+
+    sightings: Sequence[Sighting | None]
+    track_ids: Sequence[int]
+    new_ids: frozenset[int]
+    merged: frozenset[int]
+
+
+class Places(Protocol):
+    """Detections placed and followed, frame by frame."""
+
+    @property
+    def site(self) -> Site:
+        """What places are counted in; a local one's metres are pixels of the first frame."""
+
+    def m_per_px(self, frame: Frame) -> float | None:
+        """The ground's sampling distance in the frame; None where unknown."""
+
+    def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
+        """Place a frame's detections and give them to their tracks."""
+
+    def tracks(self) -> Sequence[Track]:
+        """All tracks as they are known now."""
+
+    def finish(self) -> Sequence[Track]:
+        """All tracks when nothing more comes."""
+
+    def notices(self) -> tuple[Notice, ...]:
+        """How frames were placed, and what could not be."""
+
+    def path_m(self) -> Floats:
+        """(N, 2) where the camera was, in site metres; none where nothing says so."""
+
+
+def places_of(setup: FlightSetup, least_score: float) -> Places:
+    """The way to place a flight's detections that its telemetry allows; all of them score `least_score` or more."""
+    why_not = _why_not_on_ground(setup)
+    sure_score = min(TrackerSettings.sure_score, least_score)  # lower ones would never begin a track
+    return GroundPlaces(setup, sure_score) if why_not is None else ImagePlaces(setup, sure_score, why_not)
+
+
+class GroundPlaces:
+    """Detections on the ground of a flight with telemetry, tracked in metres."""
+
+    def __init__(self, setup: FlightSetup, sure_score: float) -> None:
+        self._setup = setup
+        self._tracker = Tracker(TrackerSettings(sure_score=sure_score))
+        self._unlocated: Counter[str] = Counter()
+        knows_heading = setup.track is None or setup.track.attitude != "none"
+        self._turning = None if knows_heading else _Turning()
+        self._path: list[Floats] = []
+        self._site = new_site(setup, setup.source.name, 1.0, 0.0)
+
+    @property
+    def site(self) -> Site:
+        """The flight's own frame of metres."""
+        return self._site
+
+    def m_per_px(self, frame: Frame) -> float | None:
+        """Along the optical axis; None where the camera looks at the horizon or its height is not known."""
+        prior = self._prior(frame)
+        down = -float(prior.rotation[2, 2])
+        height_m = float(prior.position_m[2])
+        if down < 0.1 or height_m <= 0:
+            return None
+        return height_m / down / self._setup.source.camera.camera.fx_px
+
+    def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
+        """Place a frame's detections on level ground and give them to their tracks."""
+        prior = self._prior(frame)
+        if self._turning is not None:
+            prior = self._turning.take(frame, time_ns, found, prior)
+        camera = self._setup.source.camera
+        sightings, unlocated = locate(
+            found, frame.index, frame.name, time_ns, camera.camera, prior, focal_sigma=camera.focal_sigma
+        )
+        self._unlocated.update(unlocated)
+        outline_m = footprint(camera.camera, Pose(prior.rotation, prior.position_m))
+        known = [each for each in sightings if each is not None]
+        update = self._tracker.update(
+            known, time_ns=time_ns, footprint_m=outline_m if np.isfinite(outline_m).all() else None
+        )
+        if prior.knows_place and len(self._path) < _MOST_DRONE_PLACES:
+            self._path.append(prior.position_m[:2])
+        return _taken(sightings, update)
+
+    def tracks(self) -> Sequence[Track]:
+        """All tracks as they are known now."""
+        return self._tracker.tracks()
+
+    def finish(self) -> Sequence[Track]:
+        """All tracks when nothing more comes."""
+        return self._tracker.finish()
+
+    def notices(self) -> tuple[Notice, ...]:
+        """How frames were placed, and what could not be."""
+        track = self._setup.track
+        words = {"gimbal": "its gimbal's angles", "body": "the aircraft's angles, the camera taken as fixed downwards"}
+        nadir = "no angles: the camera taken as looking straight down, its heading found from the pictures' motion"
+        how = words.get(track.attitude, nadir) if track else ""
+        text = f"places come from the telemetry's position, height ({track.height_words if track else ''}) and {how}"
+        return (
+            *self._setup.notices, Notice("placed_by", 1, text),
+            *(Notice("not_placed", count, f"{count} detections have no place on the ground: {reason}")
+              for reason, count in self._unlocated.most_common()),
+        )
+
+    def path_m(self) -> Floats:
+        """(N, 2) where the camera was."""
+        return np.array(self._path).reshape(-1, 2)
+
+    def _prior(self, frame: Frame) -> CameraPrior:
+        """Telemetry's word, its height's sigma with that of the ground in it."""
+        prior = self._setup.prior(frame, first=False)
+        track = self._setup.track
+        if track is None:
+            return prior
+        sigma = prior.position_sigma_m.copy()
+        sigma[2] = np.hypot(sigma[2], track.altitude_offset_sigma_m)
+        return replace(prior, position_sigma_m=sigma)
+
+
+class _Turning:
+    """The heading of a camera of which telemetry tells none, from what its pictures show of its motion."""
+
+    def __init__(self) -> None:
+        self._motion, self._heading = ImageMotion(), HeadingFromMotion()
+        self._segments = 1
+
+    def take(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> CameraPrior:
+        """The prior with the heading in it, where that is known by now."""
+        _, outline_px = self._motion.locate(found, frame, time_ns)
+        if self._motion.segments != self._segments:
+            self._segments = self._motion.segments
+            self._heading.lose()
+        if not prior.knows_place:
+            return prior
+        heading = self._heading.add(time_ns / 1e9, outline_px, prior.position_m[:2])
+        if not np.isfinite(heading.sigma_deg):
+            return prior
+        sigma_deg = np.array([*prior.attitude_sigma_deg[:2], heading.sigma_deg])
+        rotation = site_from_gimbal_rotation(heading.heading_deg, -90.0, 0.0)
+        return replace(prior, rotation=rotation, attitude_sigma_deg=sigma_deg)
+
+
+class ImagePlaces:
+    """Detections of a flight that nothing places, tracked in the first frame's pixels."""
+
+    def __init__(self, setup: FlightSetup, sure_score: float, why_not: str) -> None:
+        self._setup, self._why_not = setup, why_not
+        self._motion, self._tracker = ImageMotion(), Tracker(replace(IN_PICTURES, sure_score=sure_score))
+        self._site = Site(setup.source.name, setup.frame.origin, "", 1.0, is_local=True)
+
+    @property
+    def site(self) -> Site:
+        """A frame without metres: the first picture's pixels."""
+        return self._site
+
+    def m_per_px(self, frame: Frame) -> float | None:
+        """Unknown."""
+        return None
+
+    def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
+        """Take the camera's motion out of a frame's detections and give them to their tracks."""
+        sightings, outline = self._motion.locate(found, frame, time_ns)
+        update = self._tracker.update(sightings, time_ns=time_ns, footprint_m=outline)
+        return _taken(sightings, update)
+
+    def tracks(self) -> Sequence[Track]:
+        """All tracks as they are known now."""
+        return self._tracker.tracks()
+
+    def finish(self) -> Sequence[Track]:
+        """All tracks when nothing more comes."""
+        return self._tracker.finish()
+
+    def notices(self) -> tuple[Notice, ...]:
+        """Why nothing is placed on the ground."""
+        text = f"{self._why_not}: nothing is placed on the ground, objects are followed in the picture"
+        others = [each for each in self._setup.notices if each.code != "no_telemetry"]
+        if self._motion.guessed:
+            words = f"{self._motion.guessed} frames show no motion that fits: taken to go on as before"
+            others.append(Notice("motion_guessed", self._motion.guessed, words))
+        if self._motion.segments > 1:
+            words = f"the picture changed {self._motion.segments - 1} times all at once: objects are counted anew"
+            others.append(Notice("scene_cuts", self._motion.segments - 1, words))
+        return (*others, Notice("not_on_ground", 1, text))
+
+    def path_m(self) -> Floats:
+        """Nothing says where the camera was."""
+        return np.zeros((0, 2))
+
+
+def _why_not_on_ground(setup: FlightSetup) -> str | None:
+    """What telemetry lacks for places on the ground; None where it has all that is needed."""
+    track = setup.track
+    if track is None:
+        return "telemetry without a single fix" if len(setup.source.telemetry) else "no telemetry"
+    if not np.isfinite(track.vertical_sigma_m):
+        return "telemetry has no height"
+    if not np.isfinite(track.altitude_offset_sigma_m):
+        return f"heights are {track.height_words.split(',')[0]} and the ground's is unknown (give --ground-elevation)"
+    return None
+
+
+def _taken(sightings: Sequence[Sighting | None], update: TrackUpdate) -> Taken:
+    ids = iter(update.track_ids)
+    of_detections = [0 if each is None else next(ids) for each in sightings]
+    return Taken(sightings, of_detections, frozenset(update.new), frozenset(update.merged))
