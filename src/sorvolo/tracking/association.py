@@ -6,7 +6,6 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from sorvolo.geometry.arrays import Anything, Floats, PointsM
-from sorvolo.tracking.common_shift import CommonShift
 from sorvolo.tracking.motion import Motions
 
 _GATE = 11.8  # squared distance in sigmas, two axes: 3 in 1000 of one object's sightings lie beyond
@@ -34,16 +33,18 @@ class Pairs:
 
 
 def place_likelihoods(
-    motions: Motions, places_m: PointsM, covariances_m2: Floats, shift_m: PointsM, shift_m2: Floats
+    motions: Motions, places_m: PointsM, covariances_m2: Floats, offsets_m: PointsM, offsets_m2: Floats
 ) -> Floats:
     """(tracks, sightings) log density of each sighting's place if it is that track's; very low beyond the gate.
 
-    `covariances_m2` (sightings, 2, 2) are the sightings' own; the frame's common shift (2,) is known to (2, 2).
+    `covariances_m2` (sightings, 2, 2) are the sightings' own; a track's sightings would lie `offsets_m` (tracks, 2)
+    beside it, with variance `offsets_m2` (tracks,) per axis.
     """
-    gaps = places_m[None, None] - shift_m - motions.means[:, :, None, :2]  # (N, 2, M, 2)
-    spread = motions.covariances[:, :, None, :2, :2] + (covariances_m2 + shift_m2)[None, None]
-    inverse = _inverse(spread)
-    squared = np.einsum("nkma,nkmab,nkmb->nkm", gaps, inverse, gaps)
+    gaps = places_m[None, None] - (motions.means[:, :, :2] + offsets_m[:, None])[:, :, None]  # (N, 2, M, 2)
+    loose = offsets_m2[:, None, None, None, None] * np.eye(2)
+    inverse = _inverse(motions.covariances[:, :, None, :2, :2] + covariances_m2[None, None] + loose)
+    x, y = gaps[..., 0], gaps[..., 1]
+    squared = inverse[..., 0, 0] * x * x + 2 * inverse[..., 0, 1] * x * y + inverse[..., 1, 1] * y * y
     logs = -0.5 * (squared - np.log(_determinant(inverse))) - np.log(2 * np.pi)
     logs = np.where(squared <= _GATE, logs + np.log(motions.weights)[:, :, None], _NEVER)
     return np.logaddexp(logs[:, 0], logs[:, 1])
@@ -79,29 +80,34 @@ def assigned(gains: Floats) -> Pairs:
 
 
 def voted_shift(
-    motions: Motions, places_m: PointsM, covariances_m2: Floats, shift: CommonShift, fits: Floats, gains: Floats,
-    new_log_density: float,
+    motions: Motions, places_m: PointsM, covariances_m2: Floats, shares: Floats, loose_m2: Floats, slow_m2: float,
+    fits: Floats, gains: Floats, new_log_density: float, reluctance: float = 0.0,
 ) -> PointsM:
-    """(2,) the frame's common shift under which the pattern of its sightings fits the tracks best.
+    """(2,) the error of the frame's shift under which the pattern of its sightings fits the tracks best.
 
-    Each likely pair votes for the shift that brings it together; a shift's worth is that of all sightings with their
-    best tracks. `fits` (tracks, sightings) is what beside place speaks for pairs, `gains` what all together does.
+    Each likely pair votes for the error that brings it together; an error's worth is that of all sightings with their
+    best tracks. It has variance `slow_m2` per axis; a track shows its share of it (tracks,), with variance `loose_m2`
+    (tracks,) beside. `fits` (tracks, sightings) is what beside place speaks for pairs, `gains` what all together does;
+    an error must be worth `reluctance` more than none.
     """
-    rows, columns = np.nonzero(gains > 0)
+    rows, columns = np.nonzero((gains > 0) & (shares > 0.3)[:, None])
     if not len(rows):
-        return shift.mean_m
+        return np.zeros(2)
     best = np.argsort(-gains[rows, columns], kind="stable")[:_MOST_VOTES]
-    tracks_m, track_m2 = motions.places_m, motions.place_covariances_m2
-    shifts = np.concatenate([shift.mean_m[None], places_m[columns[best]] - tracks_m[rows[best]]])
-    near, seen = np.unique(rows), np.unique(columns)
+    tracks_m, track_m2 = motions.places_m, motions.place_covariances_m2 + loose_m2[:, None, None] * np.eye(2)
+    asked = (places_m[columns[best]] - tracks_m[rows[best]]) / shares[rows[best], None]
+    errors = np.concatenate([np.zeros((1, 2)), asked])
+    near, seen = (np.unique(each) for each in np.nonzero(gains > 0))
     gaps = places_m[None, seen] - tracks_m[near][:, None]  # (N, M, 2)
-    spread = track_m2[near][:, None] + covariances_m2[seen][None]
-    inverse = _inverse(spread)
+    inverse = _inverse(track_m2[near][:, None] + covariances_m2[seen][None])
     base = 0.5 * np.log(_determinant(inverse)) - np.log(2 * np.pi) + fits[np.ix_(near, seen)] - new_log_density
-    x, y = np.moveaxis(gaps[None] - shifts[:, None, None], -1, 0)  # (S, N, M) each
+    steps = errors[:, None, :] * shares[near][None, :, None]  # (S, N, 2)
+    x, y = np.moveaxis(gaps[None] - steps[:, :, None], -1, 0)  # (S, N, M) each
     squared = inverse[..., 0, 0] * x * x + 2 * inverse[..., 0, 1] * x * y + inverse[..., 1, 1] * y * y
-    worth = np.maximum(base - 0.5 * squared, 0.0).max(axis=1).sum(axis=1) + shift.log_prior(shifts)
-    chosen: PointsM = shifts[int(np.argmax(worth))]
+    worth = np.maximum(base - 0.5 * squared, 0.0).max(axis=1).sum(axis=1)
+    worth -= 0.5 * (errors**2).sum(axis=1) / max(slow_m2, 1e-9)
+    worth[1:] -= reluctance
+    chosen: PointsM = errors[int(np.argmax(worth))]
     return chosen
 
 

@@ -1,84 +1,189 @@
 """The error that all sightings of a frame have in common: GPS and tilt shift a whole frame, not one object in it.
 
-Places of tracks are kept in a map that the sightings themselves make; the shift is how far a frame lies beside that
-map. It forgets itself over a minute as GPS does, and what a frame's pattern of objects says of it leaves each object's
-own place free of it.
+A sighting lies at its object's place plus the frame's shift plus its own error. The shift wanders as GPS does; a place
+that was first seen with a wrong shift is wrong by as much, and so are all that were seen with it. One Kalman filter
+over the shift and the errors of all places (as in simultaneous localisation and mapping, Smith, Self and Cheeseman
+1990) keeps what they share: an old object seen again corrects the shift and with it all new ones. East and north err
+alike, so that one covariance serves both.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, PointsM
-from sorvolo.tracking.motion import log_density
+from sorvolo.geometry.arrays import Anything, Floats, PointsM
 
 FORGETS_S = 60.0
 """How long a GPS error lasts."""
 
-_FIRST_JITTER = 0.3  # of the shared sigma: what changes from frame to frame, until the frames say it
+_FIRST_JITTER = 0.2  # of the shared sigma: what changes from frame to frame, until the frames say it
 _LEAST_JITTER = 0.03
 _LEARNS = 0.05
-_LOST_SHARE = 0.02  # of frames: a wrong match has led the shift astray, and nothing is known of it but its size
-_EYE = np.eye(2)
+_MOST_ROWS = 300  # places kept with what they share; those not seen for longest keep their own sigma only
+_TINY = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class FittedShift:
-    """The shift (2,) with its covariance, and as each of M matched objects' others have it: (M, 2), (M, 2, 2)."""
+    """What M matched objects say: of each, what its others predict it beside its place, (M, 2), with variance (M,).
 
-    shift_m: PointsM
-    covariance_m2: Floats
+    `jump_m` (2,) is the frame's own part of the shift, gone with it. The rest is what the filter's next state is made
+    of: the objects' `rows` in it (M,), its `crosses` (rows, M) with what was seen, `gains` (rows, M), and the inverse
+    covariance of what was seen, `trusts` (M, M), which makes `solved` (M, 2) of it.
+    """
+
     of_others_m: PointsM
     of_others_m2: Floats
+    rows: Anything
+    gains: Floats
+    crosses: Floats
+    solved: Floats
+    trusts: Floats
+    jump_m: Floats
 
 
 class CommonShift:
-    """How far frames lie beside the map, frame after frame. `move_on` and `settle` change it."""
+    """The shift of frames and the errors of places, by the ids of their tracks."""
 
     def __init__(self) -> None:
         self.mean_m = np.zeros(2)
-        self.covariance_m2 = np.zeros((2, 2))
-        self.limit_m2 = 0.0  # variance per axis of a shift of which nothing else is known
-        self._jitter_m2 = -1.0
+        self.jitter_m2 = -1.0
+        self.jump_m = np.zeros(2)
+        self._covariance = np.zeros((1, 1))  # row 0 is the shift's
+        self._rows: dict[int, int] = {}
+        self._seen: dict[int, int] = {}  # in order of the frames in which they were last matched
+        self._frozen: dict[int, float] = {}
+        self._frame = 0
 
     def move_on(self, elapsed_s: float, shared_sigma_m: float) -> None:
         """A frame `elapsed_s` later, whose sightings share an error of `shared_sigma_m` per axis."""
-        if self._jitter_m2 < 0:
-            self._jitter_m2 = (_FIRST_JITTER * shared_sigma_m) ** 2
-            return  # the first frame is where the map begins
+        shared_m2 = shared_sigma_m**2
+        self._frame += 1
+        self.jump_m = np.zeros(2)
+        if self.jitter_m2 < 0:
+            self.jitter_m2 = _FIRST_JITTER**2 * shared_m2
+            self._covariance[0, 0] = shared_m2
         keeps = float(np.exp(-elapsed_s / FORGETS_S))
-        self.limit_m2 = limit_m2 = 2 * shared_sigma_m**2  # this frame's error and that of those that made the map
+        slow_m2 = max(shared_m2 - self.jitter_m2, 0.25 * shared_m2)
         self.mean_m = keeps * self.mean_m
-        grown = keeps**2 * self.covariance_m2 + ((1 - keeps**2) * limit_m2 + self._jitter_m2) * _EYE
-        self.covariance_m2 = grown * min(1.0, limit_m2 / max(float(np.trace(grown)) / 2, 1e-12))
+        self._covariance[0] *= keeps
+        self._covariance[:, 0] *= keeps
+        self._covariance[0, 0] += (1 - keeps**2) * slow_m2
 
-    def log_prior(self, shifts_m: PointsM) -> Floats:
-        """(S,) log density of shifts (S, 2) before the frame's sightings are looked at."""
-        usual = log_density(shifts_m - self.mean_m, self.covariance_m2 + 1e-6 * _EYE)
-        astray = log_density(shifts_m, (self.limit_m2 + 1e-6) * _EYE)
-        return np.logaddexp(np.log(1 - _LOST_SHARE) + usual, np.log(_LOST_SHARE) + astray)
+    def loosen(self, variance_m2: float) -> None:
+        """The shift has jumped, as receivers' do now and then."""
+        self._covariance[0, 0] += variance_m2
 
-    def forget(self) -> None:
-        """Go back to knowing nothing: the shift had gone astray."""
-        self.mean_m, self.covariance_m2 = np.zeros(2), self.limit_m2 * _EYE
+    def begin(self, ids: Sequence[int]) -> None:
+        """Places seen first in this frame, at their sighting less the shift: wrong by as much as the shift is."""
+        for number in ids:
+            self._append(number, -self._covariance[0], float(self._covariance[0, 0]))
 
-    def fit(self, gaps_m: PointsM, covariances_m2: Floats) -> FittedShift:
-        """The shift by matched objects: M gaps between seen and known places, (M, 2) with (M, 2, 2)."""
-        trusts = np.linalg.inv(covariances_m2)
-        own = np.linalg.inv(self.covariance_m2 + 1e-8 * _EYE)
-        total = own + trusts.sum(axis=0)
-        weighted = np.einsum("mab,mb->ma", trusts, gaps_m)
-        sum_weighted = own @ self.mean_m + weighted.sum(axis=0)
-        covariance = np.linalg.inv(total)
-        others_m2 = np.linalg.inv(total - trusts)
-        others_m = np.einsum("mab,mb->ma", others_m2, sum_weighted - weighted)
-        return FittedShift(covariance @ sum_weighted, covariance, others_m, others_m2)
+    def variance_m2(self, number: int) -> float:
+        """How far a place may lie off on the ground, per axis, beside what its own sightings err."""
+        row = self._rows.get(number)
+        return self._frozen.get(number, 0.0) if row is None else float(self._covariance[row, row])
 
-    def settle(self, fitted: FittedShift, matched: int, shared_sigma_m: float) -> None:
-        """Take a frame's shift over; several objects together teach how much it changes between frames."""
-        if matched >= 3:
-            jump = fitted.shift_m - self.mean_m
-            seen_m2 = float(np.clip(jump @ jump / 2 - np.trace(fitted.covariance_m2) / 2, 0, shared_sigma_m**2))
-            least_m2 = (_LEAST_JITTER * shared_sigma_m) ** 2
-            self._jitter_m2 = max((1 - _LEARNS) * self._jitter_m2 + _LEARNS * seen_m2, least_m2)
-        self.mean_m, self.covariance_m2 = fitted.shift_m, fitted.covariance_m2
+    def drop(self, numbers: Sequence[int]) -> None:
+        """Forget tracks."""
+        rows = [self._rows[number] for number in numbers if number in self._rows]
+        for number in numbers:
+            self._frozen.pop(number, None)
+            self._rows.pop(number, None)
+            self._seen.pop(number, None)
+        if rows:
+            self._covariance = np.delete(np.delete(self._covariance, rows, axis=0), rows, axis=1)
+            left = sorted(self._rows, key=self._rows.__getitem__)
+            self._rows = {number: place for place, number in enumerate(left, 1)}
+
+    def predict(self, ids: Sequence[int]) -> tuple[Floats, Floats]:
+        """Of each track (N,): how much of an error of the shift its sightings would show, and the variance of both."""
+        across, own = self._known(ids)
+        shift_m2 = self._covariance[0, 0]
+        return 1 + across / max(shift_m2, _TINY), np.maximum(shift_m2 + 2 * across + own, 0.0)
+
+    @property
+    def slow_m2(self) -> float:
+        """Variance per axis of what the frame's shift has in common with its neighbours'."""
+        return float(self._covariance[0, 0])
+
+    def fit(self, ids: Sequence[int], gaps_m: PointsM, variances_m2: Floats) -> FittedShift:
+        """What matched tracks say of each other: (M, 2) seen less known places and shift, each erring alone by (M,)."""
+        for number in ids:
+            if number not in self._rows:
+                self._append(number, np.zeros(len(self._covariance)), self._frozen.pop(number, 0.0))
+        rows = np.array([self._rows[number] for number in ids])
+        crosses = self._covariance[:, :1] + self._covariance[:, rows]
+        spread = crosses[0][None] + crosses[rows] + self.jitter_m2 + np.diag(variances_m2 + _TINY)
+        trusts = np.linalg.inv((spread + spread.T) / 2)
+        solved = trusts @ gaps_m
+        own_trust = np.diag(trusts)
+        misses_m = solved / own_trust[:, None]  # what is seen less what all others predict
+        return FittedShift(
+            misses_m, np.maximum(1 / own_trust - variances_m2, 0.0), rows, crosses @ trusts, crosses, solved, trusts,
+            self.jitter_m2 * solved.sum(axis=0),
+        )
+
+    def offsets(self, fitted: FittedShift, ids: Sequence[int]) -> tuple[PointsM, Floats]:
+        """How far beside place and shift a frame's sightings of tracks lie by the fit, (N, 2), with variance (N,)."""
+        _, before = self.predict(ids)
+        lines = np.array([
+            fitted.crosses[self._rows[number]] if number in self._rows else np.zeros(fitted.crosses.shape[1])
+            for number in ids
+        ]).reshape(len(ids), -1) + fitted.crosses[0] + self.jitter_m2
+        gained = np.einsum("nm,mk,nk->n", lines, fitted.trusts, lines)
+        return lines @ fitted.solved, np.maximum(before + self.jitter_m2 - gained, 0.0)
+
+    def settle(self, fitted: FittedShift, ids: Sequence[int], movers: Sequence[int]) -> dict[int, Floats]:
+        """Take a fit over; how far places of tracks move by it, (2,) each, of those fitted by what the others say.
+
+        Places of `movers` hold no map: they are new in every frame.
+        """
+        moved = fitted.crosses @ fitted.solved
+        if len(ids) >= 3:
+            seen_m2 = float(fitted.jump_m @ fitted.jump_m) / 2
+            left_m2 = max(self.jitter_m2 - self.jitter_m2**2 * float(fitted.trusts.sum()), 0.0)
+            least_m2 = _LEAST_JITTER**2 * max(self._covariance[0, 0], self.jitter_m2)
+            self.jitter_m2 = max((1 - _LEARNS) * self.jitter_m2 + _LEARNS * (seen_m2 + left_m2), least_m2)
+        self._covariance -= fitted.gains @ fitted.crosses.T
+        self._covariance = (self._covariance + self._covariance.T) / 2
+        self.mean_m, self.jump_m = self.mean_m + moved[0], fitted.jump_m
+        for place, row in enumerate(fitted.rows):
+            moved[row] -= fitted.gains[row, place] * fitted.of_others_m[place]
+        for number in movers:
+            row = self._rows[number]
+            self._covariance[row] = -self._covariance[0]
+            self._covariance[:, row] = -self._covariance[:, 0]
+            self._covariance[row, row] = self._covariance[0, 0]
+        for number in ids:
+            self._seen.pop(number, None)
+            self._seen[number] = self._frame
+        self._freeze()
+        return {
+            number: moved[row] for number, row in self._rows.items()
+            if row < len(moved) and abs(moved[row, 0]) + abs(moved[row, 1]) > 1e-4
+        }
+
+    def _known(self, ids: Sequence[int]) -> tuple[Floats, Floats]:
+        """(N,) covariances with the shift and variances of places."""
+        rows = np.array([self._rows.get(number, -1) for number in ids], np.int64)
+        frozen = np.array([self._frozen.get(number, 0.0) for number in ids])
+        across = np.where(rows >= 0, self._covariance[0, rows], 0.0)
+        return across, np.where(rows >= 0, self._covariance[rows, rows], frozen)
+
+    def _append(self, number: int, line: Floats, variance_m2: float) -> None:
+        size = len(self._covariance)
+        grown = np.empty((size + 1, size + 1))
+        grown[:size, :size] = self._covariance
+        grown[size, :size] = grown[:size, size] = line
+        grown[size, size] = variance_m2
+        self._covariance, self._rows[number], self._seen[number] = grown, size, self._frame
+
+    def _freeze(self) -> None:
+        if len(self._rows) <= _MOST_ROWS + 50:
+            return
+        oldest = sorted(self._seen, key=self._seen.__getitem__)[:len(self._rows) - _MOST_ROWS]
+        kept = {number: self.variance_m2(number) for number in oldest}
+        self.drop(oldest)
+        self._frozen.update(kept)

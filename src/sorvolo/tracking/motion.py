@@ -51,16 +51,19 @@ class Motions:
         return Motions(self.means[rows], self.covariances[rows], self.weights[rows], self.habits[rows])
 
     @property
+    def likelier(self) -> Anything:
+        """(N,) the likelier model of each."""
+        return np.argmax(self.weights, axis=1)
+
+    @property
     def places_m(self) -> PointsM:
-        """(N, 2) where they are, both models taken together."""
-        return np.einsum("nk,nki->ni", self.weights, self.means[:, :, :2])
+        """(N, 2) where they are, by the likelier model: what may move seldom has moved far."""
+        return self.means[np.arange(len(self)), self.likelier, :2]
 
     @property
     def place_covariances_m2(self) -> Floats:
         """(N, 2, 2) how well that is known."""
-        apart = self.means[:, :, :2] - self.places_m[:, None, :]
-        spread = self.covariances[:, :, :2, :2] + apart[..., :, None] * apart[..., None, :]
-        return np.einsum("nk,nkij->nij", self.weights, spread)
+        return self.covariances[np.arange(len(self)), self.likelier, :2, :2]
 
 
 def habits_of(label: str, unit_m: float) -> Floats:

@@ -28,7 +28,8 @@ _USUAL_STEP_S = 0.2  # sightings and gaps closer in time than this say less each
 _FORGOTTEN_S = 120.0  # tentative tracks out of view
 _SURE = 6.0  # evidence beyond this does not count: what leaves must be noticed
 _PENALTY_OF_ENDED = -1.5
-_ASTRAY = 13.8  # squared distance in sigmas from where the common shift is thought: 1 in 1000
+_PUZZLED = 0.3  # of a frame's sure sightings: if more belong nowhere, the shift may have jumped
+_JUMP_RELUCTANCE = 5.0
 _MOVER_VIEWS = 4  # at least, until one that moves is sure: any two sightings make a mover
 _FIRST_VIEWS = 15  # within which a mover may turn out to be one that was seen before
 
@@ -141,11 +142,11 @@ class Tracker:
 
     def tracks(self) -> list[Track]:
         """All tracks as they are known now, tentative ones as well, in order of their ids."""
-        return [each.track() for each in self._followed]
+        return [each.track(self._shift.variance_m2(each.id)) for each in self._followed]
 
     def finish(self) -> list[Track]:
         """All confirmed tracks; tentative ones are given up."""
-        self._followed = [each for each in self._followed if each.confirmed]
+        self._keep([each for each in self._followed if each.confirmed])
         return self.tracks()
 
     def _near(self, seen: "_Seen", time_ns: int, footprint_m: PointsM | None) -> list[Followed]:
@@ -175,45 +176,78 @@ class Tracker:
         fits = self._fits(near, seen)
         fits[:, list(seen.doubles)] = -np.inf
         sure = seen.scores >= self._settings.sure_score
-        shift = self._shift
+        shift, ids = self._shift, [each.id for each in near]
+        places_m = seen.places_m - shift.mean_m
 
-        def gains(shift_m: PointsM, shift_m2: Floats) -> Floats:
-            return place_likelihoods(motions, seen.places_m, seen.own_m2, shift_m, shift_m2) + fits - unseen
+        def gains(offsets_m: PointsM, offsets_m2: Floats) -> Floats:
+            return place_likelihoods(motions, places_m, seen.own_m2, offsets_m, offsets_m2) + fits - unseen
 
         def assign(gain: Floats) -> Pairs:
             first = assigned(np.where(sure, gain, -1.0))
             gain = gain.copy()
             gain[first.tracks], gain[:, first.sightings], gain[:, sure] = -1.0, -1.0, -1.0
-            second = assigned(gain)
-            return first.joined(second)
+            return first.joined(assigned(gain))
 
-        gain = gains(shift.mean_m, shift.covariance_m2)
+        def vote(shares: Floats, left_m2: Floats, slow_m2: float, gain: Floats, reluctance: float) -> PointsM:
+            return voted_shift(
+                motions, places_m, seen.own_m2, shares, left_m2, slow_m2, fits, gain, float(unseen), reluctance
+            )
+
+        none_m, even = np.zeros((len(near), 2)), np.ones(len(near))
+        own_m2 = np.trace(seen.own_m2, axis1=1, axis2=2) / 2
+        shares, loose_m2 = shift.predict(ids)
+        gain = gains(none_m, loose_m2 + shift.jitter_m2)
         pairs = assign(gain)
-        settled_m2 = np.median(seen.own_m2, axis=0)
-        open_m2 = np.trace(shift.covariance_m2)
-        puzzled = len(pairs) < min(len(near), int(sure.sum()))
-        if open_m2 > np.trace(settled_m2) or (puzzled and shift.limit_m2 > open_m2):
-            wide = gains(np.zeros(2), shift.limit_m2 * np.eye(2)) if puzzled else gain
-            voted_m = voted_shift(motions, seen.places_m, seen.own_m2, shift, fits, wide, float(unseen))
-            off_m = voted_m - shift.mean_m
-            if off_m @ np.linalg.solve(shift.covariance_m2 + settled_m2, off_m) > _ASTRAY:
-                shift.forget()
-            pairs = assign(gains(voted_m, settled_m2))
+        jump_m2 = self._shared_m**2
+        if int(sure.sum()) - len(pairs) >= max(2, _PUZZLED * sure.sum()):
+            wide = gains(none_m, loose_m2 + shift.jitter_m2 + jump_m2)
+            if vote(even, loose_m2 + shift.jitter_m2, jump_m2, wide, _JUMP_RELUCTANCE).any():
+                shift.loosen(jump_m2)
+                shares, loose_m2 = shift.predict(ids)
+                gain = wide
+        if (loose_m2 > np.median(own_m2)).any():
+            left_m2 = np.maximum(loose_m2 - shares**2 * shift.slow_m2, 0.0) + shift.jitter_m2
+            error_m = vote(shares, left_m2, shift.slow_m2, gain, 0.0)
+            settled_m2 = shares**2 * min(float(np.median(own_m2)), shift.slow_m2)
+            gain = gains(shares[:, None] * error_m, left_m2 + settled_m2)
+            pairs = assign(gain)
         if len(pairs) > 1:
-            fitted = shift.fit(*_gaps(motions, seen, pairs, shift.limit_m2))
-            pairs = assign(gains(fitted.shift_m, fitted.covariance_m2))
+            fitted = shift.fit(*self._told(near, motions, places_m, own_m2, pairs))
+            pairs = assign(gains(*shift.offsets(fitted, ids)))
         if not len(pairs):
             return none, motions
-        fitted = shift.fit(*_gaps(motions, seen, pairs, shift.limit_m2))
-        better = corrected(
-            motions.only(pairs.tracks), seen.places_m[pairs.sightings] - fitted.of_others_m,
-            seen.own_m2[pairs.sightings] + fitted.of_others_m2,
-        )
-        shift.settle(fitted, len(pairs), self._shared_m)
+        matched, gaps_m, variances_m2 = self._told(near, motions, places_m, own_m2, pairs)
+        fitted = shift.fit(matched, gaps_m, variances_m2)
+        movers = [number for number, row in zip(matched, pairs.tracks) if motions.weights[row, MOVES] > 0.5]
+        steps_m = shift.settle(fitted, matched, movers)
+        by_id = {each: row for row, each in enumerate(ids)}
         means, covariances, weights = motions.means.copy(), motions.covariances.copy(), motions.weights.copy()
+        for followed in self._followed:
+            if followed.id in steps_m:
+                followed.shift(steps_m[followed.id])
+                if followed.id in by_id:
+                    means[by_id[followed.id], :, :2] += steps_m[followed.id]
+        before = replace(motions, means=means).only(pairs.tracks)
+        better = corrected(
+            before, before.places_m + fitted.of_others_m,
+            seen.own_m2[pairs.sightings] + fitted.of_others_m2[:, None, None] * np.eye(2),
+        )
         means[pairs.tracks], covariances[pairs.tracks] = better.means, better.covariances
         weights[pairs.tracks] = better.weights
         return pairs, replace(motions, means=means, covariances=covariances, weights=weights)
+
+    def _told(
+        self, near: list[Followed], motions: Motions, places_m: PointsM, own_m2: Floats, pairs: Pairs
+    ) -> tuple[list[int], PointsM, Floats]:
+        """What pairs tell of the shift: ids, seen less known places (M, 2), and how little that is to be trusted."""
+        matched = motions.only(pairs.tracks)
+        known_m2 = np.trace(matched.place_covariances_m2, axis1=1, axis2=2) / 2
+        # a mover knows no place of its own that could hold the map
+        restless_m2 = matched.weights[:, MOVES] * self._shared_m**2
+        return (
+            [near[row].id for row in pairs.tracks], places_m[pairs.sightings] - matched.places_m,
+            own_m2[pairs.sightings] + known_m2 + restless_m2,
+        )
 
     def _fits(self, near: list[Followed], seen: "_Seen") -> Floats:
         """(tracks, sightings) what beside place speaks for each pair, as logs."""
@@ -233,7 +267,7 @@ class Tracker:
         settings = self._settings
         if followed.is_out:
             followed.passes, followed.is_out = followed.passes + 1, False
-        followed.record(seen.sightings[column], seen.own_m2[column], seen.looks_of(column))
+        followed.record(seen.sightings[column], seen.looks_of(column))
         for row, stronger in seen.doubles.items():
             if stronger == column:
                 followed.vote(seen.labels[row], float(seen.scores[row]))
@@ -254,8 +288,9 @@ class Tracker:
         if not fresh:
             return []
         habits = np.array([habits_of(seen.labels[row], self._settings.unit_m) for row in fresh])
+        shift = self._shift
         motions = begun(
-            seen.places_m[fresh] - self._shift.mean_m, seen.own_m2[fresh] + self._shift.covariance_m2, habits
+            seen.places_m[fresh] - shift.mean_m - shift.jump_m, seen.own_m2[fresh] + shift.jitter_m2 * np.eye(2), habits
         )
         started = []
         for index, row in enumerate(fresh):
@@ -269,6 +304,7 @@ class Tracker:
             started.append(followed)
             ids[row] = followed.id
         self._followed += started
+        shift.begin([each.id for each in started])
         return started
 
     def _missed(
@@ -279,7 +315,7 @@ class Tracker:
         missing, ended = [], []
         if len(rows):
             sigmas = np.sqrt(np.trace(motions.place_covariances_m2[rows], axis1=1, axis2=2) / 2)
-            places_m = motions.places_m[rows] + self._shift.mean_m
+            places_m = motions.places_m[rows] + self._shift.mean_m + self._shift.jump_m
             if footprint_m is None:
                 depth_m = np.array([0.0 if time_ns - near[row].last_ns < 2e9 else -np.inf for row in rows])
             else:
@@ -298,10 +334,10 @@ class Tracker:
         near_ids = {each.id for each in near}
         for followed in self._followed:
             followed.is_out |= followed.id not in near_ids and followed.last_ns < time_ns
-        self._followed = [
+        self._keep([
             each for each in self._followed
             if each.confirmed or (each.evidence >= 0 and time_ns - each.last_ns < _FORGOTTEN_S * 1e9)
-        ]
+        ])
         return missing, ended
 
     def _join(self, now: list[Followed], missing: list[Followed]) -> dict[int, int]:
@@ -329,8 +365,13 @@ class Tracker:
                 del by_id[gone.id]
                 merged[gone.id] = kept.id
         if merged:
-            self._followed = [each for each in self._followed if each.id not in merged]
+            self._keep([each for each in self._followed if each.id not in merged])
         return merged
+
+    def _keep(self, kept: list[Followed]) -> None:
+        ids = {each.id for each in kept}
+        self._shift.drop([each.id for each in self._followed if each.id not in ids])
+        self._followed = kept
 
 
 class _Seen:
@@ -372,15 +413,6 @@ def _stacked(near: list[Followed], time_ns: int) -> Motions:
         np.concatenate([each.weights for each in motions]), np.concatenate([each.habits for each in motions]),
     )
     return predicted(together, np.array([(time_ns - each.motion_ns) / 1e9 for each in near]))
-
-
-def _gaps(motions: Motions, seen: _Seen, pairs: Pairs, loose_m2: float) -> tuple[PointsM, Floats]:
-    """Seen less known places of pairs, (M, 2) with (M, 2, 2)."""
-    matched = motions.only(pairs.tracks)
-    gaps_m = seen.places_m[pairs.sightings] - matched.places_m
-    # a mover knows no place of its own that could hold the map
-    restless_m2 = (matched.weights[:, MOVES] * loose_m2)[:, None, None] * np.eye(2)
-    return gaps_m, seen.own_m2[pairs.sightings] + matched.place_covariances_m2 + restless_m2
 
 
 def _log_odds(score: float) -> float:
