@@ -19,6 +19,7 @@ from sorvolo.tracking.locate import locate
 from sorvolo.tracking.tracker import IN_PICTURES, Tracker, TrackerSettings, TrackUpdate
 
 _MOST_DRONE_PLACES = 200_000
+_OF_MAPS = ("no_telemetry", "ground_unknown", "height_unknown")  # notices that say what a mapping does about it
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +206,7 @@ class ImagePlaces:
     def notices(self) -> tuple[Notice, ...]:
         """Why nothing is placed on the ground."""
         text = f"{self._why_not}: nothing is placed on the ground, objects are followed in the picture"
-        others = [each for each in self._setup.notices if each.code != "no_telemetry"]
+        others = [each for each in self._setup.notices if each.code not in _OF_MAPS]
         if self._motion.guessed:
             words = f"{self._motion.guessed} frames show no motion that fits: taken to go on as before"
             others.append(Notice("motion_guessed", self._motion.guessed, words))
