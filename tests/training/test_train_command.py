@@ -1,6 +1,10 @@
 """`sorvolo train`: a tiny network learns, is stopped, goes on, and is written; bad input is told."""
 
 import json
+import os
+import signal
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +21,7 @@ from sorvolo.missions.train_detector import TrainingUpdate, train_detector  # no
 from sorvolo.missions.train_settings import TrainSettings  # noqa: E402
 from sorvolo.missions.training_sets import DataOptions, read_training_sets, simulate_samples  # noqa: E402
 from sorvolo.store.training_page import training_page  # noqa: E402
+from sorvolo.training.checkpoint import read_checkpoint  # noqa: E402
 
 _WIDTH, _HEIGHT = 128, 96
 
@@ -101,6 +106,29 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(data: Path, tmp_path: P
         next(_train(data, tmp_path / "stopped", settings))
     with pytest.raises(SettingsError, match=r"cannot go on with other settings: .*seed was 1, is 2"):
         list(_train(data, tmp_path / "stopped", _settings(rpn="standard", seed=2), resume=True))
+
+
+def test_ctrl_c_waits_for_the_step_and_leaves_a_checkpoint(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = signal.getsignal(signal.SIGINT)
+
+    def interrupt() -> None:
+        while signal.getsignal(signal.SIGINT) is before:
+            time.sleep(0.05)
+        time.sleep(1.0)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    alarm = threading.Thread(target=interrupt, daemon=True)
+    alarm.start()
+    options = ["--weights", "none", "--steps", "100000", "--batch", "1", "--side", "64", "--val", "0", "--json"]
+    assert main(["train", str(data), "--out", str(tmp_path / "out"), *options]) == 130
+    alarm.join()
+    told = capsys.readouterr()
+    assert "stopping after this step" in told.err and "--resume goes on" in told.err
+    last = json.loads(told.out.splitlines()[-1])["step"]
+    content = (tmp_path / "out" / "checkpoint.pt").read_bytes()
+    assert read_checkpoint(content, "checkpoint").state["step"] == last
 
 
 def test_other_labels_are_other_data(tmp_path: Path) -> None:

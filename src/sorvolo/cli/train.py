@@ -113,7 +113,8 @@ def train(
         else:
             _show(updates, wish)
         if wish.is_there:
-            cast(Generator[Any], updates).close()  # leaves a checkpoint
+            cast(Generator[Any], updates).close()  # leaves a checkpoint, once it has learnt at all
+            typer.echo(f"the same command with --resume goes on where {out} is now", err=True)
             raise KeyboardInterrupt
     if not as_json:
         typer.echo(f"{out / 'training.html'} tells how it went; sorvolo evaluate detector measures the model on more")
