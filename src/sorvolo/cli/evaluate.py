@@ -14,6 +14,7 @@ from sorvolo.cli.evaluate_detector import detector
 from sorvolo.missions.evaluate_changes import FlightChanges, evaluate_changes
 from sorvolo.missions.evaluate_changes import as_json as measures_as_json
 from sorvolo.missions.evaluate_mosaic import MosaicEvaluation, evaluate_mosaic
+from sorvolo.missions.evaluate_objects import FlightObjects, evaluate_objects
 from sorvolo.mosaic.quality import Spread
 from sorvolo.store.exports import plain_json
 
@@ -72,6 +73,48 @@ def changes(
     console = Console()
     for each in measured:
         show_changes(console, each)
+
+
+@evaluate_app.command()
+def objects(
+    site: Annotated[Path, typer.Argument(help="The site folder of `sorvolo map` or `sorvolo compare`.")],
+    truth: Annotated[Path, typer.Option(help="Folder that `sorvolo simulate` made.")],
+    flight: Annotated[str | None, typer.Option(help="One of the site's flights; else all.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
+) -> None:
+    """What stands on the map against the truth: found, missed, false, counted once, how well placed.
+
+    Example: sorvolo evaluate objects field-map --truth simulated-field
+    """
+    measured = evaluate_objects(site, truth, flight=flight)
+    if as_json:
+        typer.echo(json.dumps(plain_json(measured), indent=1))
+        return
+    console = Console()
+    for each in measured:
+        _show_objects(console, each)
+
+
+def _show_objects(console: Console, measured: FlightObjects) -> None:
+    table = Table("objects", "to find", "found", "named right", "reported twice", "false")
+    for name, counts in (*measured.by_class.items(), ("all", measured.all)):
+        numbers = counts.must_find, counts.found, counts.named_right, counts.twice, counts.false
+        if any(numbers) or name == "all":
+            table.add_row(name, *map(str, numbers))
+    console.print(table)
+    console.print(
+        f"{measured.flight}: {measured.count_error:+.1%} counted too many; {measured.moving} of the found ones move, "
+        f"of {measured.moving_right} it is told rightly whether they do"
+    )
+    if math.isfinite(measured.rms_m):
+        console.print(
+            f"{measured.flight}: places off by {measured.rms_m:.2f} m rms, {measured.p95_m:.2f} m at 95 %, "
+            f"{measured.own_rms_m:.2f} m rms without the map's own shift of {measured.map_shift_m:.2f} m; "
+            f"{_share(measured.within_two_sigma)} within twice the stated sigma, median "
+            f"{measured.sigma_median_m:.2f} m; lengths off by {measured.length_error_m:.2f} m median"
+        )
+    for each in measured.missed:
+        console.print(f"{measured.flight}: missed {each}", highlight=False)
 
 
 def show_changes(console: Console, measured: FlightChanges) -> None:

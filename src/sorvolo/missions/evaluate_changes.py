@@ -22,28 +22,16 @@ from sorvolo.change.metrics import (
 )
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Matrix3, PointsM
-from sorvolo.geometry.homography import apply_homography, fit_similarity
-from sorvolo.missions.frame_rows import (
-    FrameRow,
-    frame_row,
-    map_frames,
-    read_features,
-    site_points,
-    time_ns_of,
-    true_names,
-    truth_file,
-)
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.missions.frame_rows import PairedFlights, read_features, site_points, time_ns_of, truth_file
 from sorvolo.missions.mask_folders import MaskScores, compare_mask_folders, has_masks
 from sorvolo.store.archive import Archive
 from sorvolo.store.exports import plain_json
 from sorvolo.survey.findings import ChangeKind
 from sorvolo.survey.flight import Site
-from sorvolo.survey.mosaic import Status
 
 VIDEO_VIEWS, PHOTO_VIEWS = 3, 2
 """So many clear views make an event one that must be found; what moves needs three in any case."""
-
-_NOT_COMPARED = {"not-aligned", "outside", "lost", Status.REJECTED.value}
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +74,7 @@ def evaluate_changes(
         described = archive.site()
     if described.is_local:
         raise InputError(f"{found}: a map without geo-reference cannot be compared with a simulation's truth")
-    flights = _Flights.read(found, truth_file(truth), described)
+    flights = PairedFlights.read(found, truth_file(truth), described)
     known = [name for name in names if flights.true_name(name) in true_flights]
     if not known:
         raise InputError(
@@ -189,56 +177,8 @@ def _own_masks(site: Path, flight: str) -> Path:
     return folder
 
 
-@dataclass(frozen=True, eq=False)
-class _Flights:
-    """The frames of the site's flights and of the truth's, and which are the same."""
-
-    mine: Mapping[str, Sequence[FrameRow]]
-    true: Mapping[str, Mapping[str, FrameRow]]
-    names: Mapping[str, str]
-
-    @classmethod
-    def read(cls, site: Path, frames_file: Path, described: Site) -> "_Flights":
-        true: dict[str, dict[str, FrameRow]] = {}
-        for feature in read_features(frames_file):
-            row = frame_row(feature, described.frame, frames_file)
-            true.setdefault(str(feature["properties"].get("flight", "")), {})[row.name] = row
-        mine = map_frames(site, described)
-        return cls(mine, true, true_names(mine, true))
-
-    def true_name(self, name: str) -> str:
-        return self.names.get(name, "")
-
-    def placed(self, names: Sequence[str]) -> list[tuple[str, FrameRow]]:
-        """The frames of these flights that lie somewhere, with their flights."""
-        return [
-            (name, row) for name in names for row in self.mine.get(name, ())
-            if row.status not in _NOT_COMPARED and np.isfinite(row.outline_m).all()
-        ]
-
-    def clock(self, name: str) -> tuple[int, int]:
-        """When the flight ended by its own clock, and how far that is behind the truth's: logs may tell no date."""
-        true = self.true[self.names[name]]
-        behind_ns = [true[row.name].time_ns - row.time_ns for row in self.mine[name] if row.name in true]
-        return max((row.time_ns for row in self.mine[name]), default=0), int(np.median(behind_ns)) if behind_ns else 0
-
-    def map_from_truth(self, names: Sequence[str]) -> tuple[Matrix3, float]:
-        """The similarity that takes true places to where these flights lie; the rms of what it moves, NaN if none."""
-        pairs = [
-            (row.outline_m, self.true[self.names[name]][row.name].outline_m)
-            for name, row in self.placed(names) if name in self.names and row.name in self.true[self.names[name]]
-        ]
-        pairs = [pair for pair in pairs if np.isfinite(pair).all()]
-        if not pairs:
-            return np.eye(3), math.nan
-        mine_m, true_m = (np.concatenate(side) for side in zip(*pairs))
-        matrix = fit_similarity(mine_m, true_m)
-        moved_m = apply_homography(matrix, true_m) - true_m
-        return matrix, float(np.sqrt((moved_m**2).sum(axis=1).mean()))
-
-
 def _evaluate(
-    site: Path, described: Site, flights: _Flights, flight: str, true_folder: Path, least_px: int
+    site: Path, described: Site, flights: PairedFlights, flight: str, true_folder: Path, least_px: int
 ) -> FlightChanges:
     remarks = []
     masks = None

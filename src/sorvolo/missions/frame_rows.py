@@ -1,6 +1,7 @@
 """The frames of flights, as a map's or a truth's frames.geojson tells them, in the site's metres."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -10,10 +11,13 @@ from typing import Any
 import numpy as np
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.arrays import Floats, Matrix3
 from sorvolo.geometry.geodesy import LocalFrame
+from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.survey.flight import Site
+from sorvolo.survey.mosaic import Status
 
+_NOT_PLACED = {"not-aligned", "outside", "lost", Status.REJECTED.value}
 _SAME_FLIGHT_NS = 60 * 10**9  # clocks differ, flights lie hours apart
 
 
@@ -98,6 +102,56 @@ def true_names(
         if best and alike[best]:
             named[name] = best
     return named
+
+
+@dataclass(frozen=True, eq=False)
+class PairedFlights:
+    """The frames of the site's flights and of the truth's, and which are the same."""
+
+    mine: Mapping[str, Sequence[FrameRow]]
+    true: Mapping[str, Mapping[str, FrameRow]]
+    names: Mapping[str, str]
+
+    @classmethod
+    def read(cls, site: Path, frames_file: Path, described: Site) -> "PairedFlights":
+        """The frames of a site folder and of a truth's frames.geojson; raises InputError where one cannot be read."""
+        true: dict[str, dict[str, FrameRow]] = {}
+        for feature in read_features(frames_file):
+            row = frame_row(feature, described.frame, frames_file)
+            true.setdefault(str(feature["properties"].get("flight", "")), {})[row.name] = row
+        mine = map_frames(site, described)
+        return cls(mine, true, true_names(mine, true))
+
+    def true_name(self, name: str) -> str:
+        """The truth's name of one of the site's flights; "" where the truth does not know it."""
+        return self.names.get(name, "")
+
+    def placed(self, names: Sequence[str]) -> list[tuple[str, FrameRow]]:
+        """The frames of these flights that lie somewhere, with their flights."""
+        return [
+            (name, row) for name in names for row in self.mine.get(name, ())
+            if row.status not in _NOT_PLACED and np.isfinite(row.outline_m).all()
+        ]
+
+    def clock(self, name: str) -> tuple[int, int]:
+        """When the flight ended by its own clock, and how far that is behind the truth's: logs may tell no date."""
+        true = self.true[self.names[name]]
+        behind_ns = [true[row.name].time_ns - row.time_ns for row in self.mine[name] if row.name in true]
+        return max((row.time_ns for row in self.mine[name]), default=0), int(np.median(behind_ns)) if behind_ns else 0
+
+    def map_from_truth(self, names: Sequence[str]) -> tuple[Matrix3, float]:
+        """The similarity that takes true places to where these flights lie; the rms of what it moves, NaN if none."""
+        pairs = [
+            (row.outline_m, self.true[self.names[name]][row.name].outline_m)
+            for name, row in self.placed(names) if name in self.names and row.name in self.true[self.names[name]]
+        ]
+        pairs = [pair for pair in pairs if np.isfinite(pair).all()]
+        if not pairs:
+            return np.eye(3), math.nan
+        mine_m, true_m = (np.concatenate(side) for side in zip(*pairs))
+        matrix = fit_similarity(mine_m, true_m)
+        moved_m = apply_homography(matrix, true_m) - true_m
+        return matrix, float(np.sqrt((moved_m**2).sum(axis=1).mean()))
 
 
 def time_ns_of(text: str) -> int:

@@ -27,7 +27,7 @@ from sorvolo.store.derived import (
 from sorvolo.store.exports import plain_json
 from sorvolo.store.flight_writer import FlightWriter
 from sorvolo.store.images import read_keyframe
-from sorvolo.store.object_records import StoredObject
+from sorvolo.store.object_records import StoredObject, StoredSearch
 from sorvolo.store.objects import OBJECTS
 from sorvolo.store.site_folder import CATALOGUE, lock_site_folder, make_site_folder
 from sorvolo.store.tiles import GrowingTiles, TileBlobs, TileView
@@ -209,13 +209,17 @@ class Archive:
     @property
     def is_searched(self) -> bool:
         """Whether any flight's frames were searched for objects."""
-        with self._catalogue.reading() as connection:
-            return bool(object_records.load_searches(connection))
+        return bool(self.searches())
 
     def objects(self, flight_id: str | None = None) -> list[StoredObject]:
         """The objects that complete runs found, by flight rank and number; of one flight."""
         with self._catalogue.reading() as connection:
             return object_records.load_objects(connection, flight_id)
+
+    def searches(self) -> list[StoredSearch]:
+        """Which ground each complete run searched for objects, by flight rank."""
+        with self._catalogue.reading() as connection:
+            return object_records.load_searches(connection)
 
     def newest_objects(self, flights: Collection[str] | None = None) -> list[StoredObject]:
         """What stands on the site by the newest look at each piece of ground; as far as these flights know."""

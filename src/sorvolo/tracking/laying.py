@@ -68,7 +68,8 @@ def lay_on_ground(seen: Detections, frame: PlacedFrame, *, has_metres: bool = Tr
         spans_m = np.array([around_m[2] - around_m[1], around_m[4] - around_m[3]])
         sides_m = np.hypot(*spans_m.T)
         m_per_px = float(np.sqrt(np.prod(sides_m) / max(np.prod(boxes[k, 2:] - boxes[k, :2]), 1e-6)))
-        own_sigma_m = _own_sigma_m(sides_m, m_per_px, frame, is_cut=bool(cut[k]))
+        unseen_m = _unseen_m(name, float(sides_m.max()), has_metres=has_metres) if cut[k] else 0.0
+        own_sigma_m = _own_sigma_m(sides_m, m_per_px, frame, unseen_m)
         usual_sigma_m = 0.15 * heights_m[k] * lean
         sighting = Sighting(
             frame.index, frame.name, frame.time_ns, name, float(seen.scores[k]), seen.boxes_px[k], place_m,
@@ -111,12 +112,19 @@ def usual_height_m(name: str) -> float:
     return TYPICAL_SIZE_M[name][2] if name in TYPICAL_SIZE_M else 1.0
 
 
-def _own_sigma_m(sides_m: Floats, m_per_px: float, frame: PlacedFrame, *, is_cut: bool) -> float:
+def _unseen_m(name: str, side_m: float, *, has_metres: bool) -> float:
+    """How much of something may lie beyond the picture's edge: what it lacks to its usual length, or as much again."""
+    if not has_metres or name not in TYPICAL_SIZE_M:
+        return side_m
+    return max(TYPICAL_SIZE_M[name][0] - side_m, 0.3 * side_m)
+
+
+def _own_sigma_m(sides_m: Floats, m_per_px: float, frame: PlacedFrame, unseen_m: float) -> float:
     side_m = float(sides_m.mean())
     pose_m = frame.residual_px * m_per_px if np.isfinite(frame.residual_px) else 0.0
     if frame.status is Status.GPS_ONLY and np.isfinite(frame.sigma_m):
         pose_m = frame.sigma_m
-    parts = [_LEAST_SIGMA_M, _LEAST_SIGMA_PX * m_per_px, _BOX_SIGMA * side_m, pose_m, 0.4 * side_m if is_cut else 0.0]
+    parts = [_LEAST_SIGMA_M, _LEAST_SIGMA_PX * m_per_px, _BOX_SIGMA * side_m, pose_m, 0.4 * unseen_m]
     return float(np.sqrt(np.sum(np.square(parts))))
 
 

@@ -12,7 +12,10 @@ _MOST_M_S = {"person": 4.0, "car": 20.0}  # a runner; a car in town
 _OTHER_M_S = 4.0
 _LEAST_M_S = 0.25  # slower is a place badly known
 _LONGEST_GAP_S = 6.0
-_LEAST_VIEWS = 3  # two sightings lie on a straight line whatever they are
+_LEAST_VIEWS = 3  # two sightings lie on a straight line whatever they are: these must be whole and sure
+_SURE = 0.5
+_AGAIN_S = 60.0  # what walks on as it did is known again after so long
+_SWERVE = 0.35  # of the way that it goes meanwhile
 _MOST_OFF = 3.0  # sigmas, rms, from even motion along a line
 _WOBBLE_M_S2 = 0.4  # how much walkers turn and change their pace
 
@@ -31,8 +34,9 @@ class Walk:
 def walks(laid: Sequence[LaidSighting]) -> list[Walk]:
     """The walks among these sightings, none of which stands; each sighting is in one walk at most.
 
-    A walk needs three sightings of one class on an even way, no faster than its class moves and fast enough to be seen.
-    The longest, then the straightest, are taken first.
+    A walk needs three sightings of one class on an even way, or two sure ones, no faster than its class moves and fast
+    enough to be seen. The longest, then the straightest, are taken first; a walk that goes on as another one ended is
+    part of it.
     """
     times_s = np.array([each.sighting.time_ns for each in laid], np.int64) / 1e9
     order: TimesNs = np.argsort(times_s, kind="stable")
@@ -47,12 +51,12 @@ def walks(laid: Sequence[LaidSighting]) -> list[Walk]:
                 candidates.append(found)
     candidates.sort(key=lambda found: (-len(found[0]), found[1]))
     taken: set[int] = set()
-    result = []
+    result: list[list[int]] = []
     for members, _ in candidates:
         if taken.isdisjoint(members):
             taken.update(members)
-            result.append(_walk(members, laid, times_s))
-    return result
+            result.append(members)
+    return [_walk(members, laid, times_s) for members in _joined(result, laid, times_s)]
 
 
 def _followed(
@@ -79,12 +83,40 @@ def _followed(
         if np.hypot(*(laid[k].sighting.position_m - expected_m)) < _MOST_OFF * sigma_m:
             members.append(int(k))
     if len(members) < _LEAST_VIEWS:
-        return None
+        is_sure = all(laid[k].sighting.score >= _SURE and not laid[k].is_cut for k in members)
+        return (members, 0.0) if is_sure else None
     _, velocity_m_s, _ = _line(members, laid, times_s, float(times_s[members[-1]]))
     off = _off(members, laid, times_s)
     if off > _MOST_OFF or not _LEAST_M_S <= np.hypot(*velocity_m_s) <= fastest_m_s:
         return None
     return members, off
+
+
+def _joined(found: list[list[int]], laid: Sequence[LaidSighting], times_s: Floats) -> list[list[int]]:
+    """The same walks, those in one that show one walker out of view for a while."""
+    rest = sorted(found, key=lambda members: times_s[members[0]])
+    result: list[list[int]] = []
+    for later in rest:
+        begins_s = float(times_s[later[0]])
+        best, best_m = None, np.inf
+        for earlier in result:
+            gap_s = begins_s - float(times_s[earlier[-1]])
+            one, other = laid[earlier[-1]].sighting, laid[later[0]].sighting
+            if one.label != other.label or not 0 < gap_s <= _AGAIN_S:
+                continue
+            expected_m, before_m_s, spread = _line(earlier, laid, times_s, begins_s)
+            _, after_m_s, _ = _line(later, laid, times_s, begins_s)
+            speed_m_s = float(np.hypot(*before_m_s))
+            apart_m = float(np.hypot(*(other.position_m - expected_m)))
+            turned_m_s = float(np.hypot(*(after_m_s - before_m_s)))
+            reach_m = 1.0 + min(2 * spread, 3.0) + _SWERVE * speed_m_s * gap_s
+            if apart_m <= reach_m and turned_m_s <= max(speed_m_s, 0.5):
+                best, best_m = (earlier, apart_m) if apart_m < best_m else (best, best_m)
+        if best is None:
+            result.append(later)
+        else:
+            best += later
+    return result
 
 
 def _line(

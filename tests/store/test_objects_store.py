@@ -1,0 +1,147 @@
+"""Objects on disk: the files of a flight and of the site, what a later flight replaces, catalogues of older formats."""
+
+import json
+import sqlite3
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_flights import SITE, frame, image
+
+from sorvolo.errors import StoreError
+from sorvolo.store import schema
+from sorvolo.store.archive import Archive
+from sorvolo.store.images import image_from_jpeg, jpeg_from_image
+from sorvolo.store.objects_page import objects_section
+from sorvolo.survey.map_objects import MapObject, ObjectSearch
+
+CROP = jpeg_from_image(image(3))
+
+
+def thing(object_id: str, east_m: float, north_m: float, label: str = "car", **others: object) -> MapObject:
+    """A car, seen four times."""
+    plain = MapObject(
+        object_id, label, 0.8, np.array([east_m, north_m]), 0.2, 4.4, 1.8, 4, 5, 1_700_000_000 * 10**9,
+        1_700_000_009 * 10**9, class_scores={label: 1.0}, best_frame="3", crop_jpeg=CROP,
+    )
+    return replace(plain, **others)
+
+
+def search(
+    objects: tuple[MapObject, ...], west_m: float = -50.0, east_m: float = 50.0, frames: int = 3
+) -> ObjectSearch:
+    """A search of some frames over one rectangle of ground."""
+    outline = [[west_m, 50.0], [east_m, 50.0], [east_m, -50.0], [west_m, -50.0]]
+    return ObjectSearch("fast", ("person", "car"), objects, np.array([outline] * frames), frames, 9, 1)
+
+
+def commit(folder: Path, flight: str, found: ObjectSearch | None) -> None:
+    """Make a flight with one frame part of the site."""
+    with Archive.open(folder, write=True) as archive:
+        if not archive.has_site:
+            archive.create_site(SITE)
+        with archive.begin_flight(flight, flight, {}) as writer:
+            paths = {0: writer.save_image(0, image(0))}
+            writer.commit([frame(0)], paths, {}, "<p>report", search=found)
+
+
+def features(path: Path) -> dict[str, dict[str, object]]:
+    """The properties by id."""
+    return {each["id"]: each["properties"] for each in json.loads(path.read_text())["features"]}
+
+
+def test_files_of_a_flight_and_of_the_site(tmp_path: Path) -> None:
+    """Both say the same; the crops lie where they say."""
+    commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0), thing("a-o2", 9.0, -2.0, "person", length_m=float("nan")))))
+    own, whole = features(tmp_path / "flights/a/objects.geojson"), features(tmp_path / "objects.geojson")
+    assert list(own) == list(whole) == ["a-o1", "a-o2"]
+    assert own["a-o1"]["class"] == "car"
+    assert own["a-o2"]["length_m"] is None
+    assert whole["a-o1"]["east_m"] == 3.0
+    assert own["a-o1"]["first_seen"] == "2023-11-14T22:13:20.000000Z"
+    north = json.loads((tmp_path / "objects.geojson").read_text())["features"][0]["geometry"]["coordinates"][1]
+    assert north == pytest.approx(46.5 + 4.0 / 111_170, abs=2e-6)
+    for crop in (tmp_path / str(whole["a-o1"]["crop"]), tmp_path / "flights/a" / str(own["a-o1"]["crop"])):
+        assert image_from_jpeg(crop.read_bytes(), "crop").shape == (54, 96, 3)
+
+
+def test_a_later_flight_replaces_what_it_looked_at(tmp_path: Path) -> None:
+    """Gone where two of its frames looked and found nothing, kept where none looked, older where it still stands."""
+    commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0), thing("a-o2", 9.0, -2.0), thing("a-o3", -30.0, 0.0))))
+    later = thing("b-o1", 3.3, 4.1, first_seen_ns=1_700_090_000 * 10**9, last_seen_ns=1_700_090_009 * 10**9)
+    commit(tmp_path, "b", search((later,), west_m=-10.0))
+    site = features(tmp_path / "objects.geojson")
+    assert list(site) == ["a-o3", "b-o1"]
+    assert site["b-o1"]["flights"] == ["a", "b"]
+    assert site["b-o1"]["first_seen"] == "2023-11-14T22:13:20.000000Z"
+    assert features(tmp_path / "flights/b/objects.geojson")["b-o1"]["flights"] == ["b"]
+    with Archive.open(tmp_path, write=False) as archive:
+        assert [each.thing.id for each in archive.newest_objects({"a"})] == ["a-o1", "a-o2", "a-o3"]
+        assert [each.flight_id for each in archive.searches()] == ["a", "b"]
+
+
+def test_one_frame_does_not_take_away(tmp_path: Path) -> None:
+    """One of a later flight's frames may have missed it; a flight of one frame says what it says."""
+    commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0),)))
+    mixed = search((), west_m=100.0, east_m=200.0, frames=2)
+    once = replace(mixed, outlines_m=np.concatenate([mixed.outlines_m, search(()).outlines_m[:1]]))
+    commit(tmp_path, "b", once)
+    assert list(features(tmp_path / "objects.geojson")) == ["a-o1"]
+    commit(tmp_path, "c", search((), frames=1))
+    assert list(features(tmp_path / "objects.geojson")) == []
+
+
+def test_mapped_again_without_a_model(tmp_path: Path) -> None:
+    """The former run's files go with it, crops and all."""
+    commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0),)))
+    commit(tmp_path, "a", None)
+    assert not (tmp_path / "objects.geojson").exists()
+    assert not (tmp_path / "flights/a/objects.geojson").exists()
+    assert not (tmp_path / "flights/a/objects").exists()
+
+
+def test_what_was_deleted_is_made_again(tmp_path: Path) -> None:
+    """The catalogue is the truth."""
+    commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0),)))
+    (tmp_path / "objects.geojson").unlink()
+    with Archive.open(tmp_path, write=True):
+        pass
+    assert list(features(tmp_path / "objects.geojson")) == ["a-o1"]
+
+
+def test_a_site_of_format_2(tmp_path: Path) -> None:
+    """It is read as having no objects, and brought up to date when it is written."""
+    commit(tmp_path, "a", None)
+    connection = sqlite3.connect(tmp_path / "site.db")
+    connection.executescript("DROP TABLE objects; DROP TABLE searches; PRAGMA user_version = 2;")
+    connection.close()
+    with Archive.open(tmp_path, write=False) as archive:
+        assert archive.objects() == []
+        assert not archive.is_searched
+    commit(tmp_path, "b", search((thing("b-o1", 3.0, 4.0),)))
+    assert list(features(tmp_path / "objects.geojson")) == ["b-o1"]
+    with sqlite3.connect(tmp_path / "site.db") as connection:
+        assert connection.execute("PRAGMA user_version").fetchone() == (schema.SCHEMA_VERSION,)
+
+
+def test_a_site_of_a_later_format_is_refused(tmp_path: Path) -> None:
+    """Its files stay as they are."""
+    commit(tmp_path, "a", None)
+    connection = sqlite3.connect(tmp_path / "site.db")
+    connection.execute(f"PRAGMA user_version = {schema.SCHEMA_VERSION + 1}")
+    connection.close()
+    with pytest.raises(StoreError, match="format version"):
+        Archive.open(tmp_path, write=True)
+
+
+def test_section_of_the_report() -> None:
+    """Text is escaped; without a model it says why nothing was looked for; old reports have no section."""
+    row = {"id": "a-o1", "class": "<b>", "score": 0.8, "east_m": 1.0, "north_m": 2.0, "sigma_m": None, "views": 3}
+    told = {"model": "fast", "classes": {"<b>": 1}, "list": [row]}
+    page = objects_section({"objects": told}, {"a-o1": CROP})
+    assert "<b>" not in page
+    assert "1 &lt;b&gt;" in page
+    assert "data:image/jpeg;base64," in page
+    assert "no model was wanted" in objects_section({"objects": {"model": None, "why_not": "no model was wanted"}}, {})
+    assert objects_section({}, {}) == ""

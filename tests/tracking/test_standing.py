@@ -1,0 +1,177 @@
+"""What stands on a map, from sightings whose truth is known: each once, in its place, walkers as walkers."""
+
+import numpy as np
+import pytest
+
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.ground import footprint
+from sorvolo.geometry.homography import site_from_image_homography
+from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
+from sorvolo.survey.mosaic import PlacedFrame, Status
+from sorvolo.survey.objects import CLASSES, TYPICAL_SIZE_M, Detections
+from sorvolo.tracking.laying import LaidSighting, lay_on_ground, shows
+from sorvolo.tracking.standing import Fused, fitted_size_m, fuse
+
+CAMERA = Camera(960, 540, 800.0, 800.0, 479.5, 269.5, np.array([-0.1, 0.02, 0.0, 0.0, 0.0]))
+SECOND_NS = 10**9
+
+
+Thing = tuple[str, float, float, float, tuple[float, float]]
+"""Class, east, north, yaw, velocity."""
+
+
+def placed(
+    index: int, east_m: float, north_m: float, *, yaw_deg: float = 90.0, pitch_deg: float = -88.0
+) -> PlacedFrame:
+    """A frame taken 30 m up, a second after the one before."""
+    pose = Pose(site_from_gimbal_rotation(yaw_deg, pitch_deg, 0.0), np.array([east_m, north_m, 30.0]))
+    return PlacedFrame(
+        str(index), index, index * SECOND_NS, Status.VISION, "", CAMERA, pose, site_from_image_homography(CAMERA, pose),
+        footprint(CAMERA, pose), 0.2, 0.5,
+    )
+
+
+def survey() -> list[PlacedFrame]:
+    """Two strips there and back, 4 m from frame to frame."""
+    there = [placed(k, 4.0 * k, 0.0) for k in range(10)]
+    return there + [placed(10 + k, 36.0 - 4.0 * k, 8.0, yaw_deg=270.0) for k in range(10)]
+
+
+def box_of(frame: PlacedFrame, label: str, east_m: float, north_m: float, yaw_deg: float) -> np.ndarray | None:
+    """The box around a body of its class's usual size; None where the picture does not show it whole."""
+    length, width, height = TYPICAL_SIZE_M[label]
+    turn = np.radians(yaw_deg)
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)]) * [length / 2, width / 2, height]
+    rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    points = corners @ rotation.T + [east_m, north_m, 0.0]
+    pose = frame.site_from_camera
+    assert pose is not None
+    image = CAMERA.pixels_from_points((points - pose.translation_m) @ pose.rotation) + 0.5
+    low, high = image.min(axis=0), image.max(axis=0)
+    if (low < 2).any() or (high > [CAMERA.width_px - 2, CAMERA.height_px - 2]).any():
+        return None
+    return np.concatenate([low, high])
+
+
+def sightings(
+    frames: list[PlacedFrame], things: list[Thing], *, misses: float = 0.2, false_alarms: float = 0.0, seed: int = 1
+) -> list[LaidSighting]:
+    """What a detector sees of things whose boxes' edges err by a pixel."""
+    random = np.random.default_rng(seed)
+    result: list[LaidSighting] = []
+    for frame in frames:
+        seconds = frame.time_ns / SECOND_NS
+        boxes, labels = [], []
+        for label, east_m, north_m, yaw_deg, (east_m_s, north_m_s) in things:
+            box = box_of(frame, label, east_m + east_m_s * seconds, north_m + north_m_s * seconds, yaw_deg)
+            if box is not None and random.random() >= misses:
+                boxes.append(box + random.normal(0, 1.0, 4))
+                labels.append(CLASSES.index(label))
+        for _ in range(random.poisson(false_alarms)):
+            x, y = random.uniform(0, 900), random.uniform(0, 500)
+            boxes.append(np.array([x, y, x + 20, y + 20]))
+            labels.append(int(random.integers(3)))
+        scores = random.uniform(0.4, 0.95, len(boxes))
+        seen = Detections(np.array(boxes).reshape(-1, 4), scores, np.array(labels), CLASSES)
+        result += [each for each in lay_on_ground(seen, frame) if each is not None]
+    return result
+
+
+THINGS = [
+    ("car", 12.0, 3.0, 30.0, (0.0, 0.0)), ("car", 12.8, 5.6, 30.0, (0.0, 0.0)), ("person", 20.0, 1.0, 0.0, (0.0, 0.0)),
+    ("person", 21.2, 1.0, 0.0, (0.0, 0.0)), ("small object", 26.0, 6.0, 60.0, (0.0, 0.0)),
+]
+
+
+def nearest(fused: Fused, east_m: float, north_m: float) -> tuple[str, float]:
+    """Class and distance of the object nearest to a place."""
+    distances_m = [float(np.hypot(*(each.position_m - [east_m, north_m]))) for each in fused.objects]
+    best = int(np.argmin(distances_m))
+    return fused.objects[best].label, distances_m[best]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_each_thing_once_in_its_place(seed: int) -> None:
+    """Cars side by side and people 1.2 m apart, from two strips in opposite directions, one view in five missing."""
+    frames = survey()
+    fused = fuse(sightings(frames, THINGS, seed=seed), frames)
+    assert len(fused.objects) == len(THINGS)
+    assert not any(each.moves for each in fused.objects)
+    for label, east_m, north_m, _, _ in THINGS:
+        found, distance_m = nearest(fused, east_m, north_m)
+        assert found == label
+        assert distance_m < 0.15
+
+
+def test_what_few_frames_saw_is_left_out() -> None:
+    """Boxes around nothing, two in three frames, leave hardly any object behind."""
+    frames = survey()
+    laid = sightings(frames, THINGS, false_alarms=0.67)
+    fused = fuse(laid, frames)
+    assert len(THINGS) <= len(fused.objects) <= len(THINGS) + 2
+    assert fused.dropped >= 5
+    assert sum(len(each.members) for each in fused.objects) + fused.dropped == len(laid)
+
+
+def test_a_walker_is_one_and_moves() -> None:
+    """1.3 m/s along the strip: seen at many places, told once, with its velocity and where it was last."""
+    frames = survey()[:10]
+    fused = fuse(sightings(frames, [("person", 8.0, 2.0, 0.0, (1.3, -0.3))], misses=0.0), frames)
+    (walker,) = fused.objects
+    assert walker.moves
+    assert np.hypot(*(walker.velocity_m_s - [1.3, -0.3])) < 0.3
+    last_s = max(frames[k].time_ns for k in range(10) if box_of(
+        frames[k], "person", 8.0 + 1.3 * k, 2.0 - 0.3 * k, 0.0) is not None) / SECOND_NS
+    assert np.hypot(*(walker.position_m - [8.0 + 1.3 * last_s, 2.0 - 0.3 * last_s])) < 0.5
+
+
+def test_its_own_sigma_is_honest() -> None:
+    """Errors against the truth lie within twice the stated sigma about as often as they should."""
+    frames = survey()
+    inside = []
+    for seed in range(12):
+        for each in fuse(sightings(frames, THINGS, seed=10 + seed), frames).objects:
+            offsets_m = np.array([each.position_m - np.array(thing[1:3]) for thing in THINGS])
+            nearest_m = offsets_m[np.argmin(np.hypot(*offsets_m.T))]
+            inside += [abs(error_m) < 2 * each.sigma_m for error_m in nearest_m]
+    assert np.mean(inside) > 0.9
+
+
+def test_a_turned_cars_size() -> None:
+    """A box around a car that stands askew is larger than the car: the fit finds its sides."""
+    frames = survey()
+    for yaw_deg in (0.0, 30.0, 75.0):
+        laid = sightings(frames, [("car", 15.0, 3.0, yaw_deg, (0.0, 0.0))], misses=0.0)
+        length_m, width_m = fitted_size_m(laid, "car", TYPICAL_SIZE_M["car"][2])
+        assert abs(length_m - 4.4) < 0.5
+        assert abs(width_m - 1.8) < 0.5
+
+
+def test_two_classes_for_one_thing() -> None:
+    """Two boxes of one frame on one place, of two classes, are one object, named by the higher sum."""
+    frames = survey()[:4]
+    laid = []
+    for frame in frames:
+        box = box_of(frame, "small object", 8.0, 1.0, 0.0)
+        if box is not None:
+            seen = Detections(np.array([box, box + 1]), np.array([0.8, 0.5]), np.array([2, 0]), CLASSES)
+            laid += [each for each in lay_on_ground(seen, frame) if each is not None]
+    (only,) = fuse(laid, frames).objects
+    assert only.label == "small object"
+    assert 0.3 < only.class_scores["person"] < 0.5
+
+
+def test_nothing_seen_and_no_place() -> None:
+    """No sighting makes no object; a rejected frame lays nothing; above the horizon nothing lies on the ground."""
+    assert fuse([], survey()).objects == ()
+    level = placed(0, 0.0, 0.0, pitch_deg=0.0)
+    sky = Detections(np.array([[400.0, 10.0, 420.0, 30.0]]), np.array([0.9]), np.array([0]), CLASSES)
+    assert lay_on_ground(sky, level) == [None]
+
+
+def test_shows_only_what_is_whole_in_the_picture() -> None:
+    """A place under the camera is shown, one at the picture's edge only if what stands there is small."""
+    frame = placed(0, 0.0, 0.0, pitch_deg=-90.0)
+    edge_m = 30.0 * 270 / 800 - 0.3
+    places_m = np.array([[0.0, 0.0], [edge_m, 0.0], [edge_m, 0.0], [40.0, 0.0]])
+    assert shows(frame, places_m, np.zeros(4), np.array([2.0, 0.05, 2.0, 0.1])).tolist() == [True, True, False, False]
