@@ -4,6 +4,7 @@ import hashlib
 import re
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -127,6 +128,22 @@ def open_sources(
         each.name = _free_name(safe_name(each.name), each.fingerprint, taken)
         taken[each.name] = each.fingerprint
     return list(sources)
+
+
+@contextmanager
+def opened_sources(
+    inputs: Sequence[Path | str], telemetry: Path | str | None = None, camera: Path | str | None = None,
+    known: Mapping[str, str] = MappingProxyType({}), *, live: LiveSettings = LiveSettings(),  # noqa: B008 (frozen)
+    until: threading.Event | None = None,
+) -> Iterator[list[Source]]:
+    """The same as `open_sources`; live sources are closed at the end, however it comes."""
+    sources = open_sources(inputs, telemetry, camera, known, live=live, until=until)
+    try:
+        yield sources
+    finally:
+        for each in sources:
+            if isinstance(each, LiveSource):
+                each.close()
 
 
 def safe_name(text: str) -> str:

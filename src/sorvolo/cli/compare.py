@@ -14,7 +14,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from sorvolo.cli.map import newest_version, read_json, tell_path
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.cli.map import ended_by_signal, newest_version, read_json, tell_path
 from sorvolo.missions.compare_flights import compare_flights
 from sorvolo.missions.settings import CompareSettings
 from sorvolo.store.archive import Archive
@@ -35,9 +36,13 @@ class ChangeMethod(StrEnum):
 
 
 def compare(
-    inputs: Annotated[list[Path], typer.Argument(help="Videos, folders of photos, or photos of a later flight.")],
+    inputs: Annotated[
+        list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources of a later flight.")
+    ],
     site: Annotated[Path, typer.Option(help="Folder of the map that an earlier flight made.")],
-    telemetry: Annotated[Path | None, typer.Option(help="The flight's log, if not beside the video.")] = None,
+    telemetry: Annotated[
+        str | None, typer.Option(help="The flight's log, if not beside the video; of a live one, the receiver's link.")
+    ] = None,
     camera: Annotated[str, typer.Option(help="Calibration file, preset name or EXIF code, or aov=DEG.")] = "",
     area: Annotated[
         Path | None, typer.Option(help="Outline outside of which frames are not used: GeoJSON, KML, KMZ.")
@@ -62,9 +67,13 @@ def compare(
     model: Annotated[
         str, typer.Option(help="Tells what changed, before and after: a model's name, a file, or none.")
     ] = "default",
+    give_up: Annotated[float, typer.Option(help="A live source silent for so long has ended, s.")] = 30.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Find what appeared, disappeared or moves since the map in the site folder was made, and update the map.
+
+    Live sources are those of `sorvolo map`. Ctrl-C ends a live flight, and what it showed is kept; a second Ctrl-C
+    leaves it out.
 
     Example: sorvolo compare DJI_0057.MP4 --site field
 
@@ -75,7 +84,8 @@ def compare(
         model=model,
     )
     results = compare_and_read_results(
-        inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area, steps=steps
+        inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area, steps=steps,
+        live=LiveSettings(keeps_all=True, give_up_s=give_up),
     )
     if as_json:
         typer.echo(json.dumps({"site": str(site), "flights": results}, indent=1))
@@ -84,17 +94,19 @@ def compare(
 
 
 def compare_and_read_results(
-    inputs: Sequence[Path], site: Path, settings: CompareSettings, *, telemetry: Path | None = None,
+    inputs: Sequence[Path | str], site: Path, settings: CompareSettings, *, telemetry: Path | str | None = None,
     camera: str | None = None, area: Path | None = None, steps: Path | None = None,
+    live: LiveSettings = LiveSettings(keeps_all=True),  # noqa: B008 (frozen)
 ) -> list[dict[str, Any]]:
     """Compare with a bar and each change as it is announced on stderr; report and changes of each flight, in order."""
     before = newest_version(site)
-    comparing = compare_flights(
-        inputs, site, settings, telemetry=telemetry, camera=camera, area=area, steps=steps
-    )
-    # closed even when the bar is stopped: then the site is as it was
-    with closing(comparing) as updates:
-        _show_progress(updates, Console(stderr=True))
+    with ended_by_signal(inputs) as until:
+        comparing = compare_flights(
+            inputs, site, settings, telemetry=telemetry, camera=camera, area=area, steps=steps, live=live, until=until
+        )
+        # closed even when the bar is stopped: then the site is as it was
+        with closing(comparing) as updates:
+            _show_progress(updates, Console(stderr=True))
     with Archive.open(site, write=False) as archive:
         compared = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
         return [_result(archive.flight_folder(flight_id)) for flight_id in compared]

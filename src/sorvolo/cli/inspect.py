@@ -3,7 +3,6 @@
 import json
 import math
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -18,8 +17,10 @@ _MOST_NAMES = 4
 
 
 def inspect(
-    inputs: Annotated[list[Path], typer.Argument(help="Videos, folders of photos, or photos.")],
-    telemetry: Annotated[Path | None, typer.Option(help="The flight's log, if not beside the video.")] = None,
+    inputs: Annotated[list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources.")],
+    telemetry: Annotated[
+        str | None, typer.Option(help="The flight's log, if not beside the video; of a live one, the receiver's link.")
+    ] = None,
     camera: Annotated[str, typer.Option(help="Calibration file, preset name or EXIF code, or aov=DEG.")] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
 ) -> None:

@@ -1,8 +1,10 @@
 """`sorvolo map`: flights into a site folder, and in the end what became of them."""
 
 import json
-from collections.abc import Mapping, Sequence
-from contextlib import closing
+import signal
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +14,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sorvolo.capture.live.addresses import is_live_address
+from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.cli.progress import show_progress
 from sorvolo.errors import StoreError
 from sorvolo.missions.map_flight import map_flights
@@ -38,10 +42,10 @@ class Transform(StrEnum):
 
 
 def map_command(
-    inputs: Annotated[list[Path], typer.Argument(help="Videos, folders of photos, or photos.")],
+    inputs: Annotated[list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources.")],
     site: Annotated[Path, typer.Option(help="Folder of the map; one that exists is extended.")],
     telemetry: Annotated[
-        Path | None, typer.Option(help="The flight's log, if not beside the video.")
+        str | None, typer.Option(help="The flight's log, if not beside the video; of a live one, the receiver's link.")
     ] = None,
     camera: Annotated[str, typer.Option(help="Calibration file, preset name or EXIF code, or aov=DEG.")] = "",
     area: Annotated[
@@ -65,19 +69,26 @@ def map_command(
     model: Annotated[
         str, typer.Option(help="Looks for people, cars, objects: a model's name, a file, or none.")
     ] = "default",
+    give_up: Annotated[float, typer.Option(help="A live source silent for so long has ended, s.")] = 30.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Make a geo-referenced map of one or more flights, or extend the map in the site folder.
 
+    Live sources are addresses (rtsp://, rtmp://, udp://, tcp://), webcam:0, and follow:PATH for a video or a folder of
+    photos that is being written. Ctrl-C ends a live flight, and its map is finished; a second Ctrl-C leaves it out.
+
     Example: sorvolo map DJI_0042.MP4 --site field
 
     Example: sorvolo map photos/ --site field --camera phantom.xml --area field.geojson
+
+    Example: sorvolo map rtsp://192.168.1.10/live --telemetry serial:/dev/ttyUSB0 --site field
     """
     settings = MapSettings(
         method.value, gsd, overlap, offset, ground_elevation, crs or None, transform.value, model=model,
     )
     reports = map_and_read_reports(
-        inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area
+        inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area,
+        live=LiveSettings(keeps_all=True, give_up_s=give_up),
     )
     if as_json:
         plain = [{key: value for key, value in each.items() if key != "track"} for each in reports]
@@ -88,18 +99,47 @@ def map_command(
 
 
 def map_and_read_reports(
-    inputs: Sequence[Path], site: Path, settings: MapSettings, *, telemetry: Path | None = None,
+    inputs: Sequence[Path | str], site: Path, settings: MapSettings, *, telemetry: Path | str | None = None,
     camera: str | None = None, area: Path | None = None,
+    live: LiveSettings = LiveSettings(keeps_all=True),  # noqa: B008 (frozen)
 ) -> list[dict[str, Any]]:
     """Map with a bar on stderr; the reports of the flights that were mapped, in order."""
     before = newest_version(site)
-    mapping = map_flights(inputs, site, settings, telemetry=telemetry, camera=camera, area=area)
-    # closed even when the bar is stopped: then the site is as it was
-    with closing(mapping) as updates:
-        show_progress(updates, Console(stderr=True))
+    with ended_by_signal(inputs) as until:
+        mapping = map_flights(
+            inputs, site, settings, telemetry=telemetry, camera=camera, area=area, live=live, until=until
+        )
+        # closed even when the bar is stopped: then the site is as it was
+        with closing(mapping) as updates:
+            show_progress(updates, Console(stderr=True))
     with Archive.open(site, write=False) as archive:
         mapped = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
         return [read_json(archive.flight_folder(flight_id) / "report.json") for flight_id in mapped]
+
+
+@contextmanager
+def ended_by_signal(inputs: Sequence[Path | str]) -> Iterator[threading.Event]:
+    """An event that Ctrl-C or SIGTERM sets once where an input is live; the next one stops the command as ever."""
+    until = threading.Event()
+    if not any(is_live_address(str(each)) for each in inputs):
+        yield until
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    def end(*_: Any) -> None:
+        until.set()
+        restore()
+
+    for number in before:
+        signal.signal(number, end)
+    try:
+        yield until
+    finally:
+        restore()
 
 
 def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Console) -> None:

@@ -1,12 +1,14 @@
 """Mode 1, later flights: sources against the map in a site folder, frame by frame."""
 
+import threading
 import time
 from collections.abc import Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from sorvolo.capture.areas import read_area
-from sorvolo.capture.source import Source, open_sources
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.capture.source import Source, opened_sources
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.compare_run import CompareRun
 from sorvolo.missions.detecting import Detects
@@ -21,15 +23,17 @@ from sorvolo.survey.flight import Frame, PosedFrame
 
 
 def compare_flights(
-    inputs: Sequence[Path], site: Path, settings: CompareSettings = CompareSettings(), *,  # noqa: B008 (frozen)
-    telemetry: Path | None = None, camera: Path | str | None = None, area: Path | None = None,
+    inputs: Sequence[Path | str], site: Path, settings: CompareSettings = CompareSettings(), *,  # noqa: B008 (frozen)
+    telemetry: Path | str | None = None, camera: Path | str | None = None, area: Path | None = None,
     steps: Path | None = None, detector: Detects | None = None,
+    live: LiveSettings = LiveSettings(keeps_all=True), until: threading.Event | None = None,  # noqa: B008 (frozen)
 ) -> Generator[CompareUpdate]:
     """Compare one or more later flights with the map in the site folder, yielding an update for each frame compared.
 
-    `inputs`, `telemetry`, `camera`, `area` and `detector` are those of `map_flights`. An update carries the changes
-    that its frame made sure of. `steps` is a folder for the intermediate pictures of method thesis (its Figure 3.14).
-    The flights' findings and the new version of the map are part of the site when a flight's last update was yielded.
+    `inputs`, `telemetry`, `camera`, `area`, `detector`, `live` and `until` are those of `map_flights`. An update
+    carries the changes that its frame made sure of. `steps` is a folder for the intermediate pictures of method thesis
+    (its Figure 3.14). The flights' findings and the new version of the map are part of the site when a flight's last
+    update was yielded.
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being compared is left out, those before it are in.
     """
@@ -39,9 +43,9 @@ def compare_flights(
     with Archive.open(site, write=False) as archive:
         if not archive.tiles():
             raise StoreError(f"{site} holds no map yet; make one of an earlier flight: sorvolo map INPUT --site {site}")
-    sources = open_sources(inputs, telemetry, camera, known_flights(site))
     looks = open_detector(settings.model) if detector is None else detector
-    with Archive.open(site, write=True) as archive:
+    opened = opened_sources(inputs, telemetry, camera, known_flights(site), live=live, until=until)
+    with opened as sources, Archive.open(site, write=True) as archive:
         for source in sources:
             yield from _compare_one(
                 source, archive, settings, wanted, steps, looks, telemetry_named=telemetry is not None

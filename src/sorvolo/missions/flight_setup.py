@@ -1,12 +1,12 @@
 """Before the first frame: clocks tied, telemetry in the site frame, the site itself, what can be known beforehand."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from sorvolo.capture.source import Source
+from sorvolo.capture.source import LiveSource, Source
 from sorvolo.capture.sync import Clock, Track, shifted, site_origin, tie_clocks, track_from_telemetry
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Floats, PointsM
@@ -16,15 +16,19 @@ from sorvolo.missions.settings import MapSettings
 from sorvolo.mosaic.selection import interval_s
 from sorvolo.store.archive import Archive
 from sorvolo.survey.area import Area
-from sorvolo.survey.flight import CameraPrior, Frame, Notice, PosedFrame, Site
+from sorvolo.survey.flight import CameraPrior, Frame, Notice, PosedFrame, Site, Telemetry, no_telemetry
 
 _ANOTHER_PLACE_M = 20_000.0
-_UNTIMED_STEP_S = 0.2  # candidates of a video without telemetry: five a second, the pictures decide
+_UNTIMED_STEP_S = 0.2  # candidates of a video without telemetry, or live: five a second, the pictures decide
+_LIVE_SPEED_M_S = 5.0  # a flight that has just begun does not show yet how fast it will be
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class FlightSetup:
-    """All that is known of a flight before its first frame is read; `track` is None without telemetry."""
+    """All that is known of a flight before its first frame is read; `track` is None without telemetry.
+
+    Of a live flight more becomes known while it goes on: `renew` takes it in, and changes what is told of telemetry.
+    """
 
     source: Source
     frame: LocalFrame
@@ -36,12 +40,35 @@ class FlightSetup:
     expected_keyframes: int
     site: Site | None
     notices: tuple[Notice, ...]
+    offset_s: float = 0.0
+    ground_elevation_m: float | None = None
+    telemetry: Telemetry = field(default_factory=no_telemetry)  # the one that `track` was made of
+    telemetry_version: int = 0
 
     def prior(self, frame: Frame, *, first: bool) -> CameraPrior:
         """What telemetry says of a frame's camera; without telemetry, only that it looks down."""
+        self.renew(frame.time_ns)
         if self.track is None:
             return _local_prior(self.source.camera.camera, first)
         return self.track.prior(self.seconds(frame), smooth_s=self.smooth_s)
+
+    def renew(self, time_ns: int) -> None:
+        """Take in what a live flight's telemetry says by now, once the fix after `time_ns` came or is late.
+
+        The zero of heights stays where it was, so that all frames are counted from the same.
+        """
+        if self.track is None or not isinstance(self.source, LiveSource):
+            return
+        self.source.wait_for_telemetry(time_ns)
+        if self.source.telemetry_version == self.telemetry_version:
+            return
+        self.telemetry_version = self.source.telemetry_version
+        self.telemetry = self.source.telemetry
+        self.clock = _live_clock(self.source, self.telemetry)
+        found, _ = track_from_telemetry(
+            self.telemetry, self.clock, self.frame, ground_elevation_m=self.ground_elevation_m
+        )
+        self.track = _continued(self.track, shifted(found, self.offset_s))
 
     def seconds(self, frame: Frame) -> float:
         """Seconds of the frame on the frames' clock."""
@@ -75,6 +102,10 @@ def prepare(
     `finds_itself`: the flight's frames are looked for in the site's map, so that they need no GPS. Raises InputError
     when the flight belongs to another place than the site, or the telemetry to another flight.
     """
+    is_live = isinstance(source, LiveSource)
+    if isinstance(source, LiveSource):
+        source.wait_for_first_fixes()
+    telemetry_version = source.telemetry_version if isinstance(source, LiveSource) else 0
     telemetry = source.telemetry
     duration_s = source.frame_count / source.frame_rate_hz if source.frame_rate_hz > 0 else 0.0
     if finds_itself and site is not None and (site.is_local or not telemetry.has_fixes):
@@ -99,6 +130,7 @@ def prepare(
             )
         step_s = _UNTIMED_STEP_S if source.kind == "video" else 0.0
         lack = "telemetry without a single fix" if len(telemetry) else "no telemetry"
+        lack += " in time" if is_live and telemetry_named else ""
         text = f"{lack}: the map is in a local frame of its own, without metres and north"
         return FlightSetup(
             source, LocalFrame(Geodetic(0.0, 0.0)), None, None, step_s, step_s, 0.0,
@@ -110,14 +142,17 @@ def prepare(
             f"the site {site.name} has no geo-reference, but the flight {source.name} has GPS: map it into a new site "
             "folder"
         )
-    clock = tie_clocks(
+    clock = _live_clock(source, telemetry) if isinstance(source, LiveSource) else tie_clocks(
         telemetry, kind=source.kind, start_ns=source.start_ns, duration_s=duration_s,
         offset_given=settings.offset_s is not None, strict=telemetry_named,
     )
     origin = site.origin if site is not None else site_origin(telemetry)
     assert origin is not None  # has_fixes
     frame = LocalFrame(origin)
-    track, notices = track_from_telemetry(telemetry, clock, frame, ground_elevation_m=settings.ground_elevation_m)
+    ground_m = settings.ground_elevation_m
+    if ground_m is None and np.isfinite(source.ground_elevation_m):
+        ground_m = source.ground_elevation_m
+    track, notices = track_from_telemetry(telemetry, clock, frame, ground_elevation_m=ground_m)
     if site is not None:
         _check_place(site, track, source.name)
     if settings.offset_s is not None:
@@ -126,7 +161,7 @@ def prepare(
     covered = (track.sample_s[known] >= -1.5 * track.interval_s - 0.5) & (
         track.sample_s[known] <= duration_s + 1.5 * track.interval_s + 0.5
     )
-    if source.kind == "video" and not covered.any():
+    if source.kind == "video" and not is_live and not covered.any():
         raise InputError(
             f"the telemetry ({telemetry.format}) has no fix during the {duration_s:.0f} s of {source.name}; give the "
             "telemetry of this flight, or another --offset"
@@ -134,10 +169,12 @@ def prepare(
     camera = source.camera.camera
     height_m = max(float(np.median(track.up_m[known])), 2.0)
     path_s, path_m = track.sample_s[known], track.east_north_m[known]
-    speed = _speed_m_s(path_s, path_m)
+    speed = max(_speed_m_s(path_s, path_m), _LIVE_SPEED_M_S if is_live else 0.0)
     keyframe_s = interval_s(camera, height_m, speed, settings.overlap)
     if source.kind == "photos":
         step_s, expected = 0.0, source.frame_count
+    elif is_live:
+        step_s, expected = _UNTIMED_STEP_S, 2
     else:
         # the thesis takes frames by eq. 3.17 alone; planar looks at three times as many and lets the pictures decide
         share = 1 if settings.method == "thesis" else 3
@@ -145,7 +182,8 @@ def prepare(
         expected = max(2, round(duration_s / keyframe_s))
     smooth_s = 0.5 * keyframe_s if source.kind == "video" and settings.method == "planar" else 0.0
     return FlightSetup(
-        source, frame, clock, track, step_s, keyframe_s, smooth_s, expected, site, (*clock.notices, *notices)
+        source, frame, clock, track, step_s, keyframe_s, smooth_s, expected, site, (*clock.notices, *notices),
+        settings.offset_s or 0.0, ground_m, telemetry, telemetry_version,
     )
 
 
@@ -164,7 +202,7 @@ def new_site(setup: FlightSetup, name: str, m_per_px: float, ground_up_m: float)
     """
     if setup.track is None:
         return Site(name, Geodetic(0.0, 0.0), "", m_per_px, is_local=True)
-    telemetry = setup.source.telemetry
+    telemetry = setup.telemetry
     for column, stated in (("ellipsoidal_height_m", "ellipsoidal"), ("orthometric_height_m", "orthometric")):
         heights = telemetry[column]
         if np.isfinite(heights).mean() > 0.5:
@@ -196,6 +234,22 @@ def _speed_m_s(path_s: Floats, path_m: PointsM) -> float:
         return 1.0
     steps = np.column_stack([np.interp(times, path_s, path_m[:, k]) for k in range(2)])
     return max(0.3, float(np.percentile(np.linalg.norm(np.diff(steps, axis=0), axis=1) / np.diff(times), 75)))
+
+
+def _live_clock(source: LiveSource, telemetry: Telemetry) -> Clock:
+    """A live source ties its telemetry to its frames itself."""
+    return Clock(
+        (telemetry.time_ns - source.start_ns) / 1e9, source.telemetry_tie, source.telemetry_sigma_s, source.start_ns
+    )
+
+
+def _continued(before: Track, now: Track) -> Track:
+    """The track as it is known now, its heights counted from the same zero as before."""
+    same_m = np.interp(before.sample_s, now.sample_s, now.up_m)
+    return replace(
+        now, up_m=now.up_m + np.median(before.up_m - same_m), height_words=before.height_words,
+        vertical_sigma_m=before.vertical_sigma_m, altitude_offset_sigma_m=before.altitude_offset_sigma_m,
+    )
 
 
 def _local_prior(camera: Camera, first: bool) -> CameraPrior:

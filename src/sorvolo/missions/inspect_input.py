@@ -7,22 +7,20 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
+from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.photos import PhotoSource
-from sorvolo.capture.source import Source, open_sources
+from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.capture.video import VideoSource
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.planning import footprint_size_m, minimum_frame_rate, px_per_m
 from sorvolo.geometry.track import find_strips, length_m, speeds_m_s
-from sorvolo.registration.features import gray_from_rgb, sharpness
-from sorvolo.survey.flight import CameraModel, Frame, Notice, Telemetry
+from sorvolo.missions.glimpses import glimpses_of, sharpness_and_texture
+from sorvolo.survey.flight import CameraModel, Notice, Telemetry
 
-_GLIMPSES = 5
-_GLIMPSE_SIDE_PX = 960
 _WANTED_OVERLAP = 0.7
 _SECOND_NS = 1_000_000_000
 _ZONE_NS = 900 * _SECOND_NS  # time zones differ by quarters of an hour
@@ -156,13 +154,14 @@ class Inspection:
 
 
 def inspect_input(
-    inputs: Sequence[Path], telemetry: Path | None = None, camera: Path | str | None = None
+    inputs: Sequence[Path | str], telemetry: Path | str | None = None, camera: Path | str | None = None
 ) -> list[Inspection]:
-    """Look at each flight among the inputs: all metadata, and a handful of frames.
+    """Look at each flight among the inputs: all metadata, and a handful of frames; of a live one the next seconds.
 
     Raises InputError where `open_sources` does.
     """
-    return [_inspect(source) for source in open_sources(inputs, telemetry, camera)]
+    with opened_sources(inputs, telemetry, camera) as sources:
+        return [_inspect(source) for source in sources]
 
 
 def _inspect(source: Source) -> Inspection:
@@ -189,7 +188,8 @@ def _inspect(source: Source) -> Inspection:
 
 def _frame_facts(source: Source) -> FrameFacts:
     camera = source.camera.camera
-    seen = [_sharpness_and_texture(frame) for frame in _glimpses(source)]
+    glimpses = glimpses_of(source)
+    seen = [sharpness_and_texture(frame) for frame in glimpses]
     sharp, texture = np.median(seen, axis=0).tolist() if seen else (math.nan, math.nan)
     if isinstance(source, VideoSource):
         info = source.info
@@ -198,34 +198,22 @@ def _frame_facts(source: Source) -> FrameFacts:
             camera.height_px, info.codec, info.container, info.path.stat().st_size, info.start_ns,
             info.start_origin, sharp, texture,
         )
-    times_s, suffixes, size = np.zeros(0), "", 0
+    times_s, suffixes, container, size = np.zeros(0), "", "", 0
+    if isinstance(source, LiveSource):
+        times_s = np.array([frame.time_ns for frame in glimpses]) / _SECOND_NS
+    if isinstance(source, LiveStream):
+        suffixes, container = source.facts.codec, source.facts.container
     if isinstance(source, PhotoSource):
         photos = source.album.photos
         times_s = np.array([photo.time_ns for photo in photos]) / _SECOND_NS
         suffixes = ", ".join(sorted({photo.path.suffix.lower().lstrip(".") for photo in photos}))
         size = sum(photo.path.stat().st_size for photo in photos)
     return FrameFacts(
-        source.frame_count, source.frame_rate_hz, _median(np.diff(times_s)),
+        source.frame_count, source.frame_rate_hz,
+        _median(np.diff(times_s)) if source.kind == "photos" else math.nan,
         float(np.ptp(times_s)) if len(times_s) else math.nan, camera.width_px, camera.height_px,
-        suffixes, "", size, source.start_ns, source.start_origin, sharp, texture,
+        suffixes, container, size, source.start_ns, source.start_origin, sharp, texture,
     )
-
-
-def _glimpses(source: Source) -> list[Frame]:
-    if isinstance(source, VideoSource):
-        return source.glimpses(_GLIMPSES)
-    count = min(_GLIMPSES, source.frame_count)
-    chosen = {round(index) for index in np.linspace(0, source.frame_count - 1, count)}
-    return [frame for frame in source.frames(lambda index, _: index in chosen) if isinstance(frame, Frame)]
-
-
-def _sharpness_and_texture(frame: Frame) -> tuple[float, float]:
-    gray = gray_from_rgb(frame.image)
-    scale = min(1.0, _GLIMPSE_SIDE_PX / max(gray.shape))
-    small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    smooth = cv2.GaussianBlur(small, (0, 0), 1.0).astype(np.float64)  # without the sensor's noise
-    detail = smooth - cv2.boxFilter(small, cv2.CV_64F, (31, 31))
-    return sharpness(np.asarray(small, np.uint8)), float(detail.std())
 
 
 def _telemetry_facts(source: Source, frames: FrameFacts) -> TelemetryFacts:
@@ -246,6 +234,8 @@ def _tie(source: Source, frames: FrameFacts) -> tuple[str, float]:
     telemetry = source.telemetry
     if not len(telemetry):
         return "no telemetry", math.nan
+    if isinstance(source, LiveSource):
+        return source.telemetry_tie, frames.duration_s
     if telemetry.format == "exif":
         return "in each photo", frames.duration_s
     tied_ns = telemetry.video_time_ns[telemetry.video_time_ns >= 0]

@@ -1,11 +1,13 @@
 """Mode 1, first flight: sources to a map in a site folder, frame by frame."""
 
+import threading
 import time
 from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 
 from sorvolo.capture.areas import read_area
-from sorvolo.capture.source import Source, open_sources
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.capture.source import Source, opened_sources
 from sorvolo.missions.detecting import Detects
 from sorvolo.missions.flight_run import FlightRun
 from sorvolo.missions.flight_setup import known_flights, prepare
@@ -21,23 +23,26 @@ from sorvolo.survey.mosaic import MosaicUpdate, Status
 
 
 def map_flights(
-    inputs: Sequence[Path], site: Path, settings: MapSettings = MapSettings(), *,  # noqa: B008 (frozen)
-    telemetry: Path | None = None, camera: Path | str | None = None, area: Path | None = None,
-    detector: Detects | None = None,
+    inputs: Sequence[Path | str], site: Path, settings: MapSettings = MapSettings(), *,  # noqa: B008 (frozen)
+    telemetry: Path | str | None = None, camera: Path | str | None = None, area: Path | None = None,
+    detector: Detects | None = None, live: LiveSettings = LiveSettings(keeps_all=True),  # noqa: B008 (frozen)
+    until: threading.Event | None = None,
 ) -> Generator[MosaicUpdate]:
     """Map one or more flights into the site folder, yielding an update for each selected frame.
 
-    `inputs` are videos, folders of photos, or photos; `telemetry` a file of the only flight (else what lies beside
-    it is used); `camera` a calibration file, a preset's name, "aov=DEG" or "focal_px=PX"; `area` a polygon outside
-    of which frames are not used; `detector` one that looks for objects in place of the model that the settings name.
+    `inputs` are videos, folders of photos, photos, or live sources (see `open_sources`); `telemetry` a file of the
+    only flight (else what lies in or beside it is used), or a receiver's link; `camera` a calibration file, a preset's
+    name, "aov=DEG" or "focal_px=PX"; `area` a polygon outside of which frames are not used; `detector` one that looks
+    for objects in place of the model that the settings name. A live flight is read as `live` says until it ends or
+    `until` is set; then its map is finished like any other's.
     Nothing of a flight is part of the site until its last update was yielded.
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being mapped is left out, those before it are in.
     """
     wanted = None if area is None else read_area(area)
-    sources = open_sources(inputs, telemetry, camera, known_flights(site))
     looks = open_detector(settings.model) if detector is None else detector
-    with Archive.open(site, write=True) as archive:
+    opened = opened_sources(inputs, telemetry, camera, known_flights(site), live=live, until=until)
+    with opened as sources, Archive.open(site, write=True) as archive:
         for source in sources:
             yield from _map_one(source, archive, settings, wanted, looks, telemetry_named=telemetry is not None)
 

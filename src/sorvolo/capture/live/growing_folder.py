@@ -33,6 +33,7 @@ class GrowingFolder:
     kind = "photos"
     is_live = True
     frame_rate_hz = ground_elevation_m = nan
+    telemetry_tie, telemetry_sigma_s = "each photo carries its own fix", 0.0
 
     def __init__(self, folder: Path, settings: LiveSettings, until: threading.Event) -> None:
         self._folder, self._settings, self._until = folder, settings, until

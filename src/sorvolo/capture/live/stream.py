@@ -79,6 +79,7 @@ class LiveStream:
         self._held_told: list[tuple[int, LocalSet]] = []
         self._held_since: tuple[float, int] | None = None  # the monotonic clock's and the stream's
         self._held_fixes: list[tuple[int, Epoch]] = []
+        self._clocks_agree = False
         self._delays_ns: deque[int] = deque(maxlen=_DELAYS_KEPT)
         self._is_ready = threading.Event()
         self._wanted: Callable[[int, int], bool] | None = None
@@ -130,6 +131,18 @@ class LiveStream:
     def telemetry_version(self) -> int:
         """Grows with every sample: whether `telemetry` has more than before."""
         return self._log.version
+
+    @property
+    def telemetry_tie(self) -> str:
+        """How telemetry's times came onto the frames' clock, in words."""
+        if self._link is None:
+            return "the metadata came with the frames"
+        return "both carry UTC" if self._clocks_agree else "both are timed by when they came"
+
+    @property
+    def telemetry_sigma_s(self) -> float:
+        """How far off that may be, s: a link's delay, or a metadata packet's in the aircraft."""
+        return 0.5 if self._link is None else 1.0
 
     @property
     def ground_elevation_m(self) -> float:
@@ -363,8 +376,8 @@ class LiveStream:
         self._delays_ns.append(arrived_ns - epoch.time_ns)
         least_ns = min(self._delays_ns)
         ahead_ns = self._clock.host_from_tie_ns()
-        agree = self._clock.tie is not Tie.ARRIVAL and abs(least_ns - ahead_ns) < _CLOCKS_AGREE_NS
-        self._log.add(epoch.time_ns + (0 if agree else least_ns - ahead_ns), epoch.values)
+        self._clocks_agree = self._clock.tie is not Tie.ARRIVAL and abs(least_ns - ahead_ns) < _CLOCKS_AGREE_NS
+        self._log.add(epoch.time_ns + (0 if self._clocks_agree else least_ns - ahead_ns), epoch.values)
 
     # ---- pictures ---------------------------------------------------------------------------------------------
 
