@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 TRAINS := $(VENV)/.trains
 SEEDS ?= 101 102 103
 
-.PHONY: demo test check bench
+.PHONY: demo test check bench model
 
 demo: $(READY)
 	$(BIN)/sorvolo demo demo-site
@@ -21,6 +21,12 @@ check: $(TRAINS)
 
 bench: $(READY)
 	$(BIN)/python benchmarks/mosaic_methods.py $(SEEDS)
+
+# The packaged model anew: make model DATA=FOLDER LITE0=WEIGHTS, the labelled sets and EfficientNet-Lite0's weights.
+STEPS ?= 6500
+model: $(TRAINS)
+	$(BIN)/python benchmarks/train_default_model.py $(DATA) build/model --weights $(LITE0) --steps $(STEPS)
+	$(BIN)/python benchmarks/pack_default_model.py build/model/weights.pt $(DATA) --steps $(STEPS)
 
 $(READY): requirements.lock pyproject.toml setup.py $(wildcard src/sorvolo/kernels/*.?pp)
 	$(PYTHON) -m venv $(VENV)
