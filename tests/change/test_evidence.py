@@ -9,13 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
-from sorvolo.change.outlines import KnownPlace
 from sorvolo.errors import SettingsError
 from sorvolo.survey.findings import Change, ChangeKind
 
 
-def collect(views, rejected=(), **how) -> tuple[EvidenceMap, list[tuple[int, Change]]]:
-    evidence = EvidenceMap(M_PER_PX, EvidenceSettings(**how), "f", rejected)
+def collect(views, **how) -> tuple[EvidenceMap, list[tuple[int, Change]]]:
+    evidence = EvidenceMap(M_PER_PX, EvidenceSettings(**how), "f")
     return evidence, [(view.index, change) for view in views for change in evidence.add(view)]
 
 
@@ -186,19 +185,6 @@ def test_a_single_view_is_believed_only_if_very_sure_and_at_half_the_score():
     assert change.views == 1 and change.score < 0.4
     assert collect([unsure], single_view_score=0.9)[0].conclude() == ()
     assert collect([sure])[0].conclude() == ()  # unless asked for, a single view is not believed at all
-
-
-def test_what_a_person_rejected_does_not_come_back():
-    views = list(flight([Thing(0, 0), Thing(3, 2)]))
-    known, _ = collect(views)
-    rejected = known.conclude()[0]
-    evidence, told = collect(views, [KnownPlace(rejected.outline_m, rejected.kind)])
-    assert [each.id for _, each in told] == ["f-2"]  # ids stay those of the first comparison
-    assert [each.id for each in evidence.conclude()] == ["f-2"]
-    assert evidence.suppressed == 1
-    # the same place with another kind is news
-    other, _ = collect(views, [KnownPlace(rejected.outline_m, ChangeKind.DISAPPEARED)])
-    assert len(other.conclude()) == 2 and other.suppressed == 0
 
 
 def test_low_scores_are_kept_but_not_told():

@@ -20,15 +20,13 @@ from sorvolo.change.cells import (
     cut_off_pieces,
     lay,
     pieces,
-    scale_m_per_px,
 )
 from sorvolo.change.gathering import GatheredChange, upright_weight
-from sorvolo.change.moving import BlobTracker, MovingSettings, Track, standing_outline_m
-from sorvolo.change.outlines import KnownPlace, is_known, measures
-from sorvolo.change.patches import PatchWindow, cut, patch_of
+from sorvolo.change.movers import Movers
+from sorvolo.change.moving import BlobTracker, MovingSettings
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Floats, ImageGray, Mask, Matrix3, PointsM
-from sorvolo.survey.findings import Change, ChangeKind, ComparedView
+from sorvolo.geometry.arrays import Floats, ImageGray, Mask, Matrix3
+from sorvolo.survey.findings import Change, ComparedView
 
 _CELL_PX = 3
 _LEAST_CELL_M = 0.05
@@ -84,16 +82,12 @@ class _Witness:
 class EvidenceMap:
     """The changes of one flight while its views come in. `add` changes it; `conclude` says the last word.
 
-    `site_m_per_px` is the map's pixel, `id_prefix` begins every change's id: the flight's name. `rejected` are the
-    places where a person said no on an earlier flight: a change of the same kind there is not told but counted in
-    `suppressed`. Views must come in order of time; the same views give the same changes and ids.
+    `site_m_per_px` is the map's pixel, `id_prefix` begins every change's id: the flight's name. Views must come in
+    order of time; the same views give the same changes and ids.
     """
 
-    def __init__(
-        self, site_m_per_px: float, settings: EvidenceSettings, id_prefix: str, rejected: Sequence[KnownPlace] = ()
-    ) -> None:
-        self.suppressed = 0
-        self._settings, self._prefix, self._rejected = settings, id_prefix, tuple(rejected)
+    def __init__(self, site_m_per_px: float, settings: EvidenceSettings, id_prefix: str) -> None:
+        self._settings, self._prefix = settings, id_prefix
         self._site_m_per_px = site_m_per_px
         self._cell_m = max(_LEAST_CELL_M, _CELL_PX * site_m_per_px)
         self._join_m = max(settings.join_m, 3 * self._cell_m) if settings.join_m else 0.0
@@ -103,8 +97,7 @@ class EvidenceMap:
         self._found: dict[int, GatheredChange] = {}  # by number, in order
         self._merged: dict[int, int] = {}
         self._parted: dict[int, list[Change]] = {}  # what turned out to be several things, by number
-        self._movers: dict[int, Change] = {}  # by the tracker's number
-        self._unwanted_movers: set[int] = set()
+        self._movers = Movers(id_prefix, site_m_per_px, self._cell_m)
         self._seeds: list[GatheredChange] = []
         self._recent: deque[_Witness] = deque(maxlen=settings.n)
         self._number = 0
@@ -135,7 +128,7 @@ class EvidenceMap:
         new = self._gather(view, witness, earlier, evidence, budget)
         shown = self._update(view, witness, evidence.owner, {each.number for each in new}, budget)
         announced = [self._told(each, view.time_ns) for each in shown]
-        announced += self._tell_movers(view, followed.movers)
+        announced += self._movers.see(view, followed.movers, self._next_number)
         self._keep_seeds(view, laid, evidence, budget)
         return tuple(each for each in announced if each is not None)
 
@@ -143,10 +136,10 @@ class EvidenceMap:
         """All changes told so far as they are known now, in the order of their numbers."""
         found = [
             self._change(each) for each in self._found.values()
-            if each.is_told and not each.is_hidden and each.number not in self._parted
+            if each.is_told and not each.is_taken_back and each.number not in self._parted
         ]
         parts = [each for several in self._parted.values() for each in several]
-        known = [each for each in found if each is not None] + parts + list(self._movers.values())
+        known = [each for each in found if each is not None] + parts + list(self._movers.changes)
         return tuple(sorted(known, key=_number_of))
 
     def conclude(self) -> tuple[Change, ...]:
@@ -156,33 +149,29 @@ class EvidenceMap:
         saw, and no other could, is told if that view was very sure, with half the score. Neighbours that were one
         change so far, joined by a shadow, become two: the larger one keeps the id.
         """
-        settings = self._settings
         for seed in self._seeds:
             self._grow_late(seed)
         self._seeds = []
         for change in self._found.values():
             if not change.is_told:
                 self._told(change, -1)
-            elif change.share < settings.least_share or change.score < settings.least_score:
-                change.is_hidden = True
+            elif not self._is_sure(change):
+                change.is_taken_back = True
         self._part()
         return self.changes()
 
     def _part(self) -> None:
         self._parted = {}
         for change in list(self._found.values()):
-            whole = self._change(change) if change.is_told and not change.is_hidden else None
+            whole = self._change(change) if change.is_told and not change.is_taken_back else None
             if whole is None:
                 continue
             parts = change.parted(whole, self._cells_of(change), self._cell_m, self._join_m)
             if len(parts) < 2:
                 continue
-            numbered = [
+            self._parted[change.number] = [parts[0]] + [
                 replace(each, id=f"{self._prefix}-{self._next_number()}", announced_ns=-1) for each in parts[1:]
             ]
-            wanted = [each for each in numbered if not is_known(each.outline_m, each.kind, self._rejected)]
-            self.suppressed += len(numbered) - len(wanted)
-            self._parted[change.number] = [parts[0], *wanted]
 
     def _is_repeat(self, view: ComparedView) -> bool:
         if self._last is None:
@@ -265,18 +254,15 @@ class EvidenceMap:
         return change
 
     def _told(self, change: GatheredChange, now_ns: int) -> Change | None:
-        """The change if it is to be told now for the first time: sure enough, and nobody said no to it before."""
-        settings = self._settings
-        is_sure = change.score >= settings.least_score and change.share >= settings.least_share
-        record = None if change.is_told or change.is_hidden or not is_sure else self._change(change)
+        """The change if it is to be told now: for the first time sure enough."""
+        record = None if change.is_told or not self._is_sure(change) else self._change(change)
         if record is None:
-            return None
-        if is_known(record.outline_m, record.kind, self._rejected):
-            self.suppressed += 1
-            change.is_hidden = True
             return None
         change.is_told, change.announced_ns = True, now_ns
         return replace(record, announced_ns=now_ns)
+
+    def _is_sure(self, change: GatheredChange) -> bool:
+        return change.score >= self._settings.least_score and change.share >= self._settings.least_share
 
     def _answer(self, laid: LaidView, window: CellWindow, cells: Mask) -> tuple[float, float, float, Floats]:
         """What a view says of some cells: the shares of them it saw and flagged, how sure, where the flagged lie."""
@@ -443,50 +429,6 @@ class EvidenceMap:
         self._grid.own(seed.cells, cells, seed.number)
         self._found[seed.number] = seed
 
-    def _tell_movers(self, view: ComparedView, movers: Sequence[Track]) -> list[Change]:
-        """Bring the moving things up to date; those told for the first time."""
-        told = []
-        for track in movers:
-            if track.mover in self._unwanted_movers:
-                continue
-            known = self._movers.get(track.mover)
-            number = _number_of(known) if known else self._next_number()
-            change = self._moving(view, track, f"{self._prefix}-{number}")
-            if known:
-                change = replace(
-                    change, first_seen_ns=known.first_seen_ns, views=max(change.views, known.views + 1),
-                    announced_ns=known.announced_ns,
-                )
-            elif is_known(change.outline_m, change.kind, self._rejected):
-                self.suppressed += 1
-                self._unwanted_movers.add(track.mover)
-                continue
-            else:
-                told.append(change)
-            self._movers[track.mover] = change
-        return told
-
-    def _moving(self, view: ComparedView, track: Track, change_id: str) -> Change:
-        """A moving thing as this view shows it."""
-        m_per_px = scale_m_per_px(view)
-        outline_m = standing_outline_m(view, track.last.blob)
-        if outline_m is None:
-            outline_m = _square(track.last.blob.place_m, self._cell_m)
-        window = PatchWindow.around(outline_m.min(axis=0), outline_m.max(axis=0), self._site_m_per_px, 512)
-        size = measures(outline_m)
-        residual_m = view.residual_px * m_per_px if np.isfinite(view.residual_px) else 0.0
-        score = track.score_sum / track.count * (track.count + 1) / (track.count + 2)
-        return Change(
-            change_id, ChangeKind.MOVING, float(np.clip(score, 0, 1)), outline_m, track.first.time_ns,
-            track.last.time_ns, track.count, size.area_m2, size.length_m,
-            float(np.hypot(residual_m, self._cell_m / np.sqrt(12))), patch_of(window, cut(view, window), outline_m),
-            track.velocity_m_s, announced_ns=view.time_ns,
-        )
-
 
 def _number_of(change: Change) -> int:
     return int(change.id.rsplit("-", 1)[1])
-
-
-def _square(place_m: Floats, side_m: float) -> PointsM:
-    return place_m + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side_m / 2

@@ -32,7 +32,7 @@ class GatheredChange:
         self.number = number
         self.is_told = False
         self.announced_ns = -1
-        self.is_hidden = False  # a person said no to it, or it turned out to be nothing
+        self.is_taken_back = False  # told, but it turned out to be nothing
         self.first_seen_ns = self.last_seen_ns = first_seen_ns
         self.views = self.asked = 0
         self._weight_for = self._weight_asked = 0.0
@@ -148,7 +148,6 @@ class GatheredChange:
         """Become one with a younger change; its pictures are forgotten."""
         self.first_seen_ns = min(self.first_seen_ns, younger.first_seen_ns)
         self.last_seen_ns = max(self.last_seen_ns, younger.last_seen_ns)
-        self.is_hidden = self.is_hidden and younger.is_hidden
         if younger.is_told and not self.is_told:
             self.is_told, self.announced_ns = True, younger.announced_ns
         if self.cells is not None and younger.cells is not None:

@@ -8,27 +8,23 @@ as long as some h below 0.6 H explains it; only the rest of its motion counts.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.change.cells import scale_m_per_px
-from sorvolo.change.shadows import shadow_of_arrival, thing_of
+from sorvolo.change.shadows import shadow_of_arrival
+from sorvolo.change.standing import RIM_PX, Blob, blobs_of
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Floats, Mask, PointsM
+from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.geometry.polygons import signed_area
 from sorvolo.survey.findings import ComparedView
 
 _MOST_PARALLAX = 0.6 / (1 - 0.6)  # h / (H - h) of a thing 0.6 times as high as the camera flies
 _UNLIKELY_PARALLAX = 0.5  # no thing that came is a third as high as the camera flies
 _POINTS = 12  # of a track, that its velocity is fitted to
-_MOST_BOXES = 64
-_RIM_PX = 2
-_AROUND_PX = 4
+_NEAR_PX = 8  # what is looked at around a place to tell shadows
 _RIGID_POINTS, _RIGID_LENGTHS, _RIGID_LENGTH_M = 5, 2.0, 2.5
 _LOST_FOR_S = 20.0  # a thing that moves steadily is known again after so long
-_UPRIGHT_M, _PERSON_M = 1.0, 1.9  # narrower than this it may be a person, who leans as this height does at most
 
 
 @dataclass(frozen=True)
@@ -53,18 +49,6 @@ class MovingSettings:
     def fastest_m_s(self, length_m: float) -> float:
         """The greatest speed that something of this length may have."""
         return self.most_speed_m_s + self.most_lengths_s * length_m
-
-
-@dataclass(frozen=True, eq=False)
-class Blob:
-    """One changed piece of a view: where it stands on the ground (2,), its size, and its mean colour (3,)."""
-
-    box: int  # row of the view's boxes
-    place_m: Floats
-    length_m: float
-    area_m2: float
-    colour: Floats
-    score: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +158,7 @@ class BlobTracker:
         self._lost += [each for each in gone if each.mover]
         self._lost = [each for each in self._lost if (now_ns - each.last.time_ns) * 1e-9 <= _LOST_FOR_S]
         tracks = [each for each in self._tracks if each not in gone]
-        blobs = _blobs(view)
+        blobs = blobs_of(view)
         is_moving, may_move = np.zeros(len(view.boxes), bool), np.zeros(len(view.boxes), bool)
         movers: list[Track] = []
         pairs = _pairs(tracks, blobs, now_ns, settings)
@@ -280,7 +264,7 @@ def _follow_over_rim(
         ahead_s = (view.time_ns - track.last.time_ns) * 1e-9
         expected_m = track.last.blob.place_m + ahead_s * track.velocity_m_s
         pixel = apply_homography(image_from_site, expected_m[None])[0]
-        reach_px = 0.75 * track.last.blob.length_m / m_per_px + _RIM_PX
+        reach_px = 0.75 * track.last.blob.length_m / m_per_px + RIM_PX
         for index, (x, y, w, h) in enumerate(view.boxes):
             nearest = np.clip(pixel, [x, y], [x + w, y + h])
             if index not in whole and float(np.hypot(*(pixel - nearest))) < reach_px:
@@ -295,8 +279,7 @@ def _is_still_there(first: TrackPoint, view: ComparedView) -> bool:
     if not np.isfinite(pixel).all() or not (0 <= pixel[0] < width - 1 and 0 <= pixel[1] < height - 1):
         return False
     x, y = round(pixel[0]), round(pixel[1])
-    reach = 2 * _AROUND_PX
-    window = slice(max(y - reach, 0), y + reach), slice(max(x - reach, 0), x + reach)
+    window = slice(max(y - _NEAR_PX, 0), y + _NEAR_PX), slice(max(x - _NEAR_PX, 0), x + _NEAR_PX)
     changed = view.changed[window] > 0
     dark = shadow_of_arrival(view.reference[window], view.image[window], changed)
     # the shadow of what walked on may lie where it set out
@@ -338,93 +321,3 @@ def _pairs(
             found.append((row, column))
             costs[row], costs[:, column] = np.inf, np.inf
     return found
-
-
-def _blobs(view: ComparedView) -> list[Blob]:
-    """The blobs that lie whole inside the view; one cut by its rim would seem to move with the camera."""
-    height, width = view.changed.shape
-    m_per_px = scale_m_per_px(view)
-    blobs = []
-    for index in np.argsort(-view.scores, kind="stable")[:_MOST_BOXES]:
-        x, y, w, h = (int(each) for each in view.boxes[index])
-        if x < _RIM_PX or y < _RIM_PX or x + w > width - _RIM_PX or y + h > height - _RIM_PX:
-            continue
-        if w * h > 0.15 * width * height or not _is_known_around(view.valid, x, y, w, h):
-            continue
-        window = slice(max(y - _AROUND_PX, 0), y + h + _AROUND_PX), slice(max(x - _AROUND_PX, 0), x + w + _AROUND_PX)
-        changed = view.changed[window] > 0
-        thing = thing_of(changed, shadow_of_arrival(view.reference[window], view.image[window], changed))
-        ys, xs = np.nonzero(thing)
-        if not len(xs):
-            continue
-        x, y = window[1].start + int(xs.min()), window[0].start + int(ys.min())
-        w, h = int(np.ptp(xs)) + 1, int(np.ptp(ys)) + 1
-        part = thing[ys.min():ys.max() + 1, xs.min():xs.max() + 1].view(np.uint8) * np.uint8(255)
-        moments = cv2.moments(part, binaryImage=True)
-        if moments["m00"] <= 0:
-            continue
-        hull = cv2.convexHull(cv2.findNonZero(part)).reshape(-1, 2) + np.array([x, y])
-        hull_m = apply_homography(view.site_from_image, hull.astype(np.float64))
-        middle = np.array([[x + moments["m10"] / moments["m00"], y + moments["m01"] / moments["m00"]]])
-        place_m = apply_homography(view.site_from_image, middle)[0]
-        if not (np.isfinite(hull_m).all() and np.isfinite(place_m).all()):
-            continue
-        foot_m = _foot_m(hull_m, hull_m, view.camera_m, m_per_px)
-        place_m = place_m if foot_m is None else foot_m.mean(axis=0)
-        colour = np.array(cv2.mean(view.image[y : y + h, x : x + w], part)[:3])
-        area_m2 = moments["m00"] * m_per_px**2
-        score = float(view.scores[index])
-        blobs.append(Blob(int(index), place_m, max(w, h) * m_per_px, area_m2, colour, score))
-    return blobs
-
-
-def standing_outline_m(view: ComparedView, blob: Blob) -> PointsM | None:
-    """(N, 2) where a blob of the view stands on the ground, without its shadow and, if it may be a person, without the
-    body that leans away from the camera; None where nothing of it is left."""
-    x, y, w, h = (int(each) for each in view.boxes[blob.box])
-    window = slice(max(y - _AROUND_PX, 0), y + h + _AROUND_PX), slice(max(x - _AROUND_PX, 0), x + w + _AROUND_PX)
-    changed = view.changed[window] > 0
-    thing = thing_of(changed, shadow_of_arrival(view.reference[window], view.image[window], changed))
-    if not thing.any():
-        return None
-    corner = np.array([window[1].start, window[0].start])
-    all_m, thing_m = (
-        apply_homography(view.site_from_image, np.argwhere(mask)[:, ::-1] + corner) for mask in (changed, thing)
-    )
-    if not np.isfinite(all_m).all():
-        return None
-    outline_m = _foot_m(thing_m, all_m, view.camera_m, scale_m_per_px(view))
-    if outline_m is None:
-        outline_m = np.asarray(cv2.convexHull(thing_m.astype(np.float32)).reshape(-1, 2), np.float64)
-    return outline_m if len(outline_m) >= 3 and abs(signed_area(outline_m)) > 0 else None
-
-
-def _foot_m(thing_m: PointsM, changed_m: PointsM, camera_m: Floats, m_per_px: float) -> PointsM | None:
-    """(4, 2) the ground under something narrow that leans away from the camera; None for what does not.
-
-    The feet are at its near end, no nearer than a person's would be, and a person is about as long as wide from above.
-    `thing_m` are points of the lit thing: dark trousers may be missing, so `changed_m` says how near it begins.
-    """
-    away = thing_m.mean(axis=0) - camera_m[:2]
-    distance_m = float(np.hypot(*away))
-    if distance_m < 1e-6:
-        return None
-    site_from_lean = np.array([away, [-away[1], away[0]]]) / distance_m
-    thing, changed = ((each - camera_m[:2]) @ site_from_lean.T for each in (thing_m, changed_m))
-    (_, left), (far, right) = thing.min(axis=0), thing.max(axis=0)
-    width_m = right - left + m_per_px
-    nearest = far * (1 - _PERSON_M / max(float(camera_m[2]), 2 * _PERSON_M)) - width_m
-    behind = changed[(changed[:, 1] >= left) & (changed[:, 1] <= right) & (changed[:, 0] >= nearest), 0]
-    near = float(behind.min(initial=far))
-    if width_m > _UPRIGHT_M or far - near <= width_m:
-        return None
-    middle = near + width_m - m_per_px
-    corners = np.array([[near, left], [middle, left], [middle, right], [near, right]])
-    return np.asarray(corners @ site_from_lean + camera_m[:2])
-
-
-def _is_known_around(valid: Mask, x: int, y: int, w: int, h: int) -> bool:
-    rim = 2 * (w + h)
-    part = valid[max(y - 1, 0) : y + h + 1, max(x - 1, 0) : x + w + 1]
-    unknown = part.size - int(np.count_nonzero(part))
-    return unknown < 0.1 * rim
