@@ -235,9 +235,9 @@ class Teller:
         if self._outputs.cot and self._cot is None:
             text = f"nothing places this flight on Earth, so nothing was told to {self._outputs.cot}"
             found.append(Notice("cot_without_place", 1, text))
-        for outbox in [*self._alerts, *([self._cot] if self._cot is not None else [])]:
+        for outbox in self._alerts:
             found += outbox.notices()
-        return tuple(found)
+        return (*found, *(self._cot.notices() if self._cot is not None else ()))
 
     def _event(self, track: Track) -> bytes:
         return cot_event(
