@@ -1,4 +1,4 @@
-"""The packaged model from trained weights: python benchmarks/pack_default_model.py WEIGHTS DATA (the end of `make model`).
+"""The packaged model from trained weights: benchmarks/pack_default_model.py WEIGHTS DATA (the end of `make model`).
 
 Reporting thresholds come from validation pictures, which neither train nor measure: blocks of HIT-UAV, videos of
 TinyPerson, simulated pictures of a seed of their own. The graph is checked against torch. With --measured FILE, the
@@ -34,7 +34,7 @@ BEST_PX = {"person": [12, 130], "car": [14, 220], "small object": [10, 130]}  # 
 TRAINED_ON = (
     ("HIT-UAV, thermal, blocks of ids", "CC BY 4.0", "Suo et al., HIT-UAV, Scientific Data 2023"),
     ("TinyPerson, videos", "CC BY 4.0", "Yu et al., Scale Match for Tiny Person Detection, 2020"),
-    ("a dummy on a pond, one video", "CC BY 4.0", "Roboflow Universe, mannequin"),
+    ("a dummy on a pond, one video", "CC BY 4.0", "as published under that licence"),
     ("aerial cars, flights", "CC BY-SA", "Yauhen Kharuzhy and the Minsk OpenStreetMap community"),
     (f"simulated pictures, seed {SIMULATED_SEED}, {SIMULATED_PICTURES} of them", "Apache-2.0", "sorvolo simulate"),
     ("ground of two flights of photos, with composed small objects", "BSD-2-Clause, CC0", "brighton_beach, caliterra"),
@@ -43,7 +43,7 @@ TRAINED_ON = (
 FAILS = (
     "people below 10 px: most are missed; crowds more so",
     "small objects were never seen in real labelled pictures, only composed and simulated",
-    "daylight people come from beaches, one pond and simulation: clothing, poses and ground of other kinds are not known",
+    "daylight people come from beaches, one pond and simulation: other clothing, poses and ground are not known",
     "trucks and buses count as nothing in particular; bicycles and their riders likewise",
     "false-colour thermal palettes look like daylight to it",
 )

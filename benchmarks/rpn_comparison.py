@@ -2,7 +2,7 @@
 
 HIT-UAV's thermal frames, training and held-out blocks of ids; the `fast` preset, scaled down to what two cores can do:
 the same few iterations, samples, optimiser and batch norms in every arm, three seeds each. Arms: the standard stem; the
-thesis's nine modules (an eighth as wide); a plain stack of 3x3 convolutions of the nine modules' cost; our residual one.
+thesis's nine modules, an eighth as wide; a plain stack of 3x3 convolutions of the nine modules' cost; our residual one.
 Writes results/rpn_comparison.json with the differences and their intervals over the seeds (Student's t).
 """
 
