@@ -111,9 +111,9 @@ def fly(patrol: Patrol, objects: Things) -> Iterator[SeenFrame]:
         seen = np.flatnonzero(inside & (random.random(len(where)) > patrol.misses))
         false = random.uniform(-half_m, half_m, (random.poisson(patrol.false_alarms), 2))
         owners = np.concatenate([seen, np.full(len(false), -1)])
-        labels = np.concatenate([objects.labels[seen], random.integers(0, 3, len(false))])
-        confused = random.random(len(labels)) < patrol.wrong_class
-        labels = np.where(confused, random.integers(0, 3, len(labels)), labels)
+        kinds = np.concatenate([objects.labels[seen], random.integers(0, 3, len(false))])
+        confused = random.random(len(kinds)) < patrol.wrong_class
+        labels = np.where(confused, random.integers(0, 3, len(kinds)), kinds)
         scores = np.concatenate([random.beta(6, 2.5, len(seen)), random.uniform(0.25, 0.7, len(false))])
         at = np.concatenate([local[seen], false]) + random.normal(0, patrol.own_m, (len(owners), 2))
         turn = np.radians(patrol.heading_deg)
@@ -121,21 +121,21 @@ def fly(patrol: Patrol, objects: Things) -> Iterator[SeenFrame]:
         places = drone + shift + turned @ axes
         footprint = drone + shift + np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]]) * half_m @ axes
         sightings = [
-            _sighting(patrol, number, time_s, place, spot, int(label), float(score), random)
-            for place, spot, label, score in zip(places, at, labels, scores)
+            _sighting(patrol, number, time_s, place, spot, CLASSES[label], TYPICAL_SIZE_M[CLASSES[kind]], score, random)
+            for place, spot, label, kind, score in zip(places, at, labels, kinds, scores)
         ]
         order = np.argsort([-each.score for each in sightings]) if sightings else np.zeros(0, int)
         yield SeenFrame(time_s, [sightings[row] for row in order], owners[order], inside, footprint)
 
 
-def _sighting(patrol, number, time_s, place, spot, label, score, random) -> Sighting:
-    name = CLASSES[label]
-    size_m = np.sort(np.array(TYPICAL_SIZE_M[name][:2]) * np.exp(random.normal(0, 0.15, 2)))[::-1]
+def _sighting(patrol, number, time_s, place, spot, name, sides_m, score, random) -> Sighting:
+    size_m = np.sort(np.array(sides_m[:2]) * np.exp(random.normal(0, 0.15, 2)))[::-1]
     middle_px = np.array([spot[1], -spot[0]]) / HEIGHT_M * FOCAL_PX + [WIDTH_PX / 2, DEPTH_PX / 2]
     half_px = size_m / HEIGHT_M * FOCAL_PX / 2
     turned = np.radians(patrol.heading_deg) * np.linalg.norm(spot)
     shared2 = patrol.gps_m**2 + patrol.jitter_m**2 + turned**2 / 2
+    box_px = np.concatenate([middle_px - half_px, middle_px + half_px])
     return Sighting(
-        number, str(number), int(time_s * 1e9), name, score, np.concatenate([middle_px - half_px, middle_px + half_px]),
-        place, np.eye(2) * (patrol.own_m**2 + shared2), size_m, float(np.sqrt(shared2)),
+        number, str(number), int(time_s * 1e9), name, float(score), box_px, place,
+        np.eye(2) * (patrol.own_m**2 + shared2), size_m, float(np.sqrt(shared2)),
     )

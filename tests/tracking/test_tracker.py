@@ -141,6 +141,27 @@ def test_appearance_tells_who_came_back():
     assert tracker.update(back, time_ns=int(120e9), footprint_m=AROUND_M, appearance=looks[1:2]).track_ids == (2,)
 
 
+@pytest.mark.parametrize("kind", ["lawnmower", "there and back"])
+def test_patrols_count_each_object_once(kind):
+    """What is in view for a second or more counts; places of what stands are inside their own 95 % ellipse."""
+    patrol = Patrol(seed=301, kind=kind, per_ha=8.0, size_m=(160.0, 120.0))
+    objects, tracker = things(patrol), Tracker()
+    in_view, owners = np.zeros(len(objects.labels), int), {}
+    for frame in fly(patrol, objects):
+        update = tracker.update(frame.sightings, time_ns=int(frame.time_s * 1e9), footprint_m=frame.footprint_m)
+        owners |= {number: owner for number, owner in zip(update.track_ids, frame.owners) if owner >= 0}
+        in_view += frame.inside
+    tracks, there = tracker.finish(), int((in_view >= 5).sum())
+    assert there >= 10
+    assert abs(len(tracks) - there) <= 1
+    standing = [track for track in tracks if not objects.velocity_m_s[owners[track.id]].any()]
+    assert sum(track.moving for track in standing) <= 1
+    errors_m = np.array([track.position_m - objects.start_m[owners[track.id]] for track in standing])
+    sigmas = [error @ np.linalg.solve(track.covariance_m2, error) for error, track in zip(errors_m, standing)]
+    assert np.sqrt(np.mean(errors_m**2)) < 2.0
+    assert np.mean(np.array(sigmas) < 5.991) >= 0.9
+
+
 def test_the_same_frames_give_the_same_tracks():
     def ids():
         patrol = Patrol(seed=9, size_m=(80.0, 80.0))

@@ -26,12 +26,12 @@ class Habits:
 
 
 HABITS = {
-    "person": Habits(1.3, 0.35, 0.3), "car": Habits(8.0, 1.0, 0.2), "small object": Habits(0.6, 0.2, 0.02),
+    "person": Habits(1.3, 0.15, 0.3), "car": Habits(8.0, 0.3, 0.2), "small object": Habits(0.6, 0.1, 0.02),
 }
-OTHER_HABITS = Habits(3.0, 0.6, 0.2)
+OTHER_HABITS = Habits(3.0, 0.3, 0.2)
 
 _SWAY_M = 0.05  # per root second: people shift their weight, maps of neighbouring strips do not fit
-_STARTS_EVERY_S, _STOPS_EVERY_S = 60.0, 30.0
+_STARTS_EVERY_S, _STOPS_EVERY_S = 60.0, 60.0
 
 
 @dataclass(frozen=True, eq=False)

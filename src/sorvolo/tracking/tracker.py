@@ -30,6 +30,7 @@ _SURE = 6.0  # evidence beyond this does not count: what leaves must be noticed
 _PENALTY_OF_ENDED = -1.5
 _PUZZLED = 0.3  # of a frame's sure sightings: if more belong nowhere, the shift may have jumped
 _JUMP_RELUCTANCE = 5.0
+_LONG_S = 1.0
 _MOVER_VIEWS = 4  # at least, until one that moves is sure: any two sightings make a mover
 _FIRST_VIEWS = 15  # within which a mover may turn out to be one that was seen before
 
@@ -43,7 +44,7 @@ class TrackerSettings:
     """
 
     sure_score: float = 0.4  # sightings below this only prolong tracks (Zhang et al. 2022, ByteTrack)
-    least_views: int = 2
+    least_views: int = 3  # two are enough where they lie a second apart
     least_evidence: float = 3.5
     missed: float = 0.7
     new_per_m2: float = 5e-4  # how densely objects lie that nobody has seen yet
@@ -273,7 +274,10 @@ class Tracker:
                 followed.vote(seen.labels[row], float(seen.scores[row]))
         followed.evidence = min(followed.evidence + max(weight, 0.3) * _log_odds(seen.scores[column]), _SURE)
         followed.ended = False
-        least_views = max(settings.least_views, _MOVER_VIEWS if followed.moves else 0)
+        is_long = followed.last_ns - followed.first_ns >= _LONG_S * 1e9
+        least_views = min(settings.least_views, 2) if is_long else settings.least_views
+        if followed.moves:
+            least_views = max(least_views, _MOVER_VIEWS)
         if followed.confirmed or followed.views < least_views or followed.evidence < settings.least_evidence:
             return False
         followed.confirmed = True
