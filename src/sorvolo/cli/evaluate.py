@@ -135,6 +135,12 @@ def show_changes(console: Console, measured: FlightChanges) -> None:
         )
     if measured.events is not None:
         _show_events(console, measured.flight, measured.events, measured.map_shift_m)
+    if measured.classes is not None:
+        classes = measured.classes
+        console.print(
+            f"{measured.flight}: of events found under the right kind, what it was or is is told rightly of "
+            f"{classes.right}, wrongly of {classes.wrong}, not at all of {classes.unnamed}"
+        )
     for remark in measured.remarks:
         console.print(f"{measured.flight}: {remark}")
 

@@ -34,11 +34,21 @@ VIDEO_VIEWS, PHOTO_VIEWS = 3, 2
 """So many clear views make an event one that must be found; what moves needs three in any case."""
 
 
+@dataclass(frozen=True)
+class ClassCounts:
+    """Found events of the right kind: what they were or are is told rightly, wrongly, or not at all."""
+
+    right: int
+    wrong: int
+    unnamed: int
+
+
 @dataclass(frozen=True, eq=False)
 class FlightChanges:
     """One compared flight against the truth; what could not be measured is None, and `remarks` say why.
 
     `map_shift_m` is how far the map lies from the truth (rms over frames); it is taken out before events are matched.
+    `classes` is None where no change has a class: nobody looked.
     """
 
     flight: str
@@ -47,6 +57,7 @@ class FlightChanges:
     match: EventMatch | None
     map_shift_m: float
     remarks: tuple[str, ...]
+    classes: ClassCounts | None = None
 
 
 def evaluate_changes(
@@ -102,6 +113,7 @@ def as_json(measured: Sequence[FlightChanges]) -> list[dict[str, Any]]:
                 "found_share": each.events.found_share, "false_per_hectare": each.events.false_per_hectare,
             }),
             "lists": None if each.match is None else _lists(each.match),
+            "classes": None if each.classes is None else plain_json(each.classes),
             "map_shift_m": plain_json(each.map_shift_m), "remarks": list(each.remarks),
         }
         for each in measured
@@ -202,7 +214,33 @@ def _evaluate(
     scores = score_events(match, ground.area_m2, settings)
     if match.pairs and not scores.judged_late:
         remarks.append("when events were announced is not known: none is judged late")
-    return FlightChanges(flight, masks, scores, match, shift_m, tuple(remarks))
+    classes = _class_counts(match, site / "flights" / flight / "changes.geojson", true_folder / "events.geojson")
+    return FlightChanges(flight, masks, scores, match, shift_m, tuple(remarks), classes)
+
+
+def _class_counts(match: EventMatch, found: Path, true: Path) -> ClassCounts | None:
+    """How many of the pairs of one kind have the truth's classes, before and after as far as the kind has them."""
+    told = {str(each["properties"]["id"]): _classes_of(each) for each in read_features(found)}
+    if not any(name for classes in told.values() for name in classes):
+        return None
+    known = {_event_name(each["properties"]): _classes_of(each) for each in read_features(true)}
+    counts = {"right": 0, "wrong": 0, "unnamed": 0}
+    for pair in match.pairs:
+        if pair.found.kind is pair.true.kind:
+            mine = told[pair.found.id]
+            counts["right" if mine == known[pair.true.id] else "wrong" if any(mine) else "unnamed"] += 1
+    return ClassCounts(**counts)
+
+
+def _classes_of(feature: Mapping[str, Any]) -> tuple[str, str]:
+    """What was there, and what is; of what moves only what it is."""
+    said = feature["properties"]
+    before = "" if said["kind"] == ChangeKind.MOVING else said.get("class_before") or ""
+    return before, said.get("class_after") or ""
+
+
+def _event_name(said: Mapping[str, Any]) -> str:
+    return f"{said['number']} {said['class_before'] or said['class_after']}"
 
 
 def _read_true(
@@ -223,7 +261,7 @@ def _read_true(
                 is_seen = int(np.count_nonzero(ground.holds(path_m))) >= max(views, VIDEO_VIEWS)
             else:
                 is_seen = len(clear_ns) >= views and bool(ground.holds(outline_m).all())
-            name = f"{said['number']} {said['class_before'] or said['class_after']}"
+            name = _event_name(said)
             events.append(TrueEvent(name, kind, outline_m, float(said["length_m"]), clear_ns, path_m, is_seen))
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(f"{path}: an event is not as docs/simulation.md says ({error!r})") from error

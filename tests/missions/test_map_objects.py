@@ -1,0 +1,226 @@
+"""Objects through whole missions: a small simulated site mapped and compared with a detector that knows the truth."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from truth_detector import TruthDetector
+
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.missions.change_classes import ChangeClasses, object_at, seen_at
+from sorvolo.missions.compare_flights import compare_flights
+from sorvolo.missions.evaluate_changes import evaluate_changes
+from sorvolo.missions.evaluate_objects import evaluate_objects
+from sorvolo.missions.map_flight import map_flights
+from sorvolo.missions.map_objects import open_detector
+from sorvolo.missions.settings import CompareSettings, MapSettings
+from sorvolo.missions.simulate_site import simulate_site
+from sorvolo.simulation.settings import (
+    ImagingSettings,
+    OutputSettings,
+    PathSettings,
+    SceneSettings,
+    SensorSettings,
+    SimulationSettings,
+)
+from sorvolo.store.archive import Archive
+from sorvolo.survey.findings import Change, ChangeKind, Patch
+from sorvolo.survey.map_objects import MapObject
+from sorvolo.survey.objects import Detections, Sighting, no_detections
+
+
+class Knowing(TruthDetector):
+    """The truth's detector; what it was not told of, such as a picture made from frames, shows nothing."""
+
+    def detect(
+        self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
+        least_score: float | None = None, classes: Sequence[str] | None = None,
+    ) -> Detections:
+        """See `TruthDetector.detect`."""
+        try:
+            return super().detect(image, tiles=tiles, m_per_px=m_per_px, least_score=least_score, classes=classes)
+        except KeyError:
+            return no_detections(self.classes)
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two flights over a site with people, cars and small objects; boxes of every frame."""
+    folder = tmp_path_factory.mktemp("objects") / "simulated"
+    settings = SimulationSettings(
+        seed=5, flights=2,
+        scene=SceneSettings(people=3, cars=3, small_objects=3, has_scenery=False),
+        path=PathSettings(height_m=20, speed_m_s=6, length_m=24, strips=2, strip_spacing_m=6),
+        imaging=ImagingSettings(width_px=480, height_px=270, fps=6),
+        sensor=SensorSettings(noise_m=(0.2, 0.2, 0.2)), output=OutputSettings(truth_step=1),
+    )
+    for _ in simulate_site(folder, settings):
+        pass
+    return folder
+
+
+@pytest.fixture(scope="module")
+def mapped(simulated: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first flight mapped while it is searched."""
+    site = tmp_path_factory.mktemp("objects") / "site"
+    for _ in map_flights([simulated / "flight1/flight1.mp4"], site, detector=Knowing(simulated)):
+        pass
+    return site
+
+
+@pytest.fixture(scope="module")
+def compared(simulated: Path, mapped: Path) -> Path:
+    """The second flight compared with that map."""
+    for _ in compare_flights([simulated / "flight2/flight2.mp4"], mapped, detector=Knowing(simulated, "flight2")):
+        pass
+    return mapped
+
+
+def report_of(site: Path, flight: str) -> dict[str, Any]:
+    """report.json."""
+    return dict(json.loads((site / "flights" / flight / "report.json").read_text()))
+
+
+def test_map_finds_each_object_once(simulated: Path, mapped: Path) -> None:
+    """All that was seen clearly is found once, within decimetres of the others, under its class."""
+    (measured,) = evaluate_objects(mapped, simulated, flight="flight1")
+    assert measured.all.must_find >= 6
+    assert measured.all.found >= measured.all.must_find - 1
+    assert measured.all.named_right == measured.all.found
+    assert measured.all.twice + measured.all.false <= 1
+    assert measured.own_rms_m < 0.25
+    assert measured.within_two_sigma > 0.8
+    assert measured.length_error_m < 0.3
+
+
+def test_report_crops_and_site_file(mapped: Path) -> None:
+    """The report tells what was found and shows it; the crops are pictures; both files hold the same objects."""
+    told = report_of(mapped, "flight1")["objects"]
+    own = json.loads((mapped / "flights/flight1/objects.geojson").read_text())["features"]
+    assert told["count"] == len(own) == sum(told["classes"].values()) == len(told["list"])
+    assert told["model"] == "truth"
+    assert told["frames"] > 3
+    for each in own:
+        assert (mapped / "flights/flight1" / each["properties"]["crop"]).read_bytes().startswith(b"\xff\xd8")
+    page = (mapped / "flights/flight1/report.html").read_text()
+    assert "What stands here" in page
+    assert own[0]["id"] in page
+
+
+def test_compare_names_changes(simulated: Path, compared: Path) -> None:
+    """What the truth's detector saw is what changes are named; the later flight's objects replace the earlier one's."""
+    (measured,) = evaluate_changes(compared, simulated, flight="flight2")
+    assert measured.classes is not None
+    assert measured.classes.right >= 2
+    assert measured.classes.wrong <= 1
+    assert measured.classes.unnamed <= 1
+    with Archive.open(compared, write=False) as archive:
+        newest, searches = archive.newest_objects(), archive.searches()
+    assert {each.flight_id for each in searches} == {"flight1", "flight2"}
+    assert sum(each.flight_id == "flight2" for each in newest) >= 4
+    assert any(each.flights == ("flight1", "flight2") for each in newest)
+    assert "is now" in (compared / "flights/flight2/changes.html").read_text()
+
+
+def test_without_a_model(simulated: Path, tmp_path: Path) -> None:
+    """Mapping works, and the report says that nothing was looked for."""
+    for _ in map_flights([simulated / "flight1/flight1.mp4"], tmp_path / "site", MapSettings(model="none")):
+        pass
+    assert report_of(tmp_path / "site", "flight1")["objects"]["why_not"] == "no model was wanted"
+    assert "Nothing was looked for" in (tmp_path / "site/flights/flight1/report.html").read_text()
+    assert not (tmp_path / "site/objects.geojson").exists()
+    with pytest.raises(InputError, match="no flight of it was searched"):
+        evaluate_objects(tmp_path / "site", simulated)
+
+
+def test_a_model_that_is_not_there(simulated: Path, tmp_path: Path) -> None:
+    """A name that is not installed is told before anything is mapped; "none" is no error."""
+    assert open_detector("none") is None
+    with pytest.raises(InputError, match="no model 'nosuch'"):
+        next(map_flights([simulated / "flight1/flight1.mp4"], tmp_path / "site", MapSettings(model="nosuch")))
+    with pytest.raises(InputError, match="no model 'nosuch'"):
+        open_detector(CompareSettings(model="nosuch").mapping.model)
+
+
+# ---- what a change is ------------------------------------------------------------------------------------------------
+
+
+def change_at(kind: ChangeKind, velocity_m_s: tuple[float, float] = (0.0, 0.0)) -> Change:
+    """A change of a square metre around east 10, north 20."""
+    outline_m = np.array([[9.5, 19.5], [10.5, 19.5], [10.5, 20.5], [9.5, 20.5]])
+    rgba = np.full((20, 20, 4), 255, np.uint8)
+    changed = np.zeros((20, 20), bool)
+    changed[5:15, 5:15] = True
+    return Change(
+        "f-1", kind, 0.9, outline_m, 0, 10 * 10**9, 5, 1.0, 1.0, 0.1, Patch(9.0, 21.0, 0.1, rgba, rgba, changed),
+        np.array(velocity_m_s),
+    )
+
+
+def standing(label: str, east_m: float, north_m: float, length_m: float, *, moving: bool = False) -> MapObject:
+    """An object that three of four frames saw."""
+    velocity = np.array([1.0, 0.0]) if moving else np.zeros(2)
+    return MapObject(label, label, 0.8, np.array([east_m, north_m]), 0.3, length_m, 0.5, 3, 4, 0, 1, moving, velocity)
+
+
+def sighting(label: str, east_m: float, north_m: float, seconds: float, score: float = 0.8) -> Sighting:
+    """One view of something a metre long."""
+    place_m, size_m = np.array([east_m, north_m]), np.array([1.0, 0.5])
+    return Sighting(
+        1, "1", int(seconds * 1e9), label, score, np.array([0, 0, 9, 9]), place_m, 0.01 * np.eye(2), size_m
+    )
+
+
+def test_the_object_in_a_change() -> None:
+    """The nearest in place and size, not what passes by, and nothing from afar."""
+    change = change_at(ChangeKind.APPEARED)
+    person, car = standing("person", 10.1, 20.0, 0.6), standing("car", 10.3, 21.4, 4.4)
+    assert object_at(change, [car, person]) == "person"
+    assert object_at(change, [car]) == "car"
+    assert object_at(change, [standing("person", 10.0, 22.0, 0.6)]) == ""
+    assert object_at(change, [standing("person", 10.0, 20.0, 0.6, moving=True)]) == ""
+
+
+def test_sightings_on_the_way_of_what_moves() -> None:
+    """At 2 m/s east it was 6 m further west three seconds before; what stands there at other times is not it."""
+    change = change_at(ChangeKind.MOVING, (2.0, 0.0))
+    assert seen_at(change, [sighting("person", 4.0, 20.0, 7.0)]) == "person"
+    assert seen_at(change, [sighting("person", 4.0, 26.0, 7.0)]) == ""
+    assert seen_at(change, [sighting("car", 10.0, 20.0, 3.0)]) == ""
+    still = change_at(ChangeKind.APPEARED)
+    told = [sighting("car", 10.0, 20.0, 3.0, 0.9), *(sighting("person", 10.2, 20.0, s, 0.5) for s in (4.0, 5.0))]
+    assert seen_at(still, told) == "person"
+
+
+class Sees(Knowing):
+    """Sees one car in the middle of any picture."""
+
+    def __init__(self, simulated: Path, score: float) -> None:
+        super().__init__(simulated)
+        self._score = score
+
+    def detect(
+        self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
+        least_score: float | None = None, classes: Sequence[str] | None = None,
+    ) -> Detections:
+        """See `Knowing.detect`."""
+        x, y = image.shape[1] / 2, image.shape[0] / 2
+        box_px = np.array([[x - 5, y - 5, x + 5, y + 5]])
+        return Detections(box_px, np.array([self._score]), np.array([1]), self.classes)
+
+
+def test_a_changes_own_pictures_are_the_last_word(simulated: Path) -> None:
+    """Where no flight saw an object, the detector looks at the change's pictures; each kind has the side it has."""
+    classes = ChangeClasses(Sees(simulated, 0.8), [standing("person", 10.0, 20.0, 0.6)])
+    for kind, before, after in (
+        (ChangeKind.APPEARED, "", "car"), (ChangeKind.DISAPPEARED, "person", ""),
+        (ChangeKind.REPLACED, "person", "car"), (ChangeKind.MOVING, "", "car"),
+    ):
+        named = classes.at_once(change_at(kind))
+        assert (named.class_before, named.class_after) == (before, after)
+    unsure = ChangeClasses(Sees(simulated, 0.1), []).at_once(change_at(ChangeKind.REPLACED))
+    assert (unsure.class_before, unsure.class_after) == ("", "")
