@@ -1,5 +1,6 @@
 """ImageNet weights: each form that is read, and why others are refused; no network is used."""
 
+import hashlib
 import io
 import json
 import pickle
@@ -152,6 +153,18 @@ def test_tfjs_that_is_no_resnet_is_refused(tmp_path: Path) -> None:
         archive.addfile(member, io.BytesIO(text))
     with pytest.raises(InputError, match=r"shard\.bin is missing"):
         read_weights(tmp_path / "package.tgz")
+
+
+def test_a_cached_package_with_its_hash_is_taken_without_a_network(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lite0: dict[str, "torch.Tensor"]
+) -> None:
+    monkeypatch.setenv("SORVOLO_CACHE", str(tmp_path))
+    (tmp_path / "weights").mkdir()
+    save_file(lite0, tmp_path / "weights" / "net.safetensors")
+    sha256 = hashlib.sha256((tmp_path / "weights" / "net.safetensors").read_bytes()).hexdigest()
+    monkeypatch.setitem(module.SOURCES, "lite0", module._Source("http://127.0.0.1:9/net.safetensors", sha256, "MIT"))
+    weights = load_weights("auto", "lite0")
+    assert weights is not None and weights.origin == "net.safetensors (MIT)"
 
 
 def test_a_cached_package_must_have_its_hash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

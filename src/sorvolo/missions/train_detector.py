@@ -1,5 +1,6 @@
 """Train the detector: labelled pictures and weights in, checkpoints on the way, a model file and a report out."""
 
+import math
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,8 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors.torch
-import torch
 
 from sorvolo import __version__
 from sorvolo.capture.photos import read_picture
@@ -23,15 +22,22 @@ from sorvolo.missions.training_sets import DataOptions, TrainingSets, read_train
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports import json_bytes, plain_json
 from sorvolo.store.training_page import training_page
-from sorvolo.training.checkpoint import checkpoint_bytes, read_checkpoint, restore
+from sorvolo.training.checkpoint import (
+    checkpoint_bytes,
+    load_weights_bytes,
+    read_checkpoint,
+    restore,
+    weights_bytes,
+)
 from sorvolo.training.drawing import batches_from
 from sorvolo.training.export import ExportCheck, check_export, export_onnx
 from sorvolo.training.faster_rcnn import FasterRCNN
-from sorvolo.training.four_steps import STEP_NAMES, FourStepSettings, FourStepTraining
-from sorvolo.training.joint import JointSettings, JointTraining, Progress
-from sorvolo.training.presets import NETS, build
+from sorvolo.training.four_steps import STEP_NAMES, FourStepTraining
+from sorvolo.training.joint import Progress
+from sorvolo.training.presets import NETS
 from sorvolo.training.progress import Check, History, Learner, seconds_left
 from sorvolo.training.samples import Augmentation
+from sorvolo.training.starting import device_of, start_learner
 from sorvolo.training.weights import ImageNetWeights, load_weights
 
 MODEL, REPORT, PAGE = "model.onnx", "training.json", "training.html"
@@ -90,7 +96,7 @@ def train_detector(
     that cannot be used, SettingsError for a device that is not there, for an `out` that holds another run, and for
     resuming with other settings or data; StoreError on a full disk.
     """
-    device = _device(device)
+    device = device_of(device)
     _claim(out, resume)
     steps = settings.steps
     if settings.synthetic > 0:
@@ -102,7 +108,12 @@ def train_detector(
         places, options, synthetic=settings.synthetic, seed=settings.seed, simulated=out / SIMULATED
     )
     yield TrainingUpdate(0, steps, f"preparing the network ({settings.preset})")
-    run = _prepared(out, settings, sets, device)
+    weights = load_weights(settings.weights, NETS[settings.preset])
+    learner = start_learner(
+        settings.preset, sets.classes, settings.rpn, settings.schedule, weights, steps=steps, batch=settings.batch,
+        seed=settings.seed, device=device,
+    )
+    run = _Run(out, settings, sets, learner, _Reader(sets), device, weights)
     if resume:
         checkpoint = read_checkpoint((out / CHECKPOINT).read_bytes(), str(out / CHECKPOINT))
         restore(run.learner, checkpoint, run.identity)
@@ -111,16 +122,6 @@ def train_detector(
     yield TrainingUpdate(run.learner.step, steps, "measuring and writing the model")
     check = _finish(run)
     yield TrainingUpdate(run.learner.step, steps, f"{out / MODEL} is ready", check=check)
-
-
-def _device(wanted: str) -> str:
-    if wanted == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if wanted.startswith("cuda") and not torch.cuda.is_available():
-        raise SettingsError(f"device {wanted} asked for, but this torch sees no GPU; use --device cpu")
-    if wanted != "cpu" and not wanted.startswith("cuda"):
-        raise SettingsError(f"device must be auto, cpu or cuda, got {wanted!r}")
-    return wanted
 
 
 def _claim(out: Path, resume: bool) -> None:
@@ -132,26 +133,6 @@ def _claim(out: Path, resume: bool) -> None:
         raise SettingsError(f"{out} already holds a run; --resume goes on with it, another --out starts anew")
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-
-
-def _prepared(out: Path, settings: TrainSettings, sets: TrainingSets, device: str) -> _Run:
-    torch.set_flush_denormal(True)  # weights that decay to almost nothing cost a hundred times the time
-    torch.manual_seed(settings.seed)
-    weights = load_weights(settings.weights, NETS[settings.preset])
-    model = build(settings.preset, sets.classes, settings.rpn, weights)
-    model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    learner: Learner
-    if settings.schedule == "joint":
-        rate = 1e-3 if settings.preset == "fast" else 2e-4
-        joint = JointSettings(
-            steps=settings.steps, batch=settings.batch, rate=rate,
-            backbone_rate=rate if weights is None else rate / 5, warm_steps=min(200, max(1, settings.steps // 10)),
-            mixed_precision=device != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported(),
-        )
-        learner = JointTraining(model, joint, settings.seed, device)
-    else:
-        learner = FourStepTraining(model, FourStepSettings(steps=settings.steps), settings.seed, device)
-    return _Run(out, settings, sets, learner, _Reader(sets), device, weights)
 
 
 class _Reader:
@@ -187,6 +168,11 @@ def _learn(run: _Run) -> Iterator[TrainingUpdate]:
     try:
         while learner.step < settings.steps and run.history.is_worth_going_on(settings.patience):
             progress = learner.learn(next(batches))
+            if not math.isfinite(progress.loss):
+                raise SettingsError(
+                    f"the loss of step {progress.step} is no number: learning has come apart. Take larger batches, "
+                    f"--weights auto or another --seed; {run.out / CHECKPOINT} is from before"
+                )
             here_s = time.monotonic() - started_s
             run.history = run.history.after(progress, before_s + here_s, every=max(1, settings.steps // _ROWS))
             check = _check(run) if _is_check_due(run) else None
@@ -218,7 +204,7 @@ def _check(run: _Run) -> Check:
     check = _look(run, run.learner.average, _MOST_CHECKED).check(run.learner.step)
     run.history = run.history.checked(check)
     if run.history.best is check:
-        atomic_write_bytes(run.out / BEST, _weights_bytes(run.learner.average))
+        atomic_write_bytes(run.out / BEST, weights_bytes(run.learner.average))
     return check
 
 
@@ -230,10 +216,6 @@ def _save(run: _Run) -> None:
     atomic_write_bytes(run.out / CHECKPOINT, checkpoint_bytes(run.learner, run.identity, run.history))
 
 
-def _weights_bytes(model: FasterRCNN) -> bytes:
-    return safetensors.torch.save({name: value.cpu().contiguous() for name, value in model.state_dict().items()})
-
-
 def _look(run: _Run, model: FasterRCNN, most: int) -> Checked:
     return check_model(model, run.sets.classes, run.sets.held_out, run.reader, device=run.device, most=most)
 
@@ -242,7 +224,7 @@ def _finish(run: _Run) -> Check | None:
     """The best weights as a model file, checked against torch, with the report."""
     model, classes, best = run.learner.average, run.sets.classes, run.history.best
     if best is not None:
-        model.load_state_dict(safetensors.torch.load((run.out / BEST).read_bytes()))
+        load_weights_bytes(model, (run.out / BEST).read_bytes(), str(run.out / BEST))
     checked = _look(run, model, _MOST_CHECKED_LAST) if run.sets.held_out else Checked({}, {})
     thresholds = checked.thresholds(classes)
     scores = {name: each.score for name, each in thresholds.items()}

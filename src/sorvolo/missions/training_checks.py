@@ -3,19 +3,16 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-import torch
 
 from sorvolo.detection.metrics import ClassMatch, CocoNumbers, Threshold, best_threshold, judged_classes, match_pictures
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
-from sorvolo.survey.objects import Detections
 from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.progress import Check
+from sorvolo.training.seeing import see
 
-_LONGEST_PX = 1280  # larger pictures are made smaller: they are looked at whole, without tiles
 _FALLBACK_THRESHOLD = 0.5  # where nothing was held out to choose one
 _FEW = 10  # objects found, from which on the range of their sizes says something
 
@@ -67,7 +64,6 @@ def check_model(
     total = sum(len(each) for each in held_out)
     matches: dict[str, tuple[ClassMatch, ...]] = {}
     numbers: dict[str, tuple[CocoNumbers, ...]] = {}
-    model.eval()
     for whole in held_out:
         count = min(len(whole), max(1, round(most * len(whole) / total)))
         rows = np.unique(np.linspace(0, len(whole) - 1, count).round().astype(int))
@@ -79,30 +75,13 @@ def check_model(
             except InputError:
                 continue
             seen.append(picture)
-            found.append(detect(model, classes, image, device))
+            found.append(see(model, classes, image, device))
         labelled = whole.only(seen)
         own, _, by_class = match_pictures(labelled, found, judged_classes(labelled, classes))
         for match in own:
             matches[match.label] = (*matches.get(match.label, ()), match)
             numbers[match.label] = (*numbers.get(match.label, ()), by_class[match.label])
     return Checked(matches, numbers)
-
-
-@torch.no_grad()
-def detect(model: FasterRCNN, classes: Sequence[str], picture: ImageRGB, device: str = "cpu") -> Detections:
-    """What the network, in evaluation mode, finds in one picture (H, W, 3), padded to its stride."""
-    height, width = picture.shape[:2]
-    scale = min(1.0, _LONGEST_PX / max(height, width))
-    seen = picture
-    if scale < 1:
-        seen = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    down, right = (-side % model.stride for side in seen.shape[:2])
-    padded = np.pad(seen, ((0, down), (0, right), (0, 0)), constant_values=114)
-    planes = torch.from_numpy(np.ascontiguousarray(padded.transpose(2, 0, 1))[None]).to(device)
-    boxes, scores, labels = (each.cpu().numpy() for each in model(planes))
-    boxes = np.clip(boxes / scale, 0, [width, height, width, height])
-    kept = (boxes[:, 2:] > boxes[:, :2]).all(1)
-    return Detections(boxes[kept], scores[kept], labels[kept], tuple(classes))
 
 
 def best_sizes_px(

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from io import BytesIO
 from typing import Any
 
+import safetensors.torch
 import torch
 
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.progress import History, Learner
 
 _FORMAT = 1
@@ -73,3 +75,17 @@ def restore(learner: Learner, checkpoint: Checkpoint, settings: Mapping[str, Any
         first = str(error).strip().split("\n")[0][:160]
         raise InputError(f"the checkpoint does not fit this network ({first}); start anew without --resume") from error
     torch.set_rng_state(checkpoint.state["torch_random"])
+
+
+def weights_bytes(model: FasterRCNN) -> bytes:
+    """The network's weights alone, as a safetensors file."""
+    return safetensors.torch.save({name: value.cpu().contiguous() for name, value in model.state_dict().items()})
+
+
+def load_weights_bytes(model: FasterRCNN, data: bytes, name: str) -> None:
+    """Take what `weights_bytes` gave. Raises InputError, naming `name`, when it is damaged or of another network."""
+    try:
+        model.load_state_dict(safetensors.torch.load(data))
+    except (safetensors.SafetensorError, RuntimeError) as error:
+        first = str(error).strip().split("\n")[0][:160]
+        raise InputError(f"{name} does not hold this network's weights, or is damaged ({first}); train anew") from error

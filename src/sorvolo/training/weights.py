@@ -9,7 +9,7 @@ import urllib.error
 import urllib.request
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -82,6 +82,8 @@ def load_weights(choice: str, net: Net) -> ImageNetWeights | None:
     if choice == "none":
         return None
     weights = read_weights(fetch(net) if choice == "auto" else Path(choice))
+    if choice == "auto":
+        weights = replace(weights, origin=f"{SOURCES[net].name} ({SOURCES[net].licence})")
     if weights.net != net:
         raise InputError(f"{choice} holds weights of {weights.net}, but this preset is built on {net}; {_WAYS}")
     return weights
