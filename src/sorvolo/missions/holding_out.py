@@ -4,7 +4,7 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.splits import split_by_blocks, split_by_group
 
-_BLOCKS, _GAP = 20, 10  # into which a set of too few videos is cut; frames left out between them, at most
+_BLOCKS, _GAP = 10, 10  # into which a set of too few videos is cut; frames left out between them, at most
 
 
 def hold_out(labelled: LabelledSet, share: float, seed: int) -> tuple[LabelledSet, LabelledSet, list[str]]:
@@ -27,7 +27,7 @@ def hold_out(labelled: LabelledSet, share: float, seed: int) -> tuple[LabelledSe
         pass  # too few videos: told below
     block = max(1, len(labelled) // _BLOCKS)
     try:
-        parts = split_by_blocks(labelled, shares, block, min(_GAP, block), seed)
+        parts = split_by_blocks(labelled, shares, block, min(_GAP, block // 2), seed)
     except InputError as error:
         return labelled, empty, [f"nothing of {labelled.name} is held out: {error}"]
     text = (

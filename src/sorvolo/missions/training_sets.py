@@ -9,20 +9,20 @@ from typing import Any
 from sorvolo.capture.photos import read_picture
 from sorvolo.detection.light import is_thermal
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.missions.holding_out import hold_out
 from sorvolo.missions.simulate_pictures import simulate_pictures
 from sorvolo.missions.simulation_folder import PICTURES_MARK
 from sorvolo.simulation.pictures import PictureSettings
 from sorvolo.store.datasets import read_dataset
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.survey.splits import shared_groups, split_by_blocks, split_by_group
+from sorvolo.survey.splits import shared_groups
 from sorvolo.training.samples import Share
 
 _SMALL = CLASSES[2]
 _LOOKED_AT = 9  # pictures of a set by which it is told whether it is thermal
 _SYNTHETIC_PICTURES = (4, 1200)  # made at least and at most
 _SYNTHETIC_THERMAL = 0.2
-_BLOCKS, _GAP = 10, 10  # into which a set of too few videos is cut; frames left out between them, at most
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,9 @@ class TrainingSets:
 
     def described(self) -> list[dict[str, Any]]:
         """Each set for the report: its part, pictures, videos, boxes of each class."""
-        parts = [(share.labelled, "learnt from", share.thermal) for share in self.shares]
+        parts: list[tuple[LabelledSet, str, bool | None]] = [
+            (share.labelled, "learnt from", share.thermal) for share in self.shares
+        ]
         parts += [(each, "checked on", None) for each in self.held_out]
         return [
             {
@@ -102,7 +104,7 @@ def read_training_sets(
         learnt, held_out = whole, [_read(Path(options.val), options)]
         notices += [notice.text for each in whole for notice in shared_groups(each, held_out[0])]
     else:
-        parts = [_split(each, share, seed) for each in whole]
+        parts = [hold_out(each, share, seed) for each in whole]
         learnt, held_out = [each[0] for each in parts], [each[1] for each in parts if len(each[1])]
         notices += [text for each in parts for text in each[2]]
     shares = [Share(each, float(len(each)), thermal=_is_thermal(each)) for each in learnt]
@@ -136,31 +138,6 @@ def _read(place: Path, options: DataOptions) -> LabelledSet:
         place, form=options.form, classes=options.classes, ignore=options.ignore, unlabelled=options.unlabelled,
         group_pattern=options.group_pattern,
     )
-
-
-def _split(labelled: LabelledSet, share: float, seed: int) -> tuple[LabelledSet, LabelledSet, list[str]]:
-    """What is learnt from, what is held out, and what is to be said of it; whole videos wherever there are enough."""
-    shares = {"learnt": 1 - share, "held out": share}
-    empty = labelled.only([])
-    if share == 0:
-        return labelled, empty, []
-    try:
-        parts = split_by_group(labelled, shares, seed)
-        if share / 3 <= len(parts["held out"]) / len(labelled) <= min(3 * share, (1 + share) / 2):
-            return parts["learnt"], parts["held out"], []
-    except InputError:
-        pass  # too few videos: told below
-    block = max(1, len(labelled) // _BLOCKS)
-    try:
-        parts = split_by_blocks(labelled, shares, block, min(_GAP, block // 2), seed)
-    except InputError as error:
-        return labelled, empty, [f"nothing of {labelled.name} is held out: {error}"]
-    text = (
-        f"{labelled.name} has too few videos to hold whole ones out: blocks of about {block} neighbouring frames were "
-        "instead; frames of one video look alike, so the score will be too good"
-    )
-    told = [notice.text for each in parts.values() for notice in each.notices]
-    return parts["learnt"], parts["held out"], [text, *(f"{labelled.name}: {each}" for each in told)]
 
 
 def _share_of(val: str) -> float | None:

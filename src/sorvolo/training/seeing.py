@@ -22,7 +22,7 @@ def see(model: FasterRCNN, classes: Sequence[str], picture: ImageRGB, device: st
     scale = min(1.0, _LONGEST_PX / max(height, width))
     seen = picture
     if scale < 1:
-        seen = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        seen = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
     down, right = (-side % model.stride for side in seen.shape[:2])
     padded = np.pad(seen, ((0, down), (0, right), (0, 0)), constant_values=_FILL)
     planes = torch.from_numpy(np.ascontiguousarray(padded.transpose(2, 0, 1))[None]).to(device)
