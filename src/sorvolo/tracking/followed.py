@@ -1,6 +1,6 @@
 """One object while it is followed: what was seen of it so far, and the track that it makes."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -14,6 +14,9 @@ _MOST_PATH = 400
 @dataclass(eq=False)
 class Followed:
     """A track while it grows; only the tracker changes it. `motion` is one row at `motion_ns`, in the tracker's map.
+
+    Of it come `moves`, whether it does more likely than not, `place_m` (2,), and `rough`: east, north, their speeds
+    (zero unless it moves) and the time in ns, for a first look at who is near.
 
     `evidence` is a log odds for its being there: sightings add to it, frames that show its place without it take away.
     """
@@ -38,24 +41,22 @@ class Followed:
     path_ns: list[int] = field(default_factory=list)
     together: dict[int, int] = field(default_factory=dict)  # neighbours by id: frames that saw both
     apart: dict[int, int] = field(default_factory=dict)  # neighbours by id: frames that could see both and saw one
+    moves: bool = field(init=False)
+    place_m: PointsM = field(init=False)
+    rough: tuple[float, ...] = field(init=False)
+    _clearest: float = 0.0
     _told: Track | None = None
 
-    @property
-    def place_m(self) -> PointsM:
-        """(2,) in the map, at `motion_ns`."""
-        return self.motion.places_m[0]
+    def __post_init__(self) -> None:
+        self.go_on(self.motion, self.motion_ns)
 
-    @property
-    def rough(self) -> tuple[float, float, float, float, int]:
-        """East, north and velocity, zero unless it moves, at a time in ns: for a first look at who is near."""
-        east, north = self.place_m
-        velocity = self.motion.means[0, MOVES, 2:] if self.moves else (0.0, 0.0)
-        return float(east), float(north), float(velocity[0]), float(velocity[1]), self.motion_ns
-
-    @property
-    def moves(self) -> bool:
-        """Whether it moves more likely than not."""
-        return bool(self.motion.weights[0, MOVES] > 0.5)
+    def go_on(self, motion: Motions, time_ns: int) -> None:
+        """Take its motion at a time over."""
+        self.motion, self.motion_ns = motion, time_ns
+        self.moves = bool(motion.weights[0, MOVES] > 0.5)
+        self.place_m = motion.places_m[0]
+        velocity = motion.means[0, MOVES, 2:].tolist() if self.moves else (0.0, 0.0)
+        self.rough = (*self.place_m.tolist(), *velocity, float(time_ns))
 
     @property
     def label(self) -> str:
@@ -81,15 +82,16 @@ class Followed:
         self.log_sides = self.log_sides + (sides - self.log_sides) / self.views
         if looks is not None:
             self.looks = looks if self.looks is None else self.looks + (looks - self.looks) / self.views
-        if _clearness(sighting) > _clearness(self.best):
-            self.best = sighting
+        clearness = _clearness(sighting)
+        if clearness > self._clearest:
+            self.best, self._clearest = sighting, clearness
         self.last_ns = sighting.time_ns
         self._extend_path(sighting.time_ns)
 
     def join(self, other: "Followed") -> None:
         """Take in another track of the same object; the one seen last says where it is."""
         if other.motion_ns >= self.motion_ns and other.last_ns >= self.last_ns:
-            self.motion, self.motion_ns = other.motion, other.motion_ns
+            self.go_on(other.motion, other.motion_ns)
         later = other.first_ns > self.last_ns
         self.passes += other.passes if later else 0
         self.evidence = max(self.evidence, other.evidence)
@@ -108,7 +110,8 @@ class Followed:
             for own in (self.id, other.id):
                 counts.pop(own, None)
         self._told = None
-        self.best = max(self.best, other.best, key=_clearness)
+        if other._clearest > self._clearest:
+            self.best, self._clearest = other.best, other._clearest
         self.first_ns, self.last_ns = min(self.first_ns, other.first_ns), max(self.last_ns, other.last_ns)
         order = np.argsort([*self.path_ns, *other.path_ns], kind="stable")
         places = [*self.path_m, *other.path_m]
@@ -117,16 +120,17 @@ class Followed:
 
     def shift(self, step_m: Floats) -> None:
         """Move it in the map, (2,)."""
-        means = self.motion.means.copy()
+        motion = self.motion
+        means = motion.means.copy()
         means[:, :, :2] += step_m
-        self.motion = replace(self.motion, means=means)
+        self.go_on(Motions(means, motion.covariances, motion.weights, motion.habits), self.motion_ns)
         self.path_m = [place + step_m for place in self.path_m] if self.moves else self.path_m
 
     def track(self, shared_m2: float) -> Track:
         """As it is known now; its place in the map has an error of `shared_m2` per axis beside its own."""
         place_m = self.place_m
         told = self._told
-        if told is not None and told.confirmed == self.confirmed and abs(told.position_m - place_m).max() < 0.01:
+        if told is not None and told.confirmed == self.confirmed and _is_near(told.position_m, place_m, shared_m2):
             return told
         total = sum(self.scores.values())
         path_m, path_ns = (np.array(self.path_m), self.path_ns) if self.moves else (place_m[None], [self.last_ns])
@@ -148,5 +152,11 @@ class Followed:
 
 def _clearness(sighting: Sighting) -> float:
     """How well a sighting shows its object: sure, and large in the picture."""
-    left, top, right, bottom = sighting.box_px
+    left, top, right, bottom = sighting.box_px.tolist()
     return float(sighting.score * max((right - left) * (bottom - top), 1.0) ** 0.25)
+
+
+def _is_near(told_m: PointsM, place_m: PointsM, shared_m2: float) -> bool:
+    """Whether a place has moved by so little that nobody needs to be told."""
+    east, north = told_m[0] - place_m[0], told_m[1] - place_m[1]
+    return bool(east * east + north * north < 0.01 * shared_m2 + 1e-4)

@@ -36,7 +36,7 @@ _STARTS_EVERY_S, _STOPS_EVERY_S = 60.0, 60.0
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """What is known of the motion of N objects; `habits` (N, 3) are their Habits in units of the place a second."""
+    """What is known of the motion of N objects; `habits` (N, 4) as `habits_of` gives them."""
 
     means: Floats
     covariances: Floats
@@ -67,9 +67,9 @@ class Motions:
 
 
 def habits_of(label: str, unit_m: float) -> Floats:
-    """(3,) a class's habits where one unit of the place is `unit_m` metres."""
+    """(4,) a class's habits where one unit of the place is `unit_m` metres: its Habits, and how far it sways."""
     habits = HABITS.get(label, OTHER_HABITS)
-    return np.array([habits.speed_m_s / unit_m, habits.unsteadiness / unit_m, habits.moving_share])
+    return np.array([habits.speed_m_s / unit_m, habits.unsteadiness / unit_m, habits.moving_share, _SWAY_M / unit_m])
 
 
 def begun(places_m: PointsM, covariances_m2: Floats, habits: Floats) -> Motions:
@@ -132,8 +132,7 @@ def _move_on(means: Floats, covariances: Floats, elapsed_s: Floats, habits: Floa
     covariances[:, STANDS, :2, 2:] = 0.0
     covariances[:, STANDS, 2:, :2] = 0.0
     covariances[:, STANDS, 2:, 2:] = (habits[:, 0] ** 2)[:, None, None] * _EYE
-    sway = _SWAY_M * habits[:, 0] / HABITS["person"].speed_m_s  # in the unit of the place
-    covariances[:, STANDS, :2, :2] += (np.minimum(sway, 2 * _SWAY_M) ** 2)[:, None, None] * t * _EYE
+    covariances[:, STANDS, :2, :2] += (habits[:, 3] ** 2)[:, None, None] * t * _EYE
     means[:, MOVES, :2] += elapsed_s[:, None] * means[:, MOVES, 2:]
     step = np.broadcast_to(np.eye(4), (len(means), 4, 4)).copy()
     step[:, :2, 2:] = t * _EYE

@@ -123,7 +123,7 @@ class Tracker:
         new: list[int] = []
         for row, column in zip(pairs.tracks, pairs.sightings):
             followed = near[row]
-            followed.motion, followed.motion_ns = motions.only(slice(row, row + 1)), time_ns
+            followed.go_on(motions.only(slice(row, row + 1)), time_ns)
             if self._record(followed, seen, int(column), min(1.0, (time_ns - followed.last_ns) / 1e9 / _USUAL_STEP_S)):
                 new.append(followed.id)
             ids[column] = followed.id
@@ -410,7 +410,7 @@ def _own_covariances(sightings: Sequence[Sighting]) -> Floats:
 def _stacked(near: list[Followed], time_ns: int) -> Motions:
     """All tracks' motions, moved on to one moment."""
     if not near:
-        return Motions(np.zeros((0, 2, 4)), np.zeros((0, 2, 4, 4)), np.zeros((0, 2)), np.zeros((0, 3)))
+        return Motions(np.zeros((0, 2, 4)), np.zeros((0, 2, 4, 4)), np.zeros((0, 2)), np.zeros((0, 4)))
     motions = [each.motion for each in near]
     together = Motions(
         np.concatenate([each.means for each in motions]), np.concatenate([each.covariances for each in motions]),
