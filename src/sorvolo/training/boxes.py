@@ -1,4 +1,4 @@
-"""Boxes in tensors: overlap, offsets from anchors and back, suppression; alike in training and in the exported graph."""
+"""Boxes in tensors: overlap, offsets from anchors and back, suppression; alike in training and exported graph."""
 
 import numpy as np
 import torch
