@@ -58,7 +58,7 @@ def measured(folder: Path, seed: int) -> dict[str, float]:
     for _ in simulate_site(folder / "flown", replace(settings, imaging=replace(settings.imaging, fps=10.0))):
         pass
     camera = folder / "flown" / "camera.xml"
-    for _ in map_flights([folder / "flown" / "flight1"], folder / "site", camera=camera):
+    for _ in map_flights([folder / "flown" / "flight1"], folder / "site", MapSettings(model="none"), camera=camera):
         pass
     source = open_sources([folder / "flown" / "flight2"], None, camera)[0]
     truth = {

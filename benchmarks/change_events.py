@@ -29,7 +29,7 @@ from mosaic_methods import commit, machine
 from sorvolo.missions.compare_flights import compare_flights
 from sorvolo.missions.evaluate_changes import as_json, evaluate_changes
 from sorvolo.missions.map_flight import map_flights
-from sorvolo.missions.settings import CompareSettings
+from sorvolo.missions.settings import CompareSettings, MapSettings
 from sorvolo.missions.simulate_site import simulate_site
 from sorvolo.simulation.presets import preset
 from sorvolo.simulation.settings import ImagingSettings
@@ -123,7 +123,8 @@ def simulate(folder: Path, name: str, seed: int, length_m: float | None, *, is_s
             pass
     if not (base / "mosaic.tif").is_file():
         shutil.rmtree(base, ignore_errors=True)
-        for _ in map_flights([flight(simulation, 1)], base, camera=simulation / "camera.xml"):
+        blind = MapSettings(model="none")
+        for _ in map_flights([flight(simulation, 1)], base, blind, camera=simulation / "camera.xml"):
             pass
     return simulation, base
 
@@ -151,7 +152,7 @@ def run_apart(method: str, simulation: Path, site: Path, limit_s: float, *, mask
 
 def run_method(method: str, masks: bool, simulation: Path, site: Path) -> None:
     """In the child: compare, then print the cost as JSON."""
-    settings = CompareSettings(method=method, writes_masks=masks)
+    settings = CompareSettings(method=method, model="none", writes_masks=masks)
     before, started = resource.getrusage(resource.RUSAGE_SELF), time.monotonic()
     (last,) = deque(compare_flights([flight(simulation, 2)], site, settings, camera=simulation / "camera.xml"), 1)
     after = resource.getrusage(resource.RUSAGE_SELF)

@@ -30,7 +30,7 @@ from sorvolo.geometry.polygons import points_inside
 from sorvolo.missions.compare_flights import compare_flights
 from sorvolo.missions.frame_rows import map_frames, site_points
 from sorvolo.missions.map_flight import map_flights
-from sorvolo.missions.settings import CompareSettings
+from sorvolo.missions.settings import CompareSettings, MapSettings
 from sorvolo.store.archive import Archive
 
 RESULTS = Path(__file__).parent / "results" / "change_real.json"
@@ -96,7 +96,7 @@ def main() -> None:
                 known, later = halves(options.data / name, folder, parity)
                 base = folder / "base"
                 if not (base / "mosaic.tif").is_file():
-                    list(map_flights([known], base))
+                    list(map_flights([known], base, MapSettings(model="none")))
                 for method in options.methods:
                     print(f"{name}, map of photos {parity}::2: {method}", file=sys.stderr, flush=True)
                     site = folder / method
@@ -131,7 +131,7 @@ def halves(photos: Path, folder: Path, parity: int) -> tuple[Path, Path]:
 def compare(method: str, photos: Path, site: Path) -> None:
     """In the child: compare, then print the cost as JSON."""
     started = time.monotonic()
-    (last,) = deque(compare_flights([photos], site, CompareSettings(method=method)), 1)
+    (last,) = deque(compare_flights([photos], site, CompareSettings(method=method, model="none")), 1)
     used = resource.getrusage(resource.RUSAGE_SELF)
     print(json.dumps({
         "photos": last.frames_expected, "views": last.views, "compared": last.compared,

@@ -120,7 +120,8 @@ def run_method(method: str, simulation: Path, site: Path) -> None:
     if method == "opencv-scans":
         stitch_with_opencv(photos, site)
     else:
-        for _ in map_flights([photos], site, MapSettings(method=method), camera=simulation / "camera.xml"):
+        settings = MapSettings(method=method, model="none")
+        for _ in map_flights([photos], site, settings, camera=simulation / "camera.xml"):
             pass
     after = resource.getrusage(resource.RUSAGE_SELF)
     cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

@@ -20,6 +20,7 @@ from mosaic_methods import commit, machine
 from sorvolo.capture.photo_metadata import read_photo_metadata
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.missions.map_flight import map_flights
+from sorvolo.missions.settings import MapSettings
 
 RESULTS = Path(__file__).parent / "results" / "real_flights.json"
 _GPS_IFD = 0x8825
@@ -46,7 +47,7 @@ def mapped(folder: Path) -> dict[str, object]:
     """Frames by how they ended, seconds and the report's figures of one flight."""
     with tempfile.TemporaryDirectory() as site:
         started_s, started_cpu_s = time.monotonic(), time.process_time()
-        list(map_flights([folder], Path(site) / "site"))
+        list(map_flights([folder], Path(site) / "site", MapSettings(model="none")))
         wall_s, cpu_s = time.monotonic() - started_s, time.process_time() - started_cpu_s
         report = json.loads(next(Path(site).glob("site/flights/*/report.json")).read_text())
     frames = {key: report["frames"][key] for key in ("selected", "vision", "gps-only", "rejected")}
@@ -74,7 +75,7 @@ def withheld_rms_m(folder: Path, parity: int) -> float:
                 exif = picture.getexif()
                 del exif[_GPS_IFD]
                 picture.save(photos / path.name, "JPEG", exif=exif, xmp=picture.info.get("xmp", b""), quality=95)
-        list(map_flights([photos], Path(scratch) / "site"))
+        list(map_flights([photos], Path(scratch) / "site", MapSettings(model="none")))
         found = json.loads(next(Path(scratch).glob("site/flights/*/frames.geojson")).read_text())
     frame = LocalFrame(Geodetic(*next(iter(taken_out.values()))))
     misses = []

@@ -15,12 +15,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from sorvolo.store.datasets import read_dataset
 
 from detection_data import SMALL, aerial_cars, hituav, in_order, mannequin, tinyperson
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.simulate_pictures import simulate_pictures
 from sorvolo.simulation.pictures import PictureSettings
+from sorvolo.store.datasets import read_dataset
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
 from sorvolo.training.joint import JointSettings, JointTraining, batches

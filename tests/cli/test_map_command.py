@@ -42,7 +42,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 def _arguments(simulated: Path, site: Path) -> list[str]:
     video, camera = simulated / "flight1" / "flight1.mp4", simulated / "camera.xml"
-    return ["map", str(video), "--site", str(site), "--camera", str(camera)]
+    return ["map", "--model", "none", str(video), "--site", str(site), "--camera", str(camera)]
 
 
 def test_json_then_words(simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

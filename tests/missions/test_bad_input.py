@@ -27,7 +27,7 @@ _GPS_IFD, _ORIENTATION = 34853, 274
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     """The one line that a command, which must fail with code 1, says on stderr."""
     capsys.readouterr()
-    assert cli.main(["map", *map(str, arguments)]) == 1
+    assert cli.main(["map", "--model", "none", *map(str, arguments)]) == 1
     told = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
     assert len(told) == 1 and told[0].startswith("error: ") and "bug" not in told[0], told
     return told[0]
@@ -35,7 +35,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
 
 def mapped(site: Path, *arguments: str | Path) -> dict[str, Any]:
     """The report of the only flight of a command that must succeed."""
-    assert cli.main(["map", *map(str, arguments), "--site", str(site)]) == 0
+    assert cli.main(["map", "--model", "none", *map(str, arguments), "--site", str(site)]) == 0
     (path,) = site.glob("flights/*/report.json")
     return json.loads(path.read_text())
 
@@ -188,7 +188,7 @@ def test_telemetry_of_another_path_at_the_same_time(film: Path, filmed: Path, tm
     right = mapped(tmp_path / "site", film, *camera)
     assert not right["warnings"]
     again = shutil.copy(film, tmp_path / "again.mp4")  # over ground that is known the pictures decide
-    command = ["map", again, "--telemetry", telemetry, *camera, "--site", tmp_path / "site"]
+    command = ["map", "--model", "none", again, "--telemetry", telemetry, *camera, "--site", tmp_path / "site"]
     assert cli.main([*map(str, command)]) == 0
     report = json.loads((tmp_path / "site" / "flights" / "again" / "report.json").read_text())
     assert any("disagree by" in words for words in report["warnings"])
@@ -391,7 +391,8 @@ def test_a_site_folder_that_cannot_be_used(
 
 
 def _command(photos: Path, camera: Path, site: Path) -> list[str]:
-    return [sys.executable, "-m", "sorvolo", "map", str(photos), "--camera", str(camera), "--site", str(site)]
+    options = ["--model", "none", "--camera", str(camera), "--site", str(site)]
+    return [sys.executable, "-m", "sorvolo", "map", str(photos), *options]
 
 
 def test_a_disk_that_fills_up(photos: Path, photographed: Path, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.missions.compare_flights import compare_flights
 from sorvolo.missions.evaluate_changes import evaluate_changes
 from sorvolo.missions.map_flight import map_flights
-from sorvolo.missions.settings import CompareSettings
+from sorvolo.missions.settings import CompareSettings, MapSettings
 from sorvolo.missions.simulate_site import simulate_site
 from sorvolo.simulation.settings import (
     ImagingSettings,
@@ -43,6 +43,8 @@ _PAIR = SimulationSettings(
     output=OutputSettings(truth_step=2),
 )
 
+_MAP, _COMPARE = MapSettings(model="none"), CompareSettings(model="none")
+
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -57,7 +59,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def mapped(flown: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The first flight's map; copied by those who change it."""
     site = tmp_path_factory.mktemp("pair") / "site"
-    for _ in map_flights([flown / "flight1"], site, camera=flown / "camera.xml"):
+    for _ in map_flights([flown / "flight1"], site, _MAP, camera=flown / "camera.xml"):
         pass
     return site
 
@@ -72,11 +74,11 @@ def site(mapped: Path, tmp_path: Path) -> Path:
 def compared(flown: Path, mapped: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[CompareUpdate]]:
     site = tmp_path_factory.mktemp("pair") / "compared"
     shutil.copytree(mapped, site)
-    return site, compare(flown, site, CompareSettings(writes_masks=True))
+    return site, compare(flown, site, CompareSettings(model="none", writes_masks=True))
 
 
 def compare(flown: Path, site: Path, settings: CompareSettings | None = None) -> list[CompareUpdate]:
-    wanted = settings or CompareSettings()
+    wanted = settings or CompareSettings(model="none")
     return list(compare_flights([flown / "flight2"], site, wanted, camera=flown / "camera.xml"))
 
 
@@ -164,7 +166,7 @@ def test_the_map_is_painted_where_the_ground_changed_and_nowhere_else(compared, 
 def test_the_same_flight_again_gives_the_same_and_doubles_nothing(compared, flown, tmp_path):
     shutil.copytree(compared[0], tmp_path / "again")
     first = files(compared[0] / "flights" / "flight2" / "changes")
-    compare(flown, tmp_path / "again", CompareSettings(writes_masks=True))
+    compare(flown, tmp_path / "again", CompareSettings(model="none", writes_masks=True))
     assert files(tmp_path / "again" / "flights" / "flight2" / "changes") == first
     assert features(tmp_path / "again") == features(compared[0])
     with Archive.open(tmp_path / "again", write=False) as archive:
@@ -179,7 +181,7 @@ def test_the_same_flight_again_gives_the_same_and_doubles_nothing(compared, flow
 def test_stopping_half_way_leaves_the_site_as_it_was(flown, site):
     with Archive.open(site, write=False) as archive:
         before = [each.id for each in archive.versions()]
-    updates = compare_flights([flown / "flight2"], site, camera=flown / "camera.xml")
+    updates = compare_flights([flown / "flight2"], site, _COMPARE, camera=flown / "camera.xml")
     for _ in range(5):
         next(updates)
     updates.close()
@@ -190,16 +192,16 @@ def test_stopping_half_way_leaves_the_site_as_it_was(flown, site):
 
 
 def test_a_rejected_change_does_not_come_back_with_the_next_flight(flown, site, tmp_path):
-    compare(flown, site, CompareSettings(updates_map=False))
+    compare(flown, site, CompareSettings(model="none", updates_map=False))
     (rejected, *others) = features(site)
     with Archive.open(site, write=True) as archive:
         archive.review(rejected["id"], Verdict.REJECTED)
-    compare(flown, site, CompareSettings(updates_map=False))
+    compare(flown, site, CompareSettings(model="none", updates_map=False))
     assert [each["geometry"] for each in features(site)] == [each["geometry"] for each in (rejected, *others)]
     assert features(site)[0]["properties"]["review"] == "rejected"
     for suffix in (".mp4", ".csv"):
         shutil.copy(flown / "flight2" / f"flight2{suffix}", tmp_path / f"next{suffix}")
-    unchanged = CompareSettings(updates_map=False)
+    unchanged = CompareSettings(model="none", updates_map=False)
     list(compare_flights([tmp_path / "next.mp4"], site, unchanged, camera=flown / "camera.xml"))
     assert [each["geometry"] for each in features(site, "next")] == [each["geometry"] for each in others]
     assert report(site, "next")["comparison"]["suppressed"] == 1
@@ -208,7 +210,7 @@ def test_a_rejected_change_does_not_come_back_with_the_next_flight(flown, site, 
 def test_without_update_the_map_stays(flown, site):
     with Archive.open(site, write=False) as archive:
         before = dict(archive.tiles())
-    compare(flown, site, CompareSettings(updates_map=False))
+    compare(flown, site, CompareSettings(model="none", updates_map=False))
     with Archive.open(site, write=False) as archive:
         after = dict(archive.tiles())
     assert before.keys() == after.keys()
@@ -218,14 +220,14 @@ def test_without_update_the_map_stays(flown, site):
 
 def test_a_flight_without_telemetry_finds_itself(flown, site, tmp_path):
     shutil.copy(flown / "flight2" / "flight2.mp4", tmp_path / "silent.mp4")
-    updates = list(compare_flights([tmp_path / "silent.mp4"], site, camera=flown / "camera.xml"))
+    updates = list(compare_flights([tmp_path / "silent.mp4"], site, _COMPARE, camera=flown / "camera.xml"))
     assert sum(each.status is ViewStatus.COMPARED for each in updates) >= 0.8 * len(updates)
     assert features(site, "silent")
 
 
 def test_the_thesis_method_compares_too_and_shows_its_steps(flown, site, tmp_path):
     updates = list(compare_flights(
-        [flown / "flight2"], site, CompareSettings(method="thesis"), camera=flown / "camera.xml",
+        [flown / "flight2"], site, CompareSettings(model="none", method="thesis"), camera=flown / "camera.xml",
         steps=tmp_path / "steps",
     ))
     assert report(site)["comparison"]["method"] == "thesis"
@@ -234,11 +236,11 @@ def test_the_thesis_method_compares_too_and_shows_its_steps(flown, site, tmp_pat
 
 
 @pytest.mark.parametrize(("arguments", "match"), [
-    ({"settings": CompareSettings(), "steps": Path("steps")}, "--method thesis"),
+    ({"settings": CompareSettings(model="none"), "steps": Path("steps")}, "--method thesis"),
 ])
 def test_wrong_wishes_are_told(flown, site, arguments, match):
     with pytest.raises(SettingsError, match=match):
-        list(compare_flights([flown / "flight2"], site, camera=flown / "camera.xml", **arguments))
+        list(compare_flights([flown / "flight2"], site, _COMPARE, camera=flown / "camera.xml", **arguments))
 
 
 @pytest.mark.parametrize("make", [
@@ -252,13 +254,13 @@ def test_settings_are_checked(make: Callable[[], object]):
 
 def test_a_site_without_a_map_says_how_to_make_one(flown, tmp_path):
     with pytest.raises(StoreError, match="sorvolo map"):
-        list(compare_flights([flown / "flight2"], tmp_path / "none", camera=flown / "camera.xml"))
+        list(compare_flights([flown / "flight2"], tmp_path / "none", _COMPARE, camera=flown / "camera.xml"))
     assert not (tmp_path / "none").exists()
 
 
 def test_the_first_flight_cannot_be_compared_with_its_own_map(flown, site):
     with pytest.raises(InputError, match="flight1"):
-        list(compare_flights([flown / "flight1"], site, camera=flown / "camera.xml"))
+        list(compare_flights([flown / "flight1"], site, _COMPARE, camera=flown / "camera.xml"))
 
 
 def elsewhere(tmp_path: Path, metres_east: float) -> Iterator[Path]:
@@ -273,13 +275,13 @@ def elsewhere(tmp_path: Path, metres_east: float) -> Iterator[Path]:
 def test_a_flight_over_another_place_is_refused(site, tmp_path):
     folder = next(elsewhere(tmp_path, 60_000))
     with pytest.raises(InputError, match="km from the site"):
-        list(compare_flights([folder / "flight1"], site, camera=folder / "camera.xml"))
+        list(compare_flights([folder / "flight1"], site, _COMPARE, camera=folder / "camera.xml"))
 
 
 def test_other_ground_in_the_same_place_is_refused_and_leaves_no_trace(flown, site, tmp_path):
     folder = next(elsewhere(tmp_path, 0))
     with pytest.raises(InputError, match="no frame of flight1-2 fits the map"):
-        list(compare_flights([folder / "flight1"], site, camera=folder / "camera.xml"))
+        list(compare_flights([folder / "flight1"], site, _COMPARE, camera=folder / "camera.xml"))
     assert not (site / "flights" / "flight1-2").exists()
 
 
@@ -295,7 +297,7 @@ def test_ground_beside_the_map_extends_it(flown, tmp_path):
     ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
     (tmp_path / "west.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
     for _ in map_flights(
-        [flown / "flight1"], tmp_path / "site", camera=flown / "camera.xml", area=tmp_path / "west.geojson"
+        [flown / "flight1"], tmp_path / "site", _MAP, camera=flown / "camera.xml", area=tmp_path / "west.geojson"
     ):
         pass
     with Archive.open(tmp_path / "site", write=False) as archive:
@@ -311,7 +313,9 @@ def test_ground_beside_the_map_extends_it(flown, tmp_path):
 
 def test_the_command_tells_the_changes_as_json(flown, site, capsys):
     camera = str(flown / "camera.xml")
-    assert main(["compare", str(flown / "flight2"), "--site", str(site), "--camera", camera, "--json"]) == 0
+    flight = str(flown / "flight2")
+    options = ["--camera", camera, "--json", "--model", "none"]
+    assert main(["compare", flight, "--site", str(site), *options]) == 0
     told = json.loads(capsys.readouterr().out)["flights"][0]
     assert told["flight"] == "flight2"
     assert len(told["changes"]["features"]) == sum(told["comparison"]["changes"].values()) > 0
@@ -320,7 +324,7 @@ def test_the_command_tells_the_changes_as_json(flown, site, capsys):
 def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(compared, flown, site):
     command = [
         sys.executable, "-m", "sorvolo", "compare", str(flown / "flight2"), "--site", str(site),
-        "--camera", str(flown / "camera.xml"), "--masks",
+        "--camera", str(flown / "camera.xml"), "--masks", "--model", "none",
     ]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         started = time.monotonic()
@@ -331,7 +335,7 @@ def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(com
     with Archive.open(site, write=False) as archive:
         assert [each.flight_id for each in archive.versions() if each.complete] == ["flight1"]
         assert archive.changes() == []
-    compare(flown, site, CompareSettings(writes_masks=True))
+    compare(flown, site, CompareSettings(model="none", writes_masks=True))
     assert features(site) == features(compared[0])
     assert not list(site.glob("flights/flight2/staged"))
 

@@ -30,7 +30,7 @@ _PROPERTIES = {
 
 
 def run_map(site: Path, *arguments: str | Path) -> None:
-    assert cli.main(["map", *map(str, arguments), "--site", str(site)]) == 0
+    assert cli.main(["map", "--model", "none", *map(str, arguments), "--site", str(site)]) == 0
 
 
 def report_of(site: Path, flight: str) -> dict[str, Any]:

@@ -39,7 +39,8 @@ def test_a_flight_over_an_orthophoto_is_mapped_back_onto_it(orthophoto: Path, tm
     ]) == 0
     photos = simulation / "flight1" / "photos"
     camera = simulation / "camera.xml"
-    assert cli.main(["map", str(photos), "--site", str(site), "--camera", str(camera), "--gsd", "0.1"]) == 0
+    options = ["--model", "none", "--camera", str(camera), "--gsd", "0.1"]
+    assert cli.main(["map", str(photos), "--site", str(site), *options]) == 0
     with rasterio.open(site / "mosaic.tif") as mosaic, rasterio.open(simulation / "truth" / "ground.tif") as ground:
         rgba = mosaic.read()
         rows, columns = np.nonzero(rgba[3] == 255)
