@@ -17,7 +17,7 @@ from sorvolo.geometry.arrays import Anything, Floats, PointsM
 FORGETS_S = 60.0
 """How long a GPS error lasts."""
 
-_FIRST_JITTER = 0.2  # of the shared sigma: what changes from frame to frame, until the frames say it
+_FIRST_JITTER = 0.4  # of the shared sigma: what changes from frame to frame, until the frames say it
 _LEAST_JITTER = 0.03
 _LEARNS = 0.05
 _MOST_ROWS = 300  # places kept with what they share; those not seen for longest keep their own sigma only
@@ -30,7 +30,7 @@ class FittedShift:
 
     `jump_m` (2,) is the frame's own part of the shift, gone with it. The rest is what the filter's next state is made
     of: the objects' `rows` in it (M,), its `crosses` (rows, M) with what was seen, `gains` (rows, M), and the inverse
-    covariance of what was seen, `trusts` (M, M), which makes `solved` (M, 2) of it.
+    covariance of what was seen, `trusts` (M, M), which makes `solved` (M, 2) of the `gaps_m` (M, 2).
     """
 
     of_others_m: PointsM
@@ -38,6 +38,7 @@ class FittedShift:
     rows: Anything
     gains: Floats
     crosses: Floats
+    gaps_m: Floats
     solved: Floats
     trusts: Floats
     jump_m: Floats
@@ -50,6 +51,8 @@ class CommonShift:
         self.mean_m = np.zeros(2)
         self.jitter_m2 = -1.0
         self.jump_m = np.zeros(2)
+        self._shared_m2, self._lessons = 0.0, 0
+        self._left_m2 = 0.0  # variance of the frame's own jump, as far as the frame leaves it open
         self._covariance = np.zeros((1, 1))  # row 0 is the shift's
         self._rows: dict[int, int] = {}
         self._seen: dict[int, int] = {}  # in order of the frames in which they were last matched
@@ -58,12 +61,13 @@ class CommonShift:
 
     def move_on(self, elapsed_s: float, shared_sigma_m: float) -> None:
         """A frame `elapsed_s` later, whose sightings share an error of `shared_sigma_m` per axis."""
-        shared_m2 = shared_sigma_m**2
+        self._shared_m2 = shared_m2 = shared_sigma_m**2
         self._frame += 1
         self.jump_m = np.zeros(2)
         if self.jitter_m2 < 0:
             self.jitter_m2 = _FIRST_JITTER**2 * shared_m2
             self._covariance[0, 0] = shared_m2
+        self._left_m2 = self.jitter_m2
         keeps = float(np.exp(-elapsed_s / FORGETS_S))
         slow_m2 = max(shared_m2 - self.jitter_m2, 0.25 * shared_m2)
         self.mean_m = keeps * self.mean_m
@@ -76,9 +80,12 @@ class CommonShift:
         self._covariance[0, 0] += variance_m2
 
     def begin(self, ids: Sequence[int]) -> None:
-        """Places seen first in this frame, at their sighting less the shift: wrong by as much as the shift is."""
+        """Places seen first in this frame, at their sighting less the shift: wrong together by as much as that is."""
+        first = len(self._covariance)
         for number in ids:
-            self._append(number, -self._covariance[0], float(self._covariance[0, 0]))
+            line = -self._covariance[0]
+            line[first:] = self._covariance[0, 0] + self._left_m2
+            self._append(number, line, float(self._covariance[0, 0]) + self._left_m2)
 
     def variance_m2(self, number: int) -> float:
         """How far a place may lie off on the ground, per axis, beside what its own sightings err."""
@@ -121,8 +128,8 @@ class CommonShift:
         own_trust = np.diag(trusts)
         misses_m = solved / own_trust[:, None]  # what is seen less what all others predict
         return FittedShift(
-            misses_m, np.maximum(1 / own_trust - variances_m2, 0.0), rows, crosses @ trusts, crosses, solved, trusts,
-            self.jitter_m2 * solved.sum(axis=0),
+            misses_m, np.maximum(1 / own_trust - variances_m2, 0.0), rows, crosses @ trusts, crosses, gaps_m, solved,
+            trusts, self.jitter_m2 * solved.sum(axis=0),
         )
 
     def offsets(self, fitted: FittedShift, ids: Sequence[int]) -> tuple[PointsM, Floats]:
@@ -141,11 +148,9 @@ class CommonShift:
         Places of `movers` hold no map: they are new in every frame.
         """
         moved = fitted.crosses @ fitted.solved
-        if len(ids) >= 3:
-            seen_m2 = float(fitted.jump_m @ fitted.jump_m) / 2
-            left_m2 = max(self.jitter_m2 - self.jitter_m2**2 * float(fitted.trusts.sum()), 0.0)
-            least_m2 = _LEAST_JITTER**2 * max(self._covariance[0, 0], self.jitter_m2)
-            self.jitter_m2 = max((1 - _LEARNS) * self.jitter_m2 + _LEARNS * (seen_m2 + left_m2), least_m2)
+        self._left_m2 = max(self.jitter_m2 - self.jitter_m2**2 * float(fitted.trusts.sum()), 0.0)
+        if len(ids) > 1:
+            self._learn(fitted)
         self._covariance -= fitted.gains @ fitted.crosses.T
         self._covariance = (self._covariance + self._covariance.T) / 2
         self.mean_m, self.jump_m = self.mean_m + moved[0], fitted.jump_m
@@ -164,6 +169,17 @@ class CommonShift:
             number: moved[row] for number, row in self._rows.items()
             if row < len(moved) and abs(moved[row, 0]) + abs(moved[row, 1]) > 1e-4
         }
+
+    def _learn(self, fitted: FittedShift) -> None:
+        """How much frames jump, from how far all of one frame's objects together lie from where they were expected."""
+        weights = fitted.trusts.sum(axis=0) / fitted.trusts.sum()
+        expected_m2 = 1 / float(fitted.trusts.sum())  # of the weighted mean of all gaps
+        together_m = weights @ fitted.gaps_m
+        seen_m2 = float(together_m @ together_m) / 2 - expected_m2 + self.jitter_m2
+        self._lessons += 1
+        rate = max(_LEARNS, 1 / (self._lessons + 3))
+        least_m2, most_m2 = _LEAST_JITTER**2 * self._shared_m2, self._shared_m2
+        self.jitter_m2 = float(np.clip((1 - rate) * self.jitter_m2 + rate * seen_m2, least_m2, most_m2))
 
     def _known(self, ids: Sequence[int]) -> tuple[Floats, Floats]:
         """(N,) covariances with the shift and variances of places."""

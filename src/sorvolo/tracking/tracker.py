@@ -293,9 +293,7 @@ class Tracker:
             return []
         habits = np.array([habits_of(seen.labels[row], self._settings.unit_m) for row in fresh])
         shift = self._shift
-        motions = begun(
-            seen.places_m[fresh] - shift.mean_m - shift.jump_m, seen.own_m2[fresh] + shift.jitter_m2 * np.eye(2), habits
-        )
+        motions = begun(seen.places_m[fresh] - shift.mean_m - shift.jump_m, seen.own_m2[fresh], habits)
         started = []
         for index, row in enumerate(fresh):
             sighting = seen.sightings[row]
