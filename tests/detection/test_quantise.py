@@ -82,3 +82,30 @@ def test_from_a_folder_of_pictures(model: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no pictures"):
         quantise_model(model, tmp_path / "empty", out, most=9)
+
+
+def test_convolutions_of_the_head_before_a_fully_connected_layer_are_whole_numbers_too(
+    model: Path, tmp_path: Path
+) -> None:
+    own = onnx.load_model(model)
+    means = next(node for node in own.graph.node if node.op_type == "ReduceMean")
+    place = list(own.graph.node).index(means)
+    own.graph.node.remove(means)
+    for node in reversed([
+        onnx.helper.make_node("Conv", ["regions", "seen_w"], ["seen"]),
+        onnx.helper.make_node("ReduceMean", ["seen"], ["mean"], axes=[2, 3], keepdims=0),
+        onnx.helper.make_node("Gemm", ["mean", "told_w"], ["rows"]),
+        onnx.helper.make_node("Squeeze", ["rows", "axis1"], ["means"]),
+    ]):
+        own.graph.node.insert(place, node)
+    for name, values in (("seen_w", np.eye(4)[:, :, None, None]), ("told_w", np.full((4, 1), 0.25))):
+        own.graph.initializer.append(onnx.numpy_helper.from_array(values.astype(np.float32), name))
+    onnx.save(own, tmp_path / "head.onnx")
+    made = quantise(tmp_path / "head.onnx", _pictures(12))
+    assert (made.convolutions, made.of) == (3, 4), "only the one that says where stays in float"
+    (tmp_path / "head-int8.onnx").write_bytes(made.model)
+    whole, small = (Detector.load(tmp_path / f"{name}.onnx", provider="cpu") for name in ("head", "head-int8"))
+    picture = _pictures(5)[0]
+    expected, found = whole.detect(picture, least_score=0.1), small.detect(picture, least_score=0.1)
+    np.testing.assert_allclose(np.sort(found.scores), np.sort(expected.scores), atol=0.05)
+    assert len(found) >= 2

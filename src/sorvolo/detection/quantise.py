@@ -19,8 +19,12 @@ from sorvolo.geometry.arrays import Anything, ImageRGB
 LEAST_PICTURES = 8
 """With fewer pictures the ranges of the numbers are a matter of chance."""
 
-_CARRIERS = frozenset({"Conv", "Relu", "Clip", "Add", "Concat", "MaxPool", "AveragePool", "Resize", "RoiAlign"})
-_FLOAT = frozenset({"RoiAlign"})  # carries features on, but interpolates at places that eight bits cannot name
+_CARRIERS = frozenset({
+    "Conv", "Relu", "Clip", "Add", "Concat", "MaxPool", "AveragePool", "Resize", "RoiAlign", "ReduceMean",
+})
+# carry features on, but one interpolates at places that eight bits cannot name, the other means away their rounding
+_FLOAT = frozenset({"RoiAlign", "ReduceMean"})
+_READERS = frozenset({"Conv", "Gemm"})
 
 
 @dataclass(frozen=True)
@@ -123,19 +127,19 @@ def _prepare(model: Any) -> None:
 
 
 def _quantisable(model: Any) -> list[str]:
-    """Names of the nodes that carry features from one convolution to the next, those convolutions included.
+    """Names of the nodes that carry features from one layer with weights to the next, convolutions included.
 
-    The last convolution of a branch (its output reaches no other one) is not among them, nor is what works on boxes.
+    The last convolution of a branch (its output reaches no such layer) is not among them, nor is what works on boxes.
     """
     makers = {name: node for node in model.graph.node for name in node.output}
     carried: set[str] = set()  # tensors that come from a convolution through carriers alone
-    leads_on: set[str] = set()  # tensors from which another convolution is reached so
+    leads_on: set[str] = set()  # tensors from which another layer with weights is reached so
     nodes = list(model.graph.node)
     for node in nodes:
         if node.op_type == "Conv" or (node.op_type in _CARRIERS and _features_in(node) & carried):
             carried.update(node.output[:1])
     for node in reversed(nodes):
-        if node.op_type == "Conv" or (node.op_type in _CARRIERS and node.output[0] in leads_on):
+        if node.op_type in _READERS or (node.op_type in _CARRIERS and node.output[0] in leads_on):
             leads_on.update(name for name in _features_in(node) if name in makers)
     return [
         node.name for node in nodes

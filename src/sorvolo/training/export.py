@@ -4,8 +4,8 @@ import io
 import json
 import warnings
 from collections.abc import Sequence
-from copy import deepcopy
-from dataclasses import dataclass
+from copy import copy, deepcopy
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,14 +35,17 @@ class ExportCheck:
         return self.box_px <= 0.5 and self.score <= 1e-3 and self.unmatched == 0
 
 
-def export_onnx(model: FasterRCNN, info: dict[str, Any]) -> bytes:
+def export_onnx(model: FasterRCNN, info: dict[str, Any], *, regions: int | None = None) -> bytes:
     """The model as an ONNX file's bytes, with `info` as its "sorvolo" metadata (docs/detector.md has the fields).
 
-    Raises SettingsError when `info` names no classes.
+    `regions`: how many the head looks at in a picture, None for as many as the model's own `Reach` says. The file
+    finds no more objects than that. Raises SettingsError when `info` names no classes or `regions` is below 1.
     """
     if not info.get("classes"):
         raise SettingsError("an exported model needs the names of its classes")
-    own = deepcopy(model).eval().cpu()
+    if regions is not None and regions < 1:
+        raise SettingsError(f"a head looks at one region or more, not {regions}")
+    own = _reaching(deepcopy(model).eval().cpu(), regions or model.reach.regions)
     for weight in own.parameters():
         weight.data = weight.data.contiguous()
     picture = torch.randint(0, 255, (1, 3, *_TRACED_PX), dtype=torch.uint8)
@@ -61,7 +64,10 @@ def export_onnx(model: FasterRCNN, info: dict[str, Any]) -> bytes:
     graph = onnx.load_model_from_string(buffer.getvalue())
     for output in graph.graph.output:  # rows vary, whatever the traced picture had
         output.type.tensor_type.shape.dim[0].dim_param = "count"
-    full = {"format": 1, "stride": model.stride, "least_score": model.reach.least_score, **info}
+    full = {
+        "format": 1, "stride": model.stride, "least_score": model.reach.least_score, "regions": own.reach.regions,
+        **info,
+    }
     entry = graph.metadata_props.add()
     entry.key, entry.value = "sorvolo", json.dumps(full)
     onnx.checker.check_model(graph)
@@ -73,12 +79,14 @@ def check_export(model: FasterRCNN, exported: bytes, pictures: Sequence[ImageRGB
     import onnxruntime
 
     session = onnxruntime.InferenceSession(exported, providers=["CPUExecutionProvider"])
+    told = json.loads(session.get_modelmeta().custom_metadata_map["sorvolo"])
+    model = _reaching(model.eval(), told["regions"])
     worst_px, worst_score, alone, count = 0.0, 0.0, 0, 0
     for picture in pictures:
         height, width = (side // model.stride * model.stride for side in picture.shape[:2])
         planes = np.ascontiguousarray(picture[:height, :width].transpose(2, 0, 1))[None]
         with torch.no_grad():
-            boxes, scores, labels = (each.numpy() for each in model.eval()(torch.from_numpy(planes)))
+            boxes, scores, labels = (each.numpy() for each in model(torch.from_numpy(planes)))
         other_boxes, other_scores, other_labels = session.run(None, {"image": planes})
         count += len(scores)
         for box, score, label in zip(boxes, scores, labels):
@@ -95,3 +103,10 @@ def check_export(model: FasterRCNN, exported: bytes, pictures: Sequence[ImageRGB
             worst_px = max(worst_px, float(off_px[best]))
             worst_score = max(worst_score, float(abs(other_scores[same][best] - score)))
     return ExportCheck(worst_px, worst_score, alone, count)
+
+
+def _reaching(model: FasterRCNN, regions: int) -> FasterRCNN:
+    """The same layers, looking at so many regions."""
+    own = copy(model)
+    own.reach = replace(model.reach, regions=regions)
+    return own

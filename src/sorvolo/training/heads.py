@@ -109,9 +109,9 @@ class TwoLayerHead(nn.Module):
 
 
 class StageHead(nn.Module):
-    """A network's last stage as the head, as Faster R-CNN has on ResNet's C4: `stage` takes (R, C, 14, 14)."""
+    """A network's last stage as the head, as Faster R-CNN has on ResNet's C4: `stage` takes (R, C, side, side)."""
 
-    def __init__(self, stage: nn.Module, channels: int, classes: int, *, side: int = 14) -> None:
+    def __init__(self, stage: nn.Module, channels: int, classes: int, *, side: int = 7) -> None:
         super().__init__()
         self.side, self.stage = side, stage
         self.scores, self.offsets = nn.Linear(channels, classes + 1), nn.Linear(channels, 4)

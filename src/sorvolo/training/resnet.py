@@ -30,8 +30,10 @@ class FrozenNorm(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """(N, C, H, W) -> the same shape."""
-        gain = self.weight * torch.rsqrt(self.running_var + _EPSILON)
-        return features * gain[:, None, None] + (self.bias - self.running_mean * gain)[:, None, None]
+        # as one known operation, so that an export folds it into the convolution before
+        return functional.batch_norm(
+            features, self.running_mean, self.running_var, self.weight, self.bias, training=False, eps=_EPSILON
+        )
 
 
 class _Bottleneck(nn.Module):
@@ -59,16 +61,16 @@ class _Bottleneck(nn.Module):
         return functional.relu(x + (features if self.downsample is None else self.downsample(features)))
 
 
-def resnet_stage(index: int, *, original: bool, frozen_norms: bool = True) -> nn.Sequential:
+def resnet_stage(index: int, *, original: bool, frozen_norms: bool = True, halves: bool = True) -> nn.Sequential:
     """Stage `index` 1 to 4 (res2 to res5): 64, 256, 512 or 1024 channels in, four times its width out.
 
-    All but the first halve the picture.
+    All but the first halve the picture, unless `halves` is False.
     """
     inner, blocks = _STAGES[index - 1]
     channels = 64 if index == 1 else _STAGES[index - 2][0] * _GROWTH
     rows = []
     for block in range(blocks):
-        stride = 2 if block == 0 and index > 1 else 1
+        stride = 2 if halves and block == 0 and index > 1 else 1
         rows.append(_Bottleneck(channels, inner, stride, original=original, frozen_norms=frozen_norms))
         channels = inner * _GROWTH
     stage = nn.Sequential(*rows)
