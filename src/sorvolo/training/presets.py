@@ -20,6 +20,7 @@ _FAST_ANCHORS = (AnchorSettings((7, 11, 17)), AnchorSettings((25, 37, 54)), Anch
 _FAST_WIDTH = 64
 _RATIOS = (0.5, 1.0, 2.0)
 _ACCURATE_ANCHORS = tuple(AnchorSettings(sizes, _RATIOS) for sizes in ((10, 16), (25, 40), (63, 100), (160, 250)))
+_THESIS_REGIONS = 100  # six frames a second on two cores; more for crowds (docs/detector.md)
 _THESIS_ANCHORS = (AnchorSettings((16, 32, 64, 128, 256), _RATIOS),)  # of Faster R-CNN, an octave finer on either side
 
 
@@ -58,8 +59,10 @@ def thesis(
     """
     backbone = ResNet50(original=original, frozen_norms=frozen, thaw_all=not frozen)
     proposals = ProposalNetwork(backbone.channels, backbone.strides, _THESIS_ANCHORS, rpn, 512, light=False)
-    head = StageHead(resnet_stage(4, original=original, frozen_norms=frozen), 2048, len(classes))
-    return FasterRCNN(backbone, torch.nn.Identity(), proposals, head, Reach(before=2000))
+    # cut out at the 7x7 that res5's stride would leave of 14x14: a quarter as much to sample, and all of it is used
+    stage = resnet_stage(4, original=original, frozen_norms=frozen, halves=False)
+    head = StageHead(stage, 2048, len(classes))
+    return FasterRCNN(backbone, torch.nn.Identity(), proposals, head, Reach(before=2000, regions=_THESIS_REGIONS))
 
 
 NETS: Mapping[Preset, Net] = {"fast": "lite0", "accurate": "resnet50", "thesis": "resnet50"}
