@@ -260,6 +260,16 @@ def test_what_cannot_be_measured_says_why(site, simulated, tmp_path):
         evaluate_changes(site, simulated)
 
 
+def test_a_flight_that_is_there_only_in_part_is_refused(site, simulated):
+    path = site / "flights/flight2/frames.geojson"
+    path.write_text(path.read_text()[:200])
+    with pytest.raises(InputError, match="cannot be read"):
+        evaluate_changes(site, simulated)
+    path.unlink()
+    with pytest.raises(InputError, match="only in part"):
+        evaluate_changes(site, simulated)
+
+
 def test_a_report_that_is_none_is_refused(site, simulated, tmp_path):
     edit(site, lambda events: events[0]["properties"].pop("kind"))
     with pytest.raises(InputError, match=r"formats\.md"):

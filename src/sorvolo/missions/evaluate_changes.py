@@ -85,6 +85,7 @@ def evaluate_changes(
         described = archive.site()
     if described.is_local:
         raise InputError(f"{found}: a map without geo-reference cannot be compared with a simulation's truth")
+    _check_whole(found, names)
     flights = PairedFlights.read(found, truth_file(truth), described)
     known = [name for name in names if flights.true_name(name) in true_flights]
     if not known:
@@ -180,6 +181,12 @@ def _compared_flights(site: Path, flight: str | None) -> list[str]:
     if flight not in names:
         raise SettingsError(f"--flight {flight}: the compared flights of {site} are {', '.join(names)}")
     return [flight]
+
+
+def _check_whole(site: Path, flights: Sequence[str]) -> None:
+    for path in (site / "flights" / name / "frames.geojson" for name in flights):
+        if not path.is_file():
+            raise InputError(f"{path} is missing: this flight is there only in part; run `sorvolo compare` again")
 
 
 def _own_masks(site: Path, flight: str) -> Path:
