@@ -47,7 +47,8 @@ def test_tint_and_rims_are_as_specified(height: int, width: int, seed: int) -> N
     before, after = pictures(height, width, seed)
     logs = np.sort(rng.integers(0, 256, 256, dtype=np.uint8))
     labels, boxes = kernels.core_regions(
-        rng.integers(0, 256, (height, width), dtype=np.uint8), np.full((height, width), 150, np.uint8), 1.2, 0.9, 3, 8
+        rng.integers(0, 256, (height, width), dtype=np.uint8),
+        np.full((height, width), rng.integers(80, 200), np.uint8), 1.2, rng.uniform(0.1, 0.9), 3, 8,
     )
     found, plain = (np.full((height, width), 7, np.uint8) for _ in range(2))
     kernels.tint(before, after, logs, boxes, 2, found)

@@ -58,20 +58,22 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     height, width = reference.shape[:2]
     size = max(4, width // CELL_PX), max(4, height // CELL_PX)
     before, after = _logarithm(_smaller(reference, size)), _logarithm(_smaller(query, size))
-    sure = np.ones(size[::-1], bool) if known is None else _smaller(known.astype(np.uint8) * 255, size) > 250
-    if sure.sum() < 16:
+    sure = None if known is None else _smaller(known.astype(np.uint8) * 255, size) > 250
+    if sure is not None and sure.sum() < 16:
         return Light(np.ones(3), np.zeros(3), np.ones((*size[::-1], 3), np.float32), 0.0)
     window = (9, 9)
-    detail_before = (before - cv2.blur(before, window))[sure][::2]
-    detail_after = (after - cv2.blur(after, window))[sure][::2]
+    detail_before = _chosen(before - cv2.blur(before, window), sure)[::2]
+    detail_after = _chosen(after - cv2.blur(after, window), sure)[::2]
     exponents = np.array([_exponent(detail_before[:, channel], detail_after[:, channel]) for channel in range(3)])
     offset = after - exponents.astype(np.float32) * before
-    kept = offset[sure]
+    kept = _chosen(offset, sure)
     offsets = np.array([middle(kept[:, channel]) for channel in range(3)])
     local = np.clip(np.rint((offset - offsets.astype(np.float32)) * STEPS_PER_OCTAVE + 128), 0, 255).astype(np.uint8)
-    same = np.where(sure, _sameness(reference, query, size), np.float32(0))
+    same = _sameness(reference, query, size)
+    if sure is not None:
+        same[~sure] = 0
     octaves = _spread(cv2.medianBlur(local, MEDIAN_CELLS).astype(np.float32) - 128, same) / STEPS_PER_OCTAVE
-    unevenness = float(octaves[sure].mean(axis=1).std())
+    unevenness = float(_chosen(octaves, sure).mean(axis=1).std())
     return Light(exponents, offsets, np.exp2(octaves).astype(np.float32), unevenness)
 
 
@@ -84,6 +86,11 @@ def relit(image: Bgr, light: Light, out: Bgr | None = None) -> Bgr:
     gains = _SCRATCH.take("gains", (image.shape[0], image.shape[1]), (3,), np.uint16)
     cv2.resize(coarse, image.shape[1::-1], dst=gains, interpolation=cv2.INTER_LINEAR)
     return relight(image, table, gains, out)
+
+
+def _chosen(values: NDArray[np.float32], sure: Mask | None) -> NDArray[np.float32]:
+    """Values (h, w, 3) of the cells that are `sure` (h, w), of all without it: (N, 3)."""
+    return values.reshape(-1, 3) if sure is None else values[sure]
 
 
 def _sameness(reference: Bgr, query: Bgr, size: tuple[int, int]) -> NDArray[np.float32]:
@@ -136,13 +143,15 @@ def middle(values: NDArray[Any]) -> Any:
 
 def _exponent(before: NDArray[np.float32], after: NDArray[np.float32]) -> float:
     """The slope of `after` over `before` by re-weighted least squares, drawn to one where there is little to see."""
-    weights: Anything = np.ones_like(before)
     prior = 2e-4 * before.size
-    slope = 1.0
-    for _ in range(4):
+
+    def weighted_slope(weights: Anything) -> float:
         weighted = weights * before
-        slope = float((weighted @ after + prior) / (weighted @ before + prior))
+        return float((weighted @ after + prior) / (weighted @ before + prior))
+
+    slope = weighted_slope(np.ones_like(before))
+    for _ in range(3):
         rest = after - np.float32(slope) * before
         scale = max(1.5 * float(middle(np.abs(rest))), 0.01)
-        weights = 1 / (1 + (rest / np.float32(scale)) ** 2)
+        slope = weighted_slope(1 / (1 + (rest / np.float32(scale)) ** 2))
     return float(np.clip(slope, 0.5, 2.0))

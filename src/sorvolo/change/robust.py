@@ -137,16 +137,17 @@ def _result(
     if not sure.any():
         nothing = np.zeros(size[::-1], np.uint8), np.zeros((0, 4), np.int64), np.zeros(0)
         return RobustResult(*nothing, light, settling, regions.noise, known)
-    _, parts = cv2.connectedComponents(regions.weak, connectivity=8)
+    count, parts = cv2.connectedComponents(regions.weak, connectivity=8)
     went = _went(regions, parts)
     half = regions.labels.shape[::-1]
     boxes_px = regions.boxes.astype(np.float64)
     if settling.moved_px < SAME_PLACE_PX or not (sure & went).any():
-        half_mask = _filled(sure, regions, parts)
+        half_mask = _filled(sure, regions, parts, count)
     else:  # what disappeared is seen in the reference: it keeps the reference's pixels
-        gone: Anything = _filled(sure & went, regions, parts)
+        gone: Anything = _filled(sure & went, regions, parts, count)
         gone = cv2.warpPerspective(gone, settling.reference_from_query, half, flags=cv2.INTER_LINEAR)
-        half_mask = np.asarray(cv2.max(_filled(sure & ~went, regions, parts), gone), np.uint8)
+        stays = sure & ~went
+        half_mask = np.asarray(cv2.max(_filled(stays, regions, parts, count), gone) if stays.any() else gone, np.uint8)
         middle = boxes_px[:, :2] + boxes_px[:, 2:] / 2
         moved = np.column_stack([middle, np.ones(len(middle))]) @ settling.reference_from_query.T
         boxes_px[went, :2] += (moved[:, :2] / moved[:, 2:] - middle)[went]
@@ -168,16 +169,17 @@ def _went(regions: Regions, parts: Anything) -> Mask:
     return np.asarray(came[part[1:]] < 0)
 
 
-def _filled(chosen: Mask, regions: Regions, parts: Anything) -> ImageGray:
+def _filled(chosen: Mask, regions: Regions, parts: Anything, count: int) -> ImageGray:
     """The `chosen` (N,) regions with what weakly differs around their cores, less a rim of blur, and without gaps.
 
-    Where a thing has the ground's own colour nothing differs: what is nearly convex is taken to be so.
+    `parts` (h, w) are the weakly differing pieces, 0 .. `count` - 1, 0 none. Where a thing has the ground's own colour
+    nothing differs: what is nearly convex is taken to be so.
     """
     size = regions.labels.shape[0], regions.labels.shape[1]
     cores, around, whole = _SCRATCH.stack("filled", size, 3)
     looked_up(regions.labels, np.concatenate([[0], chosen * np.uint8(255)]).astype(np.uint8), cores)
     window = np.ones((5, 5), np.uint8)  # two blurs of 3 px reach two pixels out
-    held = np.zeros(int(parts.max()) + 1, bool)
+    held = np.zeros(count, bool)
     for region in np.flatnonzero(chosen):
         x, y, wide, high = regions.boxes[region]
         place = slice(y, y + high), slice(x, x + wide)

@@ -26,25 +26,35 @@ using Integers32 = pybind11::array_t<std::int32_t, pybind11::array::c_style>;
 using Words = pybind11::array_t<std::uint16_t, pybind11::array::c_style>;
 using Doubles = pybind11::array_t<double, pybind11::array::c_style>;
 
+constexpr std::ptrdiff_t RUN = 3 * 512;
+
+// A run at a time: tables are read value by value, the rest is done for many values at once.
 ROBUST_CLONES
-void relight_pixels(const std::uint8_t *from, const std::int32_t *curves, const std::uint16_t *gains, std::uint8_t *to,
-                    std::int64_t pixels) {
-    for (std::int64_t at = 0; at < pixels * 3; at += 3) {
-        for (int channel = 0; channel < 3; ++channel) {
-            const std::int32_t product = curves[channel * 256 + from[at + channel]] * gains[at + channel];
-            to[at + channel] = static_cast<std::uint8_t>(std::clamp(((product + (1 << 15)) >> 16) - 8, 0, 255));
+void relight_values(const std::uint8_t *from, const std::uint16_t *curves, const std::uint16_t *gains, std::uint8_t *to,
+                    std::ptrdiff_t values) {
+    std::uint16_t lifted[RUN];
+    for (; values > 0; values -= RUN, from += RUN, gains += RUN, to += RUN) {
+        const std::ptrdiff_t count = std::min(values, RUN);
+        for (std::ptrdiff_t at = 0; at < count; at += 3)
+            for (int channel = 0; channel < 3; ++channel)
+                lifted[at + channel] = curves[channel * 256 + from[at + channel]];
+        SORVOLO_INDEPENDENT
+        for (std::ptrdiff_t at = 0; at < count; ++at) {
+            const std::int32_t product = static_cast<std::int32_t>(lifted[at]) * gains[at];
+            to[at] = static_cast<std::uint8_t>(std::clamp(((product + (1 << 15)) >> 16) - 8, 0, 255));
         }
     }
 }
 
 void relight(const Bytes &image, const Integers32 &curves, const Words &gains, Bytes &lit) {
     const std::uint8_t *from = image.data();
-    const std::int32_t *curve = curves.data();
     const std::uint16_t *gain = gains.data();
     std::uint8_t *to = lit.mutable_data();
-    const std::int64_t pixels = image.shape(0) * image.shape(1);
+    std::uint16_t curve[3 * 256];
+    std::copy(curves.data(), curves.data() + 3 * 256, curve);
+    const std::ptrdiff_t values = image.shape(0) * image.shape(1) * 3;
     pybind11::gil_scoped_release released;
-    relight_pixels(from, curve, gain, to, pixels);
+    relight_values(from, curve, gain, to, values);
 }
 
 // How much redder than blue the query is against the reference, in quarter steps of `logs`, rounded to even, 128 alike.
@@ -73,32 +83,55 @@ void tint(const Bytes &reference, const Bytes &query, const Bytes &logs, const I
     }
 }
 
-// Along each region's rim, two pixels wide: the sum of `came` less that of `went`.
+// Along a region's rim, two pixels wide: the sum of `came` less that of `went`. `box` is the region's.
+ROBUST_CLONES
+std::int64_t balance_of(const std::int32_t *label, const std::uint8_t *came, const std::uint8_t *went,
+                        std::ptrdiff_t width, std::ptrdiff_t height, const std::int32_t *box, std::int32_t number,
+                        std::vector<std::uint8_t> &work) {
+    const std::ptrdiff_t left = box[0], top = box[1], wide = box[2], bottom = top + box[3];
+    const std::ptrdiff_t first = std::max<std::ptrdiff_t>(top - 2, 0), last = std::min(bottom + 2, height);
+    work.assign(static_cast<std::size_t>((last - first + 2) * wide + 4), 0);
+    std::uint8_t *near = work.data(), *none = near + (last - first) * wide, *rim = none + wide + 4;
+    const std::ptrdiff_t from = std::max<std::ptrdiff_t>(left - 2, 0), to = std::min(left + wide + 2, width);
+    for (std::ptrdiff_t y = first; y < last; ++y) {
+        const std::int32_t *row = label + y * width;
+        std::uint8_t *here = none - (left - 2);
+        SORVOLO_INDEPENDENT
+        for (std::ptrdiff_t x = from; x < to; ++x) here[x] = row[x] == 0;
+        std::uint8_t *line = near + (y - first) * wide;
+        SORVOLO_INDEPENDENT
+        for (std::ptrdiff_t x = 0; x < wide; ++x)
+            line[x] = none[x] | none[x + 1] | none[x + 2] | none[x + 3] | none[x + 4];
+    }
+    std::int64_t sum = 0;
+    for (std::ptrdiff_t y = top; y < bottom; ++y) {
+        std::memset(rim, 0, wide);
+        for (std::ptrdiff_t beside = std::max(y - 2, first); beside < std::min(y + 3, last); ++beside) {
+            const std::uint8_t *line = near + (beside - first) * wide;
+            SORVOLO_INDEPENDENT
+            for (std::ptrdiff_t x = 0; x < wide; ++x) rim[x] |= line[x];
+        }
+        const std::ptrdiff_t at = y * width + left;
+        std::int32_t along = 0;
+        for (std::ptrdiff_t x = 0; x < wide; ++x) {
+            const std::int32_t more = came[at + x] - went[at + x];
+            along += label[at + x] == number && rim[x] ? more : 0;
+        }
+        sum += along;
+    }
+    return sum;
+}
+
 Integers64 rim_balance(const Integers32 &labels, const Integers32 &boxes, const Bytes &came, const Bytes &went) {
-    const int height = static_cast<int>(labels.shape(0)), width = static_cast<int>(labels.shape(1));
+    const std::ptrdiff_t height = labels.shape(0), width = labels.shape(1);
     Integers64 balance({boxes.shape(0)});
     const std::int32_t *label = labels.data(), *box = boxes.data();
     const std::uint8_t *plus = came.data(), *minus = went.data();
     std::int64_t *to = balance.mutable_data();
     pybind11::gil_scoped_release released;
-    for (pybind11::ssize_t region = 0; region < boxes.shape(0); ++region, box += 4) {
-        std::int64_t sum = 0;
-        for (int y = box[1]; y < box[1] + box[3]; ++y) {
-            for (int x = box[0]; x < box[0] + box[2]; ++x) {
-                const std::int64_t at = static_cast<std::int64_t>(y) * width + x;
-                if (label[at] != region + 1) continue;
-                const int first = std::max(x - 2, 0), last = std::min(x + 2, width - 1);
-                bool is_rim = false;
-                for (int ny = std::max(y - 2, 0); ny <= std::min(y + 2, height - 1) && !is_rim; ++ny) {
-                    const std::int32_t *row = label + static_cast<std::int64_t>(ny) * width;
-                    is_rim = row[first] == 0 || row[last] == 0 || row[x] == 0 || row[std::min(first + 1, last)] == 0 ||
-                             row[std::max(last - 1, first)] == 0;
-                }
-                if (is_rim) sum += static_cast<std::int64_t>(plus[at]) - minus[at];
-            }
-        }
-        to[region] = sum;
-    }
+    std::vector<std::uint8_t> work;
+    for (pybind11::ssize_t region = 0; region < boxes.shape(0); ++region, box += 4)
+        to[region] = balance_of(label, plus, minus, width, height, box, static_cast<std::int32_t>(region) + 1, work);
     return balance;
 }
 
@@ -113,34 +146,50 @@ void looked_up(const Integers32 &labels, const Bytes &table, Bytes &out) {
 
 // Which values lie over their thresholds, 1 or 0.
 ROBUST_CLONES
-void mark_over(const std::uint8_t *value, const std::uint8_t *threshold, std::uint8_t *to, std::int64_t pixels) {
-    for (std::int64_t at = 0; at < pixels; ++at) to[at] = value[at] > threshold[at];
+void mark_over(const std::uint8_t *value, const std::uint8_t *threshold, std::uint8_t *to, std::ptrdiff_t pixels) {
+    SORVOLO_INDEPENDENT
+    for (std::ptrdiff_t at = 0; at < pixels; ++at) to[at] = value[at] > threshold[at];
 }
 
+// Pixels with an even margin of one all around: rows are `stride` long, the margin at the end of one is that at the
+// start of the next.
+struct Margined {
+    std::ptrdiff_t width, height, stride;
+    std::vector<std::uint8_t> pixels;
+
+    Margined(std::ptrdiff_t columns, std::ptrdiff_t rows)
+        : width(columns), height(rows), stride(columns + 1),
+          pixels(static_cast<std::size_t>((rows + 2) * stride + 1), 0) {}
+    std::uint8_t *row(std::ptrdiff_t y) { return pixels.data() + (y + 1) * stride + 1; }
+    void take(const std::uint8_t *from) {
+        for (std::ptrdiff_t y = 0; y < height; ++y) std::memcpy(row(y), from + y * width, width);
+    }
+};
+
 // Hands each 8-connected part of `left`, whose pixels are 1 or 0, to `take`, in order of first pixels; clears it.
+// Pixels are told by where they lie in `left.pixels`.
 template <typename Take>
-void collect_parts(int width, int height, std::vector<std::uint8_t> &left, Take take) {
+void collect_parts(Margined &left, Take take) {
+    const std::ptrdiff_t size = static_cast<std::ptrdiff_t>(left.pixels.size()), stride = left.stride;
+    const std::ptrdiff_t around[8] = {-stride - 1, -stride, -stride + 1, -1, 1, stride - 1, stride, stride + 1};
+    std::uint8_t *is_left = left.pixels.data();
     std::vector<std::int32_t> part;
-    const std::int32_t pixels = width * height;
-    for (std::int32_t start = 0; start < pixels; ++start) {
+    for (std::ptrdiff_t start = 0; start < size; ++start) {
         std::uint64_t eight;
-        for (; start + 8 <= pixels; start += 8) {
-            std::memcpy(&eight, left.data() + start, 8);
+        for (; start + 8 <= size; start += 8) {
+            std::memcpy(&eight, is_left + start, 8);
             if (eight) break;
         }
-        while (start < pixels && !left[start]) ++start;
-        if (start == pixels) break;
-        part.assign(1, start);
-        left[start] = 0;
+        while (start < size && !is_left[start]) ++start;
+        if (start == size) break;
+        part.assign(1, static_cast<std::int32_t>(start));
+        is_left[start] = 0;
         for (std::size_t next = 0; next < part.size(); ++next) {
-            const int x = part[next] % width, y = part[next] / width;
-            for (int ny = std::max(y - 1, 0); ny <= std::min(y + 1, height - 1); ++ny) {
-                for (int nx = std::max(x - 1, 0); nx <= std::min(x + 1, width - 1); ++nx) {
-                    const std::int32_t near = ny * width + nx;
-                    if (!left[near]) continue;
-                    left[near] = 0;
-                    part.push_back(near);
-                }
+            const std::ptrdiff_t here = part[next];
+            for (const std::ptrdiff_t step : around) {
+                if (!is_left[here + step]) continue;
+                is_left[here + step] = 0;
+                part.push_back(static_cast<std::int32_t>(here + step));
             }
         }
         take(part);
@@ -154,18 +203,20 @@ struct Core {
 
 pybind11::tuple core_regions(const Bytes &values, const Bytes &thresholds, double strong, double core, int least_area,
                              int most) {
-    const int height = static_cast<int>(values.shape(0)), width = static_cast<int>(values.shape(1));
-    const std::uint8_t *value = values.data(), *threshold = thresholds.data();
+    const std::ptrdiff_t height = values.shape(0), width = values.shape(1);
+    const std::uint8_t *value_rows = values.data(), *threshold_rows = thresholds.data();
     Integers32 labels({values.shape(0), values.shape(1)});
     std::int32_t *label = labels.mutable_data();
-    std::vector<Core> cores;
+    std::vector<std::int32_t> found;
     {
         pybind11::gil_scoped_release released;
-        const std::int64_t pixels = static_cast<std::int64_t>(width) * height;
-        std::fill(label, label + pixels, 0);
-        std::vector<std::uint8_t> weak(pixels), inside(pixels, 0);
-        mark_over(value, threshold, weak.data(), pixels);
-        collect_parts(width, height, weak, [&](const std::vector<std::int32_t> &part) {
+        std::fill(label, label + width * height, 0);
+        Margined weak(width, height), inside(width, height), held(width, height), limits(width, height);
+        held.take(value_rows), limits.take(threshold_rows);
+        for (std::ptrdiff_t y = 0; y < height; ++y)
+            mark_over(value_rows + y * width, threshold_rows + y * width, weak.row(y), width);
+        const std::uint8_t *value = held.pixels.data(), *threshold = limits.pixels.data();
+        collect_parts(weak, [&](const std::vector<std::int32_t> &part) {
             std::int64_t total = 0, squares = 0;
             int strong_ones = 0;
             for (const std::int32_t at : part) {
@@ -175,9 +226,10 @@ pybind11::tuple core_regions(const Bytes &values, const Bytes &thresholds, doubl
             if (strong_ones < 2) return;
             const double least = core * static_cast<double>(squares) / static_cast<double>(total);
             for (const std::int32_t at : part)
-                if (static_cast<double>(value[at]) > least) inside[at] = 1;
+                if (static_cast<double>(value[at]) > least) inside.pixels[at] = 1;
         });
-        collect_parts(width, height, inside, [&](const std::vector<std::int32_t> &part) {
+        std::vector<Core> cores;
+        collect_parts(inside, [&](const std::vector<std::int32_t> &part) {
             if (static_cast<int>(part.size()) < least_area) return;
             std::int64_t total = 0;
             for (const std::int32_t at : part) total += value[at];
@@ -185,21 +237,54 @@ pybind11::tuple core_regions(const Bytes &values, const Bytes &thresholds, doubl
         });
         std::stable_sort(cores.begin(), cores.end(), [](const Core &a, const Core &b) { return a.total > b.total; });
         if (static_cast<int>(cores.size()) > most) cores.resize(most);
-        for (std::size_t each = 0; each < cores.size(); ++each)
-            for (const std::int32_t at : cores[each].pixels) label[at] = static_cast<std::int32_t>(each) + 1;
-    }
-    Integers32 boxes({static_cast<pybind11::ssize_t>(cores.size()), pybind11::ssize_t(4)});
-    std::int32_t *box = boxes.mutable_data();
-    for (const Core &each : cores) {
-        int left = width, right = 0, top = height, bottom = 0;
-        for (const std::int32_t at : each.pixels) {
-            left = std::min(left, at % width), right = std::max(right, at % width);
-            top = std::min(top, at / width), bottom = std::max(bottom, at / width);
+        for (std::size_t each = 0; each < cores.size(); ++each) {
+            std::ptrdiff_t left = width, right = 0, top = height, bottom = 0;
+            for (const std::int32_t at : cores[each].pixels) {
+                const std::ptrdiff_t y = at / weak.stride - 1, x = at % weak.stride - 1;
+                label[y * width + x] = static_cast<std::int32_t>(each) + 1;
+                left = std::min(left, x), right = std::max(right, x);
+                top = std::min(top, y), bottom = std::max(bottom, y);
+            }
+            for (const std::ptrdiff_t side : {left, top, right - left + 1, bottom - top + 1})
+                found.push_back(static_cast<std::int32_t>(side));
         }
-        box[0] = left, box[1] = top, box[2] = right - left + 1, box[3] = bottom - top + 1;
-        box += 4;
     }
+    Integers32 boxes({static_cast<pybind11::ssize_t>(found.size() / 4), pybind11::ssize_t(4)});
+    std::copy(found.begin(), found.end(), boxes.mutable_data());
     return pybind11::make_tuple(labels, boxes);
+}
+
+// Adds up one region's window, columns left .. right - 1: `to` are count, sums and sums of squares of each of the
+// `channels`, for the region and then for what is of no region. `masks` holds twice the picture's width.
+ROBUST_CLONES
+void measure_region(const std::int32_t *label, const std::uint8_t *const *channels, std::ptrdiff_t count,
+                    std::ptrdiff_t width, std::ptrdiff_t left, std::ptrdiff_t right, std::ptrdiff_t top,
+                    std::ptrdiff_t bottom, std::int32_t number, std::uint8_t *masks, std::int64_t *to) {
+    // whole sixteens of columns, those beside the window masked: nothing is left over to be summed one by one
+    const std::ptrdiff_t wide = std::min((right - left + 15) / 16 * 16, width), begin = std::min(left, width - wide);
+    std::uint8_t *mine = masks, *around = masks + wide;
+    std::memset(masks, 0, 2 * wide);
+    std::int64_t *to_around = to + 2 * count + 1;
+    for (std::ptrdiff_t y = top; y < bottom; ++y) {
+        const std::int32_t *row = label + y * width + begin;
+        std::int32_t mine_count = 0, around_count = 0;
+        SORVOLO_INDEPENDENT
+        for (std::ptrdiff_t x = left - begin; x < right - begin; ++x) {
+            mine[x] = row[x] == number ? 255 : 0, around[x] = row[x] == 0 ? 255 : 0;
+            mine_count += row[x] == number, around_count += row[x] == 0;
+        }
+        to[0] += mine_count, to_around[0] += around_count;
+        for (std::ptrdiff_t channel = 0; channel < count; ++channel) {
+            const std::uint8_t *values = channels[channel] + y * width + begin;
+            std::int32_t sum = 0, squares = 0, sum_around = 0, squares_around = 0;
+            for (std::ptrdiff_t x = 0; x < wide; ++x) {
+                const std::int16_t a = values[x] & mine[x], b = values[x] & around[x];
+                sum += a, squares += a * a, sum_around += b, squares_around += b * b;
+            }
+            to[1 + channel] += sum, to[1 + count + channel] += squares;
+            to_around[1 + channel] += sum_around, to_around[1 + count + channel] += squares_around;
+        }
+    }
 }
 
 Integers64 measure_regions(const Integers32 &labels, const Integers32 &boxes, const std::vector<Bytes> &channels,
@@ -214,23 +299,12 @@ Integers64 measure_regions(const Integers32 &labels, const Integers32 &boxes, co
     std::int64_t *to = sums.mutable_data();
     pybind11::gil_scoped_release released;
     std::fill(to, to + regions * 2 * fields, 0);
+    std::vector<std::uint8_t> masks(2 * static_cast<std::size_t>(width));
     for (pybind11::ssize_t region = 0; region < regions; ++region, box += 4, to += 2 * fields) {
         const int left = std::max(box[0] - margin, 0), right = std::min(box[0] + box[2] + margin, width);
         const int top = std::max(box[1] - margin, 0), bottom = std::min(box[1] + box[3] + margin, height);
-        for (int y = top; y < bottom; ++y) {
-            for (int x = left; x < right; ++x) {
-                const std::int64_t at = static_cast<std::int64_t>(y) * width + x;
-                const std::int32_t here = label[at];
-                if (here != 0 && here != region + 1) continue;
-                std::int64_t *row = here == 0 ? to + fields : to;
-                ++row[0];
-                for (int channel = 0; channel < count; ++channel) {
-                    const std::int32_t value = values[channel][at];
-                    row[1 + channel] += value;
-                    row[1 + count + channel] += value * value;
-                }
-            }
-        }
+        measure_region(label, values.data(), count, width, left, right, top, bottom,
+                       static_cast<std::int32_t>(region) + 1, masks.data(), to);
     }
     return sums;
 }
