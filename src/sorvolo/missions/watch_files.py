@@ -60,6 +60,7 @@ class WatchFiles:
         self._crops_bytes = 0
         self._best: dict[int, Sighting] = {}
         self.crop_names: dict[int, str] = {}
+        self._forgotten: list[str] = []
         self._told_s = time.monotonic()
         self._labelled: list[tuple[LabelledPicture, Floats]] = []
         self._classes: tuple[str, ...] = ()
@@ -101,11 +102,13 @@ class WatchFiles:
         return self.crop_names.get(track.id)
 
     def forget(self, track_ids: Iterable[int]) -> None:
-        """Remove the crops of tracks that turned out to be others."""
-        for track_id in track_ids:
-            name = self.crop_names.pop(track_id, None)
-            if name is not None:
-                (self.folder / name).unlink(missing_ok=True)
+        """The crops of tracks that turned out to be others belong to nothing any more; `clear` removes them."""
+        self._forgotten += [name for each in track_ids if (name := self.crop_names.pop(each, None)) is not None]
+
+    def clear(self) -> None:
+        """Remove the crops that were forgotten; not earlier, for whom an alert told may still be looking at them."""
+        for name in self._forgotten:
+            (self.folder / name).unlink(missing_ok=True)
 
     def show(self, tracks: Iterable[Track]) -> None:
         """Bring `tracks.geojson` up to date, unless that was done within the last seconds."""

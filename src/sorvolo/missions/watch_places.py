@@ -19,6 +19,7 @@ from sorvolo.tracking.locate import locate
 from sorvolo.tracking.tracker import IN_PICTURES, Tracker, TrackerSettings, TrackUpdate
 
 _MOST_DRONE_PLACES = 200_000
+_GIMBAL_TILT_SIGMA_DEG = 1.0  # a mapping doubts gimbals more, since the pictures tell it better; here nothing else does
 _OF_MAPS = ("no_telemetry", "ground_unknown", "height_unknown")  # notices that say what a mapping does about it
 
 
@@ -146,7 +147,10 @@ class GroundPlaces:
             return prior
         sigma = prior.position_sigma_m.copy()
         sigma[2] = np.hypot(sigma[2], track.altitude_offset_sigma_m)
-        return replace(prior, position_sigma_m=sigma)
+        attitude = prior.attitude_sigma_deg.copy()
+        if track.attitude == "gimbal":
+            attitude[:2] = np.minimum(attitude[:2], _GIMBAL_TILT_SIGMA_DEG)
+        return replace(prior, position_sigma_m=sigma, attitude_sigma_deg=attitude)
 
 
 class _Turning:

@@ -128,6 +128,7 @@ class WatchRun:
             self._files.close()
             self._teller.tell_finally(tracks)
             self._teller.close(_LAST_ALERTS_S, _LAST_EVENTS_S)
+            self._files.clear()
             site, crop_names = self._places.site, self._files.crop_names
             write_detections_geojson(self._folder, site)
             write_tracks(self._folder, tracks, site, crop_names)
