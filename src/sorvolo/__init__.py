@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     )
     from sorvolo.missions.compare_flights import compare_flights
     from sorvolo.missions.evaluate_changes import evaluate_changes
+    from sorvolo.missions.evaluate_detector import EvaluationSettings, evaluate_detector, read_sets, write_evaluation
     from sorvolo.missions.evaluate_mosaic import evaluate_mosaic
+    from sorvolo.missions.evaluate_objects import evaluate_objects
     from sorvolo.missions.inspect_input import inspect_input
     from sorvolo.missions.map_flight import map_flights
     from sorvolo.missions.plan_flight import (
@@ -33,14 +35,21 @@ if TYPE_CHECKING:
         write_plan,
     )
     from sorvolo.missions.settings import CompareSettings, MapSettings
+    from sorvolo.missions.simulate_pictures import simulate_pictures
     from sorvolo.missions.simulate_site import simulate_site
+    from sorvolo.missions.train_detector import train_detector
+    from sorvolo.missions.train_settings import TrainSettings
+    from sorvolo.missions.training_sets import DataOptions
     from sorvolo.missions.watch import watch
     from sorvolo.missions.watch_run import WatchUpdate
     from sorvolo.missions.watch_settings import WatchOutputs, WatchSettings
+    from sorvolo.simulation.pictures import PictureSettings
     from sorvolo.simulation.presets import preset, preset_names
     from sorvolo.simulation.settings import SimulationSettings
     from sorvolo.store.archive import Archive
+    from sorvolo.store.datasets import read_dataset
     from sorvolo.survey.findings import Verdict
+    from sorvolo.survey.objects import Detections
 
 __version__ = "0.1.0"
 
@@ -48,10 +57,14 @@ __all__ = [
     "Archive",
     "CompareSettings",
     "Comparison",
+    "DataOptions",
+    "Detections",
     "Detector",
+    "EvaluationSettings",
     "GeometryError",
     "InputError",
     "MapSettings",
+    "PictureSettings",
     "PlanSettings",
     "RobustSettings",
     "SettingsError",
@@ -59,6 +72,7 @@ __all__ = [
     "SorvoloError",
     "StoreError",
     "ThesisSettings",
+    "TrainSettings",
     "Verdict",
     "WatchOutputs",
     "WatchSettings",
@@ -70,7 +84,9 @@ __all__ = [
     "compare_flights",
     "compare_images",
     "evaluate_changes",
+    "evaluate_detector",
     "evaluate_mosaic",
+    "evaluate_objects",
     "find_views",
     "inspect_input",
     "map_flights",
@@ -80,10 +96,15 @@ __all__ = [
     "preset",
     "preset_names",
     "read_area",
+    "read_dataset",
+    "read_sets",
+    "simulate_pictures",
     "simulate_site",
     "thesis_steps",
+    "train_detector",
     "watch",
     "write_calibration",
+    "write_evaluation",
     "write_plan",
 ]
 
@@ -97,21 +118,30 @@ _HOMES = {
     "missions.calibrate_camera": ("calibrate_camera", "find_views", "parse_board", "write_calibration"),
     "missions.compare_flights": ("compare_flights",),
     "missions.evaluate_changes": ("evaluate_changes",),
+    "missions.evaluate_detector": ("EvaluationSettings", "evaluate_detector", "read_sets", "write_evaluation"),
     "missions.evaluate_mosaic": ("evaluate_mosaic",),
+    "missions.evaluate_objects": ("evaluate_objects",),
     "missions.inspect_input": ("inspect_input",),
     "missions.map_flight": ("map_flights",),
     "missions.plan_flight": (
         "PlanSettings", "answer_questions", "camera_to_plan_with", "plan_over", "write_plan",
     ),
     "missions.settings": ("CompareSettings", "MapSettings"),
+    "missions.simulate_pictures": ("simulate_pictures",),
     "missions.simulate_site": ("simulate_site",),
+    "missions.train_detector": ("train_detector",),
+    "missions.train_settings": ("TrainSettings",),
+    "missions.training_sets": ("DataOptions",),
     "missions.watch": ("watch",),
     "missions.watch_run": ("WatchUpdate",),
     "missions.watch_settings": ("WatchOutputs", "WatchSettings"),
+    "simulation.pictures": ("PictureSettings",),
     "simulation.presets": ("preset", "preset_names"),
     "simulation.settings": ("SimulationSettings",),
     "store.archive": ("Archive",),
+    "store.datasets": ("read_dataset",),
     "survey.findings": ("Verdict",),
+    "survey.objects": ("Detections",),
 }
 
 
