@@ -1,6 +1,9 @@
 """What sends live streams in tests: simulated drones that speak MPEG-TS, KLV and NMEA over the loopback."""
 
+import json
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -109,3 +112,18 @@ def sending(url: str, **kwargs: Any) -> Iterator[Sender]:
 
 def udp_url(port: int) -> str:
     return f"udp://127.0.0.1:{port}?pkt_size=1316"
+
+
+@contextmanager
+def sending_apart(url: str, **kwargs: Any) -> Iterator["subprocess.Popen[bytes]"]:
+    """The same in a process of its own: PyAV's writers hold Python's lock while they wait for the other side."""
+    process = subprocess.Popen([sys.executable, __file__, url, json.dumps(kwargs)])
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+if __name__ == "__main__":
+    Sender(sys.argv[1], **json.loads(sys.argv[2])).run()

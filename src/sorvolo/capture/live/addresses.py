@@ -14,6 +14,11 @@ STREAM_SCHEMES = ("rtsp", "rtsps", "rtmp", "rtmps", "udp", "rtp", "tcp", "srt", 
 """Addresses of streams, as `scheme://...`."""
 
 _WAITING = frozenset({"udp", "rtp"})  # a sender may begin at any time; nothing has to be dialled
+# without a host: the usual port, and how FFmpeg is told to be the server that a drone pushes its video to
+_LISTENING: Mapping[str, tuple[int, Mapping[str, str]]] = {
+    "rtmp": (1935, {"listen": "1"}), "tcp": (0, {"listen": "1"}),
+    "rtsp": (554, {"rtsp_flags": "listen", "listen_timeout": "3"}),
+}
 # live: nothing is held back for a smoother picture, and a damaged packet does not end the stream
 _COMMON = {
     "fflags": "nobuffer+discardcorrupt", "flags": "low_delay", "analyzeduration": "1000000", "probesize": "5000000",
@@ -24,6 +29,7 @@ _BY_SCHEME: Mapping[str, Mapping[str, str]] = {
     "rtmp": {"rtmp_live": "live"},
     "http": {"protocol_whitelist": "http,https,tls,tcp"},  # whatever a playlist may name
     "https": {"protocol_whitelist": "http,https,tls,tcp"},
+    "tcp": {"protocol_whitelist": "tcp"},
     "udp": {"fifo_size": "57344", "overrun_nonfatal": "1"},  # 188-byte packets: 10 MB
 }
 
@@ -54,6 +60,7 @@ def is_live_address(text: str) -> bool:
 def live_address(text: str) -> StreamAddress | FollowedPath:
     """What `rtsp://...`, `udp://:5000`, `webcam:0`, `/dev/video0`, `follow:PATH` and the like name.
 
+    Without a host (`rtmp://:1935/live`, `tcp://:5000`) a stream is waited for, as drones push theirs.
     `webcam:0?size=1280x720&rate=30` asks a webcam for a size and rate; what stands behind the `?` of a stream's
     address is FFmpeg's. Raises InputError for an address that cannot be, or a protocol that this FFmpeg lacks.
     """
@@ -83,19 +90,20 @@ def _stream(text: str) -> StreamAddress:
     scheme = parts.scheme.lower()
     if scheme in ("udp", "rtp", "tcp") and port is None:
         raise InputError(f"{shown_address(text)} has no port; give for instance {scheme}://:5000")
-    if not parts.hostname and scheme not in ("udp", "rtp"):
-        example = f"{scheme}://192.168.1.10:{port or 554}/live"
-        raise InputError(f"{shown_address(text)} has no host; give for instance {example}")
+    if not parts.hostname and scheme not in (*_WAITING, *_LISTENING):
+        raise InputError(f"{shown_address(text)} has no host; give for instance {scheme}://192.168.1.10/live")
     if scheme == "srt" and not _has_protocol("srt"):
         raise InputError(
             "this PyAV was built without SRT; receive it with another program and pass it on, for instance: "
             "srt-live-transmit srt://HOST:PORT udp://127.0.0.1:5000, then give udp://:5000"
         )
-    # without a host FFmpeg listens nowhere: :5000 means every address of this machine
-    url = text if parts.hostname else text.replace("://", "://0.0.0.0", 1).replace("0.0.0.0@", "0.0.0.0", 1)
-    listens = scheme in _WAITING or "listen" in dict(parse_qsl(parts.query, keep_blank_values=True))
+    options = {**_COMMON, **_BY_SCHEME.get(scheme, {})}
+    url = text
+    if not parts.hostname:  # the sender calls us, at whichever address of this machine
+        url = urlunsplit(parts._replace(netloc=f"0.0.0.0:{port or _LISTENING[scheme][0]}"))
+        options |= _LISTENING[scheme][1] if scheme in _LISTENING else {}
     container = "mpegts" if scheme == "udp" else None
-    return StreamAddress(url, shown_address(text), container, {**_COMMON, **_BY_SCHEME.get(scheme, {})}, listens)
+    return StreamAddress(url, shown_address(text), container, options, not parts.hostname or scheme in _WAITING)
 
 
 def _webcam(device: str, query: str) -> StreamAddress:

@@ -21,13 +21,16 @@ from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemet
 
 _POLL_S = 0.25
 _SAME_ASPECT = 0.01
+_ENDS = (b"\xff\xd9", b"IEND")  # of a JPEG, of a PNG
+_TAIL_BYTES = 32
 
 
 class GrowingFolder:
     """A flight's photos as they are copied in; fulfils `capture.source.Source`. Made by `open_growing_folder`.
 
-    A photo is taken once its size has stood still between two looks, in the order of names among those that came
-    together; none is skipped. The flight has ended when nothing came for `give_up_s`, or when `until` is set.
+    A photo is taken once its size has stood still between two looks and its end is there, or nothing was added for
+    `silent_s`; in the order of names among those that came together. None is skipped. The flight has ended when
+    nothing came for `give_up_s`, or when `until` is set.
     """
 
     kind = "photos"
@@ -144,8 +147,10 @@ class GrowingFolder:
         for path in sorted(self._folder.iterdir()):
             if path.suffix.lower() not in PHOTO_SUFFIXES or path.name[0] == "." or path in self._seen:
                 continue
-            size = path.stat().st_size
-            if size and self._sizes.get(path) == size:
+            state = path.stat()
+            size, age_s = state.st_size, time.time() - state.st_mtime
+            is_still = size > 0 and self._sizes.get(path) == size
+            if is_still and (age_s > self._settings.silent_s or _has_its_end(path)):
                 self._seen.add(path)
                 self._ready.append(path)
             self._sizes[path] = size
@@ -179,6 +184,13 @@ class GrowingFolder:
 
     def _time_ns(self, metadata: PhotoMetadata) -> int:
         return metadata.utc_ns or metadata.local_ns or time.time_ns()
+
+
+def _has_its_end(path: Path) -> bool:
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
+        tail = file.read()
+    return any(end in tail for end in _ENDS)
 
 
 def open_growing_folder(

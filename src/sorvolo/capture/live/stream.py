@@ -302,13 +302,15 @@ class LiveStream:
     def _has_held_enough(self, newest: _Held) -> bool:
         assert self._held is not None and self._held_since is not None
         since_s, since_ns = self._held_since
-        # a file's frames come at once: what counts is how much of the flight was read
-        passed_s = (newest.stamp_ns - since_ns) / 1e9 if self._is_file else newest.arrived_s - since_s
+        told = sum(bool(each.time_ns) for _, each in self._held_told)
+        if self._is_file:  # its frames come at once: what counts is how much of the flight was read
+            passed_s, usual_s, is_told = (newest.stamp_ns - since_ns) / 1e9, 0.0, told >= _FIRST_FIXES
+        else:
+            passed_s, usual_s, is_told = newest.arrived_s - since_s, _HOLD_S, told > 0
         held_bytes = len(self._held) * newest.decoded.width * newest.decoded.height * 3 // 2
         if held_bytes > self._settings.most_bytes // 2:
             return True
-        expects_more = self.facts.has_metadata and not any(told.time_ns for _, told in self._held_told)
-        return passed_s >= (_HOLD_FOR_METADATA_S if expects_more or self._is_file else _HOLD_S)
+        return passed_s >= (_HOLD_FOR_METADATA_S if self.facts.has_metadata and not is_told else usual_s)
 
     def _settle(self) -> None:
         """The frames held so far tell how the stream's clock is tied; from here on they are given on as they come."""

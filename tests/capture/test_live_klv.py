@@ -1,0 +1,164 @@
+"""MISB ST 0601: published bytes, packets written and read again, noise, and angles composed as worked by hand."""
+
+from collections import Counter
+from math import isnan, nan
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sorvolo.capture.live.klv import ITEMS, UNIVERSAL_KEY, LocalSet, checksum, encode, local_sets
+from sorvolo.capture.live.klv_telemetry import (
+    camera_of,
+    columns_of,
+    ground_elevation_m,
+    site_from_sensor_rotation,
+)
+from sorvolo.errors import InputError
+from sorvolo.geometry.pose import gimbal_angles_from_rotation
+
+_TIME_NS = 1_760_000_000_123_456_000
+
+
+def one(data: bytes) -> LocalSet:
+    (found,) = local_sets(data, Counter())
+    return found
+
+
+def packet(*items: tuple[int, str]) -> bytes:
+    """A local set of tags with values in hexadecimal, its checksum right."""
+    body = b"".join(bytes([tag, len(value) // 2]) + bytes.fromhex(value) for tag, value in items)
+    start = UNIVERSAL_KEY + bytes([len(body) + 4]) + body + bytes([1, 2])
+    return start + checksum(start).to_bytes(2, "big")
+
+
+@pytest.mark.parametrize(("tag", "value", "expected"), [
+    # the examples that ST 0601 prints beside each tag
+    (5, "71C2", 159.974365), (6, "FD3D", -0.431531724), (7, "08B8", 3.405865657), (13, "5595B66D", 60.176822967),
+    (14, "5B5360C4", 128.426759042), (15, "C221", 14190.719463), (16, "CD9C", 144.571298), (17, "D917", 152.643625),
+    (18, "724A0A20", 160.719211474), (19, "87F84B86", -168.792324834), (20, "7DC55ECE", 176.865437691),
+    (21, "03830926", 68590.983298744), (23, "F101A229", -10.542388633), (24, "14BC082B", 29.157890123),
+    (25, "34F3", 3216.037232), (75, "C221", 14190.719463), (104, "2F921E", 23456.234375),
+])
+def test_published_values(tag: int, value: str, expected: float) -> None:
+    assert one(packet((tag, value)))[ITEMS[tag].name] == pytest.approx(expected, abs=6e-6 * max(1, abs(expected) / 60))
+
+
+def test_time_version_and_unknown_tags() -> None:
+    found = one(packet((2, "0004596B5FE6B8D8"), (3, "41424344"), (94, "0102"), (65, "13")))
+    assert found.time_ns == 0x0004596B5FE6B8D8 * 1000 and found.version == 0x13 and found.values == {}
+    assert one(packet((65, "13"))).time_ns == 0
+
+
+def test_lengths_other_than_the_usual_ones_are_the_same_range_in_other_steps() -> None:
+    assert one(packet((13, "55960000")))["sensor_latitude_deg"] == pytest.approx(60.18, abs=0.01)
+    assert one(packet((13, "5596")))["sensor_latitude_deg"] == pytest.approx(60.18, abs=0.01)
+    assert one(packet((15, "C2210000")))["sensor_true_altitude_m"] == pytest.approx(14190.6, abs=0.3)
+
+
+def test_error_values_are_unknown() -> None:
+    found = one(packet((6, "8000"), (13, "80000000"), (7, "0000")))
+    assert isnan(found["platform_pitch_deg"]) and isnan(found["sensor_latitude_deg"])
+    assert found["platform_roll_deg"] == 0 and isnan(found["slant_range_m"])
+
+
+def test_long_lengths_and_tags_of_two_bytes() -> None:
+    body = bytes([0x81, 0x05, 2, 1, 2]) + bytes([15, 0x81, 2, 0xC2, 0x21]) + bytes([1, 2])
+    start = UNIVERSAL_KEY + bytes([0x82, 0, len(body) + 2]) + body
+    found = one(start + checksum(start).to_bytes(2, "big"))
+    assert found["sensor_true_altitude_m"] == pytest.approx(14190.719, abs=1e-3)
+
+
+def test_sets_are_found_behind_a_header_and_damaged_ones_counted() -> None:
+    whole = encode(_TIME_NS, {"sensor_latitude_deg": 46.5})
+    flipped = bytearray(whole)
+    flipped[30] ^= 4
+    counts: Counter[str] = Counter()
+    # the access unit header of synchronous metadata stands before each set
+    data = b"\x00\x01\xdf\x00\x20" + whole + bytes(flipped) + b"\x00\x02\xdf\x00\x20" + whole + whole[:-5]
+    assert len(list(local_sets(data, counts))) == 2
+    assert counts == {"bad_checksum": 1, "damaged": 1}
+
+
+_VALUES = st.fixed_dictionaries({}, optional={
+    item.name: st.floats(item.lowest if not item.is_signed else -item.highest, item.highest) for item in ITEMS.values()
+})
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 2**62 // 1000), _VALUES)
+def test_what_is_written_is_read_again_within_half_a_step(time_us: int, values: dict[str, float]) -> None:
+    found = one(b"..." + encode(time_us * 1000, values) + b"...")
+    assert found.time_ns == time_us * 1000 and set(found.values) == set(values)
+    for item in ITEMS.values():
+        if item.name in values:
+            span = 2 * item.highest if item.is_signed else item.highest - item.lowest
+            step = 1 / 64 if item.is_imapb else span / (2 ** (8 * item.length) - 2)
+            assert abs(found[item.name] - values[item.name]) <= step * 0.51 + 1e-12
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=80), st.binary(max_size=80), st.integers(0, 60), st.integers(0, 255))
+def test_no_bytes_make_it_fail(before: bytes, after: bytes, place: int, value: int) -> None:
+    damaged = bytearray(encode(_TIME_NS, {"sensor_latitude_deg": 1.0, "slant_range_m": 3.0}))
+    damaged[place % len(damaged)] = value
+    for data in (before + UNIVERSAL_KEY + after, before + bytes(damaged) + after):
+        for found in local_sets(data, Counter()):
+            columns_of(found)
+
+
+def test_values_out_of_range_cannot_be_written() -> None:
+    with pytest.raises(InputError, match="outside its tag's"):
+        encode(0, {"platform_pitch_deg": 25.0})
+    with pytest.raises(InputError, match="no tag for height"):
+        encode(0, {"height": 1.0})
+    assert isnan(one(encode(0, {"platform_pitch_deg": nan}))["platform_pitch_deg"])
+
+
+@pytest.mark.parametrize(("platform", "relative", "yaw_pitch_roll"), [
+    ((90, 0, 0), (0, -90, 0), (90, -90, 0)),  # straight down, the picture's top to the nose, which is east
+    ((30, 0, 0), (60, -45, 0), (90, -45, 0)),  # level: headings add up
+    # nose 10 up, looking to the right: the horizon is level ahead of the camera, but its own right side, the
+    # aircraft's tail, hangs 10 deg down
+    ((0, 10, 0), (90, 0, 0), (90, 0, 10)),
+    # right wing 20 down, looking to the right: straight along that wing
+    ((0, 0, 20), (90, 0, 0), (90, -20, 0)),
+    # nose 10 up, looking ahead 90 deg below the nose: 80 deg below the horizon, leaning forward
+    ((0, 10, 0), (0, -90, 0), (0, -80, 0)),
+])
+def test_the_cameras_angles_are_composed_as_by_hand(
+    platform: tuple[float, ...], relative: tuple[float, ...], yaw_pitch_roll: tuple[float, ...]
+) -> None:
+    found = gimbal_angles_from_rotation(site_from_sensor_rotation(platform, relative))  # type: ignore[arg-type]
+    assert np.allclose((np.array(found) - yaw_pitch_roll + 180) % 360, 180, atol=1e-6)
+
+
+def test_columns() -> None:
+    told = one(encode(_TIME_NS, {
+        "platform_heading_deg": 90.0, "platform_pitch_full_deg": 40.0, "platform_pitch_deg": nan,
+        "platform_roll_deg": 0.0, "sensor_relative_azimuth_deg": 0.0, "sensor_relative_elevation_deg": -90.0,
+        "sensor_latitude_deg": 46.5, "sensor_longitude_deg": 11.3, "sensor_true_altitude_m": 160.0,
+        "sensor_ellipsoid_height_m": 212.0, "sensor_ellipsoid_height_extended_m": 210.0,
+        "frame_center_elevation_m": 100.0,
+    }))
+    columns = columns_of(told)
+    assert columns["orthometric_height_m"] == pytest.approx(160, abs=0.2)
+    assert columns["ellipsoidal_height_m"] == pytest.approx(210, abs=0.02)  # the finer tag wins
+    assert columns["camera_pitch_deg"] == pytest.approx(-50, abs=1e-3)
+    assert columns["body_pitch_deg"] == pytest.approx(40, abs=1e-3)
+    assert ground_elevation_m(told) == pytest.approx(100, abs=0.2)
+    bare = columns_of(one(encode(_TIME_NS, {"platform_heading_deg": 90.0, "sensor_latitude_deg": 46.5})))
+    assert set(bare) == {"latitude_deg", "body_yaw_deg"}
+
+
+def test_the_lens_from_the_field_of_view() -> None:
+    wide = camera_of(one(encode(0, {"sensor_horizontal_fov_deg": 60.0})), 1000, 500)
+    assert wide is not None and wide.camera.fx_px == pytest.approx(500 / np.tan(np.radians(30)), rel=1e-3)
+    both = {"sensor_horizontal_fov_deg": 60.0, "sensor_vertical_fov_deg": 33.0}
+    measured = camera_of(one(encode(0, both)), 1000, 500)
+    assert measured is not None and measured.camera.fy_px == pytest.approx(250 / np.tan(np.radians(16.5)), rel=1e-3)
+    # the vertical angle of the whole sensor does not fit a picture that was cut
+    cut = camera_of(one(encode(0, both | {"sensor_vertical_fov_deg": 46.0})), 1000, 500)
+    assert cut is not None and cut.camera.fy_px == cut.camera.fx_px
+    assert camera_of(one(encode(0, {})), 1000, 500) is None

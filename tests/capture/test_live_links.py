@@ -1,0 +1,198 @@
+"""A receiver's sentences by UDP, TCP, serial port and a growing log, beside a live stream."""
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from live_sender import EPOCH_NS, RATE, free_port, sending, udp_url
+
+from sorvolo.capture.live.links import NmeaLink
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.capture.live.stream import LiveStream
+from sorvolo.capture.source import open_sources
+from sorvolo.capture.telemetry.nmea import Epoch
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.missions.flight_setup import prepare
+from sorvolo.missions.settings import MapSettings
+
+S = 10**9
+SETTINGS = LiveSettings(keeps_all=True, silent_s=0.4, give_up_s=20.0)
+
+
+def sentences(utc_ns: int, seconds: float = 0.0) -> bytes:
+    """GGA and RMC of a flight north at 5 m/s, 160 m above the sea."""
+    moment = datetime.fromtimestamp(utc_ns / S, UTC)
+    clock = f"{moment:%H%M%S}.{moment.microsecond // 10_000:02d}"
+    minutes = 30 + 60 * 5.0 * seconds / 111_320
+    both = (
+        f"GNGGA,{clock},46{minutes:010.7f},N,01118.0000000,E,1,12,0.8,160.0,M,48.0,M,,",
+        f"GNRMC,{clock},A,46{minutes:010.7f},N,01118.0000000,E,9.719,0.00,{moment:%d%m%y},,,A",
+    )
+    told = b""
+    for body in both:
+        total = 0
+        for letter in body.encode():
+            total ^= letter
+        told += f"${body}*{total:02X}\r\n".encode()
+    return told
+
+
+@contextmanager
+def speaking(send: Callable[[bytes], object], every_s: float = 0.1) -> Iterator[None]:
+    """A receiver that tells the time and its place until the end."""
+    is_over, began_ns = threading.Event(), time.time_ns()
+
+    def speak() -> None:
+        while not is_over.wait(every_s):
+            now_ns = time.time_ns()
+            try:
+                send(sentences(now_ns, (now_ns - began_ns) / S))
+            except OSError:
+                return
+
+    thread = threading.Thread(target=speak, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        thread.join(2)
+
+
+class Ear:
+    """What a link gives on."""
+
+    def __init__(self) -> None:
+        self.epochs: list[tuple[int, Epoch]] = []
+        self._came = threading.Condition()
+
+    def __call__(self, arrived_ns: int, epoch: Epoch) -> None:
+        with self._came:
+            self.epochs.append((arrived_ns, epoch))
+            self._came.notify_all()
+
+    def wait(self, count: int, timeout_s: float = 10.0) -> bool:
+        with self._came:
+            return self._came.wait_for(lambda: len(self.epochs) >= count, timeout_s)
+
+    def is_right(self) -> bool:
+        return all(
+            0 <= arrived_ns - epoch.time_ns < 2 * S and epoch.values["orthometric_height_m"] == 160.0
+            and abs(epoch.values["speed_m_s"] - 5) < 0.01 for arrived_ns, epoch in self.epochs
+        )
+
+
+def heard_from(address: str, ear: Ear) -> NmeaLink:
+    link = NmeaLink(address, SETTINGS, ear)
+    link.start()
+    return link
+
+
+def test_udp() -> None:
+    port, ear = free_port(), Ear()
+    link = heard_from(f"udp://:{port}", ear)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        with speaking(lambda data: sender.sendto(data.rstrip(b"\r\n"), ("127.0.0.1", port))):
+            assert ear.wait(5)
+        silent_from_s = time.monotonic()
+        while not link.outages.silent_s and time.monotonic() < silent_from_s + 5:
+            time.sleep(0.02)
+        assert link.outages.silent_s > 0  # noticed, and told when it is over
+        count = len(ear.epochs)
+        with speaking(lambda data: sender.sendto(data, ("127.0.0.1", port))):
+            assert ear.wait(count + 3)
+    link.close()
+    assert ear.is_right()
+    assert [notice.code for notice in link.notices()] == ["telemetry_outage"]
+
+
+def test_tcp_that_breaks_is_called_again() -> None:
+    ear = Ear()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = heard_from(f"tcp://127.0.0.1:{server.getsockname()[1]}", ear)
+        for round_ in range(1, 3):
+            connection, _ = server.accept()
+            with connection, speaking(connection.sendall):
+                assert ear.wait(3 * round_)
+    link.close()
+    assert ear.is_right() and link.outages.notices()[0].count >= 1
+
+
+def test_a_log_that_grows(tmp_path: Path) -> None:
+    log, ear = tmp_path / "log.nmea", Ear()
+    log.write_bytes(sentences(time.time_ns()))
+    link = heard_from(f"follow:{log}", ear)
+    with log.open("ab", buffering=0) as file, speaking(file.write):
+        assert ear.wait(4)
+    link.close()
+    assert ear.is_right()
+
+
+def test_a_serial_port() -> None:
+    pytest.importorskip("serial", reason="pyserial is not installed")
+    receiver, computer = os.openpty()
+    ear = Ear()
+    link = heard_from(f"serial:{os.ttyname(computer)}?baud=4800", ear)
+
+    def send_in_pieces(data: bytes) -> None:
+        for at in range(0, len(data), 50):
+            os.write(receiver, data[at: at + 50])
+
+    with speaking(send_in_pieces):
+        assert ear.wait(4)
+    link.close()
+    os.close(receiver)
+    os.close(computer)
+    assert ear.is_right()
+
+
+@pytest.mark.parametrize(("address", "words"), [
+    ("tcp://:5", "no link; give serial:"), ("udp://host", "no link"), ("follow:/no/such", "no such file"),
+    ("serial:/dev/no_such", "no such serial port"), ("serial:/dev/null?baud=fast", "baud=fast is no number"),
+    ("serial:/dev/null?speed=1", "unknown option speed"),
+])
+def test_links_that_cannot_be(address: str, words: str) -> None:
+    if address.startswith("serial"):
+        pytest.importorskip("serial", reason="pyserial is not installed")
+    with pytest.raises((InputError, SettingsError), match=words):
+        NmeaLink(address, SETTINGS, lambda *_: None)
+
+
+@pytest.mark.parametrize("has_metadata", [False, True])
+def test_a_receiver_beside_a_stream_tells_where_each_frame_was_taken(has_metadata: bool) -> None:
+    """The pictures' clock is this computer's or, with metadata, another: both are tied by when things come."""
+    video, gps = free_port(), free_port()
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+        speaking(lambda data: sender.sendto(data, ("127.0.0.1", gps)), 0.2),
+        sending(udp_url(video), klv=has_metadata),
+    ):
+        (source,) = open_sources(
+            [f"udp://:{video}"], telemetry=f"udp://:{gps}", live=LiveSettings(keeps_all=True, silent_s=2.0)
+        )
+        assert isinstance(source, LiveStream)
+        setup = prepare(source, MapSettings(), None, telemetry_named=True)
+        first_samples = setup.telemetry_version
+        assert setup.track is not None and first_samples >= 2
+        priors = []
+        for frame in source.frames(lambda index, _: index % 5 == 0):
+            priors.append(setup.prior(frame, first=False))  # type: ignore[arg-type]
+            if len(priors) == 12:
+                break
+        source.close()
+    assert source.telemetry.format == "nmea" and setup.telemetry_version > first_samples
+    assert all(prior.knows_place for prior in priors)
+    north_m = [prior.position_m[1] for prior in priors]
+    steps_m = [b - a for a, b in pairwise(north_m)]
+    assert all(abs(step_m - 5.0 * 5 / RATE) < 0.4 for step_m in steps_m)  # 5 m/s north, a frame in 5
+    # heights keep their zero while the telemetry grows, and no metadata came in between
+    assert len({round(float(prior.position_m[2]), 3) for prior in priors}) == 1
+    expected = "arrived" if not has_metadata else "ST 0601"
+    assert expected in source.start_origin and (source.start_ns > EPOCH_NS + 1000 * S) is not has_metadata

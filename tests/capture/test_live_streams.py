@@ -1,0 +1,250 @@
+"""Live sources on real loopback streams: times, metadata, outages, silence, sizes, and who calls whom."""
+
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from live_sender import EPOCH_NS, RATE, free_port, number_of, sending, sending_apart, udp_url
+from rtsp_server import RtspServer
+
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.capture.live.stream import LiveStream
+from sorvolo.capture.source import open_sources, opened_sources
+from sorvolo.errors import InputError
+from sorvolo.survey.flight import Frame, LostFrame
+
+S = 10**9
+ALL = LiveSettings(keeps_all=True, silent_s=1.0, give_up_s=20.0, first_s=20.0)
+
+
+def every_frame(_index: int, _time_ns: int) -> bool:
+    return True
+
+
+def taken(source: Any, count: int) -> list[tuple[float, Frame]]:
+    """The next frames, each with when it was there; the stream stays open."""
+    found = []
+    for arrived_s, frame in source:
+        assert isinstance(frame, Frame)
+        found.append((arrived_s, frame))
+        if len(found) == count:
+            break
+    return found
+
+
+def open_live(address: str, settings: LiveSettings = ALL, **kwargs: Any) -> LiveStream:
+    (source,) = open_sources([address], live=settings, **kwargs)
+    assert isinstance(source, LiveStream)
+    return source
+
+
+def test_frames_come_in_order_with_the_times_of_their_metadata() -> None:
+    port = free_port()
+    with sending(udp_url(port), klv=True):
+        source = open_live(f"udp://:{port}")
+        frames = [frame for _, frame in taken(source.arrivals(every_frame), 25)]
+        source.close()
+    assert [frame.index for frame in frames] == list(range(25))
+    for frame in frames:
+        # the drone's clock, not this computer's, says when each picture was taken
+        sent = round((frame.time_ns - EPOCH_NS) / S * RATE)
+        assert number_of(frame.image) == sent % 38
+        assert abs(frame.time_ns - EPOCH_NS - sent * S // RATE) < 0.01 * S
+    assert "ST 0601" in source.start_origin and source.kind == "video" and source.is_live
+    telemetry = source.telemetry
+    assert telemetry.format == "klv" and len(telemetry) >= 25 and source.telemetry_version == len(telemetry)
+    assert telemetry.time_ns[0] <= source.start_ns
+    last = int(np.searchsorted(telemetry.time_ns, frames[-1].time_ns - 1000))
+    assert telemetry["camera_pitch_deg"][last] == pytest.approx(-90, abs=1e-3)
+    expected_deg = 46.5 + 5.0 * (frames[-1].time_ns - EPOCH_NS) / S / 111_320
+    assert telemetry["latitude_deg"][last] == pytest.approx(expected_deg, abs=1e-6)
+    assert source.ground_elevation_m == pytest.approx(100, abs=0.2)
+    assert source.camera.camera.angle_of_view_deg[0] == pytest.approx(62.0, abs=0.01)
+    assert "field of view" in source.camera.origin and not source.notices()
+
+
+def test_without_metadata_frames_are_timed_by_when_they_came() -> None:
+    port = free_port()
+    with sending(udp_url(port)) as sender:
+        source = open_live(f"udp://:{port}")
+        frames = taken(source.arrivals(every_frame), 15)
+        source.close()
+        ahead_s = time.time() - time.monotonic()
+    steps = {round((b.time_ns - a.time_ns) / S * RATE, 1) for (_, a), (_, b) in pairwise(frames)}
+    assert steps == {1.0}
+    for _, frame in frames:
+        sent_s = min((s for index, s in sender.sent_s.items() if index % 38 == number_of(frame.image)),
+                     key=lambda s: abs(s + ahead_s - frame.time_ns / S))
+        assert abs(frame.time_ns / S - (sent_s + ahead_s)) < 0.5
+    assert [notice.code for notice in source.notices()] == ["arrival_times"]
+    assert "arrived" in source.start_origin and source.ground_elevation_m != source.ground_elevation_m
+
+
+def test_a_sender_that_dies_and_comes_back_is_one_flight_with_an_outage(caplog: pytest.LogCaptureFixture) -> None:
+    port = free_port()
+    frames: list[Frame] = []
+    with sending(udp_url(port), klv=True):
+        source = open_live(f"udp://:{port}")
+        arrivals = source.arrivals(every_frame)
+        frames += [frame for _, frame in taken(arrivals, 10)]
+
+    def read_on() -> None:
+        for _, frame in arrivals:
+            assert isinstance(frame, Frame)
+            frames.append(frame)
+            if frame.time_ns > EPOCH_NS + 410 * S // RATE:
+                return
+
+    silent_from_s = time.monotonic()
+    reader = threading.Thread(target=read_on, daemon=True)
+    reader.start()
+    while source.silent_s == 0 and time.monotonic() < silent_from_s + 10:
+        time.sleep(0.02)
+    noticed_s = time.monotonic() - silent_from_s
+    assert 0.5 < noticed_s < 4.0 and "silent for" in caplog.text
+    with sending(udp_url(port), klv=True, first=400):
+        reader.join(20)
+    assert not reader.is_alive()
+    source.close()
+    assert [frame.index for frame in frames] == list(range(len(frames)))
+    assert all(a.time_ns < b.time_ns for a, b in pairwise(frames))
+    for frame in frames:  # the second sender's stamps begin anew; its metadata ties them again
+        assert number_of(frame.image) == round((frame.time_ns - EPOCH_NS) / S * RATE) % 38
+    (outage,) = [notice for notice in source.notices() if notice.code == "outage"]
+    assert outage.count == 1 and "back after" in caplog.text
+
+
+def test_a_source_that_stays_silent_has_ended() -> None:
+    port = free_port()
+    with sending(udp_url(port), count=100):
+        source = open_live(f"udp://:{port}", LiveSettings(keeps_all=True, silent_s=0.5, give_up_s=1.0))
+        began_s = time.monotonic()
+        frames = list(source.frames(every_frame))
+    assert frames and time.monotonic() - began_s < 10
+    assert source.frame_count == len(frames)
+
+
+def test_the_newest_frame_wins_where_the_flight_is_watched() -> None:
+    port = free_port()
+    with sending(udp_url(port), klv=True):
+        source = open_live(f"udp://:{port}", LiveSettings(silent_s=2.0))
+        late_s: list[float] = []
+        for arrived_s, each in source.arrivals(every_frame):
+            frame = each
+            late_s.append(time.monotonic() - arrived_s)
+            time.sleep(0.3)  # a slow detector
+            if len(late_s) == 6:
+                break
+        source.close()
+    assert frame.index >= 15 and source.skipped >= 15
+    assert source.skipped >= frame.index + 1 - len(late_s)  # every frame that was not given on is counted
+    assert np.median(late_s) < 0.15  # however slow the detector: it is given what came last
+    assert "skipped_frame" in [notice.code for notice in source.notices()]
+
+
+def test_frames_of_another_size_are_fitted_and_of_another_shape_lost() -> None:
+    port = free_port()
+    source: LiveStream | None = None
+    results: list[Frame | LostFrame] = []
+    for size, first in (((160, 96), 0), ((320, 192), 400), ((96, 160), 800)):
+        with sending(udp_url(port), klv=True, size=size, first=first):
+            if source is None:
+                source = open_live(f"udp://:{port}")
+                arrivals = source.frames(every_frame)
+            for each in arrivals:
+                results.append(each)
+                if (each.time_ns - EPOCH_NS) / S * RATE > first + 5:
+                    break
+    assert source is not None
+    source.close()
+    by_sender = [[each for each in results if (each.time_ns - EPOCH_NS) // (400 * S // RATE) == k] for k in range(3)]
+    assert all(isinstance(each, Frame) and each.image.shape == (96, 160, 3) for each in by_sender[0] + by_sender[1])
+    assert number_of(by_sender[1][-1].image) >= 0 and len(by_sender[1]) >= 2  # type: ignore[union-attr]
+    assert by_sender[2] and all(
+        isinstance(each, LostFrame) and each.reason == "size 96x160 differs from the flight's 160x96"
+        for each in by_sender[2]
+    )
+    counts = {notice.code: notice.count for notice in source.notices()}
+    assert counts["size_changed"] == len(by_sender[1]) and counts["other_shape"] == len(by_sender[2])
+
+
+def test_a_flight_ends_when_it_is_told_to() -> None:
+    port, until = free_port(), threading.Event()
+    with sending(udp_url(port)), opened_sources([f"udp://:{port}"], live=ALL, until=until) as (source,):
+        frames = source.frames(every_frame)
+        next(frames)
+        until.set()
+        assert list(frames) == []
+
+
+@pytest.fixture
+def server() -> Iterator[RtspServer]:
+    server = RtspServer()
+    server.start()
+    yield server
+    server.close()
+
+
+def test_rtsp_with_the_senders_clock_and_a_broken_connection(server: RtspServer) -> None:
+    source = open_live(server.address)
+    frames = source.frames(every_frame)
+    first = [next(frames) for _ in range(5)]
+    server.hang_up()
+    after = []
+    for each in frames:
+        after.append(each)
+        if any(notice.code == "outage" for notice in source.notices()) and len(after) > 20:
+            break
+    source.close()
+    assert server.methods.count("PLAY") == 2 and "DESCRIBE" in server.methods
+    assert source.start_origin == "the sender's RTCP reports"
+    assert all(abs(each.time_ns / S - time.time()) < 20 for each in (*first, *after))
+    assert all(a.time_ns < b.time_ns and a.index + 1 == b.index for a, b in pairwise(first + after))
+
+
+def test_a_server_that_refuses_is_an_error_at_once() -> None:
+    server = RtspServer(password=True)
+    server.start()
+    began_s = time.monotonic()
+    with pytest.raises(InputError, match=r"401.*check the address, the name and the password") as told:
+        open_live(server.address.replace("//", "//me:secret@"))
+    server.close()
+    assert time.monotonic() - began_s < 10 and "secret" not in str(told.value)
+
+
+@pytest.mark.parametrize(("here", "there", "container"), [
+    ("rtmp://:{}/live/x", "rtmp://127.0.0.1:{}/live/x", "flv"), ("tcp://:{}", "tcp://127.0.0.1:{}", "mpegts"),
+])
+def test_streams_that_are_pushed(here: str, there: str, container: str) -> None:
+    port = free_port(socket.SOCK_STREAM)
+
+    def push() -> None:
+        time.sleep(0.5)  # the drone is switched on after the ground station
+        with sending_apart(there.format(port), container=container, count=10_000):
+            done.wait(30)
+
+    done = threading.Event()
+    threading.Thread(target=push, daemon=True).start()
+    source = open_live(here.format(port))
+    numbers = [number_of(frame.image) for _, frame in taken(source.arrivals(every_frame), 5)]
+    source.close()
+    done.set()
+    assert all((b - a) % 38 == 1 for a, b in pairwise(numbers))
+
+
+def test_nothing_there_is_an_error_that_says_so() -> None:
+    port = free_port()
+    short = LiveSettings(first_s=0.5)
+    with pytest.raises(InputError, match=rf"udp://:{port}: no picture within 0 s .*is the drone sending"):
+        open_live(f"udp://:{port}", short)
+    with pytest.raises(InputError, match="Connection refused"):
+        open_live(f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}", short)
+    with pytest.raises(InputError, match="a live source takes its telemetry from a receiver"):
+        open_live(f"udp://:{port}", short, telemetry="log.srt")
+    with pytest.raises(InputError, match="recorded flight's telemetry is a file"):
+        open_sources([__file__], telemetry="udp://:1")
