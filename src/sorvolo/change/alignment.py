@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cache
 
 import cv2
 import numpy as np
@@ -101,10 +102,16 @@ class Aligner:
             small_camera, normalise_contrast(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))  # type: ignore[arg-type]
         )
         told = self._told(small_camera, prior)
-        known = self._share_known(told, small_camera)
-        is_outside = told is not None and known < self._settings.least_known
+
+        @cache
+        def share_known() -> float:
+            return 1.0 if told is None else self._share_known(told, small_camera)
+
+        def told_inside() -> Matrix3 | None:
+            return told if share_known() >= self._settings.least_known else None
+
         worst = NotAligned("its features are found nowhere in the map where it could be", np.nan)
-        for guess, followed in self._guesses(new, small_camera, prior, time_ns, None if is_outside else told):
+        for guess, followed in self._guesses(new, small_camera, prior, time_ns, told_inside):
             found = self._fit(new, guess, self._settings.doubtful_px if followed else self._settings.most_residual_px)
             if isinstance(found, NotAligned):
                 worst = found
@@ -120,7 +127,8 @@ class Aligner:
             sx, sy = size[0] / image.shape[1], size[1] / image.shape[0]
             small_from_full = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
             return Aligned(site_from_small @ small_from_full, pose.translation_m, residual_px / scale, followed)
-        reason = f"only {known:.0%} of it lies on the map" if is_outside else worst.reason
+        is_outside = share_known() < self._settings.least_known
+        reason = f"only {share_known():.0%} of it lies on the map" if is_outside else worst.reason
         return NotAligned(reason, worst.residual_px / scale, is_outside)
 
     # ---- inside -----------------------------------------------------------------------------------------------
@@ -145,12 +153,13 @@ class Aligner:
             return None
 
     def _guesses(
-        self, new: Keyframe, camera: Camera, prior: CameraPrior, time_ns: int, told: Matrix3 | None
+        self, new: Keyframe, camera: Camera, prior: CameraPrior, time_ns: int, told_inside: Callable[[], Matrix3 | None]
     ) -> Iterator[tuple[Matrix3, bool]]:
-        """site_from_image good to a few pixels, the cheapest first."""
+        """site_from_image good to a few pixels, the cheapest first; telemetry is asked where the past is no help."""
         foretold = self._foretold(camera, prior, time_ns)
         if foretold is not None:
             yield self._shifted(new, foretold), True
+        told = told_inside()
         near = foretold if foretold is not None else told
         features = orb_features(new.gray, self._settings.links.features)
         tries: list[Callable[[], Matrix3 | None]] = []
@@ -293,8 +302,8 @@ class Aligner:
             return None
         return site_from_image @ np.linalg.inv(fitted[0])
 
-    def _share_known(self, site_from_image: Matrix3 | None, camera: Camera) -> float:
-        seen = None if site_from_image is None else self._seen(site_from_image, camera)
+    def _share_known(self, site_from_image: Matrix3, camera: Camera) -> float:
+        seen = self._seen(site_from_image, camera)
         return 0.0 if seen is None else float(seen[1].mean())
 
     def _fit(self, new: Keyframe, guess: Matrix3, most_residual_px: float) -> tuple[Matrix3, float] | NotAligned:
