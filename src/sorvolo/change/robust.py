@@ -88,11 +88,14 @@ def examine(
             cv2.cvtColor(image, cv2.COLOR_BGR2GRAY, dst=gray)
         settling = settle(grays[0], grays[1], known)
     if settling.moved_px > 0:
+        # OpenCV resamples four bands in half the time that three take it
+        four, moved = (_SCRATCH.take(name, size, (4,)) for name in ("four", "moved"))
+        cv2.cvtColor(before, cv2.COLOR_BGR2BGRA, dst=four)
         cv2.warpPerspective(
-            before, settling.reference_from_query, half, dst=spare, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            four, settling.reference_from_query, half, dst=moved, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
         )
-        before, spare = spare, before
+        cv2.cvtColor(moved, cv2.COLOR_BGRA2BGR, dst=before)
     light = fit_light(before, after, known)
     rim = None if known is None else _without_rim(known, RIM_PX + int(np.ceil(settling.moved_px)))
     lit = relit(before, light, spare)
