@@ -12,6 +12,7 @@ from hypothesis import given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 from onnx import TensorProto, helper  # noqa: E402
 
+from sorvolo.errors import SettingsError  # noqa: E402
 from sorvolo.survey.labels import LabelledPicture, LabelledSet  # noqa: E402
 from sorvolo.training.backbone import EfficientNetLite0  # noqa: E402
 from sorvolo.training.boxes import boxes_from_offsets, iou_matrix, offsets_from_boxes, suppress  # noqa: E402
@@ -116,6 +117,20 @@ def test_the_exported_graph_says_what_torch_says(trained):
     check = check_export(model, exported, [*(each.image for each in squares(6, 4)), wide])
     assert check.is_good, check
     assert check.detections > 6
+
+
+def test_an_export_looks_at_as_many_regions_as_it_is_told(trained):
+    model = trained[0].average
+    pictures = [each.image for each in squares(4, 4)]
+    whole, few = (
+        export_onnx(model, {"classes": ["square", "disc"], "name": "tiny"}, regions=count) for count in (None, 2)
+    )
+    checks = [check_export(model, each, pictures) for each in (whole, few)]
+    assert all(each.is_good for each in checks), checks
+    assert checks[1].detections < checks[0].detections
+    assert model.reach.regions == 60
+    with pytest.raises(SettingsError, match="one region or more"):
+        export_onnx(model, {"classes": ["square"]}, regions=0)
 
 
 def test_training_goes_on_from_its_state_as_if_it_had_not_stopped():
