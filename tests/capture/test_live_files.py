@@ -51,6 +51,46 @@ def test_a_recorded_video_with_metadata_needs_no_other_telemetry(tmp_path: Path)
     assert setup.clock is not None and setup.clock.first_frame_utc_ns == EPOCH_NS
 
 
+def as_synchronous(data: bytes) -> bytes:
+    """The transport stream with its metadata declared as synchronous: stream type 0x15 in every program map."""
+    changed = bytearray(data)
+    for at in range(0, len(changed), 188):
+        head = changed[at: at + 8]
+        if head[1] & 0x40 and head[3] >> 4 == 1 and head[4] == 0 and head[5] == 2:
+            section = changed[at + 5: at + 8 + ((head[6] & 15) << 8 | head[7])]
+            entry = 12 + ((section[10] & 15) << 8 | section[11])
+            while entry < len(section) - 4:
+                section[entry] = 0x15 if section[entry] == 0x06 else section[entry]
+                entry += 5 + ((section[entry + 3] & 15) << 8 | section[entry + 4])
+            section[-4:] = _crc32_mpeg(section[:-4]).to_bytes(4, "big")
+            changed[at + 5: at + 5 + len(section)] = section
+    return bytes(changed)
+
+
+def _crc32_mpeg(data: bytes) -> int:
+    crc = 0xFFFFFFFF
+    for each in data:
+        crc ^= each << 24
+        for _ in range(8):
+            crc = (crc << 1 ^ (0x04C11DB7 if crc & 0x80000000 else 0)) & 0xFFFFFFFF
+    return crc
+
+
+def test_synchronous_metadata(tmp_path: Path) -> None:
+    """ST 1402: an access unit header before each set, in a stream of type 0x15."""
+    def told(index: int) -> bytes:
+        packet = packet_of(index)
+        return b"\0" + bytes([index]) + b"\xdf" + len(packet).to_bytes(2, "big") + packet
+
+    plain = write_ts(tmp_path / "plain.ts", klv=True, klv_of=told)
+    (tmp_path / "film.ts").write_bytes(as_synchronous(plain.read_bytes()))
+    assert (tmp_path / "film.ts").read_bytes() != plain.read_bytes()
+    for film in (plain, tmp_path / "film.ts"):
+        (source,) = open_sources([film])
+        assert source.telemetry.format == "klv" and len(source.telemetry) == 30
+        assert source.telemetry.time_ns[0] == EPOCH_NS
+
+
 def test_metadata_with_damage_and_without_time(tmp_path: Path) -> None:
     def told(index: int) -> bytes:
         packet = bytearray(packet_of(index))

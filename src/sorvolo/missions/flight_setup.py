@@ -174,7 +174,7 @@ def prepare(
     if source.kind == "photos":
         step_s, expected = 0.0, source.frame_count
     elif is_live:
-        step_s, expected = _UNTIMED_STEP_S, 2
+        step_s, expected = _UNTIMED_STEP_S if settings.method == "planar" else min(keyframe_s, 2.0), 2
     else:
         # the thesis takes frames by eq. 3.17 alone; planar looks at three times as many and lets the pictures decide
         share = 1 if settings.method == "thesis" else 3

@@ -4,6 +4,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -136,7 +137,8 @@ class StreamReader:
         """One connection from opening to its end; whether any frame came."""
         came = False
         try:
-            with self._opened() as container:
+            with ExitStack() as stack:
+                container = self._opened(stack)
                 video, metadata = _streams_of(container)
                 self._hearer.opened(_facts_of(container, video, metadata))
                 self._hearer.restarted()
@@ -154,18 +156,21 @@ class StreamReader:
             self._lost("the sender ended the stream")
         except (av.FFmpegError, OSError, ValueError, IndexError, MemoryError) as error:
             self._lost(self._why(error))
+            self._counts["packet"] += self._file is not None and self._has_spoken
             if isinstance(error, _REFUSED) and not self._has_spoken:
                 self.refused = self.failure
         return came
 
-    def _opened(self) -> Any:
+    def _opened(self, stack: ExitStack) -> Any:
+        """The container, closed when the stack is."""
         if self._file is not None:
-            return av.open(self._file(self.outages), options=dict(self._address.options))
+            file = stack.enter_context(closing(self._file(self.outages)))
+            return stack.enter_context(av.open(file, options=dict(self._address.options)))
         open_s = min(_LISTEN_S if self._address.waits else _OPEN_S, max(0.2, self._left_s()))
-        return av.open(
+        return stack.enter_context(av.open(
             self._address.url, format=self._address.container, options=dict(self._address.options),
             timeout=(open_s, self._settings.silent_s),
-        )
+        ))
 
     def _lost(self, reason: str) -> None:
         self.failure = reason
