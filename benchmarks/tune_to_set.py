@@ -1,0 +1,78 @@
+"""The packaged model's weights tuned to one set's own training videos, measured on its held-out ones.
+
+python benchmarks/tune_to_set.py cats WEIGHTS DATA [--steps 800] writes results/tuned_cats.json; the model is not
+shipped (that set is for research only).
+"""
+
+import argparse
+import json
+from dataclasses import asdict
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import detection_data
+from mosaic_methods import commit, machine
+from sorvolo.detection.scores import score_set
+from sorvolo.survey.labels import LabelledSet
+from sorvolo.survey.objects import CLASSES, Detections
+from sorvolo.training.joint import JointSettings, JointTraining, batches
+from sorvolo.training.presets import fast
+from sorvolo.training.samples import Augmentation, Share, samples
+from train_default_model import reader
+
+
+def main() -> None:
+    """Tune, measure, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("name", help="of the set: cats, aerial_cars, tinyperson, hituav")
+    parser.add_argument("weights", type=Path)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--steps", type=int, default=800)
+    parser.add_argument("--side", type=int, default=384)
+    parser.add_argument("--scale", type=float, nargs=2, default=(0.6, 1.5))
+    parser.add_argument("--seed", type=int, default=1)
+    wishes = parser.parse_args()
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    parts = getattr(detection_data, wishes.name)(wishes.data)
+    labels = {each.labels[k] for each in parts["train"].pictures for k in range(len(each.labels))}
+    unlabelled = frozenset(name for index, name in enumerate(CLASSES) if index not in labels)
+    learnt = LabelledSet(wishes.name, CLASSES, parts["train"].pictures, unlabelled)
+    held_out = LabelledSet(wishes.name, CLASSES, parts["test"].pictures, unlabelled)
+    model = fast(CLASSES)
+    model.load_state_dict(torch.load(wishes.weights, weights_only=True))
+    settings = JointSettings(steps=wishes.steps, rate=5e-4, backbone_rate=1e-4, averaging=0.99, warm_steps=50)
+    training = JointTraining(model.to(memory_format=torch.channels_last), settings, wishes.seed)
+    share = Share(learnt, 1.0, tuple(wishes.scale), thermal=wishes.name == "hituav")
+    drawn = samples([share], CLASSES, reader(), Augmentation(side_px=wishes.side), wishes.seed)
+    for done in (training.learn(each) for each in islice(batches(drawn, settings.batch), wishes.steps)):
+        if done.step % 50 == 0:
+            print(done.step, round(done.loss, 3), flush=True)
+    found = [seen(training.average, reader()(each.path)) for each in held_out.pictures]
+    scores = score_set(held_out, found, CLASSES, dict.fromkeys(CLASSES, 0.5))
+    document = {
+        "benchmark": "tune_to_set", "set": wishes.name, "machine": machine(), "commit": commit(), "seed": wishes.seed,
+        "steps": wishes.steps, "pictures": len(held_out), "learnt_from": len(learnt),
+        "intervals": {name: asdict(each) for name, each in scores.intervals.items()},
+    }
+    out = Path(__file__).parent / "results" / f"tuned_{wishes.name}.json"
+    out.write_text(json.dumps(document, indent=1) + "\n")
+    print(document["intervals"], flush=True)
+
+
+@torch.no_grad()
+def seen(model: torch.nn.Module, picture: np.ndarray) -> Detections:
+    """What the network finds in a picture (H, W, 3)."""
+    height, width = picture.shape[:2]
+    padded = np.pad(picture, ((0, -height % 32), (0, -width % 32), (0, 0)), constant_values=114)
+    boxes, scores, labels = model.eval()(torch.from_numpy(np.ascontiguousarray(padded.transpose(2, 0, 1)))[None])
+    clipped = np.clip(boxes.numpy(), 0, [width, height, width, height])
+    kept = (clipped[:, 2:] > clipped[:, :2]).all(1)
+    return Detections(clipped[kept], scores.numpy()[kept], labels.numpy()[kept], CLASSES)
+
+
+if __name__ == "__main__":
+    main()
