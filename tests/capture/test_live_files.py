@@ -193,8 +193,13 @@ def test_photos_are_taken_as_they_are_copied_in(tmp_path: Path) -> None:
     (source,) = open_sources([f"follow:{folder}"], live=ALL)
     assert isinstance(source, GrowingFolder) and source.kind == "photos" and source.name == "DCIM"
     known_when_seen, frames = [], []
+    setup = prepare(source, MapSettings(), None, telemetry_named=False)
     for each in source.frames(every_frame):
         frames.append(each)
+        if isinstance(each, Frame):
+            prior = setup.prior(each, first=False)
+            assert prior.knows_place
+            assert prior.position_m[1] == pytest.approx(0.1 / 3600 * 111_150 * int(each.name[4:8]), abs=0.2)
         known_when_seen.append(source.telemetry_version)
     copier.join()
     assert [frame.name for frame in frames] == [f"DJI_{index:04d}.JPG" for index in range(6)]

@@ -48,6 +48,7 @@ class GrowingFolder:
         self._heard_s = time.monotonic()
         self._count = self._corrupt = self._untimed = 0
         self._last_ns = -1
+        self._first = folder
         self.size_px = (0, 0)
         self.name, self.fingerprint = folder.name, ""
         self.inputs: tuple[str, ...] = (str(folder),)
@@ -117,7 +118,7 @@ class GrowingFolder:
         self._closing.set()
 
     def first(self) -> tuple[Path, PhotoMetadata]:
-        """Wait for the first photo that can be read; it is the first of `frames` as well.
+        """Wait for the first photo that can be read; `frames` gives it as well, but its place is known from now on.
 
         Raises InputError when none comes in `first_s`.
         """
@@ -129,7 +130,10 @@ class GrowingFolder:
                     metadata = read_photo_metadata(path)
                 except InputError:
                     continue
-                self.start_ns = self._time_ns(metadata)
+                self._first = path
+                self.start_ns = _time_ns(metadata)
+                self._last_ns = self.start_ns - 1
+                self._note_place(self.start_ns, metadata)
                 self.size_px = metadata.shown_size_px
                 return path, metadata
             self._closing.wait(_POLL_S)
@@ -164,9 +168,10 @@ class GrowingFolder:
             self._last_ns += 1
             return LostFrame(index, path.name, self._last_ns, f"corrupt: {error}")
         self._untimed += not (metadata.utc_ns or metadata.local_ns)
-        time_ns = self._last_ns = max(self._time_ns(metadata) if index else self.start_ns, self._last_ns + 1)
-        if metadata.columns:
-            self._log.add(time_ns, metadata.columns)
+        is_first = path == self._first
+        time_ns = self._last_ns = max(self.start_ns if is_first else _time_ns(metadata), self._last_ns + 1)
+        if not is_first:
+            self._note_place(time_ns, metadata)
         if not wanted(index, time_ns):
             return None
         try:
@@ -182,8 +187,13 @@ class GrowingFolder:
             image = np.asarray(cv2.resize(image, self.size_px, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         return Frame(index, path.name, time_ns, image)
 
-    def _time_ns(self, metadata: PhotoMetadata) -> int:
-        return metadata.utc_ns or metadata.local_ns or time.time_ns()
+    def _note_place(self, time_ns: int, metadata: PhotoMetadata) -> None:
+        if metadata.columns:
+            self._log.add(time_ns, metadata.columns)
+
+
+def _time_ns(metadata: PhotoMetadata) -> int:
+    return metadata.utc_ns or metadata.local_ns or time.time_ns()
 
 
 def _has_its_end(path: Path) -> bool:
