@@ -150,8 +150,12 @@ class TestThermalFramesAndDaylightModels:
         (notice,) = self.day.notices
         assert (notice.code, notice.count) == ("thermal_model", 1) and "night" in notice.text
 
-    def test_without_one_it_is_said(self, picture: np.ndarray) -> None:
+    def test_without_one_it_is_said(self, picture: np.ndarray, tmp_path: Path) -> None:
+        classes = ["boat", "buoy", "raft"]  # none that the packaged model knows
+        told = {"thresholds": dict.fromkeys(classes, 0.3), "best_px": dict.fromkeys(classes, [4, 300])}
+        model = rectangle_model(tmp_path / "sea.onnx", name="sea", thermal=False, classes=classes, **told)
+        sea = Detector.load(model, provider="cpu", threads=1)
         for polarity in (picture[:, :, 0], 255 - picture[:, :, 0]):
-            self.day.detect(polarity)
-        (notice,) = self.day.notices
+            sea.detect(polarity)
+        (notice,) = sea.notices
         assert (notice.code, notice.count) == ("thermal_untrained", 2)

@@ -79,9 +79,10 @@ def installed_model(name: str) -> InstalledModel:
 def thermal_model(classes: Sequence[str]) -> Path | None:
     """An installed model that was trained on thermal frames and knows one of `classes`, None where there is none.
 
-    Files that cannot be used are passed over: `sorvolo models list` tells of them.
+    The user's own come before the packaged one. Files that cannot be used are passed over: `sorvolo models list` tells
+    of them.
     """
-    for each in installed_models():
+    for each in sorted(installed_models(), key=lambda model: model.is_packaged):
         try:
             info = read_info(each.path)
         except InputError:
