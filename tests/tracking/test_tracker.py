@@ -1,5 +1,7 @@
 """Objects counted once, on simulated patrols and on cases made by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from patrol import Patrol, fly, things
@@ -103,6 +105,24 @@ def test_two_boxes_of_one_object_are_one_and_the_scores_choose_its_class():
     (track,) = tracker.finish()
     assert track.label == "person" and track.views == 6
     assert track.class_scores == pytest.approx({"person": 0.8 / 1.3, "small object": 0.5 / 1.3})
+
+
+def test_a_box_within_or_around_one_of_its_class_is_no_second_object():
+    bag, loose = [100.0, 100.0, 140.0, 145.0], [95.0, 95.0, 150.0, 170.0]  # they overlap by less than half
+    for boxes, labels, count in (
+        ((bag, loose), ("small object", "small object"), 1),
+        ((loose, bag), ("small object", "small object"), 1),
+        ((loose, bag), ("car", "person"), 2),
+        ((bag, [135.0, 100.0, 175.0, 145.0]), ("person", "person"), 2),
+    ):
+        tracker = Tracker()
+        for frame in range(8):
+            seen = [
+                replace(sighting(frame, [0.5 * row, 0.0], label, 0.9 - 0.1 * row), box_px=np.array(box))
+                for row, (box, label) in enumerate(zip(boxes, labels))
+            ]
+            tracker.update(seen, time_ns=seen[0].time_ns, footprint_m=AROUND_M)
+        assert len(tracker.finish()) == count, (boxes, labels)
 
 
 def test_what_is_not_seen_where_it_should_be_ends_and_what_is_out_of_view_does_not():

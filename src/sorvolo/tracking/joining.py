@@ -10,6 +10,7 @@ from sorvolo.tracking.followed import Followed
 from sorvolo.tracking.motion import MOVES, log_density, predicted
 
 _SAME_BOX = 0.6  # overlap of two boxes from which they show one object, whatever their classes
+_WITHIN = 0.9  # of the smaller of two boxes of a class: one is a part, or a loose outline, of the other
 _FRAMES_APART = 5  # of two neighbours of which each frame sees one
 _TOGETHER_SHARE = 0.15  # of frames with one of them: what is seen together more often is two objects
 _LEAST_CLASS_FIT = 0.1
@@ -17,7 +18,10 @@ _LEAST_VIEWS = 4  # of a mover whose velocity is to be trusted
 
 
 def frame_doubles(sightings: Sequence[Sighting]) -> dict[int, int]:
-    """Rows whose box lies on that of a stronger row: weaker row to stronger row."""
+    """Rows whose box shows what a stronger row shows: weaker row to stronger row.
+
+    It overlaps that box, of whatever class, or, of the same class, lies within it or around it.
+    """
     if len(sightings) < 2:
         return {}
     boxes = np.array([each.box_px for each in sightings], np.float64)
@@ -26,11 +30,14 @@ def frame_doubles(sightings: Sequence[Sighting]) -> dict[int, int]:
     common = np.prod(np.maximum(high - low, 0.0), axis=2)
     areas = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
     overlap = common / np.maximum(areas[:, None] + areas[None] - common, 1e-9)
+    within = common / np.maximum(np.minimum(areas[:, None], areas[None]), 1e-9)
+    labels = np.array([each.label for each in sightings])
+    same = (overlap > _SAME_BOX) | ((within > _WITHIN) & (labels[:, None] == labels[None]))
     doubles: dict[int, int] = {}
     order = np.argsort([-each.score for each in sightings], kind="stable")
     for place, row in enumerate(order):
         for stronger in order[:place]:
-            if overlap[row, stronger] > _SAME_BOX and int(stronger) not in doubles:
+            if same[row, stronger] and int(stronger) not in doubles:
                 doubles[int(row)] = int(stronger)
                 break
     return doubles
