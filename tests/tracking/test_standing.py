@@ -161,6 +161,18 @@ def test_two_classes_for_one_thing() -> None:
     assert 0.3 < only.class_scores["person"] < 0.5
 
 
+def test_a_loose_outline_around_a_thing_is_no_second_one() -> None:
+    """Of two boxes of one class and frame, one around the other, one object comes; of two side by side, two."""
+    for apart_px, count in ((np.array([-6.0, -6.0, 10.0, 24.0]), 1), (np.array([26.0, 0.0, 26.0, 0.0]), 2)):
+        laid = []
+        for frame in survey()[:4]:
+            box = box_of(frame, "small object", 8.0, 1.0, 0.0)
+            if box is not None:
+                seen = Detections(np.array([box, box + apart_px]), np.array([0.8, 0.6]), np.array([2, 2]), CLASSES)
+                laid += [each for each in lay_on_ground(seen, frame) if each is not None]
+        assert len(fuse(laid, survey()[:4]).objects) == count
+
+
 def test_nothing_seen_and_no_place() -> None:
     """No sighting makes no object; a rejected frame lays nothing; above the horizon nothing lies on the ground."""
     assert fuse([], survey()).objects == ()
