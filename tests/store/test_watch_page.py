@@ -58,6 +58,14 @@ def test_a_flight_that_nothing_places_is_drawn_in_pixels() -> None:
     assert "100, 50 px" in text and "nothing placed this flight" in text
 
 
+def test_what_no_clock_dated_is_told_from_the_start() -> None:
+    report = {"flight": "f", "first_frame": "1970-01-01T00:00:00Z", "last_frame": "1970-01-01T00:00:14.000000Z"}
+    track = _track(1, first_seen="1970-01-01T00:00:03Z", last_seen="1970-01-01T00:00:09.5Z", x_px=1.0, y_px=2.0)
+    page = watch_page(report, [track], {}, np.zeros((0, 2)))
+    assert "1970" not in page
+    assert "00:00:00 to 00:00:14" in page and ">00:00:03<" in page and ">00:00:09<" in page
+
+
 def test_counts_in_words() -> None:
     assert count_words({"person": 3, "car": 0, "boat": 1}) == "3 x person, 1 x boat"
     assert count_words({}) == "nothing"

@@ -72,7 +72,7 @@ def _header(report: Mapping[str, Any], tracks: Sequence[Mapping[str, Any]]) -> s
     frames = at(report, "frames", "detected")
     return (
         f'<header><p class="over">Watch of <b>{escaped(report.get("flight"))}</b>, '
-        f'{escaped(report.get("first_frame"))} to {escaped(report.get("last_frame"))}</p>'
+        f'{_when(report.get("first_frame"))} to {_when(report.get("last_frame"))}</p>'
         f"<h1>Found: {escape(count_words(dict(counts.most_common())))}.</h1>"
         f"<p>{escaped(frames)} frames were searched for {escape(looked_for)}. Each object is counted once, however "
         "many frames and passes saw it. What no frame showed clearly, or nobody flew over, is not here.</p></header>"
@@ -154,14 +154,20 @@ def _table(report: Mapping[str, Any], tracks: Sequence[Mapping[str, Any]]) -> st
         motion = f"{np.hypot(*speed):.1f} {'px' if is_local else 'm'}/s" if speed else "stands"
         rows.append((
             escaped(each["id"]), escaped(each["class"]), f"{each['score']:.2f}", place, sigma, motion,
-            f"{each['views']} in {each['passes']}", escaped(str(each["first_seen"])[:19].replace("T", " ")),
-            escaped(str(each["last_seen"])[:19].replace("T", " ")),
+            f"{each['views']} in {each['passes']}", _when(each["first_seen"]), _when(each["last_seen"]),
         ))
     names = ("", "class", "score", "place", "within", "moves", "views in passes", "first seen", "last seen")
     return (
         f"<section><h2>All objects</h2>{table_of(rows, names)}<p class=\"note\">Within: one sigma of the place, per "
-        "axis. Times are UTC. For other programs: tracks.geojson.</p></section>"
+        "axis. Times are UTC, or from the source's start where it has no date. For other programs: tracks.geojson.</p>"
+        "</section>"
     )
+
+
+def _when(utc: object) -> str:
+    """A time to read; what no clock dated counts from 1970 on, and so is told as the time since the start."""
+    day, _, clock = str(utc or "")[:19].partition("T")
+    return escaped(clock if day == "1970-01-01" else f"{day} {clock}".strip())
 
 
 def _crops(tracks: Sequence[Mapping[str, Any]], crops: Mapping[int, bytes]) -> str:
