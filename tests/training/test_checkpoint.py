@@ -97,7 +97,7 @@ def test_other_settings_are_refused_by_name() -> None:
         restore(other, saved, _SETTINGS)
 
 
-@pytest.mark.parametrize("data", [b"", b"not a checkpoint", b"\x80\x04N."])
+@pytest.mark.parametrize("data", [b"", b"not a checkpoint", b"\x80\x04N.", b"junk"])
 def test_damaged_checkpoints_are_refused(data: bytes) -> None:
     with pytest.raises(InputError, match=r"run/checkpoint\.pt is no checkpoint of sorvolo, or damaged"):
         read_checkpoint(data, "run/checkpoint.pt")

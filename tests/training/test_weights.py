@@ -81,10 +81,11 @@ class _Evil:
         return (Path.touch, (Path("never"),))  # type: ignore[return-value]
 
 
+@pytest.mark.parametrize("content", [b"neither this nor that" * 9, b"junk"])
 @pytest.mark.parametrize("ending", ["pth", "safetensors", "whl", "tgz"])
-def test_damaged_files_are_refused_by_name(tmp_path: Path, ending: str) -> None:
+def test_damaged_files_are_refused_by_name(tmp_path: Path, ending: str, content: bytes) -> None:
     path = tmp_path / f"net.{ending}"
-    path.write_bytes(b"neither this nor that" * 9)
+    path.write_bytes(content)
     with pytest.raises(InputError, match=rf"net\.{ending}.*damaged"):
         read_weights(path)
 

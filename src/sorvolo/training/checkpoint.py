@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
@@ -15,6 +16,12 @@ from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.progress import History, Learner
 
 _FORMAT = 1
+
+UNREADABLE = (
+    pickle.UnpicklingError, struct.error, RuntimeError, EOFError, ValueError, LookupError, AttributeError,
+    AssertionError,
+)
+"""What `torch.load(weights_only=True)` raises on damaged files: its reader of pickles trusts their bytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +53,7 @@ def read_checkpoint(data: bytes, name: str) -> Checkpoint:
         about = json.loads(content["about"])
         history = History.from_plain(about["history"])
         state = {**content["state"], "torch_random": content["torch_random"]}
-    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError, ValueError) as error:
+    except (*UNREADABLE, TypeError) as error:
         first = str(error).strip().split("\n")[0][:120]
         raise InputError(
             f"{name} is no checkpoint of sorvolo, or damaged ({first}); start anew without --resume"

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-import pickle
 import tarfile
 import urllib.error
 import urllib.request
@@ -21,6 +20,7 @@ from torch import Tensor
 
 from sorvolo.errors import InputError
 from sorvolo.training.backbone import EfficientNetLite0
+from sorvolo.training.checkpoint import UNREADABLE
 from sorvolo.training.keras_resnet import resnet50_from_keras
 from sorvolo.training.resnet import IMAGENET_MEAN, IMAGENET_STD, ResNet50
 
@@ -167,7 +167,7 @@ def _from_file(data: bytes, file_name: str, name: str) -> ImageNetWeights:
 def _from_torch(data: bytes, name: str) -> ImageNetWeights:
     try:
         content = torch.load(BytesIO(data), map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
+    except UNREADABLE as error:
         first = str(error).strip().split("\n")[0][:160]
         raise InputError(
             f"{name} is no plain file of weights, or damaged ({first}). Files that would have to run code are refused; "
