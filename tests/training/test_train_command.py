@@ -218,7 +218,8 @@ def test_bad_input_is_told(data: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert "no weights at" in words(place, "--weights", "gone.pth")
     assert "device must be auto, cpu or cuda, got 'tpu'" in words(place, "--device", "tpu")
     assert "THEIRS=OURS" in words(place, "--classes", "=car")
-    assert "none of its class names" in words(place, "--classes", "Boat=boat")
+    assert "none of its class names" in (told := words(place, "--classes", "Boat=boat"))
+    assert "such as --classes " in told and "=person" in told
     if not torch.cuda.is_available():
         assert "sees no GPU; use --device cpu" in words(place, "--device", "cuda")
 
@@ -228,6 +229,10 @@ def test_pictures_without_any_object_teach_nothing(tmp_path: Path) -> None:
     for path in (place / "labels").glob("*.txt"):
         path.write_text("")
     with pytest.raises(InputError, match="none of the pictures to learn from has a labelled object"):
+        _sets(place)
+    for path in (place / "labels").glob("*.txt"):
+        path.write_text("0 1.5 1.5 0.1 0.1\n")
+    with pytest.raises(InputError, match=r"has a labelled object that can be used .*outside"):
         _sets(place)
 
 

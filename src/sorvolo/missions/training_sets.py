@@ -115,7 +115,9 @@ def read_training_sets(
     if synthetic > 0:
         shares = [replace(each, pastes=_SMALL) if _SMALL in each.labelled.unlabelled else each for each in shares]
     if not any(len(picture.labels) for each in shares for picture in each.labelled.pictures):
-        raise InputError("none of the pictures to learn from has a labelled object; check the class names")
+        remarks = "; ".join(notices) or "all their label files are empty"
+        raise InputError(f"none of the pictures to learn from has a labelled object that can be used ({remarks}); "
+                         "check the labels, their class names and what is held out with --val")
     notices += _short_classes(shares, classes)
     return TrainingSets(
         tuple(shares), tuple(_honest(each, classes) for each in held_out), classes, tuple(notices)

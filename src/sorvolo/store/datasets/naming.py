@@ -83,5 +83,5 @@ def nothing_maps(place: str, counts: Mapping[str, int], known: Iterable[str]) ->
     found = ", ".join(f"{name} ({count} boxes)" for name, count in counts.items()) or "none"
     return InputError(
         f"{place}: none of its class names ({found}) is one of those looked for ({', '.join(sorted(known))}); say "
-        f"which stand for which class, such as {{{next(iter(counts), 'name')!r}: 'person'}}"
+        f"which stand for which class, such as --classes {next(iter(counts), 'name')}=person"
     )
