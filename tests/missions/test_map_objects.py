@@ -135,6 +135,10 @@ def test_without_a_model(simulated: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "site/objects.geojson").exists()
     with pytest.raises(InputError, match="no flight of it was searched"):
         evaluate_objects(tmp_path / "site", simulated)
+    left_over = tmp_path / "site/flights/flight1/objects.geojson"
+    left_over.write_text('{"type": "FeatureCollection", "features": []}')
+    with pytest.raises(InputError, match="knows of no search of this flight; map it again with --model"):
+        evaluate_objects(tmp_path / "site", simulated)
 
 
 def test_a_model_that_is_not_there(simulated: Path, tmp_path: Path) -> None:

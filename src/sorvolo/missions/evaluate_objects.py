@@ -97,11 +97,17 @@ def evaluate_objects(site: Path, truth: Path, *, flight: str | None = None) -> t
     searched = sorted(path.parent.name for path in (site / "flights").glob("*/objects.geojson"))
     if not searched:
         raise InputError(f"{site}: no flight of it was searched for objects; run `sorvolo map` with --model")
-    if flight is not None and flight not in searched:
-        raise SettingsError(f"--flight {flight}: the flights of {site} that were searched are {', '.join(searched)}")
     with Archive.open(site, write=False) as archive:
         described = archive.site()
         outlines_m = {each.flight_id: each.outlines_m for each in archive.searches()}
+    unknown = [name for name in searched if name not in outlines_m]
+    if unknown:
+        raise InputError(
+            f"{site}: flights/{unknown[0]}/objects.geojson is there, but the site's catalogue knows of no search of "
+            "this flight; map it again with --model, or remove the file"
+        )
+    if flight is not None and flight not in searched:
+        raise SettingsError(f"--flight {flight}: the flights of {site} that were searched are {', '.join(searched)}")
     if described.is_local:
         raise InputError(f"{site}: a map without geo-reference cannot be compared with a simulation's truth")
     flights = PairedFlights.read(site, frames_file, described)
