@@ -127,6 +127,14 @@ def test_a_failed_fetch_leaves_the_old_model(folder: Path, model: Path, address:
     assert integrity(kept) is Integrity.GOOD and Detector.load("coast", provider="cpu").info.name == "coast"
 
 
+def test_a_fetched_file_that_is_no_model_is_named_as_it_was_given(folder: Path, tmp_path: Path) -> None:
+    junk = tmp_path / "junk.onnx"
+    junk.write_bytes(b"junk")
+    with pytest.raises(InputError, match=f"^nothing was installed: {junk} cannot be run"):
+        fetch_model(str(junk), _hash(junk))
+    assert not folder.exists() or not list(folder.iterdir())
+
+
 @pytest.mark.parametrize(
     ("source", "sha256", "name"),
     [

@@ -54,16 +54,18 @@ def list_models(
         table.add_column(name, overflow="fold")
     for row in rows:
         if "error" in row:
-            table.add_row(escape(row["name"]), "", escape(row["error"]), "", "", "", escape(row["path"]))
             continue
         table.add_row(
             escape(row["name"]), escape(row["preset"]), escape(", ".join(row["classes"])),
             "day and thermal" if row["thermal"] else "day", row["precision"], f"{row['bytes'] / 1e6:.1f}",
             "with the package" if row["is_packaged"] else escape(row["path"]),
         )
-    if rows:
+    if table.rows:
         console.print(table)
-    else:
+    for row in rows:
+        if "error" in row:  # below the table: no column is wide enough to say why
+            typer.echo(f"{row['name']} cannot be used: {row['error']}")
+    if not rows:
         typer.echo(f"no models are installed; your own belong in {models_folder()}")
 
 

@@ -65,7 +65,10 @@ def fetch_model(source: str, sha256: str, *, name: str = "") -> InstalledModel:
                 f"{address} is not the file that was asked for: its SHA-256 is {found}, wanted was {wanted}; nothing "
                 "was installed. Ask again for file and hash"
             )
-        read_info(temporary)
+        try:
+            read_info(temporary)
+        except InputError as error:
+            raise InputError(f"nothing was installed: {str(error).replace(str(temporary), address)}") from error
         card = {HASH_KEY: wanted, "source": address, "fetched": datetime.now(UTC).isoformat(timespec="seconds")}
         atomic_write_bytes(path.with_suffix(".json"), json.dumps(card, indent=1).encode())
     return installed_model(own)
