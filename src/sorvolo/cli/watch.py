@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.cli.map import read_json, tell_path
 from sorvolo.errors import SettingsError
 from sorvolo.missions.watch import watch
@@ -68,6 +69,7 @@ def watch_command(
     ground_elevation: Annotated[
         float | None, typer.Option(help="Of the ground, m, in telemetry's own height reference.")
     ] = None,
+    give_up: Annotated[float, typer.Option(help="A live source silent for so long has ended, s.")] = 30.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object at the end.")] = False,
 ) -> None:
     """Find people, cars and small objects in a flight, live or recorded, and say where on the ground they are.
@@ -85,7 +87,10 @@ def watch_command(
         alert_url=alert_url,
     )
     folders: dict[Path, None] = {}
-    watching = watch(source, settings, outputs, telemetry=telemetry or None, camera=camera or None)
+    watching = watch(
+        source, settings, outputs, telemetry=telemetry or None, camera=camera or None,
+        live=LiveSettings(give_up_s=give_up),
+    )
     # closed after a stop: then what was found is written
     with _stopped_by_signals(), closing(watching) as updates, suppress(KeyboardInterrupt):
         for folder in _show_progress(updates, Console(stderr=True), is_quiet=as_json):

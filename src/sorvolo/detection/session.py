@@ -174,6 +174,8 @@ def _opened(model: bytes, where: str, provider: Provider, threads: int) -> tuple
     refused = ""
     if provider in ("auto", "openvino"):
         described = _described(model, where)
+        # before OpenVINO sees it: that crashes on some models that break the contract
+        _input_size(described, where, info_from_metadata(described.get_modelmeta().custom_metadata_map, where).stride)
         try:
             run = _openvino_runner(model, threads)
         except ImportError as error:
