@@ -152,7 +152,7 @@ class TestThermalFramesAndDaylightModels:
 
     def test_without_one_it_is_said(self, picture: np.ndarray, tmp_path: Path) -> None:
         classes = ["boat", "buoy", "raft"]  # none that the packaged model knows
-        told = {"thresholds": dict.fromkeys(classes, 0.3), "best_px": dict.fromkeys(classes, [4, 300])}
+        told = {"thresholds": dict.fromkeys(classes, 0.3), "best_px": {each: [4, 300] for each in classes}}
         model = rectangle_model(tmp_path / "sea.onnx", name="sea", thermal=False, classes=classes, **told)
         sea = Detector.load(model, provider="cpu", threads=1)
         for polarity in (picture[:, :, 0], 255 - picture[:, :, 0]):
