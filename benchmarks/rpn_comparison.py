@@ -23,12 +23,14 @@ from detection_data import hituav
 from mosaic_methods import commit, machine
 from sorvolo.detection.metrics import judged_classes, match_pictures
 from sorvolo.survey.labels import LabelledSet
-from sorvolo.survey.objects import CLASSES, Detections
+from sorvolo.survey.objects import CLASSES
 from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.joint import JointSettings, JointTraining, batches
 from sorvolo.training.presets import fast
 from sorvolo.training.pyramid import convolution
 from sorvolo.training.samples import Augmentation, Share, samples
+from sorvolo.training.seeing import see
+from sorvolo.training.weights import load_lite0
 from train_default_model import reader
 
 ARMS = ("standard", "extended", "equal-cost", "extended-residual")
@@ -56,7 +58,7 @@ def main() -> None:
             started_s = time.process_time()
             torch.manual_seed(seed)
             model = arm_model(arm)
-            model.backbone.load_imagenet(torch.load(wishes.weights, weights_only=True))
+            model.backbone.load_imagenet(load_lite0(wishes.weights))
             training = JointTraining(model, JointSettings(steps=wishes.steps, batch=wishes.batch, averaging=0.99), seed)
             share = Share(parts["train"], 1.0, (0.7, 1.6), thermal=True)
             drawn = samples([share], CLASSES, reader(), Augmentation(side_px=wishes.side), seed)
@@ -103,12 +105,7 @@ def weights_of(module: nn.Module) -> int:
 def score(model: FasterRCNN, labelled: LabelledSet) -> dict[str, float]:
     """AP50 and AP of people and cars."""
     read = reader()
-    found = []
-    for each in labelled.pictures:
-        with torch.no_grad():
-            planes = torch.from_numpy(np.ascontiguousarray(read(each.path).transpose(2, 0, 1)))[None]
-            boxes, scores, labels = model.eval()(planes)
-        found.append(Detections(boxes.numpy(), scores.numpy(), labels.numpy(), CLASSES))
+    found = [see(model, CLASSES, read(each.path)) for each in labelled.pictures]
     _, _, numbers = match_pictures(labelled, found, judged_classes(labelled, CLASSES[:2]))
     out = {f"{name}_ap50": round(each.ap50, 4) for name, each in numbers.items()}
     out.update({f"{name}_ap": round(each.ap, 4) for name, each in numbers.items()})

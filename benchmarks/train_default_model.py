@@ -26,6 +26,7 @@ from sorvolo.survey.objects import CLASSES
 from sorvolo.training.joint import JointSettings, JointTraining, batches
 from sorvolo.training.presets import fast
 from sorvolo.training.samples import Augmentation, Share, samples
+from sorvolo.training.weights import load_lite0
 
 SIMULATED_SEED, SIMULATED_PICTURES = 1, 700
 
@@ -54,7 +55,7 @@ def main() -> None:
         name, pictures = share.labelled.name, len(share.labelled)
         print(f"{name}: {pictures} pictures, {boxes} boxes, weight {share.weight}", flush=True)
     model = fast(CLASSES)
-    model.backbone.load_imagenet(torch.load(wishes.weights, weights_only=True))
+    model.backbone.load_imagenet(load_lite0(wishes.weights))
     model = model.to(memory_format=torch.channels_last)
     settings = JointSettings(steps=wishes.steps, batch=wishes.batch)
     training = JointTraining(model, settings, wishes.seed, wishes.device)

@@ -10,17 +10,17 @@ from dataclasses import asdict
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
 import torch
 
 import detection_data
 from mosaic_methods import commit, machine
 from sorvolo.detection.scores import score_set
 from sorvolo.survey.labels import LabelledSet
-from sorvolo.survey.objects import CLASSES, Detections
+from sorvolo.survey.objects import CLASSES
 from sorvolo.training.joint import JointSettings, JointTraining, batches
 from sorvolo.training.presets import fast
 from sorvolo.training.samples import Augmentation, Share, samples
+from sorvolo.training.seeing import see
 from train_default_model import reader
 
 
@@ -51,7 +51,8 @@ def main() -> None:
     for done in (training.learn(each) for each in islice(batches(drawn, settings.batch), wishes.steps)):
         if done.step % 50 == 0:
             print(done.step, round(done.loss, 3), flush=True)
-    found = [seen(training.average, reader()(each.path)) for each in held_out.pictures]
+    read = reader()
+    found = [see(training.average, CLASSES, read(each.path)) for each in held_out.pictures]
     scores = score_set(held_out, found, CLASSES, dict.fromkeys(CLASSES, 0.5))
     document = {
         "benchmark": "tune_to_set", "set": wishes.name, "machine": machine(), "commit": commit(), "seed": wishes.seed,
@@ -61,17 +62,6 @@ def main() -> None:
     out = Path(__file__).parent / "results" / f"tuned_{wishes.name}.json"
     out.write_text(json.dumps(document, indent=1) + "\n")
     print(document["intervals"], flush=True)
-
-
-@torch.no_grad()
-def seen(model: torch.nn.Module, picture: np.ndarray) -> Detections:
-    """What the network finds in a picture (H, W, 3)."""
-    height, width = picture.shape[:2]
-    padded = np.pad(picture, ((0, -height % 32), (0, -width % 32), (0, 0)), constant_values=114)
-    boxes, scores, labels = model.eval()(torch.from_numpy(np.ascontiguousarray(padded.transpose(2, 0, 1)))[None])
-    clipped = np.clip(boxes.numpy(), 0, [width, height, width, height])
-    kept = (clipped[:, 2:] > clipped[:, :2]).all(1)
-    return Detections(clipped[kept], scores.numpy()[kept], labels.numpy()[kept], CLASSES)
 
 
 if __name__ == "__main__":

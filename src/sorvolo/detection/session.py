@@ -52,9 +52,7 @@ class Session:
             raise SettingsError(f"a model needs at least one thread, not {threads}")
         model = read_model(path)
         self._threads = threads or usable_cores()
-        self._run, self.provider, described = _opened(model, str(path), provider, self._threads)
-        self.info: ModelInfo = info_from_metadata(described.get_modelmeta().custom_metadata_map, str(path))
-        self.fixed_px = _input_size(described, str(path), self.info.stride)
+        self._run, self.provider, self.info, self.fixed_px = _opened(model, str(path), provider, self._threads)
         self._path = path
         self._buffer: Anything = np.zeros((1, 3, 0, 0), np.uint8)
         self._lock = threading.Lock()
@@ -119,10 +117,7 @@ class Session:
 
 def read_info(path: Path) -> ModelInfo:
     """What a model file says of itself, without making it ready to run. Raises InputError as Session does."""
-    described = _described(read_model(path), str(path))
-    info = info_from_metadata(described.get_modelmeta().custom_metadata_map, str(path))
-    _input_size(described, str(path), info.stride)
-    return info
+    return _contract(_described(read_model(path), str(path)), str(path))[0]
 
 
 def read_model(path: Path) -> bytes:
@@ -160,12 +155,14 @@ def _resized(picture: ImageRGB, scale: float) -> ImageRGB:
     return np.asarray(cv2.resize(np.ascontiguousarray(picture), size[::-1], interpolation=way), np.uint8)
 
 
-def _opened(model: bytes, where: str, provider: Provider, threads: int) -> tuple[Any, str, Any]:
-    """What runs the model, where in words, and the ONNX Runtime session that describes it."""
+def _opened(
+    model: bytes, where: str, provider: Provider, threads: int
+) -> tuple[Any, str, ModelInfo, tuple[int, int] | None]:
+    """What runs the model, where in words, what it says of itself, and its input's (height, width) if that is fixed."""
     if provider in ("auto", "cuda") and _CUDA in onnxruntime.get_available_providers():
         session = _onnx_session(model, where, threads, [_CUDA, "CPUExecutionProvider"])
         if session.get_providers()[0] == _CUDA:
-            return _runner(session), "ONNX Runtime on the GPU (CUDA)", session
+            return _runner(session), "ONNX Runtime on the GPU (CUDA)", *_contract(session, where)
     if provider == "cuda":
         raise SettingsError(
             "CUDA is not to be had here: install onnxruntime-gpu in place of onnxruntime, with a driver and CUDA of "
@@ -175,7 +172,7 @@ def _opened(model: bytes, where: str, provider: Provider, threads: int) -> tuple
     if provider in ("auto", "openvino"):
         described = _described(model, where)
         # before OpenVINO sees it: that crashes on some models that break the contract
-        _input_size(described, where, info_from_metadata(described.get_modelmeta().custom_metadata_map, where).stride)
+        contract = _contract(described, where)
         try:
             run = _openvino_runner(model, threads)
         except ImportError as error:
@@ -189,9 +186,15 @@ def _opened(model: bytes, where: str, provider: Provider, threads: int) -> tuple
                 raise InputError(f"{where}: OpenVINO refuses it ({told}); choose the provider cpu") from error
             refused = ", since OpenVINO refuses the model"
         else:
-            return run, f"OpenVINO on the CPU, {_count(threads)}", described
+            return run, f"OpenVINO on the CPU, {_count(threads)}", *contract
     session = _onnx_session(model, where, threads, ["CPUExecutionProvider"])
-    return _runner(session), f"ONNX Runtime on the CPU, {_count(threads)}{refused}", session
+    return _runner(session), f"ONNX Runtime on the CPU, {_count(threads)}{refused}", *_contract(session, where)
+
+
+def _contract(session: Any, where: str) -> tuple[ModelInfo, tuple[int, int] | None]:
+    """What the model says of itself, and its input's (height, width) if that is fixed; InputError if it breaks it."""
+    info = info_from_metadata(session.get_modelmeta().custom_metadata_map, where)
+    return info, _input_size(session, where, info.stride)
 
 
 def _count(threads: int) -> str:

@@ -127,10 +127,3 @@ class EfficientNetLite0(nn.Module):
             else:
                 folded[name] = weights[f"{norm}.bias"] - weights[f"{norm}.running_mean"] * gain
         self.load_state_dict(folded)
-
-
-def frozen_share(model: nn.Module) -> float:
-    """The share of a model's weights that training leaves as they are."""
-    sizes = torch.tensor([weight.numel() for weight in model.parameters()], dtype=torch.float64)
-    fixed = torch.tensor([not weight.requires_grad for weight in model.parameters()])
-    return float(sizes[fixed].sum() / sizes.sum())
