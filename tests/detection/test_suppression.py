@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from sorvolo.detection.session import Seen
-from sorvolo.detection.suppression import SeenTile, cover_matrix, iou_matrix, merge_tiles
+from sorvolo.detection.suppression import SeenTile, merge_tiles
+from sorvolo.geometry.boxes import cover_matrix, iou_matrix
 
 _SIZE = (100, 180)
 _LEFT, _RIGHT = (0, 0, 100, 100), (80, 0, 180, 100)

@@ -19,6 +19,7 @@ from pycocotools.cocoeval import COCOeval
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, TimesNs
+from sorvolo.geometry.boxes import iou_matrix
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections
 
@@ -249,7 +250,7 @@ def confusion(
         match, picture = matches[k], int(matches[k].pictures[d])
         box = match.boxes_px[d]
         left = [row for row in missed.get(picture, []) if row[0] != k]
-        overlaps = _overlaps(box, np.array([matches[c].true_boxes_px[g] for c, g in left]))
+        overlaps = iou_matrix(box[None], np.reshape([matches[c].true_boxes_px[g] for c, g in left], (-1, 4)))[0]
         if len(left) and overlaps.max() >= IOUS[0]:
             c, g = left[int(np.argmax(overlaps))]
             missed[picture].remove((c, g))
@@ -362,15 +363,6 @@ def _tuple(box: BoxesPx) -> tuple[float, float, float, float]:
     return left, top, right, bottom
 
 
-def _overlaps(box: BoxesPx, others: Anything) -> Floats:
-    """(N,) intersection over union of one box with others, (N, 4)."""
-    if not len(others):
-        return np.zeros(0)
-    inner = np.clip(np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2]), 0, None).prod(axis=1)
-    areas = (others[:, 2:] - others[:, :2]).prod(axis=1) + (box[2:] - box[:2]).prod()
-    return np.asarray(inner / np.maximum(areas - inner, 1e-9), np.float64)
-
-
 def _best_overlap(box: BoxesPx, match: ClassMatch, picture: int) -> float:
-    overlaps = _overlaps(box, match.true_boxes_px[match.true_pictures == picture])
+    overlaps = iou_matrix(box[None], match.true_boxes_px[match.true_pictures == picture])[0]
     return float(overlaps.max()) if len(overlaps) else 0.0

@@ -7,6 +7,7 @@ import numpy as np
 
 from sorvolo.detection.session import Seen
 from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, Mask
+from sorvolo.geometry.boxes import areas, cover_matrix, iou_matrix
 
 SAME_IOU = 0.4
 """Two tiles' boxes of a class are one object if they overlap this much in what both tiles show."""
@@ -34,18 +35,6 @@ class _Views:
     tiles: Anything
     cut: Mask  # (N,)
     room_px: Floats  # (N,) to the nearest border within the picture
-
-
-def iou_matrix(a: BoxesPx, b: BoxesPx) -> Floats:
-    """(N, M) intersection over union of boxes (N, 4) and (M, 4)."""
-    shared = _shared(a, b)
-    union = _area(a)[:, None] + _area(b)[None] - shared
-    return np.asarray(shared / np.maximum(union, 1e-9))
-
-
-def cover_matrix(a: BoxesPx, b: BoxesPx) -> Floats:
-    """(N, M) share of each box of `a`, (N, 4), that lies within each of `b`, (M, 4)."""
-    return np.asarray(_shared(a, b) / np.maximum(_area(a)[:, None], 1e-9))
 
 
 def merge_tiles(tiles: Sequence[SeenTile], size_px: tuple[int, int]) -> Seen:
@@ -132,7 +121,7 @@ def _not_covered(boxes: BoxesPx, is_piece: Mask, tiles: Sequence[set[int]]) -> A
     """Indices of the objects, without the pieces that lie in a larger box of other tiles."""
     pieces = np.flatnonzero(is_piece)
     cover = cover_matrix(boxes[pieces], boxes)
-    area = _area(boxes)
+    area = areas(boxes)
     gone = [
         piece for row, piece in enumerate(pieces.tolist())
         if any(
@@ -147,13 +136,3 @@ def _within(boxes: BoxesPx, window: Anything) -> BoxesPx:
     return np.concatenate(
         [np.clip(boxes[:, :2], window[:2], window[2:]), np.clip(boxes[:, 2:], window[:2], window[2:])], axis=1
     )
-
-
-def _shared(a: BoxesPx, b: BoxesPx) -> Floats:
-    corner = np.maximum(a[:, None, :2], b[None, :, :2])
-    far = np.minimum(a[:, None, 2:], b[None, :, 2:])
-    return np.asarray(np.clip(far - corner, 0, None).prod(axis=2), np.float64)
-
-
-def _area(boxes: BoxesPx) -> Floats:
-    return np.asarray(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None).prod(axis=1), np.float64)

@@ -5,12 +5,15 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.geometry.boxes import iou_matrix, nesting_matrix
 from sorvolo.survey.objects import Sighting
 from sorvolo.tracking.followed import Followed
 from sorvolo.tracking.motion import MOVES, log_density, predicted
 
 _SAME_BOX = 0.6  # overlap of two boxes from which they show one object, whatever their classes
-_WITHIN = 0.9  # of the smaller of two boxes of a class: 4 of 174 such pairs of validation pictures were two objects
+WITHIN = 0.9
+"""Share of the smaller of two boxes of a class that lies in the other from which on they show one object: of 174 such
+pairs in validation pictures 4 were two."""
 _FRAMES_APART = 5  # of two neighbours of which each frame sees one
 _TOGETHER_SHARE = 0.15  # of frames with one of them: what is seen together more often is two objects
 _LEAST_CLASS_FIT = 0.1
@@ -25,14 +28,10 @@ def frame_doubles(sightings: Sequence[Sighting]) -> dict[int, int]:
     if len(sightings) < 2:
         return {}
     boxes = np.array([each.box_px for each in sightings], np.float64)
-    low = np.maximum(boxes[:, None, :2], boxes[None, :, :2])
-    high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
-    common = np.prod(np.maximum(high - low, 0.0), axis=2)
-    areas = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
-    overlap = common / np.maximum(areas[:, None] + areas[None] - common, 1e-9)
-    within = common / np.maximum(np.minimum(areas[:, None], areas[None]), 1e-9)
     labels = np.array([each.label for each in sightings])
-    same = (overlap > _SAME_BOX) | ((within > _WITHIN) & (labels[:, None] == labels[None]))
+    same = (iou_matrix(boxes, boxes) > _SAME_BOX) | (
+        (nesting_matrix(boxes, boxes) > WITHIN) & (labels[:, None] == labels[None])
+    )
     doubles: dict[int, int] = {}
     order = np.argsort([-each.score for each in sightings], kind="stable")
     for place, row in enumerate(order):

@@ -12,9 +12,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from sorvolo.geometry.arrays import Anything, Floats
+from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.boxes import iou_matrix, nesting_matrix
 from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.survey.objects import TYPICAL_SIZE_M
+from sorvolo.tracking.joining import WITHIN
 from sorvolo.tracking.laying import LaidSighting, shows, usual_height_m
 from sorvolo.tracking.walking import Walk, walks
 
@@ -22,7 +24,6 @@ _GATE = 9.2  # squared distance in sigmas, two axes: 99 in 100 sightings of one 
 _OTHER_CLASS = 4.0  # added for a sighting of another class: rather another object, yet classes are mistaken
 _DRIFT_M = 0.12  # by which frames of one map lie beside each other where they were not linked
 _SAME_BOX = 0.55  # overlap of two boxes of one frame from which they show one object, whatever their classes
-_WITHIN = 0.9  # of the smaller of two boxes of a class: 4 of 174 such pairs of validation pictures were two objects
 _SHARED_FRAMES = 0.25  # of the fewer views: what is seen twice in more frames than these is two objects
 _LEAST_SHARE = 0.3  # of the frames that show its place: what fewer saw does not stand there
 _SURE = 0.5  # score from which one sighting alone is told, where no more than two frames show the place
@@ -95,15 +96,16 @@ def without_twins(laid: Sequence[LaidSighting]) -> list[list[int]]:
     They are boxes of several classes on one place, or of one class, one within the other.
     """
     order = sorted(range(len(laid)), key=lambda k: -laid[k].sighting.score)
+    boxes = np.array([each.sighting.box_px for each in laid], np.float64).reshape(-1, 4)
+    overlap, nesting = iou_matrix(boxes, boxes), nesting_matrix(boxes, boxes)
     groups: list[list[int]] = []
     for k in order:
-        box = laid[k].sighting.box_px
         for group in groups:
-            first = laid[group[0]].sighting
-            if first.label != laid[k].sighting.label:
-                is_same = _overlap(first.box_px, box) > _SAME_BOX
+            first = group[0]
+            if laid[first].sighting.label != laid[k].sighting.label:
+                is_same = overlap[first, k] > _SAME_BOX
             else:
-                is_same = _within(first.box_px, box) > _WITHIN
+                is_same = nesting[first, k] > WITHIN
             if is_same:
                 group.append(k)
                 break
@@ -340,18 +342,3 @@ def _best(members: Sequence[int], laid: Sequence[LaidSighting], label: str) -> i
         return doubt * each.sighting.score * float((right - left) * (bottom - top)) ** 0.25
 
     return max(members, key=clearness)
-
-
-def _overlap(one: Anything, other: Anything) -> float:
-    """Intersection over union of two boxes."""
-    low, high = np.maximum(one[:2], other[:2]), np.minimum(one[2:], other[2:])
-    shared = float(np.prod(np.clip(high - low, 0, None)))
-    areas = float(np.prod(one[2:] - one[:2]) + np.prod(other[2:] - other[:2]))
-    return shared / max(areas - shared, 1e-9)
-
-
-def _within(one: Anything, other: Anything) -> float:
-    """How much of the smaller of two boxes lies within the larger one."""
-    low, high = np.maximum(one[:2], other[:2]), np.minimum(one[2:], other[2:])
-    least = min(float(np.prod(one[2:] - one[:2])), float(np.prod(other[2:] - other[:2])))
-    return float(np.prod(np.clip(high - low, 0, None))) / max(least, 1e-9)
