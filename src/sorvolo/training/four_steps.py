@@ -17,8 +17,9 @@ from torch import Tensor, nn
 from sorvolo.errors import SettingsError
 from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.joint import Progress, collate
-from sorvolo.training.losses import Answer, Match, match_boxes, region_loss, sample, thesis_proposal_loss
-from sorvolo.training.proposals import Proposed, propose
+from sorvolo.training.losses import Answer, thesis_proposal_loss
+from sorvolo.training.proposals import Proposed
+from sorvolo.training.regions import draw_regions
 from sorvolo.training.samples import Sample
 
 STEP_NAMES = ("1/4 proposals", "2/4 classifier", "3/4 proposals refined", "4/4 classifier refined")
@@ -147,27 +148,12 @@ class FourStepTraining:
         self, levels: list[Tensor], proposed: Proposed, answers: Sequence[Answer]
     ) -> tuple[Tensor, Tensor]:
         """Eq. 4.2 for the classifier: both sums over the number of regions drawn."""
-        height, width = (levels[0].shape[axis] * self.model.proposals.strides[0] for axis in (2, 3))
-        regions, matches = [], []
-        for index, answer in enumerate(answers):
-            with torch.no_grad():
-                found, _ = propose(proposed, index, (height, width), before=2000, after=self.settings.proposed)
-                found = torch.cat([found, answer.boxes])
-                match = match_boxes(found, answer, over=0.5, under=0.5, best_too=False)
-                chosen = sample(match, self.settings.regions, 0.25, self.generator)
-            regions.append(found[chosen])
-            matches.append(Match(match.target[chosen]))
-        counts = [len(each) for each in regions]
-        batch = torch.repeat_interleave(torch.tensor(counts)).to(levels[0].device)
-        scores, offsets = self.model.classify(levels, torch.cat(regions), batch)
-        losses = [
-            region_loss(*each, overlap=False)
-            for each in zip(torch.split(scores, counts), torch.split(offsets, counts), regions, matches, answers)
-        ]
-        total = max(1, sum(counts))
-        return sum((each[0] for each in losses), scores.new_zeros(())) / total, sum(
-            (each[1] for each in losses), scores.new_zeros(())
-        ) / total
+        drawn = draw_regions(
+            self.model, levels, proposed, answers, self.generator, before=2000, after=self.settings.proposed,
+            count=self.settings.regions, most_positive=0.25,
+        )
+        score, box = drawn.losses(self.model, levels, answers, overlap=False)
+        return score / max(1, drawn.count), box / max(1, drawn.count)
 
 
 def _shared(model: FasterRCNN) -> nn.ModuleList:

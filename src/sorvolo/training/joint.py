@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from sorvolo.training.faster_rcnn import FasterRCNN
-from sorvolo.training.losses import Answer, joint_proposal_loss, match_boxes, region_loss, sample
-from sorvolo.training.proposals import propose
+from sorvolo.training.losses import Answer, joint_proposal_loss
+from sorvolo.training.regions import draw_regions
 from sorvolo.training.samples import Sample
 
 
@@ -109,26 +109,12 @@ class JointTraining:
     def _losses(self, levels: list[Tensor], answers: Sequence[Answer]) -> list[Tensor]:
         proposed = self.model.proposals(levels)
         proposal_score, proposal_box = joint_proposal_loss(proposed, answers)
-        height, width = (levels[0].shape[axis] * self.model.proposals.strides[0] for axis in (2, 3))
-        regions, matches, batch = [], [], []
-        for index, answer in enumerate(answers):
-            with torch.no_grad():
-                found, _ = propose(proposed, index, (height, width), before=500, after=200)
-                found = torch.cat([found, answer.boxes])
-                match = match_boxes(found, answer, over=0.5, under=0.5, best_too=False)
-                chosen = sample(match, self.settings.regions, 1 / 3, self.generator)
-            regions.append(found[chosen])
-            matches.append(type(match)(match.target[chosen]))
-            batch.append(torch.full((len(chosen),), index, dtype=torch.int64, device=found.device))
-        scores, offsets = self.model.classify(levels, torch.cat(regions), torch.cat(batch))
-        score_sum, box_sum = scores.new_zeros(()), scores.new_zeros(())
-        start, positives = 0, 0
-        for answer, match, own in zip(answers, matches, regions):
-            rows = slice(start, start + len(own))
-            score, box = region_loss(scores[rows], offsets[rows], own, match, answer, overlap=True)
-            score_sum, box_sum = score_sum + score, box_sum + box
-            start, positives = start + len(own), positives + int(match.positive.sum())
-        return [proposal_score, proposal_box, score_sum / max(1, start) * 2, box_sum / max(1, positives)]
+        drawn = draw_regions(
+            self.model, levels, proposed, answers, self.generator, before=500, after=200,
+            count=self.settings.regions, most_positive=1 / 3,
+        )
+        score, box = drawn.losses(self.model, levels, answers, overlap=True)
+        return [proposal_score, proposal_box, score / max(1, drawn.count) * 2, box / max(1, drawn.positives)]
 
     def _share_of_rate(self) -> float:
         """Up in a straight line, then down half a cosine."""
