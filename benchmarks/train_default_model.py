@@ -1,5 +1,7 @@
 """Train the default model: python benchmarks/train_default_model.py DATA OUT --weights LITE0 (`make model`).
 
+With --start MODEL instead of --weights it learns on from an exported model, such as the packaged one.
+
 DATA is a folder with the labelled sets that detection_data.py names and two flights of photos as ground for composed
 small objects; simulated pictures are made first, into OUT. Held-out parts are never read here. A run that was stopped
 goes on from its last checkpoint.
@@ -8,8 +10,9 @@ goes on from its last checkpoint.
 import argparse
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -17,18 +20,22 @@ import numpy as np
 import torch
 
 from detection_data import SMALL, aerial_cars, hituav, in_order, mannequin, tinyperson
+from sorvolo.detection.models import find_model
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.simulate_pictures import simulate_pictures
 from sorvolo.simulation.pictures import PictureSettings
 from sorvolo.store.datasets import read_dataset
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.joint import JointSettings, JointTraining, batches
+from sorvolo.training.drawing import batches_from
+from sorvolo.training.exported import load_exported
+from sorvolo.training.joint import JointSettings, JointTraining, collate
 from sorvolo.training.presets import fast
-from sorvolo.training.samples import Augmentation, Share, samples
+from sorvolo.training.samples import Augmentation, Sample, Share
 from sorvolo.training.weights import load_lite0
 
-SIMULATED_SEED, SIMULATED_PICTURES = 1, 700
+SIMULATED_SEED, SIMULATED_PICTURES = 1, 1400
+SETTLING = 12  # batches by which the norms of a started model are settled
 
 
 def main() -> None:
@@ -36,7 +43,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--weights", type=Path, required=True, help="EfficientNet-Lite0's published weights")
+    start = parser.add_mutually_exclusive_group(required=True)
+    start.add_argument("--weights", type=Path, help="EfficientNet-Lite0's published weights")
+    start.add_argument("--start", help="an installed model's name or a model file to learn on from")
     parser.add_argument("--steps", type=int, default=6000)
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--side", type=int, default=384)
@@ -54,24 +63,31 @@ def main() -> None:
         boxes = sum(len(each.labels) for each in share.labelled.pictures)
         name, pictures = share.labelled.name, len(share.labelled)
         print(f"{name}: {pictures} pictures, {boxes} boxes, weight {share.weight}", flush=True)
+    def stream(start: int, seed: int) -> Iterator[list[Sample]]:
+        crops = Augmentation(side_px=wishes.side)
+        return batches_from(shares, CLASSES, reader(), crops, seed=seed, batch=wishes.batch, start=start)
+
     model = fast(CLASSES)
-    model.backbone.load_imagenet(load_lite0(wishes.weights))
+    rate = JointSettings.rate
+    if wishes.weights is not None:
+        model.backbone.load_imagenet(load_lite0(wishes.weights))
+    else:
+        first = [each for batch in islice(stream(0, wishes.seed + 1), SETTLING) for each in batch]
+        load_exported(model, find_model(wishes.start).read_bytes(), collate(first, "cpu")[0])
+        rate *= 0.7
     model = model.to(memory_format=torch.channels_last)
-    settings = JointSettings(steps=wishes.steps, batch=wishes.batch)
+    settings = JointSettings(steps=wishes.steps, batch=wishes.batch, rate=rate, backbone_rate=rate / 5)
     training = JointTraining(model, settings, wishes.seed, wishes.device)
     checkpoint = wishes.out / "checkpoint.pt"
     if checkpoint.is_file():
         training.load_state(torch.load(checkpoint, weights_only=True))
         print(f"going on from step {training.step}", flush=True)
-    stream = batches(
-        samples(shares, CLASSES, reader(), Augmentation(side_px=wishes.side), wishes.seed + training.step),
-        wishes.batch,
-    )
+    drawn = stream(training.step, wishes.seed)
     recent: list[list[float]] = []
     started_s = time.monotonic()
     with (wishes.out / "log.jsonl").open("a") as log:
         while training.step < wishes.steps:
-            done = training.learn(next(stream))
+            done = training.learn(next(drawn))
             recent.append([done.proposal_score, done.proposal_box, done.region_score, done.region_box])
             if done.step % 50 == 0:
                 means = [round(float(each), 4) for each in np.mean(recent, axis=0)]
@@ -96,12 +112,12 @@ def training_shares(data: Path, out: Path) -> list[Share]:
             pass
     made = in_order(read_dataset(simulated))
     return [
-        Share(hituav(data)["train"], 4.0, (0.7, 1.7), thermal=True),
-        Share(tinyperson(data)["train"], 1.3, (0.8, 2.2), pastes=SMALL),
-        Share(mannequin(data)["train"], 0.25, (0.3, 1.2), pastes=SMALL),
-        Share(aerial_cars(data)["train"], 1.6, (0.25, 1.2), pastes=SMALL),
-        Share(made, 2.6, (0.6, 1.6)),
-        Share(_ground(data), 0.5, (0.12, 0.5), pastes=SMALL),
+        Share(hituav(data)["train"], 4.0, (0.7, 1.8), thermal=True),
+        Share(tinyperson(data)["train"], 1.8, (0.8, 2.4), pastes=SMALL),
+        Share(mannequin(data)["train"], 0.2, (0.3, 1.2), pastes=SMALL),
+        Share(aerial_cars(data)["train"], 1.4, (0.25, 1.2), pastes=SMALL),
+        Share(made, 3.0, (0.6, 1.6)),
+        Share(_ground(data), 0.4, (0.12, 0.5), pastes=SMALL),
     ]
 
 

@@ -5,6 +5,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from sorvolo.training.depthwise import depthwise
+
 _EPSILON = 1e-3
 _BLOCKS = (  # repeats, kernel, stride, growth, out channels
     (1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112), (4, 5, 2, 6, 192),
@@ -40,6 +42,8 @@ class SamePadded(nn.Conv2d):
         total = self.kernel_size[0] - self.stride[0]
         before = total // 2
         after = total - before
+        if before == after and self.groups > 1:
+            return depthwise(features, self.weight, self.bias, self.stride[0], before)
         if before == after:
             return functional.conv2d(features, self.weight, self.bias, self.stride, before, groups=self.groups)
         if torch.onnx.is_in_onnx_export():
@@ -47,7 +51,9 @@ class SamePadded(nn.Conv2d):
                 features, self.weight, self.bias, self.stride[0], (before, after), self.groups
             )
         padded = functional.pad(features, (before, after, before, after))
-        return functional.conv2d(padded, self.weight, self.bias, self.stride, groups=self.groups)
+        if self.groups > 1:
+            return depthwise(padded, self.weight, self.bias, self.stride[0], 0)
+        return functional.conv2d(padded, self.weight, self.bias, self.stride)
 
 
 class _Block(nn.Module):

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from sorvolo.training.depthwise import Depthwise
 from sorvolo.training.pyramid import convolution, separable
 
 Stem = Literal["standard", "extended", "extended-residual"]
@@ -155,8 +156,7 @@ class _LightInception(nn.Module):
         super().__init__()
         self.branches = nn.ModuleList(
             nn.Sequential(
-                nn.Conv2d(channels, channels, kernel, padding=kernel // 2, groups=channels, bias=False),
-                nn.BatchNorm2d(channels), nn.ReLU(inplace=True),
+                Depthwise(channels, kernel), nn.BatchNorm2d(channels), nn.ReLU(inplace=True),
             )
             for kernel in (3, 5, 7)
         )

@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.losses import Answer, joint_proposal_loss
+from sorvolo.training.proposals import Proposed
 from sorvolo.training.regions import draw_regions
 from sorvolo.training.samples import Sample
 
@@ -63,7 +64,7 @@ class JointTraining:
         others = [each for each in model.parameters() if id(each) not in own]
         self.optimiser = torch.optim.AdamW(
             [{"params": others, "rate": settings.rate}, {"params": backbone, "rate": settings.backbone_rate}],
-            lr=settings.rate, weight_decay=settings.decay,
+            lr=settings.rate, weight_decay=settings.decay, fused=True,
         )
         self._started_s = time.monotonic()
 
@@ -77,8 +78,10 @@ class JointTraining:
         # half precision where it pays, in the convolutions; on CPUs without it torch is only slower
         with torch.autocast(self.device, torch.bfloat16, enabled=self.settings.mixed_precision):
             levels = self.model.features(images)
+            proposed = self.model.proposals(levels)
         levels = [level.float() for level in levels]
-        parts = self._losses(levels, answers)
+        proposed = replace(proposed, scores=proposed.scores.float(), offsets=proposed.offsets.float())
+        parts = self._losses(levels, proposed, answers)
         self.optimiser.zero_grad(set_to_none=True)
         torch.stack(parts).sum().backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), 10.0)
@@ -106,8 +109,7 @@ class JointTraining:
         self.generator.set_state(state["generator"])
         self.step = int(state["step"])
 
-    def _losses(self, levels: list[Tensor], answers: Sequence[Answer]) -> list[Tensor]:
-        proposed = self.model.proposals(levels)
+    def _losses(self, levels: list[Tensor], proposed: Proposed, answers: Sequence[Answer]) -> list[Tensor]:
         proposal_score, proposal_box = joint_proposal_loss(proposed, answers)
         drawn = draw_regions(
             self.model, levels, proposed, answers, self.generator, before=500, after=200,
@@ -127,10 +129,10 @@ class JointTraining:
     @torch.no_grad()
     def _average(self) -> None:
         keep = min(self.settings.averaging, (1 + self.step) / (10 + self.step))
-        for mean, value in zip(self.average.state_dict().values(), self.model.state_dict().values()):
-            if mean.dtype.is_floating_point:
-                mean.lerp_(value, 1 - keep)
-            else:
+        pairs = list(zip(self.average.state_dict().values(), self.model.state_dict().values()))
+        torch._foreach_lerp_(*zip(*(each for each in pairs if each[0].dtype.is_floating_point)), 1 - keep)
+        for mean, value in pairs:
+            if not mean.dtype.is_floating_point:
                 mean.copy_(value)
 
 

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 from torch.nn import functional
 
+from sorvolo.training.depthwise import Depthwise
+
 
 def convolution(channels: int, out: int, kernel: int, *, groups: int = 1) -> nn.Sequential:
     """Convolution, batch norm, ReLU; size kept."""
@@ -18,8 +20,7 @@ def convolution(channels: int, out: int, kernel: int, *, groups: int = 1) -> nn.
 def separable(channels: int, kernel: int) -> nn.Sequential:
     """Each channel by itself, then across channels: a light convolution."""
     return nn.Sequential(
-        nn.Conv2d(channels, channels, kernel, padding=kernel // 2, groups=channels, bias=False),
-        nn.BatchNorm2d(channels), *convolution(channels, channels, 1),
+        Depthwise(channels, kernel), nn.BatchNorm2d(channels), *convolution(channels, channels, 1),
     )
 
 
