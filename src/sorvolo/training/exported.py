@@ -1,10 +1,13 @@
 """An exported model taken back into torch, to learn on: the way to tune the packaged model to one's own pictures."""
 
+import json
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import onnx
 import torch
+from google.protobuf.message import DecodeError
 from onnx import numpy_helper
 from torch import Tensor, nn
 
@@ -12,46 +15,95 @@ from sorvolo.errors import InputError
 from sorvolo.training.faster_rcnn import FasterRCNN
 
 _WEIGHTED = ("Conv", "Gemm")
+_OF_CLASSES = "head.scores"  # the one layer with a row for each class; the background's comes last
 
 
-def load_exported(model: FasterRCNN, exported: bytes, pictures: Tensor) -> None:
+def load_exported(
+    model: FasterRCNN, exported: bytes, pictures: Tensor, classes: Sequence[str] | None = None
+) -> None:
     """Give `model` the weights of an ONNX file that `export_onnx` made of one of its shape.
 
     An export folds each batch norm into the convolution before it. Here the norms are opened again: their means and
     variances are those that `pictures` (N, 3, H, W), RGB 0 to 255, give them, so that they fit the pictures which are
-    to be learnt from; what the model sees in a picture stays the same. Raises InputError where the file's layers are
-    not the model's, as those of a model in eight bits are not.
+    to be learnt from; what the model sees in a picture stays the same. `classes` are the model's: those that the file
+    names too keep what it knows of them, the others start as `model` has them; None: the same ones in the same order.
+    Raises InputError where the file's layers are not the model's, as those of a model in eight bits are not, and for a
+    model with batch norms that do not learn (ResNet-50's of the presets `accurate` and `thesis`).
     """
-    graph = onnx.load_model_from_string(exported).graph
+    graph, known = _read(exported)
     values = {each.name: each for each in graph.initializer}
+    values |= {  # an export keeps values that are the same once
+        node.output[0]: values[node.input[0]]
+        for node in graph.node if node.op_type == "Identity" and node.input[0] in values
+    }
     layers = {name: each for name, each in model.named_modules() if isinstance(each, nn.Conv2d | nn.Linear)}
-    loaded: dict[str | None, list[Tensor]] = {}
+    norms = _norms_after(model)
+    loaded: dict[str, list[Tensor]] = {}
     for node in graph.node:
         own = [values[name] for name in node.input[1:] if name in values]
         if node.op_type in _WEIGHTED and own:
-            name = _module_of(node.name, list(layers))
+            name = _module_of(node.name, list(layers)) or node.name
             loaded[name] = [torch.from_numpy(numpy_helper.to_array(each).copy()) for each in own]
-    norms = _norms_after(model)
+    if foreign := [name for name in loaded if name not in layers]:
+        raise _unfitting(f"the network has no layer {foreign[0]}, as the file has")
     for name, layer in layers.items():
-        weights = loaded.get(name)
-        if weights is None or len(weights) != 2 or weights[0].shape != layer.weight.shape:
-            found = "nothing" if weights is None else " x ".join(map(str, weights[0].shape))
-            wanted = " x ".join(map(str, layer.weight.shape))
-            raise InputError(
-                f"the model file does not fit the network: its layer {name} should be {wanted}, and is {found}; give a "
-                "float32 model of the same preset, --rpn and number of classes"
-            )
-        with torch.no_grad():
-            layer.weight.copy_(weights[0])
-            if layer.bias is not None:
-                layer.bias.copy_(weights[1])
-            else:
-                norm = norms[name]
-                norm.running_mean.zero_()  # type: ignore[operator, union-attr]
-                norm.running_var.fill_(1 - norm.eps)  # type: ignore[operator, union-attr]
-                norm.weight.fill_(1)
-                norm.bias.copy_(weights[1])
+        found = loaded.get(name, [])
+        if name == _OF_CLASSES and classes is not None and len(found) == 2:
+            found = _rows_of(layer, found, known, classes)
+        if len(found) != 2 or found[0].shape != layer.weight.shape:
+            shape = " x ".join(map(str, found[0].shape)) if found else "nothing"
+            raise _unfitting(f"its layer {name} should be {' x '.join(map(str, layer.weight.shape))}, and is {shape}")
+        _fill(name, layer, norms.get(name), *found)
     _settle(model, list(norms.values()), pictures)
+
+
+def _read(exported: bytes) -> tuple[Any, tuple[str, ...]]:
+    """The file's graph, and the names of its classes."""
+    try:
+        file = onnx.load_model_from_string(exported)
+        about = next(each.value for each in file.metadata_props if each.key == "sorvolo")
+        return file.graph, tuple(map(str, json.loads(about)["classes"]))
+    except (DecodeError, StopIteration, ValueError, LookupError, TypeError) as error:
+        raise InputError("the model file is damaged, or none that `sorvolo train` wrote; give one of those") from error
+
+
+def _unfitting(reason: str) -> InputError:
+    return InputError(
+        f"the model file does not fit the network: {reason}; give a float32 model of the same preset, --rpn and number "
+        "of classes"
+    )
+
+
+def _rows_of(
+    layer: nn.Module, found: Sequence[Tensor], known: Sequence[str], classes: Sequence[str]
+) -> list[Tensor]:
+    """The class layer's weights and bias: rows of classes of the same name and of the background are the file's."""
+    if len(found[0]) != len(known) + 1 or found[0].shape[1:] != layer.weight.shape[1:]:  # type: ignore[union-attr, index]
+        raise _unfitting(f"its {len(found[0])} rows of classes are not those of {', '.join(known)} and the background")
+    theirs = [*(known.index(name) for name in classes if name in known), len(known)]
+    own = [*(row for row, name in enumerate(classes) if name in known), len(classes)]
+    filled = [layer.weight.detach().clone(), layer.bias.detach().clone()]  # type: ignore[union-attr, operator]
+    for to, given in zip(filled, found):
+        to[own] = given[theirs]
+    return filled
+
+
+@torch.no_grad()
+def _fill(name: str, layer: nn.Module, norm: nn.BatchNorm2d | None, weight: Tensor, bias: Tensor) -> None:
+    """The layer's weight, and its bias: of one without a bias the shift of the norm, which else changes nothing."""
+    layer.weight.copy_(weight)  # type: ignore[operator, union-attr]
+    if layer.bias is not None:
+        layer.bias.copy_(bias)  # type: ignore[operator]
+        return
+    if norm is None:
+        raise InputError(
+            f"no model file can be learnt on from in this network: the batch norm behind {name} stays as ImageNet "
+            "taught it, and the file does not hold it by itself; start with --weights auto, or take the preset fast"
+        )
+    norm.running_mean.zero_()  # type: ignore[union-attr]
+    norm.running_var.fill_(1 - norm.eps)  # type: ignore[union-attr]
+    norm.weight.fill_(1)
+    norm.bias.copy_(bias)
 
 
 def _norms_after(model: nn.Module) -> dict[str, nn.BatchNorm2d]:
