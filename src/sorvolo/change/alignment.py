@@ -226,17 +226,20 @@ class Aligner:
 
     def _shifted(self, new: Keyframe, site_from_image: Matrix3) -> Matrix3:
         """The guess moved to where phase correlation of small copies puts it: refinement reaches a few pixels only."""
-        seen = self._seen(site_from_image, new.camera)
+        small = new.camera.resized(max(16, new.camera.width_px // 4), max(16, new.camera.height_px // 4))
+        size = small.width_px, small.height_px
+        step_x, step_y = new.camera.width_px / size[0], new.camera.height_px / size[1]
+        image_from_small = np.array([[step_x, 0, (step_x - 1) / 2], [0, step_y, (step_y - 1) / 2], [0, 0, 1.0]])
+        seen = self._seen(site_from_image @ image_from_small, small)
         if seen is None or seen[1].mean() < self._settings.least_known:
             return site_from_image
-        size = new.camera.width_px // 4, new.camera.height_px // 4
-        old = cv2.resize(normalised(*seen), size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        old = normalised(*seen).astype(np.float32)
         fresh = cv2.resize(new.gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         window = cv2.createHanningWindow(size, cv2.CV_32F)
         (dx, dy), response = cv2.phaseCorrelate(old, fresh, window)
         if response < 0.05 or abs(dx) > 0.4 * size[0] or abs(dy) > 0.4 * size[1]:
             return site_from_image
-        return site_from_image @ np.array([[1.0, 0.0, -4 * dx], [0.0, 1.0, -4 * dy], [0.0, 0.0, 1.0]])
+        return site_from_image @ np.array([[1.0, 0.0, -step_x * dx], [0.0, 1.0, -step_y * dy], [0.0, 0.0, 1.0]])
 
     def _by_features(
         self, new: Keyframe, features: Features, site_from_image: Matrix3, prior: CameraPrior, *, is_free: bool

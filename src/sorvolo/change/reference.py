@@ -20,7 +20,7 @@ _NOTHING = Features("orb", np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
 
 
 class ReferenceMap:
-    """A version of the map, read a tile at a time; remembers the last tiles, the last window and all features.
+    """A version of the map, read a tile at a time; remembers the last tiles, each level's last window and all features.
 
     `tiles` is any mapping from tile to RGBA; level n of the map has pixels of 2^n grid pixels.
     """
@@ -29,7 +29,7 @@ class ReferenceMap:
         self._tiles, self._grid = tiles, grid
         self._cache: OrderedDict[tuple[int, TileIndex], ImageRGBA | None] = OrderedDict()
         self._cache_tiles = max(8, cache_bytes // (4 * grid.tile_px**2))
-        self._window: tuple[int, int, int, ImageRGBA] = (-1, 0, 0, np.zeros((0, 0, 4), np.uint8))
+        self._windows: dict[int, tuple[int, int, ImageRGBA]] = {}  # of each level the last
         self._features: dict[tuple[int, TileIndex], Features] = {}
 
     @property
@@ -85,14 +85,17 @@ class ReferenceMap:
     # ---- inside -----------------------------------------------------------------------------------------------
 
     def _window_around(self, level: int, box: tuple[int, int, int, int]) -> tuple[int, int, ImageRGBA]:
-        known_level, x, y, window = self._window
-        height, width = window.shape[:2]
-        if known_level == level and x <= box[0] and y <= box[1] and box[2] <= x + width and box[3] <= y + height:
-            return x, y, window
+        if level in self._windows:
+            x, y, window = self._windows[level]
+            height, width = window.shape[:2]
+            if x <= box[0] and y <= box[1] and box[2] <= x + width and box[3] <= y + height:
+                return x, y, window
         spare = max(box[2] - box[0], box[3] - box[1]) // 4  # the next views lie beside this one
         x, y = box[0] - spare, box[1] - spare
         window = self._assembled(level, x, y, box[2] + spare - x, box[3] + spare - y)
-        self._window = level, x, y, window
+        self._windows[level] = x, y, window
+        while sum(each[2].nbytes for each in self._windows.values()) > 4 * _MOST_PX and len(self._windows) > 1:
+            self._windows.pop(next(each for each in self._windows if each != level))
         return x, y, window
 
     def _assembled(self, level: int, x: int, y: int, width: int, height: int) -> ImageRGBA:

@@ -197,7 +197,8 @@ def refine(
     if len(points) < settings.min_inliers:
         return "the overlap is too small"
     size = (new.gray.shape[1], new.gray.shape[0])
-    warped = cv2.warpPerspective(old.gray, new_from_old, size, flags=cv2.INTER_LINEAR)
+    overlaid = old.gray.shape == new.gray.shape and np.array_equal(new_from_old, np.eye(3))
+    warped = old.gray if overlaid else cv2.warpPerspective(old.gray, new_from_old, size, flags=cv2.INTER_LINEAR)
     start = points.astype(np.float32).reshape(-1, 1, 2)
     window = (settings.refine_window_px, settings.refine_window_px)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
