@@ -9,10 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
+
+from square_pictures import labelled_squares  # noqa: E402
 
 from sorvolo.cli.main import main  # noqa: E402
 from sorvolo.detection.detector import Detector  # noqa: E402
@@ -23,34 +24,10 @@ from sorvolo.missions.training_sets import DataOptions, read_training_sets, simu
 from sorvolo.store.training_page import training_page  # noqa: E402
 from sorvolo.training.checkpoint import read_checkpoint  # noqa: E402
 
-_WIDTH, _HEIGHT = 128, 96
-
-
-def _labelled(folder: Path, videos: int, frames: int, *, names: tuple[str, ...] = ("car",), seed: int = 0) -> Path:
-    """YOLO pictures of bright squares on dark ground, one of each class; the class is its brightness."""
-    rng = np.random.default_rng(seed)
-    for part in ("images", "labels"):
-        (folder / part).mkdir(parents=True)
-    for video in range(videos):
-        for frame in range(frames):
-            image = rng.integers(40, 60, (_HEIGHT, _WIDTH, 3)).astype(np.uint8)
-            rows = []
-            for label in range(len(names)):
-                side = int(rng.integers(22, 32))
-                x, y = int(rng.integers(0, _WIDTH - side)), int(rng.integers(0, _HEIGHT - side))
-                image[y:y + side, x:x + side] = (30, 220, 240) if label == 0 else (240, 60, 40)
-                rows.append(f"{label} {(x + side / 2) / _WIDTH} {(y + side / 2) / _HEIGHT} {side / _WIDTH} "
-                            f"{side / _HEIGHT}")
-            name = f"flight{video}_{frame:04d}"
-            cv2.imwrite(str(folder / "images" / f"{name}.png"), image)
-            (folder / "labels" / f"{name}.txt").write_text("\n".join(rows))
-    (folder / "classes.txt").write_text("\n".join(names))
-    return folder
-
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return _labelled(tmp_path_factory.mktemp("data") / "squares", 4, 5)
+    return labelled_squares(tmp_path_factory.mktemp("data") / "squares", 4, 5)
 
 
 def _settings(**changes: object) -> TrainSettings:
@@ -132,7 +109,7 @@ def test_ctrl_c_waits_for_the_step_and_leaves_a_checkpoint(
 
 
 def test_other_labels_are_other_data(tmp_path: Path) -> None:
-    place = _labelled(tmp_path / "squares", 2, 3)
+    place = labelled_squares(tmp_path / "squares", 2, 3)
     run = _train(place, tmp_path / "out", _settings())
     for update in run:
         if update.step == 1:
@@ -143,7 +120,7 @@ def test_other_labels_are_other_data(tmp_path: Path) -> None:
 
 
 def test_damaged_pictures_are_passed_over_and_told(tmp_path: Path) -> None:
-    place = _labelled(tmp_path / "squares", 2, 3)
+    place = labelled_squares(tmp_path / "squares", 2, 3)
     path = place / "images" / "flight0_0001.png"
     path.write_bytes(path.read_bytes()[:2000])
     options = DataOptions(val="0")
@@ -168,20 +145,20 @@ def test_whole_videos_are_held_out(data: Path) -> None:
 
 
 def test_one_video_is_split_by_blocks_and_the_score_called_too_good(tmp_path: Path) -> None:
-    sets = _sets(_labelled(tmp_path / "one", 1, 40))
+    sets = _sets(labelled_squares(tmp_path / "one", 1, 40))
     assert 0 < len(sets.held_out[0]) < 20 < len(sets.shares[0].labelled)
     assert any("frames of one video look alike, so the score will be too good" in each for each in sets.notices)
 
 
 def test_a_video_in_both_parts_is_warned_of(data: Path, tmp_path: Path) -> None:
-    other = _labelled(tmp_path / "other", 2, 2)
+    other = labelled_squares(tmp_path / "other", 2, 2)
     sets = _sets(data, val=str(other))
     assert len(sets.shares[0].labelled) == 20 and len(sets.held_out[0]) == 4
     assert any("lie in both" in each and "flight0" in each for each in sets.notices)
 
 
 def test_classes_that_a_set_knows_nothing_of_are_unlabelled_there(data: Path, tmp_path: Path) -> None:
-    people = _labelled(tmp_path / "people", 4, 2, names=("person", "car"))
+    people = labelled_squares(tmp_path / "people", 4, 2, names=("person", "car"))
     sets = _sets(data, people)
     assert sets.classes == ("person", "car")
     assert [sorted(share.labelled.unlabelled) for share in sets.shares] == [["person"], []]
@@ -225,7 +202,7 @@ def test_bad_input_is_told(data: Path, tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_pictures_without_any_object_teach_nothing(tmp_path: Path) -> None:
-    place = _labelled(tmp_path / "squares", 2, 2)
+    place = labelled_squares(tmp_path / "squares", 2, 2)
     for path in (place / "labels").glob("*.txt"):
         path.write_text("")
     with pytest.raises(InputError, match="none of the pictures to learn from has a labelled object"):

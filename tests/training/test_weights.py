@@ -16,10 +16,11 @@ torch = pytest.importorskip("torch")
 from safetensors.torch import save_file  # noqa: E402
 
 from sorvolo.errors import InputError  # noqa: E402
+from sorvolo.missions.training_start import fetch_weights, load_start, load_weights  # noqa: E402
 from sorvolo.training import weights as module  # noqa: E402
 from sorvolo.training.backbone import EfficientNetLite0  # noqa: E402
 from sorvolo.training.resnet import IMAGENET_STD, ResNet50  # noqa: E402
-from sorvolo.training.weights import fetch, load_lite0, load_weights, read_weights  # noqa: E402
+from sorvolo.training.weights import Source, load_lite0, read_weights  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +74,7 @@ def test_a_file_of_another_net_than_the_preset_needs_is_refused(
     save_file(lite0, tmp_path / "net.safetensors")
     with pytest.raises(InputError, match=r"weights of lite0, but this preset is built on resnet50"):
         load_weights(str(tmp_path / "net.safetensors"), "resnet50")
-    assert load_weights("none", "resnet50") is None
+    assert load_start("none", "thesis") is None
 
 
 class _Evil:
@@ -163,9 +164,9 @@ def test_a_cached_package_with_its_hash_is_taken_without_a_network(
     (tmp_path / "weights").mkdir()
     save_file(lite0, tmp_path / "weights" / "net.safetensors")
     sha256 = hashlib.sha256((tmp_path / "weights" / "net.safetensors").read_bytes()).hexdigest()
-    monkeypatch.setitem(module.SOURCES, "lite0", module._Source("http://127.0.0.1:9/net.safetensors", sha256, "MIT"))
+    monkeypatch.setitem(module.SOURCES, "lite0", Source("http://127.0.0.1:9/net.safetensors", sha256, "MIT"))
     weights = load_weights("auto", "lite0")
-    assert weights is not None and weights.origin == "net.safetensors (MIT)"
+    assert weights.origin == "net.safetensors (MIT)"
 
 
 def test_a_cached_package_must_have_its_hash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -175,6 +176,6 @@ def test_a_cached_package_must_have_its_hash(tmp_path: Path, monkeypatch: pytest
     place.parent.mkdir()
     place.write_bytes(b"cut short")
     # an address that nothing answers: the cut file must not be taken, and the words say what to do
-    monkeypatch.setitem(module.SOURCES, "lite0", module._Source(f"http://127.0.0.1:9/{source.name}", source.sha256, ""))
-    with pytest.raises(InputError, match=r"could not be fetched.*--weights FILE"):
-        fetch("lite0")
+    monkeypatch.setitem(module.SOURCES, "lite0", Source(f"http://127.0.0.1:9/{source.name}", source.sha256, ""))
+    with pytest.raises(InputError, match=r"cannot be fetched.*--weights FILE"):
+        fetch_weights("lite0")

@@ -59,7 +59,9 @@ def train(
     val: Annotated[
         str, typer.Option(help="A labelled set, or the share of the pictures held out, by video.")
     ] = "0.15",
-    weights: Annotated[str, typer.Option(help="ImageNet weights: auto, none, or a file.")] = "auto",
+    weights: Annotated[
+        str, typer.Option(help="ImageNet's (auto, or a file), none, or a model to tune: its name or .onnx file."),
+    ] = "auto",
     steps: Annotated[int, typer.Option(help="Batches to learn from.")] = 8000,
     batch: Annotated[int, typer.Option(help="Samples a step.")] = 4,
     side: Annotated[int, typer.Option(help="Side of the samples cut from the pictures, px.")] = 416,
@@ -86,6 +88,8 @@ def train(
     """A detector from labelled pictures (COCO, YOLO, VOC, VisDrone, Okutama-Action, UMCD).
 
     Example: sorvolo train my-labels --out my-model
+
+    Example, the packaged model tuned to one's own pictures: sorvolo train my-labels --out tuned --weights default
 
     Example: sorvolo train a b --preset accurate --val c --synthetic 0.2 --device cuda
 
@@ -128,6 +132,8 @@ def _show(updates: "Iterator[TrainingUpdate]", wish: "_Wish") -> None:
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("opening", total=None, told="")
         for update in updates:
+            for notice in update.notices:
+                progress.console.print(f"note: {escape(notice)}")
             progress.update(
                 task, description=escape(update.words), total=update.steps, completed=update.step,
                 told=_losses(update) if update.losses is not None else "",

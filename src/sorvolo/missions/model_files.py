@@ -1,17 +1,11 @@
 """Detection models on disk: fetched by hash, checked, and made smaller."""
 
-import hashlib
-import http.client
 import json
 import os
 import re
-import urllib.error
-import urllib.request
 from collections.abc import Iterator
-from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO
 
 from sorvolo.capture.photos import PHOTO_SUFFIXES, read_picture
 from sorvolo.detection.models import (
@@ -25,14 +19,12 @@ from sorvolo.detection.quantise import Quantised, quantise
 from sorvolo.detection.session import read_info
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.missions.fetched_files import copy_by_hash, is_web_address
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes, writing
 
 MIRROR_VARIABLE = "SORVOLO_MODELS_URL"
 """A team's own collection: `fetch NAME` asks for NAME.onnx under this address."""
 
-_MOST_BYTES = 1 << 30
-_CHUNK_BYTES = 1 << 20
-_PATIENCE_S = 30.0
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
@@ -59,12 +51,10 @@ def fetch_model(source: str, sha256: str, *, name: str = "") -> InstalledModel:
         folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{own}.onnx"
     with atomic_path(path) as temporary:
-        found = _copy(address, temporary)
-        if found != wanted:
-            raise InputError(
-                f"{address} is not the file that was asked for: its SHA-256 is {found}, wanted was {wanted}; nothing "
-                "was installed. Ask again for file and hash"
-            )
+        copy_by_hash(
+            address, temporary, wanted,
+            offline="bring the file on a disk and give its path: sorvolo models fetch FILE --sha256 HASH",
+        )
         try:
             read_info(temporary)
         except InputError as error:
@@ -100,7 +90,7 @@ def _pictures(paths: list[Path]) -> Iterator[ImageRGB]:
 
 def _address_of(source: str) -> str:
     """Where a model is: an address or a path as given, or that of a name in the team's own collection."""
-    if re.match(r"(?i)https?://", source) or Path(source).expanduser().is_file():
+    if is_web_address(source) or Path(source).expanduser().is_file():
         return source
     if "://" in source:
         raise SettingsError(f"{source}: models are fetched by http or https, or from a file")
@@ -111,29 +101,3 @@ def _address_of(source: str) -> str:
         f"there is no file {source}, and ${MIRROR_VARIABLE} names no collection to ask for a model of this name; give "
         "its web address or its file"
     )
-
-
-def _copy(address: str, to: Path) -> str:
-    """Copy what is at an address or a path; returns its SHA-256."""
-    digest, size = hashlib.sha256(), 0
-    try:
-        with closing(_opened(address)) as stream, to.open("wb") as file:
-            while chunk := stream.read(_CHUNK_BYTES):
-                size += len(chunk)
-                if size > _MOST_BYTES:
-                    raise InputError(f"{address} is larger than {_MOST_BYTES >> 30} GB, so no model of ours")
-                digest.update(chunk)
-                file.write(chunk)
-    except (urllib.error.URLError, TimeoutError, ConnectionError, http.client.HTTPException) as error:
-        reason = getattr(error, "reason", None) or error
-        raise InputError(
-            f"{address} cannot be fetched ({reason}). Without a network, bring the file on a disk and give its path: "
-            "sorvolo models fetch FILE --sha256 HASH"
-        ) from error
-    return digest.hexdigest()
-
-
-def _opened(address: str) -> IO[bytes]:
-    if re.match(r"(?i)https?://", address):
-        return urllib.request.urlopen(address, timeout=_PATIENCE_S)
-    return Path(address).expanduser().open("rb")

@@ -3,7 +3,8 @@
 import math
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -19,7 +20,8 @@ from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.train_settings import TrainSettings
 from sorvolo.missions.training_checks import Checked, best_sizes_px, check_model
 from sorvolo.missions.training_sets import DataOptions, TrainingSets, read_training_sets, simulate_samples
-from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.missions.training_start import load_start, told_of_classes
+from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
 from sorvolo.store.exports import json_bytes, plain_json
 from sorvolo.store.training_page import training_page
 from sorvolo.training.checkpoint import (
@@ -31,14 +33,14 @@ from sorvolo.training.checkpoint import (
 )
 from sorvolo.training.drawing import batches_from
 from sorvolo.training.export import ExportCheck, check_export, export_onnx
+from sorvolo.training.exported import ExportedModel
 from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.four_steps import STEP_NAMES, FourStepTraining
 from sorvolo.training.joint import Progress
-from sorvolo.training.presets import NETS
 from sorvolo.training.progress import Check, History, Learner, seconds_left
-from sorvolo.training.samples import Augmentation
+from sorvolo.training.samples import Augmentation, Sample
 from sorvolo.training.starting import device_of, start_learner
-from sorvolo.training.weights import ImageNetWeights, load_weights
+from sorvolo.training.weights import ImageNetWeights
 
 MODEL, REPORT, PAGE = "model.onnx", "training.json", "training.html"
 CHECKPOINT, BEST, SIMULATED = "checkpoint.pt", "best.safetensors", "simulated"
@@ -63,6 +65,7 @@ class TrainingUpdate:
     steps_per_s: float = float("nan")
     left_s: float = float("nan")
     check: Check | None = None  # the one made just now
+    notices: tuple[str, ...] = ()  # what is to be known, each told once
 
 
 @dataclass(eq=False)
@@ -75,14 +78,18 @@ class _Run:
     learner: Learner
     reader: "_Reader"
     device: str
-    weights: ImageNetWeights | None
+    start: ImageNetWeights | ExportedModel | None
+    notices: tuple[str, ...]  # told before the first step
     history: History = field(default_factory=History)
 
     @property
     def identity(self) -> dict[str, Any]:
         """What a run must share with the one that it goes on from."""
         settings = {key: value for key, value in asdict(self.settings).items() if key != "patience"}
-        begun = "none" if self.weights is None else f"ImageNet{', original strides' if self.weights.original else ''}"
+        if isinstance(self.start, ExportedModel):
+            begun = f"model with SHA-256 {self.start.sha256[:16]}"
+        else:
+            begun = "none" if self.start is None else f"ImageNet{', original strides' if self.start.original else ''}"
         return {**settings, "weights": begun, "classes": list(self.sets.classes), "data": self.sets.fingerprint}
 
 
@@ -98,6 +105,7 @@ def train_detector(
     """
     device = device_of(device)
     _claim(out, resume)
+    start = load_start(settings.weights, settings.preset)
     steps = settings.steps
     if settings.synthetic > 0:
         samples = round(steps * settings.batch * settings.synthetic)
@@ -107,21 +115,25 @@ def train_detector(
     sets = read_training_sets(
         places, options, synthetic=settings.synthetic, seed=settings.seed, simulated=out / SIMULATED
     )
-    yield TrainingUpdate(0, steps, f"preparing the network ({settings.preset})")
-    weights = load_weights(settings.weights, NETS[settings.preset])
-    learner = start_learner(
-        settings.preset, sets.classes, settings.rpn, settings.schedule, weights, steps=steps, batch=settings.batch,
-        seed=settings.seed, device=device,
-    )
-    run = _Run(out, settings, sets, learner, _Reader(sets), device, weights)
+    told = sets.notices
+    if isinstance(start, ExportedModel):
+        told += tuple(told_of_classes(start, sets.classes))
+    yield TrainingUpdate(0, steps, f"preparing the network ({settings.preset})", notices=told)
+    reader = _Reader(sets)
+    with closing(_batches(sets, reader, settings)) as first:
+        learner = start_learner(
+            settings.preset, sets.classes, settings.rpn, settings.schedule, start, first, steps=steps,
+            batch=settings.batch, seed=settings.seed, device=device,
+        )
+    run = _Run(out, settings, sets, learner, reader, device, start, told)
     if resume:
         checkpoint = read_checkpoint((out / CHECKPOINT).read_bytes(), str(out / CHECKPOINT))
         restore(run.learner, checkpoint, run.identity)
         run.history = checkpoint.history
     yield from _learn(run)
     yield TrainingUpdate(run.learner.step, steps, "measuring and writing the model")
-    check = _finish(run)
-    yield TrainingUpdate(run.learner.step, steps, f"{out / MODEL} is ready", check=check)
+    check, told = _finish(run)
+    yield TrainingUpdate(run.learner.step, steps, f"{out / MODEL} is ready", check=check, notices=told)
 
 
 def _claim(out: Path, resume: bool) -> None:
@@ -133,6 +145,7 @@ def _claim(out: Path, resume: bool) -> None:
         raise SettingsError(f"{out} already holds a run; --resume goes on with it, another --out starts anew")
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
+        remove_leftovers([out])
 
 
 class _Reader:
@@ -156,13 +169,20 @@ class _Reader:
             raise InputError(f"{path}: {error}") from error
 
 
+def _batches(
+    sets: TrainingSets, reader: _Reader, settings: TrainSettings, start: int = 0
+) -> Generator[list[Sample], None, None]:
+    """What is learnt from, batch by batch, from number `start` on."""
+    return batches_from(
+        sets.shares, sets.classes, reader, Augmentation(side_px=settings.side_px), seed=settings.seed,
+        batch=settings.batch, start=start, threads=max(1, min(8, (os.cpu_count() or 1) - 1)),
+    )
+
+
 def _learn(run: _Run) -> Iterator[TrainingUpdate]:
     """All steps that are left, with checks and checkpoints; ends early where checks no longer get better."""
     settings, learner = run.settings, run.learner
-    batches = batches_from(
-        run.sets.shares, run.sets.classes, run.reader, Augmentation(side_px=settings.side_px), seed=settings.seed,
-        batch=settings.batch, start=learner.step, threads=max(1, min(8, (os.cpu_count() or 1) - 1)),
-    )
+    batches = _batches(run.sets, run.reader, settings, learner.step)
     first, before_s, started_s = learner.step, run.history.seconds, time.monotonic()
     saved_s = started_s
     try:
@@ -220,8 +240,9 @@ def _look(run: _Run, model: FasterRCNN, most: int) -> Checked:
     return check_model(model, run.sets.classes, run.sets.held_out, run.reader, device=run.device, most=most)
 
 
-def _finish(run: _Run) -> Check | None:
-    """The best weights as a model file, checked against torch, with the report."""
+def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
+    """The best weights as a model file, checked against torch, with the report; its last check, and what is new to
+    say."""
     model, classes, best = run.learner.average, run.sets.classes, run.history.best
     if best is not None:
         load_weights_bytes(model, (run.out / BEST).read_bytes(), str(run.out / BEST))
@@ -232,19 +253,32 @@ def _finish(run: _Run) -> Check | None:
     info = {
         "name": run.out.resolve().name or "model", "preset": run.settings.preset, "version": __version__,
         "classes": list(classes), "thresholds": scores, "best_px": best_sizes_px(checked, scores, learnt, classes),
-        "licence": "as the data that it was trained on", "trained_on": ", ".join(each.name for each in learnt),
+        **_descent(run, ", ".join(each.name for each in learnt)),
         "thermal": run.sets.is_thermal, "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     exported = export_onnx(model, info)
     agreement = check_export(model.cpu(), exported, _some_pictures(run))
     atomic_write_bytes(run.out / MODEL, exported)
     check = checked.check(run.learner.step if best is None else best.step) if run.sets.held_out else None
-    report = _report(run, info, agreement, len(exported), check) | {
+    told = _closing_notices(run, agreement)
+    report = _report(run, info, agreement, len(exported), check, told) | {
         "reported": {name: asdict(each) for name, each in thresholds.items()}
     }
     atomic_write_bytes(run.out / REPORT, json_bytes(report))
     atomic_write_bytes(run.out / PAGE, training_page(plain_json(report)).encode())
-    return check
+    return check, told
+
+
+def _descent(run: _Run, learnt: str) -> dict[str, str]:
+    """The model file's licence and what it was trained on: of a tuned one also those of the model before."""
+    licence = "as the data that it was trained on"
+    if not isinstance(run.start, ExportedModel):
+        return {"licence": licence, "trained_on": learnt}
+    before = run.start.trained_on or "what is not said"
+    return {
+        "licence": f"{licence}; {run.start.origin} before: {run.start.licence or 'not said'}",
+        "trained_on": f"{learnt}; {run.start.origin} before: {before}",
+    }
 
 
 def _some_pictures(run: _Run) -> list[ImageRGB]:
@@ -267,11 +301,9 @@ def _at_least(picture: ImageRGB, side_px: int) -> ImageRGB:
     return np.pad(picture, ((0, down), (0, right), (0, 0)), constant_values=114)
 
 
-def _report(
-    run: _Run, info: Mapping[str, Any], agreement: ExportCheck, size_bytes: int, check: Check | None
-) -> dict[str, Any]:
-    """The content of training.json."""
-    notices = list(run.sets.notices)
+def _closing_notices(run: _Run, agreement: ExportCheck) -> tuple[str, ...]:
+    """What is only known in the end."""
+    notices = []
     if run.reader.damaged:
         count, (path, reason) = len(run.reader.damaged), next(iter(run.reader.damaged.items()))
         notices.append(f"{count} pictures cannot be read and were passed over (first: {path}: {reason})")
@@ -282,11 +314,19 @@ def _report(
             f"the exported model differs from torch by {agreement.box_px:.2f} px, {agreement.score:.4f} in score, "
             f"{agreement.unmatched} of {agreement.detections} detections unmatched"
         )
+    return tuple(notices)
+
+
+def _report(
+    run: _Run, info: Mapping[str, Any], agreement: ExportCheck, size_bytes: int, check: Check | None,
+    closing_notices: Sequence[str],
+) -> dict[str, Any]:
+    """The content of training.json."""
     step, steps, history = run.learner.step, run.settings.steps, run.history
     return {
         "made_by": "sorvolo train", "format": 1, "model": dict(info), "settings": asdict(run.settings),
-        "device": run.device, "weights": "none" if run.weights is None else run.weights.origin,
-        "sets": run.sets.described(), "notices": notices,
+        "device": run.device, "weights": "none" if run.start is None else run.start.origin,
+        "sets": run.sets.described(), "notices": [*run.notices, *closing_notices],
         "step": step, "steps": steps, "stopped_early": step < steps, "seconds": history.seconds,
         "losses": [asdict(row) for row in history.rows], "checks": [asdict(each) for each in history.checks],
         "best_step": None if history.best is None else history.best.step,

@@ -13,7 +13,7 @@ class TrainSettings:
     preset: Literal["fast", "accurate", "thesis"] = "fast"
     rpn: Literal["standard", "extended", "extended-residual"] = "extended-residual"
     schedule: Literal["joint", "four-steps"] = "joint"
-    weights: str = "auto"  # ImageNet weights of the backbone: auto, none, or a file
+    weights: str = "auto"  # ImageNet's of the backbone (auto, or a file), none, or a model to tune: its name or file
     steps: int = 8000  # batches
     batch: int = 4  # samples a step
     side_px: int = 416  # of the square samples

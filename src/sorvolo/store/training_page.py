@@ -111,7 +111,7 @@ def _sets(report: Mapping[str, Any]) -> str:
 def _how(report: Mapping[str, Any]) -> str:
     export = report["export"]
     rows = [[escape(key), escaped(value)] for key, value in report["settings"].items()]
-    rows.append(["ImageNet weights", escaped(report["weights"])])
+    rows.append(["began with", escaped(report["weights"])])
     rows.append([
         "exported model against torch",
         f"{export['box_px']:.3f} px, {export['score']:.5f} in score, over {export['detections']} detections",

@@ -2,12 +2,13 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import onnx
 import torch
-from google.protobuf.message import DecodeError
+from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from onnx import numpy_helper
 from torch import Tensor, nn
 
@@ -16,6 +17,18 @@ from sorvolo.training.faster_rcnn import FasterRCNN
 
 _WEIGHTED = ("Conv", "Gemm")
 _OF_CLASSES = "head.scores"  # the one layer with a row for each class; the background's comes last
+
+
+@dataclass(frozen=True, eq=False)
+class ExportedModel:
+    """A model file of ours to learn on from, and what it says of itself; `origin` names it in words."""
+
+    content: bytes
+    classes: tuple[str, ...]
+    origin: str
+    sha256: str
+    licence: str
+    trained_on: str
 
 
 def load_exported(
@@ -78,11 +91,11 @@ def _rows_of(
     layer: nn.Module, found: Sequence[Tensor], known: Sequence[str], classes: Sequence[str]
 ) -> list[Tensor]:
     """The class layer's weights and bias: rows of classes of the same name and of the background are the file's."""
-    if len(found[0]) != len(known) + 1 or found[0].shape[1:] != layer.weight.shape[1:]:  # type: ignore[union-attr, index]
+    if len(found[0]) != len(known) + 1 or found[0].shape[1:] != layer.weight.shape[1:]:
         raise _unfitting(f"its {len(found[0])} rows of classes are not those of {', '.join(known)} and the background")
     theirs = [*(known.index(name) for name in classes if name in known), len(known)]
     own = [*(row for row, name in enumerate(classes) if name in known), len(classes)]
-    filled = [layer.weight.detach().clone(), layer.bias.detach().clone()]  # type: ignore[union-attr, operator]
+    filled = [layer.weight.detach().clone(), layer.bias.detach().clone()]
     for to, given in zip(filled, found):
         to[own] = given[theirs]
     return filled
@@ -91,7 +104,7 @@ def _rows_of(
 @torch.no_grad()
 def _fill(name: str, layer: nn.Module, norm: nn.BatchNorm2d | None, weight: Tensor, bias: Tensor) -> None:
     """The layer's weight, and its bias: of one without a bias the shift of the norm, which else changes nothing."""
-    layer.weight.copy_(weight)  # type: ignore[operator, union-attr]
+    layer.weight.copy_(weight)
     if layer.bias is not None:
         layer.bias.copy_(bias)  # type: ignore[operator]
         return
@@ -100,8 +113,8 @@ def _fill(name: str, layer: nn.Module, norm: nn.BatchNorm2d | None, weight: Tens
             f"no model file can be learnt on from in this network: the batch norm behind {name} stays as ImageNet "
             "taught it, and the file does not hold it by itself; start with --weights auto, or take the preset fast"
         )
-    norm.running_mean.zero_()  # type: ignore[union-attr]
-    norm.running_var.fill_(1 - norm.eps)  # type: ignore[union-attr]
+    norm.running_mean.zero_()
+    norm.running_var.fill_(1 - norm.eps)
     norm.weight.fill_(1)
     norm.bias.copy_(bias)
 
@@ -136,8 +149,8 @@ def _settle(model: FasterRCNN, norms: Sequence[nn.BatchNorm2d], pictures: Tensor
     """Give each norm the mean and variance of what reaches it, and the gain and shift that take them out again."""
     def settle(norm: nn.Module, inputs: tuple[Tensor, ...]) -> None:
         mean, variance = inputs[0].mean((0, 2, 3)), inputs[0].var((0, 2, 3), correction=0)
-        norm.running_mean.copy_(mean)  # type: ignore[operator, union-attr]
-        norm.running_var.copy_(variance)  # type: ignore[operator, union-attr]
+        norm.running_mean.copy_(mean)
+        norm.running_var.copy_(variance)
         norm.weight.copy_(torch.sqrt(variance + norm.eps))  # type: ignore[operator]
         norm.bias.add_(mean)  # type: ignore[operator]
 

@@ -130,7 +130,8 @@ class JointTraining:
     def _average(self) -> None:
         keep = min(self.settings.averaging, (1 + self.step) / (10 + self.step))
         pairs = list(zip(self.average.state_dict().values(), self.model.state_dict().values()))
-        torch._foreach_lerp_(*zip(*(each for each in pairs if each[0].dtype.is_floating_point)), 1 - keep)
+        means, values = zip(*(each for each in pairs if each[0].dtype.is_floating_point))
+        torch._foreach_lerp_(means, values, 1 - keep)
         for mean, value in pairs:
             if not mean.dtype.is_floating_point:
                 mean.copy_(value)

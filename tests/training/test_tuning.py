@@ -1,0 +1,108 @@
+"""`sorvolo train --weights MODEL`: a model is tuned to other pictures; what does not fit is told."""
+
+import json
+from pathlib import Path
+
+import onnx
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from square_pictures import labelled_squares  # noqa: E402
+
+from sorvolo.cli.main import main  # noqa: E402
+from sorvolo.detection.detector import Detector  # noqa: E402
+from sorvolo.detection.models import find_model  # noqa: E402
+
+_BRIEFLY = ("--batch", "2", "--side", "64", "--val", "0.25", "--device", "cpu")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return labelled_squares(tmp_path_factory.mktemp("data") / "squares", 4, 5)
+
+
+@pytest.fixture(scope="module")
+def learnt(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The model file of a short training from nothing."""
+    out = tmp_path_factory.mktemp("runs") / "squares"
+    assert main(["train", str(data), "--out", str(out), "--weights", "none", "--steps", "40", *_BRIEFLY]) == 0
+    return out / "model.onnx"
+
+
+def test_a_tuned_model_knows_at_once_what_its_beginning_knew(learnt: Path, data: Path, tmp_path: Path) -> None:
+    ap50 = {}
+    for weights in (str(learnt), "none"):
+        out = tmp_path / Path(weights).stem
+        assert main(["train", str(data), "--out", str(out), "--weights", weights, "--steps", "3", *_BRIEFLY]) == 0
+        report = json.loads((out / "training.json").read_text())
+        ap50[weights] = report["held_out"]["ap50"]
+    before = json.loads((learnt.parent / "training.json").read_text())["held_out"]["ap50"]
+    assert ap50["none"] < 0.1 < 0.5 * before < ap50[str(learnt)]
+
+    info = Detector.load(tmp_path / "model" / "model.onnx").info
+    assert info.trained_on == "squares; the model squares before: squares"
+    assert info.licence.endswith("the model squares before: as the data that it was trained on")
+    report = json.loads((tmp_path / "model" / "training.json").read_text())
+    assert report["weights"] == "the model squares" and report["export"]["good"]
+
+
+def test_a_tuned_run_goes_on_from_its_own_model_only(learnt: Path, data: Path, tmp_path: Path) -> None:
+    command = ["train", str(data), "--out", str(tmp_path / "out"), "--steps", "2", *_BRIEFLY]
+    assert main([*command, "--weights", str(learnt)]) == 0
+    assert main([*command, "--weights", str(learnt), "--resume"]) == 0
+    assert main([*command, "--weights", "none", "--resume"]) == 1
+
+
+def test_new_classes_are_learnt_from_the_beginning_and_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = labelled_squares(tmp_path / "both", 2, 3, names=("car", "boat"))
+    out = tmp_path / "out"
+    command = ["train", str(data), "--out", str(out), "--weights", "default", "--steps", "1", *_BRIEFLY]
+    assert main([*command, "--classes", "car,boat"]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "note: the model default knows nothing of boat: learnt from the beginning" in told
+    assert "note: the model default knows person, small object, which nothing here labels" in told
+    notices = json.loads((out / "training.json").read_text())["notices"]
+    assert any("knows nothing of boat" in each for each in notices)
+    assert Detector.load(out / "model.onnx").classes == ("car", "boat")
+
+
+def test_the_four_steps_begin_from_a_model_too(learnt: Path, data: Path, tmp_path: Path) -> None:
+    command = ["train", str(data), "--out", str(tmp_path / "out"), "--weights", str(learnt), "--steps", "4", *_BRIEFLY]
+    assert main([*command, "--schedule", "four-steps"]) == 0
+    assert json.loads((tmp_path / "out" / "training.json").read_text())["export"]["good"]
+
+
+def test_models_that_do_not_fit_are_told(
+    learnt: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def words(*arguments: str) -> str:
+        assert main(["train", str(data), "--out", str(tmp_path / "out"), "--steps", "1", *_BRIEFLY, *arguments]) == 1
+        return " ".join(capsys.readouterr().err.split())
+
+    def told_as(**changes: object) -> str:
+        """The learnt model with another description."""
+        model = onnx.load(learnt)
+        (entry,) = [each for each in model.metadata_props if each.key == "sorvolo"]
+        entry.value = json.dumps(json.loads(entry.value) | changes)
+        onnx.save(model, tmp_path / "told.onnx")
+        return str(tmp_path / "told.onnx")
+
+    assert "is of the preset fast, not accurate: train with --preset fast" in words(
+        "--weights", str(learnt), "--preset", "accurate"
+    )
+    accurate = told_as(preset="accurate")
+    assert "cannot be learnt on from: a model file of the preset accurate lacks" in words(
+        "--weights", accurate, "--preset", "accurate"
+    )
+    assert "does not fit the network" in (told := words("--weights", str(learnt), "--rpn", "standard"))
+    assert "same preset, --rpn" in told
+    assert "is in int8 and cannot be learnt on from; give the float32 model" in words("--weights", "default-int8")
+    assert "there is no model file" in words("--weights", "gone.onnx")
+    assert "no weights at nobody" in (told := words("--weights", "nobody"))
+    assert "or a model to tune: a .onnx file, or a name that `sorvolo models list` shows" in told
+    (tmp_path / "junk.onnx").write_bytes(b"junk")
+    assert "damaged or no ONNX file" in words("--weights", str(tmp_path / "junk.onnx"))
+    assert find_model("default-int8").is_file()
