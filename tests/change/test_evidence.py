@@ -170,6 +170,15 @@ def test_photos_tell_what_most_of_the_few_that_saw_it_show():
     assert change.kind == ChangeKind.APPEARED
 
 
+def test_photos_tell_a_standing_thing_with_the_third_that_shows_it_and_are_as_sure_as_views_of_a_video():
+    thing = Thing(0, 0)
+    photos = [view_of(i, 1.4 * i, (-4 + 4 * i, 0, CAMERA_HEIGHT_M), [thing]) for i in range(3)]
+    _, told = collect(photos)
+    assert [index for index, _ in told] == [2]
+    two = collect(photos[:2])[0].conclude()
+    assert len(two) == 1 and two[0].score > 0.6
+
+
 def test_photos_of_the_same_second_taken_elsewhere_count():
     photos = [view_of(i, 0.0, (-3 + 3 * i, 0, CAMERA_HEIGHT_M), [Thing(0, 0)]) for i in range(3)]
     assert collect(photos)[0].conclude()[0].views == 3

@@ -108,6 +108,13 @@ def test_motion_across_the_drones_way_counts_in_full(along, across, speed):
     assert moved.path_m >= 0.8 * across - 1e-9
 
 
+def test_a_walker_in_three_photos_moves_and_a_standing_thing_beside_does_not():
+    things = [Thing(-5, 1, (0.5, 0.5), velocity_m_s=(0.9, 0.5)), Thing(-1, -2, (0.5, 0.5), colour=(40, 60, 220))]
+    photos = [view_of(i, 1.4 * i, (-6 + 3 * i, 0, CAMERA_HEIGHT_M), things) for i in range(3)]
+    _, final = events(photos)
+    assert sorted(each.kind for each in final) == [ChangeKind.APPEARED, ChangeKind.MOVING]
+
+
 def test_settings_are_checked():
     with pytest.raises(SettingsError):
         MovingSettings(least_views=2)

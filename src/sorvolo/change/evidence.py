@@ -24,6 +24,7 @@ from sorvolo.change.cells import (
 from sorvolo.change.gathering import GatheredChange, upright_weight
 from sorvolo.change.movers import Movers
 from sorvolo.change.moving import BlobTracker, MovingSettings
+from sorvolo.change.parts import Parts
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageGray, Mask, Matrix3
 from sorvolo.survey.findings import Change, ComparedView
@@ -36,6 +37,7 @@ _PICTURES_A_VIEW = 6  # cut anew at most, which bounds the time a view takes
 _MOST_SEEDS = 256
 _MOVED_HEIGHTS = 0.01  # the camera's way, in flying heights, after which a view is a new witness
 _ALL_CHANGED = 0.5  # share of the frame beyond which nothing in it can be followed
+_STANDS_S = 2.0  # what the same ground shows for so long stands there, however unsteady its blobs look
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ class EvidenceMap:
         self._tracker = BlobTracker(settings.moving)
         self._found: dict[int, GatheredChange] = {}  # by number, in order
         self._merged: dict[int, int] = {}
-        self._parted: dict[int, list[Change]] = {}  # what turned out to be several things, by number
+        self._parts: dict[int, Parts] = {}  # the things that a told change holds, by its number
         self._movers = Movers(id_prefix, site_m_per_px, self._cell_m)
         self._seeds: list[GatheredChange] = []
         self._recent: deque[_Witness] = deque(maxlen=settings.n)
@@ -127,27 +129,26 @@ class EvidenceMap:
         budget = [_PICTURES_A_VIEW]
         new = self._gather(view, witness, earlier, evidence, budget)
         shown = self._update(view, witness, evidence.owner, {each.number for each in new}, budget)
-        announced = [self._told(each, view.time_ns) for each in shown]
+        announced: list[Change] = []
+        for each in shown:
+            announced += self._told(each, view.time_ns)
         announced += self._movers.see(view, followed.movers, self._next_number)
-        self._keep_seeds(view, laid, evidence, budget)
-        return tuple(each for each in announced if each is not None)
+        self._keep_seeds(view, witness, evidence, budget)
+        return tuple(announced)
 
     def changes(self) -> tuple[Change, ...]:
         """All changes told so far as they are known now, in the order of their numbers."""
-        found = [
-            self._change(each) for each in self._found.values()
-            if each.is_told and not each.is_taken_back and each.number not in self._parted
-        ]
-        parts = [each for several in self._parted.values() for each in several]
-        known = [each for each in found if each is not None] + parts + list(self._movers.changes)
+        known = list(self._movers.changes)
+        for change in self._found.values():
+            if change.is_told and not change.is_taken_back:
+                known += self._records(change)
         return tuple(sorted(known, key=_number_of))
 
     def conclude(self) -> tuple[Change, ...]:
         """The last word, after the last view: all changes, with those that fewer than n views could see.
 
         A change that too small a share of all views of its ground showed is taken back. A change that only one view
-        saw, and no other could, is told if that view was very sure, with half the score. Neighbours that were one
-        change so far, joined by a shadow, become two: the larger one keeps the id.
+        saw, and no other could, is told if that view was very sure, with half the score.
         """
         for seed in self._seeds:
             self._grow_late(seed)
@@ -157,21 +158,26 @@ class EvidenceMap:
                 self._told(change, -1)
             elif not self._is_sure(change):
                 change.is_taken_back = True
-        self._part()
+            else:
+                self._part(change, -1)
         return self.changes()
 
-    def _part(self) -> None:
-        self._parted = {}
-        for change in list(self._found.values()):
-            whole = self._change(change) if change.is_told and not change.is_taken_back else None
-            if whole is None:
-                continue
-            parts = change.parted(whole, self._cells_of(change), self._cell_m, self._join_m)
-            if len(parts) < 2:
-                continue
-            self._parted[change.number] = [parts[0]] + [
-                replace(each, id=f"{self._prefix}-{self._next_number()}", announced_ns=-1) for each in parts[1:]
-            ]
+    def _part(self, change: GatheredChange, now_ns: int) -> list[Change]:
+        """Tell the things in a change from each other as its pictures now show them; those told for the first time."""
+        whole = self._change(change)
+        if whole is None:
+            return []
+        things = change.parted(whole, self._cells_of(change), self._cell_m, self._join_m)
+        parts = self._parts.setdefault(change.number, Parts())
+        return parts.take(things, change.views, now_ns, lambda: f"{self._prefix}-{self._next_number()}")
+
+    def _records(self, change: GatheredChange) -> list[Change]:
+        """A told change as it is known now: its things, where it holds several."""
+        parts = self._parts.get(change.number)
+        if parts is not None and len(parts.things) > 1:
+            return list(parts.things)
+        whole = self._change(change)
+        return [] if whole is None else [whole]
 
     def _is_repeat(self, view: ComparedView) -> bool:
         if self._last is None:
@@ -213,7 +219,9 @@ class EvidenceMap:
             if not (cells & (owner == 0)).any():
                 continue
             if not owners:
-                if np.count_nonzero(cells) < least_cells or np.mean(laid.held[part][cells]) > 0.5:
+                if np.count_nonzero(cells) < least_cells:
+                    continue
+                if np.mean(laid.held[part][cells]) > 0.5 and not self._stands(witness, earlier, part, cells):
                     continue
                 if cut_off is None:
                     cut_off = cut_off_pieces(laid)
@@ -232,6 +240,19 @@ class EvidenceMap:
             self._grid.own(window, cells, change.number)
             owner[cells] = change.number
         return [each for each in new if self._current(each.number) == each.number]
+
+    def _stands(
+        self, witness: _Witness, earlier: Sequence[_Witness], part: tuple[slice, slice], cells: Mask
+    ) -> bool:
+        """Whether views over a long enough time show these very cells."""
+        window = witness.laid.window.part(part)
+        for each in earlier:
+            if (witness.time_ns - each.time_ns) * 1e-9 < _STANDS_S:
+                return False  # and so are all later ones
+            _, flagged, _, _ = self._answer(each.laid, window, cells)
+            if flagged > 0.5:
+                return True
+        return False
 
     def _begin(
         self, view: ComparedView, earlier: Sequence[_Witness], witness: _Witness, part: tuple[slice, slice],
@@ -253,13 +274,16 @@ class EvidenceMap:
                 change.miss(self._weight(each, change.cells))
         return change
 
-    def _told(self, change: GatheredChange, now_ns: int) -> Change | None:
-        """The change if it is to be told now: for the first time sure enough."""
-        record = None if change.is_told or not self._is_sure(change) else self._change(change)
-        if record is None:
-            return None
+    def _told(self, change: GatheredChange, now_ns: int) -> list[Change]:
+        """What is to be told of the change now: all its things once it is sure enough, later those that join it."""
+        if change.is_told:
+            parts = self._parts.get(change.number)
+            is_due = now_ns >= 0 and (parts is None or parts.is_due(change.views))
+            return self._part(change, now_ns) if is_due else []
+        if not self._is_sure(change) or self._change(change) is None:
+            return []
         change.is_told, change.announced_ns = True, now_ns
-        return replace(record, announced_ns=now_ns)
+        return self._part(change, now_ns)
 
     def _is_sure(self, change: GatheredChange) -> bool:
         return change.score >= self._settings.least_score and change.share >= self._settings.least_share
@@ -329,7 +353,10 @@ class EvidenceMap:
     def _merge(self, older: GatheredChange, younger: GatheredChange) -> None:
         if younger.cells is not None:
             self._grid.own(younger.cells, self._cells_of(younger), older.number)
+        if younger.is_told:
+            self._parts.setdefault(older.number, Parts()).join(self._records(younger))
         older.take_over(younger)
+        self._parts.pop(younger.number, None)
         self._merged[younger.number] = older.number
         del self._found[younger.number]
 
@@ -359,8 +386,9 @@ class EvidenceMap:
         outline_m = change.outline_m(cells, self._cell_m, self._join_m)
         return None if outline_m is None else change.change(self._prefix, outline_m, self._cell_m)
 
-    def _keep_seeds(self, view: ComparedView, laid: LaidView, evidence: CellEvidence, budget: list[int]) -> None:
-        """Keep pictures of what is not certain yet: it may never be seen often enough for k of n."""
+    def _keep_seeds(self, view: ComparedView, witness: _Witness, evidence: CellEvidence, budget: list[int]) -> None:
+        """Keep what is not certain yet, with its pictures: it may never be seen often enough for k of n."""
+        laid = witness.laid
         weak = laid.flagged & (evidence.owner == 0)
         kept = []
         for seed in self._seeds:
@@ -372,7 +400,8 @@ class EvidenceMap:
                 kept.append(seed)
             elif (votes > 0).any() and not (owner > 0).any():
                 kept.append(seed)
-                weak[seed.cells.within(laid.window)] = False
+                self._ask(seed, view, witness)
+                weak[here] = False
         self._seeds = kept
         if budget[0] <= 0 or not weak.any():
             return
@@ -382,15 +411,26 @@ class EvidenceMap:
             for piece, part in pieces(weak, self._gap)
             if np.count_nonzero(piece & weak[part]) >= least_cells
         ]
-        for score, window in sorted(candidates, key=lambda each: -each[0])[: budget[0]]:
+        for _, window in sorted(candidates, key=lambda each: -each[0])[: budget[0]]:
             seed = GatheredChange(0, view.time_ns)
             seed.cells = window
             seed.show(view, *window.box_m(self._cell_m), self._site_m_per_px)
-            seed.see(view.time_ns, score, None, view, 1.0)
-            seed.from_camera(view.camera_m)
-            seed.vote(view.site_from_image, view.changed, view.valid)
+            self._ask(seed, view, witness)
             self._seeds.append(seed)
         del self._seeds[:-_MOST_SEEDS]
+
+    def _ask(self, seed: GatheredChange, view: ComparedView, witness: _Witness) -> None:
+        """Count what a view says of a seed's ground."""
+        assert seed.cells is not None
+        cells = self._grid.read(seed.cells).changed > 0
+        seen, flagged, score, place_m = self._answer(witness.laid, seed.cells, cells)
+        weight = self._weight(witness, seed.cells)
+        if flagged >= max(_SHOWS * seen, 1e-9):
+            seed.see(view.time_ns, score, place_m if seen > 0.99 else None, view, weight)
+            seed.from_camera(view.camera_m)
+            seed.vote(view.site_from_image, view.changed, view.valid)
+        elif seen >= 0.5:
+            seed.miss(weight)
 
     def _grow_late(self, seed: GatheredChange) -> None:
         """Tell what fewer than n views could see: the same share of them must show it as k of n."""
@@ -420,11 +460,8 @@ class EvidenceMap:
                 cells[part] &= ~piece
         if np.count_nonzero(cells) < least_cells:
             return
-        views, asked = int(changed[cells].max()), int(seen[cells].max())
         seed.number = self._next_number()
-        for _ in range(views - seed.views):
-            seed.see(seed.last_seen_ns, seed.score, None, None, 1.0)
-        for _ in range(asked - seed.asked):
+        for _ in range(int(seen[cells].max()) - seed.asked):
             seed.miss(1.0)
         self._grid.own(seed.cells, cells, seed.number)
         self._found[seed.number] = seed

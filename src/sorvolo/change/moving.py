@@ -5,6 +5,7 @@ v, its blob moves over the ground with -v h / (H - h). So what a blob moves agai
 as long as some h below 0.6 H explains it; only the rest of its motion counts.
 """
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -24,7 +25,8 @@ _UNLIKELY_PARALLAX = 0.5  # no thing that came is a third as high as the camera 
 _POINTS = 12  # of a track, that its velocity is fitted to
 _NEAR_PX = 8  # what is looked at around a place to tell shadows
 _RIGID_POINTS, _RIGID_LENGTHS, _RIGID_LENGTH_M = 5, 2.0, 2.5
-_LOST_FOR_S = 20.0  # a thing that moves steadily is known again after so long
+_PHOTOS_APART_S = 0.7  # at least, on average
+_LOST_FOR_S = 45.0  # a thing that moves steadily is known again after so long: on the next strip, too
 
 
 @dataclass(frozen=True)
@@ -32,17 +34,22 @@ class MovingSettings:
     """When something counts as moving."""
 
     least_views: int = 5
+    least_photos: int = 3  # of views so far apart in time as photos are: chance seldom fits three of them
     least_move_m: float = 1.0  # beyond what alignment and a swaying crown do
     least_lengths: float = 1.2  # of its own: then its places do not overlap, and nothing that grew explains it
     least_length_m: float = 0.3  # a person from above; smaller specks jump about
     most_speed_m_s: float = 3.0  # of something small ...
     most_lengths_s: float = 4.0  # ... and lengths a second more: a car of 4 m may go 19 m/s
     most_step_m: float = 6.0  # between two views: further away anything could be it
-    forget_s: float = 2.5  # a track without a blob for so long has ended
+    forget_s: float = 2.5  # a track without a blob for so long has ended ...
+    forget_views: int = 2  # ... and so many views
 
     def __post_init__(self) -> None:
-        if self.least_views < 3:
-            raise SettingsError(f"moving needs at least 3 views to see a steady velocity, got {self.least_views}")
+        if not 3 <= self.least_photos <= self.least_views:
+            raise SettingsError(
+                "moving needs at least 3 views to see a steady velocity, of photos no more than of a video, "
+                f"got {self.least_views} and {self.least_photos}"
+            )
         if min(self.least_move_m, self.least_lengths, self.most_speed_m_s, self.most_step_m, self.forget_s) <= 0:
             raise SettingsError("moving: distances, speeds and times must be above 0")
 
@@ -150,11 +157,14 @@ class BlobTracker:
         self._tracks: list[Track] = []
         self._lost: list[Track] = []
         self._movers = 0
+        self._times_ns: deque[int] = deque(maxlen=settings.forget_views + 1)  # of the last views
 
     def follow(self, view: ComparedView) -> Followed:
         """Take the next view's blobs; views come in order of time."""
         now_ns, settings = view.time_ns, self._settings
-        gone = [each for each in self._tracks if (now_ns - each.last.time_ns) * 1e-9 > settings.forget_s]
+        oldest_ns = min([now_ns - round(settings.forget_s * 1e9), *self._times_ns])
+        self._times_ns.append(now_ns)
+        gone = [each for each in self._tracks if each.last.time_ns < oldest_ns]
         self._lost += [each for each in gone if each.mover]
         self._lost = [each for each in self._lost if (now_ns - each.last.time_ns) * 1e-9 <= _LOST_FOR_S]
         tracks = [each for each in self._tracks if each not in gone]
@@ -198,7 +208,7 @@ class BlobTracker:
         speed_m_s = float(np.hypot(*move.velocity_m_s))
         is_own = move.path_m > needed_m and float(np.hypot(*move.own_m_s)) > 0.35 * speed_m_s
         return (
-            track.count >= settings.least_views
+            track.count >= (settings.least_photos if self._are_photos(track) else settings.least_views)
             and settings.least_length_m <= length_m
             and speed_m_s <= settings.fastest_m_s(length_m)
             and (is_own or _is_rigid(track, length_m))
@@ -206,6 +216,11 @@ class BlobTracker:
             and move.error_m < 0.05 + 0.03 * speed_m_s * track.seconds
             and not _is_still_there(track.points[0], view)
         )
+
+    def _are_photos(self, track: Track) -> bool:
+        """Whether the views were taken seldom while the track lasted."""
+        seen = [each for each in self._times_ns if each >= track.points[0].time_ns]
+        return len(seen) > 1 and (seen[-1] - seen[0]) * 1e-9 >= _PHOTOS_APART_S * (len(seen) - 1)
 
     def _number_of(self, track: Track, move: Motion) -> int:
         start = track.points[0]
