@@ -112,6 +112,20 @@ def test_wishes_that_cannot_be(detector: Detector, picture: np.ndarray, wish: di
         detector.detect(picture, **({"tiles": "auto"} | wish))  # type: ignore[arg-type]
 
 
+def test_a_sampling_distance_of_nan_is_one_that_is_not_known(detector: Detector, picture: np.ndarray) -> None:
+    for tiles in ("auto", 64, None):
+        unsaid, nan = (detector.detect(picture, tiles=tiles, m_per_px=each) for each in (None, float("nan")))  # type: ignore[call-overload]
+        np.testing.assert_array_equal(unsaid.boxes_px, nan.boxes_px)
+        assert unsaid.names == nan.names and len(nan) == 3
+
+
+def test_a_picture_of_a_hundred_megapixels_is_searched_to_its_last_corner(detector: Detector) -> None:
+    boxes = [(0, 0, 30, 40), (6380, 4400, 6420, 4450), (11960, 8970, 12000, 9000)]
+    picture = draw((9000, 12000), boxes)
+    found = detector.detect(picture)
+    np.testing.assert_allclose(sorted(map(tuple, found.boxes_px.tolist())), boxes, atol=1e-3)
+
+
 def test_a_model_of_one_size_sees_any_picture(tmp_path: Path) -> None:
     fixed = Detector.load(rectangle_model(tmp_path / "fixed.onnx", fixed=(64, 96)), provider="cpu", threads=1)
     np.testing.assert_allclose(fixed.detect(draw((40, 50), [(10, 5, 30, 25)])).boxes_px, [(10, 5, 30, 25)])

@@ -162,6 +162,33 @@ def test_the_command(folder: Path, model: Path, capsys: pytest.CaptureFixture[st
     assert "found well from 8 to 120 px" in capsys.readouterr().out
 
 
+def test_a_card_s_measurements_are_a_table(folder: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fetch_model(str(model), _hash(model))
+    ap50, ap = {"value": 0.6224, "low": 0.4, "high": 0.77}, {"value": 0.264, "low": None, "high": None}
+    card = {
+        "sha256": _hash(model), "fails": ["people below 10 px", "crowds"],
+        "measured": {"sea_side": {"person": {"labels": 1387, "AP50": ap50, "AP": ap}}, "odd": 3},
+    }
+    (folder / "coast.json").write_text(json.dumps(card))
+    assert cli.main(["models", "show", "coast"]) == 0
+    told = capsys.readouterr().out
+    assert "{" not in told and "AP50 %" in told
+    row = next(line.split() for line in told.splitlines() if "sea side" in line)
+    assert row == ["sea", "side", "person", "1387", "62.2", "(40.0-77.0)", "26.4"]
+
+
+def test_what_is_no_model_is_told_as_what_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("clip.mp4").write_bytes(b"")
+    for name in ("clip.mp4", "./clip.mp4"):
+        with pytest.raises(InputError, match=r"clip\.mp4 is no model: those are \.onnx files; give one, or a name"):
+            Detector.load(name)
+    with pytest.raises(InputError, match=r"can run code when opened"):
+        Detector.load("./net.pth")
+    with pytest.raises(InputError, match=r"there is no model 'gone\.mp4'; installed are"):
+        Detector.load("gone.mp4")
+
+
 def test_verify_finds_changed_damaged_and_unknown_files(
     folder: Path, model: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

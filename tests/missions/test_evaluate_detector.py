@@ -195,6 +195,42 @@ def test_the_command_reads_labels_tells_numbers_and_writes_the_report(toy, coco,
     assert main(["evaluate", "detector", "no-such-model", str(coco), *told]) == 1
 
 
+def test_a_damaged_picture_is_left_out_for_all_models_and_named(toy, coco, tmp_path, capsys):
+    folder = tmp_path / "coco"
+    folder.mkdir()
+    for path in coco.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    names = ["--classes", "Walker=person,Truck=car", "--unlabelled", "small object", "--draws", "20"]
+    command = ["evaluate", "detector", str(toy), str(folder), *names]
+    assert main([*command, "--out", str(tmp_path / "whole")]) == 0
+    data = (folder / "1.png").read_bytes()
+    (folder / "1.png").write_bytes(data[: len(data) // 2])
+    capsys.readouterr()
+    earlier = str(tmp_path / "whole" / FOUND)
+    assert main([*command, "--compare", earlier, "--out", str(tmp_path / "cut")]) == 0
+    told = capsys.readouterr().out.replace("\n", "")
+    assert f"note: 1 pictures cannot be read and were left out: {folder / '1.png'}" in told
+    numbers = json.loads((tmp_path / "cut" / NUMBERS).read_text())
+    assert numbers["sets"][0]["pictures"] == 3 and "1 pictures cannot be read" in numbers["notices"]
+    assert numbers["comparisons"][0]["arms"][0]["mean"] == numbers["comparisons"][0]["arms"][1]["mean"]
+    assert read_found(tmp_path / "cut" / FOUND).sets["coco"][0] == ("0.png", "2.png", "3.png")
+    # what was measured without it can be compared without it
+    assert main([*command, "--compare", str(tmp_path / "cut" / FOUND)]) == 0
+    for path in folder.glob("*.png"):
+        path.write_bytes(path.read_bytes()[:60])
+    capsys.readouterr()
+    assert main(command) == 1
+    assert "none of the 4 pictures of coco can be read" in " ".join(capsys.readouterr().err.split())
+
+
+def test_names_that_nothing_has_are_told(toy, coco, capsys):
+    command = ["evaluate", "detector", str(toy), str(coco), "--classes", "Walker=person,Truck=car"]
+    assert main([*command, "--ignore", "Lory"]) == 1
+    assert "ignore: 'Lory' is no name in the labels; there are: Walker, Truck" in capsys.readouterr().err
+    assert main([*command, "--unlabelled", "Car"]) == 1
+    assert "unlabelled: 'Car' is no class; there are: person, car, small object" in capsys.readouterr().err
+
+
 def test_videos_choose_pictures(coco):
     names = {"Walker": "person", "Truck": "car"}
     (chosen,) = read_sets([coco], classes=names, videos="video1")

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sorvolo.errors import InputError, SettingsError, SorvoloError
-from sorvolo.store.datasets import READERS, read_dataset
+from sorvolo.store.datasets import READERS, read_dataset, read_datasets
 from sorvolo.store.datasets.checking import turned
 from sorvolo.store.datasets.groups import group_of
 from sorvolo.store.datasets.yolo import names_in_yaml
@@ -159,6 +159,28 @@ def test_coco_missing_pictures_are_counted_and_none_left_is_an_error(tmp_path):
     lonely = tmp_path / "lonely"
     with pytest.raises(InputError, match="none of its 1 pictures is there"):
         read_dataset(put.put_coco(lonely / "all.json", ["gone.jpg"], []))
+
+
+@pytest.mark.parametrize(("share", "how"), [(0.35, "breaks off"), (0.8, "breaks off"), (1.0, "is damaged")])
+def test_coco_that_breaks_off_is_told_with_file_and_place(tmp_path, share, how):
+    put.put_picture(tmp_path / "a.jpg")
+    path = put.put_coco(tmp_path / "cut.json", ["a.jpg"], [(0, 1, 1, 2, 3, 4, 0)] * 9)
+    text = path.read_text()
+    path.write_text(text[: int(share * len(text))] if share < 1 else text.replace("[", "[,", 1))
+    for place in (path, tmp_path):
+        with pytest.raises(InputError, match=rf"cut\.json {how} at line 1, column \d+ \(character \d+ of \d+: .*again"):
+            read_dataset(place)
+
+
+def test_names_that_nothing_has_are_refused_over_all_sets_together(tmp_path):
+    one = yolo_folder(tmp_path / "one", "0 0.5 0.5 0.1 0.2\n")
+    two = yolo_folder(tmp_path / "two", "0 0.5 0.5 0.1 0.2\n", names="person\nBicycle\n")
+    read = read_datasets([one, two], ignore=["bicycle", "CAR"], unlabelled=["small object", "boat"], known=["boat"])
+    assert [each.name for each in read] == ["one", "two"] and read[0].unlabelled == {"small object", "boat"}
+    with pytest.raises(SettingsError, match="ignore: 'Bicycl' is no name in the labels; there are: person, car, Bi"):
+        read_datasets([one, two], ignore=["car", "Bicycl"])
+    with pytest.raises(SettingsError, match="unlabelled: 'People' is no class; there are: person, car, small object"):
+        read_datasets([one, two], unlabelled=["car", "People"])
 
 
 def test_coco_listed_twice_is_one_picture_and_two_files_are_too_many(tmp_path):

@@ -144,6 +144,20 @@ def test_whole_videos_are_held_out(data: Path) -> None:
     assert len(learnt) == 3 and len(held) == 1 and not learnt & held
 
 
+def test_what_was_remarked_is_told_on_the_terminal_too(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = labelled_squares(tmp_path / "other", 2, 2, names=("car", "boat"))
+    options = ["--weights", "none", "--rpn", "standard", "--steps", "1", "--batch", "1", "--side", "64"]
+    command = ["train", str(data), "--val", str(other), "--out", str(tmp_path / "out"), *options]
+    assert main(command) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "note: other: 4 boxes of classes that stand for none of ours left out: boat 4" in told
+    assert "lie in both" in told and "flight0" in told
+    notices = json.loads((tmp_path / "out" / "training.json").read_text())["notices"]
+    assert all(" ".join(each.split()) in told for each in notices)
+
+
 def test_one_video_is_split_by_blocks_and_the_score_called_too_good(tmp_path: Path) -> None:
     sets = _sets(labelled_squares(tmp_path / "one", 1, 40))
     assert 0 < len(sets.held_out[0]) < 20 < len(sets.shares[0].labelled)
@@ -195,6 +209,8 @@ def test_bad_input_is_told(data: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert "no weights at" in words(place, "--weights", "gone.pth")
     assert "device must be auto, cpu or cuda, got 'tpu'" in words(place, "--device", "tpu")
     assert "THEIRS=OURS" in words(place, "--classes", "=car")
+    assert "ignore: 'Bicycle' is no name in the labels; there are: car" in words(place, "--ignore", "Bicycle")
+    assert "unlabelled: 'persn' is no class; there are: person, car" in words(place, "--unlabelled", "persn")
     assert "none of its class names" in (told := words(place, "--classes", "Boat=boat"))
     assert "such as --classes " in told and "=person" in told
     if not torch.cuda.is_available():

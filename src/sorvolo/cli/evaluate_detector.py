@@ -19,6 +19,7 @@ from sorvolo.missions.evaluate_detector import (
     EvaluationSettings,
     evaluate_detector,
     evaluation_numbers,
+    known_classes,
     read_sets,
     write_evaluation,
 )
@@ -65,11 +66,11 @@ def detector(
     Example: sorvolo evaluate detector a1.onnx,a2.onnx data --compare b1.onnx,b2.onnx --out side-by-side
     """
     settings = EvaluationSettings(_tiles(tiles), draws, seed)
+    arms = [_names(each) for each in (model, *(compare or ()))]
     labelled = read_sets(
         data, form=form, classes=_pairs(classes) or None, ignore=_names(ignore), unlabelled=_names(unlabelled),
-        group_pattern=group_pattern, videos=videos, held_out=held_out, seed=seed,
+        group_pattern=group_pattern, videos=videos, held_out=held_out, seed=seed, known=known_classes(arms),
     )
-    arms = [_names(each) for each in (model, *(compare or ()))]
     with Progress(console=Console(stderr=True), transient=True) as progress:
         bar = progress.add_task("looking", total=None)
         measured = evaluate_detector(
@@ -79,10 +80,11 @@ def detector(
                 total=step.pictures_total,
             ),
         )
+    notices = (*(note.text for each in labelled for note in each.notices), *measured.notices)
     description = {
         "sorvolo": __version__, "data": ", ".join(map(str, data)), "arms": "; ".join(", ".join(arm) for arm in arms),
         "videos": videos or "all", "held_out": held_out or "all", "tiles": tiles, "draws": draws, "seed": seed,
-        "notices": "; ".join((*(note.text for each in labelled for note in each.notices), *measured.found.notices)),
+        "notices": "; ".join(notices),
     }
     if out is not None:
         write_evaluation(measured, out, description)
@@ -90,6 +92,8 @@ def detector(
         typer.echo(json.dumps(plain_json(evaluation_numbers(measured, description)), indent=1))
         return
     console = Console()
+    for notice in notices:
+        console.print(f"note: {notice}", markup=False)
     for scores in measured.sets:
         _show(console, scores)
     for side_by_side in measured.comparisons:

@@ -28,6 +28,9 @@ from sorvolo.missions.model_files import fetch_model, quantise_model
 
 models_app = typer.Typer(no_args_is_help=True)
 
+_MEASURED = "measured"
+"""In a card: {set: {class: {labels, AP50, AP}}}, each share with value, low and high."""
+
 
 @models_app.callback()
 def models() -> None:
@@ -95,9 +98,12 @@ def show(
         words = f"told from score {info.thresholds[each]:.2f}; found well from {least_px:g} to {most_px:g} px"
         table.add_row(escape(each), words)
     for key, value in card.items():
-        if key not in told:
-            table.add_row(escape(key), escape(value if isinstance(value, str) else json.dumps(value)))
-    Console().print(table)
+        if key not in told and key != _MEASURED:
+            table.add_row(escape(key.replace("_", " ")), escape(_in_words(value)))
+    console = Console()
+    console.print(table)
+    if measured := _measured(card.get(_MEASURED)):
+        console.print(measured)
 
 
 @models_app.command()
@@ -165,6 +171,38 @@ def quantise(
         f"{out}: {made.convolutions} of {made.of} convolutions in eight bits, {len(made.model) / 1e6:.1f} MB; "
         "compare it with `sorvolo evaluate detector`"
     )
+
+
+def _in_words(value: Any) -> str:
+    """A card's value for people: lists line by line, objects as name and value."""
+    if isinstance(value, list):
+        return "\n".join(_in_words(each) for each in value)
+    if isinstance(value, Mapping):
+        between = "; " if any(isinstance(each, Mapping) for each in value.values()) else ", "
+        return between.join(f"{key} {_in_words(each)}" for key, each in value.items())
+    return str(value)
+
+
+def _measured(sets: Any) -> Table | None:
+    """The card's measurements, a row for each class of each set; None where it has none of the usual form."""
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title="measured on pictures held out", title_justify="left")
+    for name in ("set", "class", "labels", "AP50 %", "AP %"):
+        table.add_column(name, justify="left" if name in ("set", "class") else "right", overflow="fold")
+    for name, classes in sets.items() if isinstance(sets, Mapping) else ():
+        for label, row in classes.items() if isinstance(classes, Mapping) else ():
+            if isinstance(row, Mapping):
+                table.add_row(
+                    escape(name.replace("_", " ")), escape(label), str(row.get("labels", "-")),
+                    _interval(row.get("AP50")), _interval(row.get("AP")),
+                )
+    return table if table.rows else None
+
+
+def _interval(told: Any) -> str:
+    """ "62.2 (42.3-77.3)" of a share with its interval, "-" where it is not said."""
+    numbers = [told.get(key) for key in ("value", "low", "high")] if isinstance(told, Mapping) else [told]
+    known = [f"{100 * each:.1f}" for each in numbers if isinstance(each, int | float)]
+    return f"{known[0]} ({known[1]}-{known[2]})" if len(known) == 3 else known[0] if known else "-"
 
 
 def _row(model: InstalledModel) -> dict[str, Any]:

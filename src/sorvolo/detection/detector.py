@@ -91,9 +91,9 @@ class Detector:
 
         A picture is uint8 RGB (H, W, 3), grey (H, W) or (H, W, 1), RGBA (its alpha is dropped), or uint16 of these
         (grey is stretched as a thermal camera's). `tiles` cuts a large one: "auto" by `m_per_px` (the ground's
-        sampling distance), a number of its pixels a side, or None for the picture as a whole; docs/detector.md gives
-        the rule. `least_score` None means each class's own threshold; `classes` None means all. Raises InputError
-        for anything that is no picture, SettingsError for a class, score or tile that cannot be.
+        sampling distance; None or NaN: not known), a number of its pixels a side, or None for the picture as a whole;
+        docs/detector.md gives the rule. `least_score` None means each class's own threshold; `classes` None means all.
+        Raises InputError for anything that is no picture, SettingsError for a class, score or tile that cannot be.
         """
         wanted = self._wanted(classes)
         least = self._least_scores(wanted, least_score)

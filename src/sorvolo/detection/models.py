@@ -58,8 +58,9 @@ def find_model(name_or_path: str | Path) -> Path:
 
     Raises InputError for a name that is not installed, with those that are.
     """
-    if isinstance(name_or_path, Path) or name_or_path.lower().endswith(".onnx") or os.sep in name_or_path:
-        return Path(name_or_path).expanduser()
+    path = Path(name_or_path).expanduser()
+    if isinstance(name_or_path, Path) or path.suffix.lower() == ".onnx" or os.sep in name_or_path or path.is_file():
+        return path
     return installed_model(name_or_path).path
 
 

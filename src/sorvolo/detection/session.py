@@ -20,6 +20,7 @@ Provider = Literal["auto", "cpu", "cuda", "openvino"]
 
 _INPUT, _OUTPUTS = "image", ("boxes", "scores", "labels")
 _FILLING = 114
+_RUN_CODE = frozenset({".pt", ".pth", ".pkl", ".pickle", ".ckpt", ".bin", ".joblib"})
 _OPENVINO_PRECISION = "f32"
 _CUDA = "CUDAExecutionProvider"
 
@@ -122,10 +123,14 @@ def read_info(path: Path) -> ModelInfo:
 
 def read_model(path: Path) -> bytes:
     """The bytes of an ONNX file; only such files are ever opened, none that could run code of their own."""
-    if path.suffix.lower() != ".onnx":
+    if path.suffix.lower() in _RUN_CODE:
         raise InputError(
             f"{path}: models are .onnx files; others (.pt, .pth, .pkl) can run code when opened, so they are not: "
             "export the model to ONNX"
+        )
+    if path.suffix.lower() != ".onnx":
+        raise InputError(
+            f"{path} is no model: those are .onnx files; give one, or a name that `sorvolo models list` shows"
         )
     try:
         return path.read_bytes()

@@ -13,12 +13,14 @@ from sorvolo.capture.photos import read_picture
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.intervals import DRAWS
 from sorvolo.detection.metrics import Mistake, judged_classes
+from sorvolo.detection.models import find_model
 from sorvolo.detection.scores import Arm, SetComparison, SetScores, compare_arms, score_set
+from sorvolo.detection.session import read_info
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import BoxesPx, ImageRGB
 from sorvolo.missions.holding_out import hold_out
 from sorvolo.store.atomic import atomic_write_bytes, writing
-from sorvolo.store.datasets import read_dataset
+from sorvolo.store.datasets import read_datasets
 from sorvolo.store.detector_files import FoundSets, mistake_picture, read_found, write_found
 from sorvolo.store.detector_page import detector_page
 from sorvolo.store.exports import json_bytes
@@ -34,6 +36,7 @@ PAGE, NUMBERS, FOUND = "detector.html", "detector.json", "detections.json"
 _KINDS = ("false alarm", "miss", "confusion")
 _SHOWN = 12  # mistakes of a kind
 _SHOWN_OF_ONE = 2  # of them from one picture
+_NAMED = 5  # damaged pictures
 
 
 @dataclass(frozen=True)
@@ -59,41 +62,54 @@ class EvaluationProgress:
 class DetectorEvaluation:
     """One model's scores on each set, and, with rivals, all of them side by side; of several seeds the first is scored.
 
-    `found` are the first model's detections; `worst` each set's worst mistakes with their pictures.
+    `found` are the first model's detections; `worst` each set's worst mistakes with their pictures; `notices` say what
+    was left out, and what the first model had to say.
     """
 
     found: FoundSets
     sets: tuple[SetScores, ...]
     comparisons: tuple[SetComparison, ...]
     worst: Mapping[str, tuple[tuple[Mistake, str, ImageRGB], ...]]
+    notices: tuple[str, ...] = ()
 
 
 def read_sets(
     places: Sequence[Path], *, form: str | None = None, classes: Mapping[str, str] | None = None,
     ignore: Iterable[str] = (), unlabelled: Iterable[str] = (), group_pattern: str | None = None, videos: str = "",
-    held_out: float = 0.0, seed: int = 1,
+    held_out: float = 0.0, seed: int = 1, known: Iterable[str] = (),
 ) -> tuple[LabelledSet, ...]:
-    """The labelled sets in these files and folders, all read with the same options (those of `read_dataset`).
+    """The labelled sets in these files and folders, all read with the same options (those of `read_datasets`).
 
     `videos` is a regular expression: only pictures whose video or flight it fits (from its start) are kept. With
-    `held_out` only the share that a training with this share and seed holds out. Raises InputError as `read_dataset`,
-    and for a set of which none is kept; SettingsError for a broken expression and a share that cannot be.
+    `held_out` only the share that a training with this share and seed holds out. Raises InputError and SettingsError as
+    `read_datasets`, InputError for a set of which none is kept, SettingsError for a broken expression and a share that
+    cannot be.
     """
     try:
         kept = re.compile(videos)
     except re.error as error:
         raise SettingsError(f"--videos {videos!r} is no regular expression: {error}") from error
     sets = []
-    for place in places:
-        whole = read_dataset(
-            place, form=form, classes=classes, ignore=ignore, unlabelled=unlabelled, group_pattern=group_pattern
-        )
+    read = read_datasets(
+        places, form=form, classes=classes, ignore=ignore, unlabelled=unlabelled, group_pattern=group_pattern,
+        known=known,
+    )
+    for place, whole in zip(places, read):
         chosen = whole.only([each for each in whole.pictures if kept.match(each.group)])
         if not len(chosen):
             groups = sorted({each.group for each in whole.pictures})
             raise InputError(f"{place}: no video or flight fits {videos!r}; there are {', '.join(groups[:8])}")
         sets.append(_held_out(chosen, held_out, seed) if held_out else chosen)
     return tuple(sets)
+
+
+def known_classes(arms: Iterable[Iterable[str]]) -> tuple[str, ...]:
+    """All classes that any model of the arms tells apart. Raises InputError as `evaluate_detector`."""
+    told = (
+        read_found(Path(place)).classes if Path(place).suffix == ".json" else read_info(find_model(place)).classes
+        for arm in arms for place in arm
+    )
+    return tuple(dict.fromkeys(name for classes in told for name in classes))
 
 
 def evaluate_detector(
@@ -106,13 +122,17 @@ def evaluate_detector(
 
     An arm is one model, or the same one trained with several seeds: names or files of models, or detections.json of
     earlier evaluations, which were made on the same pictures. Raises InputError for models and files that cannot be
-    used, for sets that label none of a model's classes, and for pictures that cannot be read.
+    used, for sets that label none of a model's classes, and for those of which no picture can be read; one picture
+    that cannot be read is left out for all models, and named in `notices`.
     """
     settings = settings or EvaluationSettings()
     names = [each.name for each in labelled]
     if len(set(names)) < len(names):
         raise InputError(f"two data sets have one name ({', '.join(names)}); rename a folder")
-    seen = [[_found(place, labelled, settings, told) for place in arm] for arm in arms]
+    damaged: dict[str, str] = {}
+    seen = [[_found(place, labelled, settings, told, damaged) for place in arm] for arm in arms]
+    seen = [[_without(each, labelled, damaged) for each in arm] for arm in seen]
+    labelled = [_readable(each, damaged) for each in labelled]
     first = seen[0][0]
     scores = tuple(
         score_set(each, first.sets[each.name][1], first.classes, first.thresholds, draws=settings.draws,
@@ -126,7 +146,7 @@ def evaluate_detector(
         each.name: tuple(_worst(each, score, first.sets[each.name][1], first.thresholds))
         for each, score in zip(labelled, scores)
     }
-    return DetectorEvaluation(first, scores, comparisons, worst)
+    return DetectorEvaluation(first, scores, comparisons, worst, (*_told_of_damaged(damaged), *first.notices))
 
 
 def write_evaluation(evaluation: DetectorEvaluation, folder: Path, description: Mapping[str, Any]) -> None:
@@ -167,15 +187,17 @@ def _held_out(labelled: LabelledSet, share: float, seed: int) -> LabelledSet:
     return replace(kept, name=labelled.name, notices=notices)
 
 
-
 def _found(
     place: str, labelled: Sequence[LabelledSet], settings: EvaluationSettings,
-    told: Callable[[EvaluationProgress], None],
+    told: Callable[[EvaluationProgress], None], damaged: dict[str, str],
 ) -> FoundSets:
-    """What the model of this name or file finds, or what a file says that it found."""
+    """What the model of this name or file finds, or what a file says that it found.
+
+    Pictures that cannot be read join `damaged`, by path with the reason; of them nothing is found.
+    """
     if Path(place).suffix == ".json":
         found = read_found(Path(place))
-        return replace(found, sets={each.name: _same_pictures(place, found, each) for each in labelled})
+        return replace(found, sets={each.name: _same_pictures(place, found, each, damaged) for each in labelled})
     detector = Detector.load(place)
     for each in labelled:
         judged_classes(each, detector.classes)  # before an hour of looking
@@ -184,20 +206,65 @@ def _found(
     for each in labelled:
         detections = []
         for picture in each.pictures:
-            image = read_picture(Path(picture.path))
-            started = time.perf_counter()
-            m_per_px = None if np.isnan(picture.m_per_px) else picture.m_per_px
-            detections.append(
-                detector.detect(image, tiles=settings.tiles, m_per_px=m_per_px, least_score=LEAST_SCORE)
-            )
-            seconds += time.perf_counter() - started
-            count += 1
+            image = _picture(picture.path, damaged)
+            if image is None:
+                detections.append(_nothing(detector.classes))
+            else:
+                started = time.perf_counter()
+                detections.append(detector.detect(
+                    image, tiles=settings.tiles, m_per_px=picture.m_per_px, least_score=LEAST_SCORE
+                ))
+                seconds += time.perf_counter() - started
+                count += 1
             told(EvaluationProgress(detector.info.name, each.name, len(detections), len(each)))
         sets[each.name] = _names(each), tuple(detections)
     return FoundSets(
         _arm_name(place), detector.classes, dict(detector.info.thresholds), sets, seconds / max(count, 1),
         tuple(notice.text for notice in detector.notices),
     )
+
+
+def _picture(path: str, damaged: dict[str, str]) -> ImageRGB | None:
+    """The picture, or None where it cannot be read, which is then noted in `damaged`."""
+    if path in damaged:
+        return None
+    try:
+        return read_picture(Path(path))
+    except (InputError, OSError) as error:
+        damaged[path] = str(error)
+        return None
+
+
+def _nothing(classes: tuple[str, ...]) -> Detections:
+    return Detections(np.zeros((0, 4), np.float32), np.zeros(0), np.zeros(0, np.int64), classes)
+
+
+def _readable(labelled: LabelledSet, damaged: Mapping[str, str]) -> LabelledSet:
+    """The set without damaged pictures. Raises InputError where none is left."""
+    kept = [each for each in labelled.pictures if each.path not in damaged]
+    if not kept:
+        first = labelled.pictures[0].path
+        raise InputError(
+            f"none of the {len(labelled)} pictures of {labelled.name} can be read (first: {first}: {damaged[first]})"
+        )
+    return labelled.only(kept)
+
+
+def _without(found: FoundSets, labelled: Sequence[LabelledSet], damaged: Mapping[str, str]) -> FoundSets:
+    """What was found, without the pictures that no model could be shown."""
+    sets = {}
+    for each in labelled:
+        files, detections = found.sets[each.name]
+        rows = [row for row, picture in enumerate(each.pictures) if picture.path not in damaged]
+        sets[each.name] = tuple(files[row] for row in rows), tuple(detections[row] for row in rows)
+    return replace(found, sets=sets)
+
+
+def _told_of_damaged(damaged: Mapping[str, str]) -> tuple[str, ...]:
+    if not damaged:
+        return ()
+    some = "; ".join(f"{path}: {reason}" for path, reason in list(damaged.items())[:_NAMED])
+    return (f"{len(damaged)} pictures cannot be read and were left out: {some}",)
 
 
 def _arm_name(place: str) -> str:
@@ -209,9 +276,9 @@ def _names(labelled: LabelledSet) -> tuple[str, ...]:
 
 
 def _same_pictures(
-    place: str, found: FoundSets, labelled: LabelledSet
+    place: str, found: FoundSets, labelled: LabelledSet, damaged: dict[str, str]
 ) -> tuple[tuple[str, ...], tuple[Detections, ...]]:
-    """The file's detections in the order of the set's pictures."""
+    """The file's detections in the order of the set's pictures; those that it lacks must be damaged ones."""
     if labelled.name not in found.sets:
         raise InputError(f"{place}: holds detections of {', '.join(found.sets)}, none of {labelled.name}")
     files, detections = found.sets[labelled.name]
@@ -219,13 +286,17 @@ def _same_pictures(
     if files == wanted:
         return files, detections
     by_name = dict(zip(files, detections))
-    missing = [name for name in wanted if name not in by_name]
+    missing = [
+        name for name, picture in zip(wanted, labelled.pictures)
+        if name not in by_name and _picture(picture.path, damaged) is not None
+    ]
     if missing or len(by_name) < len(files) or len(set(wanted)) < len(wanted):
         raise InputError(
             f"{place}: made on other pictures of {labelled.name}"
             + (f"; {len(missing)} are missing, such as {missing[0]}" if missing else "")
         )
-    return wanted, tuple(by_name[name] for name in wanted)
+    nothing = _nothing(found.classes)
+    return wanted, tuple(by_name.get(name, nothing) for name in wanted)
 
 
 def _side_by_side(
@@ -252,10 +323,10 @@ def _worst(
         for mistake in _few_of_each_picture(mistakes):
             picture = labelled.pictures[mistake.picture]
             reported = _reported(found[mistake.picture], thresholds)
-            crop = mistake_picture(
-                read_picture(Path(picture.path)), mistake.box_px, _judged_boxes(picture, labelled, scores), reported
-            )
-            yield mistake, Path(picture.path).name, crop
+            image = _picture(picture.path, {})
+            if image is not None:  # of detections.json the pictures were not needed so far
+                crop = mistake_picture(image, mistake.box_px, _judged_boxes(picture, labelled, scores), reported)
+                yield mistake, Path(picture.path).name, crop
 
 
 def _area_px(mistake: Mistake) -> float:

@@ -13,7 +13,7 @@ from sorvolo.missions.holding_out import hold_out
 from sorvolo.missions.simulate_pictures import simulate_pictures
 from sorvolo.missions.simulation_folder import PICTURES_MARK
 from sorvolo.simulation.pictures import PictureSettings
-from sorvolo.store.datasets import read_dataset
+from sorvolo.store.datasets import read_dataset, read_datasets
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
 from sorvolo.survey.splits import shared_groups
@@ -27,7 +27,7 @@ _SYNTHETIC_THERMAL = 0.2
 
 @dataclass(frozen=True)
 class DataOptions:
-    """How data sets are read, as `store.datasets.read_dataset` takes it, and what they are checked on.
+    """How data sets are read, as `store.datasets.read_datasets` takes it, and what they are checked on.
 
     `val` is a data set of its own, or the share of pictures that is held out ("0.15"); "0": nothing is checked.
     """
@@ -96,12 +96,14 @@ def read_training_sets(
     object to learn, SettingsError where `val` is neither a data set nor a share.
     """
     share = _share_of(options.val)
-    whole = [_read(place, options) for place in places]
-    if not whole and synthetic < 1:
+    if not places and synthetic < 1:
         raise InputError("no data to learn from; give folders of labelled pictures, or --synthetic 1")
-    notices = [f"{each.name}: {notice.text}" for each in whole for notice in each.notices]
+    checked = [Path(options.val)] if share is None else []
+    read = _read([*places, *checked], options)
+    whole, apart = list(read[:len(places)]), list(read[len(places):])
+    notices = [f"{each.name}: {notice.text}" for each in read for notice in each.notices]
     if share is None:
-        learnt, held_out = whole, [_read(Path(options.val), options)]
+        learnt, held_out = whole, apart
         notices += [notice.text for each in whole for notice in shared_groups(each, held_out[0])]
     else:
         parts = [hold_out(each, share, seed) for each in whole]
@@ -135,9 +137,9 @@ def simulate_samples(folder: Path, samples: int, seed: int) -> Iterator[str]:
             yield f"simulating pictures: {done.pictures_done} of {done.pictures_total}"
 
 
-def _read(place: Path, options: DataOptions) -> LabelledSet:
-    return read_dataset(
-        place, form=options.form, classes=options.classes, ignore=options.ignore, unlabelled=options.unlabelled,
+def _read(places: Sequence[Path], options: DataOptions) -> tuple[LabelledSet, ...]:
+    return read_datasets(
+        places, form=options.form, classes=options.classes, ignore=options.ignore, unlabelled=options.unlabelled,
         group_pattern=options.group_pattern,
     )
 

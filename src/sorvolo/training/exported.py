@@ -91,11 +91,11 @@ def _rows_of(
     layer: nn.Module, found: Sequence[Tensor], known: Sequence[str], classes: Sequence[str]
 ) -> list[Tensor]:
     """The class layer's weights and bias: rows of classes of the same name and of the background are the file's."""
-    if len(found[0]) != len(known) + 1 or found[0].shape[1:] != layer.weight.shape[1:]:
+    if len(found[0]) != len(known) + 1 or found[0].shape[1:] != layer.weight.shape[1:]:  # type: ignore[index]
         raise _unfitting(f"its {len(found[0])} rows of classes are not those of {', '.join(known)} and the background")
     theirs = [*(known.index(name) for name in classes if name in known), len(known)]
     own = [*(row for row, name in enumerate(classes) if name in known), len(classes)]
-    filled = [layer.weight.detach().clone(), layer.bias.detach().clone()]
+    filled = [layer.weight.detach().clone(), layer.bias.detach().clone()]  # type: ignore[operator]
     for to, given in zip(filled, found):
         to[own] = given[theirs]
     return filled
@@ -104,7 +104,7 @@ def _rows_of(
 @torch.no_grad()
 def _fill(name: str, layer: nn.Module, norm: nn.BatchNorm2d | None, weight: Tensor, bias: Tensor) -> None:
     """The layer's weight, and its bias: of one without a bias the shift of the norm, which else changes nothing."""
-    layer.weight.copy_(weight)
+    layer.weight.copy_(weight)  # type: ignore[operator]
     if layer.bias is not None:
         layer.bias.copy_(bias)  # type: ignore[operator]
         return
@@ -149,8 +149,8 @@ def _settle(model: FasterRCNN, norms: Sequence[nn.BatchNorm2d], pictures: Tensor
     """Give each norm the mean and variance of what reaches it, and the gain and shift that take them out again."""
     def settle(norm: nn.Module, inputs: tuple[Tensor, ...]) -> None:
         mean, variance = inputs[0].mean((0, 2, 3)), inputs[0].var((0, 2, 3), correction=0)
-        norm.running_mean.copy_(mean)
-        norm.running_var.copy_(variance)
+        norm.running_mean.copy_(mean)  # type: ignore[operator]
+        norm.running_var.copy_(variance)  # type: ignore[operator]
         norm.weight.copy_(torch.sqrt(variance + norm.eps))  # type: ignore[operator]
         norm.bias.add_(mean)  # type: ignore[operator]
 

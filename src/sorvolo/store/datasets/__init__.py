@@ -1,13 +1,13 @@
-"""The one door to labelled pictures of any form: `read_dataset`. Each form has a file of its own."""
+"""The one door to labelled pictures of any form: `read_dataset`, `read_datasets`. Each form has a file of its own."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.store.datasets.checking import labelled_set
 from sorvolo.store.datasets.coco import read_coco
 from sorvolo.store.datasets.groups import compiled
-from sorvolo.store.datasets.naming import naming
+from sorvolo.store.datasets.naming import naming, plain
 from sorvolo.store.datasets.okutama import read_okutama
 from sorvolo.store.datasets.parsed import Findings, ParsedSet, Reader
 from sorvolo.store.datasets.recognising import form_of
@@ -16,6 +16,7 @@ from sorvolo.store.datasets.visdrone import read_visdrone
 from sorvolo.store.datasets.voc import read_voc
 from sorvolo.store.datasets.yolo import read_yolo
 from sorvolo.survey.labels import LabelledSet
+from sorvolo.survey.objects import CLASSES
 
 READERS: Mapping[str, Reader] = {
     "coco": read_coco, "yolo": read_yolo, "voc": read_voc, "visdrone": read_visdrone, "okutama": read_okutama,
@@ -39,7 +40,45 @@ def read_dataset(
     Raises InputError when there is nothing to read, none of the names stands for a class, or labels and pictures do not
     belong together; SettingsError for an unknown form or a broken pattern.
     """
-    place = Path(place)
+    return _read(Path(place), form, classes, ignore, unlabelled, group_pattern)[0]
+
+
+def read_datasets(
+    places: Sequence[Path | str], *, form: str | None = None, classes: Mapping[str, str] | None = None,
+    ignore: Iterable[str] = (), unlabelled: Iterable[str] = (), group_pattern: str | None = None,
+    known: Iterable[str] = (),
+) -> tuple[LabelledSet, ...]:
+    """Several sets, read alike, each as `read_dataset` reads it; a slip in a name is no silent one here.
+
+    Raises InputError and SettingsError as that does, and SettingsError where a name in `ignore` is none of any set's,
+    or one in `unlabelled` no class: of ours, of `classes`, of a set, or of those that are `known` besides.
+    """
+    ignore, unlabelled = tuple(ignore), tuple(unlabelled)
+    read = [_read(Path(place), form, classes, ignore, unlabelled, group_pattern) for place in places]
+    if read:
+        names = dict.fromkeys(name for _, own in read for name in own)
+        _refuse_unknown("ignore", ignore, names, "name in the labels")
+        found = (name for labelled, _ in read for name in labelled.classes)
+        ours = dict.fromkeys([*CLASSES, *(classes or {}).values(), *found, *known])
+        _refuse_unknown("unlabelled", unlabelled, ours, "class", exact=True)
+    return tuple(labelled for labelled, _ in read)
+
+
+def _refuse_unknown(
+    option: str, asked: Iterable[str], known: Iterable[str], kind: str, *, exact: bool = False
+) -> None:
+    compared = set(known) if exact else {plain(name) for name in known}
+    unknown = [name for name in asked if (name if exact else plain(name)) not in compared]
+    if unknown:
+        there = ", ".join(known) or "none"
+        raise SettingsError(f"{option}: {', '.join(map(repr, unknown))} is no {kind}; there are: {there}")
+
+
+def _read(
+    place: Path, form: str | None, classes: Mapping[str, str] | None, ignore: Iterable[str],
+    unlabelled: Iterable[str], group_pattern: str | None,
+) -> tuple[LabelledSet, tuple[str, ...]]:
+    """The set, and all names that its own labels have."""
     if form is not None and form not in READERS:
         raise SettingsError(f"unknown form {form!r} of labels; choose one of {', '.join(READERS)}")
     pattern = None if group_pattern is None else compiled(group_pattern)
@@ -47,7 +86,8 @@ def read_dataset(
         raise InputError(f"{place} does not exist; give a folder of labelled pictures, or its label file")
     findings = Findings()
     parsed = _parsed(place, form, findings)
-    return labelled_set(parsed, place, naming(classes, ignore), unlabelled, pattern, findings)
+    labelled = labelled_set(parsed, place, naming(classes, ignore), unlabelled, pattern, findings)
+    return labelled, parsed.names
 
 
 def _parsed(place: Path, form: str | None, findings: Findings) -> ParsedSet:

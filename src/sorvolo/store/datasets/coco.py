@@ -71,12 +71,25 @@ def coco_files(folder: Path) -> list[Path]:
 
 def _looks_like_coco(path: Path) -> bool:
     text = read_text(path)  # only searched: a large one takes seconds to parse
-    return '"images"' in text and '"annotations"' in text
+    there = ['"images"' in text, '"annotations"' in text]
+    return all(there) or (any(there) and _is_cut(text))
+
+
+def _is_cut(text: str) -> bool:
+    """Whether it cannot be a whole JSON object."""
+    return not text.rstrip().endswith("}")
 
 
 def _loaded(path: Path) -> dict[str, Any]:
+    text = read_text(path)
     try:
-        whole = json.loads(read_text(path))
+        whole = json.loads(text)
+    except json.JSONDecodeError as error:
+        how = "breaks off" if _is_cut(text) or error.pos >= len(text.rstrip()) else "is damaged"
+        raise InputError(
+            f"{path} {how} at line {error.lineno}, column {error.colno} (character {error.pos} of {len(text)}: "
+            f"{error.msg}); COCO labels are one whole JSON file: copy or export it again"
+        ) from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is no JSON ({error}); COCO labels are one JSON file") from error
     missing = [key for key in ("images", "annotations", "categories") if key not in whole] if isinstance(

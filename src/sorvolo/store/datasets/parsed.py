@@ -82,6 +82,11 @@ class ParsedSet:
     pictures: tuple[ParsedPicture, ...]
     declared: tuple[str, ...] = ()
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Every class name: those of its list, then those that only boxes have."""
+        return tuple(dict.fromkeys([*self.declared, *(box.name for each in self.pictures for box in each.boxes)]))
+
 
 Reader: TypeAlias = Callable[[Path, Findings], ParsedSet]
 """Reads one form from a file or folder; raises InputError when it is not of that form."""
