@@ -76,7 +76,7 @@ def main() -> None:
         load_exported(model, find_model(wishes.start).read_bytes(), collate(first, "cpu")[0])
         rate *= 0.7
     model = model.to(memory_format=torch.channels_last)
-    settings = JointSettings(steps=wishes.steps, batch=wishes.batch, rate=rate, backbone_rate=rate / 5)
+    settings = JointSettings(steps=wishes.steps, batch=wishes.batch, rate=rate, backbone_rate=0.3 * rate)
     training = JointTraining(model, settings, wishes.seed, wishes.device)
     checkpoint = wishes.out / "checkpoint.pt"
     if checkpoint.is_file():
@@ -112,8 +112,8 @@ def training_shares(data: Path, out: Path) -> list[Share]:
             pass
     made = in_order(read_dataset(simulated))
     return [
-        Share(hituav(data)["train"], 4.0, (0.7, 1.8), thermal=True),
-        Share(tinyperson(data)["train"], 1.8, (0.8, 2.4), pastes=SMALL),
+        Share(hituav(data)["train"], 4.0, (0.8, 2.0), thermal=True),
+        Share(tinyperson(data)["train"], 1.8, (1.0, 2.8), pastes=SMALL),
         Share(mannequin(data)["train"], 0.2, (0.3, 1.2), pastes=SMALL),
         Share(aerial_cars(data)["train"], 1.4, (0.25, 1.2), pastes=SMALL),
         Share(made, 3.0, (0.6, 1.6)),

@@ -13,6 +13,8 @@ _BLOCKS = (  # repeats, kernel, stride, growth, out channels
     (1, 3, 1, 6, 320),
 )
 
+_STRIDE_8 = 5  # so many blocks come up to it
+
 
 class _OneNode(torch.autograd.Function):
     """A convolution padded unevenly as a single node of the exported graph; torch itself needs two."""
@@ -80,8 +82,9 @@ class _Block(nn.Module):
 class EfficientNetLite0(nn.Module):
     """Features of strides 4, 8 and 16 (24, 40 and 112 channels), of 32 too (320) if `deep`.
 
-    Its batch norms, which would stay as ImageNet left them, are folded into the convolutions; the layers up to stride 8
-    are frozen unless `thaw_all`. Input: (N, 3, H, W) floats 0 to 255, sides multiples of the last stride.
+    Its batch norms, which would stay as ImageNet left them, are folded into the convolutions; unless `thaw_all`
+    the stem and the first block are frozen, and the kernels that filter each channel by itself up to stride 8, which are
+    the dearest to learn. Input: (N, 3, H, W) floats 0 to 255, sides multiples of the last stride.
     """
 
     def __init__(self, *, deep: bool = False, thaw_all: bool = False) -> None:
@@ -102,7 +105,7 @@ class EfficientNetLite0(nn.Module):
                 nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
                 nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
         if not thaw_all:
-            for module in (self._conv_stem, *self._blocks[:5]):
+            for module in (self._conv_stem, blocks[0], *(each._depthwise_conv for each in blocks[1:_STRIDE_8])):
                 for weight in module.parameters():
                     weight.requires_grad = False
 

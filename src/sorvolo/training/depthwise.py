@@ -35,7 +35,8 @@ class _Depthwise(torch.autograd.Function):
 
 def depthwise(features: Tensor, weight: Tensor, bias: Tensor | None, stride: int, padding: int) -> Tensor:
     """(N, C, H, W) filtered channel by channel with `weight` (C, 1, k, k), as torch.nn.functional.conv2d does it."""
-    if features.device.type != "cpu" or not (torch.is_grad_enabled() and weight.requires_grad):
+    learns = torch.is_grad_enabled() and (features.requires_grad or weight.requires_grad)
+    if features.device.type != "cpu" or not learns:
         return functional.conv2d(features, weight, bias, stride, padding, groups=len(weight))
     out: Tensor = _Depthwise.apply(features, weight, stride, padding)  # type: ignore[no-untyped-call]
     return out if bias is None else out + bias.to(out.dtype)[:, None, None]
