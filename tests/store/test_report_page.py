@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from sorvolo.store.exports import plain_json
 from sorvolo.store.report_page import report_page
-from sorvolo.store.report_plots import Scale, round_length
+from sorvolo.store.report_plots import Scale, TrackColumns, round_length, track_plan
 
 
 def _words(page: str) -> str:
@@ -199,3 +199,17 @@ def test_ticks_lie_on_the_scale(low: float, span: float) -> None:
     ticks = list(scale.ticks(5))
     assert 4 <= len(ticks) <= 14
     assert all(-1e-4 <= scale(tick) <= 100.0001 for tick in ticks)
+
+
+@pytest.mark.parametrize("heading", [1, -1])
+def test_the_word_at_the_track_s_start_stands_clear_of_its_marks(heading: int) -> None:
+    columns = {
+        "east_m": heading * np.arange(5.0) * 10, "north_m": np.zeros(5), "residual_px": np.ones(5),
+        "gps_east_m": np.full(5, 3.0 * heading), "gps_north_m": np.zeros(5),
+    }
+    drawn = track_plan(TrackColumns(tuple("abcde"), ("vision",) * 5, columns), unit="m")
+    marks = [float(each) for each in re.findall(r'cx="([0-9.]+)"', drawn)]
+    found = re.search(r'x="([0-9.]+)" y="[0-9.]+" text-anchor="(\w+)">start<', drawn)
+    assert found is not None
+    assert found[2] == ("end" if heading > 0 else "start")
+    assert float(found[1]) < min(marks) if heading > 0 else float(found[1]) > max(marks)

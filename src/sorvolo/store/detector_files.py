@@ -87,7 +87,7 @@ def mistake_picture(
     for boxes, colour in ((labels_px, _LABEL_COLOUR), (found_px, _FOUND_COLOUR)):
         for edges in boxes:
             low, high = (np.round((edges[k:k + 2] - [x0, y0]) * scale).astype(int).tolist() for k in (0, 2))
-            cv2.rectangle(crop, low, high, colour, 2 if colour == _LABEL_COLOUR else 1, cv2.LINE_AA)
+            cv2.rectangle(crop, low, high, colour, 2, cv2.LINE_AA)
     return np.asarray(crop, np.uint8)
 
 

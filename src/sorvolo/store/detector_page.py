@@ -1,7 +1,7 @@
 """How good a detector is, as one page of HTML that needs no other file, no network and no script."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -20,7 +20,7 @@ _STYLE = """
 .key.c0{background:var(--east)}.key.c1{background:var(--gps)}.key.c2{background:var(--vision)}
 .key.c3{background:var(--north)}
 svg .c0{stroke:var(--east)}svg .c1{stroke:var(--gps)}svg .c2{stroke:var(--vision)}svg .c3{stroke:var(--north)}
-td.number,th.number{text-align:right}
+.whole{white-space:nowrap}.within{display:block;color:var(--soft);font-size:.82rem;white-space:nowrap}
 """
 _COLOURS = 4
 _KIND_WORDS = {
@@ -54,9 +54,14 @@ def _header(model: str, sets: Sequence[Any]) -> str:
     told = "; ".join(f"{escape(each.name)}: AP50 {_class_words(each.classes)}" for each in sets)
     return (
         f'<header><p class="over">Detector <b>{escaped(model)}</b></p><h1>{told}</h1>'
-        f"<p>Measured on {sum(each.pictures for each in sets)} labelled pictures of "
-        f"{sum(each.groups for each in sets)} videos or flights. All shares are in per cent.</p></header>"
+        f"<p>Measured on {sum(each.pictures for each in sets)} labelled pictures of {_videos(sets)}. All shares are in "
+        "per cent.</p></header>"
     )
+
+
+def _videos(sets: Sequence[Any]) -> str:
+    count = sum(each.groups for each in sets)
+    return "one video or flight" if count == 1 else f"{count} videos or flights"
 
 
 def _class_words(classes: Sequence[Any]) -> str:
@@ -83,7 +88,7 @@ def _overview(sets: Sequence[Any]) -> str:
     return (
         f"<section><h2>Average precision</h2>{table_of(rows, names)}"
         '<p class="note">COCO\'s AP is the mean over IoU 0.50 to 0.95; small is below 32\u00b2 px, large above '
-        "96\u00b2. In brackets the interval that holds the value with 95 %, by drawing whole videos. The thesis's mAP "
+        "96\u00b2. Below a value the interval that holds it with 95 %, by drawing whole videos. The thesis's mAP "
         "(eqs 4.3, 4.4) is the mean precision at the reporting thresholds: it says nothing of what was missed.</p>"
         + (bullet_list(remarks) if remarks else "") + "</section>"
     )
@@ -95,14 +100,13 @@ def _comparison(each: Any) -> str:
     head += [f"{escape(arm.name)} less {escape(each.arms[0].name)}" for arm in each.arms[1:]]
     rows = []
     for name in names:
-        row = [escape(name)]
+        row = ["thesis mAP" if name == "thesis_map" else escape(name)]
         for arm in each.arms:
-            spread = f" ({_share(arm.lowest[name])} to {_share(arm.highest[name])})" if arm.seeds > 1 else ""
+            spread = _within(arm.lowest[name], arm.highest[name], _share) if arm.seeds > 1 else ""
             row.append(_share(arm.mean[name]) + spread)
         for found in each.differences:
             told = found[name]
-            bounds = f" [{_points(told.low)}, {_points(told.high)}]" if math.isfinite(told.low) else ""
-            words = f"{_points(told.value)}{bounds}"
+            words = _points(told.value) + _within(told.low, told.high, _points)
             row.append(f"<b>{words}</b>" if told.is_clear else words)
         rows.append(row)
     labels = ", ".join(f"{count} {escape(name)}" for name, count in each.labels.items())
@@ -174,7 +178,7 @@ def _sizes(scores: Any) -> str:
     ):
         rows = [
             [
-                escape(label), _range(row.low, row.high, unit), str(row.count),
+                escape(label), f'<span class="whole">{_range(row.low, row.high, unit)}</span>', str(row.count),
                 f'{_share(row.recall)}<div class="bar" style="width:{100 * row.recall:.0f}%"></div>',
                 _share(row.candidates / row.count),
             ]
@@ -243,7 +247,7 @@ def _opaque(rgb: ImageRGB) -> Anything:
 
 def _range(low: float, high: float, unit: str) -> str:
     if math.isinf(high):
-        return f"{low:g} {unit} and more"
+        return f"from {low:g} {unit}"
     return f"below {high:g} {unit}" if not low else f"{low:g} to {high:g} {unit}"
 
 
@@ -260,6 +264,9 @@ def _number(value: float) -> str:
 
 
 def _with_interval(told: Any) -> str:
-    if not math.isfinite(told.low):
-        return _share(told.value)
-    return f"{_share(told.value)} [{_share(told.low)}, {_share(told.high)}]"
+    return _share(told.value) + _within(told.low, told.high, _share)
+
+
+def _within(low: float, high: float, words: Callable[[float], str]) -> str:
+    """The bounds on a line of their own; "" where they are not known."""
+    return f'<span class="within">{words(low)} to {words(high)}</span>' if math.isfinite(low) else ""

@@ -4,7 +4,7 @@ import base64
 from collections.abc import Mapping
 from typing import Any
 
-from sorvolo.store.page_parts import at, escaped, finite_or_none, length_words, number_at, seconds_words, table_of
+from sorvolo.store.page_parts import at, escaped, finite_or_none, number_at, seconds_words, table_of
 
 _MOST_CROP_BYTES = 250_000  # of all pictures together: the page stays one that can be mailed
 _MOST_ROWS = 200
@@ -82,8 +82,7 @@ def _place(row: Mapping[str, Any]) -> str:
     east, north, sigma = (finite_or_none(row.get(name)) for name in ("east_m", "north_m", "sigma_m"))
     if east is None or north is None:
         return ""
-    within = length_words(sigma)
-    return f"{east:+.1f}, {north:+.1f}" + (f" \u00b1 {within}" if within else "")
+    return f"{east:+.1f}, {north:+.1f}" + ("" if sigma is None else f" \u00b1 {sigma:.1f}") + " m"
 
 
 def _size(row: Mapping[str, Any]) -> str:

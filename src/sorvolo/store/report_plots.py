@@ -87,7 +87,13 @@ def track_plan(track: TrackColumns, *, unit: str) -> str:
         parts.append(f'<circle class="fix" cx="{fx:.1f}" cy="{fy:.1f}" r="2.4"/>')
     parts += [_mark(x(east[k]), y(north[k]), track, int(k)) for k in np.flatnonzero(shown)]
     first = int(np.flatnonzero(shown)[0])
-    parts.append(_label(x(east[first]) + 7, y(north[first]) - 7, "start", "start"))
+    second = int(np.flatnonzero(shown)[:2][-1])
+    around = [x(east[first])] + ([x(fix_east[first])] if known[first] else [])
+    # on the side to which the track does not go, clear of the fix
+    if east[second] < east[first]:
+        parts.append(_label(max(around) + 9, y(north[first]) + 4, "start", "start"))
+    else:
+        parts.append(_label(min(around) - 9, y(north[first]) + 4, "start", "end"))
     length = round_length((x_high - x_low + y_high - y_low) / 6)
     bar_y = height - 12
     parts.append(

@@ -137,7 +137,7 @@ def _plot(
         parts.append(
             f'<text class="label" x="{_MARGIN_PX - 6}" y="{y(tick) + 4:.1f}" text-anchor="end">{tick:g}</text>'
         )
-    for tick in x.ticks(8):
+    for tick in (each for each in x.ticks(8) if each == round(each)):
         parts.append(
             f'<text class="label" x="{x(tick):.1f}" y="{_LOW_PX - 16}" text-anchor="middle">{tick:g}</text>'
         )
