@@ -94,12 +94,13 @@ def test_where_nothing_is_learnt_torch_itself_is_asked(frozen: bool, monkeypatch
     monkeypatch.setattr(module._Depthwise, "apply", never)
     wanted = _own(features, weight, bias, 2, 1)
     if frozen:
-        torch.testing.assert_close(depthwise(features, weight.detach(), bias, 2, 1), wanted)
+        torch.testing.assert_close(depthwise(features.detach(), weight.detach(), bias, 2, 1), wanted)
     else:
         with torch.no_grad():
             assert torch.equal(depthwise(features, weight, bias, 2, 1), wanted)
-    with pytest.raises(AssertionError, match="detour"):
-        depthwise(features, weight, bias, 2, 1)
+    for learnt in ((features, weight.detach()), (features.detach(), weight)):
+        with pytest.raises(AssertionError, match="detour"):
+            depthwise(*learnt, bias, 2, 1)
 
 
 def test_other_devices_than_the_cpu_use_torch_itself(monkeypatch: pytest.MonkeyPatch) -> None:
