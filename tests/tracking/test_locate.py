@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.pose import rotation_from_vector, site_from_gimbal_rotation
+from sorvolo.geometry.ground import footprint
+from sorvolo.geometry.pose import Pose, rotation_from_vector, site_from_gimbal_rotation
 from sorvolo.simulation.flight import simulate_flight
 from sorvolo.simulation.settings import (
     ImagingSettings,
@@ -19,6 +20,7 @@ from sorvolo.simulation.truth import coco_boxes
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.objects import CLASSES, TYPICAL_SIZE_M, Detections, no_detections
 from sorvolo.tracking.locate import LocateSettings, locate
+from sorvolo.tracking.tracker import Tracker
 
 CAMERA = Camera.from_angle_of_view(960, 540, 62.0)
 NADIR = site_from_gimbal_rotation(0.0, -90.0, 0.0)
@@ -84,6 +86,42 @@ def test_each_part_of_the_sigma_is_what_moving_that_part_does(pitch_deg, what):
         assert covariance == pytest.approx(np.outer(step_m, step_m), rel=1e-2, abs=1e-3 * (step_m @ step_m))
 
 
+def test_what_the_pictures_edge_cuts_lies_farther_out_than_its_box():
+    whole_px = np.array([-37.0, 250.0, 33.0, 280.0])  # a car of 4.4 m, half of it in the picture
+    whole, cut = (
+        locate(Detections([box], [0.9], [CLASSES.index("car")], CLASSES), 0, "0", 0, CAMERA, EXACT)[0][0]
+        for box in (whole_px, np.clip(whole_px, 0, None))
+    )
+    box_m = 0.5 * 37 * whole.size_m[0] / 70  # by how much the middle of what is seen is off
+    off_m = cut.position_m - whole.position_m
+    assert abs(off_m[0]) < 0.5 * box_m and abs(off_m[1]) < 0.01
+    assert off_m[0] ** 2 < 4 * cut.covariance_m2[0, 0]
+    assert cut.covariance_m2[0, 0] > 4 * cut.covariance_m2[1, 1]
+    inside_px = whole_px + np.array([60.0, 0.0, 60.0, 0.0])
+    inside = locate(Detections([inside_px], [0.9], [CLASSES.index("car")], CLASSES), 0, "0", 0, CAMERA, EXACT)[0][0]
+    assert inside.covariance_m2 == pytest.approx(whole.covariance_m2, rel=0.3, abs=0.02)
+
+
+@pytest.mark.parametrize("speed_m_s", [2.0, 4.0])
+def test_a_car_that_drives_into_the_picture_is_one_and_moves(speed_m_s):
+    """It comes in over the left edge, eastwards, while the drone flies north."""
+    tracker, random = Tracker(), np.random.default_rng(3)
+    m_per_px = 59.25 / CAMERA.fx_px
+    for frame in range(30):
+        prior = replace(PRIOR, position_m=PRIOR.position_m + np.array([0.0, 1.2 * frame, 0.0]))
+        x, y = -20.0 + 0.2 * speed_m_s * frame / m_per_px, 40.0 + 1.2 * frame / m_per_px
+        box = np.array([x - 30, y - 13, x + 30, y + 13]) + random.normal(0, 1.5, 4)
+        box = np.clip(box, 0, [960, 540, 960, 540])
+        if box[2] - box[0] < 3 or box[3] - box[1] < 3 or random.random() < 0.2:
+            continue
+        found = Detections([box], [0.8], [CLASSES.index("car")], CLASSES)
+        seen, _ = locate(found, frame, str(frame), int(frame * 2e8), CAMERA, prior)
+        outline_m = footprint(CAMERA, Pose(prior.rotation, prior.position_m))
+        tracker.update(seen, time_ns=int(frame * 2e8), footprint_m=outline_m)
+    (track,) = tracker.finish()
+    assert track.moving and track.velocity_m_s == pytest.approx([speed_m_s, 0.0], abs=0.6)
+
+
 def test_a_height_model_is_met_where_the_ray_meets_it():
     def slope_m(places_m):
         return 0.2 * (places_m[:, 0] - 10.0)
@@ -131,7 +169,7 @@ def test_places_from_sixty_metres_are_as_good_as_they_say():
         motion=MotionSettings(), imaging=ImagingSettings(960, 540, fps=1.0),
     )
     flight = simulate_flight(settings)
-    frames = range(0, len(flight), 2)
+    frames = range(len(flight))
     truth = coco_boxes(flight, frames)
     things = {thing.id: thing for thing in flight.day.things}
     random = np.random.default_rng(5)

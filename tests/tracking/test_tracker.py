@@ -96,6 +96,34 @@ def test_tracks_that_never_stand_together_become_one():
     assert set(merged.values()) <= {1}
 
 
+def car(frame, place_m, own_m=0.2):
+    return replace(
+        sighting(frame, place_m, "car", own_m=own_m, shared_m=0.3), size_m=np.array([4.4, 1.9]),
+    )
+
+
+@pytest.mark.parametrize(("apart_m", "count"), [(1.6, 1), (2.6, 2)])
+def test_two_cars_have_no_room_on_one_place(apart_m, count):
+    """A second track beside a car, seen in turns with it three times, is that car; beside a parking bay it is not."""
+    tracker = Tracker()
+    for frame in range(10):
+        tracker.update([car(frame, [0.0, 0.0])], time_ns=int(frame * 2e8), footprint_m=AROUND_M)
+    for frame in range(10, 13):
+        tracker.update([car(frame, [0.0, apart_m])], time_ns=int(frame * 2e8), footprint_m=AROUND_M)
+    assert len(tracker.finish()) == count
+
+
+def test_a_glimpse_at_the_edge_is_the_car_that_then_drives_on():
+    """Three sightings that hardly tell where it is, a second without it, and then it moves from there."""
+    tracker = Tracker()
+    for frame in [0, 1, 2, *range(8, 20)]:
+        seen = [car(frame, [0.8 * frame if frame > 2 else 0.0, 0.0], own_m=1.5 if frame < 3 else 0.3)]
+        tracker.update(seen, time_ns=seen[0].time_ns, footprint_m=AROUND_M)
+    (track,) = tracker.finish()
+    assert track.moving and track.velocity_m_s == pytest.approx([4.0, 0.0], abs=0.5)
+    assert track.first_seen_ns == 0
+
+
 def test_two_boxes_of_one_object_are_one_and_the_scores_choose_its_class():
     tracker = Tracker()
     for frame in range(6):

@@ -15,6 +15,7 @@ WITHIN = 0.9
 """Share of the smaller of two boxes of a class that lies in the other from which on they show one object: of 174 such
 pairs in validation pictures 4 were two."""
 _FRAMES_APART = 5  # of two neighbours of which each frame sees one
+_OVERLAP, _FRAMES_OVERLAPPING = 0.5, 2  # nearer than this share of their longer sides two bodies have no room: fewer do
 _TOGETHER_SHARE = 0.15  # of frames with one of them: what is seen together more often is two objects
 _LEAST_CLASS_FIT = 0.1
 _LEAST_VIEWS = 4  # of a mover whose velocity is to be trusted
@@ -70,12 +71,13 @@ def double_of(followed: Followed, by_id: Mapping[int, Followed], reach_m: float)
     """The track of the same object that ran beside this one: frames see one of both, never both."""
     for neighbour, frames in followed.apart.items():
         other = by_id.get(neighbour)
-        if other is None or frames < _FRAMES_APART:
+        if other is None or followed.together.get(neighbour, 0) > _TOGETHER_SHARE * frames:
             continue
-        if followed.together.get(neighbour, 0) > _TOGETHER_SHARE * frames:
+        apart_m = float(np.linalg.norm(other.place_m - followed.place_m))
+        overlaps = apart_m < _OVERLAP * min(followed.sides_m[0], other.sides_m[0])
+        if frames < (_FRAMES_OVERLAPPING if overlaps else _FRAMES_APART):
             continue
-        near = float(np.linalg.norm(other.place_m - followed.place_m)) < reach_m
-        if near and _class_fit(followed, other) > _LEAST_CLASS_FIT:
+        if apart_m < reach_m and _class_fit(followed, other) > _LEAST_CLASS_FIT:
             return other
     return None
 
@@ -92,7 +94,7 @@ def earlier_mover(followed: Followed, others: Sequence[Followed], new_per_m2: fl
     speed, moving_share = followed.motion.habits[0, 0], followed.motion.habits[0, 2]
     new = np.log(new_per_m2 * moving_share) + log_density(state[2:], speed**2 * np.eye(2))
     for other in others:
-        if other is followed or not other.moves or other.last_ns >= followed.first_ns or other.views < _LEAST_VIEWS:
+        if other is followed or not other.confirmed or other.last_ns >= followed.first_ns:
             continue
         if other.id in followed.together:
             continue

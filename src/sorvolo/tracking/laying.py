@@ -10,11 +10,11 @@ from sorvolo.geometry.homography import pose_from_homography
 from sorvolo.geometry.pose import Pose
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.objects import TYPICAL_SIZE_M, Detections, Sighting
+from sorvolo.tracking.cut_boxes import CUT_PX, unseen_m
 
 _BOX_SIGMA = 0.06  # of a box's middle, in shares of its side
 _LEAST_SIGMA_PX = 1.0
 _LEAST_SIGMA_M = 0.03
-_CUT_PX = 1.5  # a box so near the picture's edge may go on beyond it
 _FARTHEST = 6.0  # times the height: beyond it, a pixel's error is many metres
 
 
@@ -50,7 +50,7 @@ def lay_on_ground(seen: Detections, frame: PlacedFrame, *, has_metres: bool = Tr
     heights_m = np.array([usual_height_m(name) if has_metres else 0.0 for name in seen.names])
     boxes = np.asarray(seen.boxes_px, np.float64)
     size_px = np.array([frame.camera.width_px, frame.camera.height_px])
-    beyond = np.concatenate([boxes[:, :2] <= _CUT_PX, boxes[:, 2:] >= size_px - _CUT_PX], axis=1)
+    beyond = np.concatenate([boxes[:, :2] <= CUT_PX, boxes[:, 2:] >= size_px - CUT_PX], axis=1)
     cut = np.count_nonzero(beyond, axis=1) > 0
     result: list[LaidSighting | None] = []
     for k, name in enumerate(seen.names):
@@ -68,8 +68,8 @@ def lay_on_ground(seen: Detections, frame: PlacedFrame, *, has_metres: bool = Tr
         spans_m = np.array([around_m[2] - around_m[1], around_m[4] - around_m[3]])
         sides_m = np.hypot(*spans_m.T)
         m_per_px = float(np.sqrt(np.prod(sides_m) / max(np.prod(boxes[k, 2:] - boxes[k, :2]), 1e-6)))
-        unseen_m = _unseen_m(name, float(sides_m.max()), has_metres=has_metres) if cut[k] else 0.0
-        own_sigma_m = _own_sigma_m(sides_m, m_per_px, frame, unseen_m)
+        beyond_m = unseen_m(name, float(sides_m.max()), has_metres=has_metres) if cut[k] else 0.0
+        own_sigma_m = _own_sigma_m(sides_m, m_per_px, frame, beyond_m)
         usual_sigma_m = 0.15 * heights_m[k] * lean
         sighting = Sighting(
             frame.index, frame.name, frame.time_ns, name, float(seen.scores[k]), seen.boxes_px[k], place_m,
@@ -112,19 +112,12 @@ def usual_height_m(name: str) -> float:
     return TYPICAL_SIZE_M[name][2] if name in TYPICAL_SIZE_M else 1.0
 
 
-def _unseen_m(name: str, side_m: float, *, has_metres: bool) -> float:
-    """How much of something may lie beyond the picture's edge: what it lacks to its usual length, or as much again."""
-    if not has_metres or name not in TYPICAL_SIZE_M:
-        return side_m
-    return max(TYPICAL_SIZE_M[name][0] - side_m, 0.3 * side_m)
-
-
-def _own_sigma_m(sides_m: Floats, m_per_px: float, frame: PlacedFrame, unseen_m: float) -> float:
+def _own_sigma_m(sides_m: Floats, m_per_px: float, frame: PlacedFrame, beyond_m: float) -> float:
     side_m = float(sides_m.mean())
     pose_m = frame.residual_px * m_per_px if np.isfinite(frame.residual_px) else 0.0
     if frame.status is Status.GPS_ONLY and np.isfinite(frame.sigma_m):
         pose_m = frame.sigma_m
-    parts = [_LEAST_SIGMA_M, _LEAST_SIGMA_PX * m_per_px, _BOX_SIGMA * side_m, pose_m, 0.4 * unseen_m]
+    parts = [_LEAST_SIGMA_M, _LEAST_SIGMA_PX * m_per_px, _BOX_SIGMA * side_m, pose_m, 0.4 * beyond_m]
     return float(np.sqrt(np.sum(np.square(parts))))
 
 

@@ -313,7 +313,10 @@ class Tracker:
         self, near: list[Followed], motions: Motions, rows: Anything, time_ns: int, elapsed_s: float,
         footprint_m: PointsM | None,
     ) -> tuple[list[Followed], list[int]]:
-        """What the frame should show and does not: those tracks, and the ids of the confirmed that end with it."""
+        """Tracks whose places the frame shows without them, and the ids of the confirmed that end with it.
+
+        Near the picture's edge that says nothing of whether they are there, only of which neighbours are seen instead.
+        """
         missing, ended = [], []
         if len(rows):
             sigmas = np.sqrt(np.trace(motions.place_covariances_m2[rows], axis1=1, axis2=2) / 2)
@@ -327,8 +330,9 @@ class Tracker:
                 followed = near[row]
                 if depth < 0:
                     followed.is_out = True
-                elif depth > 2 * sigma + side / 2 or footprint_m is None:
-                    missing.append(followed)
+                    continue
+                missing.append(followed)
+                if depth > 2 * sigma + side / 2 or footprint_m is None:
                     followed.evidence -= self._settings.missed * min(1.0, max(elapsed_s, 0.02) / _USUAL_STEP_S)
                     if followed.confirmed and not followed.ended and followed.evidence < 0:
                         followed.ended = True
