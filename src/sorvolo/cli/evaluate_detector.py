@@ -146,21 +146,21 @@ def _show(console: Console, scores: SetScores) -> None:
 def _show_comparison(console: Console, each: SetComparison) -> None:
     first = each.arms[0].name
     head = [arm.name for arm in each.arms] + [f"{arm.name} less {first}" for arm in each.arms[1:]]
-    table = Table("measure", *head, title=f"side by side: {each.name}")
+    table = Table("measure", *head, title=f"side by side: {each.name} (differences in percentage points)")
     for name, value in each.arms[0].mean.items():
         if not math.isfinite(value):
             continue
         cells = [_share(arm.mean[name]) for arm in each.arms]
         for found in each.differences:
             told = found[name]
-            bounds = f" ({told.low:+.1%} to {told.high:+.1%})" if math.isfinite(told.low) else ""
-            cells.append(f"{told.value:+.1%}{bounds}")
+            bounds = f" ({100 * told.low:+.1f} to {100 * told.high:+.1f})" if math.isfinite(told.low) else ""
+            cells.append(f"{100 * told.value:+.1f}{bounds}")
         table.add_row(name, *cells)
     console.print(table)
 
 
 def _between(told: Interval) -> str:
-    bounds = f" ({told.low:.1%} to {told.high:.1%})" if math.isfinite(told.low) else ""
+    bounds = f"\n{told.low:.1%} to {told.high:.1%}" if math.isfinite(told.low) else ""
     return _share(told.value) + bounds
 
 

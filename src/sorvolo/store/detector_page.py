@@ -20,7 +20,7 @@ _STYLE = """
 .key.c0{background:var(--east)}.key.c1{background:var(--gps)}.key.c2{background:var(--vision)}
 .key.c3{background:var(--north)}
 svg .c0{stroke:var(--east)}svg .c1{stroke:var(--gps)}svg .c2{stroke:var(--vision)}svg .c3{stroke:var(--north)}
-.whole{white-space:nowrap}.within{display:block;color:var(--soft);font-size:.82rem;white-space:nowrap}
+.within{display:block;color:var(--soft);font-size:.82rem;white-space:nowrap}
 """
 _COLOURS = 4
 _KIND_WORDS = {

@@ -82,9 +82,10 @@ def _place(row: Mapping[str, Any]) -> str:
     east, north, sigma = (finite_or_none(row.get(name)) for name in ("east_m", "north_m", "sigma_m"))
     if east is None or north is None:
         return ""
-    return f"{east:+.1f}, {north:+.1f}" + ("" if sigma is None else f" \u00b1 {sigma:.1f}") + " m"
+    within = "" if sigma is None else f" \u00b1 {sigma:.1f}"
+    return f'<span class="whole">{east:+.1f}, {north:+.1f}{within} m</span>'
 
 
 def _size(row: Mapping[str, Any]) -> str:
     length, width = finite_or_none(row.get("length_m")), finite_or_none(row.get("width_m"))
-    return "" if length is None or width is None else f"{length:.1f} x {width:.1f} m"
+    return "" if length is None or width is None else f'<span class="whole">{length:.1f} x {width:.1f} m</span>'

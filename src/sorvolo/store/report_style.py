@@ -27,7 +27,7 @@ figure{margin:24px 0}figcaption{margin-top:8px}
 text-align:center;
 font-size:.8rem;font-weight:600;line-height:1.5;text-shadow:0 0 3px #fff,0 0 3px #fff,0 0 3px #fff;
 filter:drop-shadow(0 0 1px #fff)}
-.figures{display:grid;grid-template-columns:repeat(auto-fit,minmax(200px,1fr));gap:12px;margin:20px 0}
+.figures{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(200px,45%),1fr));gap:12px;margin:20px 0}
 .figures div{background:var(--paper);border:1px solid var(--rule);border-radius:12px;padding:14px 16px}
 .figures dt{color:var(--soft);font-size:.8rem;text-transform:uppercase;letter-spacing:.05em}
 .figures dd{margin:2px 0;font-size:1.5rem;font-weight:650;font-variant-numeric:tabular-nums}
@@ -41,7 +41,7 @@ background:var(--rejected)}
 .key.rejected{background:var(--rejected);clip-path:polygon(20% 0,50% 30%,80% 0,100% 20%,70% 50%,100% 80%,
 80% 100%,50% 70%,20% 100%,0 80%,30% 50%,0 20%)}
 .key.east{background:var(--east)}.key.north{background:var(--north)}.key.up{background:var(--up)}
-.wide{overflow-x:auto}
+.wide{overflow-x:auto}.whole{white-space:nowrap}
 table{border-collapse:collapse;width:100%;font-size:.92rem}
 th{text-align:left;color:var(--soft);font-weight:500;font-size:.82rem}
 th,td{padding:6px 14px 6px 0;border-bottom:1px solid var(--rule);vertical-align:top}
