@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -124,7 +125,9 @@ def _tiles(text: str) -> Literal["auto"] | int | None:
 
 
 def _show(console: Console, scores: SetScores) -> None:
-    table = Table("class", "labels", "AP", "AP50", "precision", "recall", "from", "thesis AP", title=scores.name)
+    table = Table(title=scores.name, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in ("class", "labels", "AP", "AP50", "precision", "recall", "from", "thesis AP"):
+        table.add_column(name, no_wrap=True, justify="left" if name == "class" else "right")
     for row in scores.classes:
         table.add_row(
             row.label, str(row.labels), _between(scores.intervals[f"AP {row.label}"]),
@@ -160,7 +163,7 @@ def _show_comparison(console: Console, each: SetComparison) -> None:
 
 
 def _between(told: Interval) -> str:
-    bounds = f"\n{told.low:.1%} to {told.high:.1%}" if math.isfinite(told.low) else ""
+    bounds = f"\n{100 * told.low:.1f}-{100 * told.high:.1f}" if math.isfinite(told.low) else ""
     return _share(told.value) + bounds
 
 
