@@ -24,11 +24,12 @@ from mosaic_methods import commit, machine
 from sorvolo.detection.metrics import judged_classes, match_pictures
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
+from sorvolo.training.drawing import batches_from
 from sorvolo.training.faster_rcnn import FasterRCNN
-from sorvolo.training.joint import JointSettings, JointTraining, batches
+from sorvolo.training.joint import JointSettings, JointTraining
 from sorvolo.training.presets import fast
 from sorvolo.training.pyramid import convolution
-from sorvolo.training.samples import Augmentation, Share, samples
+from sorvolo.training.samples import Augmentation, Share
 from sorvolo.training.seeing import see
 from sorvolo.training.weights import load_lite0
 from train_default_model import reader
@@ -61,8 +62,9 @@ def main() -> None:
             model.backbone.load_imagenet(load_lite0(wishes.weights))
             training = JointTraining(model, JointSettings(steps=wishes.steps, batch=wishes.batch, averaging=0.99), seed)
             share = Share(parts["train"], 1.0, (0.7, 1.6), thermal=True)
-            drawn = samples([share], CLASSES, reader(), Augmentation(side_px=wishes.side), seed)
-            for batch in islice(batches(drawn, wishes.batch), wishes.steps):
+            crops = Augmentation(side_px=wishes.side)
+            drawn = batches_from([share], CLASSES, reader(), crops, seed=seed, batch=wishes.batch)
+            for batch in islice(drawn, wishes.steps):
                 training.learn(batch)
             trained_s = time.process_time() - started_s
             row = {"seed": seed, "arm": arm, "cpu_s": round(trained_s), **score(training.average, held_out)}

@@ -35,6 +35,7 @@ from sorvolo.training.samples import Augmentation, Sample, Share
 from sorvolo.training.weights import load_lite0
 
 SIMULATED_SEED, SIMULATED_PICTURES = 1, 1400
+STEEP_DEG = 75.0  # from so many degrees below the horizon a picture has no up and down
 SETTLING = 12  # batches by which the norms of a started model are settled
 
 
@@ -64,7 +65,7 @@ def main() -> None:
         name, pictures = share.labelled.name, len(share.labelled)
         print(f"{name}: {pictures} pictures, {boxes} boxes, weight {share.weight}", flush=True)
     def stream(start: int, seed: int) -> Iterator[list[Sample]]:
-        crops = Augmentation(side_px=wishes.side)
+        crops = Augmentation(side_px=wishes.side, blur=0.12)
         return batches_from(shares, CLASSES, reader(), crops, seed=seed, batch=wishes.batch, start=start)
 
     model = fast(CLASSES)
@@ -111,14 +112,21 @@ def training_shares(data: Path, out: Path) -> list[Share]:
         for _ in simulate_pictures(simulated, settings):
             pass
     made = in_order(read_dataset(simulated))
+    thermal = hituav(data)["train"]
     return [
-        Share(hituav(data)["train"], 4.0, (0.8, 2.0), thermal=True),
-        Share(tinyperson(data)["train"], 1.8, (1.0, 2.8), pastes=SMALL),
+        Share(_from(thermal, lambda angle_deg: angle_deg < STEEP_DEG), 2.8, (0.8, 2.0), thermal=True, aslant=True),
+        Share(_from(thermal, lambda angle_deg: angle_deg >= STEEP_DEG), 1.2, (0.8, 2.0), thermal=True),
+        Share(tinyperson(data)["train"], 1.8, (1.0, 2.8), pastes=SMALL, aslant=True),
         Share(mannequin(data)["train"], 0.2, (0.3, 1.2), pastes=SMALL),
         Share(aerial_cars(data)["train"], 1.4, (0.25, 1.2), pastes=SMALL),
         Share(made, 3.0, (0.6, 1.6)),
         Share(_ground(data), 0.4, (0.12, 0.5), pastes=SMALL),
     ]
+
+
+def _from(labelled: LabelledSet, fits: Callable[[float], bool]) -> LabelledSet:
+    """HIT-UAV's frames taken at angles below the horizon that `fits`; their names tell them, night_height_angle_."""
+    return labelled.only([each for each in labelled.pictures if fits(float(Path(each.path).stem.split("_")[2]))])
 
 
 def _ground(data: Path) -> LabelledSet:

@@ -17,9 +17,10 @@ from mosaic_methods import commit, machine
 from sorvolo.detection.scores import score_set
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.joint import JointSettings, JointTraining, batches
+from sorvolo.training.drawing import batches_from
+from sorvolo.training.joint import JointSettings, JointTraining
 from sorvolo.training.presets import fast
-from sorvolo.training.samples import Augmentation, Share, samples
+from sorvolo.training.samples import Augmentation, Share
 from sorvolo.training.seeing import see
 from train_default_model import reader
 
@@ -47,8 +48,9 @@ def main() -> None:
     settings = JointSettings(steps=wishes.steps, rate=5e-4, backbone_rate=1e-4, averaging=0.99, warm_steps=50)
     training = JointTraining(model.to(memory_format=torch.channels_last), settings, wishes.seed)
     share = Share(learnt, 1.0, tuple(wishes.scale), thermal=wishes.name == "hituav")
-    drawn = samples([share], CLASSES, reader(), Augmentation(side_px=wishes.side), wishes.seed)
-    for done in (training.learn(each) for each in islice(batches(drawn, settings.batch), wishes.steps)):
+    crops = Augmentation(side_px=wishes.side)
+    drawn = batches_from([share], CLASSES, reader(), crops, seed=wishes.seed, batch=settings.batch)
+    for done in (training.learn(each) for each in islice(drawn, wishes.steps)):
         if done.step % 50 == 0:
             print(done.step, round(done.loss, 3), flush=True)
     read = reader()

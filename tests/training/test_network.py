@@ -20,11 +20,11 @@ from sorvolo.training.export import check_export, export_onnx  # noqa: E402
 from sorvolo.training.faster_rcnn import FasterRCNN, Reach  # noqa: E402
 from sorvolo.training.heads import TwoLayerHead, pooled_levels, roi_align  # noqa: E402
 from sorvolo.training.inception import ExtendedStack, ResidualStack, proposal_stem  # noqa: E402
-from sorvolo.training.joint import JointSettings, JointTraining, batches  # noqa: E402
+from sorvolo.training.joint import JointSettings, JointTraining  # noqa: E402
 from sorvolo.training.losses import Answer, joint_proposal_loss, match_boxes, region_loss  # noqa: E402
 from sorvolo.training.proposals import AnchorSettings, ProposalNetwork  # noqa: E402
 from sorvolo.training.pyramid import Pyramid  # noqa: E402
-from sorvolo.training.samples import Augmentation, Sample, Share, cut_sample, samples  # noqa: E402
+from sorvolo.training.samples import Augmentation, Sample, Share, cut_sample  # noqa: E402
 from sorvolo.training.sprites import paste_small_objects  # noqa: E402
 
 _SIDE_PX = 64
@@ -56,6 +56,11 @@ def tiny(stem="extended-residual"):
     anchors = (AnchorSettings((8, 14)), AnchorSettings((22, 32)))
     proposals = ProposalNetwork(neck.channels, backbone.strides, anchors, stem, 16, light=True)
     return FasterRCNN(backbone, neck, proposals, TwoLayerHead(16, 32, 2), Reach(before=200, regions=60))
+
+
+def fours(samples):
+    """The samples in batches of four."""
+    return (samples[index:index + 4] for index in range(0, len(samples), 4))
 
 
 def squares(count, seed):
@@ -96,7 +101,7 @@ def _found_share(model, pictures):
 @pytest.fixture(scope="module")
 def trained():
     training = JointTraining(tiny(), JointSettings(steps=220, batch=4, rate=5e-3, averaging=0.9, warm_steps=10), 1)
-    stream = batches(iter(squares(220 * 4, 1)), 4)
+    stream = fours(squares(220 * 4, 1))
     losses = [training.learn(each).loss for each in islice(stream, 220)]
     return training, losses
 
@@ -136,9 +141,9 @@ def test_an_export_looks_at_as_many_regions_as_it_is_told(trained):
 def test_training_goes_on_from_its_state_as_if_it_had_not_stopped():
     pictures = squares(8 * 4, 7)
     whole = JointTraining(tiny(), JointSettings(steps=8, batch=4), 3)
-    wanted = [whole.learn(each).loss for each in islice(batches(iter(pictures), 4), 8)]
+    wanted = [whole.learn(each).loss for each in islice(fours(pictures), 8)]
     first = JointTraining(tiny(), JointSettings(steps=8, batch=4), 3)
-    stream = batches(iter(pictures), 4)
+    stream = fours(pictures)
     for _ in range(5):
         first.learn(next(stream))
     second = JointTraining(tiny("extended-residual"), JointSettings(steps=8, batch=4), 99)
@@ -312,18 +317,6 @@ def test_crops_carry_their_boxes_along():
             assert np.abs(np.array(bright) - box).max() < 2.0
             seen += 1
     assert seen > 8
-
-
-def test_samples_are_the_same_for_the_same_seed():
-    image = np.random.default_rng(0).integers(0, 255, (200, 200, 3), dtype=np.uint8)
-    picture = LabelledPicture("p", 200, 200, "g", np.array([[20, 20, 60, 50]]), np.array([0]), np.zeros((0, 4)))
-    share = Share(LabelledSet("s", ("small object",), (picture,)), 1.0, pastes="small object")
-    small = Augmentation(64)
-    runs = [
-        [each.image.sum() for each in islice(samples([share], ("small object",), lambda _: image, small, 4), 5)]
-        for _ in range(2)
-    ]
-    assert runs[0] == runs[1]
 
 
 def test_pasted_objects_stand_in_their_boxes_and_not_on_others():

@@ -83,8 +83,8 @@ class EfficientNetLite0(nn.Module):
     """Features of strides 4, 8 and 16 (24, 40 and 112 channels), of 32 too (320) if `deep`.
 
     Its batch norms, which would stay as ImageNet left them, are folded into the convolutions. Unless `thaw_all` the
-    stem and the first block are frozen, and up to stride 8 the kernels that filter each channel by itself, which are the
-    dearest to learn. Input: (N, 3, H, W) floats 0 to 255, sides multiples of the last stride.
+    stem and the first block are frozen, and up to stride 8 the kernels that filter each channel by itself, which are
+    the dearest to learn. Input: (N, 3, H, W) floats 0 to 255, sides multiples of the last stride.
     """
 
     def __init__(self, *, deep: bool = False, thaw_all: bool = False) -> None:

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
@@ -148,9 +148,3 @@ def collate(batch: Sequence[Sample], device: str) -> tuple[Tensor, list[Answer]]
         for each in batch
     ]
     return images, answers
-
-
-def batches(samples: Iterator[Sample], size: int) -> Iterator[list[Sample]]:
-    """The samples, `size` at a time."""
-    while True:
-        yield [next(samples) for _ in range(size)]

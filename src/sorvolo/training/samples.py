@@ -1,6 +1,6 @@
 """What the network learns from: crops of labelled pictures, turned, scaled, lit and blurred as the air does it."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -17,13 +17,15 @@ _LEAST_PX = 3.0  # longer side of an object; smaller ones are ignored
 @dataclass(frozen=True)
 class Share:
     """A labelled set, and how often it is drawn from; `scale` the range of magnifications; `pastes` the class name
-    under which small objects are composed onto its ground, "" for none; `thermal`: its polarity may turn."""
+    under which small objects are composed onto its ground, "" for none; `thermal`: its polarity may turn; `aslant`: its
+    pictures were not taken straight down, what is up in them stays up."""
 
     labelled: LabelledSet
     weight: float
     scale: tuple[float, float] = (0.6, 1.6)
     pastes: str = ""
     thermal: bool = False
+    aslant: bool = False
 
 
 @dataclass(frozen=True)
@@ -49,23 +51,6 @@ class Sample:
     known: Floats
 
 
-def samples(
-    shares: Sequence[Share], classes: Sequence[str], read: Callable[[str], ImageRGB], augmentation: Augmentation,
-    seed: int,
-) -> Iterator[Sample]:
-    """Endless samples, the same for the same seed. `read` gives a picture by its path."""
-    rng = np.random.default_rng(seed)
-    weights = np.array([share.weight for share in shares], float)
-    orders: list[list[int]] = [[] for _ in shares]
-    while True:
-        index = int(rng.choice(len(shares), p=weights / weights.sum()))
-        share = shares[index]
-        if not orders[index]:
-            orders[index] = list(rng.permutation(len(share.labelled)))
-        picture = share.labelled.pictures[orders[index].pop()]
-        yield cut_sample(read(picture.path), picture, share, classes, augmentation, rng)
-
-
 def cut_sample(
     image: ImageRGB, picture: LabelledPicture, share: Share, classes: Sequence[str], augmentation: Augmentation,
     rng: np.random.Generator,
@@ -77,7 +62,8 @@ def cut_sample(
     labels = rename[picture.labels] if len(picture.labels) else np.zeros(0, np.int64)
     boxes = np.asarray(picture.boxes_px, float)[labels >= 0]
     labels = labels[labels >= 0]
-    crop_from_picture = _placement(image.shape[:2], boxes, share.scale, side, augmentation.turns, rng)
+    turns = augmentation.turns and not share.aslant
+    crop_from_picture = _placement(image.shape[:2], boxes, share.scale, side, turns, rng)
     out, crop_from_picture = _warped(image, crop_from_picture, side)
     boxes, seen = _carried(boxes, crop_from_picture, side)
     ignored, in_sight = _carried(np.asarray(picture.ignored_px, float), crop_from_picture, side)
@@ -158,7 +144,7 @@ def _weathered(image: ImageRGB, how: Augmentation, rng: np.random.Generator, *, 
     """Light, colour, polarity, blur, haze and noise."""
     x = image.astype(np.float32)
     if thermal:
-        if rng.random() < 0.3:
+        if rng.random() < 0.2:
             x = 255 - x  # black hot
     else:
         x *= rng.uniform(0.85, 1.18, 3).astype(np.float32) ** (rng.random() < 0.5)
