@@ -23,7 +23,8 @@ def load_start(choice: str, preset: Preset) -> ImageNetWeights | ExportedModel |
     """
     if choice == "none":
         return None
-    if choice.lower().endswith(".onnx") or any(each.name == choice for each in installed_models()):
+    is_installed = choice != "auto" and any(each.name == choice for each in installed_models())
+    if is_installed or choice.lower().endswith(".onnx"):
         return _model(choice, preset)
     return load_weights(choice, NETS[preset])
 
