@@ -22,11 +22,14 @@ check: $(TRAINS)
 bench: $(READY)
 	$(BIN)/python benchmarks/mosaic_methods.py $(SEEDS)
 
-# The packaged model anew: make model DATA=FOLDER LITE0=WEIGHTS, the labelled sets and EfficientNet-Lite0's weights.
-STEPS ?= 6500
+# The packaged model anew: make model DATA=FOLDER LITE0=WEIGHTS, the labelled sets and EfficientNet-Lite0's weights;
+# or learnt on from the one that is there: make model DATA=FOLDER START=default.
+STEPS ?= 20000
 model: $(TRAINS)
-	$(BIN)/python benchmarks/train_default_model.py $(DATA) build/model --weights $(LITE0) --steps $(STEPS)
+	$(BIN)/python benchmarks/train_default_model.py $(DATA) build/model --steps $(STEPS) \
+	  $(if $(START),--start $(START),--weights $(LITE0))
 	$(BIN)/python benchmarks/pack_default_model.py build/model/weights.pt $(DATA) --steps $(STEPS)
+	$(BIN)/python benchmarks/pack_int8_model.py $(DATA)
 
 $(READY): requirements.lock pyproject.toml setup.py $(wildcard src/sorvolo/kernels/*.?pp)
 	$(PYTHON) -m venv $(VENV)

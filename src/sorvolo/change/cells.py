@@ -3,6 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -89,6 +90,15 @@ class LaidView:
     score: ImageGray
     held: Mask
 
+    @cached_property
+    def cut_off(self) -> Mask:
+        """The flagged pieces that end at unknown ground or at the view's rim."""
+        unseen = cv2.copyMakeBorder((~self.seen).view(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
+        beside = cv2.dilate(unseen, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
+        _, labels = cv2.connectedComponents(self.flagged.view(np.uint8), connectivity=8)
+        cut = np.unique(labels[beside & self.flagged])
+        return np.isin(labels, cut) if len(cut) else np.zeros_like(self.flagged)
+
 
 def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask) -> LaidView:
     """The view's answer for every cell of ground that it shows.
@@ -145,15 +155,6 @@ def pieces(cells: Mask, gap: int) -> Iterator[tuple[Mask, tuple[slice, slice]]]:
         x, y, w, h = (int(each) for each in stats[label, :4])
         part = (slice(y, y + h), slice(x, x + w))
         yield labels[part] == label, part
-
-
-def cut_off_pieces(laid: LaidView) -> Mask:
-    """The flagged pieces of a view that end at unknown ground or at the view's rim."""
-    unseen = cv2.copyMakeBorder((~laid.seen).view(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
-    beside = cv2.dilate(unseen, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
-    _, labels = cv2.connectedComponents(laid.flagged.view(np.uint8), connectivity=8)
-    cut = np.unique(labels[beside & laid.flagged])
-    return np.isin(labels, cut) if len(cut) else np.zeros_like(laid.flagged)
 
 
 def scale_m_per_px(view: ComparedView) -> float:

@@ -17,7 +17,6 @@ from sorvolo.change.cells import (
     CellGrid,
     CellWindow,
     LaidView,
-    cut_off_pieces,
     lay,
     pieces,
 )
@@ -210,7 +209,6 @@ class EvidenceMap:
         if not (sure & (evidence.owner == 0)).any():
             return []
         new = []
-        cut_off: Mask | None = None
         least_cells = max(2, settings.least_area_m2 / self._cell_m**2)
         for piece, part in pieces(sure | (evidence.owner > 0), self._gap):
             cells = sure[part] & piece
@@ -223,9 +221,7 @@ class EvidenceMap:
                     continue
                 if np.mean(laid.held[part][cells]) > 0.5 and not self._stands(witness, earlier, part, cells):
                     continue
-                if cut_off is None:
-                    cut_off = cut_off_pieces(laid)
-                if (cells & cut_off[part]).any() and int(evidence.votes[part][cells].max()) < settings.n:
+                if (cells & laid.cut_off[part]).any() and int(evidence.votes[part][cells].max()) < settings.n:
                     continue  # more of it will come into view soon
                 known = self._known_at(laid.window, part, cells)
                 change = self._found[known] if known else self._begin(view, earlier, witness, part, cells, budget)
@@ -330,6 +326,7 @@ class EvidenceMap:
             weight = self._weight(witness, change.cells)
             change.see(view.time_ns, score, place_m if seen > 0.99 else None, view, weight)
             change.from_camera(view.camera_m)
+            change.whole += not self._part_of(laid.cut_off, laid, change.cells, cells).any()
             if change.still_votes and number not in new:
                 change.vote(view.site_from_image, view.changed, view.valid)
             shown.append(change)
@@ -422,20 +419,29 @@ class EvidenceMap:
     def _ask(self, seed: GatheredChange, view: ComparedView, witness: _Witness) -> None:
         """Count what a view says of a seed's ground."""
         assert seed.cells is not None
-        cells = self._grid.read(seed.cells).changed > 0
-        seen, flagged, score, place_m = self._answer(witness.laid, seed.cells, cells)
+        laid, cells = witness.laid, self._grid.read(seed.cells).changed > 0
+        seen, flagged, score, place_m = self._answer(laid, seed.cells, cells)
         weight = self._weight(witness, seed.cells)
         if flagged >= max(_SHOWS * seen, 1e-9):
             seed.see(view.time_ns, score, place_m if seen > 0.99 else None, view, weight)
             seed.from_camera(view.camera_m)
             seed.vote(view.site_from_image, view.changed, view.valid)
+            seed.whole += not self._part_of(laid.cut_off, laid, seed.cells, cells).any()
+            shown = self._part_of(laid.flagged, laid, seed.cells, cells)
+            seed.held += bool(np.mean(self._part_of(laid.held, laid, seed.cells, cells)[shown]) > 0.5)
         elif seen >= 0.5:
             seed.miss(weight)
+
+    @staticmethod
+    def _part_of(marked: Mask, laid: LaidView, window: CellWindow, cells: Mask) -> Mask:
+        """What a view marks of some cells of a window, as far as the view reaches."""
+        return marked[window.within(laid.window)] & cells[laid.window.within(window)]
 
     def _grow_late(self, seed: GatheredChange) -> None:
         """Tell what fewer than n views could see: the same share of them must show it as k of n."""
         settings = self._settings
-        if seed.cells is None:
+        has_moved = seed.held > 2 and (seed.last_seen_ns - seed.first_seen_ns) * 1e-9 < _STANDS_S
+        if seed.cells is None or has_moved:
             return
         evidence = self._grid.read(seed.cells)
         seen, changed = evidence.seen.astype(float), evidence.changed

@@ -22,6 +22,7 @@ _BETTER = 1.15  # a view's pictures replace the older ones when it is so much be
 _GOOD = 0.75  # quality beyond which no better pictures are looked for
 _ASIDE = 0.15  # of the flying height: views from further aside count less
 _LEAST_WEIGHT = 0.1
+_NEVER_WHOLE = 0.35  # of the score is left of what all views show cut off
 _ONE_PLACE = 0.05  # of the flying height: seen from no wider apart, a ghost of something tall looks the same
 
 
@@ -37,6 +38,8 @@ class GatheredChange:
         self.views = self.asked = 0
         self._weight_for = self._weight_asked = 0.0
         self.weakness = 1.0  # factor of the score, for what too few views say
+        self.whole = 0  # views that showed all of it: in the others it ends at a rim
+        self.held = 0  # views in which it seemed to move, or nobody could tell
         self.cells: CellWindow | None = None
         self._score_sum = 0.0
         self._residual_m_sum = 0.0
@@ -88,13 +91,15 @@ class GatheredChange:
     @property
     def score(self) -> float:
         """0 to 1: mean sureness of its boxes x (views that show it + 1) / (views that could + 2), which is the mean of
-        a share under Bayes; halved if all of them looked from one place."""
+        a share under Bayes; halved if all of them looked from one place, and less
+        if few of them show all of it: at the rim walls lean in whole, and ends are no outlines."""
         if not self.views:
             return 0.0
         score = self._score_sum / self.views * (self.views + 1) / (self.asked + 2) * self.weakness
         apart_m = float(np.hypot(*(self._camera_high - self._camera_low)[:2]))
         is_one_place = self.views > 1 and apart_m < _ONE_PLACE * float(self._camera_high[2])
-        return float(np.clip(score * (0.5 if is_one_place else 1.0), 0, 1))
+        wholeness = _NEVER_WHOLE + (1 - _NEVER_WHOLE) * min(2 * self.whole / self.views, 1.0)
+        return float(np.clip(score * (0.5 if is_one_place else 1.0) * wholeness, 0, 1))
 
     def wants(self, low_m: Floats, high_m: Floats, view: ComparedView) -> float:
         """How much better, as a factor, the view's pictures are than those it has; infinite if it has to grow."""
@@ -148,6 +153,7 @@ class GatheredChange:
         """Become one with a younger change; its pictures are forgotten."""
         self.first_seen_ns = min(self.first_seen_ns, younger.first_seen_ns)
         self.last_seen_ns = max(self.last_seen_ns, younger.last_seen_ns)
+        self.whole = min(self.whole, younger.whole)
         if younger.is_told and not self.is_told:
             self.is_told, self.announced_ns = True, younger.announced_ns
         if self.cells is not None and younger.cells is not None:

@@ -1,6 +1,6 @@
 """Frames of a later flight to views compared with the map: aligned, resampled, searched for differences."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -30,6 +30,9 @@ _LEAST_SIDE_PX = 480
 _KNOWN_ENOUGH = 0.1  # share of a frame on known ground: with less there is nothing to compare
 _WITNESSES = 2  # earlier pictures asked about a difference: one from each side
 _NEAR_PX = 9  # what leans a little another way lies a few pixels beside
+_SURE, _WEAK = 0.5, 0.2  # what one picture surely shows the others must show at least weakly
+_SHOWN, _SEEN = 0.3, 0.7  # shares of a difference that another picture shows, and must see to be asked
+_MAP = 0  # the first of the opinions
 _ALL_CHANGED = 0.5  # share of a view: more is snow, a flood or another place, not a list of changes
 
 
@@ -94,7 +97,7 @@ class ViewMaker:
             return ViewOutcome(ViewStatus.OUTSIDE, reason, residual_px, share, site_from_full)
         query = as_bgr(image)
         found = self._difference(as_bgr(reference), query, valid, learns=True)
-        if self._pictures is not None and len(found.boxes):
+        if self._pictures is not None:
             found = self._attested(found, aligned, query, valid)
         changed = np.count_nonzero(found.mask) / max(1, int(np.count_nonzero(valid)))
         if changed > _ALL_CHANGED:
@@ -186,34 +189,47 @@ class ViewMaker:
         return self._site_grid.grid_from_site_affine(centre[:2] / centre[2], 50.0) @ site_from_image
 
     def _attested(self, found: Difference, aligned: Aligned, query: Anything, valid: Mask) -> Difference:
-        """The differences that the earlier pictures taken nearest to this one show, too, as far as they see them."""
+        """What differs from the map, or from one of the earlier pictures taken nearest to this one, and is believed.
+
+        One of them must show it surely, and all earlier pictures that see its place must show it as well, at least
+        weakly; what the map hardly shows needs another picture that does.
+        """
         assert self._pictures is not None
-        keep = np.ones(len(found.boxes), bool)
+        opinions = [(found, valid)]
         height, width = valid.shape
         for picture, sees in self._pictures.seen_from(
             aligned.site_from_image, aligned.camera_m, width, height, _WITNESSES
         ):
             sees &= self._lens_sees
-            other = self._difference(as_bgr(picture), query, sees, learns=False)
-            near = cv2.dilate(other.mask, np.ones((_NEAR_PX, _NEAR_PX), np.uint8))
-            for k in np.flatnonzero(keep):
-                x, y, w, h = found.boxes[k]
-                window = slice(y, y + h), slice(x, x + w)
-                shown = found.mask[window] > 0
-                if np.count_nonzero(shown & sees[window]) > 0.7 * np.count_nonzero(shown):
-                    keep[k] = np.count_nonzero(shown & (near[window] > 0)) > 0.3 * np.count_nonzero(shown)
-            if not keep.any():
-                break
-        mask = found.mask
-        for x, y, w, h in found.boxes[~keep]:
-            mask[y:y + h, x:x + w] = 0
-        return Difference(mask, found.boxes[keep], found.scores[keep])
+            opinions.append((self._difference(as_bgr(picture), query, sees, learns=False), sees))
+        window = np.ones((_NEAR_PX, _NEAR_PX), np.uint8)
+        near = [cv2.dilate(each.mask, window) > 0 for each, _ in opinions]
+        mask = np.zeros_like(found.mask)
+        boxes, scores = [], []
+        for own, (opinion, _) in enumerate(opinions):
+            for k in np.flatnonzero(opinion.scores >= _SURE):
+                x, y, w, h = opinion.boxes[k]
+                part = np.s_[y:y + h, x:x + w]
+                shown = (opinion.mask[part] > 0) & valid[part]
+                if np.count_nonzero(shown & (mask[part] > 0)) > _SHOWN * np.count_nonzero(shown) or not shown.any():
+                    continue  # believed already, or on ground that the map does not know
+                answers = {
+                    other: np.count_nonzero(shown & near[other][part]) > _SHOWN * np.count_nonzero(shown)
+                    for other, (_, sees) in enumerate(opinions)
+                    if other != own and np.count_nonzero(shown & sees[part]) > _SEEN * np.count_nonzero(shown)
+                }
+                by_map = answers.pop(_MAP, own == _MAP)
+                if all(answers.values()) and (by_map or answers):
+                    mask[part] |= shown.view(np.uint8) * np.uint8(255)
+                    boxes.append(opinion.boxes[k])
+                    scores.append(opinion.scores[k])
+        return Difference(mask, np.array(boxes, np.int64).reshape(-1, 4), np.array(scores, np.float64))
 
     def _difference(self, reference: Anything, query: Anything, valid: Mask, *, learns: bool) -> Difference:
         if self._tuning is None:
             thesis = compare_thesis(reference, query, valid)
             return Difference(thesis.mask, thesis.boxes, np.full(len(thesis.boxes), 0.5))
-        found = compare_robust(reference, query, valid, self._tuning.settings())
+        found = compare_robust(reference, query, valid, replace(self._tuning.settings(), least_score=_WEAK))
         if learns:
             self._tuning.observe(found)
         return Difference(found.mask, found.boxes, found.scores)
