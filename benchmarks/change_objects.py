@@ -32,11 +32,11 @@ def paint_objects(
     scene: Scene, rng: np.random.Generator, scale: float, low_contrast: float, cutouts: list[Cutout],
     donor: np.ndarray, margin_px: int,
 ) -> Scene:
-    """One to three things put on the ground before or after; each 12 to 80 px times `scale`."""
+    """One to three more things put on the ground before or after; each 12 to 80 px times `scale`."""
     pictures = [scene.before.copy(), scene.after.copy()]
     covers = [scene.removed.copy(), scene.added.copy()]
     shades = [scene.shade_before.copy(), scene.shade_after.copy()]
-    taken = np.zeros(scene.added.shape, bool)
+    taken = (scene.removed > 0) | (scene.added > 0)
     sun = rng.uniform(0, 2 * np.pi)
     for _ in range(int(rng.integers(1, 4))):
         is_low = rng.uniform() < low_contrast

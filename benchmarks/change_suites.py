@@ -119,11 +119,13 @@ def picture(path: str) -> np.ndarray:
     return np.ascontiguousarray(raster.rgb[..., ::-1])
 
 
-def pairs(suite: str, seed: int, count: int, places: list[Ground], split: str) -> Iterator[Pair]:
-    """`count` pairs of a suite; the same arguments give the same pairs."""
+def pairs(
+    suite: str, seed: int, count: int, places: list[Ground], split: str, crowding: int = 1
+) -> Iterator[Pair]:
+    """`count` pairs of a suite, with `crowding` times as many things; the same arguments give the same pairs."""
     for number in range(count):
         rng = _random(suite, seed, number, split)
-        scene, source, known = _scene(rng, suite, places)
+        scene, source, known = _scene(rng, suite, places, crowding)
         yield _pair(suite, source, scene, known, rng, clouds_before=True)
 
 
@@ -138,7 +140,9 @@ def _random(suite: str, seed: int, number: int, split: str) -> np.random.Generat
     return np.random.default_rng([seed, number, *f"{split} {suite}".encode()])
 
 
-def _scene(rng: np.random.Generator, suite: str, places: list[Ground]) -> tuple[Scene, str, np.ndarray]:
+def _scene(
+    rng: np.random.Generator, suite: str, places: list[Ground], crowding: int = 1
+) -> tuple[Scene, str, np.ndarray]:
     """Ground with a margin before and after, masks of what differs, where both are known; sources weigh the same."""
     nuisance = SUITES[suite]
     if suite == "real":
@@ -160,14 +164,16 @@ def _scene(rng: np.random.Generator, suite: str, places: list[Ground]) -> tuple[
         if (known > 250).mean() > 0.7:
             break
     scale = size[0] / 1280 * nuisance.object_scale
-    empty = Scene(before, after, *[np.zeros(before.shape[:2], np.float32)] * 4)
+    scene = Scene(before, after, *[np.zeros(before.shape[:2], np.float32)] * 4)
     inside = known[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX] > 250
     if rng.uniform() >= nuisance.changed:
-        return empty, source, inside
-    cutouts = [_cutout(choice, rng) for _ in range(3)]
-    donor = picture(choice[int(rng.integers(len(choice)))].path)
-    kept = [each for each in cutouts if each is not None]
-    return paint_objects(empty, rng, scale, nuisance.low_contrast, kept, donor, MARGIN_PX), source, inside
+        return scene, source, inside
+    for _ in range(crowding):
+        cutouts = [_cutout(choice, rng) for _ in range(3)]
+        donor = picture(choice[int(rng.integers(len(choice)))].path)
+        kept = [each for each in cutouts if each is not None]
+        scene = paint_objects(scene, rng, scale, nuisance.low_contrast, kept, donor, MARGIN_PX)
+    return scene, source, inside
 
 
 def _cut(pictures: tuple[np.ndarray, ...], size: tuple[int, int], rng: np.random.Generator) -> list[np.ndarray]:

@@ -1,28 +1,33 @@
 """Train the check of regions: python benchmarks/train_blob_check.py [--data ../shared/data] [--count 120]
 
-Answers are exact: the suites of change_suites.py over the caliterra flight's photos (CC0) and procedural grounds, and
-simulated flights (simulated_pairs.py), with random numbers that no score uses. Boosted oblivious trees, written to
-src/sorvolo/change/blob_check.json.
+Answers are exact: the suites of change_suites.py over the caliterra flight's photos (CC0), grounds painted over them
+(painted_grounds.py) and procedural ones, and simulated flights (simulated_pairs.py), with random numbers that no score
+uses. Boosted oblivious trees, written to src/sorvolo/change/blob_check.json.
 """
 
 import argparse
 import json
+import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from change_suites import SUITES, Ground, grounds, pairs
+from change_suites import SUITES, Ground, grounds, pairs, picture
+from painted_grounds import painted_ground
 from simulated_pairs import simulated_pairs
-from sorvolo.change.blobs import FEATURES, RegionSettings
+from sorvolo.change.blobs import FEATURES, Regions, RegionSettings
 from sorvolo.change.robust import RobustSettings, examine
 from sorvolo.simulation.ground import GroundKind
 
 TARGET = Path(__file__).parents[1] / "src" / "sorvolo" / "change" / "blob_check.json"
-SPLIT, SEED, EACH = "train", 9000, 20
+SPLIT, SEED, EACH = "train", 9000, 10
+CROWDING = 3
+EAGER = RegionSettings(reach_px=1, least_difference=6.0, activity_factor=1.0, strong_factor=1.25)
 SITE_SEED, PAIRS_OF_A_SITE = 1000, 14
 TREES, DEPTH, RATE, BINS = 300, 4, 0.1, 48
+CAUTION = 0.8  # log-odds taken off: what is alarmed for nothing is worse than what one view misses
 
 
 def main() -> None:
@@ -31,11 +36,13 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[2] / "shared" / "data")
     parser.add_argument("--count", type=int, default=120, help="pairs of each suite")
     parser.add_argument("--sites", type=int, default=40, help="simulated sites, each of another seed")
+    parser.add_argument("--painted", type=int, default=40, help="painted grounds")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--suites", nargs="+", choices=list(SUITES), default=list(SUITES))
     parser.add_argument("--seed", type=int, default=SEED, help="the first of them")
     parser.add_argument("--collect", type=Path, help="only collect regions, into this .npz")
     parser.add_argument("--rows", type=Path, nargs="+", help="train on regions collected before, joined")
+    parser.add_argument("--onto", type=Path, help="trees to go on from; their features may be fewer")
     parser.add_argument("--output", type=Path, default=TARGET)
     options = parser.parse_args()
     if options.rows:
@@ -45,24 +52,40 @@ def main() -> None:
         told = [str(each["told"]) for each in kept]
     else:
         rows, answers, suites, sources = collect_all(options)
-        command = f"--count {options.count} --sites {options.sites} --seed {options.seed}"
+        command = f"--count {options.count} --sites {options.sites} --painted {options.painted} --seed {options.seed}"
         told = [f"{command}: {len(rows)} regions of {', '.join(sources)}"]
         if options.collect:
             np.savez_compressed(options.collect, rows=rows, answers=answers, suites=suites, told=told[0])
             return
-    trees = train(rows, answers, suites == "simulated")
+    before = json.loads(options.onto.read_text()) if options.onto else None
+    trees = train(rows, answers, suites == "simulated", before)
     print(f"{len(rows)} regions, {int(answers.sum())} of them changes")
     trees["trained"] = {"regions": len(rows), "changes": int(answers.sum()), "collected": told}
+    if before:
+        trees["trained"]["onto"] = before["trained"]
     options.output.write_text(json.dumps(trees) + "\n")
 
 
 def collect_all(options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
     """Features (N, F), answers (N,) and suites (N,) of all regions, and the grounds' sources."""
+    with tempfile.TemporaryDirectory() as folder:
+        return _collected(options, Path(folder))
+
+
+def _collected(
+    options: argparse.Namespace, painted: Path
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
     places = [each for each in grounds(options.data, "dev") if each.source == "caliterra"]
+    photos = [each.path for each in places]
     names = [name for name in options.suites if places or name != "real"]
     places += [Ground("procedural", f"{kind.value} {500 + n}") for kind in GroundKind for n in range(3)]
+    places += [
+        Ground("painted", str(_paint(photos, painted, number)))
+        for number in range(options.painted if photos else 0)
+    ]
     parts = range(-(-options.count // EACH))
-    tasks = [("simulated", SITE_SEED + site, PAIRS_OF_A_SITE, []) for site in range(options.sites)]
+    first = SITE_SEED + options.seed - SEED
+    tasks = [("simulated", first + site, PAIRS_OF_A_SITE, []) for site in range(options.sites)]
     tasks += [(name, options.seed + part, EACH, places) for name in names for part in parts]
     with ProcessPoolExecutor(options.jobs) as pool:
         collected = list(pool.map(collect, *zip(*tasks)))
@@ -73,31 +96,48 @@ def collect_all(options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray, np
     return rows, answers, suites, sorted(sources)
 
 
+def _paint(photos: list[str], folder: Path, number: int) -> Path:
+    rng = np.random.default_rng([SEED, number])
+    path = folder / f"{number}.png"
+    cv2.imwrite(str(path), painted_ground(picture(photos[int(rng.integers(len(photos)))]), rng))
+    return path
+
+
 def collect(suite: str, seed: int, count: int, places: list[Ground]) -> tuple[np.ndarray, np.ndarray]:
-    """Features (N, F) and answers (N,) of the regions found in a suite's pairs."""
+    """Features (N, F) and answers (N,) of the regions found in a suite's pairs, each pair taken both ways round.
+
+    Eager settings find more of what is no change, and the same things with other rims: the check sees more for as many
+    pairs.
+    """
     cv2.setNumThreads(1)
     rows, answers = [], []
-    settings = RobustSettings(regions=RegionSettings())
-    found = simulated_pairs(seed, count) if suite == "simulated" else pairs(suite, seed, count, places, SPLIT)
+    found = simulated_pairs(seed, count) if suite == "simulated" else pairs(suite, seed, count, places, SPLIT, CROWDING)
     for pair in found:
-        regions, *_ = examine(pair.reference, pair.query, pair.valid, settings)
-        size = regions.labels.shape[::-1]
-        total = np.bincount(regions.labels.ravel(), minlength=len(regions.boxes) + 1)[1:]
-        shares = []
-        for mask in (pair.truth, pair.ignored):
-            cover = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-            shares.append(np.bincount(regions.labels.ravel(), cover.ravel(), minlength=len(total) + 1)[1:] / total)
-        changed, ignored = shares
-        clear = (changed > 0.3) | ((changed < 0.05) & (ignored < 0.2))
-        rows.append(regions.features[clear])
-        answers.append(changed[clear] > 0.3)
+        for before, after in ((pair.reference, pair.query), (pair.query, pair.reference)):
+            for settings in (RegionSettings(), EAGER):
+                regions, *_ = examine(before, after, pair.valid, RobustSettings(regions=settings))
+                changed, ignored = (_shares(regions, mask) for mask in (pair.truth, pair.ignored))
+                clear = (changed > 0.3) | ((changed < 0.05) & (ignored < 0.2))
+                rows.append(regions.features[clear])
+                answers.append(changed[clear] > 0.3)
     return np.concatenate(rows), np.concatenate(answers)
 
 
-def train(rows: np.ndarray, answers: np.ndarray, simulated: np.ndarray) -> dict[str, object]:
+def _shares(regions: Regions, mask: np.ndarray) -> np.ndarray:
+    """The share (N,) of each region's pixels that lie in a mask of the pictures' own size."""
+    count = len(regions.boxes) + 1
+    cover = cv2.resize(mask.astype(np.float32), regions.labels.shape[::-1], interpolation=cv2.INTER_AREA)
+    total = np.bincount(regions.labels.ravel(), minlength=count)[1:]
+    return np.bincount(regions.labels.ravel(), cover.ravel(), minlength=count)[1:] / np.maximum(total, 1)
+
+
+def train(
+    rows: np.ndarray, answers: np.ndarray, simulated: np.ndarray, onto: dict | None = None
+) -> dict[str, object]:
     """Boosted oblivious trees: each level of a tree asks one question of all; logistic loss.
 
-    `simulated` (N,) tells regions of simulated flights; as a whole they weigh as much as all others.
+    `simulated` (N,) tells regions of simulated flights; as a whole they weigh as much as all others. `onto` are trees
+    whose answers the new ones correct.
     """
     rng = np.random.default_rng(5)
     cuts = [np.unique(np.quantile(column, np.linspace(0, 1, BINS + 1)[1:-1])) for column in rows.T]
@@ -108,7 +148,13 @@ def train(rows: np.ndarray, answers: np.ndarray, simulated: np.ndarray) -> dict[
         weights = weights * np.where(simulated, 0.5 * count / simulated.sum(), 0.5 * count / (~simulated).sum())
     prior = float(np.log((weights @ answers) / (weights @ ~answers)))
     features, thresholds, leaves = [], [], []
+    if onto:
+        prior, thresholds, leaves = onto["prior"], list(onto["thresholds"]), list(onto["leaves"])
+        features = [[FEATURES.index(onto["names"][one]) for one in tree] for tree in onto["features"]]
+    powers = 1 << np.arange(DEPTH)[::-1]
     margin = np.full(count, prior)
+    for tree, cut, values in zip(features, thresholds, leaves):
+        margin += np.array(values)[(rows[:, tree] > np.array(cut)) @ powers]
     for _ in range(TREES):
         chance = 1 / (1 + np.exp(-margin))
         sample = rng.uniform(size=count) < 0.7
@@ -137,7 +183,8 @@ def train(rows: np.ndarray, answers: np.ndarray, simulated: np.ndarray) -> dict[
         features.append(tree_features)
         thresholds.append([float(f"{value:.6g}") for value in tree_thresholds])
         leaves.append([round(float(value), 4) for value in values])
-    return {"names": list(FEATURES), "prior": prior, "features": features, "thresholds": thresholds, "leaves": leaves}
+    trees = {"features": features, "thresholds": thresholds, "leaves": leaves}
+    return {"names": list(FEATURES), "prior": prior - CAUTION, **trees}
 
 
 if __name__ == "__main__":

@@ -11,20 +11,25 @@ from sorvolo.geometry.arrays import Anything, Floats, Mask
 from sorvolo.kernels import core_regions, differences, match_regions, measure_regions, rim_balance, tint
 
 RING_PX = 4
+WIDE_PX = 20  # what the ground does around a region and its neighbours, wind among it
+NEIGHBOUR_PX = 100
+GREEN_CELL_PX = 4
 SPECK_PX = 9
 NEAR_PX = 31
 WEAK_PART = 0.1  # of the largest difference near: what is weaker belongs to clouds and shadows, not to the thing
 MOST_SPECK = 48.0
 MATCH_MARGIN_PX = 3
 MATCH_REACH_PX = 6
-MOST_REGIONS = 64
+MOST_REGIONS = 64  # a byte holds their labels
 
 FEATURES = (
     "log area", "log length", "aspect", "fill", "difference", "difference spread", "chroma share", "sharpness",
     "difference over activity", "difference over noise", "ratio", "ratio step", "ratio spread", "ratio spread outside",
     "edges after", "edges before", "edges outside", "edge contrast", "detail difference", "detail outside",
     "alike in place", "alike best", "alike gain", "match length", "match rest", "match gain", "level", "activity",
-    "came", "colour step", "colour spread", "noise", "rest", "unevenness", "regions",
+    "came", "colour step", "colour spread", "structure kept", "structure kept outside", "structure before",
+    "structure after", "rim light", "rim difference", "wide ratio", "wide ratio spread", "wide detail", "green before",
+    "green after", "part of strongest", "part of neighbours", "neighbours", "noise", "rest", "unevenness", "regions",
 )
 
 _LOG = np.clip(np.rint(np.log2((np.arange(256) + 8) / 8) * 50), 0, 255).astype(np.uint8)
@@ -52,7 +57,8 @@ class RegionSettings:
 class Regions:
     """Regions 1 .. N of `labels` (h, w) int32: `boxes` (N, 4) int32 x, y, w, h and `features` (N, len(FEATURES)).
 
-    `weak` (h, w) uint8 is 255 wherever the pictures differ at all, `noise` the 95 % quantile of small differences.
+    `strength` (h, w) uint8 is how much the pictures differ, until the thread compares others; `weak` (h, w) uint8 is
+    255 wherever they differ at all, `noise` the 95 % quantile of small differences.
     Outside of `known` (h, w), None where everything is, nothing is found. `came` (N,) is positive where the query shows
     a thing on the reference's ground, negative where it is the other way round.
     """
@@ -60,6 +66,7 @@ class Regions:
     labels: NDArray[np.int32]
     boxes: NDArray[np.int32]
     features: Floats
+    strength: Image
     weak: Image
     noise: float
     known: Mask | None
@@ -93,7 +100,7 @@ def find_regions(
         smooth, threshold, settings.strong_factor, settings.core, settings.least_area_px, MOST_REGIONS
     )
     if len(boxes) == 0:
-        return Regions(labels, boxes, np.zeros((0, len(FEATURES))), weak, noise, known, np.zeros(0))
+        return Regions(labels, boxes, np.zeros((0, len(FEATURES))), smooth, weak, noise, known, np.zeros(0))
     # a shadow takes from all colours alike: red over blue stays
     colour = tint(reference, query, _LOG, boxes, RING_PX, _SCRATCH.take("tint", size))
     log_before, log_after = _SCRATCH.stack("logarithms", size, 2)
@@ -101,14 +108,16 @@ def find_regions(
     cv2.LUT(light_after, _LOG, dst=log_after)
     frame = np.array([noise, rest_px, unevenness, np.log1p(len(boxes))])
     channels = [difference, chroma, activity, light_after, came, went, colour, log_before, log_after]
-    features = _measured(labels, boxes, channels, frame)
+    green = _green(reference, boxes), _green(query, boxes)
+    features = _measured(labels, boxes, channels, green, frame)
     # along its outline a thing's values are new, while the ground's are still to be seen near
     balance = rim_balance(labels, boxes, came, went).astype(np.float64)
-    return Regions(labels, boxes, features, weak, noise, known, balance)
+    return Regions(labels, boxes, features, smooth, weak, noise, known, balance)
 
 
 def _measured(
-    labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: list[Image], frame: NDArray[np.float64]
+    labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: list[Image], green: tuple[Floats, Floats],
+    frame: NDArray[np.float64],
 ) -> Floats:
     difference, chroma, activity, level, came, went, colour, log_before, log_after = channels
     size = labels.shape[0], labels.shape[1]
@@ -121,17 +130,23 @@ def _measured(
     cv2.morphologyEx(log_before, cv2.MORPH_GRADIENT, window, dst=edges_before)
     cv2.absdiff(detail_after, detail_before, dst=detail)
     stack = [difference, chroma, activity, level, ratio, edges_after, edges_before, detail, came, went, colour]
-    sums = measure_regions(labels, boxes, stack, RING_PX).astype(np.float64)
-    count = np.maximum(sums[:, :, :1], 1)
-    means = sums[:, :, 1:12] / count
-    spreads = np.sqrt(np.maximum(sums[:, :, 12:] / count - means**2, 0))
+    sums = measure_regions(labels, boxes, [*stack, detail_before, detail_after], RING_PX)
+    means, spreads = _moments(sums)
     within, around = means[:, 0], means[:, 1]
+    kept, had, has = _structure(means[..., (7, 11, 12)], spreads[..., (7, 11, 12)])
+    sharp, steep = _SCRATCH.stack("sharp", size, 2)
+    cv2.morphologyEx(ratio, cv2.MORPH_GRADIENT, window, dst=sharp)
+    cv2.morphologyEx(difference, cv2.MORPH_GRADIENT, window, dst=steep)
+    rim = _moments(measure_regions(_rims(labels), boxes, [sharp, steep], 0))[0][:, 0]
+    wide, wide_spreads = (each[:, 1] for each in _moments(measure_regions(labels, boxes, [ratio, detail], WIDE_PX)))
     reach = MATCH_REACH_PX
     searched = _SCRATCH.take("searched", size, margin_px=reach)
     cv2.copyMakeBorder(detail_before, reach, reach, reach, reach, cv2.BORDER_REFLECT, dst=searched)
     matched = match_regions(detail_after, searched, _grown(boxes, labels.shape), reach)
-    area, long, short = sums[:, 0, 0], boxes[:, 2:].max(axis=1), boxes[:, 2:].min(axis=1)
+    long, short = boxes[:, 2:].max(axis=1), boxes[:, 2:].min(axis=1)
+    area = sums[:, 0, 0].astype(np.float64)
     difference_in, noise = within[:, 0], frame[0]
+    step = within[:, 4] - wide[:, 0]
     columns = [
         np.log(area), np.log(long), short / long, area / (boxes[:, 2] * boxes[:, 3]),
         difference_in, spreads[:, 0, 0], 2 * within[:, 1] / np.maximum(difference_in, 1),
@@ -142,8 +157,55 @@ def _measured(
         matched[:, 0], matched[:, 1], matched[:, 1] - matched[:, 0], np.hypot(matched[:, 2], matched[:, 3]),
         matched[:, 5], matched[:, 5] / np.maximum(matched[:, 4], 1), within[:, 3], within[:, 2],
         (within[:, 8] - within[:, 9]) / np.maximum(difference_in, 1), within[:, 10] - around[:, 10], spreads[:, 0, 10],
+        kept[:, 0], kept[:, 1], had[:, 0], has[:, 0], rim[:, 0] / (np.abs(step) + 4), rim[:, 1] / (difference_in + 4),
+        step / (wide_spreads[:, 0] + 2), wide_spreads[:, 0], wide[:, 1], *green,
+        *_standing_out(boxes, area * difference_in),
     ]
     return np.column_stack(columns + [np.full(len(boxes), value) for value in frame])
+
+
+def _moments(sums: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Means and standard deviations (N, 2, C) of channels within regions and around them, 0 where there is no pixel."""
+    channels = sums.shape[2] // 2
+    count = np.maximum(sums[:, :, :1], 1).astype(np.float64)
+    means = sums[:, :, 1 : 1 + channels] / count
+    return means, np.sqrt(np.maximum(sums[:, :, 1 + channels :] / count - means**2, 0))
+
+
+def _structure(means: Floats, spreads: Floats) -> tuple[Floats, Floats, Floats]:
+    """How alike (N, 2) the details before and after are, -1 to 1, within and around; and how strong before and after.
+
+    From the moments (N, 2, 3) of what they are apart, of the details before and after: a correlation.
+    """
+    apart = spreads[..., 0] ** 2 + means[..., 0] ** 2 - (means[..., 2] - means[..., 1]) ** 2
+    before, after = spreads[..., 1] ** 2, spreads[..., 2] ** 2
+    alike = (before + after - apart) / (2 * np.sqrt((before + 1) * (after + 1)))
+    return alike, spreads[..., 1], spreads[..., 2]
+
+
+def _standing_out(boxes: NDArray[np.int32], strength: Floats) -> tuple[Floats, Floats, Floats]:
+    """Each region's strength (N,) against the strongest, and against all near, in logarithms; how many are near."""
+    middles = boxes[:, :2] + boxes[:, 2:] / 2
+    near = np.abs(middles[:, None] - middles[None]).max(axis=2) < NEIGHBOUR_PX
+    strength = strength + 1.0
+    return np.log(strength / strength.max()), np.log(strength / (near @ strength)), np.log(near.sum(axis=1))
+
+
+def _rims(labels: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The labels (h, w) of pixels next to pixels of no region, 0 elsewhere."""
+    size = labels.shape[0], labels.shape[1]
+    inner = cv2.erode(labels.astype(np.uint8), np.ones((3, 3), np.uint8), dst=_SCRATCH.take("inner", size))
+    return np.asarray(labels * (inner == 0))
+
+
+def _green(image: Image, boxes: NDArray[np.int32]) -> Floats:
+    """How much greener (N,) than red and blue a BGR picture (h, w, 3) is in the middle of boxes, grey levels."""
+    columns, rows = ((boxes[:, :2] + boxes[:, 2:] // 2) // GREEN_CELL_PX * GREEN_CELL_PX).T
+    y, x = np.mgrid[:GREEN_CELL_PX, :GREEN_CELL_PX]
+    y, x = (np.minimum(start[:, None, None] + step, side - 1)
+            for start, step, side in ((rows, y, image.shape[0]), (columns, x, image.shape[1])))
+    blue, green, red = image[y, x].mean(axis=(1, 2)).T
+    return np.asarray(green - (red + blue) / 2)
 
 
 def _details(logarithm: Image, to: Image) -> None:

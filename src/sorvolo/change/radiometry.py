@@ -16,6 +16,7 @@ Bgr = NDArray[np.uint8]
 
 BLACK_LEVEL = 8.0  # added before logarithms: below it a camera shows noise, not light
 CELL_PX = 8
+FINE = 4  # pixels of a cell each way, where structure is compared
 MEDIAN_CELLS = 5  # what is smaller than half of it cannot change the local gain
 LEAST_ALIKE, MOST_ALIKE = 0.25, 0.5  # correlation of details: the ground is another one, and surely the same
 FLAT = 6.0  # what noise leaves of the variance of details, in squared steps of the logarithm
@@ -57,7 +58,8 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     """
     height, width = reference.shape[:2]
     size = max(4, width // CELL_PX), max(4, height // CELL_PX)
-    before, after = _logarithm(_smaller(reference, size)), _logarithm(_smaller(query, size))
+    fine = tuple(_smaller(each, (FINE * size[0], FINE * size[1])) for each in (reference, query))
+    before, after = (_logarithm(_smaller(each, size)) for each in fine)
     sure = None if known is None else _smaller(known.astype(np.uint8) * 255, size) > 250
     if sure is not None and sure.sum() < 16:
         return Light(np.ones(3), np.zeros(3), np.ones((*size[::-1], 3), np.float32), 0.0)
@@ -69,7 +71,7 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     kept = _chosen(offset, sure)
     offsets = np.array([middle(kept[:, channel]) for channel in range(3)])
     local = np.clip(np.rint((offset - offsets.astype(np.float32)) * STEPS_PER_OCTAVE + 128), 0, 255).astype(np.uint8)
-    same = _sameness(reference, query, size)
+    same = _sameness(*fine, size)
     if sure is not None:
         same[~sure] = 0
     octaves = _spread(cv2.medianBlur(local, MEDIAN_CELLS).astype(np.float32) - 128, same) / STEPS_PER_OCTAVE
@@ -94,12 +96,11 @@ def _chosen(values: NDArray[np.float32], sure: Mask | None) -> NDArray[np.float3
 
 
 def _sameness(reference: Bgr, query: Bgr, size: tuple[int, int]) -> NDArray[np.float32]:
-    """How sure each cell shows the same ground, 0 to 1: its finest structure is there in both, whatever the light.
+    """How sure each of `size` cells (w, h) shows the same ground, 0 to 1: its finest structure is there in both.
 
     Things put on the ground, however large, hide its structure: their cells say nothing about the light.
     """
-    fine = 4 * size[0], 4 * size[1]
-    before, after = (_details(cv2.cvtColor(_smaller(each, fine), cv2.COLOR_BGR2GRAY)) for each in (reference, query))
+    before, after = (_details(cv2.cvtColor(each, cv2.COLOR_BGR2GRAY)) for each in (reference, query))
     sums = [
         cv2.blur(cv2.resize(product, size, interpolation=cv2.INTER_AREA), (5, 5))
         for product in (before * after, before * before, after * after)

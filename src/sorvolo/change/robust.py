@@ -1,6 +1,6 @@
 """The robust change method: two aligned pictures -> what changed, whatever the light, leaves and leaning trees do."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -20,6 +20,9 @@ CLOSES_PX = 9
 LEAST_CONVEXITY = 0.5
 SAME_PLACE_PX = 0.6  # half size pixels
 ALL_KNOWN = 0x0101  # two True side by side
+CALM_PX = 0.4  # rest of the flow below: values are looked for one pixel less far around
+RIM_WIDTH_PX = 5  # a thing's outline runs where half of the difference within this is left ...
+SLACK, LEAST_SHARE = 5.0, 0.25  # ... of what it was before the ground's own range was taken off, at least this share
 RIM_PX = 4  # around the unknown, in half size pixels: resampling mixes the unknown into it
 
 
@@ -99,9 +102,15 @@ def examine(
     light = fit_light(before, after, known)
     rim = None if known is None else _without_rim(known, RIM_PX + int(np.ceil(settling.moved_px)))
     lit = relit(before, light, spare)
-    regions = find_regions(lit, after, rim, settings.regions, settling.rest_px, light.unevenness)
+    regions = find_regions(lit, after, rim, _for_pair(settings.regions, settling), settling.rest_px, light.unevenness)
     share = 1.0 if rim is None else cv2.countNonZero(rim.view(np.uint8)) / rim.size
     return regions, light, settling, share
+
+
+def _for_pair(settings: RegionSettings, settling: Settling) -> RegionSettings:
+    """Where hardly anything moves values need not be looked for as far around, and less is hidden by them."""
+    is_calm = settling.rest_px < CALM_PX and settings.reach_px > 1
+    return replace(settings, reach_px=settings.reach_px - 1) if is_calm else settings
 
 
 def _check(reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask | None) -> None:
@@ -154,8 +163,7 @@ def _result(
         middle = boxes_px[:, :2] + boxes_px[:, 2:] / 2
         moved = np.column_stack([middle, np.ones(len(middle))]) @ settling.reference_from_query.T
         boxes_px[went, :2] += (moved[:, :2] / moved[:, 2:] - middle)[went]
-    larger = cv2.resize(half_mask, size, interpolation=cv2.INTER_LINEAR)
-    mask = np.asarray(cv2.threshold(larger, 127, 255, cv2.THRESH_BINARY, dst=larger)[1], np.uint8)
+    mask = _enlarged(half_mask, size)
     factor = np.array([size[0] / half[0], size[1] / half[1]])
     corners = np.clip(np.rint(boxes_px[sure, :2] * factor), 0, np.array(size) - 1).astype(np.int64)
     sides = np.rint(boxes_px[sure, 2:] * factor).astype(np.int64)
@@ -163,20 +171,35 @@ def _result(
     return RobustResult(mask, boxes, scores[sure], light, settling, regions.noise, known)
 
 
+def _enlarged(half_mask: ImageGray, size: tuple[int, int]) -> ImageGray:
+    """The mask at full `size` (w, h), 255 where the half size one passes 127; only around things where size is even."""
+    mask = np.zeros(size[::-1], np.uint8)
+    x, y, wide, high = cv2.boundingRect(half_mask)
+    top, left, bottom, right = max(0, y - 1), max(0, x - 1), y + high + 1, x + wide + 1
+    window, place = half_mask, mask
+    if size[0] % 2 == 0 and size[1] % 2 == 0:
+        window, place = half_mask[top:bottom, left:right], mask[2 * top : 2 * bottom, 2 * left : 2 * right]
+    larger = cv2.resize(window, place.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    place[:] = cv2.threshold(larger, 127, 255, cv2.THRESH_BINARY)[1]
+    return mask
+
+
 def _went(regions: Regions, parts: Anything) -> Mask:
     """Which regions (N,) are things that the reference shows; what touches is one thing."""
-    part = np.zeros(len(regions.boxes) + 1, np.int64)
-    inside = regions.labels > 0
-    part[regions.labels[inside]] = parts[inside]
-    came = np.bincount(part[1:], regions.came, minlength=1)
-    return np.asarray(came[part[1:]] < 0)
+    part = np.zeros(len(regions.boxes), np.int64)
+    for region, (x, y, wide, high) in enumerate(regions.boxes):
+        place = slice(y, y + high), slice(x, x + wide)
+        part[region] = parts[place].flat[(regions.labels[place] == region + 1).argmax()]
+    came = np.bincount(part, regions.came, minlength=1)
+    return np.asarray(came[part] < 0)
 
 
 def _filled(chosen: Mask, regions: Regions, parts: Anything, count: int) -> ImageGray:
     """The `chosen` (N,) regions with what weakly differs around their cores, less a rim of blur, and without gaps.
 
     `parts` (h, w) are the weakly differing pieces, 0 .. `count` - 1, 0 none. Where a thing has the ground's own colour
-    nothing differs: what is nearly convex is taken to be so.
+    nothing differs: what is nearly convex is taken to be so. The outline runs, to a part of a pixel, where the result
+    passes 127.
     """
     size = regions.labels.shape[0], regions.labels.shape[1]
     cores, around, whole = _SCRATCH.stack("filled", size, 3)
@@ -198,6 +221,22 @@ def _filled(chosen: Mask, regions: Regions, parts: Anything, count: int) -> Imag
         hull = cv2.convexHull(outline)
         is_full = cv2.contourArea(outline) > LEAST_CONVEXITY * cv2.contourArea(hull)
         cv2.drawContours(whole, [hull if is_full else outline], -1, 255.0, cv2.FILLED)
+    outlined = _outlined(whole, regions.strength)
     if regions.known is not None:
-        whole[~regions.known] = 0
-    return np.array(whole, np.uint8)
+        outlined[~regions.known] = 0
+    return outlined
+
+
+def _outlined(whole: ImageGray, strength: Anything) -> ImageGray:
+    """Things (h, w) 0 or 255 whose rim is drawn anew where the difference falls below a part of its height nearby."""
+    outlined = np.zeros_like(whole)
+    x, y, wide, high = cv2.boundingRect(whole)
+    window = np.s_[max(0, y - 1) : y + high + 1, max(0, x - 1) : x + wide + 1]
+    thing, here = whole[window], strength[window]
+    near = np.ones((RIM_WIDTH_PX, RIM_WIDTH_PX), np.uint8)
+    height = cv2.max(cv2.dilate(cv2.min(thing, here), near), 1.0).astype(np.float32)
+    limit = np.maximum(np.float32(0.5) * height - np.float32(SLACK), np.float32(LEAST_SHARE) * height)
+    rim = np.clip(127.5 + 255 * (here - limit) / height, 0, 255).astype(np.uint8)
+    rim[cv2.dilate(thing, np.ones((3, 3), np.uint8)) == 0] = 0
+    outlined[window] = cv2.max(rim, cv2.erode(thing, near))
+    return outlined
