@@ -47,7 +47,7 @@ def test_output_and_gradients_are_torchs(stride: int, kernel: int, padding: int,
 
 def test_the_derivatives_are_those_of_small_steps() -> None:
     features, weight, bias = (each.detach().double().requires_grad_() for each in _inputs(3))
-    # the weights' gradient is reckoned in float32, so its steps are larger and its tolerance is float32's
+    # gradients are reckoned in float32, so the steps are larger and the tolerance is float32's
     assert torch.autograd.gradcheck(
         lambda *each: depthwise(*each, 2, 1), (features[:1, :, :6, :6], weight, bias), eps=1e-3, atol=1e-3, rtol=1e-3
     )
@@ -63,23 +63,24 @@ def test_features_in_channels_last_are_the_same() -> None:
 
 
 def test_a_frozen_picture_or_weight_asks_for_the_other_gradient_only() -> None:
-    features, weight, _ = _inputs(3)
+    features, weight, _ = _inputs(5)
     fixed = features.detach()
-    (to_weight,) = torch.autograd.grad(depthwise(fixed, weight, None, 1, 1).sum(), [weight])
-    (wanted,) = torch.autograd.grad(_own(fixed, weight, None, 1, 1).sum(), [weight])
+    (to_weight,) = torch.autograd.grad(depthwise(fixed, weight, None, 1, 2).sum(), [weight])
+    (wanted,) = torch.autograd.grad(_own(fixed, weight, None, 1, 2).sum(), [weight])
     torch.testing.assert_close(to_weight, wanted)
-    out = depthwise(features, weight.detach(), None, 1, 1)
+    out = depthwise(features, weight.detach(), None, 1, 2)
     (to_features,) = torch.autograd.grad(out.sum(), [features])
-    (wanted,) = torch.autograd.grad(_own(features, weight.detach(), None, 1, 1).sum(), [features])
+    (wanted,) = torch.autograd.grad(_own(features, weight.detach(), None, 1, 2).sum(), [features])
     torch.testing.assert_close(to_features, wanted)
 
 
-def test_under_autocast_the_type_is_bfloat16_and_the_weights_gradient_exact() -> None:
+@pytest.mark.parametrize("stride", [1, 2])
+def test_under_autocast_the_type_is_bfloat16_and_gradients_are_near_the_exact_ones(stride: int) -> None:
     features, weight, bias = _inputs(5)
     with torch.autocast("cpu", torch.bfloat16):
-        found = _taught(depthwise, (features, weight, bias), 1, 2)
+        found = _taught(depthwise, (features, weight, bias), stride, 2)
         assert found[0].dtype == torch.bfloat16
-    exact = _taught(_own, (features, weight, bias), 1, 2)
+    exact = _taught(_own, (features, weight, bias), stride, 2)
     assert [each.dtype for each in found[1:]] == [torch.float32] * 3
     for mine, wanted in zip(found, exact):
         torch.testing.assert_close(mine.float(), wanted, atol=0.03 * float(wanted.abs().max()), rtol=0.03)
@@ -98,6 +99,8 @@ def test_where_nothing_is_learnt_torch_itself_is_asked(frozen: bool, monkeypatch
     else:
         with torch.no_grad():
             assert torch.equal(depthwise(features, weight, bias, 2, 1), wanted)
+    small = depthwise(features, weight, bias, 1, 1)  # quick anyway
+    torch.testing.assert_close(small, _own(features, weight, bias, 1, 1))
     for learnt in ((features, weight.detach()), (features.detach(), weight)):
         with pytest.raises(AssertionError, match="detour"):
             depthwise(*learnt, bias, 2, 1)
@@ -109,8 +112,8 @@ def test_other_devices_than_the_cpu_use_torch_itself(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(module._Depthwise, "apply", never)
     device = "cuda" if torch.cuda.is_available() else "meta"
-    features, weight, bias = (each.detach().to(device).requires_grad_() for each in _inputs(3))
-    out = depthwise(features, weight, bias, 1, 1)
+    features, weight, bias = (each.detach().to(device).requires_grad_() for each in _inputs(5))
+    out = depthwise(features, weight, bias, 1, 2)
     assert out.device.type == device and out.shape == features.shape
 
 

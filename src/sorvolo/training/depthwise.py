@@ -4,10 +4,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+_QUICK_KERNEL = 3
+
 
 class _Depthwise(torch.autograd.Function):
-    """The same numbers as torch's own; the weights' gradient is reckoned in float32, several times as fast there as in
-    bfloat16 (benchmarks/depthwise_speed.py)."""
+    """What torch's own says. The weights' gradient is reckoned in float32, and where there is a stride the features' too:
+    several times as fast as in bfloat16 (benchmarks/depthwise_speed.py)."""
 
     @staticmethod
     def forward(ctx, features: Tensor, weight: Tensor, stride: int, padding: int) -> Tensor:  # type: ignore[no-untyped-def]
@@ -23,9 +25,10 @@ class _Depthwise(torch.autograd.Function):
         places = [stride, stride], [padding, padding], [1, 1], False, [0, 0], len(weight)
         to_features = to_weight = None
         if ctx.needs_input_grad[0]:
+            kind = grown.dtype if stride == 1 else torch.float32
             to_features = torch.ops.aten.convolution_backward(
-                grown, features, weight.to(grown.dtype), None, *places, [True, False, False]
-            )[0]
+                grown.to(kind), features.to(kind), weight.to(kind), None, *places, [True, False, False]
+            )[0].to(features.dtype)
         if ctx.needs_input_grad[1]:
             to_weight = torch.ops.aten.convolution_backward(
                 grown.float(), features.float(), weight.float(), None, *places, [False, True, False]
@@ -36,7 +39,8 @@ class _Depthwise(torch.autograd.Function):
 def depthwise(features: Tensor, weight: Tensor, bias: Tensor | None, stride: int, padding: int) -> Tensor:
     """(N, C, H, W) filtered channel by channel with `weight` (C, 1, k, k), as torch.nn.functional.conv2d does it."""
     learns = torch.is_grad_enabled() and (features.requires_grad or weight.requires_grad)
-    if features.device.type != "cpu" or not learns:
+    is_quick = weight.shape[-1] <= _QUICK_KERNEL and stride == 1  # in bfloat16 too
+    if features.device.type != "cpu" or not learns or is_quick:
         return functional.conv2d(features, weight, bias, stride, padding, groups=len(weight))
     out: Tensor = _Depthwise.apply(features, weight, stride, padding)  # type: ignore[no-untyped-call]
     return out if bias is None else out + bias.to(out.dtype)[:, None, None]
