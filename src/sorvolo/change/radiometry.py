@@ -58,8 +58,9 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     """
     height, width = reference.shape[:2]
     size = max(4, width // CELL_PX), max(4, height // CELL_PX)
-    fine = tuple(_smaller(each, (FINE * size[0], FINE * size[1])) for each in (reference, query))
-    before, after = (_logarithm(_smaller(each, size)) for each in fine)
+    fine = FINE * size[0], FINE * size[1]
+    reference, query = _smaller(reference, fine), _smaller(query, fine)
+    before, after = (_logarithm(_smaller(each, size)) for each in (reference, query))
     sure = None if known is None else _smaller(known.astype(np.uint8) * 255, size) > 250
     if sure is not None and sure.sum() < 16:
         return Light(np.ones(3), np.zeros(3), np.ones((*size[::-1], 3), np.float32), 0.0)
@@ -71,7 +72,7 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     kept = _chosen(offset, sure)
     offsets = np.array([middle(kept[:, channel]) for channel in range(3)])
     local = np.clip(np.rint((offset - offsets.astype(np.float32)) * STEPS_PER_OCTAVE + 128), 0, 255).astype(np.uint8)
-    same = _sameness(*fine, size)
+    same = _sameness(reference, query, size)
     if sure is not None:
         same[~sure] = 0
     octaves = _spread(cv2.medianBlur(local, MEDIAN_CELLS).astype(np.float32) - 128, same) / STEPS_PER_OCTAVE

@@ -234,7 +234,7 @@ def _outlined(whole: ImageGray, strength: Anything) -> ImageGray:
     window = np.s_[max(0, y - 1) : y + high + 1, max(0, x - 1) : x + wide + 1]
     thing, here = whole[window], strength[window]
     near = np.ones((RIM_WIDTH_PX, RIM_WIDTH_PX), np.uint8)
-    height = cv2.max(cv2.dilate(cv2.min(thing, here), near), 1.0).astype(np.float32)
+    height = np.maximum(cv2.dilate(cv2.min(thing, here), near), 1).astype(np.float32)
     limit = np.maximum(np.float32(0.5) * height - np.float32(SLACK), np.float32(LEAST_SHARE) * height)
     rim = np.clip(127.5 + 255 * (here - limit) / height, 0, 255).astype(np.uint8)
     rim[cv2.dilate(thing, np.ones((3, 3), np.uint8)) == 0] = 0
