@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import fromstring
 
+import av
 import cv2
 import numpy as np
 import pytest
 from truth_detector import TruthDetector
 
+from sorvolo.detection.contract import ModelInfo
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.simulate_site import simulate_site
@@ -29,6 +31,7 @@ from sorvolo.simulation.settings import (
     SimulationSettings,
 )
 from sorvolo.store.datasets import read_dataset
+from sorvolo.survey.objects import CLASSES, Detections, no_detections
 
 _FLOWN = SimulationSettings(
     seed=77, flights=1,
@@ -139,6 +142,46 @@ def test_without_telemetry_objects_are_counted_in_the_picture(
     assert len(truth) <= report["objects"]["total"] <= 2 * len(truth) + 1 and updates
     tracks = _read(tmp_path / "watch" / "tracks.geojson")
     assert tracks["crs"] is None and "x_px" in tracks["features"][0]["properties"]
+
+
+def test_after_a_cut_places_and_objects_begin_anew(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
+    """The same pictures upside down after a few of noise: other objects, in pixels of their own first picture."""
+    random = np.random.default_rng(1)
+    with av.open(str(_video(flown))) as video:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)][:15]
+    noise = [random.integers(0, 255, pictures[0].shape, np.uint8) for _ in range(6)]
+    frames = [*pictures, *noise, *(np.ascontiguousarray(each[::-1, ::-1]) for each in pictures)]
+    (tmp_path / "photos").mkdir()
+    for number, picture in enumerate(frames):
+        cv2.imwrite(str(tmp_path / "photos" / f"{number:03d}.png"), picture[..., ::-1])
+    finder = _InTheMiddle(detector.info)
+    updates = list(watch(tmp_path / "photos", outputs=WatchOutputs(folder=tmp_path / "watch"), detector=finder))
+    first, last = updates[0].segment, updates[-1].segment
+    assert first == 1 and last > 1
+    tracks = [each["properties"] for each in _read(tmp_path / "watch" / "tracks.geojson")["features"]]
+    assert {first, last} <= {each["segment"] for each in tracks}
+    assert len({each["id"] for each in tracks}) == len(tracks)
+    height, width = pictures[0].shape[:2]
+    assert all(abs(each["x_px"]) < 3 * width and abs(each["y_px"]) < 3 * height for each in tracks)
+    lines = [json.loads(line) for line in (tmp_path / "watch" / "detections.jsonl").read_text().splitlines()]
+    assert lines[0]["segment"] == 1 and lines[-1]["segment"] == last
+    assert f"segment {last}" in (tmp_path / "watch" / "report.html").read_text()
+
+
+class _InTheMiddle:
+    """Finds a person in the middle of every picture that is not noise."""
+
+    classes, provider, notices = CLASSES, "the middle", ()
+
+    def __init__(self, info: ModelInfo) -> None:
+        self.info = info
+
+    def detect(self, image: ImageRGB, **_: object) -> Detections:
+        if np.abs(np.diff(image.astype(int), axis=0)).mean() > 50:
+            return no_detections(CLASSES)
+        height, width = image.shape[:2]
+        box = [width / 2 - 8, height / 2 - 8, width / 2 + 8, height / 2 + 8]
+        return Detections(np.array([box]), np.array([0.9]), np.array([CLASSES.index("person")]), CLASSES)
 
 
 def test_heights_without_a_ground_are_said_and_can_be_helped(

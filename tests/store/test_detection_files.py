@@ -166,6 +166,15 @@ def test_annotated_pictures_show_the_box_only(tmp_path: Path) -> None:
     assert cv2.imread(str(tmp_path / "annotated" / "7.jpg")).shape == (120, 160, 3)
 
 
+def test_words_of_neighbouring_boxes_do_not_hide_each_other() -> None:
+    image, boxes = np.full((300, 400, 3), 90, np.uint8), np.array([[100, 100, 140, 140]] * 2, np.float32)
+    once = annotated(image, boxes[:1], [0], ["person 1 0.90"], [True])
+    twice = annotated(image, boxes, [0, 0], ["person 1 0.90", "person 2 0.80"], [True, True])
+    above, below = slice(70, 98), slice(144, 175)
+    assert (once[above] == twice[above]).all() and (once[below] == 90).all()
+    assert (twice[below] != 90).any()
+
+
 def test_the_video_keeps_the_frames_times(tmp_path: Path) -> None:
     path = tmp_path / "annotated.mp4"
     with AnnotatedVideo(path) as video:

@@ -68,12 +68,13 @@ def test_a_point_of_the_ground_stays_where_it_was():
     assert outline.shape == (4, 2)
 
 
-def test_a_cut_begins_elsewhere_and_is_counted():
+def test_a_cut_begins_anew_and_is_counted():
     motion = ImageMotion()
     before = fly(motion, ground(1), [((500 + 5 * k, 500),) for k in range(5)], (520.0, 500.0))
     after = fly(motion, ground(2), [((900 + 5 * k, 800),) for k in range(5)], (920.0, 800.0), start=5)
     assert motion.segments == 2
-    assert after[0][1][:, 0].min() > before[-1][1][:, 0].max() + 10 * WIDTH
+    assert after[0][1] == pytest.approx(before[0][1])  # the outline of a first picture, both
+    assert after[0][0].shared_sigma_m == 0.0
     assert np.ptp([sighting.position_m for sighting, _ in after], axis=0).max() < 2.0
 
 

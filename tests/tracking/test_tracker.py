@@ -141,6 +141,7 @@ def test_a_box_within_or_around_one_of_its_class_is_no_second_object():
         ((bag, loose), ("small object", "small object"), 1),
         ((loose, bag), ("small object", "small object"), 1),
         ((loose, bag), ("car", "person"), 2),
+        ((loose, [96.0, 97.0, 140.0, 163.0]), ("person", "small object"), 1),
         ((bag, [135.0, 100.0, 175.0, 145.0]), ("person", "person"), 2),
     ):
         tracker = Tracker()
@@ -151,6 +152,16 @@ def test_a_box_within_or_around_one_of_its_class_is_no_second_object():
             ]
             tracker.update(seen, time_ns=seen[0].time_ns, footprint_m=AROUND_M)
         assert len(tracker.finish()) == count, (boxes, labels)
+
+
+def test_what_is_taken_now_for_this_and_now_for_that_is_one():
+    tracker = Tracker()
+    for frame in range(24):
+        label = "person" if frame % 3 else "small object"
+        seen = [sighting(frame, [0.1 if frame % 3 else 0.0, 0.0], label, 0.9 if frame % 3 else 0.6, own_m=0.05)]
+        tracker.update(seen, time_ns=seen[0].time_ns, footprint_m=AROUND_M)
+    (track,) = tracker.finish()
+    assert track.label == "person"
 
 
 def test_what_is_not_seen_where_it_should_be_ends_and_what_is_out_of_view_does_not():
@@ -220,6 +231,12 @@ def test_the_same_frames_give_the_same_tracks():
         ]
 
     assert ids() == ids()
+
+
+def test_ids_go_on_where_an_earlier_tracker_ended():
+    tracker = Tracker(first_id=7)
+    follow(tracker, [[[0.0, 0.0], [9.0, 0.0]]] * 5)
+    assert sorted(track.id for track in tracker.finish()) == [7, 8] and tracker.next_id == 9
 
 
 def test_settings_and_columns_that_do_not_fit_are_refused():

@@ -162,13 +162,15 @@ def _show_result(result: Mapping[str, Any], console: Console) -> None:
     )
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     on_ground = result["georeferenced"]
+    has_cuts = len({each.get("segment") for each in tracks}) > 1
     unit = "m" if on_ground else "px"
-    for name in ("id", "class", "score", "latitude, longitude" if on_ground else "x, y px", f"within {unit}", "views",
-                 "moves"):
+    place_name = "latitude, longitude" if on_ground else "segment: x, y px" if has_cuts else "x, y px"
+    for name in ("id", "class", "score", place_name, f"within {unit}", "views", "moves"):
         table.add_column(name, no_wrap=True)
     for each in tracks[:_MOST_ROWS]:
         place = (
             f"{each['latitude']:.6f}, {each['longitude']:.6f}" if on_ground
+            else f"{each['segment']}: {each['x_px']:.0f}, {each['y_px']:.0f}" if has_cuts
             else f"{each['x_px']:.0f}, {each['y_px']:.0f}"
         )
         table.add_row(

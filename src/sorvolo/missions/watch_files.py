@@ -11,6 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
+
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.missions.watch_settings import WatchOutputs
 from sorvolo.store.annotated import AnnotatedVideo, annotated, write_annotated
@@ -19,17 +21,20 @@ from sorvolo.store.detection_files import (
     ANNOTATED_PICTURES,
     ANNOTATED_VIDEO,
     LABELS,
+    TRACKS,
     DetectionLines,
     crop_around,
     detection_row,
+    tracks_geojson,
     write_crop,
-    write_tracks,
 )
+from sorvolo.store.exports import geojson_bytes
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.store.label_files import picture_of_detections, write_coco, write_yolo
 from sorvolo.survey.flight import Frame, Site
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections, Sighting, Track
+from sorvolo.tracking.joining import frame_doubles
 
 _MOST_WAITING = 4  # frames; a disk that is slower than the detector slows the watch, it does not fill the memory
 _TRACKS_EVERY_S = 5.0
@@ -48,6 +53,7 @@ class SeenFrame:
     track_ids: Sequence[int]  # one for each detection
     confirmed: frozenset[int]
     headline: str
+    segment: int  # of a flight that is followed in the picture, 0 on the ground
 
 
 class WatchFiles:
@@ -60,6 +66,7 @@ class WatchFiles:
         self._crops_bytes = 0
         self._best: dict[int, Sighting] = {}
         self.crop_names: dict[int, str] = {}
+        self._segments: dict[int, int] = {}  # by track
         self._forgotten: list[str] = []
         self._told_s = time.monotonic()
         self._labelled: list[tuple[LabelledPicture, Floats]] = []
@@ -87,6 +94,7 @@ class WatchFiles:
     def add(self, seen: SeenFrame) -> None:
         """Write one frame's part soon. Raises what went wrong with an earlier one (StoreError on a full disk)."""
         self._raise_earlier()
+        self._segments |= dict.fromkeys(seen.track_ids, seen.segment)
         for sighting in seen.sightings:
             if sighting is not None:
                 self._keep_crop(sighting, crop_around(seen.frame.image, sighting.box_px))
@@ -114,7 +122,17 @@ class WatchFiles:
         """Bring `tracks.geojson` up to date, unless that was done within the last seconds."""
         if time.monotonic() - self._told_s >= _TRACKS_EVERY_S:
             self._told_s = time.monotonic()
-            write_tracks(self.folder, tracks, self._site, self.crop_names)
+            self.write_tracks(tracks)
+
+    def write_tracks(self, tracks: Iterable[Track]) -> list[dict[str, Any]]:
+        """Replace `tracks.geojson`: readers see the old one or the new one. Returns each track's properties there."""
+        collection = tracks_geojson(tracks, self._site, self.crop_names)
+        rows = [each["properties"] for each in collection["features"]]
+        if self._site.is_local:
+            for row in rows:
+                row["segment"] = self._segments[row["id"]]
+        atomic_write_bytes(self.folder / TRACKS, geojson_bytes(collection), durable=False)
+        return rows
 
     def close(self) -> None:
         """Write what waits and close the files. Raises what went wrong with it."""
@@ -197,20 +215,24 @@ def _key(sighting: Sighting) -> tuple[int, bytes]:
 
 def _rows(seen: SeenFrame, site: Site) -> list[dict[str, Any]]:
     found = seen.detections
+    segment = {"segment": seen.segment} if site.is_local else {}
     return [
         detection_row(
             seen.frame, seen.time_ns, found.names[row], float(found.scores[row]), found.boxes_px[row].tolist(),
             seen.sightings[row], seen.track_ids[row] or None, site,
-        )
+        ) | segment
         for row in range(len(found))
     ]
 
 
 def _drawn(seen: SeenFrame) -> ImageRGB:
-    found = seen.detections
-    counted = [track_id in seen.confirmed for track_id in seen.track_ids]
+    """The frame with a box for each object, the surest of those that show it."""
+    doubles = frame_doubles(seen.detections.boxes_px, seen.detections.names, seen.detections.scores)
+    rows = [row for row in range(len(seen.detections)) if row not in doubles]
+    found, track_ids = seen.detections.only(np.array(rows, int)), [seen.track_ids[row] for row in rows]
+    counted = [track_id in seen.confirmed for track_id in track_ids]
     words = [
         f"{name} {track_id} {score:.2f}" if is_counted else ""
-        for name, track_id, score, is_counted in zip(found.names, seen.track_ids, found.scores, counted)
+        for name, track_id, score, is_counted in zip(found.names, track_ids, found.scores, counted)
     ]
     return annotated(seen.frame.image, found.boxes_px, found.labels.tolist(), words, counted, seen.headline)

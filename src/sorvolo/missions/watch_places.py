@@ -27,13 +27,15 @@ _OF_MAPS = ("no_telemetry", "ground_unknown", "height_unknown")  # notices that 
 class Taken:
     """What became of a frame's detections, each with its sighting, if it has a place, and its track (0: none).
 
-    `merged` are ids of tracks that turned out to be objects seen before.
+    `merged` are ids of tracks that turned out to be objects seen before. `segment` counts the stretches of a flight
+    that is followed in the picture, from 1, each with places in the pixels of its own first frame; 0 on the ground.
     """
 
     sightings: Sequence[Sighting | None]
     track_ids: Sequence[int]
     new_ids: frozenset[int]
     merged: frozenset[int]
+    segment: int = 0
 
 
 class Places(Protocol):
@@ -41,7 +43,7 @@ class Places(Protocol):
 
     @property
     def site(self) -> Site:
-        """What places are counted in; a local one's metres are pixels of the first frame."""
+        """What places are counted in; a local one's metres are pixels of a segment's first frame."""
 
     def m_per_px(self, frame: Frame) -> float | None:
         """The ground's sampling distance in the frame; None where unknown."""
@@ -177,16 +179,18 @@ class _Turning:
 
 
 class ImagePlaces:
-    """Detections of a flight that nothing places, tracked in the first frame's pixels."""
+    """Detections of a flight that nothing places, tracked in the first frame's pixels; after a cut all begins anew."""
 
     def __init__(self, setup: FlightSetup, sure_score: float, why_not: str) -> None:
         self._setup, self._why_not = setup, why_not
-        self._motion, self._tracker = ImageMotion(), Tracker(replace(IN_PICTURES, sure_score=sure_score))
+        self._settings = replace(IN_PICTURES, sure_score=sure_score)
+        self._motion, self._tracker = ImageMotion(), Tracker(self._settings)
+        self._segment, self._earlier = 1, list[Track]()
         self._site = Site(setup.source.name, setup.frame.origin, "", 1.0, is_local=True)
 
     @property
     def site(self) -> Site:
-        """A frame without metres: the first picture's pixels."""
+        """A frame without metres: pixels of the first picture of each segment."""
         return self._site
 
     def m_per_px(self, frame: Frame) -> float | None:
@@ -196,16 +200,20 @@ class ImagePlaces:
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
         """Take the camera's motion out of a frame's detections and give them to their tracks."""
         sightings, outline = self._motion.locate(found, frame, time_ns)
+        if self._motion.segments != self._segment:
+            self._segment = self._motion.segments
+            self._earlier += self._tracker.finish()
+            self._tracker = Tracker(self._settings, first_id=self._tracker.next_id)
         update = self._tracker.update(sightings, time_ns=time_ns, footprint_m=outline)
-        return _taken(sightings, update)
+        return replace(_taken(sightings, update), segment=self._segment)
 
     def tracks(self) -> Sequence[Track]:
         """All tracks as they are known now."""
-        return self._tracker.tracks()
+        return [*self._earlier, *self._tracker.tracks()]
 
     def finish(self) -> Sequence[Track]:
         """All tracks when nothing more comes."""
-        return self._tracker.finish()
+        return [*self._earlier, *self._tracker.finish()]
 
     def notices(self) -> tuple[Notice, ...]:
         """Why nothing is placed on the ground."""

@@ -17,7 +17,7 @@ from sorvolo.missions.watch_report import WatchLog, build_watch_report, count_by
 from sorvolo.missions.watch_settings import WatchOutputs, WatchSettings
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.cursor_on_target import CotSender, cot_event, cot_place, cot_removal, cot_type
-from sorvolo.store.detection_files import track_properties, tracks_geojson, write_detections_geojson, write_tracks
+from sorvolo.store.detection_files import track_properties, write_detections_geojson
 from sorvolo.store.exports import json_bytes
 from sorvolo.store.watch_page import count_words, watch_page
 from sorvolo.survey.flight import Frame, LostFrame, Notice, Site
@@ -34,7 +34,8 @@ class WatchUpdate:
     `detections` are all of the frame's; `sightings` those that have a place; `new` the tracks that this frame
     confirmed, `tracks` all confirmed ones that it saw. `counts` are the objects so far, by class. `latency_s` is from
     a live frame's arrival to this update, and of a recorded one how long it took. `frames_expected` is 0 for a live
-    source. Places are metres of `site`; pixels of the first frame where it is local.
+    source. Places are metres of `site`; where it is local, pixels of the first frame of their `segment`, which counts
+    from 1.
     """
 
     frame_name: str
@@ -51,6 +52,7 @@ class WatchUpdate:
     seconds: float
     folder: Path
     site: Site
+    segment: int
 
 
 class WatchRun:
@@ -99,7 +101,7 @@ class WatchRun:
         with log.stage("hand over"):
             self._files.add(SeenFrame(
                 frame, time_ns, found, taken.sightings, taken.track_ids, frozenset(each.id for each in confirmed),
-                f"frame {frame.name}: {count_words(counts)}",
+                f"frame {frame.name}: {count_words(counts)}", taken.segment,
             ))
             seen_ids = set(taken.track_ids)
             seen = [track for track in confirmed if track.id in seen_ids]
@@ -107,7 +109,7 @@ class WatchRun:
                 self._files.crop_of(track)
             new = [track for track in confirmed if track.id in taken.new_ids]
             self._files.forget(taken.merged)
-            self._teller.tell(new, seen, self._files.crop_names)
+            self._teller.tell(new, seen, self._files.crop_names, taken.segment)
             self._teller.take_back(taken.merged)
             self._files.show(confirmed)
         latency_s = time.monotonic() - arrived_s
@@ -116,7 +118,7 @@ class WatchRun:
         return WatchUpdate(
             frame.name, time_ns, found, [each for each in taken.sightings if each is not None], new, seen, counts,
             latency_s, log.read, log.detected, source.frame_count, log.seconds, self._folder,
-            self._places.site,
+            self._places.site, taken.segment,
         )
 
     def finish(self, *, ended: str, skipped: int) -> None:
@@ -131,7 +133,7 @@ class WatchRun:
             self._files.clear()
             site, crop_names = self._places.site, self._files.crop_names
             write_detections_geojson(self._folder, site)
-            write_tracks(self._folder, tracks, site, crop_names)
+            rows = self._files.write_tracks(tracks)
         notices = (
             *self._places.notices(), *self._detector.notices, *source_notices(self._setup.source, self.log),
             *self._teller.notices(),
@@ -141,7 +143,6 @@ class WatchRun:
             self._setup, self._settings, self._outputs, self._detector.info, self._detector.provider, self.log, tracks,
             notices, self._warnings(tracks), ended=ended, skipped=skipped, on_ground=not site.is_local,
         )
-        rows = [each["properties"] for each in tracks_geojson(tracks, site, crop_names)["features"]]
         crops = {track_id: (self._folder / name).read_bytes() for track_id, name in crop_names.items()}
         atomic_write_bytes(self._folder / "report.json", json_bytes(report))
         page = watch_page(report, rows, crops, self._places.path_m())
@@ -193,12 +194,13 @@ class Teller:
             post = alert_url(outputs.alert_url)
             self._alerts.append(Outbox(post, code="alert_url", what=f"the alert to {outputs.alert_url}"))
 
-    def tell(self, new: Sequence[Track], seen: Sequence[Track], crops: Mapping[int, str]) -> None:
+    def tell(self, new: Sequence[Track], seen: Sequence[Track], crops: Mapping[int, str], segment: int) -> None:
         """Alert once of each new track; tell the TAK server of all that are seen, each at its pace."""
+        of_segment = {"segment": segment} if self._site.is_local else {}
         for track in new:
             crop = crops.get(track.id)
             alert = {
-                "flight": self._flight, **track_properties(track, self._site),
+                "flight": self._flight, **track_properties(track, self._site), **of_segment,
                 "crop": None if crop is None else str((self._folder / crop).resolve()),
             }
             alert["time"] = alert["last_seen"]

@@ -18,27 +18,32 @@ _COLOURS = ((255, 196, 0), (0, 200, 255), (255, 90, 160), (120, 230, 80), (190, 
 _VIDEO_SIDE_PX = 1920  # of the longer side: larger videos help no one on a screen and take long
 _TICKS_PER_S = 90_000
 
+_Bar = tuple[int, int, int, int]  # left, top, right, bottom edge of a bar with words
+
 
 def annotated(
     image: ImageRGB, boxes_px: BoxesPx, labels: Sequence[int], words: Sequence[str], counted: Sequence[bool],
     headline: str = "",
 ) -> ImageRGB:
-    """A copy of the picture (H, W, 3) with boxes (N, 4), each in its class's colour with its words above.
+    """A copy of the picture (H, W, 3) with boxes (N, 4), each in its class's colour with its words above or below.
 
     Boxes that are `counted` (of confirmed tracks) are drawn strong, the others thin. The headline stands top left.
     """
     drawn = image.copy()
     size = max(image.shape[:2]) / 1280
     strong, letters = max(2, round(2 * size)), max(0.4, 0.5 * size)
+    written: list[_Bar] = []
+    if headline:
+        written.append(_write(drawn, headline, [(0, 0)], 1.2 * letters, (255, 255, 255), written))
     # the strong ones last, so that nothing hides them
     for row in sorted(range(len(boxes_px)), key=lambda each: counted[each]):
         colour = _COLOURS[labels[row] % len(_COLOURS)]
         left, top, right, bottom = (round(float(edge)) for edge in boxes_px[row])
         cv2.rectangle(drawn, (left, top), (right, bottom), colour, strong if counted[row] else 1, cv2.LINE_AA)
         if words[row]:
-            _write(drawn, words[row], (left, top - strong - 6), letters, colour)
-    if headline:
-        _write(drawn, headline, (0, 0), 1.2 * letters, (255, 255, 255))
+            above, below = top - strong - 6, bottom + strong + round(30 * letters)
+            corners = [(left, above), (left, below), (right + strong + 2, bottom)]
+            written.append(_write(drawn, words[row], corners, letters, colour, written))
     return drawn
 
 
@@ -112,11 +117,27 @@ class AnnotatedVideo:
         self._stream, self._first_ns = stream, time_ns
 
 
-def _write(picture: ImageRGB, words: str, corner: tuple[int, int], size: float, colour: tuple[int, int, int]) -> None:
-    """Words on a dark bar, readable on any ground and within the picture; OpenCV's letters are ASCII."""
+def _write(
+    picture: ImageRGB, words: str, corners: Sequence[tuple[int, int]], size: float, colour: tuple[int, int, int],
+    written: Sequence[_Bar],
+) -> _Bar:
+    """Words on a dark bar within the picture, at the first of the lower left corners where they hide none written.
+
+    OpenCV's letters are ASCII.
+    """
     plain = words.encode("ascii", "replace").decode()
     (width, height), below = cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
-    x = max(0, min(corner[0], picture.shape[1] - width - 2))
-    y = max(height + 2, corner[1])
-    cv2.rectangle(picture, (x, y - height - 2), (x + width + 2, y + below), (20, 20, 20), cv2.FILLED)
-    cv2.putText(picture, plain, (x + 1, y), cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
+    bars = []
+    for corner in corners:
+        x = max(0, min(corner[0], picture.shape[1] - width - 2))
+        y = max(height + 2, min(corner[1], picture.shape[0] - below))
+        bars.append((x, y - height - 2, x + width + 2, y + below))
+    bar = next((each for each in bars if not any(_meet(each, other) for other in written)), bars[0])
+    cv2.rectangle(picture, bar[:2], bar[2:], (20, 20, 20), cv2.FILLED)
+    place = (bar[0] + 1, bar[3] - below)
+    cv2.putText(picture, plain, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
+    return bar
+
+
+def _meet(one: _Bar, other: _Bar) -> bool:
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]

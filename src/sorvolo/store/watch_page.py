@@ -52,7 +52,7 @@ def watch_page(
     body = [
         _header(report, tracks),
         _warnings(report),
-        _map(report, tracks, drone_m),
+        *_maps(report, tracks, drone_m),
         _table(report, tracks),
         _crops(tracks, crops),
         _how_it_went(report),
@@ -84,7 +84,18 @@ def _warnings(report: Mapping[str, Any]) -> str:
     return f'<section class="warn"><h2>Look at this first</h2>{bullet_list(warnings)}</section>' if warnings else ""
 
 
-def _map(report: Mapping[str, Any], tracks: Sequence[Mapping[str, Any]], drone_m: Floats) -> str:
+def _maps(report: Mapping[str, Any], tracks: Sequence[Mapping[str, Any]], drone_m: Floats) -> list[str]:
+    """One map, or one for each segment of a flight that was followed in the picture: their pixels are not the same."""
+    segments = sorted({each.get("segment", 0) for each in tracks})
+    if len(segments) < 2:
+        return [_map(report, tracks, drone_m, "Where")]
+    of_segments = {name: [each for each in tracks if each.get("segment", 0) == name] for name in segments}
+    return [_map(report, of_one, drone_m, f"Where, segment {name}") for name, of_one in of_segments.items()]
+
+
+def _map(
+    report: Mapping[str, Any], tracks: Sequence[Mapping[str, Any]], drone_m: Floats, title: str
+) -> str:
     """Objects and the camera's path seen from above; north is up, in a local frame the first frame's top."""
     is_local = not report.get("georeferenced")
     x_key, y_key = ("x_px", "y_px") if is_local else ("east_m", "north_m")
@@ -130,11 +141,12 @@ def _map(report: Mapping[str, Any], tracks: Sequence[Mapping[str, Any]], drone_m
         for k, name in enumerate(classes)
     )
     where = (
-        "Pixels of the first frame, the camera's own motion taken out: nothing placed this flight on the ground."
+        "Pixels of the first frame, or the first after a cut, the camera's own motion taken out: nothing placed this "
+        "flight on the ground."
         if is_local else "North is up; the dashed line is the camera's way. The pale discs are one sigma of the place."
     )
     return (
-        f'<section><h2>Where</h2><p>{key}</p><svg viewBox="0 0 {_WIDE_PX:.0f} {height_px:.0f}" role="img">'
+        f'<section><h2>{escape(title)}</h2><p>{key}</p><svg viewBox="0 0 {_WIDE_PX:.0f} {height_px:.0f}" role="img">'
         f"<title>Where the objects are</title>{''.join(parts)}</svg><p class=\"note\">{where}</p></section>"
     )
 
@@ -143,10 +155,12 @@ def _table(report: Mapping[str, Any], tracks: Sequence[Mapping[str, Any]]) -> st
     if not tracks:
         return ""
     is_local = not report.get("georeferenced")
+    has_cuts = len({each.get("segment") for each in tracks}) > 1
     rows = []
     for each in tracks:
         if is_local:
-            place = f"{each['x_px']:.0f}, {each['y_px']:.0f} px"
+            of_segment = f" in segment {each['segment']}" if has_cuts else ""
+            place = f"{each['x_px']:.0f}, {each['y_px']:.0f} px{of_segment}"
         else:
             place = f"{each['latitude']:.6f}, {each['longitude']:.6f}"
         sigma = with_unit("{:.1f}" + (" px" if is_local else " m"), finite_or_none(each.get("sigma_m"))) or ""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, Mask
+from sorvolo.geometry.arrays import BoxesPx, Floats, Mask
 from sorvolo.survey.objects import TYPICAL_SIZE_M
 
 CUT_PX = 1.5
@@ -12,7 +12,7 @@ _CUT_SHARE = 0.06  # of its side: edges err
 _AS_MUCH_AGAIN = 0.3  # of the visible side, where that is as long as its class usually is
 
 
-def cut_edges(boxes_px: Floats, width_px: int, height_px: int) -> Mask:
+def cut_edges(boxes_px: BoxesPx | Floats, width_px: int, height_px: int) -> Mask:
     """(N, 4) bool: whether the left, top, right and bottom edges of boxes (N, 4) lie at the picture's.
 
     Those of a detector end there; what reaches beyond was never cut.

@@ -1,4 +1,4 @@
-"""The camera's own motion taken out of pictures that nothing places: sightings in the first picture's pixels."""
+"""The camera's own motion taken out of pictures that nothing places: sightings in a first picture's pixels."""
 
 from dataclasses import dataclass
 
@@ -39,8 +39,8 @@ class ImageMotion:
 
     Corners are followed by pyramidal Lucas-Kanade (Bouguet 2001) with detected objects masked out, and a similarity
     from each picture to the first one is fitted to them by RANSAC. A picture whose motion is not found goes on as the
-    last ones did and is counted in `guessed`; a cut, or several of those, begins a new of the `segments`, whose places
-    lie far to the right of all before, so that no object of one is taken for one of another.
+    last ones did and is counted in `guessed`; a cut, or several of those, begins a new of the `segments`, whose first
+    picture its places are counted in: they have nothing to do with those of the segments before.
     """
 
     def __init__(self) -> None:
@@ -50,10 +50,9 @@ class ImageMotion:
         self._step = np.eye(2, 3)  # image from last image
         self._way_px, self._guessed_px = 0.0, 0.0
         self._failures = 0
-        self._rightmost_px = 0.0
 
     def locate(self, found: Detections, frame: Frame, time_ns: int) -> tuple[list[Sighting], PointsPx]:
-        """Each detection's place in the first picture's pixels, and (4, 2) what the picture shows of them.
+        """Each detection's place in pixels of its segment's first picture, and (4, 2) what the picture shows of them.
 
         A sighting's `shared_sigma_m` is how far the way may have drifted since its segment began, in pixels.
         """
@@ -62,7 +61,6 @@ class ImageMotion:
         outline = _moved(self._first_from_image, np.array([
             [-0.5, -0.5], [width_px - 0.5, -0.5], [width_px - 0.5, height_px - 0.5], [-0.5, height_px - 0.5],
         ]))
-        self._rightmost_px = max(self._rightmost_px, float(outline[:, 0].max()))
         scale = float(np.sqrt(abs(np.linalg.det(self._first_from_image[:, :2]))))
         drift_px = _DRIFT_SHARE * self._way_px + self._guessed_px
         boxes = found.boxes_px.astype(np.float64)
@@ -124,7 +122,7 @@ class ImageMotion:
     def _begin_segment(self) -> None:
         self.segments += 1
         self._failures, self._way_px, self._guessed_px, self._step = 0, 0.0, 0.0, np.eye(2, 3)
-        self._first_from_image = np.array([[1.0, 0.0, np.ceil(self._rightmost_px) + 100_000.0], [0.0, 1.0, 0.0]])
+        self._first_from_image = np.eye(2, 3)
 
     def _look_anew(
         self, gray: ImageGray, thumbnail: Floats, boxes_px: Floats, shrink: float, here: PointsPx, places: PointsPx
@@ -186,7 +184,7 @@ def _similarity(here: PointsPx, places: PointsPx) -> tuple[Floats | None, Floats
     nothing = np.zeros(len(here), bool)
     if len(here) < _LEAST_INLIERS:
         return None, nothing
-    origin = places.mean(axis=0)  # far segments lie at large numbers
+    origin = places.mean(axis=0)  # a long way leads to large numbers
     spread = np.ptp(places, axis=0).max() / max(np.ptp(here, axis=0).max(), 1e-9)
     cv2.setRNGSeed(1)
     fit, kept = cv2.estimateAffinePartial2D(

@@ -4,13 +4,13 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.geometry.arrays import BoxesPx, Floats, PointsM
 from sorvolo.geometry.boxes import iou_matrix, nesting_matrix
-from sorvolo.survey.objects import Sighting
 from sorvolo.tracking.followed import Followed
 from sorvolo.tracking.motion import MOVES, log_density, predicted
 
 _SAME_BOX = 0.6  # overlap of two boxes from which they show one object, whatever their classes
+_LEAST_NESTED = 0.5  # overlap of boxes of two classes, one within the other, from which they show one object
 WITHIN = 0.9
 """Share of the smaller of two boxes of a class that lies in the other from which on they show one object: of 174 such
 pairs in validation pictures 4 were two."""
@@ -21,20 +21,21 @@ _LEAST_CLASS_FIT = 0.1
 _LEAST_VIEWS = 4  # of a mover whose velocity is to be trusted
 
 
-def frame_doubles(sightings: Sequence[Sighting]) -> dict[int, int]:
-    """Rows whose box shows what a stronger row shows: weaker row to stronger row.
+def frame_doubles(boxes_px: BoxesPx | Floats, labels: Sequence[str], scores: Floats) -> dict[int, int]:
+    """Rows whose box shows what a stronger row shows: weaker row to stronger row; (N, 4), N and N of one frame.
 
-    It overlaps that box, of whatever class, or, of the same class, lies within it or around it.
+    It overlaps that box, or lies within it or around it: of the same class always, of another one if it is not much
+    smaller, for a bag beside a person or a person in a car is a thing of its own.
     """
-    if len(sightings) < 2:
+    if len(labels) < 2:
         return {}
-    boxes = np.array([each.box_px for each in sightings], np.float64)
-    labels = np.array([each.label for each in sightings])
-    same = (iou_matrix(boxes, boxes) > _SAME_BOX) | (
-        (nesting_matrix(boxes, boxes) > WITHIN) & (labels[:, None] == labels[None])
-    )
+    boxes, names = np.asarray(boxes_px, np.float64), np.array(labels)
+    overlap = iou_matrix(boxes, boxes)
+    is_nested = nesting_matrix(boxes, boxes) > WITHIN
+    is_alike = (names[:, None] == names[None]) | (overlap > _LEAST_NESTED)
+    same = (overlap > _SAME_BOX) | (is_nested & is_alike)
     doubles: dict[int, int] = {}
-    order = np.argsort([-each.score for each in sightings], kind="stable")
+    order = np.argsort(-np.asarray(scores, np.float64), kind="stable")
     for place, row in enumerate(order):
         for stronger in order[:place]:
             if same[row, stronger] and int(stronger) not in doubles:
@@ -68,7 +69,10 @@ def neighbours(
 
 
 def double_of(followed: Followed, by_id: Mapping[int, Followed], reach_m: float) -> Followed | None:
-    """The track of the same object that ran beside this one: frames see one of both, never both."""
+    """The track of the same object that ran beside this one: frames see one of both, never both.
+
+    Of another class it must lie where there is no room for two: the detector takes it now for this, now for that.
+    """
     for neighbour, frames in followed.apart.items():
         other = by_id.get(neighbour)
         if other is None or followed.together.get(neighbour, 0) > _TOGETHER_SHARE * frames:
@@ -77,7 +81,8 @@ def double_of(followed: Followed, by_id: Mapping[int, Followed], reach_m: float)
         overlaps = apart_m < _OVERLAP * min(followed.sides_m[0], other.sides_m[0])
         if frames < (_FRAMES_OVERLAPPING if overlaps else _FRAMES_APART):
             continue
-        if apart_m < reach_m and _class_fit(followed, other) > _LEAST_CLASS_FIT:
+        is_alike = _class_fit(followed, other) > _LEAST_CLASS_FIT
+        if apart_m < reach_m and (is_alike or (overlaps and frames >= _FRAMES_APART)):
             return other
     return None
 

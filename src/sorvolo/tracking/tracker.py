@@ -82,15 +82,17 @@ class TrackUpdate:
 class Tracker:
     """Follows objects through a flight's frames, in order of time. Only `update` and `finish` change it.
 
+    Ids count from `first_id`; `next_id` is the next one that is free.
+
     Places are kept in a map that the sightings make; each frame's common error against it is found from the pattern of
     all objects (`common_shift`), so that GPS drift neither breaks tracks nor is averaged away as if it were noise.
     """
 
-    def __init__(self, settings: TrackerSettings | None = None) -> None:
+    def __init__(self, settings: TrackerSettings | None = None, *, first_id: int = 1) -> None:
         self._settings = settings or TrackerSettings()
         self._shift = CommonShift()
         self._followed: list[Followed] = []
-        self._next_id = 1
+        self.next_id = first_id
         self._time_ns: int | None = None
         self._shared_m = 0.0
         self._classes: list[str] = []
@@ -298,10 +300,10 @@ class Tracker:
         for index, row in enumerate(fresh):
             sighting = seen.sightings[row]
             followed = Followed(
-                self._next_id, motions.only(slice(index, index + 1)), sighting.time_ns, 0.0, sighting.time_ns,
+                self.next_id, motions.only(slice(index, index + 1)), sighting.time_ns, 0.0, sighting.time_ns,
                 sighting.time_ns, sighting,
             )
-            self._next_id += 1
+            self.next_id += 1
             self._record(followed, seen, row, 1.0)
             started.append(followed)
             ids[row] = followed.id
@@ -390,7 +392,8 @@ class _Seen:
         self.labels = [each.label for each in sightings]
         self.sides_m = np.array([each.size_m[0] for each in sightings])
         self.own_m2 = _own_covariances(sightings)
-        self.doubles = frame_doubles(sightings)
+        boxes_px = np.array([each.box_px for each in sightings]).reshape(-1, 4)
+        self.doubles = frame_doubles(boxes_px, self.labels, self.scores)
 
     def looks_of(self, row: int) -> Floats | None:
         """An appearance vector, if there is one."""
