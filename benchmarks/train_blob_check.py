@@ -7,6 +7,7 @@ uses. Boosted oblivious trees, written to src/sorvolo/change/blob_check.json.
 
 import argparse
 import json
+import shlex
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -53,6 +54,8 @@ def main() -> None:
     else:
         rows, answers, suites, sources = collect_all(options)
         command = f"--count {options.count} --sites {options.sites} --painted {options.painted} --seed {options.seed}"
+        if options.suites != list(SUITES):
+            command += " --suites " + shlex.join(options.suites)
         told = [f"{command}: {len(rows)} regions of {', '.join(sources)}"]
         if options.collect:
             np.savez_compressed(options.collect, rows=rows, answers=answers, suites=suites, told=told[0])
