@@ -65,6 +65,8 @@ def _checks(report: Mapping[str, Any]) -> str:
     for row in checks:
         for name, value in row["classes"].items():
             lines.setdefault(name, []).append((row["step"], value))
+    if list(lines.values()).count(lines["all classes"]) == len(lines) == 2:  # the mean over one class is that class
+        del lines["all classes"]
     plot = _plot("AP50 over steps", lines, low=0.0, high=1.0)
     if not plot:
         return ""
