@@ -1,7 +1,7 @@
 """Frames of a later flight to views compared with the map: aligned, resampled, searched for differences."""
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,7 +11,8 @@ from sorvolo.change.reference import ReferenceMap
 from sorvolo.change.robust import compare_robust
 from sorvolo.change.thesis import compare_thesis
 from sorvolo.change.tuning import FlightTuning
-from sorvolo.geometry.arrays import Anything, Boxes, Floats, ImageGray, ImageRGB, Mask, Matrix3, PointsM
+from sorvolo.change.witnesses import LEAST_SURENESS, Difference, believed
+from sorvolo.geometry.arrays import Anything, Boxes, ImageGray, ImageRGB, Mask, Matrix3, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.ground import footprint
@@ -29,19 +30,7 @@ from sorvolo.survey.mosaic import PlacedFrame, Status
 _LEAST_SIDE_PX = 480
 _KNOWN_ENOUGH = 0.1  # share of a frame on known ground: with less there is nothing to compare
 _WITNESSES = 2  # earlier pictures asked about a difference: one from each side
-_NEAR_PX = 9  # what leans a little another way lies a few pixels beside
-_SURE, _WEAK = 0.5, 0.2  # what one picture surely shows the others must show at least weakly
-_SHOWN, _SEEN = 0.3, 0.7  # shares of a difference that another picture shows, and must see to be asked
-_MAP = 0  # the first of the opinions
 _ALL_CHANGED = 0.5  # share of a view: more is snow, a flood or another place, not a list of changes
-
-
-class Difference(NamedTuple):
-    """What one comparison of two aligned pictures says: mask (0 or 255), boxes (N, 4), scores (N,) in 0 to 1."""
-
-    mask: ImageGray
-    boxes: Boxes
-    scores: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,47 +178,22 @@ class ViewMaker:
         return self._site_grid.grid_from_site_affine(centre[:2] / centre[2], 50.0) @ site_from_image
 
     def _attested(self, found: Difference, aligned: Aligned, query: Anything, valid: Mask) -> Difference:
-        """What differs from the map, or from one of the earlier pictures taken nearest to this one, and is believed.
-
-        One of them must show it surely, and all earlier pictures that see its place must show it as well, at least
-        weakly; what the map hardly shows needs another picture that does.
-        """
+        """What differs from the map or from one of the earlier pictures taken nearest, as far as they bear it out."""
         assert self._pictures is not None
-        opinions = [(found, valid)]
         height, width = valid.shape
+        earlier = []
         for picture, sees in self._pictures.seen_from(
             aligned.site_from_image, aligned.camera_m, width, height, _WITNESSES
         ):
             sees &= self._lens_sees
-            opinions.append((self._difference(as_bgr(picture), query, sees, learns=False), sees))
-        window = np.ones((_NEAR_PX, _NEAR_PX), np.uint8)
-        near = [cv2.dilate(each.mask, window) > 0 for each, _ in opinions]
-        mask = np.zeros_like(found.mask)
-        boxes, scores = [], []
-        for own, (opinion, _) in enumerate(opinions):
-            for k in np.flatnonzero(opinion.scores >= _SURE):
-                x, y, w, h = opinion.boxes[k]
-                part = np.s_[y:y + h, x:x + w]
-                shown = (opinion.mask[part] > 0) & valid[part]
-                if np.count_nonzero(shown & (mask[part] > 0)) > _SHOWN * np.count_nonzero(shown) or not shown.any():
-                    continue  # believed already, or on ground that the map does not know
-                answers = {
-                    other: np.count_nonzero(shown & near[other][part]) > _SHOWN * np.count_nonzero(shown)
-                    for other, (_, sees) in enumerate(opinions)
-                    if other != own and np.count_nonzero(shown & sees[part]) > _SEEN * np.count_nonzero(shown)
-                }
-                by_map = answers.pop(_MAP, own == _MAP)
-                if all(answers.values()) and (by_map or answers):
-                    mask[part] |= shown.view(np.uint8) * np.uint8(255)
-                    boxes.append(opinion.boxes[k])
-                    scores.append(opinion.scores[k])
-        return Difference(mask, np.array(boxes, np.int64).reshape(-1, 4), np.array(scores, np.float64))
+            earlier.append((self._difference(as_bgr(picture), query, sees, learns=False), sees))
+        return believed((found, valid), earlier)
 
     def _difference(self, reference: Anything, query: Anything, valid: Mask, *, learns: bool) -> Difference:
         if self._tuning is None:
             thesis = compare_thesis(reference, query, valid)
             return Difference(thesis.mask, thesis.boxes, np.full(len(thesis.boxes), 0.5))
-        found = compare_robust(reference, query, valid, replace(self._tuning.settings(), least_score=_WEAK))
+        found = compare_robust(reference, query, valid, replace(self._tuning.settings(), least_score=LEAST_SURENESS))
         if learns:
             self._tuning.observe(found)
         return Difference(found.mask, found.boxes, found.scores)
