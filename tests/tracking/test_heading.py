@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sorvolo.tracking.heading import Heading, HeadingFromMotion
+from sorvolo.tracking.heading import CompassError, Heading, HeadingFromMotion
 
 _M_PER_PX = 0.05
 
@@ -74,3 +74,25 @@ def test_hovering_tells_nothing_and_a_cut_begins_anew() -> None:
     assert last.sigma_deg < 5
     finder.lose()
     assert finder.add(6.0, _outline(0.0, np.zeros(2), 0.0, np.zeros(2)), np.array([0.0, 30.0])).sigma_deg == np.inf
+
+
+@pytest.mark.parametrize("off_deg", [-4.0, 0.0, 3.0])
+def test_a_wrong_compass_shows_in_the_way_that_the_ground_takes(off_deg: float) -> None:
+    """Of the slip that the heading makes a tracker's shift follows half, with noise."""
+    compass, random = CompassError(), np.random.default_rng(4)
+    camera_m, shift_m = np.zeros(2), np.zeros(2)
+    for frame in range(150):
+        step_m = 0.2 * 8.0 * np.array([np.cos(0.02 * frame), np.sin(0.02 * frame)])
+        camera_m = camera_m + step_m
+        left_rad = np.radians(off_deg - compass.clockwise_deg)
+        shift_m = shift_m + 0.5 * left_rad * np.array([-step_m[1], step_m[0]])
+        compass.add(0.2 * frame, camera_m, shift_m + random.normal(0, 0.05, 2))
+    assert abs(compass.clockwise_deg - off_deg) < max(0.5, 0.6 * abs(off_deg))
+    assert compass.clockwise_deg * off_deg >= 0
+
+
+def test_hovering_says_nothing_of_the_compass() -> None:
+    compass, random = CompassError(), np.random.default_rng(5)
+    for frame in range(200):
+        compass.add(0.2 * frame, random.normal(0, 0.3, 2), random.normal(0, 1.0, 2))
+    assert abs(compass.clockwise_deg) < 0.5

@@ -9,17 +9,18 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.ground import footprint
-from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
+from sorvolo.geometry.pose import Pose, rotation_from_vector, site_from_gimbal_rotation
 from sorvolo.missions.flight_setup import FlightSetup, new_site
 from sorvolo.survey.flight import CameraPrior, Frame, Notice, Site
 from sorvolo.survey.objects import Detections, Sighting, Track
-from sorvolo.tracking.heading import HeadingFromMotion
+from sorvolo.tracking.heading import CompassError, HeadingFromMotion
 from sorvolo.tracking.image_motion import ImageMotion
 from sorvolo.tracking.locate import locate
 from sorvolo.tracking.tracker import IN_PICTURES, Tracker, TrackerSettings, TrackUpdate
 
 _MOST_DRONE_PLACES = 200_000
 _GIMBAL_TILT_SIGMA_DEG = 1.0  # a mapping doubts gimbals more, since the pictures tell it better; here nothing else does
+_COMPASS_TOLD_DEG = 2.0
 _OF_MAPS = ("no_telemetry", "ground_unknown", "height_unknown")  # notices that say what a mapping does about it
 
 
@@ -80,6 +81,7 @@ class GroundPlaces:
         self._unlocated: Counter[str] = Counter()
         knows_heading = setup.track is None or setup.track.attitude != "none"
         self._turning = None if knows_heading else _Turning()
+        self._compass = CompassError()
         self._path: list[Floats] = []
         self._site = new_site(setup, setup.source.name, 1.0, 0.0)
 
@@ -102,6 +104,9 @@ class GroundPlaces:
         prior = self._prior(frame)
         if self._turning is not None:
             prior = self._turning.take(frame, time_ns, found, prior)
+        else:
+            site_from_read = rotation_from_vector(np.array([0.0, 0.0, np.radians(self._compass.clockwise_deg)]))
+            prior = replace(prior, rotation=site_from_read @ prior.rotation)
         camera = self._setup.source.camera
         sightings, unlocated = locate(
             found, frame.index, frame.name, time_ns, camera.camera, prior, focal_sigma=camera.focal_sigma
@@ -112,6 +117,8 @@ class GroundPlaces:
         update = self._tracker.update(
             known, time_ns=time_ns, footprint_m=outline_m if np.isfinite(outline_m).all() else None
         )
+        if prior.knows_place and self._turning is None:
+            self._compass.add(time_ns / 1e9, prior.position_m[:2], self._tracker.shift_m)
         if prior.knows_place and len(self._path) < _MOST_DRONE_PLACES:
             self._path.append(prior.position_m[:2])
         return _taken(sightings, update)
@@ -130,9 +137,13 @@ class GroundPlaces:
         words = {"gimbal": "its gimbal's angles", "body": "the aircraft's angles, the camera taken as fixed downwards"}
         nadir = "no angles: the camera taken as looking straight down, its heading found from the pictures' motion"
         how = words.get(track.attitude, nadir) if track else ""
+        compass_deg = self._compass.clockwise_deg
+        side = "clockwise" if compass_deg > 0 else "counter-clockwise"
+        off = f"the compass reads about {abs(compass_deg):.0f} degrees too far {side}, by what stands: taken off"
+        compass = (Notice("compass_off", 1, off),) if abs(compass_deg) > _COMPASS_TOLD_DEG else ()
         text = f"places come from the telemetry's position, height ({track.height_words if track else ''}) and {how}"
         return (
-            *self._setup.notices, Notice("placed_by", 1, text),
+            *self._setup.notices, Notice("placed_by", 1, text), *compass,
             *(Notice("not_placed", count, f"{count} detections have no place on the ground: {reason}")
               for reason, count in self._unlocated.most_common()),
         )

@@ -101,7 +101,7 @@ class WatchRun:
         with log.stage("hand over"):
             self._files.add(SeenFrame(
                 frame, time_ns, found, taken.sightings, taken.track_ids, frozenset(each.id for each in confirmed),
-                f"frame {frame.name}: {count_words(counts)}", taken.segment,
+                f"frame {frame.name}, counted so far: {count_words(counts)}", taken.segment,
             ))
             seen_ids = set(taken.track_ids)
             seen = [track for track in confirmed if track.id in seen_ids]

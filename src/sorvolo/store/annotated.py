@@ -31,7 +31,7 @@ def annotated(
     """
     drawn = image.copy()
     size = max(image.shape[:2]) / 1280
-    strong, letters = max(2, round(2 * size)), max(0.4, 0.5 * size)
+    strong, thin, letters = max(2, round(2 * size)), max(1, round(size)), max(0.4, 0.5 * size)
     written: list[_Bar] = []
     if headline:
         written.append(_write(drawn, headline, [(0, 0)], 1.2 * letters, (255, 255, 255), written))
@@ -39,7 +39,7 @@ def annotated(
     for row in sorted(range(len(boxes_px)), key=lambda each: counted[each]):
         colour = _COLOURS[labels[row] % len(_COLOURS)]
         left, top, right, bottom = (round(float(edge)) for edge in boxes_px[row])
-        cv2.rectangle(drawn, (left, top), (right, bottom), colour, strong if counted[row] else 1, cv2.LINE_AA)
+        cv2.rectangle(drawn, (left, top), (right, bottom), colour, strong if counted[row] else thin, cv2.LINE_AA)
         if words[row]:
             above, below = top - strong - 6, bottom + strong + round(30 * letters)
             corners = [(left, above), (left, below), (right + strong + 2, bottom)]

@@ -1,4 +1,4 @@
-"""Where a camera's top points when telemetry does not say: the way the pictures show, laid over that of the fixes."""
+"""Where a camera's top points: from the pictures' way over the ground without a compass, and how wrong a compass is."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -10,6 +10,9 @@ from sorvolo.geometry.arrays import Floats, PointsPx
 _WINDOW_S = 20.0
 _LEAST_M = 6.0  # of way, rms: less is within the fixes' own errors
 _LEAST_SIGMA_DEG = 4.0
+_STRETCH_S, _LEAST_WAY_M = 2.0, 15.0  # over which a compass is checked
+_GAIN_PER_S, _LEARNS_S = 0.3, 15.0  # of what is seen, and how long: later the way back over the map moves the shift
+_MOST_DEG, _BROKEN_S = 15.0, 10.0
 _STEPS_PER_ERROR = 8.0  # neighbouring fixes, and neighbouring frames' tilts, err alike
 
 
@@ -65,3 +68,40 @@ class HeadingFromMotion:
         sigma_deg = float(np.degrees(np.arctan2(miss_m, reach_m * np.sqrt(count))))
         heading_deg = float(np.degrees(-np.angle(turn) + self._turned_rad)) % 360
         return Heading(heading_deg, max(sigma_deg, _LEAST_SIGMA_DEG) if reach_m > 2 * miss_m else float("inf"))
+
+
+class CompassError:
+    """How wrong a compass is, from what the ground seems to do while the camera flies over it; only `add` changes it.
+
+    Places laid with a heading that is wrong by an angle are turned about the camera; as it flies on, all that stands
+    seems to move sideways, by this angle times its way. A tracker takes that for the frames' common shift, of which it
+    follows a part: so the shift's way is held against the camera's and what they agree on is taken off bit by bit, less
+    and less: on the way back over a map that was begun with the wrong heading the shift says nothing of the compass.
+    """
+
+    def __init__(self) -> None:
+        self.clockwise_deg, self._learnt_s = 0.0, 0.0
+        self._points: deque[tuple[float, Floats, Floats]] = deque()
+
+    def add(self, time_s: float, camera_m: Floats, shift_m: Floats) -> float:
+        """Take in one frame: where its camera was and the shift of its sightings, (2,) east and north.
+
+        Returns by how much the compass reads too far clockwise, as known by now, in degrees.
+        """
+        if self._points and not 0 <= time_s - self._points[-1][0] < _BROKEN_S:
+            self._points.clear()
+        self._points.append((time_s, camera_m, shift_m.copy()))
+        _, camera_before_m, shift_before_m = self._points[0]
+        way_m, slip_m = camera_m - camera_before_m, shift_m - shift_before_m
+        if time_s - self._points[0][0] < _STRETCH_S:
+            return self.clockwise_deg
+        self._points.popleft()
+        way_m2 = float(way_m @ way_m)
+        # against the fixes' own wander a short way says little
+        seen_rad = float(way_m[0] * slip_m[1] - way_m[1] * slip_m[0]) / (way_m2 + _LEAST_WAY_M**2)
+        frame_s = time_s - self._points[-2][0] if len(self._points) > 1 else 0.0
+        gain = _GAIN_PER_S * min(frame_s, 1.0) * float(np.exp(-self._learnt_s / _LEARNS_S))
+        self._learnt_s += frame_s * way_m2 / (way_m2 + _LEAST_WAY_M**2)
+        change_deg = gain * float(np.degrees(seen_rad))
+        self.clockwise_deg = float(np.clip(self.clockwise_deg + change_deg, -_MOST_DEG, _MOST_DEG))
+        return self.clockwise_deg
