@@ -28,7 +28,6 @@ CROWDING = 3
 EAGER = RegionSettings(reach_px=1, least_difference=6.0, activity_factor=1.0, strong_factor=1.25)
 SITE_SEED, PAIRS_OF_A_SITE = 1000, 14
 TREES, DEPTH, RATE, BINS = 300, 4, 0.1, 48
-CAUTION = 0.8  # log-odds taken off: what is alarmed for nothing is worse than what one view misses
 
 
 def main() -> None:
@@ -187,7 +186,7 @@ def train(
         thresholds.append([float(f"{value:.6g}") for value in tree_thresholds])
         leaves.append([round(float(value), 4) for value in values])
     trees = {"features": features, "thresholds": thresholds, "leaves": leaves}
-    return {"names": list(FEATURES), "prior": prior - CAUTION, **trees}
+    return {"names": list(FEATURES), "prior": prior, **trees}
 
 
 if __name__ == "__main__":

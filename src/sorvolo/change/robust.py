@@ -33,7 +33,7 @@ _SCRATCH = Scratch()
 class RobustSettings:
     """How sure a change must be, and what is looked at; the rest each pair of pictures sets itself."""
 
-    least_score: float = 0.5
+    least_score: float = 0.69  # for a pair on its own; where several views vote less will do
     settles: bool = True  # take out the last pixels of misalignment
     regions: RegionSettings = field(default_factory=RegionSettings)
 
