@@ -34,6 +34,7 @@ _LASTING = 0.3  # share of all views that must flag a cell
 _SHOWS = 0.12  # share of a change's cells that a view must flag: from above a person covers few of them
 _PICTURES_A_VIEW = 6  # cut anew at most, which bounds the time a view takes
 _MOST_SEEDS = 256
+_FEW_VIEWS_SCORE = 0.6  # of what fewer than k views show: two views of a tree often agree
 _MOVED_HEIGHTS = 0.01  # the camera's way, in flying heights, after which a view is a new witness
 _ALL_CHANGED = 0.5  # share of the frame beyond which nothing in it can be followed
 _STANDS_S = 2.0  # what the same ground shows for so long stands there, however unsteady its blobs look
@@ -466,9 +467,11 @@ class EvidenceMap:
                 cells[part] &= ~piece
         if np.count_nonzero(cells) < least_cells:
             return
-        seed.number = self._next_number()
         for _ in range(int(seen[cells].max()) - seed.asked):
             seed.miss(1.0)
+        if cells is late and seed.views < settings.k and seed.score < _FEW_VIEWS_SCORE:
+            return
+        seed.number = self._next_number()
         self._grid.own(seed.cells, cells, seed.number)
         self._found[seed.number] = seed
 
