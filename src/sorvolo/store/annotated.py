@@ -32,18 +32,21 @@ def annotated(
     drawn = image.copy()
     size = max(image.shape[:2]) / 1280
     strong, thin, letters = max(2, round(2 * size)), max(1, round(size)), max(0.4, 0.5 * size)
+    # the strong ones last, and all words after all boxes, so that nothing hides them
+    order = sorted(range(len(boxes_px)), key=lambda each: counted[each])
+    edges = [tuple(round(float(edge)) for edge in box) for box in boxes_px]
+    colours = [_COLOURS[label % len(_COLOURS)] for label in labels]
+    for row in order:
+        thickness = strong if counted[row] else thin
+        cv2.rectangle(drawn, edges[row][:2], edges[row][2:], colours[row], thickness, cv2.LINE_AA)
     written: list[_Bar] = []
     if headline:
         written.append(_write(drawn, headline, [(0, 0)], 1.2 * letters, (255, 255, 255), written))
-    # the strong ones last, so that nothing hides them
-    for row in sorted(range(len(boxes_px)), key=lambda each: counted[each]):
-        colour = _COLOURS[labels[row] % len(_COLOURS)]
-        left, top, right, bottom = (round(float(edge)) for edge in boxes_px[row])
-        cv2.rectangle(drawn, (left, top), (right, bottom), colour, strong if counted[row] else thin, cv2.LINE_AA)
-        if words[row]:
-            above, below = top - strong - 6, bottom + strong + round(30 * letters)
-            corners = [(left, above), (left, below), (right + strong + 2, bottom)]
-            written.append(_write(drawn, words[row], corners, letters, colour, written))
+    for row in (each for each in order if words[each]):
+        left, top, right, bottom = edges[row]
+        above, below = top - strong - 6, bottom + strong + round(30 * letters)
+        corners = [(left, above), (left, below), (right + strong + 2, bottom)]
+        written.append(_write(drawn, words[row], corners, letters, colours[row], written))
     return drawn
 
 
