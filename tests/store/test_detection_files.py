@@ -25,7 +25,6 @@ from sorvolo.store.detection_files import (
     tracks_geojson,
     write_crop,
     write_detections_geojson,
-    write_tracks,
 )
 from sorvolo.survey.flight import Frame, Site
 from sorvolo.survey.objects import Sighting, Track
@@ -124,8 +123,7 @@ def test_tracks_carry_path_and_crop(tmp_path: Path) -> None:
     assert told["first_seen"] == "2026-05-28T20:26:40.000000Z"
     assert len(told["path"]["coordinates"]) == len(told["path"]["times"]) == 2
     assert told["path"]["coordinates"][1] == first["geometry"]["coordinates"]
-    write_tracks(tmp_path, [_track()], _LOCAL, {})
-    local = json.loads((tmp_path / "tracks.geojson").read_text())
+    local = tracks_geojson([_track()], _LOCAL, {})
     assert local["crs"] is None and local["features"][0]["geometry"]["coordinates"] == [100.0, 200.0]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, TimesNs
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes, remove_leftovers, writing
-from sorvolo.store.exports import geojson_bytes, json_bytes, longitude_latitude, plain_json, rounded, utc_text
+from sorvolo.store.exports import json_bytes, longitude_latitude, plain_json, rounded, utc_text
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.flight import Frame, Site
 from sorvolo.survey.objects import Sighting, Track
@@ -156,11 +156,6 @@ def tracks_geojson(tracks: Iterable[Track], site: Site, crops: Mapping[int, str]
         })
     collection["features"] = features
     return collection
-
-
-def write_tracks(folder: Path, tracks: Iterable[Track], site: Site, crops: Mapping[int, str]) -> None:
-    """Replace `tracks.geojson`: readers see the old one or the new one."""
-    atomic_write_bytes(folder / TRACKS, geojson_bytes(tracks_geojson(tracks, site, crops)), durable=False)
 
 
 def crop_around(image: ImageRGB, box_px: Anything | Sequence[float], *, margin: float = 0.6) -> ImageRGB:
