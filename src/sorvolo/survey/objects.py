@@ -64,8 +64,8 @@ class Sighting:
     `position_m` (2,) east, north in the site frame with `covariance_m2` (2, 2). Of a flight that nothing places, one
     unit is a pixel of its segment's first frame, with the camera's motion taken out (as a local Site). `shared_sigma_m`
     is the part of the error that all sightings of a frame, and of its neighbours in time, have in common (GPS,
-    heading), within `covariance_m2`. `size_m` (2,) is the longer and the shorter side of the box on the ground. `box_px`
-    (4,) as BoxesPx.
+    heading), within `covariance_m2`. `size_m` (2,) is the longer and the shorter side of the box on the ground.
+    `box_px` (4,) as BoxesPx.
     """
 
     frame_index: int
