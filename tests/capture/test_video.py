@@ -209,7 +209,7 @@ def test_damage_in_the_middle_does_not_end_the_video(tmp_path: Path) -> None:
     source = open_video(path)
     frames = all_frames(source)
     assert len(frames) > 40 and frames[-1].time_ns > 2.2e9
-    assert codes(source) & {"decode_error", "damaged_frame"}
+    assert codes(source) & {"decode_error", "damaged_frame", "backward_pts"}  # whichever of them the damage hit
 
 
 def test_a_frame_of_another_size_is_lost_with_its_reason(tmp_path: Path) -> None:

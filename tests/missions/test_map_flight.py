@@ -100,7 +100,8 @@ def test_a_video_that_looks_ahead_by_half_a_right_angle(oblique: Path, tmp_path:
     assert shape_m < 2 * _M_PER_PX and absolute_m < 0.4  # metres; the far corners lie 60 m off
     run_map(tmp_path / "blind", flight / "flight1.mp4", "--telemetry", flight / "other" / "flight1.gpx")
     (warning,) = (each for each in report_of(tmp_path / "blind", "flight1")["warnings"] if "straight down" in each)
-    assert "4" in warning and "angles" in warning  # some 45 degrees
+    told_deg = float(warning.split(" deg")[0].rpartition(" ")[2])
+    assert told_deg == pytest.approx(45, abs=10) and "angles" in warning
 
 
 def test_the_report_counts_every_second_up_to_itself(filmed: Path, tmp_path: Path) -> None:
