@@ -7,8 +7,9 @@ import pytest
 from toy_models import draw, onnx, rectangle_model, square_model
 
 from sorvolo.detection.detector import Detector
+from sorvolo.detection.models import find_model
 from sorvolo.detection.quantise import quantise
-from sorvolo.errors import InputError
+from sorvolo.errors import InputError, SettingsError
 from sorvolo.missions.model_files import quantise_model
 from sorvolo.store.images import jpeg_from_image
 
@@ -109,3 +110,28 @@ def test_convolutions_of_the_head_before_a_fully_connected_layer_are_whole_numbe
     expected, found = whole.detect(picture, least_score=0.1), small.detect(picture, least_score=0.1)
     np.testing.assert_allclose(np.sort(found.scores), np.sort(expected.scores), atol=0.05)
     assert len(found) >= 2
+
+
+def test_parts_that_are_named_stay_in_float(model: Path) -> None:
+    packaged = find_model("default")
+    whole = quantise(packaged, _pictures(8))
+    backbone = quantise(packaged, _pictures(8), float_parts=("neck", "proposals"))
+    assert 20 < backbone.convolutions < whole.convolutions
+    assert {weight.data_type for weight in _weights(backbone.model, "neck")} == {onnx.TensorProto.FLOAT}
+    with pytest.raises(SettingsError, match=r"no part tail; it has backbone, head, neck, proposals"):
+        quantise(packaged, _pictures(8), float_parts=("tail",))
+    with pytest.raises(SettingsError, match="no part neck"):
+        quantise(model, _pictures(8), float_parts=("neck",))
+
+
+def _weights(model: bytes, part: str) -> list[onnx.TensorProto]:
+    """What the part's convolutions are given besides features, through a DequantizeLinear or not."""
+    graph = onnx.load_model_from_string(model).graph
+    values = {each.name: each for each in graph.initializer}
+    makers = {node.output[0]: node for node in graph.node}
+    found = []
+    for node in graph.node:
+        if node.op_type == "Conv" and node.name.startswith(f"/{part}/"):
+            name = node.input[1]
+            found.append(values[makers[name].input[0] if name in makers else name])
+    return found

@@ -159,6 +159,10 @@ def quantise(
     pictures: Annotated[Path, typer.Option(help="Folder of pictures such as it will see, all lights and grounds.")],
     out: Annotated[Path, typer.Option(help="The .onnx file to write.")],
     most: Annotated[int, typer.Option(min=8, help="Use at most so many of the pictures.")] = 64,
+    float_parts: Annotated[
+        list[str] | None,
+        typer.Option("--float", help="Leave a part in float: backbone, neck, proposals. Can be repeated."),
+    ] = None,
 ) -> None:
     """Make a model that is smaller and quicker, in whole numbers of eight bits. Measure both before you trust it.
 
@@ -166,7 +170,7 @@ def quantise(
 
     Example: sorvolo models quantise mine.onnx --pictures flights/ --out mine-int8.onnx
     """
-    made = quantise_model(find_model(model), pictures, out, most=most)
+    made = quantise_model(find_model(model), pictures, out, most=most, float_parts=float_parts or ())
     typer.echo(
         f"{out}: {made.convolutions} of {made.of} convolutions in eight bits, {len(made.model) / 1e6:.1f} MB; "
         "compare it with `sorvolo evaluate detector`"

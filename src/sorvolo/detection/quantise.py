@@ -3,7 +3,7 @@
 import json
 import logging
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,15 +36,16 @@ class Quantised:
     of: int
 
 
-def quantise(path: Path, pictures: Iterable[ImageRGB]) -> Quantised:
+def quantise(path: Path, pictures: Iterable[ImageRGB], *, float_parts: Sequence[str] = ()) -> Quantised:
     """The model file `path` with its convolutions in int8, by the same contract (its metadata says so).
 
     `pictures` (H, W, 3) are what it will have to see: all lights and grounds, some dozens. Weights are scaled per
     channel, activations by the least and the greatest value that occurs (static quantisation, Q and DQ nodes:
     Jacob et al. 2018). In float remain the last convolutions of each branch, which say how likely and where, and all
-    that handles boxes. Whether it is good enough must be measured: `sorvolo evaluate detector` on both.
-    Raises InputError for a file that is no model of ours or is in eight bits already and for too few pictures,
-    SettingsError where the package onnx is not installed.
+    that handles boxes, and the network's parts that `float_parts` names ("backbone", "neck", "proposals"): what is
+    narrow gains little speed and loses most. Whether it is good enough must be measured: `sorvolo evaluate detector`
+    on both. Raises InputError for a file that is no model of ours or is in eight bits already and for too few
+    pictures, SettingsError where the package onnx is not installed and for a part that the model does not have.
     """
     try:
         import onnx
@@ -58,7 +59,11 @@ def quantise(path: Path, pictures: Iterable[ImageRGB]) -> Quantised:
         raise InputError(f"{path} is in eight bits already; give the model that it was made from")
     model = onnx.load_model(path)
     _prepare(model)
-    chosen = _quantisable(model)
+    parts = {node.name.split("/")[1] for node in model.graph.node if node.name.startswith("/")}
+    if unknown := [each for each in float_parts if each not in parts]:
+        there = ", ".join(sorted(parts & {"backbone", "neck", "proposals", "head"}))
+        raise SettingsError(f"{path} has no part {', '.join(unknown)}; it has {there}")
+    chosen = [name for name in _quantisable(model) if name.split("/")[1:2] not in [[each] for each in float_parts]]
     if not chosen:
         raise InputError(f"{path} has no convolutions that lead to others: eight bits would gain nothing")
     samples = _Samples(session, pictures)

@@ -3,7 +3,7 @@
 import json
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -64,10 +64,13 @@ def fetch_model(source: str, sha256: str, *, name: str = "") -> InstalledModel:
     return installed_model(own)
 
 
-def quantise_model(model: Path, pictures: Path, out: Path, *, most: int) -> Quantised:
+def quantise_model(
+    model: Path, pictures: Path, out: Path, *, most: int, float_parts: Sequence[str] = ()
+) -> Quantised:
     """Write `model` in eight bits to `out`, its ranges from at most `most` pictures of a folder, evenly chosen.
 
-    Raises InputError for a folder without pictures and as `quantise` does, StoreError where `out` cannot be written.
+    `float_parts` is for `quantise`, which raises what is raised, besides InputError for a folder without pictures and
+    StoreError where `out` cannot be written.
     """
     if out.suffix.lower() != ".onnx":
         raise SettingsError(f"--out {out}: a model's file ends in .onnx")
@@ -78,7 +81,7 @@ def quantise_model(model: Path, pictures: Path, out: Path, *, most: int) -> Quan
         raise InputError(f"there are no pictures in {pictures}; needed are {', '.join(sorted(PHOTO_SUFFIXES))}")
     count = min(most, len(paths))
     chosen = [paths[index * len(paths) // count] for index in range(count)]
-    result = quantise(model, _pictures(chosen))
+    result = quantise(model, _pictures(chosen), float_parts=float_parts)
     atomic_write_bytes(out, result.model)
     return result
 
