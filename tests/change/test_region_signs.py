@@ -3,23 +3,10 @@
 import cv2
 import numpy as np
 import pytest
+from sensor_noise import camera
 
 from sorvolo.change.blobs import FEATURES
 from sorvolo.change.robust import RobustSettings, compare_robust, examine
-from sorvolo.simulation.canvas import Area
-from sorvolo.simulation.ground import GroundKind, paint_ground
-
-
-@pytest.fixture(scope="module")
-def ground() -> np.ndarray:
-    """A piece of dirt road, 480 x 360 px."""
-    raster = paint_ground(GroundKind.DIRT, Area(-12.0, -9.0, 12.0, 9.0), 0.05, np.random.default_rng(3)).raster
-    return np.ascontiguousarray(raster.rgb[..., ::-1])
-
-
-def camera(image: np.ndarray, seed: int) -> np.ndarray:
-    noise = np.random.default_rng(seed).normal(0, 2, image.shape)
-    return np.clip(image + noise, 0, 255).astype(np.uint8)
 
 
 def signs(reference: np.ndarray, query: np.ndarray) -> dict[str, float]:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sensor_noise import camera
 
 from sorvolo import kernels
 from sorvolo.change.blob_check import Trees, how_sure
@@ -14,20 +15,6 @@ from sorvolo.change.settling import settle
 from sorvolo.change.tuning import FlightTuning
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.kernels import reference_robust
-from sorvolo.simulation.canvas import Area
-from sorvolo.simulation.ground import GroundKind, paint_ground
-
-
-@pytest.fixture(scope="module")
-def ground() -> np.ndarray:
-    """A piece of dirt road, 480 x 360 px."""
-    raster = paint_ground(GroundKind.DIRT, Area(-12.0, -9.0, 12.0, 9.0), 0.05, np.random.default_rng(3)).raster
-    return np.ascontiguousarray(raster.rgb[..., ::-1])
-
-
-def camera(image: np.ndarray, seed: int) -> np.ndarray:
-    noise = np.random.default_rng(seed).normal(0, 2, image.shape)
-    return np.clip(image + noise, 0, 255).astype(np.uint8)
 
 
 def with_box(image: np.ndarray, colour: tuple[int, int, int] = (190, 60, 40)) -> np.ndarray:

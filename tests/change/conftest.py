@@ -1,0 +1,14 @@
+"""The ground on which pictures are compared."""
+
+import numpy as np
+import pytest
+
+from sorvolo.simulation.canvas import Area
+from sorvolo.simulation.ground import GroundKind, paint_ground
+
+
+@pytest.fixture(scope="module")
+def ground() -> np.ndarray:
+    """A piece of dirt road, 480 x 360 px, BGR."""
+    raster = paint_ground(GroundKind.DIRT, Area(-12.0, -9.0, 12.0, 9.0), 0.05, np.random.default_rng(3)).raster
+    return np.ascontiguousarray(raster.rgb[..., ::-1])
