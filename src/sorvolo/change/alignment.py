@@ -123,9 +123,7 @@ class Aligner:
                 continue
             self._remember(time_ns, pose, prior, site_from_small, small_camera)
             self._misses = 0
-            # centres of pixels lie half a pixel inside: small = (full + 1/2) s - 1/2
-            sx, sy = size[0] / image.shape[1], size[1] / image.shape[0]
-            small_from_full = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
+            small_from_full = _resized(size[0] / image.shape[1], size[1] / image.shape[0])
             return Aligned(site_from_small @ small_from_full, pose.translation_m, residual_px / scale, followed)
         is_outside = share_known() < self._settings.least_known
         reason = f"only {share_known():.0%} of it lies on the map" if is_outside else worst.reason
@@ -229,8 +227,7 @@ class Aligner:
         small = new.camera.resized(max(16, new.camera.width_px // 4), max(16, new.camera.height_px // 4))
         size = small.width_px, small.height_px
         step_x, step_y = new.camera.width_px / size[0], new.camera.height_px / size[1]
-        image_from_small = np.array([[step_x, 0, (step_x - 1) / 2], [0, step_y, (step_y - 1) / 2], [0, 0, 1.0]])
-        seen = self._seen(site_from_image @ image_from_small, small)
+        seen = self._seen(site_from_image @ _resized(step_x, step_y), small)
         if seen is None or seen[1].mean() < self._settings.least_known:
             return site_from_image
         old = normalised(*seen).astype(np.float32)
@@ -327,6 +324,11 @@ class Aligner:
             return NotAligned("its points fit the map badly", residual_px)
         fit: Matrix3 = guess @ np.linalg.inv(found.new_from_old)
         return _stiffened(fit, found, guess, new.camera), residual_px
+
+
+def _resized(x: float, y: float) -> Matrix3:
+    """(3, 3) from pixels to those of the picture made x and y times as large: to = (from + 1/2) x - 1/2."""
+    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
 
 
 def _stiffened(site_from_image: Matrix3, link: Link, site_from_old: Matrix3, camera: Camera) -> Matrix3:
