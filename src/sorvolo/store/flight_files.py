@@ -99,7 +99,8 @@ _SENSOR_WIDTH_MM = 6.3  # what a small drone's 1/2.3 inch sensor measures
 def video_writer(
     path: Path, size_px: tuple[int, int], fps: float, started_ns: int, crf: int
 ) -> Iterator[Callable[[ImageRGB], None]]:
-    """Write H.264 in MP4 image by image, with one thread, so that the same images give the same bytes.
+    """Write H.264 in MP4 image by image, with one thread and without weighted prediction (x264's choice of
+    weights is not the same in every run), so that the same images give the same bytes.
 
     Frame i has exactly the time i / fps. The start is the file's creation time, as drones write it. Raises
     StoreError when the disk is full or the folder cannot be written.
@@ -113,7 +114,9 @@ def video_writer(
         stream.width, stream.height, stream.pix_fmt = *size_px, "yuv420p"
         stream.codec_context.thread_count = 1
         stream.codec_context.time_base = 1 / rate
-        stream.options = {"crf": str(crf), "preset": "veryfast", "threads": "1", "flags": "+bitexact"}
+        stream.options = {
+            "crf": str(crf), "preset": "veryfast", "threads": "1", "weightp": "none", "flags": "+bitexact",
+        }
         count = 0
 
         def write(image: ImageRGB) -> None:
