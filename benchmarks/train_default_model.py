@@ -34,7 +34,7 @@ from sorvolo.training.presets import fast
 from sorvolo.training.samples import Augmentation, Sample, Share
 from sorvolo.training.weights import load_lite0
 
-SIMULATED_SEED, SIMULATED_PICTURES = 1, 1400
+SIMULATED_SEED, SIMULATED_PICTURES = 1, 1800
 STEEP_DEG = 75.0  # from so many degrees below the horizon a picture has no up and down
 SETTLING = 12  # batches by which the norms of a started model are settled
 
@@ -114,8 +114,8 @@ def training_shares(data: Path, out: Path) -> list[Share]:
     made = in_order(read_dataset(simulated))
     thermal = hituav(data)["train"]
     return [
-        Share(_from(thermal, lambda angle_deg: angle_deg < STEEP_DEG), 2.8, (0.8, 2.0), thermal=True, aslant=True),
-        Share(_from(thermal, lambda angle_deg: angle_deg >= STEEP_DEG), 1.2, (0.8, 2.0), thermal=True),
+        Share(_from(thermal, lambda angle_deg: angle_deg < STEEP_DEG), 3.2, (1.0, 2.3), thermal=True, aslant=True),
+        Share(_from(thermal, lambda angle_deg: angle_deg >= STEEP_DEG), 1.4, (1.0, 2.3), thermal=True),
         Share(tinyperson(data)["train"], 1.8, (1.0, 2.8), pastes=SMALL, aslant=True),
         Share(mannequin(data)["train"], 0.2, (0.3, 1.2), pastes=SMALL),
         Share(aerial_cars(data)["train"], 1.4, (0.25, 1.2), pastes=SMALL),

@@ -5,7 +5,8 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, ImageRGBA
 from sorvolo.simulation.noise import fractal
-from sorvolo.simulation.objects import LYING, Body, Label, Light, Standing, Thing
+from sorvolo.simulation.objects import LYING, POSES, Body, Label, Light, Part, Standing, Thing
+from sorvolo.simulation.people import build_person
 from sorvolo.simulation.view import Patch, cut_out, opaque
 
 _BOTH_SIDES = np.zeros(3)
@@ -94,7 +95,9 @@ def _box_walls(length_m: float, width_m: float, height_m: float, texel_m: float,
     return [_plain((side, height_m), texels, colour, grain, rng) for side in (length_m, width_m) * 2]
 
 
-def _person(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Patch | Standing]:
+def _person(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Part]:
+    if thing.kind in POSES:
+        return build_person(thing, light, texel_m, rng)
     is_lying = thing.kind == LYING
     height = thing.size_m[0 if is_lying else 2]
     shirt, trousers = _CLOTHES[rng.integers(len(_CLOTHES))], rng.uniform(25, 90) * np.array([0.9, 0.95, 1.15])
@@ -127,7 +130,7 @@ def _person(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator
     ]
 
 
-def _car(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Patch | Standing]:
+def _car(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Part]:
     length, width, height = thing.size_m
     paint = _PAINTS[rng.integers(len(_PAINTS))] * rng.uniform(0.85, 1.05)
     glass = np.array([38.0, 46, 54])
@@ -138,7 +141,7 @@ def _car(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -
         for at in (0.2, 0.79):  # wheels
             half = int(0.34 / length * columns)
             wall[rows // 3:, max(0, int(at * columns) - half):int(at * columns) + half] = 26
-    parts: list[Patch | Standing] = []
+    parts: list[Part] = []
     parts += _prism(
         _rectangle(length, width, 0.18), _rectangle(length * 0.98, width * 0.96, waist), walls, light
     )
@@ -169,7 +172,7 @@ def _car(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -
     return parts
 
 
-def _small(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Patch | Standing]:
+def _small(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Part]:
     length, width, height = thing.size_m
     if thing.kind == "tyre":
         rubber = _disc((length, width), texel_m, np.array([30.0, 30, 33]), 1.0)
@@ -211,13 +214,13 @@ def _small(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator)
         lid[::max(2, rows // 5)] *= 0.7
         lid[rows // 2 - rows // 8: rows // 2 + rows // 8 + 1, -max(1, columns // 8):] = (30, 30, 32)
     top = _rectangle(length * taper, width * taper, height)
-    parts: list[Patch | Standing] = []
+    parts: list[Part] = []
     parts += _prism(_rectangle(length, width, 0.0), top, walls, light)
     parts.append(_quad(top[3], top[2], top[1], top[0], _as_texture(lid, light.shade(_UP)), _UP))
     return parts
 
 
-def _tree(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Patch | Standing]:
+def _tree(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Part]:
     """A crown of leafy layers, denser and darker inside, bright on the sun's side, above a trunk."""
     width, _, height = thing.size_m
     is_bush = thing.kind == "bush"
@@ -225,7 +228,7 @@ def _tree(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) 
     low = 0.05 * height if is_bush else 0.3 * height
     # a crown that is few pixels wide needs few layers
     count = int(np.clip(width / texel_m / 14, 3, 4 if is_bush else 9))
-    parts: list[Patch | Standing] = []
+    parts: list[Part] = []
     if not is_bush:
         bark = np.full(
             (_texels(low, 2 * texel_m) + 1, max(2, _texels(0.3, texel_m)), 3), (84, 66, 50), np.uint8
@@ -252,7 +255,7 @@ def _tree(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) 
     return parts
 
 
-def _house(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Patch | Standing]:
+def _house(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Part]:
     length, width, height = thing.size_m
     plaster = np.array([[226.0, 214, 190], [214, 196, 160], [206, 178, 150], [220, 220, 214]])[
         rng.integers(4)
@@ -263,7 +266,7 @@ def _house(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator)
     for wall in walls:
         _paint_windows(wall, eaves)
     base, top = _rectangle(length, width, 0.0), _rectangle(length, width, eaves)
-    parts: list[Patch | Standing] = list(_prism(base, top, walls, light))
+    parts: list[Part] = list(_prism(base, top, walls, light))
     if is_flat:
         return parts + _flat_roof(length, width, height, light, texel_m, rng)
     gable = _plain((width, height - eaves), (texel_m, 2.5 * texel_m), plaster, 0.04, rng)
@@ -313,7 +316,7 @@ def _roof_tiles(size_m: tuple[float, float], texel_m: float, rng: np.random.Gene
 
 
 def _flat_roof(length: float, width: float, height: float, light: Light, texel_m: float,
-               rng: np.random.Generator) -> list[Patch | Standing]:
+               rng: np.random.Generator) -> list[Part]:
     felt = _plain(
         (length, width), (texel_m, texel_m), np.array([142.0, 140, 136]) * rng.uniform(0.7, 1.2), 0.09, rng
     )
@@ -330,7 +333,7 @@ def _flat_roof(length: float, width: float, height: float, light: Light, texel_m
             cv2.LINE_AA,
         )
     roof = _rectangle(length, width, height)
-    parts: list[Patch | Standing] = [
+    parts: list[Part] = [
         _quad(roof[3], roof[2], roof[1], roof[0], _as_texture(felt, light.shade(_UP)), _UP)
     ]
     for _ in range(int(rng.integers(1, 4))):

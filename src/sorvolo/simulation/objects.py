@@ -37,6 +37,13 @@ SMALL_KINDS = ("box", "big box", "suitcase", "metal suitcase", "bag", "tyre", "g
 LYING = "lying person"
 """The kind of a person who lies on the ground: whom search teams look for."""
 
+POSES = {
+    "standing": (0.25, 0.4, 1.0), "walking": (0.5, 0.4, 1.0), "waving": (0.3, 0.5, 1.25),
+    "crouching": (0.55, 0.4, 0.6), "sitting": (0.7, 0.5, 0.55), "lying": (1.1, 0.7, 0.16),
+}
+"""The kinds of people who are drawn limb by limb, each dressed in an own way: about how long, wide and high they are,
+as shares of their stature."""
+
 _SMALL_SIZES_M = {  # length, width, height
     "box": (0.45, 0.35, 0.32), "big box": (0.95, 0.75, 0.7), "suitcase": (0.72, 0.48, 0.28),
     "metal suitcase": (0.55, 0.4, 0.2), "bag": (0.6, 0.36, 0.3), "tyre": (0.66, 0.66, 0.2),
@@ -119,17 +126,50 @@ class Standing:
 
 
 @dataclass(frozen=True, eq=False)
+class Limb:
+    """A round part between two points of the object's frame, (2, 3), whose outline is the same from all around."""
+
+    ends_m: PointsM
+    width_m: float
+    texture: ImageRGBA  # its top at the first end
+
+    def facing(self, turn: Matrix3, place_m: Vector3, eye_m: Floats) -> Patch:
+        """The patch as seen from `eye_m`, (4,) homogeneous: as long as the limb looks from there, and round ends."""
+        start, end = self.ends_m @ turn.T + place_m
+        sight = eye_m[:3] - eye_m[3] * (start + end) / 2
+        sight = sight / np.linalg.norm(sight)
+        along = (end - start) - sight * float((end - start) @ sight)
+        length = float(np.linalg.norm(along))
+        if length < 1e-6:  # seen along its axis: a disc
+            along, length = np.cross(sight, _UP if abs(sight[2]) < 0.9 else np.array([1.0, 0.0, 0.0])), 0.0
+        along = along / np.linalg.norm(along)
+        half = np.cross(along, sight) * self.width_m / 2
+        middle, reach = (start + end) / 2, along * (length + self.width_m) / 2
+        top, bottom = middle - reach, middle + reach
+        corners = np.array([top - half, top + half, bottom + half, bottom - half])
+        return Patch.spanned(corners, self.texture, _BOTH_SIDES)
+
+
+Part = Patch | Standing | Limb
+
+
+@dataclass(frozen=True, eq=False)
 class Body:
     """An object's parts in the order in which they are painted, in its own frame."""
 
-    parts: tuple[Patch | Standing, ...]
+    parts: tuple[Part, ...]
 
     def placed(self, turn: Matrix3, place_m: Vector3, eye_m: Floats) -> list[Patch]:
         """The patches where the object stands, for an eye at `eye_m`, (4,) homogeneous."""
-        return [
-            part.facing(place_m, eye_m) if isinstance(part, Standing) else part.moved(turn, place_m)
-            for part in self.parts
-        ]
+        patches = []
+        for part in self.parts:
+            if isinstance(part, Standing):
+                patches.append(part.facing(place_m, eye_m))
+            elif isinstance(part, Limb):
+                patches.append(part.facing(turn, place_m, eye_m))
+            else:
+                patches.append(part.moved(turn, place_m))
+        return patches
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +188,10 @@ class Light:
 
 def new_size(label: Label, kind: str, rng: np.random.Generator) -> tuple[float, float, float]:
     """A likely length, width and height in metres."""
+    if label is Label.PERSON and kind in POSES:
+        stature = float(rng.uniform(0.95, 1.4) if rng.uniform() < 0.1 else rng.uniform(1.5, 1.95))
+        length, width, high = POSES[kind]
+        return length * stature, width * stature, high * stature
     if label is Label.PERSON:
         height = float(rng.uniform(1.6, 1.88))
         return (height, 0.5, 0.24) if kind == LYING else (0.34, 0.52, height)

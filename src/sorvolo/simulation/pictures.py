@@ -13,7 +13,7 @@ from sorvolo.geometry.polygons import polygon_area
 from sorvolo.geometry.pose import Pose, site_from_body_nadir_rotation
 from sorvolo.simulation.canvas import Area, GroundRaster
 from sorvolo.simulation.ground import GroundKind, Layout, PaintedGround, paint_ground
-from sorvolo.simulation.objects import LYING, Label, Thing, new_kind, new_size
+from sorvolo.simulation.objects import LYING, POSES, Label, Thing, new_kind, new_size
 from sorvolo.simulation.photographed import photographed
 from sorvolo.simulation.rendering import render, render_labels
 from sorvolo.simulation.settings import LaterSettings, SimulationSettings, WeatherSettings
@@ -204,8 +204,8 @@ def _targets(
     for label in (Label.CAR, Label.PERSON, Label.SMALL):
         for _ in range(counts[label]):
             kind = new_kind(label, rng)
-            if label is Label.PERSON and rng.uniform() < 0.15:
-                kind = LYING
+            if label is Label.PERSON:
+                kind = _person(rng)
             size_m = new_size(label, kind, rng)
             new = Thing(
                 len(others) + len(placed) + 1, label, kind, 0.0, 0.0, 0.0, size_m, int(rng.integers(2**31))
@@ -217,6 +217,13 @@ def _targets(
                     placed.append(new)
                     break
     return tuple(placed)
+
+
+def _person(rng: np.random.Generator) -> str:
+    """A kind of person: mostly one drawn limb by limb, else the plain figures of simulated flights."""
+    if rng.uniform() < 0.25:
+        return LYING if rng.uniform() < 0.2 else str(Label.PERSON)
+    return str(rng.choice(list(POSES), p=(0.28, 0.34, 0.08, 0.08, 0.1, 0.12)))
 
 
 def _place(

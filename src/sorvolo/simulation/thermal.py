@@ -8,7 +8,7 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats, ImageRGB, ImageRGBA
 from sorvolo.simulation.canvas import GroundRaster
 from sorvolo.simulation.noise import layer
-from sorvolo.simulation.objects import Body, Label, Standing, Thing
+from sorvolo.simulation.objects import Body, Label, Part, Thing
 from sorvolo.simulation.photographed import recompressed
 from sorvolo.simulation.view import Patch, cut_out
 from sorvolo.simulation.world import Day
@@ -61,7 +61,7 @@ def _warm_body(thing: Thing, body: Body, rng: np.random.Generator) -> Body:
         warmth = float(np.copysign(_LEAST_CONTRAST, warmth))
     detail = float(rng.uniform(0.3, 0.8) if thing.label is Label.TREE else rng.uniform(0.05, 0.25))
     mean = _mean_grey([part.texture for part in body.parts])
-    parts: list[Patch | Standing] = [
+    parts: list[Part] = [
         replace(part, texture=_warmed(part.texture, _GROUND + warmth, detail, mean)) for part in body.parts
     ]
     if thing.label is Label.PERSON and len(parts) > 2:  # feet and clothes are cooler than the head
