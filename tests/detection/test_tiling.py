@@ -54,7 +54,23 @@ class TestScale:
         assert scale_for(other, 0.5, other.classes) == 1
 
 
+    def test_a_person_in_a_thermal_frame_has_twice_the_pixels(self) -> None:
+        for m_per_px in (0.08, 0.12):
+            by_day, by_night = (scale_for(_INFO, 2 * m_per_px, CLASSES), scale_for(_INFO, m_per_px, CLASSES, True))
+            assert by_night == pytest.approx(by_day) and by_night > 1
+        assert scale_for(_INFO, 0.02, CLASSES, True) == 1
+        assert scale_for(_INFO, 0.08, ["car"], True) == 1
+
+
 class TestPlan:
+    def test_a_small_thermal_frame_of_unknown_ground_is_magnified(self) -> None:
+        frame = plan_tiles((512, 640), _INFO, CLASSES, thermal=True)
+        assert frame.scale == 1.5 and frame.places_px == ((0, 0, 640, 512),)
+        assert plan_tiles((512, 640), _INFO, CLASSES).scale == 1
+        assert plan_tiles((512, 640), _INFO, CLASSES, tiles=None, thermal=True).scale == 1
+        assert plan_tiles((512, 640), _INFO, CLASSES, tiles=256, thermal=True).scale == 1
+        assert plan_tiles((1080, 1920), _INFO, CLASSES, thermal=True).scale == 1, "a monochrome camera's, rather"
+
     @pytest.mark.parametrize("size", [(1080, 1920), (3000, 4000), (2250, 4000), (1500, 2000), (700, 9000)])
     @pytest.mark.parametrize("m_per_px", [math.nan, 0.02, 0.05, 0.2, 0.004])
     def test_tiles_cover_the_picture_and_overlap_by_an_object(self, size: tuple[int, int], m_per_px: float) -> None:
@@ -110,7 +126,7 @@ class TestTiledPictures:
     def test_magnified_tiles_give_boxes_in_the_picture(self, detector: Detector) -> None:
         boxes = [(40, 30, 60, 44), (900, 700, 930, 760), (600, 300, 612, 318)]
         picture = draw((1100, 1400), boxes)
-        for m_per_px in (0.15, 1.7 / 240):  # twice as large, in tiles; half as large
+        for m_per_px in (0.075, 1.7 / 240):  # grey, so taken for thermal: 1.5 times as large, in tiles; half as large
             found = detector.detect(picture, tiles="auto", m_per_px=m_per_px, least_score=0.3)
             assert len(found) == 3
             order = np.argsort(found.boxes_px[:, 0])

@@ -123,12 +123,14 @@ class Detector:
     def _seen(
         self, picture: Anything, tiles: Tiles, m_per_px: float, wanted: Sequence[str], least: Anything
     ) -> Detections:
-        session = self._session_for(picture)
+        thermal = is_thermal(picture)
+        session = self._session_for(thermal)
         rgb = rgb_from_picture(picture)
         size_px = rgb.shape[0], rgb.shape[1]
         asked = [name for name in wanted if name in session.info.classes]
         plan = plan_tiles(
-            size_px, session.info, asked, tiles=tiles, m_per_px=m_per_px, fixed_px=session.fixed_px
+            size_px, session.info, asked, tiles=tiles, m_per_px=m_per_px, fixed_px=session.fixed_px,
+            thermal=thermal,
         )
         looks = [SeenTile(place, _look(session, rgb, place, plan.scale)) for place in plan.places_px]
         seen = looks[0].seen if len(looks) == 1 else merge_tiles(looks, size_px)
@@ -139,9 +141,9 @@ class Detector:
         told = (labels >= 0) & (seen.scores >= least[labels])
         return Detections(seen.boxes_px[told], seen.scores[told], labels[told], self.classes)
 
-    def _session_for(self, picture: Anything) -> Session:
+    def _session_for(self, thermal: bool) -> Session:
         """This model, or for a thermal frame that it was not trained on, an installed one that was."""
-        if self.info.thermal or not is_thermal(picture):
+        if self.info.thermal or not thermal:
             return self._session
         self._thermal_frames += 1
         if not self._night_was_sought:

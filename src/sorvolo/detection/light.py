@@ -8,7 +8,7 @@ from sorvolo.geometry.arrays import Anything, Floats, ImageRGB
 _LEAST_SPAN = 64  # counts; a thermal frame of one temperature is not stretched until its noise fills the range
 _STRETCH_PERCENT = (0.5, 99.5)
 _COLOUR_LEVELS = 10  # grey through a video's coding strays by up to five; daylight pictures of ours reach 17 and more
-_COLOUR_PERCENT = 99.0
+_COLOUR_SHARE = 0.01  # of a picture may have colour and the picture still be grey: a logo, a cross-hair
 _GLIMPSE_STEP = 4
 
 
@@ -38,10 +38,10 @@ def is_thermal(picture: Anything) -> bool:
     _check(picture)
     if picture.ndim == 2 or picture.shape[2] == 1:
         return True
-    glimpse = picture[::_GLIMPSE_STEP, ::_GLIMPSE_STEP, :3].astype(np.int32)
-    spread = glimpse.max(axis=2) - glimpse.min(axis=2)
+    red, green, blue = (picture[::_GLIMPSE_STEP, ::_GLIMPSE_STEP, channel] for channel in range(3))
+    spread = np.maximum(np.maximum(red, green), blue) - np.minimum(np.minimum(red, green), blue)
     levels = _COLOUR_LEVELS * (256 if picture.dtype == np.uint16 else 1)
-    return bool(np.percentile(spread, _COLOUR_PERCENT) <= levels)
+    return bool(np.count_nonzero(spread > levels) <= _COLOUR_SHARE * spread.size)
 
 
 def _check(picture: Anything) -> None:

@@ -26,6 +26,8 @@ TASK = Task.RECOGNITION
 
 _SIDE_PX = 1280  # of a tile as the network sees it
 _MOST_LARGER = 3.0  # magnified further, a picture is only blurred more
+_THERMAL_PX = 2.0  # times as many pixels as by day must a person have: thermal optics blur, and clothes hide limbs
+_THERMAL_LARGER = 1.5  # where the ground's sampling distance is not known: thermal sensors have few pixels
 _LEAST_OVERLAP_PX, _SPARE = 64, 1.15
 _LEAST_SIDE_PX = 64
 
@@ -38,14 +40,14 @@ class TilePlan:
     places_px: tuple[tuple[int, int, int, int], ...]
 
 
-def scale_for(info: ModelInfo, m_per_px: float, wanted: Sequence[str]) -> float:
+def scale_for(info: ModelInfo, m_per_px: float, wanted: Sequence[str], thermal: bool = False) -> float:
     """How many times larger the model should see a picture whose pixel covers `m_per_px` of ground.
 
     A person from straight above must be as large as Johnson's criteria ask (`TASK`, the same numbers as `sorvolo
     plan`) and as the model needs, `best_px`; else the picture is magnified, at most three times. A person's whole
     length, as seen aslant, must not be larger than the model knows; else the picture is made smaller. Between the two
     it stays as it is. Where no person is `wanted`, the smallest wanted class of known size takes its place; where
-    there is none, the scale is 1.
+    there is none, the scale is 1. A `thermal` frame must show a person twice as large.
     """
     known = [name for name in wanted if name in TYPICAL_SIZE_M]
     if not known:
@@ -55,6 +57,8 @@ def scale_for(info: ModelInfo, m_per_px: float, wanted: Sequence[str]) -> float:
     critical_m = BOTTOM_CRITICAL_M if name == "person" else width_m
     least_px, most_px = info.best_px[name]
     least = m_per_px * max(required_px_per_m(TASK, critical_m), least_px / length_m)
+    if thermal and name == "person":
+        least *= _THERMAL_PX
     most = m_per_px * most_px / max(length_m, height_m)
     if least > 1:
         return min(least, _MOST_LARGER)
@@ -63,15 +67,16 @@ def scale_for(info: ModelInfo, m_per_px: float, wanted: Sequence[str]) -> float:
 
 def plan_tiles(
     size_px: tuple[int, int], info: ModelInfo, wanted: Sequence[str], *, tiles: Tiles = "auto",
-    m_per_px: float = math.nan, fixed_px: tuple[int, int] | None = None,
+    m_per_px: float = math.nan, fixed_px: tuple[int, int] | None = None, thermal: bool = False,
 ) -> TilePlan:
     """The tiles of a picture of (height, width) `size_px`.
 
-    `tiles` "auto": the scale comes from `m_per_px` (NaN: unknown, then 1), and a picture that is still small is one
-    tile; else tiles of about 1280 px as the model sees them. A number: tiles of so many of the picture's pixels a
-    side, not scaled. None: the picture as it is. Tiles overlap by the longest object that is wanted, as far as its
-    size is known, at most by half. A model of one input size, `fixed_px`, gets tiles of that size from "auto".
-    Raises SettingsError for a tile size or a sampling distance that cannot be.
+    `tiles` "auto": the scale comes from `m_per_px`; where that is unknown (NaN), it is 1, or 1.5 for a `thermal` frame
+    that is small. A picture that is still small is one tile; else tiles of about 1280 px as the model sees them. A
+    number: tiles of so many of the picture's pixels a side, not scaled. None: the picture as it is. Tiles overlap by
+    the longest object that is wanted, as far as its size is known, at most by half. A model of one input size,
+    `fixed_px`, gets tiles of that size from "auto". Raises SettingsError for a tile size or a sampling distance that
+    cannot be.
     """
     height, width = size_px
     if m_per_px <= 0 or math.isinf(m_per_px):
@@ -86,7 +91,10 @@ def plan_tiles(
     if isinstance(tiles, int):
         sides = float(tiles), float(tiles)
     else:
-        scale = 1.0 if math.isnan(m_per_px) else scale_for(info, m_per_px, wanted)
+        if not math.isnan(m_per_px):
+            scale = scale_for(info, m_per_px, wanted, thermal)
+        elif tiles == "auto" and thermal and height * width * _THERMAL_LARGER**2 <= MOST_WHOLE_PX:
+            scale = _THERMAL_LARGER
         if fixed_px is None and height * width * scale**2 <= MOST_WHOLE_PX:
             return TilePlan(scale, ((0, 0, width, height),))
         sides = (
