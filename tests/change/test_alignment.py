@@ -166,3 +166,34 @@ def test_levels_lie_over_each_other(tiles):
     assert known.all()
     expected = cv2.resize(large, (100, 80), interpolation=cv2.INTER_AREA).astype(int)
     assert np.abs(small.astype(int) - expected).mean() < 1.5
+
+
+class _Counted(dict):
+    """Tiles that count how often they are read."""
+
+    reads = 0
+
+    def get(self, *about):
+        self.reads += 1
+        return super().get(*about)
+
+
+def test_a_small_view_beside_a_large_one_shows_the_same_and_reads_no_tile(tiles):
+    counted = _Counted(tiles)
+    reference = ReferenceMap(counted, SITE_GRID.grid)
+    pose = Pose(turned(10.0, 4.0), np.array([38.0, 38.0, 30.0]))
+    grid_from_image = SITE_GRID.grid_from_site_affine(np.zeros(2), 50.0) @ site_from_image_homography(CAMERA, pose)
+    large, large_known = reference.seen_from(grid_from_image, CAMERA.width_px, CAMERA.height_px)
+    reads = counted.reads
+    small, known = reference.seen_from(grid_from_image, CAMERA.width_px, CAMERA.height_px, shrink=4)
+    assert counted.reads == reads
+    assert small.shape == (90, 160, 3)
+    whole = cv2.resize(large_known.view(np.uint8) * 255, (160, 90), interpolation=cv2.INTER_AREA) == 255
+    assert not known[~cv2.dilate(whole.view(np.uint8), np.ones((3, 3))).astype(bool)].any()
+    assert known.sum() > 0.95 * whole.sum()
+    expected = cv2.resize(large, (160, 90), interpolation=cv2.INTER_AREA).astype(int)
+    apart = [
+        np.abs(small.astype(int) - np.roll(expected, shift, (0, 1)))[known & whole].mean()
+        for shift in ((0, 0), (0, 1), (0, -1), (1, 0), (-1, 0))
+    ]
+    assert apart[0] < 0.5 * min(apart[1:])

@@ -7,7 +7,7 @@ from functools import cache
 import cv2
 import numpy as np
 
-from sorvolo.change.reference import ReferenceMap, normalised
+from sorvolo.change.reference import ReferenceMap, normalised, resized
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, Matrix3, PointsM, PointsPx, Vector3
 from sorvolo.geometry.camera import Camera
@@ -29,6 +29,7 @@ from sorvolo.survey.mosaic import Features, Keyframe, Link
 
 _UNKNOWN = CameraPrior(np.zeros(3), np.full(3, np.inf), np.eye(3), np.full(3, np.inf))
 _NO_FEATURES = Features("orb", np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
+_SMALL = 4  # times smaller are the copies that are shifted onto each other
 _TRACKED_S = 2.0  # a fit older than this foretells nothing
 
 
@@ -123,7 +124,7 @@ class Aligner:
                 continue
             self._remember(time_ns, pose, prior, site_from_small, small_camera)
             self._misses = 0
-            small_from_full = _resized(size[0] / image.shape[1], size[1] / image.shape[0])
+            small_from_full = resized(size[0] / image.shape[1], size[1] / image.shape[0])
             return Aligned(site_from_small @ small_from_full, pose.translation_m, residual_px / scale, followed)
         is_outside = share_known() < self._settings.least_known
         reason = f"only {share_known():.0%} of it lies on the map" if is_outside else worst.reason
@@ -216,21 +217,20 @@ class Aligner:
             return None
         return self._site_grid.grid_from_site_affine(centre[:2] / centre[2], 50.0) @ site_from_image
 
-    def _seen(self, site_from_image: Matrix3, camera: Camera) -> tuple[ImageRGB, Mask] | None:
+    def _seen(self, site_from_image: Matrix3, camera: Camera, shrink: int = 1) -> tuple[ImageRGB, Mask] | None:
         grid_from_image = self._on_grid(site_from_image, camera)
         if grid_from_image is None:
             return None
-        return self._reference.seen_from(grid_from_image, camera.width_px, camera.height_px)
+        return self._reference.seen_from(grid_from_image, camera.width_px, camera.height_px, shrink)
 
     def _shifted(self, new: Keyframe, site_from_image: Matrix3) -> Matrix3:
         """The guess moved to where phase correlation of small copies puts it: refinement reaches a few pixels only."""
-        small = new.camera.resized(max(16, new.camera.width_px // 4), max(16, new.camera.height_px // 4))
-        size = small.width_px, small.height_px
-        step_x, step_y = new.camera.width_px / size[0], new.camera.height_px / size[1]
-        seen = self._seen(site_from_image @ _resized(step_x, step_y), small)
+        seen = self._seen(site_from_image, new.camera, shrink=_SMALL)
         if seen is None or seen[1].mean() < self._settings.least_known:
             return site_from_image
         old = normalised(*seen).astype(np.float32)
+        size = old.shape[1], old.shape[0]
+        step_x, step_y = new.camera.width_px / size[0], new.camera.height_px / size[1]
         fresh = cv2.resize(new.gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         window = cv2.createHanningWindow(size, cv2.CV_32F)
         (dx, dy), response = cv2.phaseCorrelate(old, fresh, window)
@@ -324,11 +324,6 @@ class Aligner:
             return NotAligned("its points fit the map badly", residual_px)
         fit: Matrix3 = guess @ np.linalg.inv(found.new_from_old)
         return _stiffened(fit, found, guess, new.camera), residual_px
-
-
-def _resized(x: float, y: float) -> Matrix3:
-    """(3, 3) from pixels to those of the picture made x and y times as large: to = (from + 1/2) x - 1/2."""
-    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
 
 
 def _stiffened(site_from_image: Matrix3, link: Link, site_from_old: Matrix3, camera: Camera) -> Matrix3:

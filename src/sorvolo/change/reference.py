@@ -30,6 +30,7 @@ class ReferenceMap:
         self._cache: OrderedDict[tuple[int, TileIndex], ImageRGBA | None] = OrderedDict()
         self._cache_tiles = max(8, cache_bytes // (4 * grid.tile_px**2))
         self._windows: dict[int, tuple[int, int, ImageRGBA]] = {}  # of each level the last
+        self._shrunk: dict[int, tuple[int, ImageRGBA]] = {}  # the same by how much smaller
         self._features: dict[tuple[int, TileIndex], Features] = {}
 
     @property
@@ -37,9 +38,16 @@ class ReferenceMap:
         """Whether the map shows nothing at all."""
         return len(self._tiles) == 0
 
-    def seen_from(self, grid_from_image: Matrix3, width_px: int, height_px: int) -> tuple[ImageRGB, Mask]:
-        """The map resampled to an image's pixels, and where it is known; nothing is known of views to the horizon."""
-        nothing = np.zeros((height_px, width_px, 3), np.uint8), np.zeros((height_px, width_px), bool)
+    def seen_from(
+        self, grid_from_image: Matrix3, width_px: int, height_px: int, shrink: int = 1
+    ) -> tuple[ImageRGB, Mask]:
+        """The map resampled to an image's pixels, and where it is known; nothing is known of views to the horizon.
+
+        With `shrink` n the result is an n-th as wide and high, made of the window that the whole image needs: whoever
+        asks for both pays for no coarse tiles.
+        """
+        size = max(1, width_px // shrink), max(1, height_px // shrink)
+        nothing = np.zeros((size[1], size[0], 3), np.uint8), np.zeros((size[1], size[0]), bool)
         outline = outline_on_grid(grid_from_image, width_px, height_px)
         if outline is None:
             return nothing
@@ -51,9 +59,11 @@ class ReferenceMap:
             return nothing
         x, y, window = self._window_around(level, (int(low[0]), int(low[1]), int(high[0]), int(high[1])))
         window_from_image = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, 1.0]]) @ level_from_image
-        seen = cv2.warpPerspective(
-            window, window_from_image, (width_px, height_px), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        )
+        if shrink > 1:
+            window = self._shrunk_window(level, shrink)
+            image_from_small = resized(width_px / size[0], height_px / size[1])
+            window_from_image = resized(1 / shrink, 1 / shrink) @ window_from_image @ image_from_small
+        seen = cv2.warpPerspective(window, window_from_image, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
         return cv2.cvtColor(seen, cv2.COLOR_RGBA2RGB), seen[..., 3] == 255  # type: ignore[return-value]
 
     def features_under(self, grid_from_image: Matrix3, width_px: int, height_px: int, margin: float) -> Features:
@@ -94,9 +104,24 @@ class ReferenceMap:
         x, y = box[0] - spare, box[1] - spare
         window = self._assembled(level, x, y, box[2] + spare - x, box[3] + spare - y)
         self._windows[level] = x, y, window
+        self._shrunk.pop(level, None)
         while sum(each[2].nbytes for each in self._windows.values()) > 4 * _MOST_PX and len(self._windows) > 1:
-            self._windows.pop(next(each for each in self._windows if each != level))
+            other = next(each for each in self._windows if each != level)
+            self._windows.pop(other)
+            self._shrunk.pop(other, None)
         return x, y, window
+
+    def _shrunk_window(self, level: int, shrink: int) -> ImageRGBA:
+        """The level's last window at a part of its size; a rim that fills no pixel is left out."""
+        held = self._shrunk.get(level)
+        if held is None or held[0] != shrink:
+            window = self._windows[level][2]
+            height, width = window.shape[0] // shrink, window.shape[1] // shrink
+            small = cv2.resize(
+                window[: height * shrink, : width * shrink], (width, height), interpolation=cv2.INTER_AREA
+            )
+            self._shrunk[level] = held = shrink, np.asarray(small, np.uint8)
+        return held[1]
 
     def _assembled(self, level: int, x: int, y: int, width: int, height: int) -> ImageRGBA:
         side = self._grid.tile_px
@@ -187,9 +212,13 @@ def level_for(grid_from_image: Matrix3, width_px: int, height_px: int) -> int:
     return int(np.clip(np.rint(0.5 * np.log2(max(abs(np.linalg.det(linear)), 1e-12))), 0, 8))
 
 
+def resized(x: float, y: float) -> Matrix3:
+    """(3, 3) from pixels to those of the picture made x and y times as large: to = (from + 1/2) x - 1/2."""
+    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
+
+
 def _level_from_grid(level: int) -> Matrix3:
-    scale = 0.5**level
-    return np.array([[scale, 0.0, 0.5 * scale - 0.5], [0.0, scale, 0.5 * scale - 0.5], [0.0, 0.0, 1.0]])
+    return resized(0.5**level, 0.5**level)
 
 
 def _joined(parts: list[Features]) -> Features:
