@@ -37,8 +37,11 @@ def survey() -> list[PlacedFrame]:
     return there + [placed(10 + k, 36.0 - 4.0 * k, 8.0, yaw_deg=270.0) for k in range(10)]
 
 
-def box_of(frame: PlacedFrame, label: str, east_m: float, north_m: float, yaw_deg: float) -> np.ndarray | None:
-    """The box around a body of its class's usual size; None where the picture does not show it whole."""
+def box_of(
+    frame: PlacedFrame, label: str, east_m: float, north_m: float, yaw_deg: float, *, least_shown: float = 1.0
+) -> np.ndarray | None:
+    """The box around a body of its class's usual size, as far as the picture shows it; None where that is less of
+    either side than `least_shown`."""
     length, width, height = TYPICAL_SIZE_M[label]
     turn = np.radians(yaw_deg)
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)]) * [length / 2, width / 2, height]
@@ -48,13 +51,16 @@ def box_of(frame: PlacedFrame, label: str, east_m: float, north_m: float, yaw_de
     assert pose is not None
     image = CAMERA.pixels_from_points((points - pose.translation_m) @ pose.rotation) + 0.5
     low, high = image.min(axis=0), image.max(axis=0)
-    if (low < 2).any() or (high > [CAMERA.width_px - 2, CAMERA.height_px - 2]).any():
+    size_px = np.array([CAMERA.width_px, CAMERA.height_px])
+    if least_shown == 1.0 and ((low < 2).any() or (high > size_px - 2).any()):
         return None
-    return np.concatenate([low, high])
+    inside = np.clip([low, high], 0, size_px)
+    return None if ((inside[1] - inside[0]) < least_shown * (high - low)).any() else inside.reshape(4)
 
 
 def sightings(
-    frames: list[PlacedFrame], things: list[Thing], *, misses: float = 0.2, false_alarms: float = 0.0, seed: int = 1
+    frames: list[PlacedFrame], things: list[Thing], *, misses: float = 0.2, false_alarms: float = 0.0, seed: int = 1,
+    least_shown: float = 1.0,
 ) -> list[LaidSighting]:
     """What a detector sees of things whose boxes' edges err by a pixel."""
     random = np.random.default_rng(seed)
@@ -63,7 +69,10 @@ def sightings(
         seconds = frame.time_ns / SECOND_NS
         boxes, labels = [], []
         for label, east_m, north_m, yaw_deg, (east_m_s, north_m_s) in things:
-            box = box_of(frame, label, east_m + east_m_s * seconds, north_m + north_m_s * seconds, yaw_deg)
+            box = box_of(
+                frame, label, east_m + east_m_s * seconds, north_m + north_m_s * seconds, yaw_deg,
+                least_shown=least_shown,
+            )
             if box is not None and random.random() >= misses:
                 boxes.append(box + random.normal(0, 1.0, 4))
                 labels.append(CLASSES.index(label))
@@ -101,6 +110,51 @@ def test_each_thing_once_in_its_place(seed: int) -> None:
         found, distance_m = nearest(fused, east_m, north_m)
         assert found == label
         assert distance_m < 0.15
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 40.0, 90.0])
+def test_what_one_strip_only_cuts_is_no_second_object(yaw_deg: float) -> None:
+    """The first strip's edge cuts two cars in all its frames, by a half and a third; the second shows them whole."""
+    frames = survey()
+    half, third = ("car", 14.0, 17.7, yaw_deg, (0.0, 0.0)), ("car", 24.0, 17.0, yaw_deg, (0.0, 0.0))
+    laid = sightings(frames, [half, third], misses=0.0, least_shown=0.15)
+    cut = [each.is_cut for each in laid]
+    assert min(cut.count(True), cut.count(False)) > 5
+    fused = fuse(laid, frames)
+    assert len(fused.objects) == 2 and not any(each.moves for each in fused.objects)
+    for _, east_m, north_m, _, _ in (half, third):
+        assert nearest(fused, east_m, north_m)[1] < 0.2
+    assert all(abs(each.size_m[0] - 4.4) < 0.8 for each in fused.objects)
+
+
+def test_what_every_frame_cuts_has_no_size_and_a_place_that_says_so() -> None:
+    """A car beyond the rim of all that was flown: told once, its place within the stated sigma, its length unknown."""
+    frames = survey()
+    fused = fuse(sightings(frames, [("car", 16.0, -18.0, 90.0, (0.0, 0.0))], misses=0.0, least_shown=0.2), frames)
+    (car,) = fused.objects
+    assert np.isnan(car.size_m).all() and not car.moves
+    assert car.sigma_m > 0.3
+    assert np.abs(car.position_m - [16.0, -18.0]).max() < 2 * car.sigma_m
+
+
+def test_pieces_at_the_edge_that_others_show_to_be_nothing() -> None:
+    """Twice a piece of a car at the edge, where several frames would show the whole car and see none."""
+    frames = survey()
+    boxes = {0: [300.0, 0.0, 360.0, 50.0], 1: [300.0, 0.0, 350.0, 60.0]}
+    laid = []
+    for index, box in boxes.items():
+        seen = Detections(np.array([box]), np.array([0.8]), np.array([CLASSES.index("car")]), CLASSES)
+        laid += [each for each in lay_on_ground(seen, frames[index]) if each is not None]
+    assert len(laid) == 2
+    assert fuse(laid, frames).objects == ()
+
+
+def test_what_is_far_too_short_for_its_class_is_not_laid() -> None:
+    """A box of 1 m is no car, however sure the detector is, but a thing; at the edge it may be a part of a car."""
+    frame = placed(0, 0.0, 0.0, pitch_deg=-90.0)
+    boxes = np.array([[400.0, 200.0, 427.0, 220.0]] * 2 + [[400.0, 0.0, 427.0, 20.0]])
+    seen = Detections(boxes, np.full(3, 0.9), np.array([1, 2, 1]), CLASSES)
+    assert [each is None for each in lay_on_ground(seen, frame)] == [CLASSES[1] == "car", False, False]
 
 
 def test_what_few_frames_saw_is_left_out() -> None:

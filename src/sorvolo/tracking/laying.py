@@ -10,11 +10,14 @@ from sorvolo.geometry.homography import pose_from_homography
 from sorvolo.geometry.pose import Pose
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.objects import TYPICAL_SIZE_M, Detections, Sighting
-from sorvolo.tracking.cut_boxes import CUT_PX, unseen_m
+from sorvolo.tracking.cut_boxes import beyond_edges, cut_edges
 
 _BOX_SIGMA = 0.06  # of a box's middle, in shares of its side
 _LEAST_SIGMA_PX = 1.0
 _LEAST_SIGMA_M = 0.03
+_LEAST_LENGTH = 0.4  # of a class's usual length: what is shorter is none, however sure the detector is
+_CUT_PX = 3.0  # pieces of cars at the edge end up to so far from it
+_ASIDE = 0.4  # of what a cut box's middle may be off outwards: along the edge, where a slanting body's corner shows
 _FARTHEST = 6.0  # times the height: beyond it, a pixel's error is many metres
 
 
@@ -26,7 +29,8 @@ class LaidSighting:
     above the ground that its box's middle then has. `lean` (2,) is how far that place moves, east and north, with each
     metre that the middle lies higher: towards the camera. `own_sigma_m` is the place's error against other frames of
     the flight, per axis. `axes` (2, 2) are the directions on the ground, a row each, along which the box's width and
-    height are `sides_m` (2,). `is_cut` says that the picture's edge cuts it.
+    height are `sides_m` (2,). `beyond_m2` (2, 2) is the covariance of where its middle may lie beyond the picture's
+    edge, zero where that does not cut it; all sightings that are cut alike err alike in that.
     """
 
     sighting: Sighting
@@ -35,11 +39,18 @@ class LaidSighting:
     own_sigma_m: float
     axes: Floats
     sides_m: Floats
-    is_cut: bool
+    beyond_m2: Floats
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether the picture's edge cuts it."""
+        return bool(np.any(self.beyond_m2))
 
 
 def lay_on_ground(seen: Detections, frame: PlacedFrame, *, has_metres: bool = True) -> list[LaidSighting | None]:
     """Where each detection of a frame stands on level ground, None where that is at the horizon or unknown.
+
+    None as well for what is far too short for its class, as a window is for a car, and not cut by the picture's edge.
 
     A box's middle is taken as the middle of the body, half its class's usual height above the ground (TYPICAL_SIZE_M);
     without metres it lies on the ground. Boxes are in the frame's own pixels, lens distortion and all.
@@ -49,9 +60,7 @@ def lay_on_ground(seen: Detections, frame: PlacedFrame, *, has_metres: bool = Tr
         return [None] * len(seen)
     heights_m = np.array([usual_height_m(name) if has_metres else 0.0 for name in seen.names])
     boxes = np.asarray(seen.boxes_px, np.float64)
-    size_px = np.array([frame.camera.width_px, frame.camera.height_px])
-    beyond = np.concatenate([boxes[:, :2] <= CUT_PX, boxes[:, 2:] >= size_px - CUT_PX], axis=1)
-    cut = np.count_nonzero(beyond, axis=1) > 0
+    cut = cut_edges(boxes, frame.camera.width_px, frame.camera.height_px, _CUT_PX)
     result: list[LaidSighting | None] = []
     for k, name in enumerate(seen.names):
         up_m = heights_m[k] / 2
@@ -67,16 +76,24 @@ def lay_on_ground(seen: Detections, frame: PlacedFrame, *, has_metres: bool = Tr
             continue
         spans_m = np.array([around_m[2] - around_m[1], around_m[4] - around_m[3]])
         sides_m = np.hypot(*spans_m.T)
+        if has_metres and not cut[k].any() and sides_m.max() < _LEAST_LENGTH * usual_length_m(name):
+            result.append(None)
+            continue
         m_per_px = float(np.sqrt(np.prod(sides_m) / max(np.prod(boxes[k, 2:] - boxes[k, :2]), 1e-6)))
-        beyond_m = unseen_m(name, float(sides_m.max()), has_metres=has_metres) if cut[k] else 0.0
-        own_sigma_m = _own_sigma_m(sides_m, m_per_px, frame, beyond_m)
+        axes = spans_m / np.maximum(sides_m, 1e-9)[:, None]
+        outward_m, beyond_m2 = (each[0] for each in beyond_edges(
+            (name,), cut[k:k + 1], axes[None], sides_m[None], has_metres=has_metres
+        ))
+        beyond_m2 = beyond_m2 + _ASIDE**2 * np.trace(beyond_m2) * np.eye(2)
+        own_sigma_m = _own_sigma_m(sides_m, m_per_px, frame)
         usual_sigma_m = 0.15 * heights_m[k] * lean
         sighting = Sighting(
-            frame.index, frame.name, frame.time_ns, name, float(seen.scores[k]), seen.boxes_px[k], place_m,
-            own_sigma_m**2 * np.eye(2) + np.outer(usual_sigma_m, usual_sigma_m), np.sort(sides_m)[::-1],
+            frame.index, frame.name, frame.time_ns, name, float(seen.scores[k]), seen.boxes_px[k],
+            place_m + outward_m, own_sigma_m**2 * np.eye(2) + np.outer(usual_sigma_m, usual_sigma_m) + beyond_m2,
+            np.sort(sides_m)[::-1],
         )
-        axes = spans_m / np.maximum(sides_m, 1e-9)[:, None]
-        result.append(LaidSighting(sighting, up_m, lean, own_sigma_m, axes, sides_m, bool(cut[k])))
+        own_sigma_m = float(np.hypot(own_sigma_m, np.sqrt(np.trace(beyond_m2) / 2)))
+        result.append(LaidSighting(sighting, up_m, lean, own_sigma_m, axes, sides_m, beyond_m2))
     return result
 
 
@@ -112,12 +129,17 @@ def usual_height_m(name: str) -> float:
     return TYPICAL_SIZE_M[name][2] if name in TYPICAL_SIZE_M else 1.0
 
 
-def _own_sigma_m(sides_m: Floats, m_per_px: float, frame: PlacedFrame, beyond_m: float) -> float:
+def usual_length_m(name: str) -> float:
+    """How long a class's members usually are; 0 for classes that are not ours."""
+    return TYPICAL_SIZE_M[name][0] if name in TYPICAL_SIZE_M else 0.0
+
+
+def _own_sigma_m(sides_m: Floats, m_per_px: float, frame: PlacedFrame) -> float:
     side_m = float(sides_m.mean())
     pose_m = frame.residual_px * m_per_px if np.isfinite(frame.residual_px) else 0.0
     if frame.status is Status.GPS_ONLY and np.isfinite(frame.sigma_m):
         pose_m = frame.sigma_m
-    parts = [_LEAST_SIGMA_M, _LEAST_SIGMA_PX * m_per_px, _BOX_SIGMA * side_m, pose_m, 0.4 * beyond_m]
+    parts = [_LEAST_SIGMA_M, _LEAST_SIGMA_PX * m_per_px, _BOX_SIGMA * side_m, pose_m]
     return float(np.sqrt(np.sum(np.square(parts))))
 
 

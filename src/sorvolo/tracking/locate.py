@@ -11,12 +11,11 @@ from sorvolo.geometry.arrays import Floats, PointsM, PointsPx
 from sorvolo.geometry.camera import Camera
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.objects import TYPICAL_SIZE_M, Detections, Sighting
-from sorvolo.tracking.cut_boxes import cut_edges, unseen_m
+from sorvolo.tracking.cut_boxes import beyond_edges, cut_edges
 
 GroundHeight = Callable[[PointsM], Floats]
 """Heights (N,) of the ground above the site's level plane, m, at east, north (N, 2); NaN where it is not known."""
 
-_BEYOND, _BEYOND_SIGMA = 0.4, 0.5  # of what lies beyond the picture's edge: by how much a cut box's middle is off
 _OTHER_HEIGHT_M = 1.0  # of a class that nothing is known of
 _GROUND_STEPS = 12
 _GROUND_SETTLED_M = 0.3
@@ -85,8 +84,11 @@ def locate(
     sigma_px = np.maximum(settings.box_sigma_share * sides_px, settings.least_box_sigma_px)
     own += per_px @ (sigma_px[:, :, None] ** 2 * np.eye(2)) @ per_px.transpose(0, 2, 1)
     own += ((settings.height_sigma_share * heights / 2) ** 2)[:, None, None] * away[:, :, None] @ away[:, None, :]
-    sizes_m = np.linalg.norm(per_px * sides_px[:, None, :], axis=1)
-    outward_m, beyond_m2 = _beyond_edges(found, camera, per_px, sizes_m)
+    slopes_m = np.linalg.norm(per_px, axis=1)
+    sizes_m = slopes_m * sides_px
+    axes = per_px.transpose(0, 2, 1) / np.maximum(slopes_m, 1e-9)[:, :, None]
+    cut = cut_edges(boxes, camera.width_px, camera.height_px)
+    outward_m, beyond_m2 = beyond_edges(found.names, cut, axes, sizes_m)
     places_m, own = places_m + outward_m, own + beyond_m2
     sizes_m = np.sort(sizes_m, axis=1)[:, ::-1]
     covariances = shared + own
@@ -110,21 +112,6 @@ def locate(
                 covariances[row], sizes_m[row], float(shared_sigmas[row]),
             )
     return sightings, unlocated
-
-
-def _beyond_edges(found: Detections, camera: Camera, per_px: Floats, sides_m: Floats) -> tuple[Floats, Floats]:
-    """How far beside its box an object's middle may lie that the picture's edge cuts: (N, 2) m, with (N, 2, 2) m2.
-
-    Without it, what comes into view seems to be dragged along by the picture's edge.
-    """
-    outward_m, spread_m2 = np.zeros((len(found), 2)), np.zeros((len(found), 2, 2))
-    cut = cut_edges(found.boxes_px, camera.width_px, camera.height_px)
-    for row, axis in np.argwhere(cut[:, :2] | cut[:, 2:]):
-        beyond_m = unseen_m(found.names[row], float(sides_m[row, axis]))
-        out = per_px[row, :, axis] / max(float(np.linalg.norm(per_px[row, :, axis])), 1e-9)
-        outward_m[row] += _BEYOND * (float(cut[row, 2 + axis]) - float(cut[row, axis])) * beyond_m * out
-        spread_m2[row] += (_BEYOND_SIGMA * beyond_m) ** 2 * np.outer(out, out)
-    return outward_m, spread_m2
 
 
 def _unplaced(prior: CameraPrior) -> str | None:

@@ -17,7 +17,7 @@ from sorvolo.geometry.boxes import iou_matrix, nesting_matrix
 from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.survey.objects import TYPICAL_SIZE_M
 from sorvolo.tracking.joining import WITHIN
-from sorvolo.tracking.laying import LaidSighting, shows, usual_height_m
+from sorvolo.tracking.laying import LaidSighting, shows, usual_height_m, usual_length_m
 from sorvolo.tracking.walking import Walk, walks
 
 _GATE = 9.2  # squared distance in sigmas, two axes: 99 in 100 sightings of one object lie nearer
@@ -26,6 +26,7 @@ _DRIFT_M = 0.12  # by which frames of one map lie beside each other where they w
 _SAME_BOX = 0.55  # overlap of two boxes of one frame from which they show one object, whatever their classes
 _SHARED_FRAMES = 0.25  # of the fewer views: what is seen twice in more frames than these is two objects
 _LEAST_SHARE = 0.3  # of the frames that show its place: what fewer saw does not stand there
+_LEAST_CUT_SHARE = 0.7  # of both, where those that saw it all cut it and the others would show it whole
 _SURE = 0.5  # score from which one sighting alone is told, where no more than two frames show the place
 _TOP = 0.85  # of a body's height: tops are narrower than feet
 _HEIGHT_SIGMA = 0.3  # of a class's usual height
@@ -38,8 +39,9 @@ class Standing:
     """One object; `members` are the indices of its sightings, in order of time, `best` that of its clearest.
 
     `position_m` (2,) is its foot, where it was last seen if it moves, with `sigma_m`, per axis, against other objects
-    of the same map. `size_m` (2,) are the longer and the shorter side. `velocity_m_s` (2,) is zero unless it moves.
-    `possible_views` counts the frames that show its place and what stands there whole, at least its own.
+    of the same map. `size_m` (2,) are the longer and the shorter side, NaN of what the picture's edge always cut.
+    `velocity_m_s` (2,) is zero unless it moves. `possible_views` counts the frames that show its place and what stands
+    there whole, at least its own.
     """
 
     members: tuple[int, ...]
@@ -148,20 +150,29 @@ def fitted_size_m(laid: Sequence[LaidSighting], label: str, height_m: float) -> 
 
 @dataclass(eq=False)
 class _Gathering:
-    """An object while its sightings come together: information (2, 2), and information times place (2,)."""
+    """An object while its sightings come together: information (2, 2), and information times place (2,).
+
+    They are those of whole views where there are any: what the picture's edge cuts is off to the same side in frame
+    after frame. `beyond_m2` (2, 2) is what the best of them leaves open of where the middle lies beyond that edge.
+    """
 
     members: list[int]
     information: Floats
     weighted_m: Floats
     label_scores: dict[str, float]
+    beyond_m2: Floats
 
     @property
     def covariance(self) -> Floats:
-        return np.asarray(np.linalg.inv(self.information), np.float64)
+        return np.asarray(np.linalg.inv(self.information) + self.beyond_m2, np.float64)
 
     @property
     def place_m(self) -> Floats:
         return np.asarray(np.linalg.solve(self.information, self.weighted_m), np.float64)
+
+    @property
+    def is_cut(self) -> bool:
+        return bool(np.any(self.beyond_m2))
 
     @property
     def label(self) -> str:
@@ -169,8 +180,12 @@ class _Gathering:
 
     def take(self, other: "_Gathering") -> None:
         self.members += other.members
-        self.information = self.information + other.information
-        self.weighted_m = self.weighted_m + other.weighted_m
+        if self.is_cut == other.is_cut:
+            self.information = self.information + other.information
+            self.weighted_m = self.weighted_m + other.weighted_m
+            self.beyond_m2 = min(self.beyond_m2, other.beyond_m2, key=np.trace)
+        elif self.is_cut:
+            self.information, self.weighted_m, self.beyond_m2 = other.information, other.weighted_m, other.beyond_m2
         for name, score in other.label_scores.items():
             self.label_scores[name] = self.label_scores.get(name, 0.0) + score
 
@@ -207,7 +222,7 @@ def _begin(members: list[int], laid: Sequence[LaidSighting]) -> _Gathering:
     for k in members:
         each = laid[k].sighting
         scores[each.label] = scores.get(each.label, 0.0) + each.score
-    return _Gathering(members, information, information @ first.position_m, scores)
+    return _Gathering(members, information, information @ first.position_m, scores, laid[members[0]].beyond_m2)
 
 
 def _reach_m(each: _Gathering, laid: Sequence[LaidSighting]) -> float:
@@ -262,20 +277,35 @@ def _frames_of(members: Sequence[int], laid: Sequence[LaidSighting]) -> set[int]
 def _possible_views(
     groups: Sequence[Sequence[int]], laid: Sequence[LaidSighting], frames: Sequence[PlacedFrame]
 ) -> list[int]:
-    """How many frames show each object's place, and it whole; at least those that saw it."""
+    """How many frames show each object's place, and it whole; at least those that saw it.
+
+    What all of them cut is seen by none that shows it whole: there both are counted, the latter where it is sure of
+    showing it, wherever it lies beyond the others' edges.
+    """
     firsts = [[laid[k] for k in group] for group in groups]
     places_m = np.array([np.median([each.sighting.position_m for each in group], axis=0) for group in firsts])
     up_m = np.array([np.median([each.middle_up_m for each in group]) for group in firsts])
     reach_m = np.array([np.median([each.sighting.size_m[0] for each in group]) for group in firsts]) / 2
+    open_m = np.array([_open_m(group) for group in firsts])
+    usual_m = np.array([usual_length_m(group[0].sighting.label) for group in firsts])
+    reach_m = np.where(open_m > 0, np.maximum(reach_m, usual_m / 2) + 2 * open_m, reach_m)
     counts = np.zeros(len(groups), int)
     for frame in frames:
         counts += shows(frame, places_m, up_m, reach_m).astype(int)
-    return [max(int(count), len(_frames_of(group, laid))) for count, group in zip(counts, groups)]
+    seen = [len(_frames_of(group, laid)) for group in groups]
+    return [int(n + views) if is_open else max(int(n), views) for n, views, is_open in zip(counts, seen, open_m > 0)]
+
+
+def _open_m(group: Sequence[LaidSighting]) -> float:
+    """How far the middle of what the picture's edge always cut may lie beyond; 0 where a frame shows it whole."""
+    return float(np.sqrt(min(np.trace(each.beyond_m2) for each in group) / 2))
 
 
 def _stands(group: Sequence[int], possible: int, laid: Sequence[LaidSighting]) -> bool:
     """Whether enough of the frames that show the place saw it there."""
     views = len(_frames_of(group, laid))
+    if views < possible and _open_m([laid[k] for k in group]) > 0:
+        return views >= _LEAST_CUT_SHARE * possible
     if views == 1:
         return possible <= 2 and laid[group[0]].sighting.score >= _SURE
     return views >= _LEAST_SHARE * possible
@@ -310,9 +340,11 @@ def _standing(members: Sequence[int], laid: Sequence[LaidSighting], possible: in
     right.append(np.zeros(1))
     normal = (matrix := np.concatenate(rows)).T @ matrix
     answer = np.asarray(np.linalg.solve(normal, matrix.T @ np.concatenate(right)), np.float64)
-    covariance = np.linalg.inv(normal)[:2, :2]
+    covariance = np.linalg.inv(normal)[:2, :2] + min((each.beyond_m2 for each in whole), key=np.trace)
     height_m = 2 * max(usual_up_m + float(answer[2]), 0.0)
     size_m = fitted_size_m(chosen, label, height_m) if has_metres else _median_sides(chosen)
+    if all(each.is_cut for each in whole):  # no frame shows it whole: how long it is nobody saw
+        size_m = np.full(2, np.nan)
     return Standing(
         tuple(members), _best(members, laid, label), label, score, shares, answer[:2],
         float(np.sqrt(np.trace(covariance) / 2)), size_m, possible,
