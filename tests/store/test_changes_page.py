@@ -79,6 +79,15 @@ def test_the_numbers_stand_on_their_ground() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("east_m", "north_m", "beside"),
+    [(0.0, 0.0, "0,-100%"), (7.2, 0.0, "-100%,-100%"), (0.0, 4.8, "0,0"), (7.2, 4.8, "-100%,0")],
+)
+def test_a_number_stands_beside_its_outline_and_within_the_map(east_m: float, north_m: float, beside: str) -> None:
+    page = page_of([fake_change(1, east_m=east_m, north_m=north_m, size_m=0.4)])
+    assert f"transform:translate({beside})" in page
+
+
 def test_names_are_escaped() -> None:
     evil = '<img src=x onerror="alert(1)">&Überflug'
     report = fake_report(5) | {

@@ -1,5 +1,6 @@
 """The page of a watch: what it says, that it is whole and needs nothing else, and that names stay text."""
 
+import re
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,22 @@ def test_a_page_says_what_where_and_how_sure() -> None:
     assert page.names.count("img") == 1 and page.names.count("circle") == 4 and "polyline" in page.names
     assert all(address.startswith(("data:", "#")) for address in page.addresses)
     assert "1 more have no picture here" in text
+
+
+def test_neighbours_on_the_map_have_names_that_can_be_read() -> None:
+    tracks = [_track(k, east_m=east_m) for k, east_m in ((11, 30.0), (12, 30.0), (13, 30.2), (14, 0.0), (15, 60.0))]
+    page = watch_page(_REPORT, tracks, {}, np.zeros((0, 2)))
+    found = re.findall(r'<text class="label" x="([\d.-]+)" y="([\d.-]+)">(1\d)<', page)
+    assert [name for _, _, name in found] == ["11", "12", "13", "14", "15"]
+    lefts, bases = np.array([[float(x), float(y)] for x, y, _ in found]).T
+    apart = (np.abs(np.subtract.outer(lefts, lefts)) >= 14) | (np.abs(np.subtract.outer(bases, bases)) >= 11)
+    assert (apart | np.eye(5, dtype=bool)).all()
+
+
+def test_a_day_is_said_once_in_a_row() -> None:
+    days = {"first_seen": "2026-05-01T23:59:58Z", "last_seen": "2026-05-02T00:00:01Z"}
+    page = watch_page(_REPORT, [_track(1), _track(2, **days)], {}, np.zeros((0, 2)))
+    assert ">2026-05-01 10:00:00<" in page and ">10:00:09<" in page and ">2026-05-02 00:00:01<" in page
 
 
 def test_nothing_found_and_nothing_known_is_a_page_too() -> None:

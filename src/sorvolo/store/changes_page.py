@@ -36,6 +36,7 @@ from sorvolo.survey.flight import Site
 _MANY = 40  # changes on one map: their numbers become small
 _CROP_PX = 320
 _CROPS_BYTES = 6_000_000  # of all crops in the page together
+_RIM = 0.96  # of the map: where an outline reaches beyond, its number stands on the other side
 _UNKNOWN_SHARE = 0.1  # of the ground: more is said first
 _KIND_WORDS = {
     ChangeKind.APPEARED: "is there now and was not before",
@@ -161,12 +162,16 @@ def _swipe(
     for each in changes:
         outline_px = _outline_px(each, grid, after)
         outlines.append(_polygons(outline_px, each))
-        x, y = outline_px.max(axis=0)[0], outline_px.min(axis=0)[1]
+        low, high = outline_px.min(axis=0), outline_px.max(axis=0)
+        is_right, is_above = high[0] < _RIM * width_px, low[1] > (1 - _RIM) * height_px  # else the rim would cut it
+        x, y = high[0] if is_right else low[0], low[1] if is_above else high[1]
         if 0 <= x <= width_px and 0 <= y <= height_px:
+            beside = f"{'0' if is_right else '-100%'},{'-100%' if is_above else '0'}"
             pins.append(
                 f'<a class="pin {_classes(each)}" data-kind="{each.kind.value}" href="#change-{each.number}" '
                 f'title="{each.number}: {each.kind.value}" '
-                f'style="left:{100 * x / width_px:.3f}%;top:{100 * y / height_px:.3f}%">{each.number}</a>'
+                f'style="left:{100 * x / width_px:.3f}%;top:{100 * y / height_px:.3f}%;'
+                f'transform:translate({beside})">{each.number}</a>'
             )
     size = f'width="{width_px}" height="{height_px}"'
     many = " many" if len(changes) > _MANY else ""
@@ -222,7 +227,8 @@ def _overview(changes: Sequence[StoredChange], site: Site) -> str:
     return (
         f'<section><h2>All changes</h2><div class="wide{long}"><table class="overview"><tr>{head}</tr>{rows}</table>'
         "</div>"
-        '<p class="note">Size: the longer side. Within: one sigma of the place, per axis. Seen: the first time, UTC. '
+        '<p class="note">Size: the longer side. Within: one sigma of the place, per axis. Seen: the first time, UTC, '
+        "or counted from the flight's start where no clock told the date. "
         "Files for other programs: changes.geojson, and the pictures in the folder changes.</p></section>"
     )
 

@@ -27,7 +27,7 @@ background:var(--paper);color:var(--ink);cursor:pointer}
 .stack polygon.halo{stroke:#fff;stroke-width:4.6;opacity:.75}
 polygon.appeared{stroke:#0b7a53}polygon.disappeared{stroke:#d5301f}polygon.replaced{stroke:#7a3fc4}
 polygon.moving{stroke:#e08600;stroke-dasharray:5 3}
-.pin{position:absolute;transform:translate(-50%,-50%);min-width:22px;height:22px;padding:0 5px;border-radius:11px;
+.pin{position:absolute;min-width:22px;height:22px;padding:0 5px;border-radius:11px;
 color:#fff;font-size:12px;line-height:20px;font-weight:650;text-align:center;text-decoration:none;
 border:1px solid #fff;box-shadow:0 1px 3px #0008}
 .pin:hover,.pin:focus{z-index:3;outline:3px solid #fff}

@@ -28,7 +28,10 @@ from sorvolo.store.report_plots import round_length
 from sorvolo.store.report_style import STYLE
 
 _WIDE_PX, _HIGH_PX, _RIM_PX = 940.0, 560.0, 36.0
+_LETTER_PX, _LINE_PX = 7.5, 12.0  # of the map's labels
+_ROWS = 3  # so many lines a label may lie from its dot
 _CROPS_BYTES = 8_000_000  # of all crops in the page together
+_Box = tuple[float, float, float, float]  # left, top, right, bottom
 _COLOURS = ("#d9480f", "#1971c2", "#a61e77", "#2b8a3e", "#6741d9", "#b08900")
 _WATCH_STYLE = """
 .found{display:grid;grid-template-columns:repeat(auto-fill,minmax(170px,1fr));gap:16px}
@@ -120,15 +123,15 @@ def _map(
         line = " ".join(f"{x:.1f},{y:.1f}" for x, y in map(at_px, thinned))
         parts.append(f'<polyline class="drone" points="{line}"/>')
     classes = list(dict.fromkeys(str(each["class"]) for each in tracks))
-    for each, place in zip(tracks, places):
+    dots_px = [at_px(place) for place in places]
+    for each, (x, y), label in zip(tracks, dots_px, _labels(dots_px, [str(each["id"]) for each in tracks])):
         colour = _colour(classes, each)
-        x, y = at_px(place)
         radius = max(4.0, float(each.get("sigma_m") or 0.0) * scale)
         name = escape(f"{each['class']} {each['id']}")
         parts.append(
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="{colour}" fill-opacity=".18"></circle>'
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"><title>{name}</title></circle>'
-            f'<text class="label" x="{x + 7:.1f}" y="{y + 4:.1f}">{escape(str(each["id"]))}</text>'
+            f"{label}"
         )
     unit = "px" if is_local else "m"
     bar = round_length(0.25 * (_WIDE_PX - 2 * _RIM_PX) / scale)
@@ -151,6 +154,29 @@ def _map(
     )
 
 
+def _labels(dots_px: Sequence[tuple[float, float]], names: Sequence[str]) -> list[str]:
+    """Each dot's name as SVG, beside it where no name or dot stands yet: right, left, above, below, or farther off."""
+    taken = [(x - 4, y - 4, x + 4, y + 4) for x, y in dots_px]
+    labels = []
+    for (x, y), name in zip(dots_px, names):
+        wide = _LETTER_PX * len(name)
+        sides = [
+            (x + dx, y + dy, x + dx + wide, y + dy + _LINE_PX)
+            for row in range(_ROWS) for dx, dy in (
+                (7.0, row * _LINE_PX - 6), (-7 - wide, row * _LINE_PX - 6),
+                (-wide / 2, -(row + 1) * _LINE_PX - 6), (-wide / 2, row * _LINE_PX + 6),
+            )
+        ]
+        place = next((each for each in sides if not any(_meet(each, other) for other in taken)), sides[0])
+        taken.append(place)
+        labels.append(f'<text class="label" x="{place[0]:.1f}" y="{place[3] - 2:.1f}">{escape(name)}</text>')
+    return labels
+
+
+def _meet(one: _Box, other: _Box) -> bool:
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+
+
 def _table(report: Mapping[str, Any], tracks: Sequence[Mapping[str, Any]]) -> str:
     if not tracks:
         return ""
@@ -166,10 +192,12 @@ def _table(report: Mapping[str, Any], tracks: Sequence[Mapping[str, Any]]) -> st
         sigma = with_unit("{:.1f}" + (" px" if is_local else " m"), finite_or_none(each.get("sigma_m"))) or ""
         speed = each.get("velocity_m_s")
         motion = f"{np.hypot(*speed):.1f} {'px' if is_local else 'm'}/s" if speed else "stands"
-        rows.append((
+        first, last = _when(each["first_seen"]), _when(each["last_seen"])
+        cells = (
             escaped(each["id"]), escaped(each["class"]), f"{each['score']:.2f}", place, sigma, motion,
-            f"{each['views']} in {each['passes']}", _when(each["first_seen"]), _when(each["last_seen"]),
-        ))
+            f"{each['views']} in {each['passes']}", first, last if first[:10] != last[:10] else last[-8:],
+        )
+        rows.append(tuple(f'<span class="whole">{cell}</span>' for cell in cells))
     names = ("", "class", "score", "place", "within", "moves", "views in passes", "first seen", "last seen")
     return (
         f"<section><h2>All objects</h2>{table_of(rows, names)}<p class=\"note\">Within: one sigma of the place, per "
