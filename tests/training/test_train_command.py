@@ -152,7 +152,7 @@ def test_what_was_remarked_is_told_on_the_terminal_too(
     command = ["train", str(data), "--val", str(other), "--out", str(tmp_path / "out"), *options]
     assert main(command) == 0
     told = " ".join(capsys.readouterr().out.split())
-    assert "note: other: 4 boxes of classes that stand for none of ours left out: boat 4" in told
+    assert "note: other: 4 boxes of classes that stand for none of ours left out: boat (4)" in told
     assert "lie in both" in told and "flight0" in told
     notices = json.loads((tmp_path / "out" / "training.json").read_text())["notices"]
     assert all(" ".join(each.split()) in told for each in notices)

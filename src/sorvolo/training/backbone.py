@@ -44,18 +44,15 @@ class SamePadded(nn.Conv2d):
         total = self.kernel_size[0] - self.stride[0]
         before = total // 2
         after = total - before
-        if before == after and self.groups > 1:
-            return depthwise(features, self.weight, self.bias, self.stride[0], before)
-        if before == after:
-            return functional.conv2d(features, self.weight, self.bias, self.stride, before, groups=self.groups)
-        if torch.onnx.is_in_onnx_export():
+        if before != after and torch.onnx.is_in_onnx_export():
             return _OneNode.apply(  # type: ignore[no-untyped-call]
                 features, self.weight, self.bias, self.stride[0], (before, after), self.groups
             )
-        padded = functional.pad(features, (before, after, before, after))
+        if before != after:
+            features, before = functional.pad(features, (before, after, before, after)), 0
         if self.groups > 1:
-            return depthwise(padded, self.weight, self.bias, self.stride[0], 0)
-        return functional.conv2d(padded, self.weight, self.bias, self.stride)
+            return depthwise(features, self.weight, self.bias, self.stride[0], before)
+        return functional.conv2d(features, self.weight, self.bias, self.stride, before)
 
 
 class _Block(nn.Module):

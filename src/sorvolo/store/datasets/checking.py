@@ -140,7 +140,7 @@ def _left_out(counts: Counter[str], names: Naming) -> tuple[Notice, ...]:
     rest = {name: count for name, count in counts.items() if not names.is_target(name) and not names.is_ignored(name)}
     if not rest:
         return ()
-    found = ", ".join(f"{name} {count}" for name, count in rest.items())
+    found = ", ".join(f"{name} ({count})" for name, count in rest.items())
     total = sum(rest.values())
     text = f"{total} boxes of classes that stand for none of ours left out: {found}"
     return (Notice("unmapped_classes", total, text),)
