@@ -57,7 +57,7 @@ def fake_report(frames: int = 60, *, georeferenced: bool = True) -> dict[str, An
         "registration_cpu_s_per_keyframe": 0.052, "peak_memory_mb": 412.3,
         "notices": [{"code": "bad_checksum", "count": 3, "text": "3 sentences had a wrong checksum"},
                     {"code": "gap", "count": 1, "text": "one gap of 3.1 s without fixes"}],
-        "warnings": ["the camera is a guess (preset); give --camera for a true scale"],
+        "warnings": ["camera: a GUESS, give --camera; until then the scale is not sure"],
         "settings": {"method": "planar", "m_per_px": None, "overlap": 0.7, "offset_s": None},
         "versions": {"python": "3.11.9", "numpy": "2.4.6"},
         "track": track,

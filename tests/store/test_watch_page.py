@@ -41,7 +41,7 @@ def test_a_page_says_what_where_and_how_sure() -> None:
     assert "a <notice>" in text and "a <warning>" in text and "DJI<1>" in text and "Apache-2.0 & others" in text
     assert page.names.count("img") == 1 and page.names.count("circle") == 4 and "polyline" in page.names
     assert all(address.startswith(("data:", "#")) for address in page.addresses)
-    assert "1 more have no picture here" in text
+    assert "1 more have no picture here" in text and "40, of which 1 without a place on the ground" in text
 
 
 def test_neighbours_on_the_map_have_names_that_can_be_read() -> None:
@@ -73,6 +73,7 @@ def test_a_flight_that_nothing_places_is_drawn_in_pixels() -> None:
     page = checked(watch_page(local, [track | {"x_px": 100.0, "y_px": 50.0}], {}, np.zeros((0, 2))))
     text = " ".join(page.text)
     assert "100, 50 px" in text and "nothing placed this flight" in text
+    assert "40, of which none with a place on the ground" in text
 
 
 def test_what_no_clock_dated_is_told_from_the_start() -> None:

@@ -53,11 +53,11 @@ def _show(entries: Sequence[HistoryEntry], console: Console) -> None:
         return
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for name in ("no", "complete (UTC)", "flight", "by", "new tiles", "MB", "changes", "reviewed"):
-        table.add_column(name, no_wrap=name not in ("flight", "changes", "reviewed"), overflow="fold")
+        table.add_column(name, no_wrap=name != "flight", overflow="fold")
     for each in entries:
         removed = f" (-{each.tiles_removed})" if each.tiles_removed else ""
-        changes = ", ".join(f"{count} {kind}" for kind, count in each.changes.items())
-        reviewed = ", ".join(
+        changes = "\n".join(f"{count} {kind}" for kind, count in each.changes.items())
+        reviewed = "\n".join(
             f"{count} {word}" for word, count in (("confirmed", each.confirmed), ("rejected", each.rejected)) if count
         )
         again = " (again since)" if each.is_replaced else ""

@@ -222,7 +222,7 @@ def _warnings(
             "flown in opposite directions may not fit each other; give telemetry with the camera's angles"
         )
     if setup.source.camera.focal_sigma > 0.1:
-        warnings.append(f"the camera is a guess ({setup.source.camera.origin}); give --camera for a true scale")
+        warnings.append(f"camera: {setup.source.camera.origin}; until then the scale is not sure")
     return warnings
 
 

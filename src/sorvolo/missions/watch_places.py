@@ -231,11 +231,13 @@ class ImagePlaces:
         text = f"{self._why_not}: nothing is placed on the ground, objects are followed in the picture"
         others = [each for each in self._setup.notices if each.code not in _OF_MAPS]
         if self._motion.guessed:
-            words = f"{self._motion.guessed} frames show no motion that fits: taken to go on as before"
+            words = f"frames that show no motion that fits, taken to go on as before: {self._motion.guessed}"
             others.append(Notice("motion_guessed", self._motion.guessed, words))
         if self._motion.segments > 1:
-            words = f"the picture changed {self._motion.segments - 1} times all at once: objects are counted anew"
-            others.append(Notice("scene_cuts", self._motion.segments - 1, words))
+            cuts = self._motion.segments - 1
+            times = "once" if cuts == 1 else f"{cuts} times"
+            words = f"the picture changed all at once, {times}: objects are counted anew from there on"
+            others.append(Notice("scene_cuts", cuts, words))
         return (*others, Notice("not_on_ground", 1, text))
 
     def path_m(self) -> Floats:

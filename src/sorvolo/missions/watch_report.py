@@ -77,6 +77,7 @@ def build_watch_report(
     total = sum(log.found.values())
     seconds = log.seconds
     latency = np.array(log.latency_s)
+    height = setup.track.height_words if setup.track else "none"
     return {
         "sorvolo": sorvolo.__version__,
         "flight": source.name,
@@ -102,7 +103,7 @@ def build_watch_report(
         "telemetry": {
             "format": source.telemetry.format, "samples": len(source.telemetry),
             "tie": setup.clock.tie if setup.clock else "none",
-            "height": setup.track.height_words if setup.track else "none",
+            "height": height if on_ground else height.split(",")[0],  # what follows says how a map finds it
             "attitude": setup.track.attitude if setup.track else "none",
         },
         "latency_s": {

@@ -162,8 +162,7 @@ class WatchRun:
                 "the notices say why"
             )
         if not self._places.site.is_local and self._setup.source.camera.focal_sigma > 0.1:
-            origin = self._setup.source.camera.origin
-            warnings.append(f"the camera is a guess ({origin}); give --camera, or places are some percent off")
+            warnings.append(f"camera: {self._setup.source.camera.origin}; until then places are some percent off")
         far = [track for track in tracks if track.sigma_m > 10] if not self._places.site.is_local else []
         if far:
             warnings.append(

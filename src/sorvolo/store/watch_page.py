@@ -235,13 +235,14 @@ def _how_it_went(report: Mapping[str, Any]) -> str:
     total = number_at(report, "seconds", "total")
     rate = number_at(report, "frames_per_second")
     latency = report.get("latency_s") or {}
+    missing = f"{escaped(at(report, 'detections', 'not_placed'))} without"
+    unplaced = missing if report.get("georeferenced") else "none with"
     rows = [
         ("frames", join_words(
             f"{escaped(frames.get('detected'))} searched of {escaped(frames.get('read'))} read,",
             f"{escaped(frames.get('skipped'))} skipped to keep up,", f"{escaped(frames.get('lost'))} unusable",
         )),
-        ("detections", f"{escaped(at(report, 'detections', 'total'))}, of which "
-                       f"{escaped(at(report, 'detections', 'not_placed'))} have no place on the ground"),
+        ("detections", f"{escaped(at(report, 'detections', 'total'))}, of which {unplaced} a place on the ground"),
         ("took", join_words(seconds_words(total), with_unit("({:.1f} frames a second)", rate))),
         ("of it", ", ".join(
             f"{escape(name)} {seconds_words(finite_or_none(value))}"
