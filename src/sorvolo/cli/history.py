@@ -52,18 +52,18 @@ def _show(entries: Sequence[HistoryEntry], console: Console) -> None:
         console.print("no map yet")
         return
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in ("no", "complete (UTC)", "flight", "by", "new tiles", "MB", "changes", "reviewed"):
-        table.add_column(name, no_wrap=name != "flight", overflow="fold")
+    for name in ("no", "complete (UTC)", "flight", "by", "new/all", "MB", "changes", "reviewed"):
+        table.add_column(name, no_wrap=name not in ("flight", "changes", "reviewed"), overflow="fold")
     for each in entries:
         removed = f" (-{each.tiles_removed})" if each.tiles_removed else ""
-        changes = "\n".join(f"{count} {kind}" for kind, count in each.changes.items())
-        reviewed = "\n".join(
+        changes = ", ".join(f"{count} {kind}" for kind, count in each.changes.items())
+        reviewed = ", ".join(
             f"{count} {word}" for word, count in (("confirmed", each.confirmed), ("rejected", each.rejected)) if count
         )
         again = " (again since)" if each.is_replaced else ""
         table.add_row(
             str(each.version), each.date_utc[:16].replace("T", " "), escape(each.flight) + again, each.kind,
-            f"{each.tiles_changed} of {each.tiles}{removed}", f"{each.bytes_changed / 1e6:.1f}",
+            f"{each.tiles_changed}/{each.tiles}{removed}", f"{each.bytes_changed / 1e6:.1f}",
             changes or ("none" if each.kind == "compare" else ""), reviewed,
         )
     console.print(table)
