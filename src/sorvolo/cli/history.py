@@ -52,7 +52,7 @@ def _show(entries: Sequence[HistoryEntry], console: Console) -> None:
         console.print("no map yet")
         return
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in ("no", "complete (UTC)", "flight", "by", "new/all", "MB", "changes", "reviewed"):
+    for name in ("no", "complete (UTC)", "flight", "by", "tiles", "MB", "changes", "reviewed"):
         table.add_column(name, no_wrap=name not in ("flight", "changes", "reviewed"), overflow="fold")
     for each in entries:
         removed = f" (-{each.tiles_removed})" if each.tiles_removed else ""
@@ -67,3 +67,4 @@ def _show(entries: Sequence[HistoryEntry], console: Console) -> None:
             changes or ("none" if each.kind == "compare" else ""), reviewed,
         )
     console.print(table)
+    console.print("tiles: new of all", style="dim")
