@@ -140,8 +140,9 @@ def _show(updates: "Iterator[TrainingUpdate]", wish: "_Wish") -> None:
             )
             if update.check is not None:
                 each = ", ".join(f"{escape(name)} {_number(ap50)}" for name, ap50 in update.check.classes.items())
+                at = "step" if update.losses is not None else "the model as written, of step"
                 progress.console.print(
-                    f"step {update.check.step}: AP50 {_number(update.check.ap50)} ({each}), "
+                    f"{at} {update.check.step}: AP50 {_number(update.check.ap50)} ({each}), "
                     f"AP {_number(update.check.ap)}"
                 )
             if wish.is_there:
