@@ -13,6 +13,8 @@ import av
 import cv2
 import numpy as np
 import pytest
+import rasterio
+from rasterio.transform import Affine
 from truth_detector import TruthDetector
 
 from sorvolo.detection.contract import ModelInfo
@@ -201,6 +203,36 @@ def test_heights_without_a_ground_are_said_and_can_be_helped(
     report = _read(tmp_path / "known" / "report.json")
     assert report["georeferenced"]
     assert any("straight down" in each["text"] for each in report["notices"])
+
+
+def test_a_height_model_places_what_its_heights_alone_cannot(
+    flown: Path, detector: TruthDetector, tmp_path: Path
+) -> None:
+    """Level ground told by a model is level ground told by a number; both together are not taken."""
+    log = flown / "flight1" / "other" / "flight1.nmea"
+    ground_m = 83.3 - 48.3
+    model = tmp_path / "ground.tif"
+    with rasterio.open(
+        model, "w", driver="GTiff", width=200, height=200, count=1, dtype="float32", crs="EPSG:4326",
+        transform=Affine(1e-4, 0, 12.5935, 0, -1e-4, 41.9025),
+    ) as sink:
+        sink.write(np.full((1, 200, 200), ground_m, np.float32))
+    few = WatchSettings(frames_per_second=1)
+    places = []
+    for name, settings in (
+        ("number", replace(few, ground_elevation_m=ground_m)), ("model", replace(few, height_model=str(model))),
+    ):
+        outputs = WatchOutputs(folder=tmp_path / name)
+        list(watch(_video(flown), settings, outputs, telemetry=log, camera=flown / "camera.xml", detector=detector))
+        assert _read(tmp_path / name / "report.json")["georeferenced"]
+        tracks = _read(tmp_path / name / "tracks.geojson")["features"]
+        places.append([(each["properties"]["east_m"], each["properties"]["north_m"]) for each in tracks])
+    assert len(places[0]) > 3 and len(places[0]) == len(places[1])
+    assert np.abs(np.subtract(*places)).max() < 0.3  # the model's own error is in the weights
+    notices = _read(tmp_path / "model" / "report.json")["notices"]
+    assert any("the height model's ground" in each["text"] for each in notices)
+    with pytest.raises(SettingsError, match="not both"):
+        replace(few, height_model=str(model), ground_elevation_m=3.0)
 
 
 def test_those_who_want_it_are_told(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:

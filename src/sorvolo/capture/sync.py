@@ -112,6 +112,11 @@ class Track:
     interval_s: float
     longest_gap_s: float = field(default=3.0)
 
+    @property
+    def counts_from_takeoff(self) -> bool:
+        """Whether heights are those above take-off, wherever in the world that is."""
+        return self.height_words.startswith("above take-off")
+
     def prior(self, time_s: float, *, smooth_s: float = 0.0) -> CameraPrior:
         """What telemetry says at `time_s` on the frames' clock (eq. 3.18: linear between fixes).
 

@@ -121,13 +121,12 @@ def show_changes(console: Console, measured: FlightChanges) -> None:
     """The tables of one flight's changes."""
     if measured.masks is not None:
         masks = measured.masks
-        table = Table("per", "TP", "FP", "FN", "TN", "precision", "recall", "accuracy", "F1", "unknown")
-        for name, counts in (("pixel", masks.pixels), ("frame", masks.frames)):
-            shares = (counts.precision, counts.recall, counts.accuracy, counts.f1)
-            table.add_row(
-                name, *(f"{number:,}" for number in (counts.tp, counts.fp, counts.fn, counts.tn)),
-                *(_share(share, 2) for share in shares), f"{counts.unknown:,}",
-            )
+        table = Table("per", "pixel", "frame")
+        both = masks.pixels, masks.frames
+        for name in ("tp", "fp", "fn", "tn", "unknown"):
+            table.add_row(name.upper() if len(name) < 3 else name, *(f"{getattr(each, name):,}" for each in both))
+        for name in ("precision", "recall", "accuracy", "f1"):
+            table.add_row("F1" if name == "f1" else name, *(_share(getattr(each, name), 2) for each in both))
         console.print(table)
         console.print(
             f"{measured.flight}: {masks.compared} masks compared; {masks.only_found} found ones have no truth, "

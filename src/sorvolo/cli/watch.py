@@ -69,6 +69,9 @@ def watch_command(
     ground_elevation: Annotated[
         float | None, typer.Option(help="Of the ground, m, in telemetry's own height reference.")
     ] = None,
+    height_model: Annotated[
+        str, typer.Option(help="GeoTIFF of the ground's heights, m, in the same reference; else it is level.")
+    ] = "",
     give_up: Annotated[float, typer.Option(help="A live source silent for so long has ended, s.")] = 30.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object at the end.")] = False,
 ) -> None:
@@ -81,7 +84,9 @@ def watch_command(
 
     Example: sorvolo watch rtsp://192.168.1.10/live --telemetry udp://:10110 --cot udp://239.2.3.1:6969
     """
-    settings = WatchSettings(model, _names(classes), least_score, _tiles(tiles), every, fps, offset, ground_elevation)
+    settings = WatchSettings(
+        model, _names(classes), least_score, _tiles(tiles), every, fps, offset, ground_elevation, height_model
+    )
     outputs = WatchOutputs(
         out, save.value, _names(labels), cot, {**COT_TYPES, **_types(cot_type or [])}, alert_command=alert_command,
         alert_url=alert_url,

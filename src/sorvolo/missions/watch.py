@@ -13,8 +13,9 @@ from sorvolo.capture.source import LiveSource, Source, open_sources
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.missions.detecting import Detects
-from sorvolo.missions.flight_setup import prepare
+from sorvolo.missions.flight_setup import FlightSetup, prepare
 from sorvolo.missions.settings import MapSettings
+from sorvolo.missions.watch_ground import over_heights
 from sorvolo.missions.watch_places import places_of
 from sorvolo.missions.watch_run import WatchRun, WatchUpdate
 from sorvolo.missions.watch_settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
@@ -64,9 +65,16 @@ def _watch_one(
     telemetry_named: bool,
 ) -> Generator[WatchUpdate]:
     mapping = MapSettings(offset_s=settings.offset_s, ground_elevation_m=settings.ground_elevation_m)
-    setup = prepare(source, mapping, None, telemetry_named=telemetry_named)
+
+    def prepared(mapping: MapSettings) -> FlightSetup:
+        return prepare(source, mapping, None, telemetry_named=telemetry_named)
+
+    if settings.height_model:
+        setup, ground = over_heights(prepared, mapping, Path(settings.height_model))
+    else:
+        setup, ground = prepared(mapping), None
     least = settings.least_score if settings.least_score is not None else min(detector.info.thresholds.values())
-    places = places_of(setup, least)
+    places = places_of(setup, least, ground)
     claim_folder(folder, source.name, source.fingerprint, replaces=not isinstance(source, LiveSource))
     with WatchRun(setup, places, detector, settings, outputs, folder) as run:
         ended = _STOPPED

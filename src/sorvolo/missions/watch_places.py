@@ -15,12 +15,13 @@ from sorvolo.survey.flight import CameraPrior, Frame, Notice, Site
 from sorvolo.survey.objects import Detections, Sighting, Track
 from sorvolo.tracking.heading import CompassError, HeadingFromMotion
 from sorvolo.tracking.image_motion import ImageMotion
-from sorvolo.tracking.locate import locate
+from sorvolo.tracking.locate import GroundHeight, LocateSettings, locate
 from sorvolo.tracking.tracker import IN_PICTURES, Tracker, TrackerSettings, TrackUpdate
 
 _MOST_DRONE_PLACES = 200_000
 _GIMBAL_TILT_SIGMA_DEG = 1.0  # a mapping doubts gimbals more, since the pictures tell it better; here nothing else does
 _COMPASS_TOLD_DEG = 2.0
+_OVER_MODEL = LocateSettings(ground_sigma_m=1.0)  # of a height model, where it stands on its own
 _OF_MAPS = ("no_telemetry", "ground_unknown", "height_unknown")  # notices that say what a mapping does about it
 
 
@@ -65,18 +66,21 @@ class Places(Protocol):
         """(N, 2) where the camera was, in site metres; none where nothing says so."""
 
 
-def places_of(setup: FlightSetup, least_score: float) -> Places:
-    """The way to place a flight's detections that its telemetry allows; all of them score `least_score` or more."""
+def places_of(setup: FlightSetup, least_score: float, ground: GroundHeight | None = None) -> Places:
+    """The way to place a flight's detections that its telemetry allows; all of them score `least_score` or more.
+
+    `ground` gives the ground's height over the flight's zero; None: it is level.
+    """
     why_not = _why_not_on_ground(setup)
     sure_score = min(TrackerSettings.sure_score, least_score)  # lower ones would never begin a track
-    return GroundPlaces(setup, sure_score) if why_not is None else ImagePlaces(setup, sure_score, why_not)
+    return GroundPlaces(setup, sure_score, ground) if why_not is None else ImagePlaces(setup, sure_score, why_not)
 
 
 class GroundPlaces:
     """Detections on the ground of a flight with telemetry, tracked in metres."""
 
-    def __init__(self, setup: FlightSetup, sure_score: float) -> None:
-        self._setup = setup
+    def __init__(self, setup: FlightSetup, sure_score: float, ground: GroundHeight | None) -> None:
+        self._setup, self._ground = setup, ground
         self._tracker = Tracker(TrackerSettings(sure_score=sure_score))
         self._unlocated: Counter[str] = Counter()
         knows_heading = setup.track is None or setup.track.attitude != "none"
@@ -84,6 +88,8 @@ class GroundPlaces:
         self._compass = CompassError()
         self._path: list[Floats] = []
         self._site = new_site(setup, setup.source.name, 1.0, 0.0)
+        if ground is not None:  # one height would be told for all objects
+            self._site = replace(self._site, height_reference="above ground")
 
     @property
     def site(self) -> Site:
@@ -94,13 +100,13 @@ class GroundPlaces:
         """Along the optical axis; None where the camera looks at the horizon or its height is not known."""
         prior = self._prior(frame)
         down = -float(prior.rotation[2, 2])
-        height_m = float(prior.position_m[2])
+        height_m = float(prior.position_m[2]) - self._below_m(prior)
         if down < 0.1 or height_m <= 0:
             return None
         return height_m / down / self._setup.source.camera.camera.fx_px
 
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
-        """Place a frame's detections on level ground and give them to their tracks."""
+        """Place a frame's detections on the ground and give them to their tracks."""
         prior = self._prior(frame)
         if self._turning is not None:
             prior = self._turning.take(frame, time_ns, found, prior)
@@ -109,10 +115,11 @@ class GroundPlaces:
             prior = replace(prior, rotation=site_from_read @ prior.rotation)
         camera = self._setup.source.camera
         sightings, unlocated = locate(
-            found, frame.index, frame.name, time_ns, camera.camera, prior, focal_sigma=camera.focal_sigma
+            found, frame.index, frame.name, time_ns, camera.camera, prior, focal_sigma=camera.focal_sigma,
+            ground_height_m=self._ground or 0.0, settings=LocateSettings() if self._ground is None else _OVER_MODEL,
         )
         self._unlocated.update(unlocated)
-        outline_m = footprint(camera.camera, Pose(prior.rotation, prior.position_m))
+        outline_m = footprint(camera.camera, Pose(prior.rotation, prior.position_m), self._below_m(prior))
         known = [each for each in sightings if each is not None]
         update = self._tracker.update(
             known, time_ns=time_ns, footprint_m=outline_m if np.isfinite(outline_m).all() else None
@@ -141,7 +148,9 @@ class GroundPlaces:
         side = "clockwise" if compass_deg > 0 else "counter-clockwise"
         off = f"the compass reads about {abs(compass_deg):.0f} degrees too far {side}, by what stands: taken off"
         compass = (Notice("compass_off", 1, off),) if abs(compass_deg) > _COMPASS_TOLD_DEG else ()
-        text = f"places come from the telemetry's position, height ({track.height_words if track else ''}) and {how}"
+        over = ", over the height model's ground" if self._ground is not None else ""
+        height = f"{track.height_words if track else ''}{over}"
+        text = f"places come from the telemetry's position, height ({height}) and {how}"
         return (
             *self._setup.notices, Notice("placed_by", 1, text), *compass,
             *(Notice("not_placed", count, f"{count} detections have no place on the ground: {reason}")
@@ -151,6 +160,13 @@ class GroundPlaces:
     def path_m(self) -> Floats:
         """(N, 2) where the camera was."""
         return np.array(self._path).reshape(-1, 2)
+
+    def _below_m(self, prior: CameraPrior) -> float:
+        """The ground's height below the camera; 0 where nothing says."""
+        if self._ground is None or not prior.knows_place:
+            return 0.0
+        below_m = float(self._ground(prior.position_m[None, :2])[0])
+        return below_m if np.isfinite(below_m) else 0.0
 
     def _prior(self, frame: Frame) -> CameraPrior:
         """Telemetry's word, its height's sigma with that of the ground in it."""

@@ -27,6 +27,7 @@ class WatchSettings:
     frames_per_second: float | None = None  # of flight; None: 10, and of a live stream as many as there is time for
     offset_s: float | None = None  # telemetry time = video time + this; None: as their clocks say
     ground_elevation_m: float | None = None  # of the ground, in the telemetry's own height reference
+    height_model: str = ""  # a GeoTIFF of the ground's heights, in the same reference; empty: the ground is level
 
     def __post_init__(self) -> None:
         if self.least_score is not None and not 0 <= self.least_score <= 1:
@@ -39,6 +40,8 @@ class WatchSettings:
             raise SettingsError(f"every N-th frame: N must be 1 or more, got {self.every}")
         if self.frames_per_second is not None and not 0.001 <= self.frames_per_second <= 1000:
             raise SettingsError(f"frames a second must lie in 0.001 to 1000, got {self.frames_per_second}")
+        if self.height_model and self.ground_elevation_m is not None:
+            raise SettingsError("give a height model or the ground's elevation, not both")
         if self.offset_s is not None and not abs(self.offset_s) <= 86_400 * 365:
             raise SettingsError(f"the clock offset must be a number of seconds, got {self.offset_s}")
 

@@ -1,0 +1,96 @@
+"""A height model of the ground: a GeoTIFF of heights, asked by place."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from pyproj import Transformer
+from rasterio.enums import Resampling
+from rasterio.errors import CRSError, RasterioError
+from rasterio.transform import Affine
+from rasterio.warp import transform_bounds
+from rasterio.windows import Window
+from scipy.ndimage import map_coordinates
+
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Floats
+
+_WGS84 = "EPSG:4326"
+_MOST_PX = 4096  # a side that is kept: finer models are averaged
+_ENVIRONMENT = {"GDAL_CACHEMAX": 128, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
+
+
+@dataclass(frozen=True, eq=False)
+class HeightModel:
+    """Heights (H, W), m, NaN where unknown, each that of its pixel's middle; `crs_from_pixels` starts at corners."""
+
+    heights_m: Floats
+    crs_from_pixels: Affine
+    crs: str
+
+    def at(self, longitudes_deg: Floats, latitudes_deg: Floats) -> Floats:
+        """(N,) heights at places of WGS84, between the four pixels around; NaN outside and beside unknown ones."""
+        x, y = self._crs_from_wgs84.transform(longitudes_deg, latitudes_deg)
+        back = ~self.crs_from_pixels
+        columns, rows = (a * np.asarray(x) + b * np.asarray(y) + c for a, b, c in (back[:3], back[3:6]))
+        known = np.isfinite(columns) & np.isfinite(rows)
+        heights_m = np.full(len(known), np.nan)
+        places = np.array([rows[known], columns[known]]) - 0.5
+        heights_m[known] = map_coordinates(self.heights_m, places, order=1, cval=np.nan)
+        return heights_m
+
+    @cached_property
+    def _crs_from_wgs84(self) -> Transformer:
+        return Transformer.from_crs(_WGS84, self.crs, always_xy=True)
+
+
+def read_height_model(path: Path, bounds_deg: tuple[float, float, float, float]) -> HeightModel:
+    """The part of a GeoTIFF of heights within west, south, east, north, degrees of WGS84.
+
+    Only the GTiff driver opens it: a VRT renamed .tif could name any other file. Raises InputError for a file that is
+    no GeoTIFF with one band and a place on Earth, and for one of other ground.
+    """
+    if not path.is_file():
+        raise InputError(f"no such file: {path}; a GeoTIFF of heights was needed")
+    try:
+        with rasterio.Env(**_ENVIRONMENT), rasterio.open(path, driver="GTiff") as source:
+            if source.crs is None:
+                raise InputError(f"{path} has no coordinate reference system; export it with one")
+            if source.count != 1:
+                raise InputError(f"{path} has {source.count} bands; a height model has one, of heights in metres")
+            window = _window(source, bounds_deg)
+            if window is None:
+                west, south, east, north = transform_bounds(source.crs, _WGS84, *source.bounds)
+                raise InputError(
+                    f"{path} holds ground from {south:.4f}, {west:.4f} to {north:.4f}, {east:.4f}, and the flight is "
+                    f"at {bounds_deg[1]:.4f}, {bounds_deg[0]:.4f}: give the height model of its ground"
+                )
+            step = math.ceil(max(window.width, window.height) / _MOST_PX)
+            shape = math.ceil(window.height / step), math.ceil(window.width / step)
+            read = source.read(1, window=window, out_shape=shape, masked=True, resampling=Resampling.average)
+            heights_m = np.where(np.ma.getmaskarray(read), np.nan, np.asarray(read.data, np.float64))
+            heights_m = heights_m * source.scales[0] + source.offsets[0]
+            transform = source.window_transform(window)
+            wide, high = window.width / shape[1], window.height / shape[0]
+            crs_from_pixels = Affine(
+                transform.a * wide, transform.b * high, transform.c, transform.d * wide, transform.e * high, transform.f
+            )
+            return HeightModel(heights_m, crs_from_pixels, source.crs.to_wkt())
+    except (RasterioError, CRSError) as error:
+        raise InputError(f"{path} is no readable GeoTIFF ({error}); export it as GeoTIFF again") from error
+
+
+def _window(source: rasterio.DatasetReader, bounds_deg: tuple[float, float, float, float]) -> Window | None:
+    """The whole pixels that the bounds touch; None where there are none."""
+    left, bottom, right, top = transform_bounds(_WGS84, source.crs, *bounds_deg)
+    back = ~source.transform
+    x, y = np.array([left, left, right, right]), np.array([bottom, top, bottom, top])
+    columns, rows = (a * x + b * y + c for a, b, c in (back[:3], back[3:6]))
+    first = max(0, math.floor(columns.min())), max(0, math.floor(rows.min()))
+    last = min(source.width, math.ceil(columns.max())), min(source.height, math.ceil(rows.max()))
+    if first[0] >= last[0] or first[1] >= last[1]:
+        return None
+    return Window(first[0], first[1], last[0] - first[0], last[1] - first[1])
