@@ -1,6 +1,6 @@
 """One picture in the light of another: a power law per channel for the camera, a smooth gain for clouds' shadows."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -22,6 +22,9 @@ LEAST_ALIKE, MOST_ALIKE = 0.25, 0.5  # correlation of details: the ground is ano
 FLAT = 6.0  # what noise leaves of the variance of details, in squared steps of the logarithm
 FLAT_TRUST = 0.003  # of cells without any structure: they tell where nothing better is near
 REACHES_CELLS = ((3, 1.0), (7, 0.1), (17, 0.01), (49, 1e-3))  # how far a cell's gain tells about its neighbours'
+NEAR_CELLS = 11  # around things: there the ground tells the light once it is known what hides it
+LEAST_HIDDEN = 12  # of 255: cells that are hidden to more say nothing
+LEAST_GAIN = 0.02  # of a gain: less makes no difference
 STEPS_PER_OCTAVE = 48.0
 GAIN_ONE = 4096
 CURVE_ONE = 16
@@ -35,19 +38,32 @@ class Light:
     """What turns the reference's light into the query's: query + 8 = 2**offset * (reference + 8)**exponent * gain.
 
     `exponents` and `offsets` (3,) are per channel, blue green red; `gains` (h, w, 3) float32 are factors on a coarse
-    grid over the picture; `unevenness` is their spread in octaves, what clouds do.
+    grid over the picture; `unevenness` is their spread in octaves, what clouds do. `cells` is what the gains are from.
     """
 
     exponents: Floats
     offsets: Floats
     gains: NDArray[np.float32]
     unevenness: float
+    cells: "Cells"
 
     @property
     def brightness(self) -> Floats:
         """(3,) by which factor a middle grey of the reference is brighter in the query."""
         middle = np.log2(100.0 + BLACK_LEVEL)
         return np.asarray(2.0 ** (self.offsets + (self.exponents - 1.0) * middle))
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """What each cell alone says of the local gain: `steps` (h, w, 3) float32, `STEPS_PER_OCTAVE` to an octave.
+
+    `trust` (h, w) float32, 0 to 1, is how sure it shows the same ground; nothing is known of it where not `known`.
+    """
+
+    steps: NDArray[np.float32]
+    trust: NDArray[np.float32]
+    known: Mask | None
 
 
 def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
@@ -63,7 +79,8 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     before, after = (_logarithm(_smaller(each, size)) for each in (reference, query))
     sure = None if known is None else _smaller(known.astype(np.uint8) * 255, size) > 250
     if sure is not None and sure.sum() < 16:
-        return Light(np.ones(3), np.zeros(3), np.ones((*size[::-1], 3), np.float32), 0.0)
+        nothing = np.zeros((*size[::-1], 3), np.float32)
+        return Light(np.ones(3), np.zeros(3), nothing + 1, 0.0, Cells(nothing, nothing[..., 0], sure))
     window = (9, 9)
     detail_before = _chosen(before - cv2.blur(before, window), sure)[::2]
     detail_after = _chosen(after - cv2.blur(after, window), sure)[::2]
@@ -75,9 +92,26 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     same = _sameness(reference, query, size)
     if sure is not None:
         same[~sure] = 0
-    octaves = _spread(cv2.medianBlur(local, MEDIAN_CELLS).astype(np.float32) - 128, same) / STEPS_PER_OCTAVE
+    cells = Cells(cv2.medianBlur(local, MEDIAN_CELLS).astype(np.float32) - 128, same, sure)
+    octaves = _spread(cells.steps, same) / STEPS_PER_OCTAVE
     unevenness = float(_chosen(octaves, sure).mean(axis=1).std())
-    return Light(exponents, offsets, np.exp2(octaves).astype(np.float32), unevenness)
+    return Light(exponents, offsets, np.exp2(octaves).astype(np.float32), unevenness, cells)
+
+
+def light_around(light: Light, things: Anything) -> Light:
+    """The light where it is known what hides the ground: `things` (h, w) uint8, 255 or 0, of the pictures' size.
+
+    All other ground near is trusted, plain ground too. The same `light` where that makes no difference near a thing.
+    """
+    size = light.cells.trust.shape[1], light.cells.trust.shape[0]
+    covers = cv2.resize(cv2.dilate(things, np.ones((5, 5), np.uint8)), size, interpolation=cv2.INTER_AREA)
+    hidden = covers > LEAST_HIDDEN
+    near = cv2.dilate(hidden.view(np.uint8), np.ones((NEAR_CELLS, NEAR_CELLS), np.uint8)) > 0
+    trusted = near & ~hidden if light.cells.known is None else near & ~hidden & light.cells.known
+    trust = np.where(hidden, np.float32(0), np.where(trusted, np.float32(1), light.cells.trust))
+    gains = np.exp2(_spread(light.cells.steps, trust) / STEPS_PER_OCTAVE).astype(np.float32)
+    changes = np.abs(gains[near] - light.gains[near]) > LEAST_GAIN * light.gains[near]
+    return replace(light, gains=gains) if changes.any() else light
 
 
 def relit(image: Bgr, light: Light, out: Bgr | None = None) -> Bgr:

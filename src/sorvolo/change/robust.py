@@ -1,6 +1,8 @@
 """The robust change method: two aligned pictures -> what changed, whatever the light, leaves and leaning trees do."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -8,6 +10,7 @@ from numpy.typing import NDArray
 
 from sorvolo.change.blob_check import how_sure
 from sorvolo.change.blobs import FEATURES, Regions, RegionSettings, find_regions
+from sorvolo.change.growing import Piece, Views, grown, without_halos
 from sorvolo.change.radiometry import Light, fit_light, relit
 from sorvolo.change.scratch import Scratch
 from sorvolo.change.settling import Settling, settle
@@ -22,7 +25,7 @@ SAME_PLACE_PX = 0.6  # half size pixels
 ALL_KNOWN = 0x0101  # two True side by side
 CALM_PX = 0.4  # rest of the flow below: values are looked for one pixel less far around
 RIM_WIDTH_PX = 5  # a thing's outline runs where half of the difference within this is left ...
-SLACK, LEAST_SHARE = 5.0, 0.25  # ... of what it was before the ground's own range was taken off, at least this share
+SLACK, LEAST_SHARE = 5.0, 0.4  # ... of what it was before the ground's own range was taken off, at least this share
 RIM_PX = 4  # around the unknown, in half size pixels: resampling mixes the unknown into it
 
 
@@ -66,15 +69,25 @@ def compare_robust(
     """
     _check(reference, query, valid)
     settings = settings or RobustSettings()
-    regions, light, settling, known = examine(reference, query, valid, settings)
-    scores = how_sure(regions.features, FEATURES)
-    return _result(regions, scores, settings, light, settling, known, query.shape[1::-1])
+    examined = examine(reference, query, valid, settings)
+    scores = how_sure(examined.regions.features, FEATURES)
+    return _result(examined, scores, scores >= settings.least_score, query.shape[1::-1])
+
+
+class Examined(NamedTuple):
+    """The regions that differ at half size, before anything is said about them; and what the pair set itself."""
+
+    regions: Regions
+    light: Light
+    settling: Settling
+    known: float  # share of the picture
+    views: Views
 
 
 def examine(
     reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask | None, settings: RobustSettings
-) -> tuple[Regions, Light, Settling, float]:
-    """The regions that differ at half size, before anything is said about them; and what the pair set itself."""
+) -> Examined:
+    """Look at a pair of pictures as `compare_robust` does."""
     height, width = query.shape[:2]
     half = width // 2, height // 2
     size = half[::-1]
@@ -102,9 +115,10 @@ def examine(
     light = fit_light(before, after, known)
     rim = None if known is None else _without_rim(known, RIM_PX + int(np.ceil(settling.moved_px)))
     lit = relit(before, light, spare)
-    regions = find_regions(lit, after, rim, _for_pair(settings.regions, settling), settling.rest_px, light.unevenness)
+    for_pair = _for_pair(settings.regions, settling)
+    regions = find_regions(lit, after, rim, for_pair, settling.rest_px, light.unevenness)
     share = 1.0 if rim is None else cv2.countNonZero(rim.view(np.uint8)) / rim.size
-    return regions, light, settling, share
+    return Examined(regions, light, settling, share, Views(before, after, lit, rim, for_pair))
 
 
 def _for_pair(settings: RegionSettings, settling: Settling) -> RegionSettings:
@@ -141,25 +155,26 @@ def _without_rim(known: Mask, rim_px: int) -> Mask:
     return np.asarray(cv2.erode(known.astype(np.uint8), window, borderValue=1) > 0)
 
 
-def _result(
-    regions: Regions, scores: Floats, settings: RobustSettings, light: Light, settling: Settling, known: float,
-    size: tuple[int, int],
-) -> RobustResult:
-    sure = scores >= settings.least_score
+def _result(examined: Examined, scores: Floats, sure: Mask, size: tuple[int, int]) -> RobustResult:
+    """The answer at full `size` (w, h): the `sure` (N,) among the regions."""
+    regions, light, settling, known, views = examined
     if not sure.any():
         nothing = np.zeros(size[::-1], np.uint8), np.zeros((0, 4), np.int64), np.zeros(0)
         return RobustResult(*nothing, light, settling, regions.noise, known)
     count, parts = cv2.connectedComponents(regions.weak, connectivity=8)
     went = _went(regions, parts)
+    regions, views = without_halos(regions, sure, views, light)
+    pieces = {int(each): grown(regions, int(each), not went[each], views) for each in np.flatnonzero(sure)}
     half = regions.labels.shape[::-1]
-    boxes_px = regions.boxes.astype(np.float64)
+    boxes_px = np.array([_around(box, pieces.get(each)) for each, box in enumerate(regions.boxes)], np.float64)
     if settling.moved_px < SAME_PLACE_PX or not (sure & went).any():
-        half_mask = _filled(sure, regions, parts, count)
+        half_mask = _filled(sure, regions, pieces, parts, count)
     else:  # what disappeared is seen in the reference: it keeps the reference's pixels
-        gone: Anything = _filled(sure & went, regions, parts, count)
+        gone: Anything = _filled(sure & went, regions, pieces, parts, count)
         gone = cv2.warpPerspective(gone, settling.reference_from_query, half, flags=cv2.INTER_LINEAR)
         stays = sure & ~went
-        half_mask = np.asarray(cv2.max(_filled(stays, regions, parts, count), gone) if stays.any() else gone, np.uint8)
+        half_mask = _filled(stays, regions, pieces, parts, count) if stays.any() else np.zeros(half[::-1], np.uint8)
+        half_mask = np.asarray(cv2.max(half_mask, gone), np.uint8)
         middle = boxes_px[:, :2] + boxes_px[:, 2:] / 2
         moved = np.column_stack([middle, np.ones(len(middle))]) @ settling.reference_from_query.T
         boxes_px[went, :2] += (moved[:, :2] / moved[:, 2:] - middle)[went]
@@ -169,6 +184,16 @@ def _result(
     sides = np.rint(boxes_px[sure, 2:] * factor).astype(np.int64)
     boxes = np.hstack([corners, np.minimum(sides, np.array(size) - corners)])
     return RobustResult(mask, boxes, scores[sure], light, settling, regions.noise, known)
+
+
+def _around(box: Anything, piece: Piece | None) -> tuple[int, int, int, int]:
+    """x, y, width, height of what holds a region's box and what it has grown to."""
+    x, y, wide, high = (int(each) for each in box)
+    if piece is None:
+        return x, y, wide, high
+    left, top, piece_wide, piece_high = piece.box
+    right, bottom = max(x + wide, left + piece_wide), max(y + high, top + piece_high)
+    return min(x, left), min(y, top), right - min(x, left), bottom - min(y, top)
 
 
 def _enlarged(half_mask: ImageGray, size: tuple[int, int]) -> ImageGray:
@@ -194,8 +219,11 @@ def _went(regions: Regions, parts: Anything) -> Mask:
     return np.asarray(came[part] < 0)
 
 
-def _filled(chosen: Mask, regions: Regions, parts: Anything, count: int) -> ImageGray:
-    """The `chosen` (N,) regions with what weakly differs around their cores, less a rim of blur, and without gaps.
+def _filled(
+    chosen: Mask, regions: Regions, pieces: Mapping[int, Piece | None], parts: Anything, count: int
+) -> ImageGray:
+    """The things of the `chosen` (N,) regions: their `pieces`, and where there is none the region with what weakly
+    differs around its core, less a rim of blur; without gaps.
 
     `parts` (h, w) are the weakly differing pieces, 0 .. `count` - 1, 0 none. Where a thing has the ground's own colour
     nothing differs: what is nearly convex is taken to be so. The outline runs, to a part of a pixel, where the result
@@ -203,40 +231,45 @@ def _filled(chosen: Mask, regions: Regions, parts: Anything, count: int) -> Imag
     """
     size = regions.labels.shape[0], regions.labels.shape[1]
     cores, around, whole = _SCRATCH.stack("filled", size, 3)
-    looked_up(regions.labels, np.concatenate([[0], chosen * np.uint8(255)]).astype(np.uint8), cores)
-    window = np.ones((5, 5), np.uint8)  # two blurs of 3 px reach two pixels out
-    held = np.zeros(count, bool)
-    for region in np.flatnonzero(chosen):
-        x, y, wide, high = regions.boxes[region]
-        place = slice(y, y + high), slice(x, x + wide)
-        held[parts[place][regions.labels[place] == region + 1]] = True
-    held[0] = False
-    looked_up(parts, held.astype(np.uint8) * np.uint8(255), whole)
-    cv2.erode(whole, window, dst=around)
-    np.multiply(around, regions.labels == 0, out=around)
-    cv2.max(cores, around, dst=around)
-    cv2.morphologyEx(around, cv2.MORPH_CLOSE, np.ones((CLOSES_PX, CLOSES_PX), np.uint8), dst=whole)
-    outlines, _ = cv2.findContours(whole, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    alone = np.array([bool(is_chosen) and pieces[each] is None for each, is_chosen in enumerate(chosen)], bool)
+    if alone.any():
+        looked_up(regions.labels, np.concatenate([[0], alone * np.uint8(255)]).astype(np.uint8), cores)
+        held = np.zeros(count, bool)
+        for region in np.flatnonzero(alone):
+            x, y, wide, high = regions.boxes[region]
+            place = slice(y, y + high), slice(x, x + wide)
+            held[parts[place][regions.labels[place] == region + 1]] = True
+        held[0] = False
+        looked_up(parts, held.astype(np.uint8) * np.uint8(255), whole)
+        cv2.erode(whole, np.ones((5, 5), np.uint8), dst=around)  # two blurs of 3 px reach two pixels out
+        np.multiply(around, regions.labels == 0, out=around)
+        cv2.max(cores, around, dst=around)
+    else:
+        around[:] = 0
+    for region in np.flatnonzero(chosen & ~alone):
+        piece = pieces[int(region)]
+        if piece is not None:
+            around[piece.window][piece.mask] = 255
+    x, y, wide, high = cv2.boundingRect(around)
+    things = np.s_[max(0, y - CLOSES_PX) : y + high + CLOSES_PX, max(0, x - CLOSES_PX) : x + wide + CLOSES_PX]
+    closed: Anything = cv2.morphologyEx(around[things], cv2.MORPH_CLOSE, np.ones((CLOSES_PX, CLOSES_PX), np.uint8))
+    outlines, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     for outline in outlines:
         hull = cv2.convexHull(outline)
         is_full = cv2.contourArea(outline) > LEAST_CONVEXITY * cv2.contourArea(hull)
-        cv2.drawContours(whole, [hull if is_full else outline], -1, 255.0, cv2.FILLED)
-    outlined = _outlined(whole, regions.strength)
+        cv2.drawContours(closed, [hull if is_full else outline], -1, 255.0, cv2.FILLED)
+    outlined = np.zeros(size, np.uint8)
+    outlined[things] = _outlined(closed, regions.strength[things])
     if regions.known is not None:
         outlined[~regions.known] = 0
     return outlined
 
 
-def _outlined(whole: ImageGray, strength: Anything) -> ImageGray:
+def _outlined(thing: ImageGray, strength: Anything) -> ImageGray:
     """Things (h, w) 0 or 255 whose rim is drawn anew where the difference falls below a part of its height nearby."""
-    outlined = np.zeros_like(whole)
-    x, y, wide, high = cv2.boundingRect(whole)
-    window = np.s_[max(0, y - 1) : y + high + 1, max(0, x - 1) : x + wide + 1]
-    thing, here = whole[window], strength[window]
     near = np.ones((RIM_WIDTH_PX, RIM_WIDTH_PX), np.uint8)
-    height = np.maximum(cv2.dilate(cv2.min(thing, here), near), 1).astype(np.float32)
+    height = np.maximum(cv2.dilate(cv2.min(thing, strength), near), 1).astype(np.float32)
     limit = np.maximum(np.float32(0.5) * height - np.float32(SLACK), np.float32(LEAST_SHARE) * height)
-    rim = np.clip(127.5 + 255 * (here - limit) / height, 0, 255).astype(np.uint8)
+    rim = np.clip(127.5 + 255 * (strength - limit) / height, 0, 255).astype(np.uint8)
     rim[cv2.dilate(thing, np.ones((3, 3), np.uint8)) == 0] = 0
-    outlined[window] = cv2.max(rim, cv2.erode(thing, near))
-    return outlined
+    return np.asarray(cv2.max(rim, cv2.erode(thing, near)), np.uint8)
