@@ -106,10 +106,10 @@ def compare_and_read_results(
         )
         # closed even when the bar is stopped: then the site is as it was
         with closing(comparing) as updates:
-            _show_progress(updates, Console(stderr=True))
+            told_ids = _show_progress(updates, Console(stderr=True))
     with Archive.open(site, write=False) as archive:
         compared = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
-        return [_result(archive.flight_folder(flight_id)) for flight_id in compared]
+        return [_result(archive.flight_folder(flight_id), told_ids) for flight_id in compared]
 
 
 def show_results(results: Sequence[Mapping[str, Any]], site: Path, console: Console) -> None:
@@ -122,25 +122,27 @@ def show_results(results: Sequence[Mapping[str, Any]], site: Path, console: Cons
     tell_path("map", site / "preview.png", console)
 
 
-def _show_progress(updates: Any, console: Console) -> None:
+def _show_progress(updates: Any, console: Console) -> list[str]:
+    """Take all updates, telling each change as it is announced; the ids of these."""
     columns = (
         SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=30),
         TextColumn("{task.fields[told]}"), TimeRemainingColumn(),
     )
-    number = 0
+    told_ids: list[str] = []
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("opening", total=None, told="")
         update: CompareUpdate
         for update in updates:
             for change in update.announced:
-                number += 1
+                told_ids.append(change.id)
                 console.print(_words_of(change), highlight=False)
             rate = f"{update.frames_read / update.seconds:.1f} frames/s, " if update.seconds > 0 else ""
             progress.update(
                 task, description="comparing",
-                told=f"{rate}{update.compared} of {update.views} compared, {number} changes",
+                told=f"{rate}{update.compared} of {update.views} compared, {len(told_ids)} changes",
                 total=max(update.frames_expected, update.frames_read), completed=update.frames_read,
             )
+    return told_ids
 
 
 def _words_of(change: Change) -> str:
@@ -149,18 +151,22 @@ def _words_of(change: Change) -> str:
     named = " to ".join(escape(name) for name in (change.class_before, change.class_after) if name)
     what = f"{named}, " if named else ""
     return (
-        f"[{colour}]{change.kind.value:>11}[/{colour}]  {what}{change.length_m:.1f} m long, {centre_m[0]:+.1f} m east "
-        f"{centre_m[1]:+.1f} m north of the site's origin, within {change.sigma_m:.2f} m"
+        f"[{colour}]{change.kind.value:>11}[/{colour}]  {escape(change.id)}: {what}{change.length_m:.1f} m long, "
+        f"{centre_m[0]:+.1f} m east {centre_m[1]:+.1f} m north of the site's origin, within {change.sigma_m:.2f} m"
     )
 
 
-def _result(folder: Path) -> dict[str, Any]:
+def _result(folder: Path, told_ids: Sequence[str]) -> dict[str, Any]:
+    """What a flight's files say, and which changes were told while it lasted and are not among them in the end."""
     report = read_json(folder / "report.json")
     changes = read_json(folder / "changes.geojson")
+    kept = {feature["properties"]["id"] for feature in changes["features"]}
+    taken_back = [each for each in told_ids if each.rpartition("-")[0] == report["flight"] and each not in kept]
     return {
         "flight": report["flight"], "method": report["method"], "comparison": report["comparison"],
         "frames": report["frames"], "seconds": report["seconds"]["total"], "peak_memory_mb": report["peak_memory_mb"],
         "warnings": report["warnings"], "notices": report["notices"], "changes": changes,
+        "taken_back": taken_back,
     }
 
 
@@ -186,6 +192,11 @@ def _show_result(result: Mapping[str, Any], console: Console) -> None:
         f"{views['compared']} of {sum(views.values())} views compared over {comparison['compared_area_m2']:.0f} m2, "
         f"in {result['seconds']:.1f} s, {result['peak_memory_mb']:.0f} MB at most"
     )
+    if result["taken_back"]:
+        console.print(
+            f"taken back, since what the whole flight showed does not bear them out: {', '.join(result['taken_back'])}",
+            highlight=False, markup=False,
+        )
     for reason, count in list(comparison["reasons"].items())[:6]:
         console.print(f"  {count} x {escape(reason)}", highlight=False)
     for warning in result["warnings"]:
