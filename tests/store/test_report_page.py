@@ -30,6 +30,13 @@ def test_page_needs_nothing_else() -> None:
     assert "http" not in page and "url(" not in page and "@import" not in page
 
 
+def test_a_later_flight_fits_the_map_and_made_none() -> None:
+    words = _words(report_page(fake_report() | {"comparison": {"against_version": 1}}, fake_picture()))
+    assert re.search(r"\d+ of 60 views fit the map", words) and "changes.html" in words and "frame to the map" in words
+    alone = _words(report_page(fake_report(), fake_picture()))
+    assert "make a map" in alone and "changes.html" not in alone and "to its neighbours" in alone
+
+
 def test_picture_is_the_map_on_grey() -> None:
     picture = fake_picture(noise=0.0)
     page = report_page(fake_report(), picture)

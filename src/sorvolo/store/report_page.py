@@ -96,6 +96,8 @@ def _headline(report: Mapping[str, Any]) -> str:
     if report.get("georeferenced"):
         area, gsd = area_words(number_at(report, "area_m2")), number_at(report, "ground_sampling_distance_m")
         place = f" of {area}" + (f" at {length_words(gsd)} a pixel" if gsd is not None else "")
+    if report.get("comparison"):  # a later flight: its map is that of the flights before, brought up to date
+        return f"{'All' if vision == selected else f'{vision} of'} {selected} views fit the map{place}."
     if not vision + blind:
         return f"None of {selected} selected frames could be placed: there is no map of this flight."
     if vision == selected:
@@ -112,7 +114,7 @@ def _second_sentence(report: Mapping[str, Any]) -> str:
             "and cannot be laid over other maps."
         )
     sigma, gps = number_at(report, "sigma_m"), number_at(report, "gps_residual_m", "median")
-    parts = []
+    parts = ["What changed is told in changes.html."] if report.get("comparison") else []
     if sigma is not None:
         parts.append(
             f"The map lies in its place to {length_words(sigma)} (one sigma), what all its GPS fixes may err in common "
@@ -160,7 +162,7 @@ def _key_figures(report: Mapping[str, Any]) -> str:
          "of the map on the ground; pictures: "
          + (length_words(number_at(report, "native_ground_sampling_distance_m")) or "unknown")),
         ("residual", with_unit("{:.2f} px", number_at(report, "residual_px", "median")),
-         "median misfit of a frame to its neighbours; 95 % below "
+         f"median misfit of a frame to {'the map' if report.get('comparison') else 'its neighbours'}; 95 % below "
          + (with_unit("{:.2f} px", number_at(report, "residual_px", "p95")) or "unknown")),
         ("GPS", length_words(number_at(report, "gps_residual_m", "median")) if unit == "m" else None,
          "median distance of cameras and fixes, level; rms "
