@@ -124,7 +124,7 @@ def test_a_stop_ends_well_with_everything_written(
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
         deadline = time.monotonic() + 60
         lines = out / "detections.jsonl"
-        while not (lines.exists() and lines.stat().st_size > 300) and time.monotonic() < deadline:
+        while not (lines.exists() and lines.stat().st_size > 3000) and time.monotonic() < deadline:
             time.sleep(0.01)
         os.kill(running.pid, signal_number)
         told, err = running.communicate(timeout=60)

@@ -157,6 +157,14 @@ def test_what_is_far_too_short_for_its_class_is_not_laid() -> None:
     assert [each is None for each in lay_on_ground(seen, frame)] == [CLASSES[1] == "car", False, False]
 
 
+@pytest.mark.parametrize(("score", "count"), [(0.95, 1), (0.6, 0)])
+def test_what_one_frame_alone_shows_must_be_sure(score: float, count: int) -> None:
+    frames = [placed(0, 0.0, 0.0), placed(1, 60.0, 0.0)]
+    seen = Detections(np.array([[400.0, 200.0, 416.0, 215.0]]), np.array([score]), np.array([2]), CLASSES)
+    laid = [each for each in lay_on_ground(seen, frames[0]) if each is not None]
+    assert len(fuse(laid, frames).objects) == count
+
+
 def test_what_few_frames_saw_is_left_out() -> None:
     """Boxes around nothing, two in three frames, leave hardly any object behind."""
     frames = survey()
