@@ -179,6 +179,12 @@ def test_photos_tell_a_standing_thing_with_the_third_that_shows_it_and_are_as_su
     assert len(two) == 1 and two[0].score > 0.6
 
 
+def test_two_photos_tell_all_of_many_things():
+    things = [Thing(east, north, (0.6, 0.6)) for east in (-4, -2, 0, 2, 4) for north in (-2, 0, 2)]
+    photos = [view_of(i, 1.4 * i, (-1 + 2 * i, 0, CAMERA_HEIGHT_M), things) for i in range(2)]
+    assert len(collect(photos)[0].conclude()) == len(things)
+
+
 def test_photos_of_the_same_second_taken_elsewhere_count():
     photos = [view_of(i, 0.0, (-3 + 3 * i, 0, CAMERA_HEIGHT_M), [Thing(0, 0)]) for i in range(3)]
     assert collect(photos)[0].conclude()[0].views == 3

@@ -24,6 +24,7 @@ from sorvolo.change.gathering import GatheredChange, upright_weight
 from sorvolo.change.movers import Movers
 from sorvolo.change.moving import BlobTracker, MovingSettings
 from sorvolo.change.parts import Parts
+from sorvolo.change.restlessness import calmness, restlessness
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageGray, Mask, Matrix3
 from sorvolo.survey.findings import Change, ComparedView
@@ -32,9 +33,11 @@ _CELL_PX = 3
 _LEAST_CELL_M = 0.05
 _LASTING = 0.3  # share of all views that must flag a cell
 _SHOWS = 0.12  # share of a change's cells that a view must flag: from above a person covers few of them
-_PICTURES_A_VIEW = 6  # cut anew at most, which bounds the time a view takes
+_PICTURES_A_VIEW, _MOST_PICTURES = 6, 30  # cut anew at most, which bounds the time a view takes ...
+_VIEWS_S = 5.0  # ... where so many come in a second; where they are seldom there is more time
 _MOST_SEEDS = 256
 _FEW_VIEWS_SCORE = 0.6  # of what fewer than k views show: two views of a tree often agree
+_CALM = 0.9  # of the score is left on calm ground
 _MOVED_HEIGHTS = 0.01  # the camera's way, in flying heights, after which a view is a new witness
 _ALL_CHANGED = 0.5  # share of the frame beyond which nothing in it can be followed
 _STANDS_S = 2.0  # what the same ground shows for so long stands there, however unsteady its blobs look
@@ -49,7 +52,7 @@ class EvidenceSettings:
     least_views: int = 2  # where fewer than n ever see it
     least_views_apart_s: float = 0.1  # frames nearer in time see the same thing and say nothing new
     least_share: float = 0.4  # of all views of its ground must show it, those from above counting most
-    least_score: float = 0.28  # less sure, it is kept but not told
+    least_score: float = 0.24  # less sure, it is kept but not told
     least_area_m2: float = 0.02
     join_m: float = 0.3  # a smaller gap does not make two things of one
     single_view_score: float = 2.0  # a single view's change this sure is told at the end; above 1: never
@@ -110,6 +113,7 @@ class EvidenceMap:
         """Take in one view; the changes that it makes certain enough to be told, each once in a flight."""
         if self._is_repeat(view):
             return ()
+        budget = [self._pictures_for(view)]
         self._last = (view.index, view.time_ns, view.camera_m)
         known = int(np.count_nonzero(view.valid))
         may_follow = np.count_nonzero(view.changed) < _ALL_CHANGED * known
@@ -126,7 +130,6 @@ class EvidenceMap:
         )
         earlier = list(self._recent)
         self._recent.append(witness)
-        budget = [_PICTURES_A_VIEW]
         new = self._gather(view, witness, earlier, evidence, budget)
         shown = self._update(view, witness, evidence.owner, {each.number for each in new}, budget)
         announced: list[Change] = []
@@ -187,6 +190,11 @@ class EvidenceMap:
         has_moved = np.linalg.norm(view.camera_m - camera_m) >= 2 * _MOVED_HEIGHTS * float(view.camera_m[2])
         is_too_soon = (view.time_ns - time_ns) * 1e-9 < self._settings.least_views_apart_s
         return view.index == index or (is_too_soon and not bool(has_moved))
+
+    def _pictures_for(self, view: ComparedView) -> int:
+        """How many pictures there is time for since the last view."""
+        waited_s = np.inf if self._last is None else (view.time_ns - self._last[1]) * 1e-9
+        return int(np.clip(_PICTURES_A_VIEW * _VIEWS_S * waited_s, _PICTURES_A_VIEW, _MOST_PICTURES))
 
     def _is_new_place(self, view: ComparedView) -> bool:
         last = self._tallied_at_m
@@ -283,7 +291,13 @@ class EvidenceMap:
         return self._part(change, now_ns)
 
     def _is_sure(self, change: GatheredChange) -> bool:
-        return change.score >= self._settings.least_score and change.share >= self._settings.least_share
+        change.calmness = 1.0
+        if change.cells is not None and change.score >= self._settings.least_score:
+            own = self._cells_of(change)
+            change.calmness = calmness(restlessness(self._grid, change.cells, own, self._cell_m))
+        # nothing tall leans over calm ground: there views from aside say as much as those from above
+        share = max(change.share, change.views / change.asked) if change.calmness > _CALM else change.share
+        return change.score >= self._settings.least_score and share >= self._settings.least_share
 
     def _answer(self, laid: LaidView, window: CellWindow, cells: Mask) -> tuple[float, float, float, Floats]:
         """What a view says of some cells: the shares of them it saw and flagged, how sure, where the flagged lie."""
@@ -469,7 +483,8 @@ class EvidenceMap:
             return
         for _ in range(int(seen[cells].max()) - seed.asked):
             seed.miss(1.0)
-        if cells is late and seed.views < settings.k and seed.score < _FEW_VIEWS_SCORE:
+        shown = max(seed.views, int(np.median(changed[cells])))
+        if cells is late and shown < settings.k and seed.score < _FEW_VIEWS_SCORE:
             return
         seed.number = self._next_number()
         self._grid.own(seed.cells, cells, seed.number)

@@ -38,6 +38,7 @@ class GatheredChange:
         self.views = self.asked = 0
         self._weight_for = self._weight_asked = 0.0
         self.weakness = 1.0  # factor of the score, for what too few views say
+        self.calmness = 1.0  # factor of the score, for how calm the ground around is
         self.whole = 0  # views that showed all of it: in the others it ends at a rim
         self.held = 0  # views in which it seemed to move, or nobody could tell
         self.cells: CellWindow | None = None
@@ -91,11 +92,11 @@ class GatheredChange:
     @property
     def score(self) -> float:
         """0 to 1: mean sureness of its boxes x (views that show it + 1) / (views that could + 2), which is the mean of
-        a share under Bayes; halved if all of them looked from one place, and less
-        if few of them show all of it: at the rim walls lean in whole, and ends are no outlines."""
+        a share under Bayes; halved if all of them looked from one place, less if few
+        of them show all of it (at the rim walls lean in whole, and ends are no outlines), and on restless ground."""
         if not self.views:
             return 0.0
-        score = self._score_sum / self.views * (self.views + 1) / (self.asked + 2) * self.weakness
+        score = self._score_sum / self.views * (self.views + 1) / (self.asked + 2) * self.weakness * self.calmness
         apart_m = float(np.hypot(*(self._camera_high - self._camera_low)[:2]))
         is_one_place = self.views > 1 and apart_m < _ONE_PLACE * float(self._camera_high[2])
         wholeness = _NEVER_WHOLE + (1 - _NEVER_WHOLE) * min(2 * self.whole / self.views, 1.0)

@@ -21,6 +21,7 @@ from sorvolo.kernels import looked_up
 LEAST_SIDE_PX = 32
 CLOSES_PX = 9
 LEAST_CONVEXITY = 0.5
+LEAST_GROWN = 0.5  # sureness: what is doubted is shown as it differs, and takes no ground from around
 SAME_PLACE_PX = 0.6  # half size pixels
 ALL_KNOWN = 0x0101  # two True side by side
 CALM_PX = 0.4  # rest of the flow below: values are looked for one pixel less far around
@@ -163,8 +164,14 @@ def _result(examined: Examined, scores: Floats, sure: Mask, size: tuple[int, int
         return RobustResult(*nothing, light, settling, regions.noise, known)
     count, parts = cv2.connectedComponents(regions.weak, connectivity=8)
     went = _went(regions, parts)
-    regions, views = without_halos(regions, sure, views, light)
-    pieces = {int(each): grown(regions, int(each), not went[each], views) for each in np.flatnonzero(sure)}
+    grows = sure & (scores >= LEAST_GROWN)
+    pieces: dict[int, Piece] = {}
+    if grows.any():
+        regions, views = without_halos(regions, grows, views, light)
+    for region in np.flatnonzero(grows):
+        piece = grown(regions, int(region), not went[region], views)
+        if piece is not None:
+            pieces[int(region)] = piece
     half = regions.labels.shape[::-1]
     boxes_px = np.array([_around(box, pieces.get(each)) for each, box in enumerate(regions.boxes)], np.float64)
     if settling.moved_px < SAME_PLACE_PX or not (sure & went).any():
@@ -220,7 +227,7 @@ def _went(regions: Regions, parts: Anything) -> Mask:
 
 
 def _filled(
-    chosen: Mask, regions: Regions, pieces: Mapping[int, Piece | None], parts: Anything, count: int
+    chosen: Mask, regions: Regions, pieces: Mapping[int, Piece], parts: Anything, count: int
 ) -> ImageGray:
     """The things of the `chosen` (N,) regions: their `pieces`, and where there is none the region with what weakly
     differs around its core, less a rim of blur; without gaps.
@@ -231,7 +238,7 @@ def _filled(
     """
     size = regions.labels.shape[0], regions.labels.shape[1]
     cores, around, whole = _SCRATCH.stack("filled", size, 3)
-    alone = np.array([bool(is_chosen) and pieces[each] is None for each, is_chosen in enumerate(chosen)], bool)
+    alone = np.array([bool(is_chosen) and each not in pieces for each, is_chosen in enumerate(chosen)], bool)
     if alone.any():
         looked_up(regions.labels, np.concatenate([[0], alone * np.uint8(255)]).astype(np.uint8), cores)
         held = np.zeros(count, bool)
@@ -248,8 +255,7 @@ def _filled(
         around[:] = 0
     for region in np.flatnonzero(chosen & ~alone):
         piece = pieces[int(region)]
-        if piece is not None:
-            around[piece.window][piece.mask] = 255
+        around[piece.window][piece.mask] = 255
     x, y, wide, high = cv2.boundingRect(around)
     things = np.s_[max(0, y - CLOSES_PX) : y + high + CLOSES_PX, max(0, x - CLOSES_PX) : x + wide + CLOSES_PX]
     closed: Anything = cv2.morphologyEx(around[things], cv2.MORPH_CLOSE, np.ones((CLOSES_PX, CLOSES_PX), np.uint8))

@@ -11,7 +11,7 @@ from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
 LEAST_SURENESS = 0.2  # a picture that shows a difference so surely bears out one that shows it surely
 _SURE = 0.5
 _NEAR_PX = 9  # what leans a little another way lies a few pixels beside
-_SHOWN, _SEEN = 0.3, 0.7  # shares of a difference that another picture shows, and must see to be asked
+_SHOWN, _SEEN = 0.3, 0.95  # shares of a difference that another picture shows, and must see to be asked
 _MAP = 0  # the first of the opinions
 
 

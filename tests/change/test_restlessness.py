@@ -1,0 +1,79 @@
+"""Ground on which differences come and go makes what is found in it less sure; calm ground does not."""
+
+import numpy as np
+from blob_world import CAMERA_HEIGHT_M, M_PER_PX, Thing, view_of
+
+from sorvolo.change.cells import CellGrid, CellWindow, LaidView
+from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
+from sorvolo.change.restlessness import calmness, restlessness
+
+CELL_M = 0.1
+GROUND = CellWindow(-100, -100, 100, 100)
+THING = CellWindow(-5, -5, 5, 5)
+
+
+def laid(flagged: np.ndarray, seen: np.ndarray | None = None) -> LaidView:
+    seen = np.ones(GROUND.shape, bool) if seen is None else seen
+    return LaidView(GROUND, flagged & seen, seen, np.full(GROUND.shape, 255, np.uint8), np.zeros(GROUND.shape, bool))
+
+
+def grid_after(views: list[LaidView]) -> CellGrid:
+    grid = CellGrid(5)
+    for each in views:
+        grid.record(each, True)
+    return grid
+
+
+def thing_alone() -> np.ndarray:
+    flagged = np.zeros(GROUND.shape, bool)
+    flagged[THING.within(GROUND)] = True
+    return flagged
+
+
+def measured(views: list[LaidView]) -> float:
+    return restlessness(grid_after(views), THING, np.ones(THING.shape, bool), CELL_M)
+
+
+def test_it_is_the_share_of_views_that_flag_what_most_others_do_not():
+    rng = np.random.default_rng(5)
+    for share in (0.0, 0.05, 0.15):
+        views = [laid(thing_alone() | (rng.random(GROUND.shape) < share)) for _ in range(12)]
+        assert abs(measured(views) - share) < 0.02
+
+
+def test_neighbours_that_changed_themselves_and_the_own_rim_are_calm():
+    neighbour = thing_alone()
+    neighbour[GROUND.shape[0] // 2 + 20 : GROUND.shape[0] // 2 + 40, 90:110] = True
+    rims = [np.roll(thing_alone(), (shift, -shift), axis=(0, 1)) for shift in (-3, 0, 3)]
+    assert measured([laid(neighbour) for _ in range(6)]) == 0
+    assert measured([laid(each) for each in rims * 2]) == 0
+
+
+def test_where_nothing_else_was_seen_twice_nothing_is_known():
+    seen = thing_alone()
+    assert measured([laid(thing_alone(), seen) for _ in range(3)]) == 0
+    assert measured([laid(np.random.default_rng(1).random(GROUND.shape) < 0.5)]) == 0
+
+
+def test_calm_ground_leaves_a_score_as_it_is_and_restless_ground_hardly_anything():
+    assert calmness(0.0) == 1.0
+    assert calmness(0.01) > 0.9
+    assert calmness(0.15) < 0.1
+
+
+def photos_among(ghosts: int) -> EvidenceMap:
+    """Three photos of a thing that came, each with so many other small differences, elsewhere in each."""
+    rng = np.random.default_rng(2)
+    evidence = EvidenceMap(M_PER_PX, EvidenceSettings(), "f")
+    for i in range(3):
+        places = rng.uniform([-7, -4], [7, 4], (2 * ghosts, 2))
+        places = places[np.hypot(*places.T) > 1.5][:ghosts]
+        around = [Thing(*place, (0.4, 0.4), colour=(40, 40, 200)) for place in places]
+        evidence.add(view_of(i, 1.4 * i, (-1 + i, 0, CAMERA_HEIGHT_M), [Thing(0, 0), *around]))
+    return evidence
+
+
+def test_three_photos_that_agree_tell_on_calm_ground_and_not_where_much_else_differs_in_each():
+    calm, restless = (photos_among(ghosts).conclude() for ghosts in (0, 70))
+    assert len(calm) == 1 and calm[0].score > 0.4
+    assert [each for each in restless if np.hypot(*each.outline_m.mean(axis=0)) < 0.5] == []
