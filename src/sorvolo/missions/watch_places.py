@@ -148,8 +148,9 @@ class GroundPlaces:
         side = "clockwise" if compass_deg > 0 else "counter-clockwise"
         off = f"the compass reads about {abs(compass_deg):.0f} degrees too far {side}, by what stands: taken off"
         compass = (Notice("compass_off", 1, off),) if abs(compass_deg) > _COMPASS_TOLD_DEG else ()
-        over = ", over the height model's ground" if self._ground is not None else ""
-        height = f"{track.height_words if track else ''}{over}"
+        height = track.height_words if track else ""
+        if self._ground is not None:
+            height = f"{height.split(',')[0]}, over the height model's ground"
         text = f"places come from the telemetry's position, height ({height}) and {how}"
         return (
             *self._setup.notices, Notice("placed_by", 1, text), *compass,
