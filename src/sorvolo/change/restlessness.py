@@ -13,7 +13,7 @@ from sorvolo.geometry.arrays import Mask
 _AROUND_M = 5.0  # a crown's width
 _APART_M, _LEAN = 0.5, 0.2  # nearer lies the change's own rim, and so many of its lengths what leans with it
 _PASSING = 0.5  # of its views at most: more, and the ground there is changed itself
-_RESTLESS = 0.04  # share of views in which ground around is flagged for nothing, at which half of the score is left
+_RESTLESS = 0.05  # share of views in which ground around is flagged for nothing, at which half of the score is left
 
 
 def restlessness(grid: CellGrid, window: CellWindow, own: Mask, cell_m: float) -> float:
