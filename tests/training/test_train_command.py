@@ -38,6 +38,16 @@ def _train(data: Path, out: Path, settings: TrainSettings, *, resume: bool = Fal
     return train_detector([data], out, settings, DataOptions(val="0.25"), device="cpu", resume=resume)
 
 
+@pytest.mark.parametrize("ends_early", [True, False])
+def test_the_process_counts_as_before_when_a_training_has_ended(data: Path, tmp_path: Path, ends_early: bool) -> None:
+    updates = _train(data, tmp_path / "run", _settings(steps=2))
+    for update in updates:
+        if ends_early and update.losses is not None:
+            break
+    updates.close()  # type: ignore[attr-defined]
+    assert (torch.tensor(1e-40) * torch.tensor(0.5)).item() > 0  # smaller than a normal number, not yet nothing
+
+
 def test_the_command_learns_and_writes_a_model_that_runs(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "my-model"
     options = ["--weights", "none", "--steps", "40", "--batch", "2", "--side", "64", "--val", "0.25", "--device", "cpu"]

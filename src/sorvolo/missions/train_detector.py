@@ -39,7 +39,7 @@ from sorvolo.training.four_steps import STEP_NAMES, FourStepTraining
 from sorvolo.training.joint import Progress
 from sorvolo.training.progress import Check, History, Learner, seconds_left
 from sorvolo.training.samples import Augmentation, Sample
-from sorvolo.training.starting import device_of, start_learner
+from sorvolo.training.starting import device_of, start_learner, without_denormals
 from sorvolo.training.weights import ImageNetWeights
 
 MODEL, REPORT, PAGE = "model.onnx", "training.json", "training.html"
@@ -120,19 +120,20 @@ def train_detector(
         told += tuple(told_of_classes(start, sets.classes))
     yield TrainingUpdate(0, steps, f"preparing the network ({settings.preset})", notices=told)
     reader = _Reader(sets)
-    with closing(_batches(sets, reader, settings)) as first:
-        learner = start_learner(
-            settings.preset, sets.classes, settings.rpn, settings.schedule, start, first, steps=steps,
-            batch=settings.batch, seed=settings.seed, device=device,
-        )
-    run = _Run(out, settings, sets, learner, reader, device, start, told)
-    if resume:
-        checkpoint = read_checkpoint((out / CHECKPOINT).read_bytes(), str(out / CHECKPOINT))
-        restore(run.learner, checkpoint, run.identity)
-        run.history = checkpoint.history
-    yield from _learn(run)
-    yield TrainingUpdate(run.learner.step, steps, "measuring and writing the model")
-    check, told = _finish(run)
+    with without_denormals():
+        with closing(_batches(sets, reader, settings)) as first:
+            learner = start_learner(
+                settings.preset, sets.classes, settings.rpn, settings.schedule, start, first, steps=steps,
+                batch=settings.batch, seed=settings.seed, device=device,
+            )
+        run = _Run(out, settings, sets, learner, reader, device, start, told)
+        if resume:
+            checkpoint = read_checkpoint((out / CHECKPOINT).read_bytes(), str(out / CHECKPOINT))
+            restore(run.learner, checkpoint, run.identity)
+            run.history = checkpoint.history
+        yield from _learn(run)
+        yield TrainingUpdate(run.learner.step, steps, "measuring and writing the model")
+        check, told = _finish(run)
     yield TrainingUpdate(run.learner.step, steps, f"{out / MODEL} is ready", check=check, notices=told)
 
 

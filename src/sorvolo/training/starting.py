@@ -1,6 +1,7 @@
 """A training's beginning: the device, the network with its weights, the schedule."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import islice
 from typing import Literal
 
@@ -34,6 +35,19 @@ def device_of(wanted: str) -> str:
     return wanted
 
 
+@contextmanager
+def without_denormals() -> Iterator[None]:
+    """What is almost nothing counts as nothing meanwhile: weights that decay so far cost a hundred times as much.
+
+    The processor is told so, hence the whole thread, whatever it calculates.
+    """
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(False)
+
+
 def start_learner(
     preset: Preset, classes: Sequence[str], rpn: Stem, schedule: Literal["joint", "four-steps"],
     start: ImageNetWeights | ExportedModel | None, first: Iterator[Sequence[Sample]], *, steps: int, batch: int,
@@ -44,7 +58,6 @@ def start_learner(
     `first` are batches of what is to be learnt: they settle the norms of an exported model, and are else not drawn.
     Raises InputError where an exported model does not fit.
     """
-    torch.set_flush_denormal(True)  # weights that decay to almost nothing would cost a hundred times the time
     torch.manual_seed(seed)
     rate = _RATES[preset]
     if isinstance(start, ExportedModel):
