@@ -118,6 +118,8 @@ def test_parts_that_are_named_stay_in_float(model: Path) -> None:
     backbone = quantise(packaged, _pictures(8), float_parts=("neck", "proposals"))
     assert 20 < backbone.convolutions < whole.convolutions
     assert {weight.data_type for weight in _weights(backbone.model, "neck")} == {onnx.TensorProto.FLOAT}
+    piece = quantise(packaged, _pictures(8), float_parts=("neck", "proposals", "backbone/_blocks.1"))
+    assert backbone.convolutions - 3 == piece.convolutions, "the three of block 1, none of block 10"
     with pytest.raises(SettingsError, match=r"no part tail; it has backbone, head, neck, proposals"):
         quantise(packaged, _pictures(8), float_parts=("tail",))
     with pytest.raises(SettingsError, match="no part neck"):

@@ -161,7 +161,9 @@ def quantise(
     most: Annotated[int, typer.Option(min=8, help="Use at most so many of the pictures.")] = 64,
     float_parts: Annotated[
         list[str] | None,
-        typer.Option("--float", help="Leave a part in float: backbone, neck, proposals. Can be repeated."),
+        typer.Option(
+            "--float", help="Leave a part in float: backbone, neck, proposals, backbone/_blocks.0. Can be repeated."
+        ),
     ] = None,
 ) -> None:
     """Make a model that is smaller and quicker, in whole numbers of eight bits. Measure both before you trust it.

@@ -42,10 +42,11 @@ def quantise(path: Path, pictures: Iterable[ImageRGB], *, float_parts: Sequence[
     `pictures` (H, W, 3) are what it will have to see: all lights and grounds, some dozens. Weights are scaled per
     channel, activations by the least and the greatest value that occurs (static quantisation, Q and DQ nodes:
     Jacob et al. 2018). In float remain the last convolutions of each branch, which say how likely and where, and all
-    that handles boxes, and the network's parts that `float_parts` names ("backbone", "neck", "proposals"): what is
-    narrow gains little speed and loses most. Whether it is good enough must be measured: `sorvolo evaluate detector`
-    on both. Raises InputError for a file that is no model of ours or is in eight bits already and for too few
-    pictures, SettingsError where the package onnx is not installed and for a part that the model does not have.
+    that handles boxes, and the network's parts that `float_parts` names ("neck", "proposals", or a piece of one,
+    "backbone/_blocks.0"): what is narrow gains little speed and loses most. Whether it is good enough must be
+    measured: `sorvolo evaluate detector` on both. Raises InputError for a file that is no model of ours or is in eight
+    bits already and for too few pictures, SettingsError where the package onnx is not installed and for a part that
+    the model does not have.
     """
     try:
         import onnx
@@ -60,10 +61,10 @@ def quantise(path: Path, pictures: Iterable[ImageRGB], *, float_parts: Sequence[
     model = onnx.load_model(path)
     _prepare(model)
     parts = {node.name.split("/")[1] for node in model.graph.node if node.name.startswith("/")}
-    if unknown := [each for each in float_parts if each not in parts]:
+    if unknown := [each for each in float_parts if not any(_lies_in(node.name, each) for node in model.graph.node)]:
         there = ", ".join(sorted(parts & {"backbone", "neck", "proposals", "head"}))
         raise SettingsError(f"{path} has no part {', '.join(unknown)}; it has {there}")
-    chosen = [name for name in _quantisable(model) if name.split("/")[1:2] not in [[each] for each in float_parts]]
+    chosen = [name for name in _quantisable(model) if not any(_lies_in(name, each) for each in float_parts)]
     if not chosen:
         raise InputError(f"{path} has no convolutions that lead to others: eight bits would gain nothing")
     samples = _Samples(session, pictures)
@@ -86,6 +87,11 @@ def quantise(path: Path, pictures: Iterable[ImageRGB], *, float_parts: Sequence[
     onnx.helper.set_model_props(quantised, metadata)
     convolutions = {node.name for node in model.graph.node if node.op_type == "Conv"}
     return Quantised(quantised.SerializeToString(), len(convolutions & set(chosen)), len(convolutions))
+
+
+def _lies_in(node: str, part: str) -> bool:
+    """Whether a node of the graph, named by its path, belongs to a part of the network."""
+    return f"{node}/".startswith(f"/{part}/")
 
 
 @contextmanager
