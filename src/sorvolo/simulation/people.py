@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats, ImageRGBA, Matrix3
+from sorvolo.geometry.pose import rotation_from_vector
 from sorvolo.simulation.objects import POSES, Light, Limb, Part, Thing
 from sorvolo.simulation.view import cut_out
 
@@ -143,8 +144,7 @@ def _swung(forward_deg: float, left_deg: float) -> Floats:
 
 def _about_y(forward_deg: float) -> Matrix3:
     """The rotation that leans what stands upright forward."""
-    c, s = np.cos(np.radians(forward_deg)), np.sin(np.radians(forward_deg))
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    return rotation_from_vector(np.array([0.0, np.radians(forward_deg), 0.0]))
 
 
 def _dressed(rng: np.random.Generator) -> _Clothes:

@@ -203,9 +203,7 @@ def _targets(
     placed: list[Thing] = []
     for label in (Label.CAR, Label.PERSON, Label.SMALL):
         for _ in range(counts[label]):
-            kind = new_kind(label, rng)
-            if label is Label.PERSON:
-                kind = _person(rng)
+            kind = _person(rng) if label is Label.PERSON else new_kind(label, rng)
             size_m = new_size(label, kind, rng)
             new = Thing(
                 len(others) + len(placed) + 1, label, kind, 0.0, 0.0, 0.0, size_m, int(rng.integers(2**31))
