@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -25,6 +26,23 @@ def test_module_is_the_command() -> None:
     command = [sys.executable, "-m", "sorvolo", "--version"]
     run = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (run.returncode, run.stdout, run.stderr) == (0, f"sorvolo {sorvolo.__version__}\n", "")
+
+
+_STRUCK = """
+import sorvolo.cli.main
+def main():
+    try:
+        exec("raise KeyboardInterrupt")
+    except KeyboardInterrupt:
+        return 130
+sorvolo.cli.main.main = main
+"""
+
+
+def test_module_tells_its_code_wherever_ctrl_c_strikes(tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text(_STRUCK)
+    command, environment = [sys.executable, "-m", "sorvolo"], {**os.environ, "PYTHONPATH": str(tmp_path)}
+    assert subprocess.run(command, env=environment, timeout=60, check=False).returncode == 130
 
 
 @pytest.mark.parametrize("command", [*_COMMANDS[:4], "evaluate mosaic", *_COMMANDS[5:]])
