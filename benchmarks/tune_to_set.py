@@ -1,23 +1,27 @@
 """The packaged model's weights tuned to one set's own training videos, measured on its held-out ones.
 
-python benchmarks/tune_to_set.py cats WEIGHTS DATA [--steps 800] writes results/tuned_cats.json; the model is not
-shipped (that set is for research only).
+python benchmarks/tune_to_set.py cats WEIGHTS DATA [--steps 800] writes results/tuned_cats.json, and the tuned weights
+beside WEIGHTS. The model is not shipped (cats is for research only).
 """
 
 import argparse
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
 
+import cv2
+import numpy as np
 import torch
 
 import detection_data
 from mosaic_methods import commit, machine
 from sorvolo.detection.scores import score_set
+from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.survey.labels import LabelledSet
-from sorvolo.survey.objects import CLASSES
+from sorvolo.survey.objects import CLASSES, Detections
 from sorvolo.training.drawing import batches_from
+from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.joint import JointSettings, JointTraining
 from sorvolo.training.presets import fast
 from sorvolo.training.samples import Augmentation, Share
@@ -34,6 +38,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=800)
     parser.add_argument("--side", type=int, default=384)
     parser.add_argument("--scale", type=float, nargs=2, default=(0.6, 1.5))
+    parser.add_argument("--look", type=float, default=1.0, help="the measured pictures are shown so many times larger")
     parser.add_argument("--seed", type=int, default=1)
     wishes = parser.parse_args()
     torch.set_num_threads(1)
@@ -47,23 +52,33 @@ def main() -> None:
     model.load_state_dict(torch.load(wishes.weights, weights_only=True))
     settings = JointSettings(steps=wishes.steps, rate=5e-4, backbone_rate=1e-4, averaging=0.99, warm_steps=50)
     training = JointTraining(model.to(memory_format=torch.channels_last), settings, wishes.seed)
-    share = Share(learnt, 1.0, tuple(wishes.scale), thermal=wishes.name == "hituav")
+    aslant = wishes.name in ("hituav", "tinyperson")
+    share = Share(learnt, 1.0, tuple(wishes.scale), thermal=wishes.name == "hituav", aslant=aslant)
     crops = Augmentation(side_px=wishes.side)
     drawn = batches_from([share], CLASSES, reader(), crops, seed=wishes.seed, batch=settings.batch)
     for done in (training.learn(each) for each in islice(drawn, wishes.steps)):
         if done.step % 50 == 0:
             print(done.step, round(done.loss, 3), flush=True)
+    torch.save(training.average.state_dict(), wishes.weights.with_name(f"tuned_{wishes.name}.pt"))
     read = reader()
-    found = [see(training.average, CLASSES, read(each.path)) for each in held_out.pictures]
+    found = [looked(training.average, read(each.path), wishes.look) for each in held_out.pictures]
     scores = score_set(held_out, found, CLASSES, dict.fromkeys(CLASSES, 0.5))
     document = {
         "benchmark": "tune_to_set", "set": wishes.name, "machine": machine(), "commit": commit(), "seed": wishes.seed,
-        "steps": wishes.steps, "pictures": len(held_out), "learnt_from": len(learnt),
+        "steps": wishes.steps, "scale": wishes.scale, "look": wishes.look,
+        "pictures": len(held_out), "learnt_from": len(learnt),
         "intervals": {name: asdict(each) for name, each in scores.intervals.items()},
     }
     out = Path(__file__).parent / "results" / f"tuned_{wishes.name}.json"
     out.write_text(json.dumps(document, indent=1) + "\n")
     print(document["intervals"], flush=True)
+
+
+def looked(model: FasterRCNN, picture: ImageRGB, look: float) -> Detections:
+    """What the network finds in a picture (H, W, 3) shown `look` times larger; boxes in the picture's pixels."""
+    shown = np.asarray(cv2.resize(picture, None, fx=look, fy=look, interpolation=cv2.INTER_CUBIC), np.uint8)
+    found = see(model, CLASSES, picture if look == 1 else shown)
+    return replace(found, boxes_px=found.boxes_px / np.float32(look))
 
 
 if __name__ == "__main__":
