@@ -79,6 +79,19 @@ def test_a_walker_lost_for_a_while_is_the_same_one():
     assert [each.kind for each in final] == [ChangeKind.MOVING]
 
 
+def test_a_walker_seen_now_with_the_shadow_and_now_without_is_one():
+    things = [Thing(-3, -2, (side, side), velocity_m_s=(0.9, 0.8)) for side in (0.9, 0.5)]
+    views = [view_of(i, i / 5, (-4 + 0.5 * i / 5, 0, CAMERA_HEIGHT_M), [things[i % 2]]) for i in range(24)]
+    told, final = events(views)
+    assert len(told) == len(final) == 1 and final[0].kind == ChangeKind.MOVING
+
+
+def test_two_who_walk_side_by_side_are_two():
+    pair = [Thing(-3, north_m, (0.5, 0.5), velocity_m_s=(0.9, 0.8)) for north_m in (-2, -1)]
+    _, final = events(flight(pair))
+    assert [each.kind for each in final] == [ChangeKind.MOVING] * 2
+
+
 def test_noise_is_not_moving():
     rng = np.random.default_rng(11)
     tracker = BlobTracker()

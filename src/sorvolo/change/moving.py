@@ -26,6 +26,7 @@ _POINTS = 12  # of a track, that its velocity is fitted to
 _NEAR_PX = 8  # what is looked at around a place to tell shadows
 _RIGID_POINTS, _RIGID_LENGTHS, _RIGID_LENGTH_M = 5, 2.0, 2.5
 _PHOTOS_APART_S = 0.7  # at least, on average
+_ONE_THING_M = 0.4  # two that move alike so near each other are one thing, seen now with its shadow, now without
 _LOST_FOR_S = 45.0  # a thing that moves steadily is known again after so long: on the next strip, too
 
 
@@ -178,7 +179,7 @@ class BlobTracker:
             track = tracks[index].with_point(TrackPoint(now_ns, blob, np.array(view.camera_m[:2])))
             move = motion(track.points)
             if not track.mover and self._moves(track, move, view):
-                track = replace(track, mover=self._number_of(track, move))
+                track = replace(track, mover=self._number_of(track, move, tracks))
             if track.mover:
                 movers.append(track)
             # a thing that stopped is a change of the ground, whatever it was before
@@ -222,19 +223,30 @@ class BlobTracker:
         seen = [each for each in self._times_ns if each >= track.points[0].time_ns]
         return len(seen) > 1 and (seen[-1] - seen[0]) * 1e-9 >= _PHOTOS_APART_S * (len(seen) - 1)
 
-    def _number_of(self, track: Track, move: Motion) -> int:
-        start = track.points[0]
+    def _number_of(self, track: Track, move: Motion, others: Sequence[Track]) -> int:
+        """The number of the mover that the track shows: of one of `others` at the same place, of a lost one, or new."""
+        now_ns, start = track.last.time_ns, track.points[0]
+        for other in others:
+            expected_m = other.last.blob.place_m + (now_ns - other.last.time_ns) * 1e-9 * other.velocity_m_s
+            is_there = float(np.hypot(*(track.last.blob.place_m - expected_m))) < _ONE_THING_M
+            if other.mover and is_there and _goes_with(move, other):
+                return other.mover
         for lost in self._lost:
             gap_s = (start.time_ns - lost.last.time_ns) * 1e-9
             expected_m = lost.last.blob.place_m + gap_s * lost.velocity_m_s
             speed_m_s = float(np.hypot(*move.velocity_m_s))
             is_near = float(np.hypot(*(start.blob.place_m - expected_m))) < 1.0 + 0.4 * gap_s * speed_m_s
-            is_steady = float(np.hypot(*(move.velocity_m_s - lost.velocity_m_s))) < 0.3 + 0.5 * speed_m_s
-            if gap_s > 0 and is_near and is_steady and _alike(lost.last.blob, start.blob):
+            if gap_s > 0 and is_near and _goes_with(move, lost) and _alike(lost.last.blob, start.blob):
                 self._lost.remove(lost)
                 return lost.mover
         self._movers += 1
         return self._movers
+
+
+def _goes_with(move: Motion, track: Track) -> bool:
+    """Whether the track's velocity is about that of `move`."""
+    apart_m_s = float(np.hypot(*(move.velocity_m_s - track.velocity_m_s)))
+    return apart_m_s < 0.3 + 0.5 * float(np.hypot(*move.velocity_m_s))
 
 
 def _is_rigid(track: Track, length_m: float) -> bool:
