@@ -27,6 +27,19 @@ def test_gamma_and_white_balance_are_undone(gamma: float, gains: tuple[float, fl
     assert np.median(difference) <= 2 and np.quantile(difference, 0.95) <= 10
 
 
+def test_what_each_picture_shows_alone_flattens_nothing() -> None:
+    """Leaves, misalignment and noise: as much of the ground as of them, and dark and bright things stay so."""
+    ground = np.random.default_rng(5).normal(0, 12, (45, 60, 3))
+
+    def taken(seed: int) -> np.ndarray:
+        alone = np.random.default_rng(seed).normal(0, 12, ground.shape)
+        picture = 110 + cv2.resize(ground + alone, (480, 360), interpolation=cv2.INTER_CUBIC)
+        return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
+
+    light = fit_light(taken(6), taken(7))
+    np.testing.assert_allclose(light.exponents, 1.0, atol=0.08)
+
+
 def test_a_cloud_is_followed() -> None:
     before = textured(2)
     shade = np.ones(before.shape[:2], np.float32)

@@ -178,12 +178,16 @@ def middle(values: NDArray[Any]) -> Any:
 
 
 def _exponent(before: NDArray[np.float32], after: NDArray[np.float32]) -> float:
-    """The slope of `after` over `before` by re-weighted least squares, drawn to one where there is little to see."""
+    """The slope of `after` over `before` where both have noise, re-weighted; drawn to one where there is little to see.
+
+    It is the ratio of their spreads, the geometric mean of the regressions of each on the other: that of `after` on
+    `before` alone would be too low by what noise, misalignment and clouds add to the spread of `before`.
+    """
     prior = 2e-4 * before.size
 
     def weighted_slope(weights: Anything) -> float:
-        weighted = weights * before
-        return float((weighted @ after + prior) / (weighted @ before + prior))
+        spreads = [float((weights * each) @ each + prior) for each in (before, after)]
+        return float(np.sqrt(spreads[1] / spreads[0]))
 
     slope = weighted_slope(np.ones_like(before))
     for _ in range(3):
