@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.change.scratch import Scratch
+from sorvolo.change.shades import moved_shades
 from sorvolo.geometry.arrays import Anything, Floats, Mask
 from sorvolo.kernels import relight
 
@@ -39,6 +40,7 @@ class Light:
 
     `exponents` and `offsets` (3,) are per channel, blue green red; `gains` (h, w, 3) float32 are factors on a coarse
     grid over the picture; `unevenness` is their spread in octaves, what clouds do. `cells` is what the gains are from.
+    `shades` (h, w, 3) are further factors on a finer grid, where shadows of tall things moved; None if nowhere.
     """
 
     exponents: Floats
@@ -46,6 +48,7 @@ class Light:
     gains: NDArray[np.float32]
     unevenness: float
     cells: "Cells"
+    shades: NDArray[np.float32] | None = None
 
     @property
     def brightness(self) -> Floats:
@@ -88,6 +91,9 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     offset = after - exponents.astype(np.float32) * before
     kept = _chosen(offset, sure)
     offsets = np.array([middle(kept[:, channel]) for channel in range(3)])
+    shades = _shades(reference, query, exponents, offsets, known)
+    if shades is not None:
+        offset -= cv2.resize(shades, size, interpolation=cv2.INTER_AREA)
     local = np.clip(np.rint((offset - offsets.astype(np.float32)) * STEPS_PER_OCTAVE + 128), 0, 255).astype(np.uint8)
     same = _sameness(reference, query, size)
     if sure is not None:
@@ -95,7 +101,8 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     cells = Cells(cv2.medianBlur(local, MEDIAN_CELLS).astype(np.float32) - 128, same, sure)
     octaves = _spread(cells.steps, same) / STEPS_PER_OCTAVE
     unevenness = float(_chosen(octaves, sure).mean(axis=1).std())
-    return Light(exponents, offsets, np.exp2(octaves).astype(np.float32), unevenness, cells)
+    factors = None if shades is None else np.exp2(shades)
+    return Light(exponents, offsets, np.exp2(octaves).astype(np.float32), unevenness, cells, factors)
 
 
 def light_around(light: Light, things: Anything) -> Light:
@@ -119,10 +126,27 @@ def relit(image: Bgr, light: Light, out: Bgr | None = None) -> Bgr:
     levels = np.log2(np.arange(256) + BLACK_LEVEL)
     curves = 2.0 ** (light.exponents[:, None] * levels + light.offsets[:, None])
     table = np.clip(np.rint(curves * CURVE_ONE), 0, 16383).astype(np.int32)
-    coarse = np.clip(np.rint(light.gains * GAIN_ONE), 0, 65535).astype(np.uint16)
+    grid = light.gains
+    if light.shades is not None:
+        grid = light.shades * cv2.resize(grid, light.shades.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    steps = np.clip(np.rint(grid * GAIN_ONE), 0, 65535).astype(np.uint16)
     gains = _SCRATCH.take("gains", (image.shape[0], image.shape[1]), (3,), np.uint16)
-    cv2.resize(coarse, image.shape[1::-1], dst=gains, interpolation=cv2.INTER_LINEAR)
+    cv2.resize(steps, image.shape[1::-1], dst=gains, interpolation=cv2.INTER_LINEAR)
     return relight(image, table, gains, out)
+
+
+def _shades(
+    reference: Bgr, query: Bgr, exponents: Floats, offsets: Floats, known: Mask | None
+) -> NDArray[np.float32] | None:
+    """Octaves (h, w, 3) by which shadows that moved changed the ground of two pictures (h, w, 3); None if nowhere."""
+    levels = np.log2(np.arange(256) + BLACK_LEVEL)
+    curves = (exponents * levels[:, None] + offsets).astype(np.float32)
+    plain = np.repeat(levels.astype(np.float32)[:, None], 3, axis=1)
+    before, after = (
+        np.asarray(cv2.LUT(image, each[None]), np.float32) for image, each in ((reference, curves), (query, plain))
+    )
+    sure = None if known is None else _smaller(known.astype(np.uint8) * 255, reference.shape[1::-1]) > 250
+    return moved_shades(before, after, sure)
 
 
 def _chosen(values: NDArray[np.float32], sure: Mask | None) -> NDArray[np.float32]:
