@@ -6,7 +6,7 @@ import pytest
 
 from sorvolo.change.radiometry import fit_light, relit
 from sorvolo.change.robust import compare_robust
-from sorvolo.change.shades import moved_shades
+from sorvolo.change.shades import STEPS, moved_shades
 
 SUN_OVER_SHADE = np.array([0.52, 0.45, 0.4])  # blue green red: a shadow is a little blue
 
@@ -45,7 +45,8 @@ def test_a_thing_where_a_shadow_moved_is_found(place: tuple[int, int]) -> None:
     own = np.zeros(after.shape[:2], bool)
     own[y : y + 16, x : x + 22] = True
     assert np.count_nonzero(result.mask[own]) > 0.8 * own.sum()
-    assert np.count_nonzero(result.mask[~cv2.dilate(own.view(np.uint8), np.ones((9, 9))).view(bool)]) == 0
+    beside = ~cv2.dilate(own.view(np.uint8), np.ones((9, 9))).view(bool)
+    assert np.count_nonzero(result.mask[beside]) < 0.05 * own.sum()
 
 
 def test_a_dark_thing_hides_the_grounds_structure_and_is_no_shadow() -> None:
@@ -57,7 +58,10 @@ def test_a_dark_thing_hides_the_grounds_structure_and_is_no_shadow() -> None:
 
 
 def test_nothing_is_said_of_unknown_ground() -> None:
-    logarithms = [np.log2(shaded(ground(), place).astype(np.float32) + 8) for place in ((200, 180), (250, 190))]
+    logarithms = [
+        np.rint((np.log2(shaded(ground(), place) + 8.0) - 3) * 2 * STEPS).astype(np.uint8)
+        for place in ((200, 180), (250, 190))
+    ]
     known = np.ones((360, 480), bool)
     known[:, :240] = False
     octaves = moved_shades(logarithms[0], logarithms[1], known)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.change.scratch import Scratch
-from sorvolo.change.shades import moved_shades
+from sorvolo.change.shades import STEPS, moved_shades
 from sorvolo.geometry.arrays import Anything, Floats, Mask
 from sorvolo.kernels import relight
 
@@ -126,9 +126,9 @@ def relit(image: Bgr, light: Light, out: Bgr | None = None) -> Bgr:
     levels = np.log2(np.arange(256) + BLACK_LEVEL)
     curves = 2.0 ** (light.exponents[:, None] * levels + light.offsets[:, None])
     table = np.clip(np.rint(curves * CURVE_ONE), 0, 16383).astype(np.int32)
-    grid = light.gains
+    grid: Anything = light.gains
     if light.shades is not None:
-        grid = light.shades * cv2.resize(grid, light.shades.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+        grid = cv2.multiply(light.shades, cv2.resize(grid, light.shades.shape[1::-1], interpolation=cv2.INTER_LINEAR))
     steps = np.clip(np.rint(grid * GAIN_ONE), 0, 65535).astype(np.uint16)
     gains = _SCRATCH.take("gains", (image.shape[0], image.shape[1]), (3,), np.uint16)
     cv2.resize(steps, image.shape[1::-1], dst=gains, interpolation=cv2.INTER_LINEAR)
@@ -139,11 +139,10 @@ def _shades(
     reference: Bgr, query: Bgr, exponents: Floats, offsets: Floats, known: Mask | None
 ) -> NDArray[np.float32] | None:
     """Octaves (h, w, 3) by which shadows that moved changed the ground of two pictures (h, w, 3); None if nowhere."""
-    levels = np.log2(np.arange(256) + BLACK_LEVEL)
-    curves = (exponents * levels[:, None] + offsets).astype(np.float32)
-    plain = np.repeat(levels.astype(np.float32)[:, None], 3, axis=1)
+    levels = np.log2(np.arange(256)[:, None] + BLACK_LEVEL)
     before, after = (
-        np.asarray(cv2.LUT(image, each[None]), np.float32) for image, each in ((reference, curves), (query, plain))
+        cv2.LUT(image, np.clip(np.rint((each - np.log2(BLACK_LEVEL)) * 2 * STEPS), 0, 255).astype(np.uint8)[None])
+        for image, each in ((reference, exponents * levels + offsets), (query, np.repeat(levels, 3, axis=1)))
     )
     sure = None if known is None else _smaller(known.astype(np.uint8) * 255, reference.shape[1::-1]) > 250
     return moved_shades(before, after, sure)

@@ -4,137 +4,154 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Anything, Mask
+from sorvolo.geometry.arrays import Anything, Floats, Mask
 
-LEVELS = (0.35, 0.6, 0.9)  # octaves darker or brighter: more comes free of what it touches
-MOST_TINT = 0.6  # octaves between the colours: a shadow takes somewhat less of blue
-MOST_SPREAD = 0.12  # octaves, median distance from a shadow's own depth
+STEPS = 24  # to an octave, of differences of logarithms; these are 8 bit, 128 alike
+ALIKE = 128
+LEVELS = (8, 14, 22)  # steps darker or brighter: more comes free of what it touches
+MOST_TINT = 15  # steps between the colours: a shadow takes somewhat less of blue
+MOST_SPREAD = 3.0  # steps, mean distance from a shadow's own depth
 LEAST_WIDTH = 5  # pixels of the pictures given: narrower shadows are those of people and small things, which tell them
 LEAST_ALIKE, ALIKE_OF_FEW = 0.35, 1.5  # correlation of the ground's details within; more where few pixels tell
 FINEST = 9  # pixels: details are what is smaller
-APART = 2  # pixels that the pictures may be apart
-MOST_ASKED = 6000  # pixels that are asked
-MOST_APART = 0.25  # octaves from a shadow's depth: ground beside it that it covers, too
-RIM = 2  # pixels on both sides of a shadow's edge, where it is blurred
-LARGEST = 0.25  # of the picture: smooth gains follow what is larger
-LARGEST_HOLE, NOTCH = 150, 7  # pixels; pixels wide
+APART = 1  # pixels that the pictures may be apart
+MOST_ASKED = 4000  # pixels that are asked
 SHARP, LEAST_SHARP = 0.4, 0.4  # of its depth is left beside a shadow, at most, along so much of its edge
 BESIDE = 9  # pixels, the width of the window by which that is beside it
+LARGEST = 0.25  # of the picture: smooth gains follow what is larger
+HOLE = 11  # pixels wide, at most: what stands in a shadow and is no ground
 NEAR = 15  # pixels: how far the depth of a shadow is the same
+MOST_APART = 6  # steps from a shadow's depth: ground beside it that it covers, too
+RIM = 2  # pixels on both sides of a shadow's edge, where it is blurred
+
+Image = Anything
+"""uint8, (h, w) or (h, w, 3)."""
 
 
-def moved_shades(
-    before: NDArray[np.float32], after: NDArray[np.float32], known: Mask | None
-) -> NDArray[np.float32] | None:
+def moved_shades(before: Image, after: Image, known: Mask | None) -> NDArray[np.float32] | None:
     """Octaves (h, w, 3) by which ground is brighter that a shadow left (below 0: darker, it came); None if nowhere.
 
-    `before` and `after` (h, w, 3) are logarithms to base 2 of two pictures in the same light; nothing is said
-    where not `known` (h, w). What changes its brightness evenly, keeps its finest structure and is wide enough is the
-    same ground under another shadow; a new thing hides the ground's structure.
+    `before` and `after` (h, w, 3) uint8 are logarithms, 2 `STEPS` an octave, of two pictures in the same light; nothing
+    is said where not `known` (h, w). What changes its brightness evenly, keeps its finest structure and is wide enough
+    is the same ground under another shadow; a new thing hides the ground's structure.
     """
-    apart = np.asarray(cv2.blur(after - before, (3, 3)), np.float32)
-    bands = cv2.split(apart)
-    alike = cv2.max(cv2.max(*bands[:2]), bands[2]) - cv2.min(cv2.min(*bands[:2]), bands[2]) < MOST_TINT
+    apart = cv2.blur(cv2.addWeighted(after, 0.5, before, -0.5, ALIKE), (3, 3))
+    blue, green, red = cv2.split(apart)
+    tint = cv2.subtract(cv2.max(cv2.max(blue, green), red), cv2.min(cv2.min(blue, green), red))
+    alike = cv2.threshold(tint, MOST_TINT - 1, 255, cv2.THRESH_BINARY_INV)[1]
     if known is not None:
-        alike &= known
-    middle = np.asarray((bands[0] + bands[1] + bands[2]) * np.float32(1 / 3), np.float32)
-    octaves = np.zeros_like(apart)
-    details: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
+        alike = cv2.min(alike, known.view(np.uint8) * np.uint8(255))
+    middle = cv2.addWeighted(cv2.addWeighted(blue, 0.5, red, 0.5, 0), 2 / 3, green, 1 / 3, 0)
+    details: tuple[Image, Image] | None = None
+    octaves: NDArray[np.float32] | None = None
     for sign in (-1, 1):
-        shaded = np.zeros(alike.shape, bool)
+        shaded = np.zeros(middle.shape, np.uint8)
+        brighter = cv2.addWeighted(middle, sign, middle, 0, ALIKE - sign * ALIKE)
         for level in LEVELS:
-            count, labels = _pieces((sign * middle > level) & alike & ~shaded)
-            if count == 1:
+            differs = cv2.threshold(brighter, ALIKE + level, 255, cv2.THRESH_BINARY)[1]
+            pieces = _Pieces(cv2.min(cv2.min(differs, alike), cv2.bitwise_not(shaded)))
+            if pieces.count == 1:
                 break
             details = details or (_details(before), _details(after))
-            shaded |= (_is_sharp(labels, count, sign * middle) & _kept(labels, count, middle, *details))[labels]
+            kept = pieces.are_shadows(middle)
+            if kept.any():
+                kept &= pieces.show_the_same(*details)
+                shaded |= (kept.astype(np.uint8) * np.uint8(255))[pieces.labels]
         if shaded.any():
-            octaves += _octaves(shaded, apart, sign)
-    if known is not None:
+            own = _octaves(shaded, apart)
+            octaves = own if octaves is None else octaves + own
+    if octaves is not None and known is not None:
         octaves[~known] = 0
-    return octaves if octaves.any() else None
+    return octaves
 
 
-def _pieces(mask: Mask) -> tuple[int, NDArray[np.int32]]:
-    """The wide enough pieces of a mask: how many with the ground, which is 0, and the labels (h, w)."""
-    window = np.ones((LEAST_WIDTH, LEAST_WIDTH), np.uint8)
-    opened = cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_OPEN, window)
-    count, labels = cv2.connectedComponents(opened, connectivity=4)
-    return count, np.asarray(labels, np.int32)
+class _Pieces:
+    """The wide enough pieces of a mask (h, w), 0 or 255: `count` of them with the ground, which is 0 in `labels`."""
+
+    def __init__(self, mask: Image) -> None:
+        window = np.ones((LEAST_WIDTH, LEAST_WIDTH), np.uint8)
+        self._opened: Image = cv2.morphologyEx(mask, cv2.MORPH_OPEN, window)
+        self.count, self.labels = cv2.connectedComponents(self._opened, connectivity=4, ltype=cv2.CV_16U)
+        if self.count == 1:
+            return
+        # some of the pixels that lie within pieces, and whose they are
+        places = _places(cv2.erode(self._opened, np.ones((3, 3), np.uint8)))
+        step = max(1, -(-len(places) // MOST_ASKED))
+        self._places, self._share = places[::step], step / self.labels.size
+        self._own = self.labels.ravel()[self._places]
+        self._number = np.bincount(self._own, minlength=self.count)
+
+    def are_shadows(self, middle: Image) -> NDArray[np.bool_]:
+        """Which (count,) are no more than a part of the picture, about as deep everywhere, and end all at once.
+
+        `middle` (h, w) is how much brighter they are. The edge of a cloud's shadow is soft.
+        """
+        number = np.maximum(self._number, 1)
+        steps = _steps(middle, self._places)
+        depth = np.bincount(self._own, steps, self.count) / number
+        off = np.bincount(self._own, np.abs(steps - depth[self._own]), self.count)
+        fits = (self._number > 0) & (self._number * self._share < LARGEST) & (off < MOST_SPREAD * number)
+        if not fits.any():
+            return fits
+        outer = cv2.dilate(self.labels, np.ones((BESIDE, BESIDE), np.uint8))
+        outer[cv2.dilate(self._opened, np.ones((3, 3), np.uint8)) > 0] = 0
+        ring = _places(outer)
+        own = outer.ravel()[ring]
+        ends = np.bincount(own, np.abs(_steps(middle, ring)) < SHARP * np.abs(depth)[own], self.count)
+        return fits & (ends >= LEAST_SHARP * np.maximum(np.bincount(own, minlength=self.count), 1))
+
+    def show_the_same(self, before: Image, after: Image) -> NDArray[np.bool_]:
+        """Which (count,) show the same structure in the details (h, w) of both pictures, up to `APART` pixels apart."""
+        own, number = self._own, np.maximum(self._number, 1)
+
+        def centred(values: Floats) -> Floats:
+            return np.asarray(values - (np.bincount(own, values, self.count) / number)[own])
+
+        a = centred(_steps(after, self._places))
+        energy = np.bincount(own, a * a, self.count)
+        best = np.full(self.count, -1.0)
+        padded = cv2.copyMakeBorder(before, APART, APART, APART, APART, cv2.BORDER_REPLICATE)
+        rows, columns = np.divmod(self._places, before.shape[1])
+        corner = rows * padded.shape[1] + columns
+        for shift in (y * padded.shape[1] + x for y in range(2 * APART + 1) for x in range(2 * APART + 1)):
+            b = centred(_steps(padded, corner + shift))
+            common = np.bincount(own, a * b, self.count)
+            best = np.maximum(best, common / np.sqrt(energy * np.bincount(own, b * b, self.count) + 1e-9))
+        return np.asarray(best > LEAST_ALIKE + ALIKE_OF_FEW / np.sqrt(number))
 
 
-def _octaves(shaded: Mask, apart: NDArray[np.float32], sign: int) -> NDArray[np.float32]:
+def _places(image: Image) -> NDArray[np.int64]:
+    """Where an image is not 0, counted row by row."""
+    return np.flatnonzero(image != 0)
+
+
+def _steps(image: Image, places: NDArray[np.int64]) -> Floats:
+    return np.asarray(image.ravel()[places].astype(np.float64) - ALIKE)
+
+
+def _details(logarithm: Image) -> Image:
+    gray = cv2.cvtColor(logarithm, cv2.COLOR_BGR2GRAY)
+    return cv2.addWeighted(gray, 1, cv2.blur(gray, (FINEST, FINEST)), -1, ALIKE)
+
+
+def _octaves(shaded: Image, apart: Image) -> NDArray[np.float32]:
     """(h, w, 3) how deep the shadow is where `shaded`, smooth; about its rim the part of it that all colours show.
 
     What stands in it and is no ground leaves holes: they are as deep.
     """
-    weights = shaded.astype(np.float32)
-    sums = cv2.blur(np.dstack([apart * weights[..., None], weights]), (NEAR, NEAR))
-    depth = sums[..., :3] / np.maximum(sums[..., 3:], np.float32(1e-6))
+    steps = apart.astype(np.float32) - ALIKE
+    known = np.asarray(cv2.blur(shaded.astype(np.float32), (NEAR, NEAR)))
+    share = np.maximum(known, np.float32(1e-3))
+    depth = cv2.divide(cv2.blur(cv2.copyTo(steps, shaded), (NEAR, NEAR)), cv2.merge([share] * 3), scale=255)
     # narrow parts beside it
-    near = cv2.dilate(shaded.view(np.uint8), np.ones((NEAR, NEAR), np.uint8)) > 0
-    shaded = shaded | (near & (np.abs(apart - depth).max(axis=2) < MOST_APART))
-    _, holes, stats, _ = cv2.connectedComponentsWithStats((~shaded).view(np.uint8), connectivity=4)
-    whole = shaded | (stats[:, cv2.CC_STAT_AREA] < LARGEST_HOLE)[holes]
-    closed = cv2.morphologyEx(whole.view(np.uint8), cv2.MORPH_CLOSE, np.ones((NOTCH, NOTCH), np.uint8))
+    off = cv2.split(cv2.absdiff(steps, depth))
+    beside = (cv2.max(cv2.max(off[0], off[1]), off[2]) < MOST_APART) & (known > 0.5)
+    whole = cv2.max(shaded, np.asarray(beside).view(np.uint8) * np.uint8(255))
+    closed = cv2.morphologyEx(whole, cv2.MORPH_CLOSE, np.ones((HOLE, HOLE), np.uint8))
     window = np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)
-    inner, outer = (each(closed, window) > 0 for each in (cv2.erode, cv2.dilate))
-    share = np.clip((apart / np.where(np.abs(depth) < LEVELS[0] / 2, sign * LEVELS[0] / 2, depth)).min(axis=2), 0, 1)
-    return np.asarray(depth * (np.where(inner, 1, share) * outer)[..., None], np.float32)
-
-
-def _details(logarithm: NDArray[np.float32]) -> NDArray[np.float32]:
-    gray = logarithm.mean(axis=2)
-    return np.asarray(gray - cv2.blur(gray, (FINEST, FINEST)), np.float32)
-
-
-def _is_sharp(labels: NDArray[np.int32], count: int, octaves: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which pieces (count,) of `labels` (h, w) end all at once; the edge of a cloud's shadow is soft."""
-    named = labels.astype(np.uint16)
-    outer = cv2.dilate(named, np.ones((BESIDE, BESIDE), np.uint8))
-    outer[cv2.dilate(named, np.ones((3, 3), np.uint8)) > 0] = 0
-    ring = outer > 0
-    depth = np.bincount(labels.ravel(), octaves.ravel(), count) / np.maximum(np.bincount(labels.ravel()), 1)
-    own = outer[ring]
-    ends = np.bincount(own, octaves[ring] < SHARP * depth[own], count)
-    return np.asarray(ends >= LEAST_SHARP * np.maximum(np.bincount(own, minlength=count), 1))
-
-
-def _kept(
-    labels: NDArray[np.int32], count: int, middle: NDArray[np.float32], before: NDArray[np.float32],
-    after: NDArray[np.float32],
-) -> NDArray[np.bool_]:
-    """Which pieces (count,) of `labels` (h, w), 0 none, show the same finest structure in both pictures, evenly dimmed.
-
-    The correlation of the details is the best of all shifts up to `APART`.
-    """
-    inner: Anything = cv2.erode((labels > 0).view(np.uint8), np.ones((3, 3), np.uint8))
-    rows, columns = np.nonzero(inner)
-    if len(rows) == 0:
-        return np.zeros(count, bool)
-    step = -(-len(rows) // MOST_ASKED)
-    rows, columns = rows[::step], columns[::step]
-    own = labels[rows, columns]
-    number = np.maximum(np.bincount(own, minlength=count), 1)
-    depth, a = (_without_mean(each[rows, columns], own, number) for each in (middle, after))
-    is_even = np.bincount(own, np.abs(depth), count) < MOST_SPREAD * number
-    energy = np.bincount(own, a * a, count)
-    width = before.shape[1] + 2 * APART
-    padded = cv2.copyMakeBorder(before, APART, APART, APART, APART, cv2.BORDER_REPLICATE).ravel()
-    best = np.full(count, -1.0)
-    places = rows * width + columns
-    for shift in (y * width + x for y in range(2 * APART + 1) for x in range(2 * APART + 1)):
-        b = _without_mean(padded[places + shift], own, number)
-        common = np.bincount(own, a * b, count)
-        best = np.maximum(best, common / np.sqrt(energy * np.bincount(own, b * b, count) + 1e-9))
-    is_even &= np.bincount(labels.ravel(), minlength=count) < LARGEST * labels.size
-    kept = is_even & (best > LEAST_ALIKE + ALIKE_OF_FEW / np.sqrt(number))
-    kept[0] = False
-    return np.asarray(kept)
-
-
-def _without_mean(
-    values: NDArray[np.float32], own: NDArray[np.int32], number: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Values (N,) less the mean of their own piece."""
-    return np.asarray(values - (np.bincount(own, values, len(number)) / number)[own])
+    inner, outer = cv2.erode(closed, window), cv2.dilate(closed, window)
+    parts = cv2.split(steps / np.where(depth == 0, np.float32(1), depth))
+    part = np.clip(cv2.min(cv2.min(parts[0], parts[1]), parts[2]), 0, 1)
+    part[inner > 0] = 1
+    part[outer == 0] = 0
+    return np.asarray(cv2.multiply(depth, cv2.merge([part] * 3), scale=1 / STEPS), np.float32)
