@@ -2,6 +2,9 @@
 
 import hashlib
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -58,6 +61,31 @@ def site(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("simulation") / "site"
     run(folder, SMALL)
     return folder
+
+
+WRITE_A_VIDEO = """
+import sys
+from pathlib import Path
+import numpy as np
+from sorvolo.store.flight_files import video_writer
+
+ground = np.random.default_rng(1).integers(0, 256, (60, 100, 3), np.uint8).repeat(4, axis=0).repeat(4, axis=1)
+with video_writer(Path(sys.argv[1]), (320, 180), 10.0, 0, 20) as write:
+    for k in range(12):
+        write(np.ascontiguousarray(ground[2 * k:2 * k + 180, 3 * k:3 * k + 320]))
+"""
+
+
+def test_a_video_does_not_depend_on_what_lay_in_memory_before(tmp_path):
+    written = []
+    for filling in ("1", "85", "170"):  # glibc fills new memory with it; elsewhere it says nothing
+        path = tmp_path / f"{filling}.mp4"
+        subprocess.run(
+            [sys.executable, "-c", WRITE_A_VIDEO, str(path)], check=True, timeout=60,
+            env={**os.environ, "MALLOC_PERTURB_": filling},
+        )
+        written.append(path.read_bytes())
+    assert written[1:] == written[:1] * 2
 
 
 def test_one_seed_gives_the_same_bytes(site, tmp_path):

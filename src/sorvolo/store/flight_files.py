@@ -99,8 +99,8 @@ _SENSOR_WIDTH_MM = 6.3  # what a small drone's 1/2.3 inch sensor measures
 def video_writer(
     path: Path, size_px: tuple[int, int], fps: float, started_ns: int, crf: int
 ) -> Iterator[Callable[[ImageRGB], None]]:
-    """Write H.264 in MP4 image by image, with one thread and without weighted prediction (x264's choice of
-    weights is not the same in every run), so that the same images give the same bytes.
+    """Write H.264 in MP4 image by image, so that the same images give the same bytes: with one thread, and without
+    x264's weighted prediction and macroblock tree, whose look-ahead reads memory that it never wrote.
 
     Frame i has exactly the time i / fps. The start is the file's creation time, as drones write it. Raises
     StoreError when the disk is full or the folder cannot be written.
@@ -115,7 +115,8 @@ def video_writer(
         stream.codec_context.thread_count = 1
         stream.codec_context.time_base = 1 / rate
         stream.options = {
-            "crf": str(crf), "preset": "veryfast", "threads": "1", "weightp": "none", "flags": "+bitexact",
+            "crf": str(crf), "preset": "veryfast", "threads": "1", "weightp": "none", "mbtree": "0",
+            "flags": "+bitexact",
         }
         count = 0
 
