@@ -311,6 +311,20 @@ def test_the_same_flight_again_doubles_nothing(photographed: Path, tmp_path: Pat
         assert len(archive.flights()) == 1 and len(archive.keyframes()) == 8
 
 
+def test_the_map_does_not_depend_on_when_it_was_shown_while_it_grew(
+    filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    film = tmp_path / "film.mp4"
+    shutil.copy(_film(filmed), film)  # without telemetry, whose offsets would move every frame at last
+    monkeypatch.setattr("sorvolo.missions.map_planar._PAINT_REST", 0)
+    maps = []
+    for paint_every in (1, 1000):  # keyframes
+        monkeypatch.setattr("sorvolo.missions.map_planar._PAINT_EVERY", paint_every)
+        run_map(tmp_path / f"every {paint_every}", film, "--camera", filmed / "camera.xml")
+        maps.append((tmp_path / f"every {paint_every}" / "mosaic.tif").read_bytes())
+    assert maps[0] == maps[1]
+
+
 def test_every_selected_frame_ends_once_with_a_reason_unless_by_vision(filmed: Path, tmp_path: Path) -> None:
     site = tmp_path / "site"
     run_map(site, _film(filmed), "--camera", filmed / "camera.xml", "--overlap", "0.5")

@@ -21,6 +21,7 @@ STEPS = st.lists(
         st.tuples(st.just("get"), INDICES, st.just(0)),
         st.tuples(st.just("delete"), INDICES, st.just(0)),
         st.tuples(st.just("save"), INDICES, st.just(0)),
+        st.tuples(st.just("take back"), INDICES, st.just(0)),
     ),
     max_size=40,
 )
@@ -49,6 +50,9 @@ def test_growing_tiles_are_a_dict(steps: list[tuple[str, TileIndex, int]], limit
                 assert (int(tiles[index][0, 0, 0]) if index in tiles else 0) == truth.get(index, 0)
             elif action == "delete" and index in truth:
                 del tiles[index], truth[index]
+            elif action == "take back":
+                tiles.take_back()
+                truth = {(0, 0): 1, (1, 1): 2}
             elif action == "save":
                 rows = {**rows, **tiles.save()}
                 rows = {key: sha256 for key, sha256 in rows.items() if sha256 is not None}

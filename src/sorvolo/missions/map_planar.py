@@ -35,6 +35,7 @@ from sorvolo.survey.mosaic import PlacedFrame, Status
 
 _WAIT_FOR_HEIGHT = 12  # keyframes held back until the height above ground is seen in them
 _PAINT_EVERY = 8  # keyframes painted together: tiles that several touch are rendered once
+_PAINT_REST = 4  # times as long as a painting took: showing a map that still moves must not hold up the flight
 _LOCAL_M_PER_PX = 1.0
 _TILT_OFFSET_DEG = 2.0  # a gimbal's zero, or a camera's mount
 _HEADING_OFFSET_DEG = 5.0  # a drone's compass beside its motors
@@ -127,10 +128,10 @@ class PlanarRun(FlightRun):
             with self._log.stage(Stage.REGISTER):
                 self._mapper.settle()
                 self._offset = self._find_offset()
-                self._dirty |= set(self._frames)
             self._start_painting()
             self._exposure = self._mapper.exposure()
             self._straighten()
+            self._start_over()
             self._show(force=True)
         return self._placed()
 
@@ -172,21 +173,34 @@ class PlanarRun(FlightRun):
         if self._canvas is not None:
             return
         writer = self.begin()
-        site_grid = self._archive.site_grid()
-        shrink = self._native_m_per_px() / site_grid.grid.m_per_px
+        shrink = self._native_m_per_px() / self._archive.site_grid().grid.m_per_px
         if shrink < 0.77:  # a coarse map does not need every pixel of the pictures
             full = self._lens.camera
             self._stored = full.resized(max(16, round(full.width_px * shrink)), max(16, round(full.height_px * shrink)))
         self._valid = self._lens.valid(self._stored.width_px, self._stored.height_px)
-        self._canvas = Canvas(
+        self._canvas = self._new_canvas(writer)
+        for keyframe_id, image in self._held.items():
+            self._save(keyframe_id, image)
+        self._held.clear()
+
+    def _new_canvas(self, writer: FlightWriter) -> Canvas:
+        site_grid = self._archive.site_grid()
+        canvas = Canvas(
             site_grid.grid, writer.tiles, self._image,
             painted=[each.canvas_frame(site_grid) for each in self._known.values()], keeps_known_ground=True,
         )
         if self._known:
-            self._canvas.paint([], forget=[each for each, known in self._known.items() if known.is_superseded])
-        for keyframe_id, image in self._held.items():
-            self._save(keyframe_id, image)
-        self._held.clear()
+            canvas.paint([], forget=[each for each, known in self._known.items() if known.is_superseded])
+        return canvas
+
+    def _start_over(self) -> None:
+        """Take back what was shown while frames still moved: when that was painted, which a clock decides, and how
+        little a frame had to move to be left as it was must not be seen in the map."""
+        assert self._writer is not None
+        if self._painted_at:
+            self._writer.take_back_tiles()
+            self._canvas = self._new_canvas(self._writer)
+        self._dirty = set(self._frames)
 
     def _native_m_per_px(self) -> float:
         if self._setup.track is None:
@@ -247,8 +261,7 @@ class PlanarRun(FlightRun):
                 forget=[each for each, frame in painted.items() if frame is None],
             )
             self._dirty.clear()
-        # showing a map that still moves must not hold up the flight: at most a fifth of the time goes into it
-        self._paint_again_s = time.monotonic() + 4 * (time.monotonic() - started_s)
+        self._paint_again_s = time.monotonic() + _PAINT_REST * (time.monotonic() - started_s)
         if force or time.monotonic() - self._shown_s > self._settings.live_s:
             with self._log.stage(Stage.STORE):
                 self._writer.flush()

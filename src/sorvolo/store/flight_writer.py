@@ -107,6 +107,10 @@ class FlightWriter:
         write_view_masks(folder, name, changed, valid)
         self._boxes[name] = boxes_json(boxes)
 
+    def take_back_tiles(self) -> None:
+        """Make `tiles` what they were before the flight; readers see it with the next `flush`."""
+        self._growing.take_back()
+
     def flush(self) -> None:
         """Let readers see the map as it is now."""
         changed = self._growing.save()

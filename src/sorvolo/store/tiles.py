@@ -128,6 +128,7 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
         self, blobs: TileBlobs, base: Mapping[TileIndex, str], tile_px: int, limit_bytes: int
     ) -> None:
         self._blobs, self._tile_px, self._limit_bytes = blobs, tile_px, limit_bytes
+        self._base = dict(base)
         self._hashes = dict(base)  # what is on disk
         self._loaded: OrderedDict[TileIndex, ImageRGBA] = OrderedDict()
         self._unsaved: set[TileIndex] = set()  # loaded and newer than the disk
@@ -186,6 +187,14 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
         changed = {index: self._hashes.get(index) for index in self._changed}
         self._changed.clear()
         return changed
+
+    def take_back(self) -> None:
+        """Undo every change: the tiles are the earlier version's again."""
+        for index in self._unsaved | {each for each in self if self._hashes.get(each) != self._base.get(each)}:
+            del self[index]
+        for index in self._base.keys() - self._hashes.keys():
+            self._replace_hash(index, self._base[index])
+            self._changed.add(index)
 
     def take_superseded(self) -> set[str]:
         """Hashes that this version no longer uses; the caller knows whether another version does."""
