@@ -19,7 +19,7 @@ from sorvolo.simulation.settings import (
 from sorvolo.simulation.truth import coco_boxes
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.objects import CLASSES, TYPICAL_SIZE_M, Detections, no_detections
-from sorvolo.tracking.locate import LocateSettings, locate
+from sorvolo.tracking.locate import TOO_SHORT, LocateSettings, locate
 from sorvolo.tracking.tracker import Tracker
 
 CAMERA = Camera.from_angle_of_view(960, 540, 62.0)
@@ -28,7 +28,7 @@ PRIOR = CameraPrior(np.array([10.0, 20.0, 60.0]), np.full(3, 0.5), NADIR, np.arr
 EXACT = replace(PRIOR, position_sigma_m=np.zeros(3), attitude_sigma_deg=np.zeros(3))
 
 
-def one(middle_px, label="car", side_px=20.0):
+def one(middle_px, label="car", side_px=40.0):
     x, y = np.asarray(middle_px) + 0.5
     box = [x - side_px / 2, y - side_px / 2, x + side_px / 2, y + side_px / 2]
     return Detections(np.array([box]), np.array([0.9]), np.array([CLASSES.index(label)]), CLASSES)
@@ -44,10 +44,24 @@ def test_below_the_camera_lies_what_is_in_the_middle():
     assert not unlocated
     assert sighting.position_m == pytest.approx([10.0, 20.0])
     half_m = 60 - TYPICAL_SIZE_M["car"][2] / 2
-    assert sighting.size_m == pytest.approx([20 * half_m / CAMERA.fx_px] * 2)
+    assert sighting.size_m == pytest.approx([40 * half_m / CAMERA.fx_px] * 2)
     # 0.5 m of GPS with 0.5 degrees of tilt at 59.25 m, beside the box's own
     assert sighting.shared_sigma_m == pytest.approx(np.hypot(0.5, np.radians(0.5) * half_m), rel=0.01)
     assert sighting.sigma_m > sighting.shared_sigma_m
+
+
+def test_what_is_far_too_short_for_its_class_is_set_aside():
+    window_px = 0.8 * CAMERA.fx_px / 59.25  # of a car that is 0.8 m long
+    sighting, unlocated = place(one([400.0, 300.0], side_px=window_px))
+    assert sighting is None and unlocated == {TOO_SHORT: 1}
+    for found, prior in (
+        (one([400.0, 300.0], side_px=5.0 * window_px), PRIOR),
+        (one([400.0, 300.0], "person", window_px), PRIOR),
+        (one([window_px / 2 - 0.5, 300.0], side_px=window_px), PRIOR),  # the picture's edge cuts it
+        (one([400.0, 300.0], side_px=window_px), replace(PRIOR, position_sigma_m=np.array([0.5, 0.5, 40.0]))),
+    ):
+        sighting, unlocated = place(found, prior)
+        assert sighting is not None and not unlocated
 
 
 def test_the_middle_of_an_object_stands_above_its_foot():

@@ -15,7 +15,7 @@ from sorvolo.survey.flight import CameraPrior, Frame, Notice, Site
 from sorvolo.survey.objects import Detections, Sighting, Track
 from sorvolo.tracking.heading import CompassError, HeadingFromMotion
 from sorvolo.tracking.image_motion import ImageMotion
-from sorvolo.tracking.locate import GroundHeight, LocateSettings, locate
+from sorvolo.tracking.locate import TOO_SHORT, GroundHeight, LocateSettings, locate
 from sorvolo.tracking.tracker import IN_PICTURES, Tracker, TrackerSettings, TrackUpdate
 
 _MOST_DRONE_PLACES = 200_000
@@ -49,6 +49,10 @@ class Places(Protocol):
 
     def m_per_px(self, frame: Frame) -> float | None:
         """The ground's sampling distance in the frame; None where unknown."""
+
+    @property
+    def set_aside(self) -> int:
+        """Detections so far that are far too short for their class: they have a place, but are no such thing."""
 
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
         """Place a frame's detections and give them to their tracks."""
@@ -105,6 +109,11 @@ class GroundPlaces:
             return None
         return height_m / down / self._setup.source.camera.camera.fx_px
 
+    @property
+    def set_aside(self) -> int:
+        """See `Places.set_aside`."""
+        return self._unlocated[TOO_SHORT]
+
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
         """Place a frame's detections on the ground and give them to their tracks."""
         prior = self._prior(frame)
@@ -151,11 +160,13 @@ class GroundPlaces:
         height = track.height_words if track else ""
         if self._ground is not None:
             height = f"{height.split(',')[0]}, over the height model's ground"
+        short = f"{self.set_aside} detections are {TOO_SHORT} and were set aside, as a map leaves them out"
         text = f"places come from the telemetry's position, height ({height}) and {how}"
         return (
             *self._setup.notices, Notice("placed_by", 1, text), *compass,
             *(Notice("not_placed", count, f"{count} detections have no place on the ground: {reason}")
-              for reason, count in self._unlocated.most_common()),
+              for reason, count in self._unlocated.most_common() if reason != TOO_SHORT),
+            *((Notice("too_short", self.set_aside, short),) if self.set_aside else ()),
         )
 
     def path_m(self) -> Floats:
@@ -224,6 +235,11 @@ class ImagePlaces:
     def m_per_px(self, frame: Frame) -> float | None:
         """Unknown."""
         return None
+
+    @property
+    def set_aside(self) -> int:
+        """None: without metres nothing is too short."""
+        return 0
 
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
         """Take the camera's motion out of a frame's detections and give them to their tracks."""

@@ -70,7 +70,7 @@ def count_by_class(tracks: Sequence[Track]) -> dict[str, int]:
 def build_watch_report(
     setup: FlightSetup, settings: WatchSettings, outputs: WatchOutputs, model: ModelInfo, provider: str, log: WatchLog,
     tracks: Sequence[Track], notices: Sequence[Notice], warnings: Sequence[str], *, ended: str, skipped: int,
-    on_ground: bool,
+    set_aside: int, on_ground: bool,
 ) -> dict[str, Any]:
     """report.json of one watch; its keys are specified in docs/formats.md. Numbers that are not known are None."""
     source, camera = setup.source, setup.source.camera
@@ -92,7 +92,8 @@ def build_watch_report(
             "lost": sum(log.lost.values()), "reasons": dict(log.lost.most_common()),
         },
         "detections": {
-            "total": total, "placed": log.placed, "not_placed": total - log.placed,
+            "total": total, "placed": log.placed, "not_placed": total - log.placed - set_aside,
+            "set_aside": set_aside,
             "by_class": dict(log.found.most_common()),
         },
         "model": {**_facts(model), "runs_on": provider},

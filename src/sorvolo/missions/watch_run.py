@@ -141,7 +141,8 @@ class WatchRun:
         self.log.wall_s["write, beside the rest"] = self._files.seconds
         report = build_watch_report(
             self._setup, self._settings, self._outputs, self._detector.info, self._detector.provider, self.log, tracks,
-            notices, self._warnings(tracks), ended=ended, skipped=skipped, on_ground=not site.is_local,
+            notices, self._warnings(tracks), ended=ended, skipped=skipped,
+            set_aside=self._places.set_aside, on_ground=not site.is_local,
         )
         crops = {track_id: (self._folder / name).read_bytes() for track_id, name in crop_names.items()}
         atomic_write_bytes(self._folder / "report.json", json_bytes(report))
@@ -155,7 +156,7 @@ class WatchRun:
 
     def _warnings(self, tracks: Sequence[Track]) -> list[str]:
         warnings = []
-        total = sum(self.log.found.values())
+        total = sum(self.log.found.values()) - self._places.set_aside
         if not self._places.site.is_local and total and self.log.placed < 0.5 * total:
             warnings.append(
                 f"{total - self.log.placed} of {total} detections have no place on the ground and are in no track; "

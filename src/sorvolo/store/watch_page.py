@@ -242,7 +242,11 @@ def _how_it_went(report: Mapping[str, Any]) -> str:
             f"{escaped(frames.get('detected'))} searched of {escaped(frames.get('read'))} read,",
             f"{escaped(frames.get('skipped'))} skipped to keep up,", f"{escaped(frames.get('lost'))} unusable",
         )),
-        ("detections", f"{escaped(at(report, 'detections', 'total'))}, of which {unplaced} a place on the ground"),
+        ("detections", join_words(
+            f"{escaped(at(report, 'detections', 'total'))}, of which {unplaced} a place on the ground",
+            f"and {short} set aside, far too short for their class" if (short := at(report, "detections", "set_aside"))
+            else "",
+        )),
         ("took", join_words(seconds_words(total), with_unit("({:.1f} frames a second)", rate))),
         ("of it", ", ".join(
             f"{escape(name)} {seconds_words(finite_or_none(value))}"

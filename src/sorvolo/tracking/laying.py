@@ -11,12 +11,11 @@ from sorvolo.geometry.pose import Pose
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.objects import TYPICAL_SIZE_M, Detections, Sighting
 from sorvolo.tracking.cut_boxes import beyond_edges, cut_edges
+from sorvolo.tracking.plausible import TOO_SHORT_CUT_PX, far_too_short
 
 _BOX_SIGMA = 0.06  # of a box's middle, in shares of its side
 _LEAST_SIGMA_PX = 1.0
 _LEAST_SIGMA_M = 0.03
-_LEAST_LENGTH = 0.4  # of a class's usual length: what is shorter is none, however sure the detector is
-_CUT_PX = 3.0  # pieces of cars at the edge end up to so far from it
 _ASIDE = 0.4  # of what a cut box's middle may be off outwards: along the edge, where a slanting body's corner shows
 _FARTHEST = 6.0  # times the height: beyond it, a pixel's error is many metres
 
@@ -60,7 +59,7 @@ def lay_on_ground(seen: Detections, frame: PlacedFrame, *, has_metres: bool = Tr
         return [None] * len(seen)
     heights_m = np.array([usual_height_m(name) if has_metres else 0.0 for name in seen.names])
     boxes = np.asarray(seen.boxes_px, np.float64)
-    cut = cut_edges(boxes, frame.camera.width_px, frame.camera.height_px, _CUT_PX)
+    cut = cut_edges(boxes, frame.camera.width_px, frame.camera.height_px, TOO_SHORT_CUT_PX)
     result: list[LaidSighting | None] = []
     for k, name in enumerate(seen.names):
         up_m = heights_m[k] / 2
@@ -76,7 +75,7 @@ def lay_on_ground(seen: Detections, frame: PlacedFrame, *, has_metres: bool = Tr
             continue
         spans_m = np.array([around_m[2] - around_m[1], around_m[4] - around_m[3]])
         sides_m = np.hypot(*spans_m.T)
-        if has_metres and not cut[k].any() and sides_m.max() < _LEAST_LENGTH * usual_length_m(name):
+        if has_metres and far_too_short((name,), sides_m[None], cut[k:k + 1])[0]:
             result.append(None)
             continue
         m_per_px = float(np.sqrt(np.prod(sides_m) / max(np.prod(boxes[k, 2:] - boxes[k, :2]), 1e-6)))
@@ -127,11 +126,6 @@ def pose_of(frame: PlacedFrame) -> Pose | None:
 def usual_height_m(name: str) -> float:
     """How high a class's members usually are; of classes that are not ours a guess between a thing and a person."""
     return TYPICAL_SIZE_M[name][2] if name in TYPICAL_SIZE_M else 1.0
-
-
-def usual_length_m(name: str) -> float:
-    """How long a class's members usually are; 0 for classes that are not ours."""
-    return TYPICAL_SIZE_M[name][0] if name in TYPICAL_SIZE_M else 0.0
 
 
 def _own_sigma_m(sides_m: Floats, m_per_px: float, frame: PlacedFrame) -> float:

@@ -12,9 +12,13 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.objects import TYPICAL_SIZE_M, Detections, Sighting
 from sorvolo.tracking.cut_boxes import beyond_edges, cut_edges
+from sorvolo.tracking.plausible import TOO_SHORT_CUT_PX, far_too_short
 
 GroundHeight = Callable[[PointsM], Floats]
 """Heights (N,) of the ground above the site's level plane, m, at east, north (N, 2); NaN where it is not known."""
+
+TOO_SHORT = "far too short for its class"
+"""The words for what could be placed, and is set aside: it is not what the detector took it for."""
 
 _OTHER_HEIGHT_M = 1.0  # of a class that nothing is known of
 _GROUND_STEPS = 12
@@ -88,6 +92,10 @@ def locate(
     sizes_m = slopes_m * sides_px
     axes = per_px.transpose(0, 2, 1) / np.maximum(slopes_m, 1e-9)[:, :, None]
     cut = cut_edges(boxes, camera.width_px, camera.height_px)
+    short = far_too_short(
+        found.names, sizes_m, cut_edges(boxes, camera.width_px, camera.height_px, TOO_SHORT_CUT_PX),
+        _scale_sigma(prior, reach * -rays_site[:, 2], focal_sigma, settings),
+    )
     outward_m, beyond_m2 = beyond_edges(found.names, cut, axes, sizes_m)
     places_m, own = places_m + outward_m, own + beyond_m2
     sizes_m = np.sort(sizes_m, axis=1)[:, ::-1]
@@ -106,6 +114,8 @@ def locate(
             unlocated[f"farther than {settings.farthest_m:g} m"] += 1
         elif not sigmas[row] <= settings.most_sigma_m:
             unlocated[f"the place is known no better than {settings.most_sigma_m:g} m"] += 1
+        elif short[row]:
+            unlocated[TOO_SHORT] += 1
         else:
             sightings[row] = Sighting(
                 frame_index, frame_name, time_ns, label, float(found.scores[row]), found.boxes_px[row], places_m[row],
@@ -123,6 +133,12 @@ def _unplaced(prior: CameraPrior) -> str | None:
     if not np.isfinite(prior.attitude_sigma_deg[:2]).all():
         return "the camera's tilt is not known"
     return None
+
+
+def _scale_sigma(prior: CameraPrior, drop_m: Floats, focal_sigma: float, settings: LocateSettings) -> Floats:
+    """(N,) how well lengths on the ground are known, relative; `drop_m` (N,) is how far it lies below the camera."""
+    height_sigma_m = np.hypot(prior.position_sigma_m[2], settings.ground_sigma_m)
+    return np.asarray(np.hypot(height_sigma_m / np.maximum(drop_m, 1e-6), focal_sigma), np.float64)
 
 
 def _rays_with_slopes(camera: Camera, middles_px: PointsPx) -> tuple[PointsM, Floats]:

@@ -17,7 +17,8 @@ from sorvolo.geometry.boxes import iou_matrix, nesting_matrix
 from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.survey.objects import TYPICAL_SIZE_M
 from sorvolo.tracking.joining import WITHIN
-from sorvolo.tracking.laying import LaidSighting, shows, usual_height_m, usual_length_m
+from sorvolo.tracking.laying import LaidSighting, shows, usual_height_m
+from sorvolo.tracking.plausible import usual_length_m
 from sorvolo.tracking.walking import Walk, walks
 
 _GATE = 9.2  # squared distance in sigmas, two axes: 99 in 100 sightings of one object lie nearer
