@@ -13,11 +13,13 @@ import cv2
 import numpy as np
 import pytest
 
+from sorvolo.capture.calibration import camera_from_option, guess_camera
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.missions.compare_flights import compare_flights
 from sorvolo.missions.evaluate_changes import evaluate_changes
+from sorvolo.missions.known_camera import known_camera
 from sorvolo.missions.map_flight import map_flights
 from sorvolo.missions.settings import CompareSettings, MapSettings
 from sorvolo.missions.simulate_site import simulate_site
@@ -223,6 +225,25 @@ def test_a_flight_without_telemetry_finds_itself(flown, site, tmp_path):
     updates = list(compare_flights([tmp_path / "silent.mp4"], site, _COMPARE, camera=flown / "camera.xml"))
     assert sum(each.status is ViewStatus.COMPARED for each in updates) >= 0.8 * len(updates)
     assert features(site, "silent")
+
+
+def test_a_guessed_camera_becomes_the_one_that_mapping_found(flown, tmp_path):
+    site = tmp_path / "site"
+    for _ in map_flights([flown / "flight1"], site, _MAP):
+        pass
+    found = report(site, "flight1")["camera"]
+    for _ in compare_flights([flown / "flight2"], site, replace(_COMPARE, updates_map=False)):
+        pass
+    told = report(site)["camera"]
+    assert told["focal_px"] == pytest.approx(found["focal_found_px"]) != found["focal_px"]
+    assert "as flight flight1 of this site found it" in told["origin"] and found["origin"] in told["origin"]
+    assert told["focal_sigma_relative"] < found["focal_sigma_relative"]
+    assert report(site)["comparison"]["residual_px"]["median"] < 1.4  # 1.8 with the guess
+    with Archive.open(site, write=False) as archive:
+        calibrated = camera_from_option(str(flown / "camera.xml"), 640, 360)
+        assert known_camera(calibrated, archive) is calibrated
+        other = guess_camera(1280, 720)
+        assert known_camera(other, archive) is other
 
 
 def test_the_thesis_method_compares_too_and_shows_its_steps(flown, site, tmp_path):

@@ -91,7 +91,7 @@ class Source(Protocol):
 def open_sources(
     inputs: Sequence[Path | str], telemetry: Path | str | None = None, camera: Path | str | None = None,
     known: Mapping[str, str] = MappingProxyType({}), *, live: LiveSettings = LiveSettings(),  # noqa: B008 (frozen)
-    until: threading.Event | None = None,
+    until: threading.Event | None = None, better_camera: Callable[[CameraModel], CameraModel] | None = None,
 ) -> list[Source]:
     """Each video, each folder of photos, all photos given one by one together, and each live source, as a flight.
 
@@ -100,7 +100,8 @@ def open_sources(
     set. `telemetry` belongs to the only flight; without it, a video's is looked for inside and beside it, and photos'
     is in them; beside a live source it is a link to a receiver (serial:, tcp://, udp://, follow:LOG). `camera` is a
     calibration file or what else `--camera` takes (capture.calibration). `known` are the site's flights, name to
-    fingerprint: another flight of the same name (cards are numbered anew) gets a name of its own.
+    fingerprint: another flight of the same name (cards are numbered anew) gets a name of its own. `better_camera` gives
+    the camera to use instead of the one that the input or `camera` tells.
     Raises InputError for what cannot be read, naming the file and what to do.
     """
     if not inputs:
@@ -127,6 +128,8 @@ def open_sources(
     for each in sources:
         each.name = _free_name(safe_name(each.name), each.fingerprint, taken)
         taken[each.name] = each.fingerprint
+        if better_camera is not None:
+            each.camera = better_camera(each.camera)
     return list(sources)
 
 
@@ -134,10 +137,10 @@ def open_sources(
 def opened_sources(
     inputs: Sequence[Path | str], telemetry: Path | str | None = None, camera: Path | str | None = None,
     known: Mapping[str, str] = MappingProxyType({}), *, live: LiveSettings = LiveSettings(),  # noqa: B008 (frozen)
-    until: threading.Event | None = None,
+    until: threading.Event | None = None, better_camera: Callable[[CameraModel], CameraModel] | None = None,
 ) -> Iterator[list[Source]]:
     """The same as `open_sources`; live sources are closed at the end, however it comes."""
-    sources = open_sources(inputs, telemetry, camera, known, live=live, until=until)
+    sources = open_sources(inputs, telemetry, camera, known, live=live, until=until, better_camera=better_camera)
     try:
         yield sources
     finally:

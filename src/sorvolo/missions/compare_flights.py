@@ -13,6 +13,7 @@ from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.compare_run import CompareRun
 from sorvolo.missions.detecting import Detects
 from sorvolo.missions.flight_setup import known_flights, prepare
+from sorvolo.missions.known_camera import known_camera
 from sorvolo.missions.map_objects import open_detector
 from sorvolo.missions.settings import CompareSettings
 from sorvolo.mosaic.selection import every
@@ -44,8 +45,11 @@ def compare_flights(
         if not archive.tiles():
             raise StoreError(f"{site} holds no map yet; make one of an earlier flight: sorvolo map INPUT --site {site}")
     looks = open_detector(settings.model) if detector is None else detector
-    opened = opened_sources(inputs, telemetry, camera, known_flights(site), live=live, until=until)
-    with opened as sources, Archive.open(site, write=True) as archive:
+    opened = opened_sources(
+        inputs, telemetry, camera, known_flights(site), live=live, until=until,
+        better_camera=lambda guess: known_camera(guess, archive),
+    )
+    with Archive.open(site, write=True) as archive, opened as sources:
         for source in sources:
             yield from _compare_one(
                 source, archive, settings, wanted, steps, looks, telemetry_named=telemetry is not None

@@ -1,5 +1,6 @@
 """The site folder: the only path layout, who may write, and how a flight enters whole or not at all."""
 
+import json
 import os
 import shutil
 from collections.abc import Collection, Iterable, Mapping
@@ -128,6 +129,14 @@ class Archive:
     def flight_folder(self, flight_id: str) -> Path:
         """Where a flight's frames.geojson, report.json, report.html, keyframes and changes lie."""
         return self._folder / "flights" / flight_id
+
+    def report(self, flight_id: str) -> Mapping[str, Any]:
+        """A flight's report.json (docs/formats.md); empty when somebody took it away or broke it."""
+        try:
+            report = json.loads((self.flight_folder(flight_id) / "report.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return report if isinstance(report, dict) else {}
 
     @property
     def has_site(self) -> bool:

@@ -1,11 +1,9 @@
 """Files that are made from the catalogue and can be made again: the map's, and those of a flight's comparison."""
 
-import json
 import os
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes, sync_file, writing
@@ -88,7 +86,7 @@ def write_change_files(archive: "Archive", flight_id: str, version: VersionEntry
         before, after = pictures(maps, _PICTURE_PX if changes else _UNCHANGED_PX, alike)
     made = {each.id: each for each in archive.versions()}
     page = changes_page(
-        _report(folder / "report.json"), changes, before, after, site, crops,
+        archive.report(flight_id), changes, before, after, site, crops,
         before_words=_words_of(made.get(version.parent_id)), after_words=_words_of(version),
     )
     atomic_write_bytes(folder / "changes.html", page.encode())
@@ -111,15 +109,6 @@ def write_site_objects(archive: "Archive") -> None:
         atomic_write_bytes(archive.objects_path, geojson_bytes(found))
     else:
         archive.objects_path.unlink(missing_ok=True)
-
-
-def _report(path: Path) -> Mapping[str, Any]:
-    """The flight's report; empty when somebody took it away or broke it: the page then says less."""
-    try:
-        report = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return report if isinstance(report, dict) else {}
 
 
 def _words_of(version: VersionEntry | None) -> str:
