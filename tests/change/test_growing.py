@@ -3,9 +3,13 @@
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from sensor_noise import camera
 
-from sorvolo.change.radiometry import fit_light, light_around
+from sorvolo.change.blobs import RegionSettings
+from sorvolo.change.growing import Views, _moved, _strength, _widened
+from sorvolo.change.radiometry import fit_light, light_around, relit, relit_parts
 from sorvolo.change.robust import RobustResult, compare_robust
 
 SIZE = (360, 480)
@@ -85,3 +89,17 @@ def test_the_light_beside_a_thing_is_that_of_the_plain_ground_there() -> None:
     off = [np.abs(np.log2(each.gains[..., 1] * each.brightness[1] * cells))[beside].mean() for each in (light, around)]
     assert off[1] < 0.75 * off[0]
     assert light_around(around, np.zeros(SIZE, np.uint8)) is around
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 60), st.integers(0, 80), st.integers(1, 3), st.integers(0, 2**32 - 1))
+def test_parts_lit_and_compared_alone_are_those_of_the_whole(top: int, left: int, reach_px: int, seed: int) -> None:
+    before, after = (np.random.default_rng(seed + k).integers(0, 256, (72, 96, 3), np.uint8) for k in range(2))
+    light = fit_light(before, after)
+    views = Views(before, after, before, None, RegionSettings(reach_px=reach_px))
+    place = np.s_[5:70, 0:90]
+    window = np.s_[max(top, 5) : top + 10, left : left + 10]
+    wide = _widened(window, place, reach_px + 2)
+    whole = _strength(relit(before, light), views, place)
+    alone = _strength(relit_parts(before, light, [wide]), views, wide)
+    np.testing.assert_array_equal(alone[_moved(window, wide)], whole[_moved(window, place)])

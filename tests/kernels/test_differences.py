@@ -1,4 +1,4 @@
-"""What two pictures differ by, their tint and the rims of regions: compiled kernels against their NumPy twins."""
+"""What two pictures differ by, their tint, rims and parts of regions: compiled kernels against their NumPy twins."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -38,6 +38,14 @@ def test_differences_are_as_specified(
         before, after, None if known is None else known.view(np.uint8), reach, weight, plain
     )
     assert np.array_equal(kernels.differences(before, after, known, reach, weight), plain)
+
+
+@settings(max_examples=100, deadline=None)
+@given(SIDES, SIDES, st.floats(0.02, 0.98), st.floats(0, 0.2), st.integers(0, 2**32 - 1))
+def test_held_parts_are_as_specified(height: int, width: int, share: float, seeded: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    mask, seeds = ((rng.random((height, width)) < each).astype(np.uint8) * 255 for each in (share, seeded))
+    assert np.array_equal(kernels.held_parts(mask, seeds), reference_robust.held_parts(mask, seeds))
 
 
 @settings(max_examples=40, deadline=None)

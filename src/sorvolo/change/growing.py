@@ -2,14 +2,15 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import ceil, floor
 
 import cv2
 import numpy as np
 
 from sorvolo.change.blobs import Image, Regions, RegionSettings
-from sorvolo.change.radiometry import Light, light_around, relit
+from sorvolo.change.radiometry import Light, light_around, relit_parts
 from sorvolo.geometry.arrays import Anything, Mask
-from sorvolo.kernels import differences
+from sorvolo.kernels import differences, held_parts
 
 REACH_PX = 20  # around a region and half of its length more: the ground that is looked at
 APART_PX = 7  # windows around regions of any kind are no quiet ground
@@ -23,6 +24,7 @@ LEAST_CONVEXITY = 0.8
 BESIDE_PX, BESIDE_QUANTILE, MOST_BESIDE = (5, 9), 0.75, 0.5  # between these widths around a piece; of the limit
 SHADE_OF_TOP, SHADE_SPREAD = 0.35, 0.1  # weaker, and of colours taken alike: a thing's shadow
 
+_BLURRED = np.floor(BLUR_OF_NEAR * np.arange(256)).astype(np.uint8)
 Window = tuple[slice, slice]
 
 
@@ -80,16 +82,18 @@ def without_halos(regions: Regions, chosen: Mask, views: Views, light: Light) ->
         slice(min(each.start for each in rows), max(each.stop for each in rows)),
         slice(min(each.start for each in columns), max(each.stop for each in columns)),
     )
-    lit = relit(views.before, around)
-    anew = regions.strength.copy()
-    anew[place] = _strength(lit, views, place)
+    parts = list(windows.values()) if sum(map(_area, windows.values())) < _area(place) else [place]
+    wide = [_widened(each, place, views.settings.reach_px + 2) for each in parts]  # two blurs and the search look there
+    lit, anew = relit_parts(views.before, around, wide), np.empty_like(regions.strength)
+    for part, within in zip(parts, wide, strict=True):
+        anew[part] = _strength(lit, views, within)[_moved(part, within)]
     strength, known_lit = regions.strength.copy(), views.lit.copy()
     clear = cv2.dilate(things, np.ones((5, 5), np.uint8)) == 0
     for region, window in windows.items():
         core = regions.labels[window] == region + 1
         rest = core & clear[window]
         if np.count_nonzero(rest) > LEAST_TAKEN * np.count_nonzero(core):
-            left_over, held = (_quantile(each[window][rest], 0.9) for each in (anew, regions.strength))
+            left_over, held = (_quantile(each[window], rest, 0.9) for each in (anew, regions.strength))
             if left_over > MOST_LEFT * held:
                 continue
         strength[window] = cv2.min(anew[window], strength[window])
@@ -110,31 +114,30 @@ def grown(regions: Regions, region: int, came: bool, views: Views) -> Piece | No
     if not quiet.any():
         return None
     top = int(strength[core].max())
-    surely = (core & (strength >= HIGHEST * top)).view(np.uint8)
-    shade = _shade(views, window, came) & (strength < SHADE_OF_TOP * top) & ~core
-    bare = np.where(shade, np.uint8(0), strength)
-    limit = max(LEAST_LIMIT, LIMIT_OF_TOP * top, QUIET_FACTOR * _quantile(bare[quiet], QUIET_QUANTILE))
+    surely = np.uint8(255) * (core & (strength >= ceil(HIGHEST * top)))
+    shade = _shade(views, window, came) & (strength < ceil(SHADE_OF_TOP * top)) & ~core
+    bare = strength * ~shade
+    limit = max(LEAST_LIMIT, LIMIT_OF_TOP * top, QUIET_FACTOR * _quantile(bare, quiet, QUIET_QUANTILE))
     while limit < HIGHEST * top:
-        above = cv2.morphologyEx((bare > limit).view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-        count, parts = cv2.connectedComponents(cv2.max(above, surely), connectivity=4)
-        held = np.zeros(count, bool)
-        held[parts[surely > 0]] = True
-        mask = held[parts]
-        if _is_thing(mask, bare, limit):
+        over: Anything = cv2.threshold(bare, floor(limit), 255, cv2.THRESH_BINARY)[1]
+        above: Anything = cv2.morphologyEx(over, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        thing = held_parts(above | surely, surely)
+        if _is_thing(thing, bare, limit):
             largest_near: Anything = cv2.dilate(strength, np.ones((BLUR_PX, BLUR_PX), np.uint8))
-            return Piece(window, mask & ((strength > BLUR_OF_NEAR * largest_near) | (surely > 0)))
+            is_sharp = strength > cv2.LUT(largest_near, _BLURRED)
+            return Piece(window, (thing > 0) & (is_sharp | (surely > 0)))
         limit *= STEP
     return None
 
 
-def _is_thing(mask: Mask, strength: Image, limit: float) -> bool:
+def _is_thing(mask: Image, strength: Image, limit: float) -> bool:
     """Whether a piece is nearly convex, and a few pixels off it the difference is gone: light fades away slowly."""
-    outlines, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    if np.count_nonzero(mask) < LEAST_CONVEXITY * cv2.contourArea(cv2.convexHull(np.concatenate(outlines))):
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if cv2.countNonZero(mask) < LEAST_CONVEXITY * cv2.contourArea(cv2.convexHull(np.concatenate(outlines))):
         return False
-    inner, outer = (cv2.dilate(mask.view(np.uint8), np.ones((px, px), np.uint8)) for px in BESIDE_PX)
+    inner, outer = (cv2.dilate(mask, np.ones((px, px), np.uint8)) for px in BESIDE_PX)
     beside = outer > inner
-    return not beside.any() or _quantile(strength[beside], BESIDE_QUANTILE) <= MOST_BESIDE * limit
+    return not beside.any() or _quantile(strength, beside, BESIDE_QUANTILE) <= MOST_BESIDE * limit
 
 
 def _window(regions: Regions, region: int) -> Window:
@@ -146,12 +149,32 @@ def _window(regions: Regions, region: int) -> Window:
     ]
 
 
-def _strength(lit: Image, views: Views, place: Window) -> Image:
+def _widened(window: Window, place: Window, by_px: int) -> Window:
+    """A window grown by a margin within `place`."""
+    rows, columns = (
+        slice(max(each.start - by_px, limit.start), min(each.stop + by_px, limit.stop))
+        for each, limit in zip(window, place, strict=True)
+    )
+    return rows, columns
+
+
+def _moved(window: Window, within: Window) -> Window:
+    """Where in the window `within` another one lies."""
+    rows, columns = (
+        slice(each.start - other.start, each.stop - other.start) for each, other in zip(window, within, strict=True)
+    )
+    return rows, columns
+
+
+def _area(window: Window) -> int:
+    return (window[0].stop - window[0].start) * (window[1].stop - window[1].start)
+
+
+def _strength(lit: Image, views: Views, window: Window) -> Image:
     """How much the pictures differ in a part of them, as `find_regions` measures it."""
-    before, after = (np.ascontiguousarray(each[place]) for each in (lit, views.after))
-    known = None if views.known is None else np.ascontiguousarray(views.known[place])
-    planes = np.empty((6, *before.shape[:2]), np.uint8)
-    difference = differences(before, after, known, views.settings.reach_px, views.settings.chroma_weight, planes)[0]
+    before, after = (np.ascontiguousarray(each[window]) for each in (lit, views.after))
+    known = None if views.known is None else np.ascontiguousarray(views.known[window])
+    difference = differences(before, after, known, views.settings.reach_px, views.settings.chroma_weight)[0]
     return cv2.blur(difference, (3, 3))
 
 
@@ -161,10 +184,11 @@ def _shade(views: Views, window: Window, came: bool) -> Mask:
     bands = cv2.split(cv2.divide(after, before, scale=128) if came else cv2.divide(before, after, scale=128))
     most = cv2.max(cv2.max(bands[0], bands[1]), bands[2])
     least = cv2.min(cv2.min(bands[0], bands[1]), bands[2])
-    return np.asarray((most < 128) & (cv2.subtract(most, least) < 128 * SHADE_SPREAD))
+    return np.asarray((most < 128) & (cv2.subtract(most, least) < ceil(128 * SHADE_SPREAD)))
 
 
-def _quantile(values: Anything, share: float) -> int:
-    """A quantile of uint8 values (N,), N > 0, without the care that np.quantile takes."""
-    counts = np.bincount(values.ravel(), minlength=256).cumsum()
-    return int(np.searchsorted(counts, share * counts[-1]))
+def _quantile(values: Image, chosen: Mask, share: float) -> int:
+    """A quantile of uint8 values (h, w) where `chosen` (h, w), somewhere, without the care that np.quantile takes."""
+    counts: Anything = cv2.calcHist([values], [0], chosen.view(np.uint8), [256], [0, 256])
+    sums = counts.ravel().astype(np.int64).cumsum()
+    return int(np.searchsorted(sums, share * sums[-1]))

@@ -1,5 +1,6 @@
 """One picture in the light of another: a power law per channel for the camera, a smooth gain for clouds' shadows."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -123,6 +124,20 @@ def light_around(light: Light, things: Anything) -> Light:
 
 def relit(image: Bgr, light: Light, out: Bgr | None = None) -> Bgr:
     """`image`, of the reference, in the query's light; written to `out` (h, w, 3) where it is given."""
+    return relight(image, *_curves_and_gains(light, image.shape[1::-1]), out)
+
+
+def relit_parts(image: Bgr, light: Light, parts: Iterable[tuple[slice, slice]]) -> Bgr:
+    """Some parts of `image`, of the reference, in the query's light; the rest of the picture holds anything."""
+    curves, gains = _curves_and_gains(light, image.shape[1::-1])
+    result = np.empty_like(image)
+    for part in parts:
+        result[part] = relight(image[part], curves, gains[part])
+    return result
+
+
+def _curves_and_gains(light: Light, size: Sequence[int]) -> tuple[NDArray[np.int32], NDArray[np.uint16]]:
+    """The light of a picture of `size` (w, h) as `relight` takes it; the gains last until the thread's next picture."""
     levels = np.log2(np.arange(256) + BLACK_LEVEL)
     curves = 2.0 ** (light.exponents[:, None] * levels + light.offsets[:, None])
     table = np.clip(np.rint(curves * CURVE_ONE), 0, 16383).astype(np.int32)
@@ -130,9 +145,9 @@ def relit(image: Bgr, light: Light, out: Bgr | None = None) -> Bgr:
     if light.shades is not None:
         grid = cv2.multiply(light.shades, cv2.resize(grid, light.shades.shape[1::-1], interpolation=cv2.INTER_LINEAR))
     steps = np.clip(np.rint(grid * GAIN_ONE), 0, 65535).astype(np.uint16)
-    gains = _SCRATCH.take("gains", (image.shape[0], image.shape[1]), (3,), np.uint16)
-    cv2.resize(steps, image.shape[1::-1], dst=gains, interpolation=cv2.INTER_LINEAR)
-    return relight(image, table, gains, out)
+    gains = _SCRATCH.take("gains", (size[1], size[0]), (3,), np.uint16)
+    cv2.resize(steps, size, dst=gains, interpolation=cv2.INTER_LINEAR)
+    return table, gains
 
 
 def _shades(

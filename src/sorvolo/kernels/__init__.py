@@ -206,6 +206,15 @@ def core_regions(
     return found
 
 
+def held_parts(mask: Bytes, seeds: Bytes) -> Bytes:
+    """The parts of a mask (h, w) that hold a pixel of `seeds` (h, w), 255 or 0: see reference_robust."""
+    _check_mask(mask)
+    if seeds.shape != mask.shape:
+        raise ValueError(f"held_parts: mask {mask.shape} and seeds {seeds.shape} do not fit")
+    parts: Bytes = _robust.held_parts(_bytes(mask), _bytes(seeds))
+    return parts
+
+
 def measure_regions(
     labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: Sequence[NDArray[np.uint8]], margin: int
 ) -> NDArray[np.int64]:

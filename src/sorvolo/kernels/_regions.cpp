@@ -148,6 +148,42 @@ Integers64 region_boxes(const Bytes &mask) {
     return boxes;
 }
 
+// Each run of columns of `mask` is a part of its own at first, and joins those that it touches in the row above.
+Bytes held_parts(const Bytes &mask, const Bytes &seeds) {
+    const int rows = static_cast<int>(mask.shape(0)), columns = static_cast<int>(mask.shape(1));
+    const std::uint8_t *pixels = mask.data(), *seed = seeds.data();
+    Bytes kept({mask.shape(0), mask.shape(1)});
+    std::uint8_t *out = kept.mutable_data();
+    py::gil_scoped_release released;
+    std::memset(out, 0, static_cast<std::size_t>(rows) * columns);
+    Labels labels;
+    std::vector<std::uint8_t> is_held;
+    std::vector<std::vector<Run>> runs(rows);
+    std::vector<Run> seeded;
+    for (int y = 0; y < rows; ++y) {
+        find_runs(pixels + static_cast<std::size_t>(y) * columns, columns, runs[y]);
+        find_runs(seed + static_cast<std::size_t>(y) * columns, columns, seeded);
+        std::size_t above = 0, next = 0;
+        for (Run &run : runs[y]) {
+            run.label = static_cast<std::int32_t>(labels.parent.size());
+            labels.parent.push_back(run.label);
+            while (next < seeded.size() && seeded[next].to <= run.from) ++next;
+            is_held.push_back(next < seeded.size() && seeded[next].from < run.to);
+            if (y == 0) continue;
+            while (above < runs[y - 1].size() && runs[y - 1][above].to <= run.from) ++above;
+            for (std::size_t i = above; i < runs[y - 1].size() && runs[y - 1][i].from < run.to; ++i)
+                labels.join(run.label, runs[y - 1][i].label);
+        }
+    }
+    for (std::size_t label = 0; label < is_held.size(); ++label)
+        if (is_held[label]) is_held[labels.root(static_cast<std::int32_t>(label))] = 1;
+    for (int y = 0; y < rows; ++y)
+        for (const Run &run : runs[y])
+            if (is_held[labels.root(run.label)])
+                std::memset(out + static_cast<std::size_t>(y) * columns + run.from, 255, run.to - run.from);
+    return kept;
+}
+
 Integers64 gray_histograms(const Bytes &image, const Bytes &tables, const Integers64 &boxes,
                            const std::optional<Bytes> &known) {
     const py::ssize_t columns = image.shape(1), count = boxes.shape(0);
@@ -192,6 +228,7 @@ void bind_regions(py::module_ &module) {
     module.def("without_isolations", &without_isolations, array("mask"), py::arg("width"), py::arg("height"),
                py::arg("most_black"), py::arg("threads"));
     module.def("region_boxes", &region_boxes, array("mask"));
+    module.def("held_parts", &held_parts, array("mask"), array("seeds"));
     module.def("gray_histograms", &gray_histograms, array("image"), array("tables"), array("boxes"),
                array("known"));
 }

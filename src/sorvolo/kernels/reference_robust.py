@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 
 def relight(
@@ -135,6 +136,12 @@ def _parts(mask: NDArray[np.bool_]) -> list[tuple[NDArray[np.int64], NDArray[np.
         found = np.array(sorted(part), np.int64)
         parts.append((found[:, 0], found[:, 1]))
     return parts
+
+
+def held_parts(mask: NDArray[np.uint8], seeds: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(h, w) 255 in the 4-connected parts of `mask` (h, w) that hold a pixel of `seeds` (h, w), else 0."""
+    labels, _ = ndimage.label(mask)
+    return np.where(np.isin(labels, labels[(mask > 0) & (seeds > 0)]), np.uint8(255), np.uint8(0))
 
 
 def measure_regions(
