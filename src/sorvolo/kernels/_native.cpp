@@ -211,7 +211,7 @@ struct Strings {
     std::uint8_t *out;
 };
 
-constexpr int BLOCK = 64, LANES = 16;
+constexpr int BLOCK = 64, LANES = 16, ROWS = 2;
 
 // One image's neighbourhood of a block of pixels: the rows dy of channel 0, the others a step further each.
 struct Window {
@@ -221,10 +221,17 @@ struct Window {
     SORVOLO_INLINE const std::uint8_t *row(int channel, int dy) const {
         return rows[dy] + channel * channel_step + across;
     }
+    SORVOLO_INLINE Window below(int down) const { return {rows + down, channel_step, across}; }
 };
 
 // How many bits differ for each of 64 pixels in a row; bytes count up to 255 before they are added up.
 using CountBlock = void (*)(const Strings &, const Window &, const Window &, std::uint16_t *);
+
+// The same for 64 pixels in each of two rows, one upon the other.
+template <CountBlock count_block>
+void count_each(const Strings &work, const Window &reference, const Window &query, std::uint16_t *counts) {
+    for (int k = 0; k < ROWS; ++k) count_block(work, reference.below(k), query.below(k), counts + k * BLOCK);
+}
 
 SORVOLO_INLINE void add_up(std::uint16_t *counts, const std::uint8_t *bits) {
     for (int x = 0; x < BLOCK; ++x) counts[x] = static_cast<std::uint16_t>(counts[x] + bits[x]);
@@ -276,42 +283,60 @@ SORVOLO_AVX2 void count_block_avx2(const Strings &work, const Window &reference,
         }
 }
 
+// One to two rows of pixels: what is around both is read once.
+template <int rows>
 SORVOLO_AVX512 void count_block_avx512(const Strings &work, const Window &reference, const Window &query,
                                        std::uint16_t *counts) {
     const int left = work.width / 2, above = work.height / 2;
     const __m512i one = _mm512_set1_epi8(1);
-    std::memset(counts, 0, BLOCK * sizeof(std::uint16_t));
+    std::memset(counts, 0, rows * BLOCK * sizeof(std::uint16_t));
     for (int channel = 0; channel < CHANNELS; ++channel) {
-        const __m512i centre_r = _mm512_loadu_si512(reference.row(channel, above) + left);
-        const __m512i centre_q = _mm512_loadu_si512(query.row(channel, above) + left);
-        __m512i bits = _mm512_setzero_si512();
+        __m512i centre_r[rows], centre_q[rows], bits[rows];
+        for (int k = 0; k < rows; ++k) {
+            centre_r[k] = _mm512_loadu_si512(reference.row(channel, above + k) + left);
+            centre_q[k] = _mm512_loadu_si512(query.row(channel, above + k) + left);
+            bits[k] = _mm512_setzero_si512();
+        }
         int added = 0;
-        for (int dy = 0; dy < work.height; ++dy) {
+        for (int dy = 0; dy < work.height + rows - 1; ++dy) {
             const std::uint8_t *row_r = reference.row(channel, dy), *row_q = query.row(channel, dy);
-            for (int dx = 0; dx < work.width; ++dx) {
-                const __mmask64 differ =
-                    _mm512_cmpge_epu8_mask(_mm512_loadu_si512(row_r + dx), centre_r) ^
-                    _mm512_cmpge_epu8_mask(_mm512_loadu_si512(row_q + dx), centre_q);
-                bits = _mm512_mask_add_epi8(bits, differ, bits, one);
-            }
+            const auto count = [&](int first, int last) SORVOLO_AVX512 __attribute__((always_inline)) {
+                for (int dx = 0; dx < work.width; ++dx) {
+                    const __m512i r = _mm512_loadu_si512(row_r + dx), q = _mm512_loadu_si512(row_q + dx);
+                    for (int k = first; k < last; ++k) {
+                        const __mmask64 differ =
+                            _mm512_cmpge_epu8_mask(r, centre_r[k]) ^ _mm512_cmpge_epu8_mask(q, centre_q[k]);
+                        bits[k] = _mm512_mask_add_epi8(bits[k], differ, bits[k], one);
+                    }
+                }
+            };
+            if (rows == 1 || (dy > 0 && dy < work.height)) count(0, rows);
+            else if (dy == 0) count(0, 1);
+            else count(rows - 1, rows);
             added += work.width;
-            if (added + work.width <= 255 && dy + 1 < work.height) continue;
-            alignas(64) std::uint8_t each[BLOCK];
-            _mm512_store_si512(each, bits);
-            add_up(counts, each);
-            bits = _mm512_setzero_si512();
+            if (added + work.width <= 255 && dy + 2 < work.height + rows) continue;
+            for (int k = 0; k < rows; ++k) {
+                alignas(64) std::uint8_t each[BLOCK];
+                _mm512_store_si512(each, bits[k]);
+                add_up(counts + k * BLOCK, each);
+                bits[k] = _mm512_setzero_si512();
+            }
             added = 0;
         }
     }
 }
 #endif
 
-CountBlock best_count_block() {
+struct Counting {
+    CountBlock one_row, two_rows;
+};
+
+Counting best_counting() {
 #ifdef SORVOLO_X86
-    if (instructions() == Instructions::avx512) return count_block_avx512;
-    if (instructions() == Instructions::avx2) return count_block_avx2;
+    if (instructions() == Instructions::avx512) return {count_block_avx512<1>, count_block_avx512<ROWS>};
+    if (instructions() == Instructions::avx2) return {count_block_avx2, count_each<count_block_avx2>};
 #endif
-    return count_block_plain;
+    return {count_block_plain, count_each<count_block_plain>};
 }
 
 // How many bits differ for one pixel, for windows up to 16 wide and 255 high.
@@ -334,18 +359,18 @@ SORVOLO_INLINE int count_pixel(const Strings &work, const Window &reference, con
     return total;
 }
 
-// The rows of both images that the window around one row reaches, mirrored over the rims, each copied once on its way.
+// The rows of both images that the windows around two rows reach, mirrored over the rims, each copied once on its way.
 class NearRows {
 public:
     NearRows(const Strings &work)
-        : work_(work), step_(work.columns + work.width + BLOCK + LANES),
-          bytes_(2 * CHANNELS * static_cast<std::size_t>(step_) * work.height), held_(work.height, -work.rows - 1000),
-          reference_(work.height), query_(work.height) {}
+        : work_(work), step_(work.columns + work.width + BLOCK + LANES), slots_(work.height + ROWS - 1),
+          bytes_(2 * CHANNELS * static_cast<std::size_t>(step_) * slots_), held_(slots_, -work.rows - 1000),
+          reference_(slots_), query_(slots_) {}
 
     void around(int y) {
-        for (int dy = 0; dy < work_.height; ++dy) {
+        for (int dy = 0; dy < slots_; ++dy) {
             const int row = y - work_.height / 2 + dy;
-            const int slot = ((row % work_.height) + work_.height) % work_.height;
+            const int slot = ((row % slots_) + slots_) % slots_;
             std::uint8_t *start = bytes_.data() + 2 * CHANNELS * static_cast<std::size_t>(step_) * slot;
             reference_[dy] = start;
             query_[dy] = start + CHANNELS * static_cast<std::size_t>(step_);
@@ -366,6 +391,7 @@ public:
 private:
     const Strings &work_;
     std::ptrdiff_t step_;
+    int slots_;
     std::vector<std::uint8_t> bytes_;
     std::vector<int> held_;  // the row that each slot holds
     std::vector<const std::uint8_t *> reference_, query_;
@@ -374,27 +400,37 @@ private:
 constexpr int FEW = 4;  // pixels in question in a block of 64: with fewer one by one is faster
 
 void compare_rows(const Strings &work, int first, int last) {
-    const CountBlock count_block = best_count_block();
+    const Counting counting = best_counting();
     const bool one_by_one = work.width <= LANES && work.height <= 255;
     NearRows near(work);
-    std::uint16_t counts[BLOCK];
-    for (int y = first; y < last; ++y) {
-        const std::uint8_t *asked = work.asked + static_cast<std::size_t>(y) * work.columns;
-        std::uint8_t *out = work.out + static_cast<std::size_t>(y) * work.columns;
+    std::uint16_t counts[ROWS * BLOCK];
+    for (int y = first; y < last; y += ROWS) {
+        const int rows = std::min(ROWS, last - y);
         bool prepared = false;
         for (int x0 = 0; x0 < work.columns; x0 += BLOCK) {
             const int pixels = std::min(BLOCK, work.columns - x0);
-            int wanted = 0;
-            for (int x = 0; x < pixels; ++x) wanted += asked[x0 + x] != 0;
-            if (wanted == 0) continue;
+            const std::size_t at = static_cast<std::size_t>(y) * work.columns + x0;
+            int wanted[ROWS] = {};
+            for (int k = 0; k < rows; ++k)
+                for (int x = 0; x < pixels; ++x) wanted[k] += work.asked[at + k * work.columns + x] != 0;
+            if (*std::max_element(wanted, wanted + rows) == 0) continue;
             if (!prepared) near.around(y);
             prepared = true;
-            if (wanted < FEW && one_by_one) {
-                for (int x = x0; x < x0 + pixels; ++x)
-                    if (asked[x] && count_pixel(work, near.reference(x), near.query(x)) > work.most) out[x] = 255;
-            } else {
-                count_block(work, near.reference(x0), near.query(x0), counts);
-                for (int x = 0; x < pixels; ++x) out[x0 + x] = asked[x0 + x] && counts[x] > work.most ? 255 : 0;
+            const int few = one_by_one ? FEW : 1;
+            const bool together = rows == ROWS && *std::min_element(wanted, wanted + ROWS) >= few;
+            if (together) counting.two_rows(work, near.reference(x0), near.query(x0), counts);
+            for (int k = 0; k < rows; ++k) {
+                const std::uint8_t *asked = work.asked + at + k * work.columns;
+                std::uint8_t *out = work.out + at + k * work.columns, *end = out + pixels;
+                std::uint16_t *count = counts + k * BLOCK;
+                if (wanted[k] < few) {
+                    for (int x = 0; x < pixels && wanted[k] > 0; ++x)
+                        if (asked[x]) count[x] = static_cast<std::uint16_t>(count_pixel(
+                            work, near.reference(x0 + x).below(k), near.query(x0 + x).below(k)));
+                } else if (!together) {
+                    counting.one_row(work, near.reference(x0).below(k), near.query(x0).below(k), count);
+                }
+                for (; out < end; ++out, ++asked, ++count) *out = *asked && *count > work.most ? 255 : 0;
             }
         }
     }

@@ -33,7 +33,9 @@
 
 // Put before a function: compiled for each of these, and the best one chosen when the module is loaded. Only what is
 // inlined into such a function gains, hence SORVOLO_INLINE for its helpers. Needs the loader of glibc.
-#if defined(SORVOLO_X86) && defined(__GLIBC__)
+#if defined(SORVOLO_X86) && defined(__GLIBC__) && __GNUC__ >= 12
+#define SORVOLO_CLONES __attribute__((target_clones("arch=x86-64-v4", "avx2", "default")))
+#elif defined(SORVOLO_X86) && defined(__GLIBC__)
 #define SORVOLO_CLONES __attribute__((target_clones("avx2", "default")))
 #else
 #define SORVOLO_CLONES

@@ -11,13 +11,6 @@
 #include <cstddef>
 #include <cstdlib>
 
-// Compiled twice, the better one chosen when the module is loaded.
-#if defined(__x86_64__) && defined(__linux__) && defined(__GNUC__)
-#define ROBUST_CLONES __attribute__((target_clones("avx2", "default")))
-#else
-#define ROBUST_CLONES
-#endif
-
 namespace sorvolo {
 
 namespace {
@@ -29,7 +22,7 @@ using Doubles = pybind11::array_t<double, pybind11::array::c_style>;
 constexpr std::ptrdiff_t RUN = 3 * 512;
 
 // A run at a time: tables are read value by value, the rest is done for many values at once.
-ROBUST_CLONES
+SORVOLO_CLONES
 void relight_values(const std::uint8_t *from, const std::uint16_t *curves, const std::uint16_t *gains, std::uint8_t *to,
                     std::ptrdiff_t values) {
     std::uint16_t lifted[RUN];
@@ -84,7 +77,7 @@ void tint(const Bytes &reference, const Bytes &query, const Bytes &logs, const I
 }
 
 // Along a region's rim, two pixels wide: the sum of `came` less that of `went`. `box` is the region's.
-ROBUST_CLONES
+SORVOLO_CLONES
 std::int64_t balance_of(const std::int32_t *label, const std::uint8_t *came, const std::uint8_t *went,
                         std::ptrdiff_t width, std::ptrdiff_t height, const std::int32_t *box, std::int32_t number,
                         std::vector<std::uint8_t> &work) {
@@ -145,7 +138,7 @@ void looked_up(const Integers32 &labels, const Bytes &table, Bytes &out) {
 }
 
 // Which values lie over their thresholds, 1 or 0.
-ROBUST_CLONES
+SORVOLO_CLONES
 void mark_over(const std::uint8_t *value, const std::uint8_t *threshold, std::uint8_t *to, std::ptrdiff_t pixels) {
     SORVOLO_INDEPENDENT
     for (std::ptrdiff_t at = 0; at < pixels; ++at) to[at] = value[at] > threshold[at];
@@ -256,7 +249,7 @@ pybind11::tuple core_regions(const Bytes &values, const Bytes &thresholds, doubl
 
 // Adds up one region's window, columns left .. right - 1: `to` are count, sums and sums of squares of each of the
 // `channels`, for the region and then for what is of no region. `masks` holds twice the picture's width.
-ROBUST_CLONES
+SORVOLO_CLONES
 void measure_region(const std::int32_t *label, const std::uint8_t *const *channels, std::ptrdiff_t count,
                     std::ptrdiff_t width, std::ptrdiff_t left, std::ptrdiff_t right, std::ptrdiff_t top,
                     std::ptrdiff_t bottom, std::int32_t number, std::uint8_t *masks, std::int64_t *to) {
@@ -322,7 +315,7 @@ double correlation(const Sums &s) {
 }
 
 // The sums of a window that the shift changes; both windows lie in steps of one, `query` without gaps between its rows.
-ROBUST_CLONES
+SORVOLO_CLONES
 void sum_window(const std::uint8_t *query, const std::int16_t *query_words, const std::uint8_t *reference,
                 const std::int16_t *reference_words, std::int64_t reference_row, int wide, int high, Sums *total) {
     for (int y = 0; y < high; ++y) {
@@ -342,7 +335,7 @@ constexpr int MOST_AT_ONCE_PX = 64;
 constexpr int LANES = 16;  // shifts along x that are summed at once
 
 // As above for the shifts 0 .. LANES - 1 along x: narrow windows leave a processor's lanes empty, shifts do not.
-ROBUST_CLONES
+SORVOLO_CLONES
 void sum_shifts(const std::uint8_t *query, const std::uint8_t *reference, std::int64_t reference_row, int wide,
                 int high, Sums *totals) {
     std::int32_t qt[LANES] = {}, tt[LANES] = {}, t[LANES] = {}, apart[LANES] = {};
@@ -399,11 +392,12 @@ Doubles match_regions(const Bytes &query, const Bytes &reference, const Integers
         const std::size_t phase_size = static_cast<std::size_t>(across) * down;
         searched.assign(phase_size * step * step + LANES, 0);  // lanes may look past the last row
         const int rows = box[3] + 2 * reach, columns = box[2] + 2 * reach;
-        for (int y = 0; y < rows; ++y) {
+        for (int y = 0; y < std::min(rows, down * step); ++y) {
             const std::uint8_t *line = t0 + (box[1] + y) * padded + box[0];
-            if (y / step >= down) break;
-            for (int x = 0; x < columns && x / step < across; ++x)
-                searched[((y % step) * step + x % step) * phase_size + (y / step) * across + x / step] = line[x];
+            for (int phase = 0; phase < step; ++phase) {
+                std::uint8_t *one = searched.data() + ((y % step) * step + phase) * phase_size + (y / step) * across;
+                for (int x = phase; x < std::min(columns, across * step); x += step) *one++ = line[x];
+            }
         }
         const bool at_once = step == 1 && wide < MOST_AT_ONCE_PX;
         searched_words.assign(searched.begin(), searched.end());
