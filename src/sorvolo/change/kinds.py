@@ -8,7 +8,7 @@ place. How much each sign counts was fitted (logistic regression) to changes of 
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageRGBA, Mask
+from sorvolo.geometry.arrays import Anything, Floats, ImageRGBA, Mask
 from sorvolo.survey.findings import ChangeKind, Patch
 
 _SIGNS = 6
@@ -39,6 +39,9 @@ def stands_out(picture: ImageRGBA, changed: Mask) -> Floats:
     spread; the gradient along the outline and across it, and inside, against the ground's gradient.
     """
     reach = int(np.clip(0.35 * np.sqrt(np.count_nonzero(changed)), 4, 40))
+    if not changed.any():
+        return np.zeros(_SIGNS)
+    picture, changed = _near(picture, changed, reach + 8)
     known = picture[..., 3] > 0
     inside = changed & known
     marked = changed.astype(np.uint8)
@@ -50,12 +53,12 @@ def stands_out(picture: ImageRGBA, changed: Mask) -> Floats:
     ring = lab[around]
     middle = np.median(ring, axis=0)
     spread = 1.4826 * np.median(np.abs(ring - middle), axis=0) + 3.0
-    far = np.minimum(np.linalg.norm((lab[inside] - middle) / spread, axis=1), 12.0)
+    far = np.minimum(_length((lab[inside] - middle) / spread), 12.0)
     shift = float(np.linalg.norm((np.median(lab[inside], axis=0) - middle) / spread))
     across_x, across_y = _outwards(marked)
     slope_x, slope_y = cv2.Sobel(lab, cv2.CV_32F, 1, 0, scale=0.25), cv2.Sobel(lab, cv2.CV_32F, 0, 1, scale=0.25)
-    slope = np.linalg.norm(np.hypot(slope_x, slope_y), axis=2)
-    outward = np.linalg.norm(slope_x * across_x[..., None] + slope_y * across_y[..., None], axis=2)
+    slope = _length(np.hypot(slope_x, slope_y))
+    outward = _length(slope_x * across_x[..., None] + slope_y * across_y[..., None])
     rim = near & (cv2.erode(marked, np.ones((5, 5), np.uint8)) == 0) & known
     rest = float(np.mean(slope[around])) + 1.0
     signs = [
@@ -63,6 +66,21 @@ def stands_out(picture: ImageRGBA, changed: Mask) -> Floats:
         float(np.mean(slope[rim])) / rest, float(np.mean(outward[rim])) / rest, float(np.mean(slope[inside])) / rest,
     ]
     return np.log(np.array(signs) + 0.05)
+
+
+def _near(picture: ImageRGBA, changed: Mask, margin_px: int) -> tuple[ImageRGBA, Mask]:
+    """The part of both that lies at most `margin_px` around what changed, something."""
+    x, y, wide, high = cv2.boundingRect(changed.view(np.uint8))
+    part = np.s_[
+        max(0, y - margin_px) : y + high + margin_px, max(0, x - margin_px) : x + wide + margin_px
+    ]
+    return picture[part], changed[part]
+
+
+def _length(vectors: Anything) -> Anything:
+    """(...) of vectors (..., 3): as np.linalg.norm along the last axis, in a tenth of the time."""
+    a, b, c = np.moveaxis(vectors, -1, 0)
+    return np.sqrt(a * a + b * b + c * c)
 
 
 def _chance(own: Floats, other: Floats) -> float:

@@ -64,7 +64,7 @@ class ReferenceMap:
             image_from_small = resized(width_px / size[0], height_px / size[1])
             window_from_image = resized(1 / shrink, 1 / shrink) @ window_from_image @ image_from_small
         seen = cv2.warpPerspective(window, window_from_image, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-        return cv2.cvtColor(seen, cv2.COLOR_RGBA2RGB), seen[..., 3] == 255  # type: ignore[return-value]
+        return cv2.cvtColor(seen, cv2.COLOR_RGBA2RGB), cv2.extractChannel(seen, 3) == 255  # type: ignore[return-value]
 
     def features_under(self, grid_from_image: Matrix3, width_px: int, height_px: int, margin: float) -> Features:
         """ORB features of the map under an image and `margin` of its size around it, `points_px` on the grid."""

@@ -115,5 +115,6 @@ def _shadow(patch: Patch, kind: ChangeKind) -> Mask:
 
 
 def _is_dark(ratio: Anything) -> Mask:
-    most, least = ratio.max(axis=-1), ratio.min(axis=-1)
+    red, green, blue = np.moveaxis(ratio, -1, 0)
+    most, least = np.maximum(np.maximum(red, green), blue), np.minimum(np.minimum(red, green), blue)
     return (most < _DARK) & (most - least < _ALIKE)

@@ -80,7 +80,7 @@ class ViewMaker:
             self._grid_from_image(aligned.site_from_image), self._camera.width_px, self._camera.height_px
         )
         valid = known & self._lens_sees
-        share = float(valid.sum() / self._lens_sees.sum())
+        share = np.count_nonzero(valid) / np.count_nonzero(self._lens_sees)
         if share < _KNOWN_ENOUGH:
             reason = f"only {share:.0%} of it lies on the map"
             return ViewOutcome(ViewStatus.OUTSIDE, reason, residual_px, share, site_from_full)

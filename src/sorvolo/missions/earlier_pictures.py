@@ -5,13 +5,13 @@ from collections.abc import Iterator, Sequence
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, ImageRGB, Mask, Matrix3, PointsM, Vector3
+from sorvolo.geometry.arrays import Anything, ImageRGB, ImageRGBA, Mask, Matrix3, PointsM, Vector3
 from sorvolo.geometry.homography import apply_homography, pose_from_homography
 from sorvolo.store.archive import Archive
 from sorvolo.store.images import ImageCache
 from sorvolo.survey.mosaic import Status
 
-_CACHE_BYTES = 96 * 2**20
+_CACHE_BYTES = 128 * 2**20
 _EDGE = 0.01  # of a stored picture: the lens's correction repeats pixels there
 
 
@@ -32,7 +32,10 @@ class EarlierPictures:
             pose = each.site_from_camera or pose_from_homography(each.site_from_image, each.camera)
             places.append(np.full(3, np.inf) if pose is None else pose.translation_m)
         self._cameras_m = np.array(places).reshape(-1, 3)
-        self._images = ImageCache(lambda index: archive.image(self._keyframes[index]), _CACHE_BYTES)
+        self._images = ImageCache(
+            lambda index: _where_it_sees(cv2.cvtColor(archive.image(self._keyframes[index]), cv2.COLOR_RGB2RGBA)),
+            _CACHE_BYTES,
+        )
 
     def seen_from(
         self, site_from_image: Matrix3, camera_m: Vector3, width_px: int, height_px: int, most: int
@@ -45,18 +48,14 @@ class EarlierPictures:
             centre = image_from_picture @ np.array([keyframe.camera.cx_px, keyframe.camera.cy_px, 1.0])
             scale = _scale(image_from_picture, (keyframe.camera.cx_px, keyframe.camera.cy_px))
             while scale < 0.6:  # a mere interpolation would skip pixels
-                picture = cv2.pyrDown(picture)  # type: ignore[assignment]
+                picture = _where_it_sees(cv2.pyrDown(picture))
                 image_from_picture = image_from_picture @ np.array([[2.0, 0, 0.0], [0, 2.0, 0.0], [0, 0, 1.0]])
                 scale *= 2
-            edge = max(2, round(_EDGE * picture.shape[1]))
-            sees = np.zeros(picture.shape[:2], np.uint8)
-            sees[edge:-edge, edge:-edge] = 255
             if centre[2] == 0:
                 continue
             size = width_px, height_px
             seen: Anything = cv2.warpPerspective(picture, image_from_picture, size, flags=cv2.INTER_LINEAR)
-            inside: Anything = cv2.warpPerspective(sees, image_from_picture, size, flags=cv2.INTER_LINEAR)
-            yield seen, inside == 255
+            yield cv2.cvtColor(seen, cv2.COLOR_RGBA2RGB), cv2.extractChannel(seen, 3) == 255  # type: ignore[misc]
 
     def _nearest(self, camera_m: Vector3, most: int) -> list[int]:
         """The nearest keyframe and then the nearest ones that lie on the other sides of the camera."""
@@ -74,6 +73,17 @@ class EarlierPictures:
                 chosen.append(each)
         chosen += [each for each in order if each not in chosen][: most - len(chosen)]
         return chosen
+
+
+def _where_it_sees(rgba: Anything) -> ImageRGBA:
+    """The picture (h, w, 4) with alpha 0 at its edge and 255 elsewhere; it is written over.
+
+    In four bands OpenCV resamples it, and where it sees, in less time than in three and one.
+    """
+    edge = max(2, round(_EDGE * rgba.shape[1]))
+    rgba[..., 3] = 0
+    rgba[edge:-edge, edge:-edge, 3] = 255
+    return rgba
 
 
 def _scale(a_from_b: Matrix3, at_px: tuple[float, float]) -> float:

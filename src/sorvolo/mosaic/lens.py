@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, Mask
+from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, Mask, PointsPx
 from sorvolo.geometry.camera import Camera
 
 _VISIBLE_PX = 0.5
@@ -23,12 +23,11 @@ class Undistorter:
     @classmethod
     def left_over(cls, camera: Camera, radial: float) -> "Undistorter | None":
         """For the distortion k that a flight found (ideal = seen (1 + k r^2)); None where it moves no pixel visibly."""
-        x, y = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
-        ideal = np.stack([(x - camera.cx_px) / camera.fx_px, (y - camera.cy_px) / camera.fy_px], axis=-1)
-        seen = _seen_from_ideal(ideal.reshape(-1, 2), radial).reshape(ideal.shape)
-        pixels = seen * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
-        if np.abs(pixels - np.stack([x, y], axis=-1)).max() < _VISIBLE_PX:
+        corners = np.array([[x, y] for x in (0, camera.width_px - 1) for y in (0, camera.height_px - 1)])
+        if np.abs(_seen_pixels(corners, camera, radial) - corners).max() < _VISIBLE_PX:  # it moves them most
             return None
+        x, y = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
+        pixels = _seen_pixels(np.column_stack([x.ravel(), y.ravel()]), camera, radial).reshape(*x.shape, 2)
         made = cls(camera.undistorted())
         made._maps = cv2.convertMaps(
             pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32), cv2.CV_16SC2
@@ -75,6 +74,12 @@ def refined_camera(camera: Camera, focal_scale: float, radial: float) -> Camera:
     return Camera(
         result.width_px, result.height_px, result.fx_px, result.fy_px, result.cx_px, result.cy_px, coefficients
     )
+
+
+def _seen_pixels(pixels: PointsPx, camera: Camera, radial: float) -> PointsPx:
+    """Where pixels (N, 2) of the perfect picture lie in the one that the camera took."""
+    focal, middle = np.array([camera.fx_px, camera.fy_px]), np.array([camera.cx_px, camera.cy_px])
+    return _seen_from_ideal((pixels - middle) / focal, radial) * focal + middle
 
 
 def _seen_from_ideal(ideal: Floats, radial: float) -> Floats:

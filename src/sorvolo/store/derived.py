@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,10 +33,14 @@ def write_map_files(archive: "Archive", version: VersionEntry) -> None:
         for path in (archive.preview_path, archive.mosaic_path, archive.kmz_path):
             path.unlink(missing_ok=True)
         return
-    write_preview(tiles, archive.preview_path)
-    write_cog(tiles, archive.site_grid(), archive.mosaic_path, crs=version.export_crs or None)
-    if not archive.site().is_local:
-        write_kmz(tiles, archive.site_grid(), archive.site().name, archive.kmz_path)
+    with ThreadPoolExecutor(1, thread_name_prefix="geotiff") as other:  # takes as long as all else together
+        geotiff = other.submit(
+            write_cog, tiles, archive.site_grid(), archive.mosaic_path, crs=version.export_crs or None
+        )
+        write_preview(tiles, archive.preview_path)
+        if not archive.site().is_local:
+            write_kmz(tiles, archive.site_grid(), archive.site().name, archive.kmz_path)
+        geotiff.result()
 
 
 def map_is_there(archive: "Archive") -> bool:
