@@ -93,7 +93,7 @@ def without_halos(regions: Regions, chosen: Mask, views: Views, light: Light) ->
         core = regions.labels[window] == region + 1
         rest = core & clear[window]
         if np.count_nonzero(rest) > LEAST_TAKEN * np.count_nonzero(core):
-            left_over, held = (_quantile(each[window], rest, 0.9) for each in (anew, regions.strength))
+            left_over, held = (_quantile(each[window][rest], 0.9) for each in (anew, regions.strength))
             if left_over > MOST_LEFT * held:
                 continue
         strength[window] = cv2.min(anew[window], strength[window])
@@ -117,7 +117,7 @@ def grown(regions: Regions, region: int, came: bool, views: Views) -> Piece | No
     surely = np.uint8(255) * (core & (strength >= ceil(HIGHEST * top)))
     shade = _shade(views, window, came) & (strength < ceil(SHADE_OF_TOP * top)) & ~core
     bare = strength * ~shade
-    limit = max(LEAST_LIMIT, LIMIT_OF_TOP * top, QUIET_FACTOR * _quantile(bare, quiet, QUIET_QUANTILE))
+    limit = max(LEAST_LIMIT, LIMIT_OF_TOP * top, QUIET_FACTOR * _quantile(bare[quiet], QUIET_QUANTILE))
     while limit < HIGHEST * top:
         over: Anything = cv2.threshold(bare, floor(limit), 255, cv2.THRESH_BINARY)[1]
         above: Anything = cv2.morphologyEx(over, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
@@ -137,7 +137,7 @@ def _is_thing(mask: Image, strength: Image, limit: float) -> bool:
         return False
     inner, outer = (cv2.dilate(mask, np.ones((px, px), np.uint8)) for px in BESIDE_PX)
     beside = outer > inner
-    return not beside.any() or _quantile(strength, beside, BESIDE_QUANTILE) <= MOST_BESIDE * limit
+    return not beside.any() or _quantile(strength[beside], BESIDE_QUANTILE) <= MOST_BESIDE * limit
 
 
 def _window(regions: Regions, region: int) -> Window:
@@ -187,8 +187,8 @@ def _shade(views: Views, window: Window, came: bool) -> Mask:
     return np.asarray((most < 128) & (cv2.subtract(most, least) < ceil(128 * SHADE_SPREAD)))
 
 
-def _quantile(values: Image, chosen: Mask, share: float) -> int:
-    """A quantile of uint8 values (h, w) where `chosen` (h, w), somewhere, without the care that np.quantile takes."""
-    counts: Anything = cv2.calcHist([values], [0], chosen.view(np.uint8), [256], [0, 256])
+def _quantile(values: Anything, share: float) -> int:
+    """A quantile of uint8 values (N,), N > 0, without the care that np.quantile takes."""
+    counts: Anything = cv2.calcHist([values], [0], None, [256], [0, 256])
     sums = counts.ravel().astype(np.int64).cumsum()
     return int(np.searchsorted(sums, share * sums[-1]))

@@ -19,14 +19,14 @@ void split_row(const std::uint8_t *bgr, std::uint8_t *blue, std::uint8_t *green,
         blue[x] = bgr[3 * x], green[x] = bgr[3 * x + 1], red[x] = bgr[3 * x + 2];
 }
 
-// The mean of 3 x 3; `sums` has one place before and one after the row.
+// The mean of 3 x 3; `sums` has one place before and one after the row, of which `columns` are the picture's.
 SORVOLO_CLONES
 void blur_row(const std::uint8_t *above, const std::uint8_t *here, const std::uint8_t *below, std::uint16_t *sums,
-              std::uint8_t *to, std::ptrdiff_t columns) {
-    for (std::ptrdiff_t x = 0; x < columns; ++x)
+              std::uint8_t *to, std::ptrdiff_t columns, std::ptrdiff_t stride) {
+    for (std::ptrdiff_t x = 0; x < stride; ++x)
         sums[x + 1] = static_cast<std::uint16_t>(above[x] + here[x] + below[x]);
     sums[0] = sums[2], sums[columns + 1] = sums[columns - 1];
-    for (std::ptrdiff_t x = 0; x < columns; ++x) {
+    for (std::ptrdiff_t x = 0; x < stride; ++x) {
         const std::uint16_t sum = static_cast<std::uint16_t>(sums[x] + sums[x + 1] + sums[x + 2] + 4);
         to[x] = static_cast<std::uint8_t>((static_cast<std::uint32_t>(sum) * 7282u) >> 16);  // by nine
     }
@@ -101,24 +101,29 @@ void mask_row(const std::uint8_t *known, std::uint8_t *to, std::ptrdiff_t column
     for (std::ptrdiff_t x = 0; x < columns; ++x) to[x] = known[x] ? to[x] : 0;
 }
 
+constexpr int LANES = 64;
+
+// Rows are kept in whole lanes, the last of them holding anything: what is left over is slow to do one by one.
+constexpr int in_lanes(int columns) { return (columns + LANES - 1) / LANES * LANES; }
+
 // One picture's rows while they pass: split, then blurred and in luma, then their extremes along the row.
 struct Passing {
     const std::uint8_t *image;
-    int rows, columns, reach, depth;
+    int rows, columns, stride, reach, depth;
     std::vector<std::uint8_t> split, values, most, least, low, high;
     std::vector<std::uint16_t> sums;
 
     Passing(const std::uint8_t *pixels, int height, int width, int reach_px)
-        : image(pixels), rows(height), columns(width), reach(reach_px), depth(2 * reach_px + 1),
-          split(9 * width), values(3 * depth * width), most(3 * depth * width), least(3 * depth * width),
-          low(width + 2 * reach_px, 0), high(width + 2 * reach_px, 255), sums(width + 2) {
+        : image(pixels), rows(height), columns(width), stride(in_lanes(width)), reach(reach_px),
+          depth(2 * reach_px + 1), split(9 * stride), values(3 * depth * stride), most(3 * depth * stride),
+          least(3 * depth * stride), low(stride + 2 * reach_px, 0), high(stride + 2 * reach_px, 255), sums(stride + 2) {
         split_at(0), split_at(1);
     }
     std::uint8_t *plane(std::vector<std::uint8_t> &ring, int row, int band) {
-        return ring.data() + (static_cast<std::size_t>(row % depth) * 3 + band) * columns;
+        return ring.data() + (static_cast<std::size_t>(row % depth) * 3 + band) * stride;
     }
     std::uint8_t *split_plane(int row, int band) {
-        return split.data() + (static_cast<std::size_t>(row % 3) * 3 + band) * columns;
+        return split.data() + (static_cast<std::size_t>(row % 3) * 3 + band) * stride;
     }
     void split_at(int row) {
         split_row(image + static_cast<std::size_t>(row) * columns * 3, split_plane(row, 0), split_plane(row, 1),
@@ -129,21 +134,21 @@ struct Passing {
         const int above = mirrored(row - 1, rows), below = mirrored(row + 1, rows);
         for (int band = 0; band < 3; ++band)
             blur_row(split_plane(above, band), split_plane(row, band), split_plane(below, band), sums.data(),
-                     plane(values, row, band), columns);
-        luma_row(plane(values, row, 0), plane(values, row, 1), plane(values, row, 2), columns);
+                     plane(values, row, band), columns, stride);
+        luma_row(plane(values, row, 0), plane(values, row, 1), plane(values, row, 2), stride);
         for (int band = 0; band < 3; ++band) {
             std::memcpy(low.data() + reach, plane(values, row, band), columns);
             std::memcpy(high.data() + reach, plane(values, row, band), columns);
-            extremes_row(low.data(), high.data(), depth, plane(most, row, band), plane(least, row, band), columns);
+            extremes_row(low.data(), high.data(), depth, plane(most, row, band), plane(least, row, band), stride);
         }
     }
     // The extremes of rows row - reach .. row + reach.
     void around(int row, int band, std::uint8_t *all_most, std::uint8_t *all_least) {
         const int first = std::max(row - reach, 0), last = std::min(row + reach, rows - 1);
-        std::memcpy(all_most, plane(most, first, band), columns);
-        std::memcpy(all_least, plane(least, first, band), columns);
+        std::memcpy(all_most, plane(most, first, band), stride);
+        std::memcpy(all_least, plane(least, first, band), stride);
         for (int each = first + 1; each <= last; ++each)
-            extremes_rows(plane(most, each, band), plane(least, each, band), all_most, all_least, columns);
+            extremes_rows(plane(most, each, band), plane(least, each, band), all_most, all_least, stride);
     }
 };
 
@@ -155,28 +160,30 @@ void differences(const Bytes &reference, const Bytes &query, const std::optional
     std::uint8_t *to = out.mutable_data();
     pybind11::gil_scoped_release released;
     Passing before(pixels[0], rows, columns, reach), after(pixels[1], rows, columns, reach);
-    std::vector<std::uint8_t> work(6 * static_cast<std::size_t>(columns));
-    std::uint8_t *most = work.data(), *least = most + columns, *beyond = least + columns;
-    std::uint8_t *went_chroma = beyond + 3 * columns;
+    const int stride = before.stride;
+    std::vector<std::uint8_t> work(10 * static_cast<std::size_t>(stride));
+    std::uint8_t *most = work.data(), *least = most + stride, *beyond = least + stride, *planes = beyond + 3 * stride;
+    std::uint8_t *went_chroma = planes + 4 * stride;
     const std::size_t plane = static_cast<std::size_t>(rows) * columns;
     for (int row = 0; row < std::min(reach, rows); ++row) before.take(row), after.take(row);
     for (int row = 0; row < rows; ++row) {
         if (row + reach < rows) before.take(row + reach), after.take(row + reach);
-        std::uint8_t *line = to + static_cast<std::size_t>(row) * columns;
         const auto outside = [&](Passing &values, Passing &others, std::uint8_t *total, std::uint8_t *chroma) {
             for (int band = 0; band < 3; ++band) {
                 others.around(row, band, most, least);
-                beyond_row(values.plane(values.values, row, band), most, least, beyond + band * columns, columns);
+                beyond_row(values.plane(values.values, row, band), most, least, beyond + band * stride, stride);
             }
-            weigh_row(beyond, beyond + columns, beyond + 2 * columns, weight, total, chroma, columns);
+            weigh_row(beyond, beyond + stride, beyond + 2 * stride, weight, total, chroma, stride);
         };
-        outside(after, before, line + 2 * plane, line + plane);
-        outside(before, after, line + 3 * plane, went_chroma);
-        join_row(line + plane, went_chroma, line + plane, columns);
-        join_row(line + 2 * plane, line + 3 * plane, line, columns);
-        if (compared) mask_row(compared + static_cast<std::size_t>(row) * columns, line, columns);
-        std::memcpy(line + 4 * plane, before.plane(before.values, row, 0), columns);
-        std::memcpy(line + 5 * plane, after.plane(after.values, row, 0), columns);
+        outside(after, before, planes + 2 * stride, planes + stride);
+        outside(before, after, planes + 3 * stride, went_chroma);
+        join_row(planes + stride, went_chroma, planes + stride, stride);
+        join_row(planes + 2 * stride, planes + 3 * stride, planes, stride);
+        const std::size_t line = static_cast<std::size_t>(row) * columns;
+        if (compared) mask_row(compared + line, planes, columns);
+        for (int each = 0; each < 4; ++each) std::memcpy(to + each * plane + line, planes + each * stride, columns);
+        std::memcpy(to + 4 * plane + line, before.plane(before.values, row, 0), columns);
+        std::memcpy(to + 5 * plane + line, after.plane(after.values, row, 0), columns);
     }
 }
 
