@@ -12,7 +12,7 @@ LEVELS = (8, 14, 22)  # steps darker or brighter: more comes free of what it tou
 MOST_TINT = 15  # steps between the colours: a shadow takes somewhat less of blue
 MOST_SPREAD = 3.0  # steps, mean distance from a shadow's own depth
 LEAST_WIDTH = 5  # pixels of the pictures given: narrower shadows are those of people and small things, which tell them
-LEAST_ALIKE, ALIKE_OF_FEW = 0.35, 1.5  # correlation of the ground's details within; more where few pixels tell
+LEAST_ALIKE, ALIKE_OF_FEW = 0.35, 2.5  # correlation of the ground's details within; more where few pixels tell
 FINEST = 9  # pixels: details are what is smaller
 APART = 1  # pixels that the pictures may be apart
 MOST_ASKED = 4000  # pixels that are asked
@@ -22,7 +22,7 @@ LARGEST = 0.25  # of the picture: smooth gains follow what is larger
 HOLE = 11  # pixels wide, at most: what stands in a shadow and is no ground
 NEAR = 15  # pixels: how far the depth of a shadow is the same
 MOST_APART = 6  # steps from a shadow's depth: ground beside it that it covers, too
-RIM = 2  # pixels on both sides of a shadow's edge, where it is blurred
+RIM, SOFT = 2, 5  # pixels on both sides of a shadow's edge, where it is blurred; outside where it is soft
 
 Image = Anything
 """uint8, (h, w) or (h, w, 3)."""
@@ -58,7 +58,8 @@ def moved_shades(before: Image, after: Image, known: Mask | None) -> NDArray[np.
                 kept &= pieces.show_the_same(*details)
                 shaded |= (kept.astype(np.uint8) * np.uint8(255))[pieces.labels]
         if shaded.any():
-            own = _octaves(shaded, apart)
+            weak = cv2.min(cv2.threshold(brighter, ALIKE + LEVELS[0] // 2, 255, cv2.THRESH_BINARY)[1], alike)
+            own = _octaves(shaded, weak, apart)
             octaves = own if octaves is None else octaves + own
     if octaves is not None and known is not None:
         octaves[~known] = 0
@@ -134,8 +135,10 @@ def _details(logarithm: Image) -> Image:
     return cv2.addWeighted(gray, 1, cv2.blur(gray, (FINEST, FINEST)), -1, ALIKE)
 
 
-def _octaves(shaded: Image, apart: Image) -> NDArray[np.float32]:
+def _octaves(shaded: Image, weak: Image, apart: Image) -> NDArray[np.float32]:
     """(h, w, 3) how deep the shadow is where `shaded`, smooth; about its rim the part of it that all colours show.
+
+    Its rim is as wide as what near it is `weak`, dimmed a little.
 
     What stands in it and is no ground leaves holes: they are as deep.
     """
@@ -147,11 +150,15 @@ def _octaves(shaded: Image, apart: Image) -> NDArray[np.float32]:
     off = cv2.split(cv2.absdiff(steps, depth))
     beside = (cv2.max(cv2.max(off[0], off[1]), off[2]) < MOST_APART) & (known > 0.5)
     whole = cv2.max(shaded, np.asarray(beside).view(np.uint8) * np.uint8(255))
-    closed = cv2.morphologyEx(whole, cv2.MORPH_CLOSE, np.ones((HOLE, HOLE), np.uint8))
     window = np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)
-    inner, outer = cv2.erode(closed, window), cv2.dilate(closed, window)
+    inner, outer = cv2.erode(whole, window), cv2.dilate(whole, window)
+    soft = cv2.min(weak, cv2.dilate(whole, np.ones((2 * SOFT + 1, 2 * SOFT + 1), np.uint8)))
     parts = cv2.split(steps / np.where(depth == 0, np.float32(1), depth))
     part = np.clip(cv2.min(cv2.min(parts[0], parts[1]), parts[2]), 0, 1)
-    part[inner > 0] = 1
-    part[outer == 0] = 0
+    part[cv2.max(outer, soft) == 0] = 0
+    # what stands in it hides the ground's light; ground that is as it was between two shadows does not
+    bands = cv2.split(np.abs(steps))
+    stands = cv2.max(cv2.max(bands[0], bands[1]), bands[2]) >= MOST_APART
+    filled = cv2.morphologyEx(whole, cv2.MORPH_CLOSE, np.ones((HOLE, HOLE), np.uint8))
+    part[(inner > 0) | ((filled > 0) & (outer == 0) & stands)] = 1
     return np.asarray(cv2.multiply(depth, cv2.merge([part] * 3), scale=1 / STEPS), np.float32)
