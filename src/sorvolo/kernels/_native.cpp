@@ -304,9 +304,9 @@ SORVOLO_AVX512 void count_block_avx512(const Strings &work, const Window &refere
                 for (int dx = 0; dx < work.width; ++dx) {
                     const __m512i r = _mm512_loadu_si512(row_r + dx), q = _mm512_loadu_si512(row_q + dx);
                     for (int k = first; k < last; ++k) {
-                        const __mmask64 differ =
-                            _mm512_cmpge_epu8_mask(r, centre_r[k]) ^ _mm512_cmpge_epu8_mask(q, centre_q[k]);
-                        bits[k] = _mm512_mask_add_epi8(bits[k], differ, bits[k], one);
+                        const __m512i less_r = _mm512_min_epu8(_mm512_subs_epu8(centre_r[k], r), one);
+                        const __m512i less_q = _mm512_min_epu8(_mm512_subs_epu8(centre_q[k], q), one);
+                        bits[k] = _mm512_add_epi8(bits[k], _mm512_xor_si512(less_r, less_q));
                     }
                 }
             };
