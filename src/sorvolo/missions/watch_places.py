@@ -160,7 +160,7 @@ class GroundPlaces:
         height = track.height_words if track else ""
         if self._ground is not None:
             height = f"{height.split(',')[0]}, over the height model's ground"
-        short = f"{self.set_aside} detections are {TOO_SHORT} and were set aside, as a map leaves them out"
+        short = f"set aside, as maps leave them out: {self.set_aside} detections far too short for their class"
         text = f"places come from the telemetry's position, height ({height}) and {how}"
         return (
             *self._setup.notices, Notice("placed_by", 1, text), *compass,
