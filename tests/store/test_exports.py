@@ -1,6 +1,7 @@
 """Frames, pictures and KMZ lie where the site says, and say what is not known."""
 
 import json
+import time
 import zipfile
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -210,6 +211,14 @@ def test_a_kmz_lies_on_the_map(tmp_path: Path, origin: Geodetic) -> None:
             assert abs(off_deg) * 111_000 * np.cos(np.radians(latitude[0])) < 0.1
     assert found == 1 and len(overlays) >= 2
     assert [path.name for path in tmp_path.iterdir()] == ["mosaic.kmz"]
+
+
+def test_the_same_map_gives_the_same_kmz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    site_grid = SiteGrid.at(ORIGIN, 0.2, "EPSG:32633")
+    for name, year in (("one", 2001), ("two", 2031)):
+        monkeypatch.setattr(time, "time", lambda year=year: (year - 1970) * 3.156e7)
+        write_kmz(marked_tiles((-700, 2300)), site_grid, "two fields", tmp_path / f"{name}.kmz")
+    assert (tmp_path / "one.kmz").read_bytes() == (tmp_path / "two.kmz").read_bytes()
 
 
 def test_a_site_says_what_its_height_is_counted_from() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import zipfile
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from datetime import UTC, datetime
@@ -172,6 +173,7 @@ def write_kmz(tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, name: s
     counts = -(-size // _KMZ_PIECE_PX)
     longitudes = np.linspace(west, east, counts[0] + 1)
     latitudes = np.linspace(north, south, counts[1] + 1)
+    simplekml.Kml.resetidcounter()
     kml = simplekml.Kml(name=name)
     with scratch_folder(path.parent) as scratch:
         for row in range(counts[1]):
@@ -186,8 +188,16 @@ def write_kmz(tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, name: s
                 overlay.icon.href = kml.addfile(str(image))
                 overlay.latlonbox.west, overlay.latlonbox.south = _wrapped_deg(box[0]), box[1]
                 overlay.latlonbox.east, overlay.latlonbox.north = _wrapped_deg(box[2]), box[3]
+        kml.savekmz(str(scratch / "map.kmz"), format=False)
         with atomic_path(path) as temporary:
-            kml.savekmz(str(temporary), format=False)
+            _timeless(scratch / "map.kmz", temporary)
+
+
+def _timeless(archive: Path, out: Path) -> None:
+    """Copy a ZIP without the times at which its files were made: the same map gives the same bytes."""
+    with zipfile.ZipFile(archive) as made, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as copy:
+        for name in made.namelist():
+            copy.writestr(zipfile.ZipInfo(name), made.read(name), zipfile.ZIP_DEFLATED)
 
 
 def name_safe(name: str) -> str:
