@@ -58,9 +58,12 @@ def moved_shades(before: Image, after: Image, known: Mask | None) -> NDArray[np.
                 kept &= pieces.show_the_same(*details)
                 shaded |= (kept.astype(np.uint8) * np.uint8(255))[pieces.labels]
         if shaded.any():
+            if octaves is None:
+                octaves = np.zeros(apart.shape, np.float32)
             weak = cv2.min(cv2.threshold(brighter, ALIKE + LEVELS[0] // 2, 255, cv2.THRESH_BINARY)[1], alike)
-            own = _octaves(shaded, weak, apart)
-            octaves = own if octaves is None else octaves + own
+            x, y, wide, high = cv2.boundingRect(shaded)
+            part = slice(max(0, y - NEAR), y + high + NEAR), slice(max(0, x - NEAR), x + wide + NEAR)
+            octaves[part] += _octaves(shaded[part], weak[part], apart[part])
     if octaves is not None and known is not None:
         octaves[~known] = 0
     return octaves
@@ -138,9 +141,7 @@ def _details(logarithm: Image) -> Image:
 def _octaves(shaded: Image, weak: Image, apart: Image) -> NDArray[np.float32]:
     """(h, w, 3) how deep the shadow is where `shaded`, smooth; about its rim the part of it that all colours show.
 
-    Its rim is as wide as what near it is `weak`, dimmed a little.
-
-    What stands in it and is no ground leaves holes: they are as deep.
+    Its rim is as wide as what near it is `weak`, dimmed a little. What stands in it leaves holes: they are as deep.
     """
     steps = apart.astype(np.float32) - ALIKE
     known = np.asarray(cv2.blur(shaded.astype(np.float32), (NEAR, NEAR)))
