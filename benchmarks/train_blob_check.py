@@ -45,6 +45,7 @@ def main() -> None:
     parser.add_argument("--onto", type=Path, help="trees to go on from; their features may be fewer")
     parser.add_argument("--output", type=Path, default=TARGET)
     options = parser.parse_args()
+    cv2.setNumThreads(1)  # a process forked from one with OpenCV's threads hangs in them
     if options.rows:
         kept = [dict(np.load(path)) for path in options.rows]
         names = "rows", "answers", "suites"
@@ -119,9 +120,10 @@ def collect(suite: str, seed: int, count: int, places: list[Ground]) -> tuple[np
             for settings in (RegionSettings(), EAGER):
                 regions, *_ = examine(before, after, pair.valid, RobustSettings(regions=settings))
                 changed, ignored = (_shares(regions, mask) for mask in (pair.truth, pair.ignored))
-                clear = (changed > 0.3) | ((changed < 0.05) & (ignored < 0.2))
+                is_change = (changed > 0.3) | ((changed > 0.1) & (_held(regions, pair.truth) > 0.5))
+                clear = is_change | ((changed < 0.05) & (ignored < 0.2))
                 rows.append(regions.features[clear])
-                answers.append(changed[clear] > 0.3)
+                answers.append(is_change[clear])
     return np.concatenate(rows), np.concatenate(answers)
 
 
@@ -131,6 +133,15 @@ def _shares(regions: Regions, mask: np.ndarray) -> np.ndarray:
     cover = cv2.resize(mask.astype(np.float32), regions.labels.shape[::-1], interpolation=cv2.INTER_AREA)
     total = np.bincount(regions.labels.ravel(), minlength=count)[1:]
     return np.bincount(regions.labels.ravel(), cover.ravel(), minlength=count)[1:] / np.maximum(total, 1)
+
+
+def _held(regions: Regions, truth: np.ndarray) -> np.ndarray:
+    """The largest share (N,) of any one true thing that each region holds: a person with a long shadow is one."""
+    small = cv2.resize(truth.astype(np.uint8) * 255, regions.labels.shape[::-1], interpolation=cv2.INTER_AREA) > 127
+    things, numbers = cv2.connectedComponents(small.view(np.uint8))
+    count = len(regions.boxes) + 1
+    pixels = np.bincount((regions.labels * things + numbers).ravel(), minlength=count * things).reshape(count, things)
+    return (pixels / np.maximum(pixels.sum(axis=0), 1))[1:, 1:].max(axis=1, initial=0.0)
 
 
 def train(
