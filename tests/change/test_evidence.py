@@ -143,6 +143,14 @@ def test_unknown_ground_says_nothing():
     assert evidence.conclude() == ()
 
 
+def test_what_is_never_seen_whole_needs_views_from_far_apart():
+    """A wall that leans over the map's rim looks the same while the camera hardly moves."""
+    half, near = (0.0, -2.0, 3.0, 2.0), {"seconds": 1.2, "start_m": (-2.0, 0.0)}
+    assert collect(flight([Thing(0, 0)], hole_m=half, **near))[0].conclude() == ()
+    assert len(collect(flight([Thing(0, 0)], **near))[0].conclude()) == 1
+    assert len(collect(flight([Thing(0, 0)], hole_m=half))[0].conclude()) == 1
+
+
 def test_a_hole_does_not_wipe_out_what_was_seen():
     views = list(flight([Thing(0, 0)]))
     blind = [view_of(v.index, v.index / 5, v.camera_m, [Thing(0, 0)], hole_m=(-3, -3, 3, 3)) for v in views]
@@ -194,11 +202,11 @@ def test_a_single_view_is_believed_only_if_very_sure_and_at_half_the_score():
     thing = Thing(0, 0)
     sure = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [thing], score=0.95)
     unsure = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [thing], score=0.7)
-    evidence, told = collect([sure], single_view_score=0.9)
+    evidence, told = collect([sure], single_view_score=0.9, least_score=0.24)
     assert told == []
     (change,) = evidence.conclude()
     assert change.views == 1 and change.score < 0.4
-    assert collect([unsure], single_view_score=0.9)[0].conclude() == ()
+    assert collect([unsure], single_view_score=0.9, least_score=0.24)[0].conclude() == ()
     assert collect([sure])[0].conclude() == ()  # unless asked for, a single view is not believed at all
 
 

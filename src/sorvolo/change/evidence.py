@@ -52,7 +52,7 @@ class EvidenceSettings:
     least_views: int = 2  # where fewer than n ever see it
     least_views_apart_s: float = 0.1  # frames nearer in time see the same thing and say nothing new
     least_share: float = 0.4  # of all views of its ground must show it, those from above counting most
-    least_score: float = 0.24  # less sure, it is kept but not told
+    least_score: float = 0.38  # less sure, it is kept but not told
     least_area_m2: float = 0.02
     join_m: float = 0.3  # a smaller gap does not make two things of one
     single_view_score: float = 2.0  # a single view's change this sure is told at the end; above 1: never

@@ -22,7 +22,8 @@ _BETTER = 1.15  # a view's pictures replace the older ones when it is so much be
 _GOOD = 0.75  # quality beyond which no better pictures are looked for
 _ASIDE = 0.15  # of the flying height: views from further aside count less
 _LEAST_WEIGHT = 0.1
-_NEVER_WHOLE = 0.3  # of the score is left of what all views show cut off
+_NEVER_WHOLE = 0.45  # of the score is left of what all views show cut off, from places far apart ...
+_FAR_APART = 0.5  # ... of the flying height; from nearer what leans over a rim looks alike in all of them
 _ONE_PLACE = 0.05  # of the flying height: seen from no wider apart, a ghost of something tall looks the same
 
 
@@ -93,13 +94,16 @@ class GatheredChange:
     def score(self) -> float:
         """0 to 1: mean sureness of its boxes x (views that show it + 1) / (views that could + 2), which is the mean of
         a share under Bayes; halved if all of them looked from one place, less if few
-        of them show all of it (at the rim walls lean in whole, and ends are no outlines), and on restless ground."""
+        of them show all of it (at the rim walls lean in whole, and ends are no outlines), above all from places near
+        each other, and on restless ground."""
         if not self.views:
             return 0.0
         score = self._score_sum / self.views * (self.views + 1) / (self.asked + 2) * self.weakness * self.calmness
         apart_m = float(np.hypot(*(self._camera_high - self._camera_low)[:2]))
-        is_one_place = self.views > 1 and apart_m < _ONE_PLACE * float(self._camera_high[2])
-        wholeness = _NEVER_WHOLE + (1 - _NEVER_WHOLE) * min(2 * self.whole / self.views, 1.0)
+        height_m = float(self._camera_high[2])
+        is_one_place = self.views > 1 and apart_m < _ONE_PLACE * height_m
+        never_whole = _NEVER_WHOLE * min(apart_m / max(_FAR_APART * height_m, 1e-6), 1.0)
+        wholeness = never_whole + (1 - never_whole) * min(2 * self.whole / self.views, 1.0)
         return float(np.clip(score * (0.5 if is_one_place else 1.0) * wholeness, 0, 1))
 
     def wants(self, low_m: Floats, high_m: Floats, view: ComparedView) -> float:
