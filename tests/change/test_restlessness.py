@@ -61,15 +61,15 @@ def test_calm_ground_leaves_a_score_as_it_is_and_restless_ground_hardly_anything
     assert calmness(0.15) < 0.2
 
 
-def photos_among(ghosts: int) -> EvidenceMap:
-    """Three photos of a thing that came, each with so many other small differences, elsewhere in each."""
+def photos_among(ghosts: int, photos: int = 3, **how: object) -> EvidenceMap:
+    """Photos of a thing that came, each with so many other small differences, elsewhere in each."""
     rng = np.random.default_rng(2)
     evidence = EvidenceMap(M_PER_PX, EvidenceSettings(), "f")
-    for i in range(3):
+    for i in range(photos):
         places = rng.uniform([-7, -4], [7, 4], (2 * ghosts, 2))
         places = places[np.hypot(*places.T) > 1.5][:ghosts]
         around = [Thing(*place, (0.4, 0.4), colour=(40, 40, 200)) for place in places]
-        evidence.add(view_of(i, 1.4 * i, (-1 + i, 0, CAMERA_HEIGHT_M), [Thing(0, 0), *around]))
+        evidence.add(view_of(i, 1.4 * i, (-1 + i, 0, CAMERA_HEIGHT_M), [Thing(0, 0), *around], **how))
     return evidence
 
 
@@ -77,3 +77,8 @@ def test_three_photos_that_agree_tell_on_calm_ground_and_not_where_much_else_dif
     calm, restless = (photos_among(ghosts).conclude() for ghosts in (0, 130))
     assert len(calm) == 1 and calm[0].score > 0.4
     assert [each for each in restless if np.hypot(*each.outline_m.mean(axis=0)) < 0.5] == []
+
+
+def test_what_all_of_many_views_show_surely_is_told_on_restless_ground():
+    told = photos_among(130, photos=10, score=0.99).conclude()
+    assert any(np.hypot(*each.outline_m.mean(axis=0)) < 0.5 for each in told)

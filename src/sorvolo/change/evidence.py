@@ -37,6 +37,7 @@ _PICTURES_A_VIEW, _MOST_PICTURES = 6, 30  # cut anew at most, which bounds the t
 _VIEWS_S = 5.0  # ... where so many come in a second; where they are seldom there is more time
 _MOST_SEEDS = 256
 _FEW_VIEWS_SCORE = 0.6  # of what fewer than k views show: two views of a tree often agree
+_DOUBT = 2.0  # restless ground counts in full where half of the score is missing
 _CALM = 0.9  # of the score is left on calm ground
 _MOVED_HEIGHTS = 0.01  # the camera's way, in flying heights, after which a view is a new witness
 _ALL_CHANGED = 0.5  # share of the frame beyond which nothing in it can be followed
@@ -291,12 +292,14 @@ class EvidenceMap:
         return self._part(change, now_ns)
 
     def _is_sure(self, change: GatheredChange) -> bool:
-        change.calmness = 1.0
+        calm = change.calmness = 1.0
         if change.cells is not None and change.score >= self._settings.least_score:
             own = self._cells_of(change)
-            change.calmness = calmness(restlessness(self._grid, change.cells, own, self._cell_m))
+            calm = calmness(restlessness(self._grid, change.cells, own, self._cell_m))
+            # views agree by chance now and then, not nearly all of them and surely
+            change.calmness = calm ** min(1.0, _DOUBT * (1 - change.score))
         # nothing tall leans over calm ground: there views from aside say as much as those from above
-        share = max(change.share, change.views / change.asked) if change.calmness > _CALM else change.share
+        share = max(change.share, change.views / change.asked) if calm > _CALM else change.share
         return change.score >= self._settings.least_score and share >= self._settings.least_share
 
     def _answer(self, laid: LaidView, window: CellWindow, cells: Mask) -> tuple[float, float, float, Floats]:

@@ -22,7 +22,7 @@ _BETTER = 1.15  # a view's pictures replace the older ones when it is so much be
 _GOOD = 0.75  # quality beyond which no better pictures are looked for
 _ASIDE = 0.15  # of the flying height: views from further aside count less
 _LEAST_WEIGHT = 0.1
-_NEVER_WHOLE = 0.45  # of the score is left of what all views show cut off, from places far apart ...
+_NEVER_WHOLE = 0.5  # of the score is left of what all views show cut off, from places far apart ...
 _FAR_APART = 0.5  # ... of the flying height; from nearer what leans over a rim looks alike in all of them
 _ONE_PLACE = 0.05  # of the flying height: seen from no wider apart, a ghost of something tall looks the same
 
