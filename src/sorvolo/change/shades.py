@@ -10,7 +10,7 @@ STEPS = 24  # to an octave, of differences of logarithms; these are 8 bit, 128 a
 ALIKE = 128
 LEVELS = (8, 14, 22)  # steps darker or brighter: more comes free of what it touches
 MOST_TINT = 15  # steps between the colours: a shadow takes somewhat less of blue
-MOST_SPREAD = 3.0  # steps, mean distance from a shadow's own depth
+MOST_SPREAD, MOST_OFF = 3.0, 9  # steps from a shadow's own depth, mean, and of each pixel
 LEAST_WIDTH = 5  # pixels of the pictures given: narrower shadows are those of people and small things, which tell them
 LEAST_ALIKE, ALIKE_OF_FEW = 0.35, 2.5  # correlation of the ground's details within; more where few pixels tell
 FINEST = 9  # pixels: details are what is smaller
@@ -22,6 +22,7 @@ LARGEST = 0.25  # of the picture: smooth gains follow what is larger
 HOLE = 11  # pixels wide, at most: what stands in a shadow and is no ground
 NEAR = 15  # pixels: how far the depth of a shadow is the same
 MOST_APART = 6  # steps from a shadow's depth: ground beside it that it covers, too
+LEAST_PART, MOST_UNLIKE = -0.25, 0.5  # of a shadow's depth, and between the colours: else it is no shadow's edge
 RIM, SOFT = 2, 5  # pixels on both sides of a shadow's edge, where it is blurred; outside where it is soft
 
 Image = Anything
@@ -56,7 +57,7 @@ def moved_shades(before: Image, after: Image, known: Mask | None) -> NDArray[np.
             kept = pieces.are_shadows(middle)
             if kept.any():
                 kept &= pieces.show_the_same(*details)
-                shaded |= (kept.astype(np.uint8) * np.uint8(255))[pieces.labels]
+                shaded |= pieces.like_the_rest(kept, middle)
         if shaded.any():
             if octaves is None:
                 octaves = np.zeros(apart.shape, np.float32)
@@ -92,7 +93,7 @@ class _Pieces:
         """
         number = np.maximum(self._number, 1)
         steps = _steps(middle, self._places)
-        depth = np.bincount(self._own, steps, self.count) / number
+        depth = self._depth = np.bincount(self._own, steps, self.count) / number
         off = np.bincount(self._own, np.abs(steps - depth[self._own]), self.count)
         fits = (self._number > 0) & (self._number * self._share < LARGEST) & (off < MOST_SPREAD * number)
         if not fits.any():
@@ -103,6 +104,19 @@ class _Pieces:
         own = outer.ravel()[ring]
         ends = np.bincount(own, np.abs(_steps(middle, ring)) < SHARP * np.abs(depth)[own], self.count)
         return fits & (ends >= LEAST_SHARP * np.maximum(np.bincount(own, minlength=self.count), 1))
+
+    def like_the_rest(self, kept: NDArray[np.bool_], middle: Image) -> Image:
+        """The pixels (h, w), 255 or 0, of the `kept` pieces (count,) that are about as deep as their piece.
+
+        What is not is a thing in the shadow.
+        """
+        lowest, highest = (
+            np.rint(ALIKE + self._depth + off).clip(0, 255).astype(np.uint8) for off in (-MOST_OFF, MOST_OFF)
+        )
+        lowest[~kept], highest[~kept] = 255, 0
+        return cv2.bitwise_and(
+            cv2.compare(middle, lowest[self.labels], cv2.CMP_GE), cv2.compare(middle, highest[self.labels], cv2.CMP_LE)
+        )
 
     def show_the_same(self, before: Image, after: Image) -> NDArray[np.bool_]:
         """Which (count,) show the same structure in the details (h, w) of both pictures, up to `APART` pixels apart."""
@@ -152,14 +166,13 @@ def _octaves(shaded: Image, weak: Image, apart: Image) -> NDArray[np.float32]:
     beside = (cv2.max(cv2.max(off[0], off[1]), off[2]) < MOST_APART) & (known > 0.5)
     whole = cv2.max(shaded, np.asarray(beside).view(np.uint8) * np.uint8(255))
     window = np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)
-    inner, outer = cv2.erode(whole, window), cv2.dilate(whole, window)
     soft = cv2.min(weak, cv2.dilate(whole, np.ones((2 * SOFT + 1, 2 * SOFT + 1), np.uint8)))
     parts = cv2.split(steps / np.where(depth == 0, np.float32(1), depth))
-    part = np.clip(cv2.min(cv2.min(parts[0], parts[1]), parts[2]), 0, 1)
-    part[cv2.max(outer, soft) == 0] = 0
-    # what stands in it hides the ground's light; ground that is as it was between two shadows does not
-    bands = cv2.split(np.abs(steps))
-    stands = cv2.max(cv2.max(bands[0], bands[1]), bands[2]) >= MOST_APART
+    least, most = cv2.min(cv2.min(parts[0], parts[1]), parts[2]), cv2.max(cv2.max(parts[0], parts[1]), parts[2])
+    part = np.clip(least, 0, 1)
+    part[cv2.max(cv2.dilate(whole, window), soft) == 0] = 0
+    # what stands in it hides the ground's light; ground between two shadows shows its own
+    hides = (least < LEAST_PART) | (np.asarray(most) - least > MOST_UNLIKE)
     filled = cv2.morphologyEx(whole, cv2.MORPH_CLOSE, np.ones((HOLE, HOLE), np.uint8))
-    part[(inner > 0) | ((filled > 0) & (outer == 0) & stands)] = 1
+    part[(cv2.erode(whole, window) > 0) | ((filled > 0) & hides)] = 1
     return np.asarray(cv2.multiply(depth, cv2.merge([part] * 3), scale=1 / STEPS), np.float32)
