@@ -76,9 +76,10 @@ class _Pieces:
     def __init__(self, mask: Image) -> None:
         window = np.ones((LEAST_WIDTH, LEAST_WIDTH), np.uint8)
         self._opened: Image = cv2.morphologyEx(mask, cv2.MORPH_OPEN, window)
-        self.count, self.labels = cv2.connectedComponents(self._opened, connectivity=4, ltype=cv2.CV_16U)
-        if self.count == 1:
+        self.count, self.labels = 1, self._opened
+        if cv2.countNonZero(self._opened) == 0:
             return
+        self.count, self.labels = cv2.connectedComponents(self._opened, connectivity=4, ltype=cv2.CV_16U)
         # some of the pixels that lie within pieces, and whose they are
         places = _places(cv2.erode(self._opened, np.ones((3, 3), np.uint8)))
         step = max(1, -(-len(places) // MOST_ASKED))
