@@ -81,7 +81,7 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     fine = FINE * size[0], FINE * size[1]
     reference, query = _smaller(reference, fine), _smaller(query, fine)
     before, after = (_logarithm(_smaller(each, size)) for each in (reference, query))
-    sure = None if known is None else _smaller(known.astype(np.uint8) * 255, size) > 250
+    sure = _surely(known, size)
     if sure is not None and sure.sum() < 16:
         nothing = np.zeros((*size[::-1], 3), np.float32)
         return Light(np.ones(3), np.zeros(3), nothing + 1, 0.0, Cells(nothing, nothing[..., 0], sure))
@@ -159,8 +159,7 @@ def _shades(
         cv2.LUT(image, np.clip(np.rint((each - np.log2(BLACK_LEVEL)) * 2 * STEPS), 0, 255).astype(np.uint8)[None])
         for image, each in ((reference, exponents * levels + offsets), (query, np.repeat(levels, 3, axis=1)))
     )
-    sure = None if known is None else _smaller(known.astype(np.uint8) * 255, reference.shape[1::-1]) > 250
-    return moved_shades(before, after, sure)
+    return moved_shades(before, after, _surely(known, (reference.shape[1], reference.shape[0])))
 
 
 def _chosen(values: NDArray[np.float32], sure: Mask | None) -> NDArray[np.float32]:
@@ -204,6 +203,11 @@ def _logarithm(image: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 def _smaller(image: NDArray[Any], size: tuple[int, int]) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _surely(known: Mask | None, size: tuple[int, int]) -> Mask | None:
+    """Which pixels of a picture of `size` (w, h) lie on known ground alone; None where everything does."""
+    return None if known is None else _smaller(known.astype(np.uint8) * 255, size) > 250
 
 
 def middle(values: NDArray[Any]) -> Any:

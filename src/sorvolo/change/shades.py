@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Anything, Floats, Mask
+from sorvolo.change.blobs import Image
+from sorvolo.geometry.arrays import Floats, Mask
 
 STEPS = 24  # to an octave, of differences of logarithms; these are 8 bit, 128 alike
 ALIKE = 128
@@ -24,9 +25,6 @@ NEAR = 15  # pixels: how far the depth of a shadow is the same
 MOST_APART = 6  # steps from a shadow's depth: ground beside it that it covers, too
 LEAST_PART, MOST_UNLIKE = -0.25, 0.5  # of a shadow's depth, and between the colours: else it is no shadow's edge
 RIM, SOFT = 2, 5  # pixels on both sides of a shadow's edge, where it is blurred; outside where it is soft
-
-Image = Anything
-"""uint8, (h, w) or (h, w, 3)."""
 
 
 def moved_shades(before: Image, after: Image, known: Mask | None) -> NDArray[np.float32] | None:
@@ -50,14 +48,14 @@ def moved_shades(before: Image, after: Image, known: Mask | None) -> NDArray[np.
         brighter = cv2.addWeighted(middle, sign, middle, 0, ALIKE - sign * ALIKE)
         for level in LEVELS:
             differs = cv2.threshold(brighter, ALIKE + level, 255, cv2.THRESH_BINARY)[1]
-            pieces = _Pieces(cv2.min(cv2.min(differs, alike), cv2.bitwise_not(shaded)))
+            pieces = _Pieces(cv2.min(cv2.min(differs, alike), cv2.bitwise_not(shaded)), middle)
             if pieces.count == 1:
                 break
             details = details or (_details(before), _details(after))
-            kept = pieces.are_shadows(middle)
+            kept = pieces.are_shadows()
             if kept.any():
                 kept &= pieces.show_the_same(*details)
-                shaded |= pieces.like_the_rest(kept, middle)
+                shaded |= pieces.like_the_rest(kept)
         if shaded.any():
             if octaves is None:
                 octaves = np.zeros(apart.shape, np.float32)
@@ -71,9 +69,12 @@ def moved_shades(before: Image, after: Image, known: Mask | None) -> NDArray[np.
 
 
 class _Pieces:
-    """The wide enough pieces of a mask (h, w), 0 or 255: `count` of them with the ground, which is 0 in `labels`."""
+    """The wide enough pieces of a mask (h, w), 0 or 255: `count` of them with the ground, which is 0 in `labels`.
 
-    def __init__(self, mask: Image) -> None:
+    `middle` (h, w) is how much brighter the ground became.
+    """
+
+    def __init__(self, mask: Image, middle: Image) -> None:
         window = np.ones((LEAST_WIDTH, LEAST_WIDTH), np.uint8)
         self._opened: Image = cv2.morphologyEx(mask, cv2.MORPH_OPEN, window)
         self.count, self.labels = 1, self._opened
@@ -85,28 +86,28 @@ class _Pieces:
         step = max(1, -(-len(places) // MOST_ASKED))
         self._places, self._share = places[::step], step / self.labels.size
         self._own = self.labels.ravel()[self._places]
-        self._number = np.bincount(self._own, minlength=self.count)
+        held = np.bincount(self._own, minlength=self.count)
+        self._is_held, self._number = held > 0, np.maximum(held, 1)
+        self._middle, self._steps = middle, _steps(middle, self._places)
+        self._depth = self._mean(self._steps)
 
-    def are_shadows(self, middle: Image) -> NDArray[np.bool_]:
+    def are_shadows(self) -> NDArray[np.bool_]:
         """Which (count,) are no more than a part of the picture, about as deep everywhere, and end all at once.
 
-        `middle` (h, w) is how much brighter they are. The edge of a cloud's shadow is soft.
+        The edge of a cloud's shadow is soft.
         """
-        number = np.maximum(self._number, 1)
-        steps = _steps(middle, self._places)
-        depth = self._depth = np.bincount(self._own, steps, self.count) / number
-        off = np.bincount(self._own, np.abs(steps - depth[self._own]), self.count)
-        fits = (self._number > 0) & (self._number * self._share < LARGEST) & (off < MOST_SPREAD * number)
+        off = self._mean(np.abs(self._steps - self._depth[self._own]))
+        fits = self._is_held & (self._number * self._share < LARGEST) & (off < MOST_SPREAD)
         if not fits.any():
             return fits
         outer = cv2.dilate(self.labels, np.ones((BESIDE, BESIDE), np.uint8))
         outer[cv2.dilate(self._opened, np.ones((3, 3), np.uint8)) > 0] = 0
         ring = _places(outer)
         own = outer.ravel()[ring]
-        ends = np.bincount(own, np.abs(_steps(middle, ring)) < SHARP * np.abs(depth)[own], self.count)
+        ends = np.bincount(own, np.abs(_steps(self._middle, ring)) < SHARP * np.abs(self._depth)[own], self.count)
         return fits & (ends >= LEAST_SHARP * np.maximum(np.bincount(own, minlength=self.count), 1))
 
-    def like_the_rest(self, kept: NDArray[np.bool_], middle: Image) -> Image:
+    def like_the_rest(self, kept: NDArray[np.bool_]) -> Image:
         """The pixels (h, w), 255 or 0, of the `kept` pieces (count,) that are about as deep as their piece.
 
         What is not is a thing in the shadow.
@@ -116,27 +117,30 @@ class _Pieces:
         )
         lowest[~kept], highest[~kept] = 255, 0
         return cv2.bitwise_and(
-            cv2.compare(middle, lowest[self.labels], cv2.CMP_GE), cv2.compare(middle, highest[self.labels], cv2.CMP_LE)
+            cv2.compare(self._middle, lowest[self.labels], cv2.CMP_GE),
+            cv2.compare(self._middle, highest[self.labels], cv2.CMP_LE),
         )
 
     def show_the_same(self, before: Image, after: Image) -> NDArray[np.bool_]:
         """Which (count,) show the same structure in the details (h, w) of both pictures, up to `APART` pixels apart."""
-        own, number = self._own, np.maximum(self._number, 1)
-
-        def centred(values: Floats) -> Floats:
-            return np.asarray(values - (np.bincount(own, values, self.count) / number)[own])
-
-        a = centred(_steps(after, self._places))
-        energy = np.bincount(own, a * a, self.count)
+        a = self._centred(_steps(after, self._places))
+        energy = self._mean(a * a)
         best = np.full(self.count, -1.0)
         padded = cv2.copyMakeBorder(before, APART, APART, APART, APART, cv2.BORDER_REPLICATE)
         rows, columns = np.divmod(self._places, before.shape[1])
         corner = rows * padded.shape[1] + columns
         for shift in (y * padded.shape[1] + x for y in range(2 * APART + 1) for x in range(2 * APART + 1)):
-            b = centred(_steps(padded, corner + shift))
-            common = np.bincount(own, a * b, self.count)
-            best = np.maximum(best, common / np.sqrt(energy * np.bincount(own, b * b, self.count) + 1e-9))
-        return np.asarray(best > LEAST_ALIKE + ALIKE_OF_FEW / np.sqrt(number))
+            b = self._centred(_steps(padded, corner + shift))
+            best = np.maximum(best, self._mean(a * b) / np.sqrt(energy * self._mean(b * b) + 1e-9))
+        return np.asarray(best > LEAST_ALIKE + ALIKE_OF_FEW / np.sqrt(self._number))
+
+    def _mean(self, values: Floats) -> Floats:
+        """(count,) means of values (N,) over the pixels of each piece."""
+        return np.asarray(np.bincount(self._own, values, self.count) / self._number)
+
+    def _centred(self, values: Floats) -> Floats:
+        """Values (N,) less the mean of their own piece."""
+        return np.asarray(values - self._mean(values)[self._own])
 
 
 def _places(image: Image) -> NDArray[np.int64]:
