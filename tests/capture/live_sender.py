@@ -7,8 +7,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from fractions import Fraction
+from random import SystemRandom
 from typing import Any
 
 import av
@@ -21,10 +22,19 @@ EPOCH_NS = 1_760_000_000 * 10**9
 """The drone's clock at its first frame: not this computer's."""
 
 
-def free_port(kind: int = socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+_PORTS = range(10_000, 15_999)
+"""Below those that systems give to sockets that ask for any, so that none of them takes a port while it is free."""
+
+
+def free_port(kind: int = socket.SOCK_DGRAM, count: int = 1) -> int:
+    """The first of `count` neighbouring ports of this computer that nobody uses."""
+    drawn = SystemRandom()  # what a test seeds would be drawn alike by two processes
+    while True:
+        first = drawn.choice(_PORTS[: len(_PORTS) - count])
+        with suppress(OSError), ExitStack() as probes:
+            for port in range(first, first + count):
+                probes.enter_context(socket.socket(socket.AF_INET, kind)).bind(("127.0.0.1", port))
+            return first
 
 
 def picture(index: int, size: tuple[int, int] = (160, 96)) -> Any:

@@ -75,7 +75,7 @@ class RtspServer(threading.Thread):
 
     def _play(self, connection: socket.socket) -> None:
         """What FFmpeg's RTP writer sends by UDP goes on over the connection: `$`, channel, length."""
-        port = free_port() & ~1
+        port = free_port(count=2)
         with closing(_bound(port)) as media, closing(_bound(port + 1)) as reports:
             url = f"rtp://127.0.0.1:{port}?pkt_size=1200"
             with sending_apart(url, container="rtp", count=100_000):

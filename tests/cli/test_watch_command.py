@@ -10,8 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "detection"))
 from toy_models import rectangle_model
 
 from sorvolo.cli import main as cli

@@ -1,7 +1,6 @@
 """The versions of a map listed, found by date, and written as they were."""
 
 import json
-import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -9,8 +8,6 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "store"))
 from fake_changes import fake_change
 from fake_flights import LOCAL_SITE, SITE, frame, map_flight, tile
 

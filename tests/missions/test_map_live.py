@@ -2,7 +2,6 @@
 
 import json
 import socket
-import sys
 import threading
 import time
 from datetime import UTC, datetime
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from live_sender import free_port, sending, udp_url
 
 from sorvolo.capture.live.klv import encode
 from sorvolo.capture.live.reconnect import LiveSettings
@@ -26,9 +26,6 @@ from sorvolo.missions.map_flight import map_flights
 from sorvolo.missions.settings import CompareSettings, MapSettings
 from sorvolo.survey.findings import ViewStatus
 from sorvolo.survey.flight import Frame
-
-sys.path.append(str(Path(__file__).parents[1] / "capture"))
-from live_sender import free_port, sending, udp_url
 
 _LIVE = LiveSettings(keeps_all=True, silent_s=4.0, give_up_s=5.0, first_s=30.0)
 _MAP = MapSettings(model="none")

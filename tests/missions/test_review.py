@@ -1,12 +1,9 @@
 """Changes are listed, confirmed and rejected, by id or by a flight's numbers."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "store"))
 from fake_changes import fake_change
 from fake_flights import SITE, frame, map_flight
 

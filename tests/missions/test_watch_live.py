@@ -1,7 +1,6 @@
 """A watch of a flight that is going on: a real stream over the loopback, faster than the detector."""
 
 import json
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from live_sender import RATE, free_port, sending, udp_url
 
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.detection.contract import ModelInfo
@@ -18,9 +18,6 @@ from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.missions.watch import watch
 from sorvolo.missions.watch_settings import WatchOutputs
 from sorvolo.survey.objects import Detections
-
-sys.path.append(str(Path(__file__).parents[1] / "capture"))
-from live_sender import RATE, free_port, sending, udp_url
 
 _LIVE = LiveSettings(silent_s=1.0, give_up_s=1.5, first_s=15.0)
 _M_PER_PX = 2 * 60.0 * np.tan(np.radians(31.0)) / 160  # of the drone that live_sender flies

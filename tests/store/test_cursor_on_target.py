@@ -9,6 +9,7 @@ from xml.etree.ElementTree import fromstring
 
 import numpy as np
 import pytest
+from live_sender import free_port
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import Geodetic
@@ -106,9 +107,9 @@ def test_what_is_no_place(url: str) -> None:
 
 def test_udp_arrives_and_a_dead_receiver_is_an_error_that_passes() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind(("127.0.0.1", 0))
+        port = free_port()
+        receiver.bind(("127.0.0.1", port))
         receiver.settimeout(5)
-        port = receiver.getsockname()[1]
         sender = CotSender(CotPlace("udp", "127.0.0.1", port))
         sender.send(b"<event/>")
         assert receiver.recv(100) == b"<event/>"
@@ -130,9 +131,9 @@ def test_udp_arrives_and_a_dead_receiver_is_an_error_that_passes() -> None:
 
 
 def test_tcp_is_connected_again_after_the_server_went_away() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
+    port = free_port(socket.SOCK_STREAM)
+    with socket.create_server(("127.0.0.1", port)) as server:
         server.settimeout(5)
-        port = server.getsockname()[1]
         sender = CotSender(CotPlace("tcp", "127.0.0.1", port))
         sender.send(b"<a/>")
         first, _ = server.accept()
