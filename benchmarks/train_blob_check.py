@@ -140,7 +140,8 @@ def _held(regions: Regions, truth: np.ndarray) -> np.ndarray:
     small = cv2.resize(truth.astype(np.uint8) * 255, regions.labels.shape[::-1], interpolation=cv2.INTER_AREA) > 127
     things, numbers = cv2.connectedComponents(small.view(np.uint8))
     count = len(regions.boxes) + 1
-    pixels = np.bincount((regions.labels * things + numbers).ravel(), minlength=count * things).reshape(count, things)
+    both = regions.labels.astype(np.int64) * things + numbers
+    pixels = np.bincount(both.ravel(), minlength=count * things).reshape(count, things)
     return (pixels / np.maximum(pixels.sum(axis=0), 1))[1:, 1:].max(axis=1, initial=0.0)
 
 

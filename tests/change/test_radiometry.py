@@ -73,12 +73,16 @@ def test_unknown_ground_does_not_count() -> None:
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.integers(0, 2**31), st.integers(1, 40), st.integers(1, 40))
-def test_relighting_agrees(seed: int, height: int, width: int) -> None:
+@given(st.integers(0, 2**31), st.integers(1, 40), st.integers(1, 40), st.integers(1, 9))
+def test_relighting_agrees(seed: int, height: int, width: int, lines: int) -> None:
     rng = np.random.default_rng(seed)
     image = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
     curves = rng.integers(0, 16384, (3, 256)).astype(np.int32)
-    gains = rng.integers(0, 65536, (height, width, 3)).astype(np.uint16)
+    gains = rng.integers(0, 65536, (lines, width, 3)).astype(np.float32)
     plain = np.empty_like(image)
-    reference_robust.relight(image, curves, gains, plain)
+    reference_robust.relight(image, curves, gains, 0, 0, width, height, plain)
     np.testing.assert_array_equal(kernels.relight(image, curves, gains), plain)
+    part = np.s_[height // 3 : height // 2 + 1, width // 4 : width]
+    alone = kernels.relight(image, curves, gains, [part], np.zeros_like(image))
+    np.testing.assert_array_equal(alone[part], plain[part])
+    assert np.count_nonzero(alone) <= np.count_nonzero(alone[part])

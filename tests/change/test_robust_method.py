@@ -162,7 +162,7 @@ def test_matches_agree(rng: np.random.Generator, height: int, width: int, reach:
 @settings(max_examples=15, deadline=None)
 @given(pictures, st.integers(1, 50), st.integers(1, 50), st.integers(1, 12), st.integers(0, 5))
 def test_measures_agree(rng: np.random.Generator, height: int, width: int, channels: int, margin: int) -> None:
-    labels = rng.integers(0, 4, (height, width)).astype(np.int32)
+    labels = rng.integers(0, 4, (height, width), dtype=np.uint8)
     stack = list(rng.integers(0, 256, (channels, height, width), dtype=np.uint8))
     corner = rng.integers(0, [width, height], (3, 2))
     boxes = np.hstack([corner, rng.integers(1, np.array([width, height]) - corner + 1)]).astype(np.int32)

@@ -5,8 +5,8 @@ import pytest
 from blob_world import M_PER_PX, START_NS, Thing, flight
 
 from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
-from sorvolo.change.shadows import thing_of, things_of
-from sorvolo.survey.findings import ChangeKind, Patch
+from sorvolo.change.shadows import is_speck_of_shade, thing_of, things_of
+from sorvolo.survey.findings import Change, ChangeKind, Patch
 
 SHADOW = (58, 58, 58)  # of ground as bright as 110
 
@@ -38,8 +38,8 @@ def test_two_things_joined_by_a_shadow_are_two_with_kinds_of_their_own():
     )
     patch.before[38:52, 100:112, :3], patch.after[38:52, 100:112, :3] = (40, 60, 230), 110
     things = things_of(patch, ChangeKind.APPEARED, patch.changed)
-    assert [kind for _, kind in things] == [ChangeKind.DISAPPEARED, ChangeKind.APPEARED]
-    left, came = (mask for mask, _ in things)
+    assert sorted(kind for _, kind in things) == [ChangeKind.APPEARED, ChangeKind.DISAPPEARED]
+    came, left = (mask for mask, _ in sorted(things, key=lambda each: each[1]))
     assert left[45, 105] and not left[45, 90]  # the shadow belongs to what came
     assert came[45, 55] and came[45, 90]
     assert np.array_equal(left | came, patch.changed)
@@ -50,6 +50,50 @@ def test_a_dark_car_with_bright_ends_is_one_thing():
     ends = [(np.s_[32:64], np.s_[x : x + 6], (230, 60, 60)) for x in (51, 131)]
     patch = patch_with(dark, *ends)
     assert len(things_of(patch, ChangeKind.APPEARED, patch.changed)) == 1
+
+
+@pytest.mark.parametrize("whole", [ChangeKind.APPEARED, ChangeKind.DISAPPEARED, ChangeKind.REPLACED])
+def test_a_car_that_left_right_beside_one_that_came_is_another_thing(whole):
+    patch = patch_with((np.s_[10:95], np.s_[40:75], (30, 60, 150)))
+    patch.before[10:95, 80:115, :3] = (215, 215, 210)
+    patch.changed[10:95, 40:115] = True  # one mask holds both, and the ground between
+    things = {kind: mask for mask, kind in things_of(patch, whole, patch.changed)}
+    assert things.keys() == {ChangeKind.APPEARED, ChangeKind.DISAPPEARED}
+    assert things[ChangeKind.APPEARED][50, 55] and not things[ChangeKind.APPEARED][50, 100]
+    assert things[ChangeKind.DISAPPEARED][50, 100] and not things[ChangeKind.DISAPPEARED][50, 55]
+
+
+def test_a_car_in_the_place_of_another_stays_one_replacement():
+    patch = patch_with((np.s_[10:95], np.s_[40:75], (30, 60, 150)))
+    patch.before[14:98, 44:78, :3] = (215, 215, 210)
+    patch.changed[10:98, 40:78] = True
+    assert len(things_of(patch, ChangeKind.REPLACED, patch.changed)) == 1
+
+
+def test_a_shadow_that_went_round_its_thing_is_not_two_things():
+    patch = patch_with((np.s_[30:60], np.s_[40:52], SHADOW))
+    patch.before[30:60, 60:72, :3] = SHADOW
+    patch.changed[30:60, 40:72] = True
+    assert len(things_of(patch, ChangeKind.REPLACED, patch.changed)) == 1
+
+
+def test_the_bright_ends_of_a_dark_car_beside_another_thing_are_one_thing():
+    car = (np.s_[30:66], np.s_[20:108], (25, 25, 25))
+    ends = [(np.s_[32:64], np.s_[x : x + 6], (230, 60, 60)) for x in (21, 101)]
+    shade, thing = (np.s_[30:66], np.s_[108:130], SHADOW), (np.s_[36:60], np.s_[130:160], (240, 240, 60))
+    patch = patch_with(car, *ends, shade, thing)
+    assert len(things_of(patch, ChangeKind.APPEARED, patch.changed)) == 2
+
+
+@pytest.mark.parametrize("side_px, score, colour, is_speck", [
+    (6, 0.5, SHADOW, True), (6, 0.7, SHADOW, False), (12, 0.5, SHADOW, False), (6, 0.5, (200, 60, 60), False),
+])
+def test_a_small_dark_unsure_change_is_a_speck_of_shade(side_px, score, colour, is_speck):
+    patch = patch_with((np.s_[40 : 40 + side_px], np.s_[60 : 60 + side_px], colour))
+    side_m = side_px * M_PER_PX
+    square = np.array([[0, 0], [side_m, 0], [side_m, side_m], [0, side_m]])
+    change = Change("f-1", ChangeKind.APPEARED, score, square, 0, 0, 5, side_m**2, side_m, 0.1, patch)
+    assert is_speck_of_shade(change) is is_speck
 
 
 @pytest.mark.parametrize("gap_m", [1.2, 2.0])

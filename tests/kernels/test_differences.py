@@ -40,6 +40,17 @@ def test_differences_are_as_specified(
     assert np.array_equal(kernels.differences(before, after, known, reach, weight), plain)
 
 
+@settings(max_examples=60, deadline=None)
+@given(SIDES, SIDES, st.integers(1, 60), st.integers(0, 2**32 - 1))
+def test_shades_are_as_specified(height: int, width: int, apart: int, seed: int) -> None:
+    lighter, darker = pictures(height, width, seed)
+    darker[: height // 2] = lighter[: height // 2] * 0.7 + 0.5
+    part = np.s_[height // 4 : height // 4 + max(2, height // 2), 0:width]
+    plain = np.empty((max(2, height // 2), width), np.uint8)
+    reference_robust.darker_alike(lighter, darker, 0, height // 4, width, len(plain), apart, plain)
+    assert np.array_equal(kernels.darker_alike(lighter, darker, part, apart), plain)
+
+
 @settings(max_examples=100, deadline=None)
 @given(SIDES, SIDES, st.floats(0.02, 0.98), st.floats(0, 0.2), st.integers(0, 2**32 - 1))
 def test_held_parts_are_as_specified(height: int, width: int, share: float, seeded: float, seed: int) -> None:
@@ -111,9 +122,11 @@ def test_what_does_not_fit_is_refused() -> None:
         kernels.differences(before, after, np.ones((3, 3), bool), 2, 2)
     with pytest.raises(ValueError, match="C order"):
         kernels.differences(before, after, None, 2, 2, np.empty((6, 24, 20), np.uint8))
-    labels = np.ones((20, 24), np.int32)
+    labels = np.ones((20, 24), np.uint8)
     with pytest.raises(ValueError, match="boxes outside"):
         kernels.rim_balance(labels, np.int32([[20, 0, 9, 3]]), before[..., 0], before[..., 1])
+    with pytest.raises(ValueError, match="a byte"):
+        kernels.core_regions(before[..., 0], after[..., 0], 1.5, 0.5, 3, 256)
 
 
 def test_what_is_handed_out_survives_the_next_pictures() -> None:
@@ -130,7 +143,7 @@ def test_scratch_keeps_one_size_and_nothing_large() -> None:
     first = scratch.stack("a", (10, 20), 3)
     assert first.shape == (3, 10, 20) and scratch.stack("a", (10, 20), 3) is first
     assert scratch.take("b", (10, 20), margin_px=2).shape == (14, 24)
-    assert scratch.take("b", (10, 20), (3,), np.uint16).shape == (10, 20, 3)
+    assert scratch.take("b", (10, 20), (3,)).shape == (10, 20, 3)
     scratch.take("a", (11, 20))
     assert scratch.stack("a", (10, 20), 3) is not first
     large = (MOST_KEPT_PX, 2)

@@ -18,6 +18,7 @@ from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.missions.compare_flights import compare_flights
+from sorvolo.missions.compare_views import ViewMaker
 from sorvolo.missions.evaluate_changes import evaluate_changes
 from sorvolo.missions.known_camera import known_camera
 from sorvolo.missions.map_flight import map_flights
@@ -191,6 +192,26 @@ def test_stopping_half_way_leaves_the_site_as_it_was(flown, site):
         assert [each.id for each in archive.versions()] == before
         assert [each.id for each in archive.flights()] == ["flight1"]
     assert not (site / "flights" / "flight2").exists()
+
+
+def test_a_view_that_fails_beside_the_rest_is_told_and_leaves_the_site_as_it_was(flown, site, monkeypatch):
+    looked, look = [], ViewMaker.look
+
+    def fails(self, posed):
+        looked.append(posed.frame.index)
+        if len(looked) == 6:
+            raise StoreError("a tile is damaged")
+        return look(self, posed)
+
+    monkeypatch.setattr(ViewMaker, "look", fails)
+    before, told = files(site), []
+    with pytest.raises(StoreError, match="a tile is damaged"):
+        for each in compare_flights([flown / "flight2"], site, _COMPARE, camera=flown / "camera.xml"):
+            told.append(each.frame_name)
+    assert len(told) == 5 and told == sorted(told), "those before it are told, in order"
+    after = files(site)
+    assert {name for name in after if "flight2" in name} == set()
+    assert all(after[name] == content for name, content in before.items() if name.endswith((".tif", ".geojson")))
 
 
 def test_a_rejected_change_does_not_come_back_with_the_next_flight(flown, site, tmp_path):

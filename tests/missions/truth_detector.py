@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,10 @@ class TruthDetector:
             licence="CC0-1.0", trained_on="nothing",
         )
         self.asked = 0
+
+    def thresholds_for(self, picture: ImageRGB) -> Mapping[str, float]:
+        """The same for all pictures."""
+        return self.info.thresholds
 
     def detect(
         self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,

@@ -20,6 +20,8 @@ WEAK_PART = 0.1  # of the largest difference near: what is weaker belongs to clo
 MOST_SPECK = 48.0
 MATCH_MARGIN_PX = 3
 MATCH_REACH_PX = 6
+DETAIL_PX = 11
+LOOKED_AT_PX = WIDE_PX + DETAIL_PX  # around regions: what is farther away changes nothing in what is measured of them
 MOST_REGIONS = 64  # a byte holds their labels
 
 FEATURES = (
@@ -55,7 +57,7 @@ class RegionSettings:
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Regions 1 .. N of `labels` (h, w) int32: `boxes` (N, 4) int32 x, y, w, h and `features` (N, len(FEATURES)).
+    """Regions 1 .. N of `labels` (h, w) uint8: `boxes` (N, 4) int32 x, y, w, h and `features` (N, len(FEATURES)).
 
     `strength` (h, w) uint8 is how much the pictures differ, until the thread compares others; `weak` (h, w) uint8 is
     255 wherever they differ at all, `noise` the 95 % quantile of small differences.
@@ -63,7 +65,7 @@ class Regions:
     a thing on the reference's ground, negative where it is the other way round.
     """
 
-    labels: NDArray[np.int32]
+    labels: NDArray[np.uint8]
     boxes: NDArray[np.int32]
     features: Floats
     strength: Image
@@ -86,7 +88,8 @@ def find_regions(
     # a large thing's inside is no clutter: only what is small among the differences raises the thresholds around it
     window = np.ones((SPECK_PX, SPECK_PX), np.uint8)
     cv2.subtract(difference, cv2.morphologyEx(difference, cv2.MORPH_OPEN, window, dst=spare), dst=specks)
-    counts = np.bincount(specks[::4, ::4].ravel(), minlength=256).cumsum()
+    some: Anything = cv2.calcHist([np.ascontiguousarray(specks[::4, ::4])], [0], None, [256], [0, 256])
+    counts = some.ravel().cumsum(dtype=np.float64)
     noise = float(np.searchsorted(counts, 0.95 * counts[-1]))
     cv2.blur(difference, (3, 3), dst=smooth)
     cv2.threshold(specks, MOST_SPECK, MOST_SPECK, cv2.THRESH_TRUNC, dst=specks)
@@ -103,11 +106,8 @@ def find_regions(
         return Regions(labels, boxes, np.zeros((0, len(FEATURES))), smooth, weak, noise, known, np.zeros(0))
     # a shadow takes from all colours alike: red over blue stays
     colour = tint(reference, query, _LOG, boxes, RING_PX, _SCRATCH.take("tint", size))
-    log_before, log_after = _SCRATCH.stack("logarithms", size, 2)
-    cv2.LUT(light_before, _LOG, dst=log_before)
-    cv2.LUT(light_after, _LOG, dst=log_after)
+    channels = [difference, chroma, activity, light_before, light_after, came, went, colour]
     frame = np.array([noise, rest_px, unevenness, np.log1p(len(boxes))])
-    channels = [difference, chroma, activity, light_after, came, went, colour, log_before, log_after]
     green = _green(reference, boxes), _green(query, boxes)
     features = _measured(labels, boxes, channels, green, frame)
     # along its outline a thing's values are new, while the ground's are still to be seen near
@@ -116,12 +116,21 @@ def find_regions(
 
 
 def _measured(
-    labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: list[Image], green: tuple[Floats, Floats],
+    labels: NDArray[np.uint8], boxes: NDArray[np.int32], channels: list[Image], green: tuple[Floats, Floats],
     frame: NDArray[np.float64],
 ) -> Floats:
-    difference, chroma, activity, level, came, went, colour, log_before, log_after = channels
-    size = labels.shape[0], labels.shape[1]
-    detail_before, detail_after, ratio, edges_after, edges_before, detail = _SCRATCH.stack("measured", size, 6)
+    planes = _SCRATCH.stack("measured", (labels.shape[0], labels.shape[1]), 10)
+    searched = _SCRATCH.take("searched", (labels.shape[0], labels.shape[1]), margin_px=MATCH_REACH_PX)
+    part, corner = _looked_at(boxes, labels.shape)
+    labels, *channels = (np.ascontiguousarray(each[part]) for each in (labels, *channels))
+    difference, chroma, activity, light_before, level, came, went, colour = channels
+    boxes = boxes - corner
+    height, width = labels.shape
+    (
+        log_before, log_after, detail_before, detail_after, ratio, edges_after, edges_before, detail, sharp, steep
+    ) = planes.reshape(-1)[: 10 * labels.size].reshape(10, height, width)
+    cv2.LUT(light_before, _LOG, dst=log_before)
+    cv2.LUT(level, _LOG, dst=log_after)
     _details(log_before, detail_before)
     _details(log_after, detail_after)
     window = np.ones((3, 3), np.uint8)
@@ -134,13 +143,12 @@ def _measured(
     means, spreads = _moments(sums)
     within, around = means[:, 0], means[:, 1]
     kept, had, has = _structure(means[..., (7, 11, 12)], spreads[..., (7, 11, 12)])
-    sharp, steep = _SCRATCH.stack("sharp", size, 2)
     cv2.morphologyEx(ratio, cv2.MORPH_GRADIENT, window, dst=sharp)
     cv2.morphologyEx(difference, cv2.MORPH_GRADIENT, window, dst=steep)
     rim = _moments(measure_regions(_rims(labels), boxes, [sharp, steep], 0))[0][:, 0]
     wide, wide_spreads = (each[:, 1] for each in _moments(measure_regions(labels, boxes, [ratio, detail], WIDE_PX)))
     reach = MATCH_REACH_PX
-    searched = _SCRATCH.take("searched", size, margin_px=reach)
+    searched = searched.reshape(-1)[: (height + 2 * reach) * (width + 2 * reach)].reshape(height + 2 * reach, -1)
     cv2.copyMakeBorder(detail_before, reach, reach, reach, reach, cv2.BORDER_REFLECT, dst=searched)
     matched = match_regions(detail_after, searched, _grown(boxes, labels.shape), reach)
     long, short = boxes[:, 2:].max(axis=1), boxes[:, 2:].min(axis=1)
@@ -191,11 +199,17 @@ def _standing_out(boxes: NDArray[np.int32], strength: Floats) -> tuple[Floats, F
     return np.log(strength / strength.max()), np.log(strength / (near @ strength)), np.log(near.sum(axis=1))
 
 
-def _rims(labels: NDArray[np.int32]) -> NDArray[np.int32]:
+def _looked_at(boxes: NDArray[np.int32], shape: tuple[int, ...]) -> tuple[tuple[slice, slice], NDArray[np.int32]]:
+    """The part of a picture of `shape` (h, w) that says what is to be known of regions in boxes (N, 4); its corner."""
+    corner = np.maximum(boxes[:, :2].min(axis=0) - LOOKED_AT_PX, 0)
+    right, bottom = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) + LOOKED_AT_PX
+    part = np.s_[int(corner[1]) : min(int(bottom), shape[0]), int(corner[0]) : min(int(right), shape[1])]
+    return part, np.array([*corner, 0, 0], np.int32)
+
+
+def _rims(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The labels (h, w) of pixels next to pixels of no region, 0 elsewhere."""
-    size = labels.shape[0], labels.shape[1]
-    inner = cv2.erode(labels.astype(np.uint8), np.ones((3, 3), np.uint8), dst=_SCRATCH.take("inner", size))
-    return np.asarray(labels * (inner == 0))
+    return labels * (cv2.erode(labels, np.ones((3, 3), np.uint8)) == 0)
 
 
 def _green(image: Image, boxes: NDArray[np.int32]) -> Floats:
@@ -209,7 +223,7 @@ def _green(image: Image, boxes: NDArray[np.int32]) -> Floats:
 
 
 def _details(logarithm: Image, to: Image) -> None:
-    cv2.blur(logarithm, (11, 11), dst=to)
+    cv2.blur(logarithm, (DETAIL_PX, DETAIL_PX), dst=to)
     cv2.addWeighted(logarithm, 1, to, -1, 128, dst=to)
 
 

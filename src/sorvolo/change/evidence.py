@@ -25,6 +25,7 @@ from sorvolo.change.movers import Movers
 from sorvolo.change.moving import BlobTracker, MovingSettings
 from sorvolo.change.parts import Parts
 from sorvolo.change.restlessness import calmness, restlessness
+from sorvolo.change.shadows import is_speck_of_shade
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageGray, Mask, Matrix3
 from sorvolo.survey.findings import Change, ComparedView
@@ -41,6 +42,8 @@ _DOUBT = 2.0  # restless ground counts in full where half of the score is missin
 _CALM = 0.9  # of the score is left on calm ground
 _MOVED_HEIGHTS = 0.01  # the camera's way, in flying heights, after which a view is a new witness
 _ALL_CHANGED = 0.5  # share of the frame beyond which nothing in it can be followed
+_PASSING, _PASSING_VIEWS = 0.5, 8  # flagged in so much smaller a share of at least so many views than ...
+_SUREST = 97  # ... the surest of a change's cells, in per cent of them, cells are no part of it
 _STANDS_S = 2.0  # what the same ground shows for so long stands there, however unsteady its blobs look
 
 
@@ -160,7 +163,7 @@ class EvidenceMap:
         for change in self._found.values():
             if not change.is_told:
                 self._told(change, -1)
-            elif not self._is_sure(change):
+            elif not (self._is_sure(change) and self._is_thing(change)):
                 change.is_taken_back = True
             else:
                 self._part(change, -1)
@@ -224,7 +227,10 @@ class EvidenceMap:
             cells = sure[part] & piece
             owner = evidence.owner[part]
             owners = sorted({self._current(int(each)) for each in np.unique(owner[piece & (owner > 0)])})
-            if not (cells & (owner == 0)).any():
+            fresh = cells & (owner == 0)
+            if not fresh.any():
+                continue
+            if owners and self._is_passing(evidence, part, piece & (owner > 0), fresh):
                 continue
             if not owners:
                 if np.count_nonzero(cells) < least_cells:
@@ -246,6 +252,14 @@ class EvidenceMap:
             self._grid.own(window, cells, change.number)
             owner[cells] = change.number
         return [each for each in new if self._current(each.number) == each.number]
+
+    @staticmethod
+    def _is_passing(evidence: CellEvidence, part: tuple[slice, slice], own: Mask, fresh: Mask) -> bool:
+        """Whether `fresh` cells are flagged so much more seldom than those that changes `own` that they are no part."""
+        seen, changed = np.maximum(evidence.seen[part], 1), evidence.changed[part]
+        of_own, of_fresh = changed[own] / seen[own], changed[fresh] / seen[fresh]
+        surest = np.percentile(of_own, _SUREST)
+        return bool(np.median(seen[fresh]) >= _PASSING_VIEWS and np.median(of_fresh) < _PASSING * surest)
 
     def _stands(
         self, witness: _Witness, earlier: Sequence[_Witness], part: tuple[slice, slice], cells: Mask
@@ -286,10 +300,14 @@ class EvidenceMap:
             parts = self._parts.get(change.number)
             is_due = now_ns >= 0 and (parts is None or parts.is_due(change.views))
             return self._part(change, now_ns) if is_due else []
-        if not self._is_sure(change) or self._change(change) is None:
+        if not self._is_sure(change) or not self._is_thing(change):
             return []
         change.is_told, change.announced_ns = True, now_ns
         return self._part(change, now_ns)
+
+    def _is_thing(self, change: GatheredChange) -> bool:
+        whole = self._change(change)
+        return whole is not None and not is_speck_of_shade(whole)
 
     def _is_sure(self, change: GatheredChange) -> bool:
         calm = change.calmness = 1.0
@@ -333,7 +351,7 @@ class EvidenceMap:
             change = self._found[number]
             if change.cells is None:
                 continue
-            cells = self._cells_of(change)
+            cells = self._without_passing(change, witness)
             seen, flagged, score, place_m = self._answer(laid, change.cells, cells)
             is_large = max(change.cells.shape) * self._cell_m > 0.5 * max(laid.window.shape) * self._cell_m
             if seen < 0.5 and not (is_large and flagged > 0):
@@ -360,6 +378,34 @@ class EvidenceMap:
             change = self._found[number]
             change.vote(view.site_from_image, view.changed, view.valid)
         return shown
+
+    def _without_passing(self, change: GatheredChange, witness: _Witness) -> Mask:
+        """The change's own cells, (rows, columns) of its window, less those that it loses now.
+
+        What leaned over a thing's place for a few views joined it and is gone from most later ones, while the thing is
+        not: it is no part of it. The views that are counted then are those that its own cells had.
+        """
+        if change.cells is None:
+            return np.zeros((1, 1), bool)
+        evidence = self._grid.read(change.cells)
+        own = evidence.owner == change.number
+        share = evidence.changed[own] / np.maximum(evidence.seen[own], 1)
+        if not share.size:
+            return own
+        passing = (share < _PASSING * np.percentile(share, _SUREST)) & (evidence.seen[own] >= _PASSING_VIEWS)
+        lost = int(np.count_nonzero(passing))
+        if not lost or len(share) - lost < max(2, self._settings.least_area_m2 / self._cell_m**2):
+            return own
+        loses = np.zeros_like(own)
+        loses[own] = passing
+        self._grid.own(change.cells, loses, 0)
+        own &= ~loses
+        if lost > len(share) / 2:
+            now = int(witness.counts)  # this view is counted apart
+            change.recount(int(np.median(evidence.changed[own])) - now, int(np.median(evidence.seen[own])) - now)
+            if change.number in self._parts:
+                self._parts[change.number].join(())  # with fewer views: look for its things again
+        return own
 
     def _weight(self, witness: _Witness, window: CellWindow) -> float:
         """What a view counts in a change's share; nothing if the camera stands where it stood before."""
@@ -479,8 +525,13 @@ class EvidenceMap:
             beside = self._grid.read(window.grown(self._gap + 1)).owner
             change = self._found[self._current(int(beside[beside > 0].min()))] if beside.any() else None
             if change is not None and change.cells is not None:
-                self._grid.own(window, piece & cells[part], change.number)
-                change.cells = change.cells.joined(window)
+                fresh = piece & cells[part]
+                whole = change.cells.joined(window)
+                evidence, there = self._grid.read(whole), np.zeros(whole.shape, bool)
+                there[window.within(whole)] = fresh
+                if not self._is_passing(evidence, np.s_[:, :], evidence.owner == change.number, there):
+                    self._grid.own(window, fresh, change.number)
+                    change.cells = whole
                 cells[part] &= ~piece
         if np.count_nonzero(cells) < least_cells:
             return

@@ -85,6 +85,15 @@ class GatheredChange:
         self.asked += 1
         self._weight_asked += weight
 
+    def recount(self, views: int, asked: int) -> None:
+        """Count anew what views said of it: `views` of `asked` flagged what is left of it."""
+        views, asked = max(views, 1), max(asked, views, 1)
+        self._score_sum *= views / max(self.views, 1)
+        self._weight_for = self._weight_asked * views / asked
+        self.whole = round(self.whole * views / max(self.views, 1))
+        self._residual_m_sum *= views / max(self.views, 1)
+        self.views, self.asked = views, asked
+
     @property
     def share(self) -> float:
         """The share of the views that show it, of those that could, each with its weight."""

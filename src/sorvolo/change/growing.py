@@ -10,7 +10,7 @@ import numpy as np
 from sorvolo.change.blobs import Image, Regions, RegionSettings
 from sorvolo.change.radiometry import Light, light_around, relit_parts
 from sorvolo.geometry.arrays import Anything, Mask
-from sorvolo.kernels import differences, held_parts
+from sorvolo.kernels import darker_alike, differences, held_parts
 
 REACH_PX = 20  # around a region and half of its length more: the ground that is looked at
 APART_PX = 7  # windows around regions of any kind are no quiet ground
@@ -93,7 +93,7 @@ def without_halos(regions: Regions, chosen: Mask, views: Views, light: Light) ->
         core = regions.labels[window] == region + 1
         rest = core & clear[window]
         if np.count_nonzero(rest) > LEAST_TAKEN * np.count_nonzero(core):
-            left_over, held = (_quantile(each[window][rest], 0.9) for each in (anew, regions.strength))
+            left_over, held = (_quantile(each[window], rest, 0.9) for each in (anew, regions.strength))
             if left_over > MOST_LEFT * held:
                 continue
         strength[window] = cv2.min(anew[window], strength[window])
@@ -117,7 +117,7 @@ def grown(regions: Regions, region: int, came: bool, views: Views) -> Piece | No
     surely = np.uint8(255) * (core & (strength >= ceil(HIGHEST * top)))
     shade = _shade(views, window, came) & (strength < ceil(SHADE_OF_TOP * top)) & ~core
     bare = strength * ~shade
-    limit = max(LEAST_LIMIT, LIMIT_OF_TOP * top, QUIET_FACTOR * _quantile(bare[quiet], QUIET_QUANTILE))
+    limit = max(LEAST_LIMIT, LIMIT_OF_TOP * top, QUIET_FACTOR * _quantile(bare, quiet, QUIET_QUANTILE))
     while limit < HIGHEST * top:
         over: Anything = cv2.threshold(bare, floor(limit), 255, cv2.THRESH_BINARY)[1]
         above: Anything = cv2.morphologyEx(over, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
@@ -137,7 +137,7 @@ def _is_thing(mask: Image, strength: Image, limit: float) -> bool:
         return False
     inner, outer = (cv2.dilate(mask, np.ones((px, px), np.uint8)) for px in BESIDE_PX)
     beside = outer > inner
-    return not beside.any() or _quantile(strength[beside], BESIDE_QUANTILE) <= MOST_BESIDE * limit
+    return not beside.any() or _quantile(strength, beside, BESIDE_QUANTILE) <= MOST_BESIDE * limit
 
 
 def _window(regions: Regions, region: int) -> Window:
@@ -180,15 +180,12 @@ def _strength(lit: Image, views: Views, window: Window) -> Image:
 
 def _shade(views: Views, window: Window, came: bool) -> Mask:
     """Where the picture that shows the thing is darker in all colours alike."""
-    before, after = (cv2.add(cv2.blur(each[window], (3, 3)), np.full(4, 8.0)) for each in (views.lit, views.after))
-    bands = cv2.split(cv2.divide(after, before, scale=128) if came else cv2.divide(before, after, scale=128))
-    most = cv2.max(cv2.max(bands[0], bands[1]), bands[2])
-    least = cv2.min(cv2.min(bands[0], bands[1]), bands[2])
-    return np.asarray((most < 128) & (cv2.subtract(most, least) < ceil(128 * SHADE_SPREAD)))
+    lighter, darker = (views.lit, views.after) if came else (views.after, views.lit)
+    return darker_alike(lighter, darker, window, ceil(128 * SHADE_SPREAD))
 
 
-def _quantile(values: Anything, share: float) -> int:
-    """A quantile of uint8 values (N,), N > 0, without the care that np.quantile takes."""
-    counts: Anything = cv2.calcHist([values], [0], None, [256], [0, 256])
+def _quantile(values: Image, where: Mask, share: float) -> int:
+    """A quantile of uint8 values (h, w) somewhere, in one pixel at least, without the care that np.quantile takes."""
+    counts: Anything = cv2.calcHist([values], [0], where.view(np.uint8), [256], [0, 256])
     sums = counts.ravel().astype(np.int64).cumsum()
     return int(np.searchsorted(sums, share * sums[-1]))

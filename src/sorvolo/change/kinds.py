@@ -18,6 +18,7 @@ _REPLACED_PRIOR = 0.5  # seldom does one thing leave where another comes
 _OWN = np.array([0.88, 0.39, 0.61, 1.53, 1.5, 0.17])  # of the date's own signs
 _OTHER = np.array([-0.32, -0.12, -0.3, -0.36, -0.4, 0.11])  # of the other date's
 _BIAS = 0.55
+_FAR = 4.0  # spreads of the ground's colours
 
 
 def kind_of(patch: Patch) -> ChangeKind:
@@ -38,7 +39,7 @@ def stands_out(picture: ImageRGBA, changed: Mask) -> Floats:
     How far its pixels, their median, and the share of far pixels lie from the ground around, in the ground's own
     spread; the gradient along the outline and across it, and inside, against the ground's gradient.
     """
-    reach = int(np.clip(0.35 * np.sqrt(np.count_nonzero(changed)), 4, 40))
+    reach = _reach_px(changed)
     if not changed.any():
         return np.zeros(_SIGNS)
     picture, changed = _near(picture, changed, reach + 8)
@@ -50,9 +51,7 @@ def stands_out(picture: ImageRGBA, changed: Mask) -> Floats:
     if not inside.any() or not around.any():
         return np.zeros(_SIGNS)
     lab = cv2.cvtColor(cv2.blur(np.ascontiguousarray(picture[..., :3]), (3, 3)), cv2.COLOR_RGB2LAB).astype(np.float32)
-    ring = lab[around]
-    middle = np.median(ring, axis=0)
-    spread = 1.4826 * np.median(np.abs(ring - middle), axis=0) + 3.0
+    middle, spread = _middle_and_spread(lab[around])
     far = np.minimum(_length((lab[inside] - middle) / spread), 12.0)
     shift = float(np.linalg.norm((np.median(lab[inside], axis=0) - middle) / spread))
     across_x, across_y = _outwards(marked)
@@ -66,6 +65,32 @@ def stands_out(picture: ImageRGBA, changed: Mask) -> Floats:
         float(np.mean(slope[rim])) / rest, float(np.mean(outward[rim])) / rest, float(np.mean(slope[inside])) / rest,
     ]
     return np.log(np.array(signs) + 0.05)
+
+
+def unlike_ground(picture: ImageRGBA, changed: Mask) -> Mask:
+    """Where (h, w) a picture's colours lie far from those of the ground around a changed region, in its own spread."""
+    known = picture[..., 3] == 255
+    reach = _reach_px(changed)
+    grown, near = (
+        cv2.dilate(changed.view(np.uint8), np.ones((side, side), np.uint8)) > 0 for side in (2 * reach + 7, 7)
+    )
+    around = known & grown & ~near
+    if not around.any():
+        return np.zeros(changed.shape, bool)
+    lab = cv2.cvtColor(cv2.medianBlur(np.ascontiguousarray(picture[..., :3]), 5), cv2.COLOR_RGB2LAB).astype(np.float32)
+    middle, spread = _middle_and_spread(lab[around])
+    return np.asarray((_length((lab - middle) / spread) > _FAR) & known)
+
+
+def _middle_and_spread(ring: Anything) -> tuple[Anything, Anything]:
+    """The median (3,) of colours (N, 3) of ground, and how far it strays from it, (3,)."""
+    middle = np.median(ring, axis=0)
+    return middle, 1.4826 * np.median(np.abs(ring - middle), axis=0) + 3.0
+
+
+def _reach_px(changed: Mask) -> int:
+    """How far around a changed region the ground is looked at."""
+    return int(np.clip(0.35 * np.sqrt(np.count_nonzero(changed)), 4, 40))
 
 
 def _near(picture: ImageRGBA, changed: Mask, margin_px: int) -> tuple[ImageRGBA, Mask]:

@@ -1,6 +1,6 @@
 """One picture in the light of another: a power law per channel for the camera, a smooth gain for clouds' shadows."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.scratch import Scratch
 from sorvolo.change.shades import STEPS, moved_shades
 from sorvolo.geometry.arrays import Anything, Floats, Mask
-from sorvolo.kernels import relight
+from sorvolo.kernels import detail_products, relight, slopes
 
 Bgr = NDArray[np.uint8]
 """(height, width, 3) uint8, blue green red."""
@@ -19,6 +18,8 @@ Bgr = NDArray[np.uint8]
 BLACK_LEVEL = 8.0  # added before logarithms: below it a camera shows noise, not light
 CELL_PX = 8
 FINE = 4  # pixels of a cell each way, where structure is compared
+DETAIL_PX = 9  # details of the finest structure are what is smaller
+NO_SLOPE = 2e-4  # squared octaves a cell by which a slope is drawn to one where there is little to see
 MEDIAN_CELLS = 5  # what is smaller than half of it cannot change the local gain
 LEAST_ALIKE, MOST_ALIKE = 0.25, 0.5  # correlation of details: the ground is another one, and surely the same
 FLAT = 6.0  # what noise leaves of the variance of details, in squared steps of the logarithm
@@ -31,8 +32,8 @@ STEPS_PER_OCTAVE = 48.0
 GAIN_ONE = 4096
 CURVE_ONE = 16
 
-_SCRATCH = Scratch()
 _LOG = (np.log2(np.arange(256) + BLACK_LEVEL) * 48).astype(np.float32)
+_OCTAVES = np.log2(np.arange(256, dtype=np.float32) + np.float32(BLACK_LEVEL))
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +89,9 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     window = (9, 9)
     detail_before = _chosen(before - cv2.blur(before, window), sure)[::2]
     detail_after = _chosen(after - cv2.blur(after, window), sure)[::2]
-    exponents = np.array([_exponent(detail_before[:, channel], detail_after[:, channel]) for channel in range(3)])
+    # the ratio of spreads, the geometric mean of the regressions of each on the other: that of the query on the
+    # reference alone would be too low by what noise, misalignment and clouds add to the spread of the reference
+    exponents = slopes(detail_before, detail_after, NO_SLOPE * len(detail_before)).clip(0.5, 2.0)
     offset = after - exponents.astype(np.float32) * before
     kept = _chosen(offset, sure)
     offsets = np.array([middle(kept[:, channel]) for channel in range(3)])
@@ -96,7 +99,7 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     if shades is not None:
         offset -= cv2.resize(shades, size, interpolation=cv2.INTER_AREA)
     local = np.clip(np.rint((offset - offsets.astype(np.float32)) * STEPS_PER_OCTAVE + 128), 0, 255).astype(np.uint8)
-    same = _sameness(reference, query, size)
+    same = _sameness(reference, query)
     if sure is not None:
         same[~sure] = 0
     cells = Cells(cv2.medianBlur(local, MEDIAN_CELLS).astype(np.float32) - 128, same, sure)
@@ -124,30 +127,24 @@ def light_around(light: Light, things: Anything) -> Light:
 
 def relit(image: Bgr, light: Light, out: Bgr | None = None) -> Bgr:
     """`image`, of the reference, in the query's light; written to `out` (h, w, 3) where it is given."""
-    return relight(image, *_curves_and_gains(light, image.shape[1::-1]), out)
+    return relight(image, *_curves_and_gains(light, image.shape[1]), out=out)
 
 
-def relit_parts(image: Bgr, light: Light, parts: Iterable[tuple[slice, slice]]) -> Bgr:
+def relit_parts(image: Bgr, light: Light, parts: Sequence[tuple[slice, slice]]) -> Bgr:
     """Some parts of `image`, of the reference, in the query's light; the rest of the picture holds anything."""
-    curves, gains = _curves_and_gains(light, image.shape[1::-1])
-    result = np.empty_like(image)
-    for part in parts:
-        result[part] = relight(image[part], curves, gains[part])
-    return result
+    return relight(image, *_curves_and_gains(light, image.shape[1]), parts)
 
 
-def _curves_and_gains(light: Light, size: Sequence[int]) -> tuple[NDArray[np.int32], NDArray[np.uint16]]:
-    """The light of a picture of `size` (w, h) as `relight` takes it; the gains last until the thread's next picture."""
+def _curves_and_gains(light: Light, width: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """The light of pictures of a width as `relight` takes it."""
     levels = np.log2(np.arange(256) + BLACK_LEVEL)
     curves = 2.0 ** (light.exponents[:, None] * levels + light.offsets[:, None])
     table = np.clip(np.rint(curves * CURVE_ONE), 0, 16383).astype(np.int32)
     grid: Anything = light.gains
     if light.shades is not None:
         grid = cv2.multiply(light.shades, cv2.resize(grid, light.shades.shape[1::-1], interpolation=cv2.INTER_LINEAR))
-    steps = np.clip(np.rint(grid * GAIN_ONE), 0, 65535).astype(np.uint16)
-    gains = _SCRATCH.take("gains", (size[1], size[0]), (3,), np.uint16)
-    cv2.resize(steps, size, dst=gains, interpolation=cv2.INTER_LINEAR)
-    return table, gains
+    steps = np.clip(np.rint(grid * GAIN_ONE), 0, 65535).astype(np.float32)
+    return table, np.asarray(cv2.resize(steps, (width, len(steps)), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def _shades(
@@ -167,25 +164,18 @@ def _chosen(values: NDArray[np.float32], sure: Mask | None) -> NDArray[np.float3
     return values.reshape(-1, 3) if sure is None else values[sure]
 
 
-def _sameness(reference: Bgr, query: Bgr, size: tuple[int, int]) -> NDArray[np.float32]:
-    """How sure each of `size` cells (w, h) shows the same ground, 0 to 1: its finest structure is there in both.
+def _sameness(reference: Bgr, query: Bgr) -> NDArray[np.float32]:
+    """How sure each cell (h, w) of `FINE` pixels a side shows the same ground, 0 to 1: both have its finest structure.
 
     Things put on the ground, however large, hide its structure: their cells say nothing about the light.
     """
-    before, after = (_details(cv2.cvtColor(each, cv2.COLOR_BGR2GRAY)) for each in (reference, query))
-    sums = [
-        cv2.blur(cv2.resize(product, size, interpolation=cv2.INTER_AREA), (5, 5))
-        for product in (before * after, before * before, after * after)
-    ]
+    before, after = (cv2.cvtColor(each, cv2.COLOR_BGR2GRAY) for each in (reference, query))
+    products = detail_products(np.asarray(before, np.uint8), np.asarray(after, np.uint8), _LOG, DETAIL_PX, FINE)
+    sums = [cv2.blur(each, (5, 5)) for each in products]
     alike = sums[0] / np.sqrt((sums[1] + FLAT) * (sums[2] + FLAT))
     sure = np.clip((alike - LEAST_ALIKE) / (MOST_ALIKE - LEAST_ALIKE), 0, 1)
     flat = np.exp(-(sums[1] + sums[2]) / (2 * FLAT)) * np.float32(FLAT_TRUST)
     return np.asarray(np.maximum(cv2.erode(sure, np.ones((3, 3), np.uint8)), flat), np.float32)
-
-
-def _details(gray: NDArray[Any]) -> NDArray[np.float32]:
-    logarithm = cv2.LUT(gray, _LOG)
-    return np.asarray(logarithm - cv2.blur(logarithm, (9, 9)), np.float32)
 
 
 def _spread(values: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -198,7 +188,7 @@ def _spread(values: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArra
 
 
 def _logarithm(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    return np.log2(image.astype(np.float32) + np.float32(BLACK_LEVEL))
+    return np.asarray(cv2.LUT(image, _OCTAVES), np.float32)
 
 
 def _smaller(image: NDArray[Any], size: tuple[int, int]) -> NDArray[np.uint8]:
@@ -217,23 +207,3 @@ def middle(values: NDArray[Any]) -> Any:
         return np.partition(values, half)[half]
     low, high = np.partition(values, (half - 1, half))[half - 1 : half + 1]
     return (low + high) / values.dtype.type(2)
-
-
-def _exponent(before: NDArray[np.float32], after: NDArray[np.float32]) -> float:
-    """The slope of `after` over `before` where both have noise, re-weighted; drawn to one where there is little to see.
-
-    It is the ratio of their spreads, the geometric mean of the regressions of each on the other: that of `after` on
-    `before` alone would be too low by what noise, misalignment and clouds add to the spread of `before`.
-    """
-    prior = 2e-4 * before.size
-
-    def weighted_slope(weights: Anything) -> float:
-        spreads = [float((weights * each) @ each + prior) for each in (before, after)]
-        return float(np.sqrt(spreads[1] / spreads[0]))
-
-    slope = weighted_slope(np.ones_like(before))
-    for _ in range(3):
-        rest = after - np.float32(slope) * before
-        scale = max(1.5 * float(middle(np.abs(rest))), 0.01)
-        slope = weighted_slope(1 / (1 + (rest / np.float32(scale)) ** 2))
-    return float(np.clip(slope, 0.5, 2.0))

@@ -240,7 +240,9 @@ def _filled(
     cores, around, whole = _SCRATCH.stack("filled", size, 3)
     alone = np.array([bool(is_chosen) and each not in pieces for each, is_chosen in enumerate(chosen)], bool)
     if alone.any():
-        looked_up(regions.labels, np.concatenate([[0], alone * np.uint8(255)]).astype(np.uint8), cores)
+        shown = np.zeros(256, np.uint8)
+        shown[1 : len(alone) + 1] = alone * np.uint8(255)
+        cv2.LUT(regions.labels, shown, dst=cores)
         held = np.zeros(count, bool)
         for region in np.flatnonzero(alone):
             x, y, wide, high = regions.boxes[region]

@@ -3,7 +3,6 @@
 import threading
 
 import numpy as np
-from numpy.typing import DTypeLike
 
 from sorvolo.geometry.arrays import Anything
 
@@ -18,26 +17,25 @@ class Scratch(threading.local):
 
     def __init__(self) -> None:
         self._size: tuple[int, int] = (0, 0)
-        self._kept: dict[tuple[str, tuple[int, ...], str], Anything] = {}
+        self._kept: dict[tuple[str, tuple[int, ...]], Anything] = {}
 
     def take(
-        self, name: str, size: tuple[int, int], bands: tuple[int, ...] = (), dtype: DTypeLike = np.uint8,
-        margin_px: int = 0,
+        self, name: str, size: tuple[int, int], bands: tuple[int, ...] = (), margin_px: int = 0
     ) -> Anything:
-        """The array `name` for pictures of `size` (h, w), grown by a margin on each side; with `bands` (h, w, ...)."""
-        return self._taken(name, size, (size[0] + 2 * margin_px, size[1] + 2 * margin_px, *bands), dtype)
+        """The uint8 array `name` for pictures of `size` (h, w), grown by a margin; with `bands` (h, w, ...)."""
+        return self._taken(name, size, (size[0] + 2 * margin_px, size[1] + 2 * margin_px, *bands))
 
     def stack(self, name: str, size: tuple[int, int], planes: int) -> Anything:
         """The uint8 array `name` of shape (planes, h, w), holding anything."""
-        return self._taken(name, size, (planes, *size), np.uint8)
+        return self._taken(name, size, (planes, *size))
 
-    def _taken(self, name: str, size: tuple[int, int], shape: tuple[int, ...], dtype: DTypeLike) -> Anything:
+    def _taken(self, name: str, size: tuple[int, int], shape: tuple[int, ...]) -> Anything:
         if size[0] * size[1] > MOST_KEPT_PX:
-            return np.empty(shape, dtype)
+            return np.empty(shape, np.uint8)
         if size != self._size:
             self._kept.clear()
             self._size = size
-        key = name, shape, np.dtype(dtype).char
+        key = name, shape
         if key not in self._kept:
-            self._kept[key] = np.empty(shape, dtype)
+            self._kept[key] = np.empty(shape, np.uint8)
         return self._kept[key]

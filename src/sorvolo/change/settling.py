@@ -8,12 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.radiometry import middle
 from sorvolo.geometry.arrays import Anything, Mask, Matrix3
+from sorvolo.kernels import fit_moves, flow_on_grid
 
 LARGEST_PX = 6.0  # at the pictures' corners, in their own pixels; what says more has lost its way
 SMALLEST_PX = 0.12  # a resampling costs more than this is worth
 GRID = (28, 16)
+RIDGE = 1e-4 * np.array([0, 0.01, 0.01, 0, 0.01, 0.01, 1, 1])  # parts of the size: bends are small, or seen
 LEAST_FLOW_PX = 32  # OpenCV's flow crashes on pictures that are wide and less high than four of its patches
 
 _LOG = np.clip(np.rint(np.log2((np.arange(256) + 8) / 8) * 50), 0, 255).astype(np.uint8)
@@ -42,9 +43,8 @@ def settle(reference: NDArray[np.uint8], query: NDArray[np.uint8], known: Mask |
         return Settling(np.eye(3), 0.0, 0.0)
     start: Any = None
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(details[1], details[0], start)
-    flow_px = cv2.resize(flow, GRID, interpolation=cv2.INTER_AREA).reshape(-1, 2) * scale
-    strength = np.abs(details[1].astype(np.float32) - 128)
-    texture = cv2.resize(strength, GRID, interpolation=cv2.INTER_AREA).ravel()
+    grid = flow_on_grid(np.asarray(flow, np.float32), details[1], *GRID[::-1]).reshape(-1, 3)
+    flow_px, texture = grid[:, :2] * scale, grid[:, 2]
     trust = np.clip(texture.astype(np.float64) / 8, 0.05, 1)
     if known is not None:
         trust *= cv2.resize(known.astype(np.float32), GRID, interpolation=cv2.INTER_AREA).ravel() > 0.99
@@ -78,22 +78,9 @@ def _near_homography(
 ) -> tuple[Matrix3, float]:
     """Homography in pixels, to first order, from displacements of the grid (as parts of the size); median rest, px."""
     rows_x, rows_y = _rows()
-    weights = trust.copy()
-    solution = np.zeros(8)
-    rest_px = np.zeros(len(trust))
-    trusted = trust > 0
-    for _ in range(4):
-        weighted_x, weighted_y = (rows_x * weights[:, None]).T, (rows_y * weights[:, None]).T
-        normal = weighted_x @ rows_x + weighted_y @ rows_y
-        right = weighted_x @ moves[:, 0] + weighted_y @ moves[:, 1]
-        solution = np.linalg.solve(normal + 1e-4 * weights.sum() * np.diag([0, 0.01, 0.01, 0, 0.01, 0.01, 1, 1]), right)
-        rest = moves - np.column_stack([rows_x @ solution, rows_y @ solution])
-        rest_px = np.hypot(rest[:, 0] * size_px[0], rest[:, 1] * size_px[1])
-        scale = max(1.5 * float(middle(rest_px[trusted])), 0.05)
-        weights = trust / (1 + (rest_px / scale) ** 2)
-    a = solution
+    a, rest_px = fit_moves(rows_x, rows_y, moves, trust, RIDGE, *size_px)
     near = np.array([[1 + a[1], a[2], a[0]], [a[4], 1 + a[5], a[3]], [-a[6], -a[7], 1.0]])
     parts_from_px = np.array([[1 / size_px[0], 0, 0.5 / size_px[0] - 0.5], [0, 1 / size_px[1], 0.5 / size_px[1] - 0.5],
                               [0, 0, 1.0]])
     matrix = np.linalg.inv(parts_from_px) @ near @ parts_from_px
-    return np.asarray(matrix / matrix[2, 2]), float(middle(rest_px[trusted]))
+    return np.asarray(matrix / matrix[2, 2]), rest_px

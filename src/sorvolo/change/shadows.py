@@ -1,11 +1,13 @@
 """Things told from the shadows they throw: a shadow is part of what changed, but not where the thing is."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from sorvolo.change.kinds import kind_of
+from sorvolo.change.kinds import kind_of, unlike_ground
 from sorvolo.change.outlines import measures, outline_of
 from sorvolo.geometry.arrays import Anything, ImageRGB, Mask
 from sorvolo.survey.findings import Change, ChangeKind, Patch
@@ -19,6 +21,13 @@ _TOLERANCE_PX = 0.7
 _APART_M = 0.5  # things so far from each other are two ...
 _LEAST_THING_M2 = 0.06  # ... if each is as large as a football at least ...
 _COMPACT, _CAR_M = 0.8, (1.2, 6.0)  # ... and both together do not fill what may be one dark car with bright parts
+_CAR_WIDTH_M, _BRIGHT = 2.7, 0.5  # at most; share of a dark car that its bright parts are at most
+_SLIVER_M, _LEAST_CONTRARY_M2, _MOSTLY = 0.15, 0.15, 0.5  # what came beside what left: its width, size, and share ...
+_LEAST_HALF_M = 0.12  # ... how far its middle lies from its rim: a painted line is narrower ...
+_SOLID, _MOST_SHARED = 0.45, 0.05  # ... how much of its hull it fills, and of the smaller hull the other's shares
+_CLEARLY, _SHADE = 0.8, 0.7  # of the light: darker is a shadow's core; and so much of a piece of shade is
+_SPECK_M2, _SPECK_SCORE = 0.2, 0.6  # smaller and less sure it is taken for one
+_COARSE_M = 0.05  # a pixel: finer shows no more of what came and what left
 _CONTRARY = {ChangeKind.APPEARED: ChangeKind.DISAPPEARED, ChangeKind.DISAPPEARED: ChangeKind.APPEARED}
 
 
@@ -39,6 +48,26 @@ def without_shadow(change: Change) -> Change:
     return replace(change, outline_m=outline_m, area_m2=size.area_m2, length_m=size.length_m)
 
 
+def is_speck_of_shade(change: Change) -> bool:
+    """Whether a change is so small, dark and unsure that it is a piece of a shadow rather than a thing.
+
+    Most of it is ground that grew darker, or brighter, all colours alike: where a shadow of something that stays
+    came, or left.
+    """
+    if change.area_m2 >= _SPECK_M2 or change.score >= _SPECK_SCORE:
+        return False
+    return any(_is_part(change.patch.changed, each) for each in _shades(change.patch))
+
+
+def _shades(patch: Patch) -> tuple[Mask, Mask]:
+    """Where (h, w) what changed is clearly darker on the later date, all colours alike, and where on the earlier."""
+    before, after, known = _in_one_light(patch)
+    inside = known & patch.changed
+    ratios = after / before, before / after
+    came, left = (_is_dark(each) & (each.max(axis=-1) < _CLEARLY) & inside for each in ratios)
+    return came, left
+
+
 def thing_of(changed: Mask, shadow: Mask) -> Mask:
     """The part of the change that is the thing, not its shadow; `changed` itself where hardly anything would stay."""
     lit = changed & ~shadow
@@ -56,21 +85,28 @@ def things_of(patch: Patch, kind: ChangeKind, changed: Mask) -> list[tuple[Mask,
     """The things in a change, each with its own kind and the part of `changed` that lies nearest to it, the largest
     first; the shadow of what came does not go to what left.
 
-    They are told apart by the ground or the shadow between them; `changed` alone where it is but one thing. A dark car
-    has bright parts far from each other: what fills a rectangle of about its size stays whole.
+    They are told apart by the ground or the shadow between them, what left from what came also where they touch;
+    `changed` alone where it is but one thing. A dark car has bright parts far from each other: what fills a rectangle
+    of about its size stays whole, unless something left beside what came.
     """
     shadow = changed & _shadow(patch, kind)
     lit = (changed & ~shadow).view(np.uint8)
     lit = np.asarray(cv2.morphologyEx(lit, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), np.uint8)
-    reach = 2 * round(_APART_M / 2 / patch.m_per_px) + 1
-    padded = cv2.copyMakeBorder(lit, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0)
-    joined = cv2.dilate(padded, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
-    count, labels = cv2.connectedComponents(joined[reach:-reach, reach:-reach], connectivity=8)
-    areas_m2 = np.bincount(labels[lit > 0], minlength=count) * patch.m_per_px**2
+    left, came = _contraries(patch, changed)
+    lit |= (left | came).view(np.uint8)
+    shadow &= ~left
+    of_left = np.where(came, 0, _joined(left, patch.m_per_px))
+    labels = _joined((lit > 0) & (of_left == 0), patch.m_per_px)
+    labels = np.where(of_left > 0, labels.max() + of_left, labels)
+    areas_m2 = np.bincount(labels[lit > 0]) * patch.m_per_px**2
     large = [label for label in np.argsort(-areas_m2) if areas_m2[label] >= max(_LEAST_THING_M2, 1e-9)]
-    if len(large) < 2 or _may_be_a_car(changed, patch.m_per_px):
+    if len(large) < 2 or (not left.any() and _may_be_a_car(changed, patch.m_per_px)):
         return [(changed, kind)]
     things = [(labels == each) & (lit > 0) for each in large]
+    if not left.any():
+        things = _with_cars_whole(things, changed, patch.m_per_px)
+    if len(things) < 2:
+        return [(changed, kind)]
     distances = [cv2.distanceTransform((~each).view(np.uint8), cv2.DIST_L2, 5) for each in things]
     contrary = _CONTRARY.get(kind)
     kinds = [kind_of(replace(patch, changed=_hull(each) & changed)) for each in things]
@@ -84,6 +120,72 @@ def _hull(mask: Anything) -> Mask:
     hull = np.zeros(mask.shape, np.uint8)
     cv2.fillConvexPoly(hull, cv2.convexHull(cv2.findNonZero(mask.view(np.uint8))), (1,))
     return hull.view(bool)
+
+
+def _joined(mask: Mask, m_per_px: float) -> NDArray[np.int32]:
+    """The number from 1 on of the thing that each pixel of a mask (h, w) belongs to, and those near it; else 0."""
+    reach = 2 * round(_APART_M / 2 / m_per_px) + 1
+    padded = cv2.copyMakeBorder(mask.view(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0)
+    joined = cv2.dilate(padded, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+    return np.asarray(cv2.connectedComponents(joined[reach:-reach, reach:-reach], connectivity=8)[1], np.int32)
+
+
+def _contraries(patch: Patch, changed: Mask) -> tuple[Mask, Mask]:
+    """What left and what came beside it (h, w), part of what `changed`; both empty where not both happened.
+
+    What only the earlier picture tells from the ground around left, what only the later one does came; each must be
+    most of what its picture shows, for a thing that took another's place is no neighbour of it.
+    """
+    nothing = np.zeros_like(changed)
+    if np.count_nonzero(changed) * patch.m_per_px**2 < 2 * _LEAST_CONTRARY_M2:
+        return nothing, nothing
+    size = tuple(max(1, round(side * min(1.0, patch.m_per_px / _COARSE_M))) for side in changed.shape[::-1])
+    before, after, small = (
+        np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_AREA), np.uint8)
+        for each in (patch.before, patch.after, changed.view(np.uint8) * np.uint8(255))
+    )
+    m_per_px = patch.m_per_px * changed.shape[1] / size[0]
+    was_there, is_there = ((small > 127) & unlike_ground(each, small > 127) for each in (before, after))
+    side = max(3, round(_SLIVER_M / m_per_px) | 1)
+    left, came = (
+        cv2.morphologyEx((own & ~other).view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
+        for own, other in ((was_there, is_there), (is_there, was_there))
+    )
+    is_both = all(
+        np.count_nonzero(own) * m_per_px**2 >= _LEAST_CONTRARY_M2
+        and cv2.distanceTransform(own.view(np.uint8), cv2.DIST_L2, 3).max() * m_per_px > _LEAST_HALF_M
+        and np.count_nonzero(own) >= _MOSTLY * np.count_nonzero(whole)
+        for own, whole in ((left, was_there), (came, is_there))
+    )
+    if is_both:
+        hulls = _hull(left), _hull(came)
+        sizes = [np.count_nonzero(each) for each in hulls]
+        is_solid = all(np.count_nonzero(own) >= _SOLID * size for own, size in zip((left, came), sizes, strict=True))
+        if is_solid and np.count_nonzero(hulls[0] & hulls[1]) <= _MOST_SHARED * min(sizes):
+            left, came = (changed & (cv2.resize(each.view(np.uint8), changed.shape[::-1]) > 0) for each in (left, came))
+            # the shadow of something that stays leaves one side and comes on another
+            new_shade, old_shade = _shades(patch)
+            if not (_is_part(left, old_shade) and _is_part(came, new_shade)):
+                return left, came & ~left
+    return nothing, nothing
+
+
+def _is_part(mask: Mask, other: Mask) -> bool:
+    return bool(np.count_nonzero(mask & other) >= _SHADE * np.count_nonzero(mask))
+
+
+def _with_cars_whole(things: list[Mask], changed: Mask, m_per_px: float) -> list[Mask]:
+    """The things, the largest first; bright ends of one dark car, with change all between them, are made one."""
+    things = list(things)
+    for first, second in combinations(range(len(things)), 2):
+        both = things[first] | things[second]
+        hull = _hull(both)
+        wide_m = min(float(each) for each in cv2.minAreaRect(cv2.findNonZero(both.view(np.uint8)))[1]) * m_per_px
+        is_dark = np.count_nonzero(both) < _BRIGHT * np.count_nonzero(hull)
+        if is_dark and wide_m <= _CAR_WIDTH_M and _may_be_a_car(hull & changed, m_per_px):
+            things[first], things[second] = np.zeros_like(both), both
+    kept = [each for each in things if each.any()]
+    return sorted(kept, key=lambda each: -np.count_nonzero(each))
 
 
 def _may_be_a_car(changed: Mask, m_per_px: float) -> bool:
@@ -103,15 +205,21 @@ def shadow_of_arrival(before: ImageRGB, after: ImageRGB, changed: Mask) -> Mask:
 
 def _shadow(patch: Patch, kind: ChangeKind) -> Mask:
     """Where the change is dark as a shadow is: on the later date where something came, on the earlier where it went."""
+    before, after, known = _in_one_light(patch)
+    nothing = np.zeros(patch.changed.shape, bool)
+    came = _is_dark(after / before) if kind is not ChangeKind.DISAPPEARED else nothing
+    went = _is_dark(before / after) if kind in (ChangeKind.DISAPPEARED, ChangeKind.REPLACED) else nothing
+    return (came | went) & known
+
+
+def _in_one_light(patch: Patch) -> tuple[Anything, Anything, Mask]:
+    """Both pictures (h, w, 3), the earlier in the later one's light around the change, and where both show ground."""
     known = (patch.before[..., 3] == 255) & (patch.after[..., 3] == 255)
     around = known & ~patch.changed
     before, after = (each[..., :3].astype(np.float32) + 8 for each in (patch.before, patch.after))
     if np.count_nonzero(around) >= _LEAST_PX:
         before = before * np.median(after[around] / before[around], axis=0)
-    nothing = np.zeros(patch.changed.shape, bool)
-    came = _is_dark(after / before) if kind is not ChangeKind.DISAPPEARED else nothing
-    went = _is_dark(before / after) if kind in (ChangeKind.DISAPPEARED, ChangeKind.REPLACED) else nothing
-    return (came | went) & known
+    return before, after, known
 
 
 def _is_dark(ratio: Anything) -> Mask:

@@ -1,7 +1,8 @@
 """The few loops that must be fast; numbers in, numbers out. This module is the only door.
 
 Each kernel exists twice with one signature: compiled in `_native`, and in NumPy in `reference`, which says what it
-computes. Both give the same numbers. Where nothing was compiled the slow ones are used, with one warning.
+computes. Both give the same numbers, sums of real numbers but for their rounding. Where nothing was compiled the slow
+ones are used, with one warning.
 """
 
 import warnings
@@ -11,7 +12,7 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.kernels import reference, reference_robust
+from sorvolo.kernels import reference, reference_light, reference_robust
 
 _native: ModuleType | None
 try:
@@ -103,19 +104,29 @@ _robust = reference_robust if _native is None else _native
 
 
 def relight(
-    image: NDArray[np.uint8], curves: NDArray[np.int32], gains: NDArray[np.uint16], out: NDArray[np.uint8] | None = None
+    image: NDArray[np.uint8], curves: NDArray[np.int32], gains: NDArray[np.float32],
+    parts: Sequence[tuple[slice, slice]] | None = None, out: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.uint8]:
-    """A picture (h, w, 3) through curves (3, 256) and times gains (h, w, 3): see reference_robust.
+    """A picture (h, w, 3) through curves (3, 256) and times lines of gains (H, w, 3) over it: see reference_robust.
 
-    `out` (h, w, 3) is written over where it is given, and returned.
+    Only `parts` of it, rows and columns from a start to a stop, are filled where they are given. `out` (h, w, 3) is
+    written over where it is given, and returned.
     """
-    if image.shape != gains.shape or image.ndim != 3 or image.shape[2] != 3 or curves.shape != (3, 256):
-        raise ValueError(f"relight: image {image.shape}, gains {gains.shape}, curves {curves.shape} do not fit")
+    if image.ndim != 3 or image.shape[2] != 3 or curves.shape != (3, 256):
+        raise ValueError(f"relight: image {image.shape} and curves {curves.shape} do not fit")
+    height, width = image.shape[:2]
+    if gains.shape != (len(gains), width, 3) or len(gains) == 0:
+        raise ValueError(f"relight: gains are lines (H, {width}, 3), got {gains.shape}")
     out = _target(out, image.shape)
-    _robust.relight(
-        np.ascontiguousarray(image, np.uint8), np.ascontiguousarray(curves, np.int32),
-        np.ascontiguousarray(gains, np.uint16), out,
-    )
+    image, curves = np.ascontiguousarray(image, np.uint8), np.ascontiguousarray(curves, np.int32)
+    gains = np.ascontiguousarray(gains, np.float32)
+    whole = [(slice(0, height), slice(0, width))]
+    for rows, columns in whole if parts is None else parts:
+        if not (0 <= rows.start <= rows.stop <= height and 0 <= columns.start <= columns.stop <= width):
+            raise ValueError(f"relight: part {rows}, {columns} lies outside of the {width} x {height} px picture")
+        _robust.relight(
+            image, curves, gains, columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start, out
+        )
     return out
 
 
@@ -159,6 +170,21 @@ def differences(
     return out
 
 
+def darker_alike(
+    lighter: NDArray[np.uint8], darker: NDArray[np.uint8], part: tuple[slice, slice], apart: int
+) -> NDArray[np.bool_]:
+    """Where in a part of two pictures (h, w, 3) one is darker in all colours alike: see reference_robust."""
+    (height, width), (rows, columns) = lighter.shape[:2], part
+    if lighter.shape != (height, width, 3) or darker.shape != lighter.shape:
+        raise ValueError(f"darker_alike: pictures {lighter.shape} and {darker.shape} do not fit")
+    if not (0 <= rows.start <= rows.stop - 2 < height - 1 and 0 <= columns.start <= columns.stop - 2 < width - 1):
+        raise ValueError(f"darker_alike: part {rows}, {columns} does not fit the {width} x {height} px picture")
+    high, wide = rows.stop - rows.start, columns.stop - columns.start
+    out = np.empty((high, wide), np.uint8)
+    _robust.darker_alike(_bytes(lighter), _bytes(darker), columns.start, rows.start, wide, high, apart, out)
+    return out.view(np.bool_)
+
+
 def tint(
     before: NDArray[np.uint8], after: NDArray[np.uint8], logs: NDArray[np.uint8], boxes: NDArray[np.int32], margin: int,
     out: NDArray[np.uint8] | None = None,
@@ -179,15 +205,16 @@ def tint(
 
 
 def rim_balance(
-    labels: NDArray[np.int32], boxes: NDArray[np.int32], came: NDArray[np.uint8], went: NDArray[np.uint8]
+    labels: NDArray[np.uint8], boxes: NDArray[np.int32], came: NDArray[np.uint8], went: NDArray[np.uint8]
 ) -> NDArray[np.int64]:
     """By how much `came` exceeds `went` along the rims of regions, (N,): see reference_robust."""
     boxes = np.ascontiguousarray(boxes, np.int32).reshape(-1, 4)
     _check_boxes("rim_balance", boxes, labels.shape)
     if not labels.shape == came.shape == went.shape or labels.ndim != 2:
         raise ValueError(f"rim_balance: labels {labels.shape}, came {came.shape}, went {went.shape} do not fit")
+    _check_labels("rim_balance", labels, len(boxes))
     balance: NDArray[np.int64] = _robust.rim_balance(
-        np.ascontiguousarray(labels, np.int32), boxes, np.ascontiguousarray(came, np.uint8),
+        np.ascontiguousarray(labels, np.uint8), boxes, np.ascontiguousarray(came, np.uint8),
         np.ascontiguousarray(went, np.uint8),
     )
     return balance
@@ -195,11 +222,13 @@ def rim_balance(
 
 def core_regions(
     values: NDArray[np.uint8], thresholds: NDArray[np.uint8], strong: float, core: float, least_area: int, most: int
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
     """Where values lie over thresholds, both (h, w), each part cut to its core: see reference_robust."""
+    if not 0 <= most <= 255:
+        raise ValueError(f"core_regions: a byte holds the labels of 0 .. 255 regions, not of {most}")
     if values.shape != thresholds.shape or values.ndim != 2:
         raise ValueError(f"core_regions: values {values.shape} and thresholds {thresholds.shape} do not fit")
-    found: tuple[NDArray[np.int32], NDArray[np.int32]] = _robust.core_regions(
+    found: tuple[NDArray[np.uint8], NDArray[np.int32]] = _robust.core_regions(
         np.ascontiguousarray(values, np.uint8), np.ascontiguousarray(thresholds, np.uint8), strong, core,
         least_area, most,
     )
@@ -216,14 +245,15 @@ def held_parts(mask: Bytes, seeds: Bytes) -> Bytes:
 
 
 def measure_regions(
-    labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: Sequence[NDArray[np.uint8]], margin: int
+    labels: NDArray[np.uint8], boxes: NDArray[np.int32], channels: Sequence[NDArray[np.uint8]], margin: int
 ) -> NDArray[np.int64]:
     """Sums over regions and over what is around them, (N, 2, 2 C + 1): see reference_robust."""
     shapes = {each.shape for each in channels}
     if shapes != {labels.shape} or labels.ndim != 2:
         raise ValueError(f"measure_regions: labels {labels.shape} and channels {shapes} do not fit")
+    _check_labels("measure_regions", labels, len(boxes))
     sums: NDArray[np.int64] = _robust.measure_regions(
-        np.ascontiguousarray(labels, np.int32), np.ascontiguousarray(boxes, np.int32).reshape(-1, 4),
+        np.ascontiguousarray(labels, np.uint8), np.ascontiguousarray(boxes, np.int32).reshape(-1, 4),
         [np.ascontiguousarray(each, np.uint8) for each in channels], margin,
     )
     return sums
@@ -244,12 +274,79 @@ def match_regions(
     return found
 
 
+_light = reference_light if _native is None else _native
+
+
+def slopes(before: NDArray[np.float32], after: NDArray[np.float32], prior: float) -> NDArray[np.float64]:
+    """By how much one of two (N, C), N > 0, is spread wider than the other, (C,): see reference_light."""
+    if before.shape != after.shape or before.ndim != 2 or len(before) == 0:
+        raise ValueError(f"slopes: before {before.shape} and after {after.shape} do not fit")
+    if not (np.isfinite(before).all() and np.isfinite(after).all()):
+        raise ValueError("slopes: before and after must be finite")
+    found: NDArray[np.float64] = _light.slopes(
+        np.ascontiguousarray(before, np.float32), np.ascontiguousarray(after, np.float32), prior
+    )
+    return found
+
+
+def fit_moves(
+    rows_x: NDArray[np.float64], rows_y: NDArray[np.float64], moves: NDArray[np.float64], trust: NDArray[np.float64],
+    ridge: NDArray[np.float64], wide: float, high: float,
+) -> tuple[NDArray[np.float64], float]:
+    """A robust linear fit (8,) of displacements (N, 2), and its median rest: see reference_light."""
+    count = len(trust)
+    if not rows_x.shape == rows_y.shape == (count, 8) or moves.shape != (count, 2) or ridge.shape != (8,):
+        raise ValueError(f"fit_moves: rows {rows_x.shape}, {rows_y.shape} and moves {moves.shape} do not fit")
+    if not ((trust >= 0).all() and (trust > 0).any() and (ridge >= 0).all()):
+        raise ValueError("fit_moves: trust is 0 or more and somewhere more, a ridge 0 or more")
+    if not (np.isfinite(rows_x).all() and np.isfinite(rows_y).all() and np.isfinite(moves).all()):
+        raise ValueError("fit_moves: rows and moves must be finite")
+    x, y, moved, trusted, damping = (
+        np.ascontiguousarray(each, np.float64) for each in (rows_x, rows_y, moves, trust, ridge)
+    )
+    found: tuple[NDArray[np.float64], float] = _light.fit_moves(x, y, moved, trusted, damping, wide, high)
+    return found
+
+
+def detail_products(
+    before: Bytes, after: Bytes, table: NDArray[np.float32], window: int, cell: int
+) -> NDArray[np.float32]:
+    """What the details of two pictures (h, w) have in common in cells, (3, h / cell, w / cell): see reference_light."""
+    if before.shape != after.shape or before.ndim != 2 or table.shape != (256,):
+        raise ValueError(f"detail_products: pictures {before.shape}, {after.shape}, table {table.shape} do not fit")
+    if not (window % 2 == 1 and 1 <= window <= min(before.shape) and 1 <= cell <= min(before.shape)):
+        raise ValueError(f"detail_products: window {window}, cell {cell} do not fit pictures {before.shape}")
+    found: NDArray[np.float32] = _light.detail_products(
+        _bytes(before), _bytes(after), np.ascontiguousarray(table, np.float32), window, cell
+    )
+    return found
+
+
+def flow_on_grid(
+    flow: NDArray[np.float32], details: NDArray[np.uint8], rows: int, columns: int
+) -> NDArray[np.float32]:
+    """A flow (h, w, 2) and how strong details (h, w) are, on a grid (rows, columns, 3): see reference_light."""
+    if details.ndim != 2 or flow.shape != (*details.shape, 2):
+        raise ValueError(f"flow_on_grid: flow {flow.shape} and details {details.shape} do not fit")
+    if not (1 <= rows <= details.shape[0] and 1 <= columns <= details.shape[1]):
+        raise ValueError(f"flow_on_grid: a grid of {rows} x {columns} does not fit details {details.shape}")
+    found: NDArray[np.float32] = _light.flow_on_grid(
+        np.ascontiguousarray(flow, np.float32), _bytes(details), rows, columns
+    )
+    return found
+
+
 def _target(out: NDArray[np.uint8] | None, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     if out is None:
         return np.empty(shape, np.uint8)
     if out.shape != shape or out.dtype != np.uint8 or not (out.flags.c_contiguous and out.flags.writeable):
         raise ValueError(f"out: found {out.dtype} of shape {out.shape}; give writeable uint8 in C order, {shape}")
     return out
+
+
+def _check_labels(kernel: str, labels: NDArray[np.uint8], count: int) -> None:
+    if labels.dtype != np.uint8 or count > 255:
+        raise ValueError(f"{kernel}: labels are bytes of at most 255 regions, got {labels.dtype} and {count} regions")
 
 
 def _check_boxes(name: str, boxes: NDArray[np.int32], shape: tuple[int, ...]) -> None:

@@ -462,4 +462,5 @@ PYBIND11_MODULE(_native, module) {
     bind_regions(module);
     bind_robust(module);
     bind_differences(module);
+    bind_light(module);
 }

@@ -120,5 +120,6 @@ SORVOLO_INLINE void padded(const Sum *row, int before, int after, int columns, S
 void bind_regions(pybind11::module_ &module);
 void bind_robust(pybind11::module_ &module);
 void bind_differences(pybind11::module_ &module);
+void bind_light(pybind11::module_ &module);
 
 }  // namespace sorvolo

@@ -16,38 +16,51 @@ namespace sorvolo {
 namespace {
 
 using Integers32 = pybind11::array_t<std::int32_t, pybind11::array::c_style>;
-using Words = pybind11::array_t<std::uint16_t, pybind11::array::c_style>;
 using Doubles = pybind11::array_t<double, pybind11::array::c_style>;
 
 constexpr std::ptrdiff_t RUN = 3 * 512;
+constexpr float TO_WHOLE = 12582912.0f;  // 1.5 * 2**23: added and taken off again, it rounds to the nearest even
 
-// A run at a time: tables are read value by value, the rest is done for many values at once.
+// A run at a time: tables are read value by value, the rest is done for many values at once. Gains lie between two rows.
 SORVOLO_CLONES
-void relight_values(const std::uint8_t *from, const std::uint16_t *curves, const std::uint16_t *gains, std::uint8_t *to,
-                    std::ptrdiff_t values) {
+void relight_values(const std::uint8_t *from, const std::uint16_t *curves, const float *above, const float *below,
+                    float share, std::uint8_t *to, std::ptrdiff_t values) {
     std::uint16_t lifted[RUN];
-    for (; values > 0; values -= RUN, from += RUN, gains += RUN, to += RUN) {
+    const float rest = 1.0f - share;
+    for (; values > 0; values -= RUN, from += RUN, above += RUN, below += RUN, to += RUN) {
         const std::ptrdiff_t count = std::min(values, RUN);
         for (std::ptrdiff_t at = 0; at < count; at += 3)
             for (int channel = 0; channel < 3; ++channel)
                 lifted[at + channel] = curves[channel * 256 + from[at + channel]];
         SORVOLO_INDEPENDENT
         for (std::ptrdiff_t at = 0; at < count; ++at) {
-            const std::int32_t product = static_cast<std::int32_t>(lifted[at]) * gains[at];
+            const float gain = (above[at] * rest + below[at] * share + TO_WHOLE) - TO_WHOLE;
+            const std::int32_t product = static_cast<std::int32_t>(lifted[at]) * static_cast<std::int32_t>(gain);
             to[at] = static_cast<std::uint8_t>(std::clamp(((product + (1 << 15)) >> 16) - 8, 0, 255));
         }
     }
 }
 
-void relight(const Bytes &image, const Integers32 &curves, const Words &gains, Bytes &lit) {
+void relight(const Bytes &image, const Integers32 &curves, const Floats32 &gains, std::ptrdiff_t left,
+             std::ptrdiff_t top, std::ptrdiff_t wide, std::ptrdiff_t high, Bytes &lit) {
+    const std::ptrdiff_t height = image.shape(0), width = image.shape(1), lines = gains.shape(0);
     const std::uint8_t *from = image.data();
-    const std::uint16_t *gain = gains.data();
+    const float *gain = gains.data();
     std::uint8_t *to = lit.mutable_data();
     std::uint16_t curve[3 * 256];
     std::copy(curves.data(), curves.data() + 3 * 256, curve);
-    const std::ptrdiff_t values = image.shape(0) * image.shape(1) * 3;
     pybind11::gil_scoped_release released;
-    relight_values(from, curve, gain, to, values);
+    const double scale = static_cast<double>(lines) / static_cast<double>(height);
+    for (std::ptrdiff_t y = top; y < top + high; ++y) {
+        const float place = static_cast<float>((static_cast<double>(y) + 0.5) * scale - 0.5);
+        const float line = std::floor(place);
+        const std::ptrdiff_t above = static_cast<std::ptrdiff_t>(line);
+        const auto row = [&](std::ptrdiff_t number) {
+            return gain + 3 * (std::clamp<std::ptrdiff_t>(number, 0, lines - 1) * width + left);
+        };
+        const std::ptrdiff_t at = 3 * (y * width + left);
+        relight_values(from + at, curve, row(above), row(above + 1), place - line, to + at, 3 * wide);
+    }
 }
 
 // How much redder than blue the query is against the reference, in quarter steps of `logs`, rounded to even, 128 alike.
@@ -78,8 +91,8 @@ void tint(const Bytes &reference, const Bytes &query, const Bytes &logs, const I
 
 // Along a region's rim, two pixels wide: the sum of `came` less that of `went`. `box` is the region's.
 SORVOLO_CLONES
-std::int64_t balance_of(const std::int32_t *label, const std::uint8_t *came, const std::uint8_t *went,
-                        std::ptrdiff_t width, std::ptrdiff_t height, const std::int32_t *box, std::int32_t number,
+std::int64_t balance_of(const std::uint8_t *label, const std::uint8_t *came, const std::uint8_t *went,
+                        std::ptrdiff_t width, std::ptrdiff_t height, const std::int32_t *box, std::uint8_t number,
                         std::vector<std::uint8_t> &work) {
     const std::ptrdiff_t left = box[0], top = box[1], wide = box[2], bottom = top + box[3];
     const std::ptrdiff_t first = std::max<std::ptrdiff_t>(top - 2, 0), last = std::min(bottom + 2, height);
@@ -87,7 +100,7 @@ std::int64_t balance_of(const std::int32_t *label, const std::uint8_t *came, con
     std::uint8_t *near = work.data(), *none = near + (last - first) * wide, *rim = none + wide + 4;
     const std::ptrdiff_t from = std::max<std::ptrdiff_t>(left - 2, 0), to = std::min(left + wide + 2, width);
     for (std::ptrdiff_t y = first; y < last; ++y) {
-        const std::int32_t *row = label + y * width;
+        const std::uint8_t *row = label + y * width;
         std::uint8_t *here = none - (left - 2);
         SORVOLO_INDEPENDENT
         for (std::ptrdiff_t x = from; x < to; ++x) here[x] = row[x] == 0;
@@ -115,16 +128,16 @@ std::int64_t balance_of(const std::int32_t *label, const std::uint8_t *came, con
     return sum;
 }
 
-Integers64 rim_balance(const Integers32 &labels, const Integers32 &boxes, const Bytes &came, const Bytes &went) {
+Integers64 rim_balance(const Bytes &labels, const Integers32 &boxes, const Bytes &came, const Bytes &went) {
     const std::ptrdiff_t height = labels.shape(0), width = labels.shape(1);
     Integers64 balance({boxes.shape(0)});
-    const std::int32_t *label = labels.data(), *box = boxes.data();
-    const std::uint8_t *plus = came.data(), *minus = went.data();
+    const std::int32_t *box = boxes.data();
+    const std::uint8_t *label = labels.data(), *plus = came.data(), *minus = went.data();
     std::int64_t *to = balance.mutable_data();
     pybind11::gil_scoped_release released;
     std::vector<std::uint8_t> work;
     for (pybind11::ssize_t region = 0; region < boxes.shape(0); ++region, box += 4)
-        to[region] = balance_of(label, plus, minus, width, height, box, static_cast<std::int32_t>(region) + 1, work);
+        to[region] = balance_of(label, plus, minus, width, height, box, static_cast<std::uint8_t>(region + 1), work);
     return balance;
 }
 
@@ -144,18 +157,26 @@ void mark_over(const std::uint8_t *value, const std::uint8_t *threshold, std::ui
     for (std::ptrdiff_t at = 0; at < pixels; ++at) to[at] = value[at] > threshold[at];
 }
 
+constexpr std::size_t MOST_KEPT = std::size_t{1} << 21;  // bytes of one working array
+
 // Pixels with an even margin of one all around: rows are `stride` long, the margin at the end of one is that at the
 // start of the next.
 struct Margined {
-    std::ptrdiff_t width, height, stride;
+    std::ptrdiff_t stride = 0;
     std::vector<std::uint8_t> pixels;
 
-    Margined(std::ptrdiff_t columns, std::ptrdiff_t rows)
-        : width(columns), height(rows), stride(columns + 1),
-          pixels(static_cast<std::size_t>((rows + 2) * stride + 1), 0) {}
+    void begin(std::ptrdiff_t columns, std::ptrdiff_t rows) {
+        stride = columns + 1;
+        pixels.assign(static_cast<std::size_t>((rows + 2) * stride + 1), 0);
+    }
     std::uint8_t *row(std::ptrdiff_t y) { return pixels.data() + (y + 1) * stride + 1; }
-    void take(const std::uint8_t *from) {
-        for (std::ptrdiff_t y = 0; y < height; ++y) std::memcpy(row(y), from + y * width, width);
+    void take(const std::uint8_t *from, std::ptrdiff_t columns, std::ptrdiff_t rows) {  // the margin holds anything
+        stride = columns + 1;
+        pixels.resize(static_cast<std::size_t>((rows + 2) * stride + 1));
+        for (std::ptrdiff_t y = 0; y < rows; ++y) std::memcpy(row(y), from + y * columns, columns);
+    }
+    void end() {  // what is large is given back
+        if (pixels.size() > MOST_KEPT) std::vector<std::uint8_t>().swap(pixels);
     }
 };
 
@@ -198,14 +219,16 @@ pybind11::tuple core_regions(const Bytes &values, const Bytes &thresholds, doubl
                              int most) {
     const std::ptrdiff_t height = values.shape(0), width = values.shape(1);
     const std::uint8_t *value_rows = values.data(), *threshold_rows = thresholds.data();
-    Integers32 labels({values.shape(0), values.shape(1)});
-    std::int32_t *label = labels.mutable_data();
+    Bytes labels({values.shape(0), values.shape(1)});
+    std::uint8_t *label = labels.mutable_data();
     std::vector<std::int32_t> found;
     {
         pybind11::gil_scoped_release released;
-        std::fill(label, label + width * height, 0);
-        Margined weak(width, height), inside(width, height), held(width, height), limits(width, height);
-        held.take(value_rows), limits.take(threshold_rows);
+        std::memset(label, 0, width * height);
+        // kept from call to call: asking the system for memory costs more than the search
+        thread_local Margined weak, inside, held, limits;
+        weak.begin(width, height), inside.begin(width, height);
+        held.take(value_rows, width, height), limits.take(threshold_rows, width, height);
         for (std::ptrdiff_t y = 0; y < height; ++y)
             mark_over(value_rows + y * width, threshold_rows + y * width, weak.row(y), width);
         const std::uint8_t *value = held.pixels.data(), *threshold = limits.pixels.data();
@@ -234,13 +257,14 @@ pybind11::tuple core_regions(const Bytes &values, const Bytes &thresholds, doubl
             std::ptrdiff_t left = width, right = 0, top = height, bottom = 0;
             for (const std::int32_t at : cores[each].pixels) {
                 const std::ptrdiff_t y = at / weak.stride - 1, x = at % weak.stride - 1;
-                label[y * width + x] = static_cast<std::int32_t>(each) + 1;
+                label[y * width + x] = static_cast<std::uint8_t>(each + 1);
                 left = std::min(left, x), right = std::max(right, x);
                 top = std::min(top, y), bottom = std::max(bottom, y);
             }
             for (const std::ptrdiff_t side : {left, top, right - left + 1, bottom - top + 1})
                 found.push_back(static_cast<std::int32_t>(side));
         }
+        weak.end(), inside.end(), held.end(), limits.end();
     }
     Integers32 boxes({static_cast<pybind11::ssize_t>(found.size() / 4), pybind11::ssize_t(4)});
     std::copy(found.begin(), found.end(), boxes.mutable_data());
@@ -250,16 +274,16 @@ pybind11::tuple core_regions(const Bytes &values, const Bytes &thresholds, doubl
 // Adds up one region's window, columns left .. right - 1: `to` are count, sums and sums of squares of each of the
 // `channels`, for the region and then for what is of no region. `masks` holds twice the picture's width.
 SORVOLO_CLONES
-void measure_region(const std::int32_t *label, const std::uint8_t *const *channels, std::ptrdiff_t count,
+void measure_region(const std::uint8_t *label, const std::uint8_t *const *channels, std::ptrdiff_t count,
                     std::ptrdiff_t width, std::ptrdiff_t left, std::ptrdiff_t right, std::ptrdiff_t top,
-                    std::ptrdiff_t bottom, std::int32_t number, std::uint8_t *masks, std::int64_t *to) {
+                    std::ptrdiff_t bottom, std::uint8_t number, std::uint8_t *masks, std::int64_t *to) {
     // whole sixteens of columns, those beside the window masked: nothing is left over to be summed one by one
     const std::ptrdiff_t wide = std::min((right - left + 15) / 16 * 16, width), begin = std::min(left, width - wide);
     std::uint8_t *mine = masks, *around = masks + wide;
     std::memset(masks, 0, 2 * wide);
     std::int64_t *to_around = to + 2 * count + 1;
     for (std::ptrdiff_t y = top; y < bottom; ++y) {
-        const std::int32_t *row = label + y * width + begin;
+        const std::uint8_t *row = label + y * width + begin;
         std::int32_t mine_count = 0, around_count = 0;
         SORVOLO_INDEPENDENT
         for (std::ptrdiff_t x = left - begin; x < right - begin; ++x) {
@@ -280,13 +304,14 @@ void measure_region(const std::int32_t *label, const std::uint8_t *const *channe
     }
 }
 
-Integers64 measure_regions(const Integers32 &labels, const Integers32 &boxes, const std::vector<Bytes> &channels,
+Integers64 measure_regions(const Bytes &labels, const Integers32 &boxes, const std::vector<Bytes> &channels,
                            int margin) {
     const int height = static_cast<int>(labels.shape(0)), width = static_cast<int>(labels.shape(1));
     const int count = static_cast<int>(channels.size()), fields = 2 * count + 1;
     const pybind11::ssize_t regions = boxes.shape(0);
     Integers64 sums({regions, pybind11::ssize_t(2), pybind11::ssize_t(fields)});
-    const std::int32_t *label = labels.data(), *box = boxes.data();
+    const std::int32_t *box = boxes.data();
+    const std::uint8_t *label = labels.data();
     std::vector<const std::uint8_t *> values;
     for (const Bytes &each : channels) values.push_back(each.data());
     std::int64_t *to = sums.mutable_data();
@@ -297,7 +322,7 @@ Integers64 measure_regions(const Integers32 &labels, const Integers32 &boxes, co
         const int left = std::max(box[0] - margin, 0), right = std::min(box[0] + box[2] + margin, width);
         const int top = std::max(box[1] - margin, 0), bottom = std::min(box[1] + box[3] + margin, height);
         measure_region(label, values.data(), count, width, left, right, top, bottom,
-                       static_cast<std::int32_t>(region) + 1, masks.data(), to);
+                       static_cast<std::uint8_t>(region + 1), masks.data(), to);
     }
     return sums;
 }
@@ -432,7 +457,7 @@ Doubles match_regions(const Bytes &query, const Bytes &reference, const Integers
 void bind_robust(pybind11::module_ &module) {
     using pybind11::arg;
     module.def("relight", &relight, arg("image").noconvert(), arg("curves").noconvert(), arg("gains").noconvert(),
-               arg("out").noconvert());
+               arg("left"), arg("top"), arg("wide"), arg("high"), arg("out").noconvert());
     module.def("looked_up", &looked_up, arg("labels").noconvert(), arg("table").noconvert(), arg("out").noconvert());
     module.def("tint", &tint, arg("reference").noconvert(), arg("query").noconvert(), arg("logs").noconvert(),
                arg("boxes").noconvert(), arg("margin"), arg("out").noconvert());

@@ -8,16 +8,24 @@ from scipy import ndimage
 
 
 def relight(
-    image: NDArray[np.uint8], curves: NDArray[np.int32], gains: NDArray[np.uint16], out: NDArray[np.uint8]
+    image: NDArray[np.uint8], curves: NDArray[np.int32], gains: NDArray[np.float32], left: int, top: int, wide: int,
+    high: int, out: NDArray[np.uint8],
 ) -> None:
-    """Fills `out` with `image` (h, w, 3) through `curves` (3, 256) and times `gains` (h, w, 3), 4096 one.
+    """Fills a part of `out` with `image` (h, w, 3) through `curves` (3, 256) and times `gains` (H, w, 3), 4096 one.
 
-    Curves give 16 a grey level, 8 levels up. The result is rounded, taken 8 levels down again and clipped to 0 .. 255.
-    Curves below 2**14 leave 32 bits enough.
+    The lines of gains are the middles of H stripes over the whole picture; between them gains are interpolated, and
+    rounded to whole numbers. Curves give 16 a grey level, 8 levels up. The result is rounded, taken 8 levels down again
+    and clipped to 0 .. 255. Curves below 2**14 and gains below 2**16 leave 32 bits enough.
     """
-    lifted = np.stack([curves[channel][image[..., channel]] for channel in range(3)], axis=-1)
-    product = lifted.astype(np.int64) * gains
-    out[:] = np.clip(((product + (1 << 15)) >> 16) - 8, 0, 255)
+    part = np.s_[top : top + high, left : left + wide]
+    lines, height = len(gains), image.shape[0]
+    place = ((np.arange(top, top + high) + 0.5) * (lines / height) - 0.5).astype(np.float32)
+    above = np.floor(place).astype(np.int64)
+    share = (place - above.astype(np.float32))[:, None, None]
+    one, other = (gains[each.clip(0, lines - 1), left : left + wide] for each in (above, above + 1))
+    fine = np.rint(one * (np.float32(1) - share) + other * share).astype(np.int64)
+    lifted = np.stack([curves[channel][image[part][..., channel]] for channel in range(3)], axis=-1)
+    out[part] = np.clip(((lifted.astype(np.int64) * fine + (1 << 15)) >> 16) - 8, 0, 255)
 
 
 def looked_up(labels: NDArray[np.int32], table: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
@@ -48,14 +56,18 @@ def differences(
 
 def _light_and_colour(image: NDArray[np.uint8]) -> NDArray[np.int64]:
     """BT.601 luma, red and blue difference of a picture blurred by 3 x 3 with a mirrored rim, rounded as in OpenCV."""
-    near = np.pad(image.astype(np.int64), ((1, 1), (1, 1), (0, 0)), mode="reflect")
-    height, width = image.shape[:2]
-    total = sum(near[y : y + height, x : x + width] for y in range(3) for x in range(3))
-    blue, green, red = np.moveaxis((np.asarray(total) + 4) // 9, 2, 0)
+    blue, green, red = np.moveaxis(_blurred(image), 2, 0)
     half = 1 << 13
     luma = (blue * 1868 + green * 9617 + red * 4899 + half) >> 14
     colours = ((red - luma) * 11682, (blue - luma) * 9241)
     return np.stack([luma, *(np.clip((each + (128 << 14) + half) >> 14, 0, 255) for each in colours)], axis=-1)
+
+
+def _blurred(image: NDArray[np.uint8]) -> NDArray[np.int64]:
+    near = np.pad(image.astype(np.int64), ((1, 1), (1, 1), (0, 0)), mode="reflect")
+    height, width = image.shape[:2]
+    total = sum(near[y : y + height, x : x + width] for y in range(3) for x in range(3))
+    return (np.asarray(total) + 4) // 9
 
 
 def _outside(
@@ -68,6 +80,22 @@ def _outside(
     luma, red, blue = np.moveaxis(np.maximum(np.maximum(values - most, least - values), 0), 2, 0)
     colour = np.minimum(red + blue, 255)
     return np.minimum(luma + weight * colour, 255), colour
+
+
+def darker_alike(
+    lighter: NDArray[np.uint8], darker: NDArray[np.uint8], left: int, top: int, wide: int, high: int, apart: int,
+    out: NDArray[np.uint8],
+) -> None:
+    """Fills `out` (high, wide) of a part of two pictures (h, w, 3): 1 where `darker` is so, all colours alike, else 0.
+
+    Both are blurred by 3 x 3 with the part's rim mirrored, and lifted by 8; by how many 128ths they are alike is below
+    128 in each colour, and less than `apart` from colour to colour.
+    """
+    part = np.s_[top : top + high, left : left + wide]
+    under, over = (np.minimum(_blurred(each[part]) + 8, 255).astype(np.float32) for each in (lighter, darker))
+    parts = np.minimum(np.rint(over * np.float32(128) / under), 255)
+    most, least = parts.max(axis=2), parts.min(axis=2)
+    out[:] = (most < 128) & (most - least < apart)
 
 
 def tint(
@@ -86,7 +114,7 @@ def tint(
 
 
 def rim_balance(
-    labels: NDArray[np.int32], boxes: NDArray[np.int32], came: NDArray[np.uint8], went: NDArray[np.uint8]
+    labels: NDArray[np.uint8], boxes: NDArray[np.int32], came: NDArray[np.uint8], went: NDArray[np.uint8]
 ) -> NDArray[np.int64]:
     """(N,) sums of `came` - `went` over the pixels of regions 1 .. N of `labels` (h, w) with a 0 within 2 px around."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(labels, 2, mode="edge"), (5, 5))
@@ -97,7 +125,7 @@ def rim_balance(
 
 def core_regions(
     values: NDArray[np.uint8], thresholds: NDArray[np.uint8], strong: float, core: float, least_area: int, most: int
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
     """Where `values` (h, w) lie over `thresholds` (h, w): labels (h, w), 0 none, and boxes (N, 4) x, y, w, h.
 
     An 8-connected part with two pixels over `strong` times their thresholds counts; it keeps the pixels over `core`
@@ -112,7 +140,7 @@ def core_regions(
             inside[part[0][held > least], part[1][held > least]] = True
     cores = [part for part in _parts(inside) if len(part[0]) >= least_area]
     cores = sorted(cores, key=lambda part: -int(values[part].astype(np.int64).sum()))[:most]
-    labels, boxes = np.zeros(values.shape, np.int32), np.zeros((len(cores), 4), np.int32)
+    labels, boxes = np.zeros(values.shape, np.uint8), np.zeros((len(cores), 4), np.int32)
     for number, (y, x) in enumerate(cores):
         labels[y, x] = number + 1
         boxes[number] = x.min(), y.min(), x.max() - x.min() + 1, y.max() - y.min() + 1
@@ -145,7 +173,7 @@ def held_parts(mask: NDArray[np.uint8], seeds: NDArray[np.uint8]) -> NDArray[np.
 
 
 def measure_regions(
-    labels: NDArray[np.int32], boxes: NDArray[np.int32], channels: Sequence[NDArray[np.uint8]], margin: int
+    labels: NDArray[np.uint8], boxes: NDArray[np.int32], channels: Sequence[NDArray[np.uint8]], margin: int
 ) -> NDArray[np.int64]:
     """(N, 2, 2 C + 1) count, C sums and C sums of squares of `channels` (h, w), for each region 1 .. N of `labels`.
 

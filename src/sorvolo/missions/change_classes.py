@@ -54,7 +54,7 @@ class ChangeClasses:
         if not len(rows) or not (rgba[..., 3] > 0).any():
             return ""
         picture, (left_px, top_px) = _enlarged(rgba)
-        thresholds = self._detector.info.thresholds
+        thresholds = self._detector.thresholds_for(picture)
         seen = self._detector.detect(
             picture, tiles="auto", m_per_px=change.patch.m_per_px,
             least_score=_LENIENT * min(thresholds.values(), default=0.5),

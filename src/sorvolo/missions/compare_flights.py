@@ -2,17 +2,18 @@
 
 import threading
 import time
-from collections.abc import Generator, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from sorvolo.capture.areas import read_area
 from sorvolo.capture.live.reconnect import LiveSettings
-from sorvolo.capture.source import Source, opened_sources
+from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.errors import InputError, SettingsError, StoreError
-from sorvolo.missions.compare_run import CompareRun
+from sorvolo.missions.compare_run import CompareRun, Looking
 from sorvolo.missions.detecting import Detects
-from sorvolo.missions.flight_setup import known_flights, prepare
+from sorvolo.missions.flight_setup import FlightSetup, known_flights, prepare
 from sorvolo.missions.known_camera import known_camera
 from sorvolo.missions.map_objects import open_detector
 from sorvolo.missions.settings import CompareSettings
@@ -20,7 +21,7 @@ from sorvolo.mosaic.selection import every
 from sorvolo.store.archive import Archive
 from sorvolo.survey.area import Area
 from sorvolo.survey.findings import CompareUpdate, ViewStatus
-from sorvolo.survey.flight import Frame, PosedFrame
+from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
 
 
 def compare_flights(
@@ -68,23 +69,36 @@ def _compare_one(
     if not is_newest:
         settings = replace(settings, updates_map=False)  # what later flights painted stays
     with CompareRun(setup, archive, settings, base, steps, detector) as run:
-        read = 0
-        for each in source.frames(every(step_s)):
-            read = each.index + 1
-            if isinstance(each, Frame):
-                posed = PosedFrame(each, setup.prior(each, first=False))
-                if not inside(posed):
-                    continue
-                outcome, announced = run.add(posed)
+        ahead = 0 if isinstance(source, LiveSource) else 1  # a live view's changes are told at once
+        for each in _looked_at(source.frames(every(step_s)), setup, inside, run, ahead):
+            if isinstance(each, Looking):
+                outcome, announced = run.add(each)
+                frame: Frame | LostFrame = each.posed.frame
                 status, reason, residual_px = outcome.status, outcome.reason, outcome.residual_px
             else:
                 run.lose(each)
-                status, reason, residual_px, announced = ViewStatus.LOST, each.reason, float("nan"), ()
+                frame, status, reason, residual_px, announced = each, ViewStatus.LOST, each.reason, float("nan"), ()
             yield CompareUpdate(
-                each.name, setup.utc_ns(each.time_ns), status, reason, residual_px, announced, read, source.frame_count,
-                run.views, run.compared, time.monotonic() - started_s,
+                frame.name, setup.utc_ns(frame.time_ns), status, reason, residual_px, announced, frame.index + 1,
+                source.frame_count, run.views, run.compared, time.monotonic() - started_s,
             )
         run.finish(source.notices(), started_s)
+
+
+def _looked_at(
+    frames: Iterable[Frame | LostFrame], setup: FlightSetup, inside: Callable[[PosedFrame], bool], run: CompareRun,
+    ahead: int,
+) -> Iterator[Looking | LostFrame]:
+    """The frames inside of the area, in order, while the run looks at them and up to `ahead` of those after."""
+    waiting: deque[Looking | LostFrame] = deque()
+    for each in frames:
+        if isinstance(each, LostFrame):
+            waiting.append(each)
+        elif inside(posed := PosedFrame(each, setup.prior(each, first=False))):
+            waiting.append(run.look(posed))
+        if len(waiting) > ahead:
+            yield waiting.popleft()
+    yield from waiting
 
 
 def _base_version(archive: Archive, source: Source) -> tuple[int, bool]:

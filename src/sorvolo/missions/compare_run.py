@@ -3,7 +3,8 @@
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -44,6 +45,14 @@ _EXTENSION_OVERLAP = 0.7
 _LOOK_OVERLAP = 0.75  # of frames that are searched for objects
 _DARK = 0.4  # times the map's brightness: less hides things
 _CELL_M = 1.0  # of the record of what was compared
+
+
+@dataclass(frozen=True, eq=False)
+class Looking:
+    """A frame and how looking at it will have ended."""
+
+    posed: PosedFrame
+    outcome: "Future[ViewOutcome]"
 
 
 class CompareRun:
@@ -89,6 +98,7 @@ class CompareRun:
         self._ground: set[tuple[int, int]] = set()
         sigmas_m = np.array([each.sigma_m for each in archive.keyframes() if each.flight_id != source.name])
         self._map_sigma_m = float(np.nanmedian(sigmas_m)) if np.isfinite(sigmas_m).any() else 0.0
+        self._eyes = ThreadPoolExecutor(1, thread_name_prefix="looking")
 
     def __enter__(self) -> Self:
         return self
@@ -96,9 +106,12 @@ class CompareRun:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._finder is not None:
-            self._finder.close()
-        self._writer.__exit__(kind, error, trace)
+        try:
+            self._eyes.shutdown(cancel_futures=True)
+            if self._finder is not None:
+                self._finder.close()
+        finally:  # also when Ctrl-C strikes again meanwhile
+            self._writer.__exit__(kind, error, trace)
 
     @property
     def views(self) -> int:
@@ -117,10 +130,15 @@ class CompareRun:
         time_ns = self._setup.utc_ns(lost.time_ns)
         self._placed[lost.index] = rejected(lost.index, lost.name, time_ns, lost.reason, camera)
 
-    def add(self, posed: PosedFrame) -> tuple[ViewOutcome, tuple[Change, ...]]:
-        """Compare one frame; how that ended, and the changes that it was the last missing witness of."""
+    def look(self, posed: PosedFrame) -> Looking:
+        """Begin to compare a frame, in a thread beside what `add` does with those before it."""
+        return Looking(posed, self._eyes.submit(self._views.look, posed))
+
+    def add(self, looking: Looking) -> tuple[ViewOutcome, tuple[Change, ...]]:
+        """Take one frame's comparison in; how that ended, and the changes that it was the last missing witness of."""
+        posed = looking.posed
         with self._log.stage(Stage.COMPARE):
-            outcome = self._views.look(posed)
+            outcome = looking.outcome.result()
         self._end(outcome.status, outcome.reason)
         if np.isfinite(outcome.residual_px):
             self._residuals_px.append(outcome.residual_px)

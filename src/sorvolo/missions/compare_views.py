@@ -28,6 +28,7 @@ from sorvolo.survey.flight import CameraPrior, PosedFrame
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
 _LEAST_SIDE_PX = 480
+_VIDEO_SIDE_PX, _PHOTO_SIDE_PX = 1280, 1600  # frames come faster than photos, and show a place more often
 _KNOWN_ENOUGH = 0.1  # share of a frame on known ground: with less there is nothing to compare
 _WITNESSES = 2  # earlier pictures asked about a difference: one from each side
 _ALL_CHANGED = 0.5  # share of a view: more is snow, a flood or another place, not a list of changes
@@ -55,7 +56,8 @@ class ViewMaker:
     ) -> None:
         self._setup, self._reference, self._site_grid = setup, reference, site_grid
         self._full = setup.source.camera.camera
-        self._camera = _comparison_camera(self._full, setup, site_grid.grid.m_per_px, settings.side_px)
+        side_px = settings.side_px or (_VIDEO_SIDE_PX if setup.source.kind == "video" else _PHOTO_SIDE_PX)
+        self._camera = _comparison_camera(self._full, setup, site_grid.grid.m_per_px, side_px)
         self._lens = Undistorter(self._camera)
         size = self._camera.width_px, self._camera.height_px
         seen = self._lens.valid(*size)

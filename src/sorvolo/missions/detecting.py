@@ -1,6 +1,6 @@
 """What missions ask of a detector, so that a test's own or a plug-in's can stand in for Sorvolo's."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal, Protocol
 
 from sorvolo.detection.contract import ModelInfo
@@ -27,6 +27,9 @@ class Detects(Protocol):
     @property
     def notices(self) -> tuple[Notice, ...]:
         """What a user should know of the pictures seen so far."""
+
+    def thresholds_for(self, picture: ImageRGB) -> Mapping[str, float]:
+        """From which score on each class is told in a picture (H, W, 3) like this."""
 
     def detect(
         self, image: ImageRGB, *, tiles: Literal["auto"] | int | None = None, m_per_px: float | None = None,

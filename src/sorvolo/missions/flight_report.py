@@ -31,7 +31,8 @@ _OBLIQUE_DEG = 35.0  # pictures that look to opposite sides share too little to 
 class Stage(StrEnum):
     """What time is spent on; reading is what the other stages leave.
 
-    The detector works beside them: its stage is what was waited for it, and laying on the ground what it saw.
+    Some work beside them: the detector's stage is what was waited for it, and laying on the ground what it saw; that of
+    comparing is what was waited for views.
     """
 
     UNDISTORT = "undistort"

@@ -45,7 +45,7 @@ def fetch_model(source: str, sha256: str, *, name: str = "") -> InstalledModel:
     if not _NAME.fullmatch(own):
         raise SettingsError(f"{own!r} cannot be a model's name: use letters, digits, '.', '_' and '-' with --name")
     if any(each.name == own and each.is_packaged for each in installed_models()):
-        raise SettingsError(f"{own!r} is the packaged model's name; give the new one another with --name")
+        raise SettingsError(f"{own!r} is a packaged model's name; give the new one another with --name")
     folder = models_folder()
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)

@@ -44,7 +44,7 @@ class CompareSettings:
     voters: int = 5  # n: ... among the last so many that saw it
     offset_s: float | None = None  # telemetry time = video time + this
     ground_elevation_m: float | None = None  # of the ground, in the telemetry's own height reference
-    side_px: int = 1280  # longest side at which frames are compared
+    side_px: int | None = None  # longest side at which frames are compared; None: photos larger than a video's frames
     updates_map: bool = True  # make a new version of the map where the ground changed or is new
     writes_masks: bool = False
     model: str = "default"  # that looks for objects: an installed one's name, a file, or "none"
@@ -59,7 +59,7 @@ class CompareSettings:
                 f"a change needs {self.votes} of the last {self.voters} views: the first must not exceed the second, "
                 "and both lie in 1 to 8"
             )
-        if not 256 <= self.side_px <= 8192:
+        if self.side_px is not None and not 256 <= self.side_px <= 8192:
             raise SettingsError(f"frames are compared at 256 to 8192 px, got {self.side_px}")
         if self.offset_s is not None and not abs(self.offset_s) <= 86_400 * 365:
             raise SettingsError(f"the clock offset must be a number of seconds, got {self.offset_s}")

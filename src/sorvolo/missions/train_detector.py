@@ -255,7 +255,8 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
         "name": run.out.resolve().name or "model", "preset": run.settings.preset, "version": __version__,
         "classes": list(classes), "thresholds": scores, "best_px": best_sizes_px(checked, scores, learnt, classes),
         **_descent(run, ", ".join(each.name for each in learnt)),
-        "thermal": run.sets.is_thermal, "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "thermal": run.sets.is_thermal, "daylight": not all(share.thermal for share in run.sets.shares),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     exported = export_onnx(model, info)
     agreement = check_export(model.cpu(), exported, _some_pictures(run))
