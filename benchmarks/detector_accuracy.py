@@ -48,6 +48,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=4, help="so many simulated flights of each preset")
     parser.add_argument("--tiles", default=None, help="auto, or pixels a side; none by default")
     parser.add_argument("--out", type=Path, help="folder for the pages")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="the file that is written")
     options = parser.parse_args()
     tiles = int(options.tiles) if options.tiles and options.tiles.isdecimal() else options.tiles
     settings = EvaluationSettings(tiles)
@@ -66,7 +67,7 @@ def main() -> None:
         print(name, json.dumps(plain_json(runs[name]["classes"])), flush=True)
         if options.out is not None:
             write_evaluation(measured, options.out / name, {"benchmark": "detector_accuracy", "set": name})
-    RESULTS.write_text(json.dumps(plain_json({
+    options.results.write_text(json.dumps(plain_json({
         "benchmark": "detector_accuracy", "machine": machine(), "commit": commit(), "model": Path(options.model).name,
         "tiles": options.tiles, "draws": settings.draws, "seed": settings.seed, "first_simulated_seed": FIRST_SEED,
         "sets": runs,

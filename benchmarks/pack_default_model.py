@@ -9,6 +9,8 @@ import argparse
 import hashlib
 import json
 import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -52,12 +54,35 @@ FAILS = (
     "trucks and buses count as nothing in particular; bicycles and their riders likewise",
     "windows and hatches on roofs are told as small objects, cones and birds as people",
     "false-colour thermal palettes look like daylight to it",
+    "thermal frames are seen by the model `thermal` (thermal_by): the figures of hituav and pictures_thermal are its",
 )
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What is said of a model: `info` is what distinguishes its metadata, `sets` those of its card's figures, or all.
+
+    `validation` makes the pictures by which thresholds are chosen, from the data's folder and one to write to.
+    """
+
+    info: Mapping[str, Any]
+    trained_on: Sequence[tuple[str, str, str]]  # what, licence, source
+    training: str
+    fails: Sequence[str]
+    validation: Callable[[Path, Path], list[LabelledSet]]
+    sets: Sequence[str] | None = None
+    remark: str = ""
 
 
 def main() -> None:
     """Choose thresholds, export, check, write the model and its card."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    info = {"name": "default", "version": "3", "thermal": True, "thermal_by": "thermal"}
+    pack(Recipe(info, TRAINED_ON, TRAINING, FAILS, validation), str(__doc__))
+
+
+def pack(recipe: Recipe, words: str) -> None:
+    """Do as the command line, described by `words`, asks."""
+    parser = argparse.ArgumentParser(description=words)
     parser.add_argument("weights", type=Path)
     parser.add_argument("data", type=Path)
     parser.add_argument("--steps", type=int, required=True, help="that the weights were trained for")
@@ -67,33 +92,37 @@ def main() -> None:
     model = fast(CLASSES)
     model.load_state_dict(torch.load(wishes.weights, weights_only=True))
     info: dict[str, Any] = {
-        "name": "default", "preset": "fast", "version": "3", "classes": list(CLASSES), "thermal": True,
+        **recipe.info, "preset": "fast", "classes": list(CLASSES),
         "thresholds": dict.fromkeys(CLASSES, 0.5), "best_px": BEST_PX, "licence": "CC-BY-SA-4.0",
-        "trained_on": "; ".join(f"{name} ({licence})" for name, licence, _ in TRAINED_ON),
+        "trained_on": "; ".join(f"{name} ({licence})" for name, licence, _ in recipe.trained_on),
         "created": f"{datetime.now(UTC):%Y-%m-%d}",
     }
+    name = info["name"]
     with tempfile.TemporaryDirectory() as folder:
         trial = Path(folder) / "trial.onnx"
-        trial.write_bytes(export_onnx(model, info))
-        sets = validation(wishes.data, Path(folder))
+        trial.write_bytes(export_onnx(model, info | {"thermal_by": ""}))  # its own scores
+        sets = recipe.validation(wishes.data, Path(folder))
         info["thresholds"] = best_thresholds(Detector.load(trial), sets)
         print(info["thresholds"], flush=True)
-        pictures = [reader()(each.path) for labelled in sets for each in labelled.pictures[::20]]
+        read = reader()
+        pictures = [read(each.path) for labelled in sets for each in labelled.pictures[::20]]
         exported = export_onnx(model, info)
         check = check_export(model, exported, pictures)
     print(check, flush=True)
     if not check.is_good:
         raise SystemExit("the exported graph differs from torch")
     wishes.out.mkdir(parents=True, exist_ok=True)
-    (wishes.out / "default.onnx").write_bytes(exported)
+    (wishes.out / f"{name}.onnx").write_bytes(exported)
+    figures = {} if wishes.measured is None else measured(json.loads(wishes.measured.read_text()))
     card = {
         **info, "sha256": hashlib.sha256(exported).hexdigest(), "bytes": len(exported), "steps": wishes.steps,
-        "training": TRAINING,
-        "trained_on": [{"what": w, "licence": s, "source": f} for w, s, f in TRAINED_ON],
-        "export": {"box_px": check.box_px, "score": check.score, "detections": check.detections}, "fails": FAILS,
-        "measured": None if wishes.measured is None else measured(json.loads(wishes.measured.read_text())),
+        "training": recipe.training,
+        "trained_on": [{"what": w, "licence": s, "source": f} for w, s, f in recipe.trained_on],
+        "export": {"box_px": check.box_px, "score": check.score, "detections": check.detections},
+        "fails": recipe.fails, **({"remark": recipe.remark} if recipe.remark else {}),
+        "measured": {each: figures[each] for each in figures if recipe.sets is None or each in recipe.sets} or None,
     }
-    (wishes.out / "default.json").write_text(json.dumps(card, indent=1) + "\n")
+    (wishes.out / f"{name}.json").write_text(json.dumps(card, indent=1) + "\n")
 
 
 def validation(data: Path, folder: Path) -> list[LabelledSet]:

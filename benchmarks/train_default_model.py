@@ -1,6 +1,7 @@
 """Train the default model: python benchmarks/train_default_model.py DATA OUT --weights LITE0 (`make model`).
 
-With --start MODEL instead of --weights it learns on from an exported model, such as the packaged one.
+With --start MODEL instead of --weights it learns on from an exported model, such as the packaged one. With --thermal
+it learns thermal frames alone, all layers of it: the packaged model `thermal`, which starts from `default`.
 
 DATA is a folder with the labelled sets that detection_data.py names and two flights of photos as ground for composed
 small objects; simulated pictures are made first, into OUT. Held-out parts are never read here. A run that was stopped
@@ -35,6 +36,7 @@ from sorvolo.training.samples import Augmentation, Sample, Share
 from sorvolo.training.weights import load_lite0
 
 SIMULATED_SEED, SIMULATED_PICTURES = 1, 1800
+SIMULATED = "simulated/boxes.json"
 STEEP_DEG = 75.0  # from so many degrees below the horizon a picture has no up and down
 SETTLING = 12  # batches by which the norms of a started model are settled
 
@@ -47,6 +49,7 @@ def main() -> None:
     start = parser.add_mutually_exclusive_group(required=True)
     start.add_argument("--weights", type=Path, help="EfficientNet-Lite0's published weights")
     start.add_argument("--start", help="an installed model's name or a model file to learn on from")
+    parser.add_argument("--thermal", action="store_true", help="the thermal model: learns thermal frames alone")
     parser.add_argument("--steps", type=int, default=6000)
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--side", type=int, default=384)
@@ -59,25 +62,28 @@ def main() -> None:
     torch.manual_seed(wishes.seed)
     wishes.out.mkdir(parents=True, exist_ok=True)
 
-    shares = training_shares(wishes.data, wishes.out)
+    shares = (thermal_shares if wishes.thermal else training_shares)(wishes.data, wishes.out)
     for share in shares:
         boxes = sum(len(each.labels) for each in share.labelled.pictures)
         name, pictures = share.labelled.name, len(share.labelled)
         print(f"{name}: {pictures} pictures, {boxes} boxes, weight {share.weight}", flush=True)
     def stream(start: int, seed: int) -> Iterator[list[Sample]]:
-        crops = Augmentation(side_px=wishes.side, blur=0.12)
+        crops = Augmentation(side_px=wishes.side, blur=0.12, tone=0.5 if wishes.thermal else 0.0)
         return batches_from(shares, CLASSES, reader(), crops, seed=seed, batch=wishes.batch, start=start)
 
-    model = fast(CLASSES)
+    model = fast(CLASSES, thaw_all=wishes.thermal)
     rate = JointSettings.rate
     if wishes.weights is not None:
         model.backbone.load_imagenet(load_lite0(wishes.weights))
     else:
         first = [each for batch in islice(stream(0, wishes.seed + 1), SETTLING) for each in batch]
         load_exported(model, find_model(wishes.start).read_bytes(), collate(first, "cpu")[0])
-        rate *= 0.7
+        rate *= 0.5 if wishes.thermal else 0.7
     model = model.to(memory_format=torch.channels_last)
-    settings = JointSettings(steps=wishes.steps, batch=wishes.batch, rate=rate, backbone_rate=0.3 * rate)
+    settings = JointSettings(
+        steps=wishes.steps, batch=wishes.batch, rate=rate, backbone_rate=0.3 * rate,
+        regions=192 if wishes.thermal else JointSettings.regions,
+    )
     training = JointTraining(model, settings, wishes.seed, wishes.device)
     checkpoint = wishes.out / "checkpoint.pt"
     if checkpoint.is_file():
@@ -106,22 +112,41 @@ def main() -> None:
 
 def training_shares(data: Path, out: Path) -> list[Share]:
     """What is learnt from, and how often each."""
-    simulated = out / "simulated"
-    if not (simulated / "boxes.json").is_file():
-        settings = PictureSettings(pictures=SIMULATED_PICTURES, seed=SIMULATED_SEED, thermal_share=0.2)
-        for _ in simulate_pictures(simulated, settings):
-            pass
-    made = in_order(read_dataset(simulated))
-    thermal = hituav(data)["train"]
+    made = _simulated(out)
     return [
-        Share(_from(thermal, lambda angle_deg: angle_deg < STEEP_DEG), 3.2, (1.0, 2.3), thermal=True, aslant=True),
-        Share(_from(thermal, lambda angle_deg: angle_deg >= STEEP_DEG), 1.4, (1.0, 2.3), thermal=True),
+        *_frames_of_heat(data),
         Share(tinyperson(data)["train"], 1.8, (1.0, 2.8), pastes=SMALL, aslant=True),
         Share(mannequin(data)["train"], 0.2, (0.3, 1.2), pastes=SMALL),
         Share(aerial_cars(data)["train"], 1.4, (0.25, 1.2), pastes=SMALL),
         Share(made, 3.0, (0.6, 1.6)),
         Share(_ground(data), 0.4, (0.12, 0.5), pastes=SMALL),
     ]
+
+
+def thermal_shares(data: Path, out: Path) -> list[Share]:
+    """What the thermal model learns from; simulated frames show what HIT-UAV does not: other poses, small things."""
+    made = _simulated(out)
+    is_thermal = {row["file_name"]: row["thermal"] for row in json.loads((out / SIMULATED).read_text())["images"]}
+    heat = made.only([each for each in made.pictures if is_thermal[f"images/{Path(each.path).name}"]])
+    return [*_frames_of_heat(data), Share(heat, 0.6, (0.8, 1.8))]
+
+
+def _frames_of_heat(data: Path) -> list[Share]:
+    """HIT-UAV's frames: those from aslant have an up and a down."""
+    thermal = hituav(data)["train"]
+    return [
+        Share(_from(thermal, lambda angle_deg: angle_deg < STEEP_DEG), 3.2, (1.0, 2.3), thermal=True, aslant=True),
+        Share(_from(thermal, lambda angle_deg: angle_deg >= STEEP_DEG), 1.4, (1.0, 2.3), thermal=True),
+    ]
+
+
+def _simulated(out: Path) -> LabelledSet:
+    """The simulated pictures, made at the first time."""
+    if not (out / SIMULATED).is_file():
+        settings = PictureSettings(pictures=SIMULATED_PICTURES, seed=SIMULATED_SEED, thermal_share=0.2)
+        for _ in simulate_pictures((out / SIMULATED).parent, settings):
+            pass
+    return in_order(read_dataset((out / SIMULATED).parent))
 
 
 def _from(labelled: LabelledSet, fits: Callable[[float], bool]) -> LabelledSet:

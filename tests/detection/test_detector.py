@@ -1,5 +1,7 @@
 """The detector on pictures of every kind, with a model that finds bright rectangles exactly."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -164,6 +166,13 @@ class TestThermalFramesAndDaylightModels:
         (notice,) = self.day.notices
         assert (notice.code, notice.count) == ("thermal_model", 1) and "night" in notice.text
 
+    def test_its_own_thresholds_hold(self) -> None:
+        rectangle_model(self.folder / "night.onnx", name="night", thresholds=dict.fromkeys(CLASSES, 0.6))
+        picture = draw((120, 200), _BOXES, labels=[0, 0, 0], scores=[130, 130, 130])
+        grey = np.repeat(picture[:, :, :1], 3, axis=2)
+        assert len(self.day.detect(grey)) == 0, "0.51 lies below them, above the daylight model's of people"
+        assert len(self.day.detect(grey, least_score=0.4)) == 3
+
     def test_without_one_it_is_said(self, picture: np.ndarray, tmp_path: Path) -> None:
         classes = ["boat", "buoy", "raft"]  # none that the packaged model knows
         told = {"thresholds": dict.fromkeys(classes, 0.3), "best_px": {each: [4, 300] for each in classes}}
@@ -173,3 +182,47 @@ class TestThermalFramesAndDaylightModels:
             sea.detect(polarity)
         (notice,) = sea.notices
         assert (notice.code, notice.count) == ("thermal_untrained", 2)
+
+    def test_a_model_names_the_one_that_looks_at_thermal_frames(self, picture: np.ndarray, tmp_path: Path) -> None:
+        known = {"thermal": True, "thermal_by": "night"}
+        both = rectangle_model(tmp_path / "both.onnx", name="both", **known)
+        grey = draw((120, 200), _BOXES, labels=[0, 0, 0], scores=[130, 130, 130])
+        grey = np.repeat(grey[:, :, :1], 3, axis=2)
+        assert len(Detector.load(both, provider="cpu", threads=1).detect(grey)) == 3, "not installed: it looks itself"
+        high = {"thresholds": dict.fromkeys(CLASSES, 0.6)}
+        rectangle_model(self.folder / "another.onnx", name="another")
+        rectangle_model(self.folder / "night.onnx", name="night", daylight=False, **high)
+        detector = Detector.load(both, provider="cpu", threads=1)
+        assert len(detector.detect(picture)) == 3 and detector.notices == ()
+        assert len(detector.detect(grey)) == 0, "the thresholds are those of the model that looks"
+        assert len(detector.detect(grey, least_score=0.4)) == 3
+        (notice,) = detector.notices
+        assert (notice.code, notice.count) == ("thermal_model", 2) and "'night', which was trained" in notice.text
+
+    def test_a_thermal_model_says_that_colour_is_not_known(self, picture: np.ndarray) -> None:
+        night = rectangle_model(self.folder / "night.onnx", name="night", daylight=False)
+        detector = Detector.load(night, provider="cpu", threads=1)
+        detector.detect(picture[:, :, 0])
+        assert detector.notices == ()
+        detector.detect(picture)
+        (notice,) = detector.notices
+        assert (notice.code, notice.count) == ("daylight_untrained", 1) and "'night'" in notice.text
+
+    def test_threads_that_ask_at_once_get_the_same_model(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        rectangle_model(self.folder / "night.onnx", name="night", thresholds=dict.fromkeys(CLASSES, 0.6))
+        grey = np.repeat(draw((120, 200), _BOXES, labels=[0, 0, 0], scores=[130, 130, 130])[:, :, :1], 3, axis=2)
+
+        def slowly(*asked: object) -> Path:
+            time.sleep(0.2)
+            return self.folder / "night.onnx"
+
+        monkeypatch.setattr("sorvolo.detection.detector.thermal_model", slowly)
+        with ThreadPoolExecutor(4) as threads:
+            found = list(threads.map(lambda _: len(self.day.detect(grey)), range(4)))
+        assert found == [0, 0, 0, 0]
+
+    def test_thresholds_are_those_of_the_model_that_looks(self, picture: np.ndarray) -> None:
+        rectangle_model(self.folder / "night.onnx", name="night", thresholds=dict.fromkeys(CLASSES, 0.6))
+        assert self.day.thresholds_for(picture) == self.day.info.thresholds
+        assert set(self.day.thresholds_for(picture[:, :, 0]).values()) == {0.6}
+        assert self.day.notices == (), "asking is not looking"

@@ -8,6 +8,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
 
+import numpy as np
 import pytest
 from toy_models import rectangle_model, square_model
 
@@ -78,6 +79,18 @@ def test_names_and_paths(folder: Path, model: Path) -> None:
     assert Detector.load("night", provider="cpu").info.name == "night"
     with pytest.raises(InputError, match=r"no model 'day'; installed are: .*night"):
         Detector.load("day")
+
+
+def test_an_own_model_that_a_packaged_name_hides_is_told(
+    folder: Path, model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "thermal.onnx").write_bytes(model.read_bytes())
+    assert find_model("thermal") != folder / "thermal.onnx"
+    for command in ("list", "verify"):
+        assert cli.main(["models", command]) == 0
+        told = " ".join(capsys.readouterr().out.split())
+        assert "is not used: 'thermal' is the name of a packaged model" in told
 
 
 def test_where_own_models_lie(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -227,3 +240,11 @@ def test_packaged_models_are_what_their_cards_say() -> None:
         assert integrity(each) is Integrity.GOOD
         assert each.path.stat().st_size <= 40e6
         assert read_info(each.path).classes == CLASSES
+    assert sum(each.path.stat().st_size for each in packaged) <= 40e6
+
+
+def test_the_packaged_model_hands_thermal_frames_to_the_thermal_one() -> None:
+    detector = Detector.load("default", provider="cpu", threads=1)
+    detector.detect(np.zeros((64, 64, 3), np.uint8))
+    (notice,) = detector.notices
+    assert notice.code == "thermal_model" and "'thermal'" in notice.text

@@ -1,5 +1,7 @@
 """Samples: crops of labelled pictures, with their boxes where the crop shows what they are of."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -47,3 +49,14 @@ def test_the_box_lies_on_what_it_is_of(aslant: bool) -> None:
         for x0, y0, x1, y1 in sample.boxes:
             y, x = int((y0 + y1) / 2), int((x0 + x1) / 2)
             assert sample.image[y, x, 0] == sample.image[..., 0].max()
+
+
+def test_another_tone_curve_changes_the_light_and_no_place() -> None:
+    image, share = _share(aslant=True)
+    picture = share.labelled.pictures[0]
+    samples = [
+        cut_sample(image, picture, share, CLASSES, replace(PLAIN, tone=often), np.random.default_rng(5))
+        for often in (0.0, 1.0)
+    ]
+    np.testing.assert_array_equal(samples[0].boxes, samples[1].boxes)
+    assert not np.array_equal(samples[0].image, samples[1].image)

@@ -17,6 +17,7 @@ from sorvolo.detection.models import (
     Integrity,
     file_sha256,
     find_model,
+    hidden_models,
     installed_models,
     integrity,
     models_folder,
@@ -41,7 +42,7 @@ def models() -> None:
 def list_models(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
 ) -> None:
-    """List the models that `--model NAME` can name: the packaged one and your own.
+    """List the models that `--model NAME` can name: the packaged ones and your own.
 
     Your own lie in $SORVOLO_MODELS, else in sorvolo/models of your data folder.
 
@@ -60,7 +61,7 @@ def list_models(
             continue
         table.add_row(
             escape(row["name"]), escape(row["preset"]), escape(", ".join(row["classes"])),
-            "day and thermal" if row["thermal"] else "day", row["precision"], f"{row['bytes'] / 1e6:.1f}",
+            _light(row), row["precision"], f"{row['bytes'] / 1e6:.1f}",
             "with the package" if row["is_packaged"] else escape(row["path"]),
         )
     if table.rows:
@@ -70,6 +71,12 @@ def list_models(
             typer.echo(f"{row['name']} cannot be used: {row['error']}")
     if not rows:
         typer.echo(f"no models are installed; your own belong in {models_folder()}")
+    _tell_hidden()
+
+
+def _tell_hidden() -> None:
+    for each in hidden_models():
+        typer.echo(f"{each.path} is not used: '{each.name}' is the name of a packaged model; rename the file")
 
 
 @models_app.command()
@@ -92,7 +99,7 @@ def show(
     table.add_column(overflow="fold")
     for name in ("preset", "version", "precision", "licence", "trained_on", "created", "path", "sha256"):
         table.add_row(name.replace("_", " "), escape(str(told[name])))
-    table.add_row("light", "day and thermal" if info.thermal else "day")
+    table.add_row("light", _light(told))
     for each in info.classes:
         least_px, most_px = info.best_px[each]
         words = f"told from score {info.thresholds[each]:.2f}; found well from {least_px:g} to {most_px:g} px"
@@ -149,6 +156,8 @@ def verify(
         typer.echo(f"{each.name}: {words}")
     if not chosen:
         typer.echo("no models are installed")
+    if not model:
+        _tell_hidden()
     if bad:
         raise typer.Exit(1)
 
@@ -221,6 +230,15 @@ def _row(model: InstalledModel) -> dict[str, Any]:
 
 def _told(info: ModelInfo) -> dict[str, Any]:
     return {key: dict(value) if isinstance(value, Mapping) else value for key, value in vars(info).items()}
+
+
+def _light(told: Mapping[str, Any]) -> str:
+    """The light that a model knows, in words."""
+    if not told["thermal"]:
+        return "day"
+    if not told["daylight"]:
+        return "thermal"
+    return f"day; thermal by {told['thermal_by']}" if told["thermal_by"] else "day and thermal"
 
 
 def _verdict(model: InstalledModel, sha256: str) -> tuple[str, bool]:

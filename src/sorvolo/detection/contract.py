@@ -24,7 +24,8 @@ class ModelInfo:
 
     `thresholds` says from which score on each class is reported; `best_px` from which to which longer side, in
     pixels, the model finds a class well. `stride`: the sides of its input are multiples of it. `thermal`: it was
-    trained on thermal frames too, not on daylight alone. `precision` is float32 or int8.
+    trained on thermal frames; `daylight`: on daylight. `thermal_by`: the installed model that looks at thermal frames
+    in its place, "" for none. `precision` is float32 or int8.
     """
 
     name: str
@@ -33,6 +34,8 @@ class ModelInfo:
     best_px: Mapping[str, tuple[float, float]]
     stride: int = _FALLBACK_STRIDE
     thermal: bool = False
+    daylight: bool = True
+    thermal_by: str = ""
     preset: str = ""
     version: str = ""
     precision: str = "float32"
@@ -83,12 +86,12 @@ def _info(told: dict[str, Any]) -> ModelInfo:
     if not 1 <= stride <= 256:
         raise ValueError(f"its stride must lie in 1 to 256, not {stride}")
     texts = {
-        each: _words(told[each]) for each in ("preset", "version", "precision", "licence", "trained_on", "created")
-        if each in told
+        each: _words(told[each])
+        for each in ("thermal_by", "preset", "version", "precision", "licence", "trained_on", "created") if each in told
     }
     return ModelInfo(
         str(told["name"]), classes, MappingProxyType(thresholds), MappingProxyType(best_px), stride,
-        bool(told.get("thermal", False)), **texts,
+        bool(told.get("thermal", False)), bool(told.get("daylight", True)), **texts,
     )
 
 

@@ -1,7 +1,8 @@
 """The detector: any picture in, people, cars and small objects out."""
 
 import math
-from collections.abc import Sequence
+import threading
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import overload
 
@@ -14,19 +15,20 @@ from sorvolo.detection.session import Provider, Seen, Session
 from sorvolo.detection.suppression import SeenTile, merge_tiles
 from sorvolo.detection.tiling import Tiles, plan_tiles
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Anything, ImageRGB
+from sorvolo.geometry.arrays import Anything, Floats, ImageRGB
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.objects import Detections
 
 
 class Detector:
-    """A model that is ready to look at pictures. `load` opens one; only `detect` is called after."""
+    """A model that is ready to look at pictures. `load` opens one; `detect` is called after, by any threads."""
 
     def __init__(self, session: Session, *, provider: Provider = "auto", threads: int | None = None) -> None:
         self._session, self._wanted_provider, self._threads = session, provider, threads
         self._at_night: Session | None = None
         self._night_was_sought = False
-        self._thermal_frames = 0
+        self._seeking = threading.Lock()
+        self._thermal_frames = self._daylight_frames = 0
 
     @classmethod
     def load(
@@ -57,19 +59,26 @@ class Detector:
 
     @property
     def notices(self) -> tuple[Notice, ...]:
-        """What a user should know of the pictures seen so far: thermal frames, and who looked at them."""
-        if not self._thermal_frames:
-            return ()
-        count, own = self._thermal_frames, self.info.name
-        if self._at_night is not None:
+        """What to know of the pictures seen so far: whose light the model does not know, who looked at them."""
+        own, told = self.info.name, []
+        if (count := self._thermal_frames) and self._at_night is not None:
             night = self._at_night.info.name
-            text = f"{count} thermal frames were seen by the model '{night}', since '{own}' knows only daylight"
-            return (Notice("thermal_model", count, text),)
-        text = (
-            f"{count} frames are thermal, but the model '{own}' was trained on daylight and no installed one on "
-            "thermal frames: little of what it says of them holds"
-        )
-        return (Notice("thermal_untrained", count, text),)
+            why = "which was trained for them" if self.info.thermal else f"since '{own}' knows only daylight"
+            text = f"{count} thermal frames were seen by the model '{night}', {why}"
+            told.append(Notice("thermal_model", count, text))
+        elif count and not self.info.thermal:
+            text = (
+                f"{count} frames are thermal, but the model '{own}' was trained on daylight and no installed one on "
+                "thermal frames: little of what it says of them holds"
+            )
+            told.append(Notice("thermal_untrained", count, text))
+        if count := self._daylight_frames:
+            text = (
+                f"{count} frames are in colour, but the model '{own}' was trained on thermal frames alone: little of "
+                "what it says of them holds; take another model"
+            )
+            told.append(Notice("daylight_untrained", count, text))
+        return tuple(told)
 
     @overload
     def detect(
@@ -96,11 +105,18 @@ class Detector:
         Raises InputError for anything that is no picture, SettingsError for a class, score or tile that cannot be.
         """
         wanted = self._wanted(classes)
-        least = self._least_scores(wanted, least_score)
+        if least_score is not None and not 0 <= least_score <= 1:
+            raise SettingsError(f"the least score must lie in 0 to 1, not {least_score}")
         sampling = math.nan if m_per_px is None else float(m_per_px)
         if not isinstance(image, Sequence) and getattr(image, "ndim", 0) != 4:
-            return self._seen(image, tiles, sampling, wanted, least)
-        return [self._seen(each, tiles, sampling, wanted, least) for each in image]
+            return self._seen(image, tiles, sampling, wanted, least_score)
+        return [self._seen(each, tiles, sampling, wanted, least_score) for each in image]
+
+    def thresholds_for(self, picture: Anything) -> Mapping[str, float]:
+        """From which score on each class is told in such a picture: those of the model that looks at it."""
+        if self._is_own(thermal=is_thermal(picture)):
+            return self.info.thresholds
+        return {**self.info.thresholds, **self._night_session().info.thresholds}
 
     def _wanted(self, classes: Sequence[str] | None) -> tuple[str, ...]:
         if classes is None:
@@ -113,15 +129,9 @@ class Detector:
             raise SettingsError(f"{named} cannot be asked of the model '{self.info.name}'; it tells apart {there}")
         return tuple(name for name in self.classes if name in classes)
 
-    def _least_scores(self, wanted: Sequence[str], least_score: float | None) -> Anything:
-        """(classes,) the score from which on each class is told; what is not wanted never."""
-        if least_score is not None and not 0 <= least_score <= 1:
-            raise SettingsError(f"the least score must lie in 0 to 1, not {least_score}")
-        least = [self.info.thresholds[name] if least_score is None else least_score for name in self.classes]
-        return np.where([name in wanted for name in self.classes], least, np.inf)
-
     def _seen(
-        self, picture: Anything, tiles: Tiles, m_per_px: float, wanted: Sequence[str], least: Anything
+        self, picture: Anything, tiles: Tiles, m_per_px: float, wanted: Sequence[str],
+        least_score: float | None,
     ) -> Detections:
         thermal = is_thermal(picture)
         session = self._session_for(thermal)
@@ -134,23 +144,40 @@ class Detector:
         )
         looks = [SeenTile(place, _look(session, rgb, place, plan.scale)) for place in plan.places_px]
         seen = looks[0].seen if len(looks) == 1 else merge_tiles(looks, size_px)
-        labels = seen.labels
+        least = _least_scores(session.info, asked, least_score)
+        told = seen.scores >= least[seen.labels]
+        labels = seen.labels[told]
         if session is not self._session:
-            own = np.array([self.classes.index(name) if name in self.classes else -1 for name in session.info.classes])
-            labels = own[labels]
-        told = (labels >= 0) & (seen.scores >= least[labels])
-        return Detections(seen.boxes_px[told], seen.scores[told], labels[told], self.classes)
+            own = [self.classes.index(name) if name in self.classes else -1 for name in session.info.classes]
+            labels = np.array(own, np.int64)[labels]
+        return Detections(seen.boxes_px[told], seen.scores[told], labels, self.classes)
 
     def _session_for(self, thermal: bool) -> Session:
-        """This model, or for a thermal frame that it was not trained on, an installed one that was."""
-        if self.info.thermal or not thermal:
+        """This model, or for a thermal frame an installed one: the one it names, or if it knows none, any that does."""
+        self._daylight_frames += not (thermal or self.info.daylight)
+        if self._is_own(thermal=thermal):
             return self._session
         self._thermal_frames += 1
-        if not self._night_was_sought:
-            self._night_was_sought = True
-            found = thermal_model(self.classes)
-            self._at_night = None if found is None else Session(found, self._wanted_provider, self._threads)
+        return self._night_session()
+
+    def _is_own(self, *, thermal: bool) -> bool:
+        """Whether this model itself looks at frames of such light, and no other is sought."""
+        return not thermal or (self.info.thermal and not self.info.thermal_by)
+
+    def _night_session(self) -> Session:
+        """What looks at thermal frames in this model's place; threads that ask at once wait for it."""
+        with self._seeking:
+            if not self._night_was_sought:
+                found = thermal_model(self.classes, self.info.thermal_by)
+                self._at_night = None if found is None else Session(found, self._wanted_provider, self._threads)
+                self._night_was_sought = True
         return self._at_night or self._session
+
+
+def _least_scores(info: ModelInfo, wanted: Sequence[str], least_score: float | None) -> Floats:
+    """(classes,) the score from which on the model's classes are told; what is not wanted never."""
+    least = [info.thresholds[name] if least_score is None else least_score for name in info.classes]
+    return np.where([name in wanted for name in info.classes], least, np.inf)
 
 
 def _look(session: Session, rgb: ImageRGB, place_px: tuple[int, int, int, int], scale: float) -> Seen:

@@ -1,4 +1,4 @@
-"""Which models there are: the packaged one and the user's, their files, and the hashes that vouch for them."""
+"""Which models there are: the packaged ones and the user's, their files, and the hashes that vouch for them."""
 
 import hashlib
 import json
@@ -53,6 +53,12 @@ def installed_models() -> list[InstalledModel]:
     return packaged + [each for each in _models_in(models_folder(), is_packaged=False) if each.name not in names]
 
 
+def hidden_models() -> list[InstalledModel]:
+    """The user's models that bear a packaged one's name, which hides them."""
+    shown = {each.path for each in installed_models()}
+    return [each for each in _models_in(models_folder(), is_packaged=False) if each.path not in shown]
+
+
 def find_model(name_or_path: str | Path) -> Path:
     """The file of an installed model, or the path that was given.
 
@@ -77,20 +83,23 @@ def installed_model(name: str) -> InstalledModel:
     )
 
 
-def thermal_model(classes: Sequence[str]) -> Path | None:
+def thermal_model(classes: Sequence[str], name: str = "") -> Path | None:
     """An installed model that was trained on thermal frames and knows one of `classes`, None where there is none.
 
-    The user's own come before the packaged one. Files that cannot be used are passed over: `sorvolo models list` tells
-    of them.
+    `name`: no other than this one. The user's own come before the packaged ones, and of these those for thermal frames
+    alone first. Files that cannot be used are passed over: `sorvolo models list` tells of them.
     """
-    for each in sorted(installed_models(), key=lambda model: model.is_packaged):
+    found: list[tuple[bool, bool, Path]] = []
+    for each in installed_models():
+        if name not in ("", each.name):
+            continue
         try:
             info = read_info(each.path)
         except InputError:
             continue
         if info.thermal and set(info.classes) & set(classes):
-            return each.path
-    return None
+            found.append((each.is_packaged, info.daylight, each.path))
+    return min(found, key=lambda row: row[:2])[2] if found else None
 
 
 def read_card(model: InstalledModel) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3, TimesNs
+from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, Matrix3, TimesNs
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.training.sprites import paste_small_objects
 
@@ -38,6 +38,7 @@ class Augmentation:
     haze: float = 0.1
     grey: float = 0.15  # how often colours are taken away
     noise: float = 0.2
+    tone: float = 0.0  # how often: another tone curve and uneven warmth, as thermal cameras' gain control makes them
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +151,8 @@ def _weathered(image: ImageRGB, how: Augmentation, rng: np.random.Generator, *, 
         x *= rng.uniform(0.85, 1.18, 3).astype(np.float32) ** (rng.random() < 0.5)
         if rng.random() < how.grey:
             x[:] = x.mean(2, keepdims=True)
+    if how.tone and rng.random() < how.tone:
+        x = np.asarray(_toned(x, rng), np.float32)
     x = (x - x.mean()) * rng.uniform(0.6, 1.35) + x.mean() + rng.uniform(-35, 35)
     if rng.random() < how.haze:
         share = rng.uniform(0.1, 0.5)
@@ -167,3 +170,11 @@ def _weathered(image: ImageRGB, how: Augmentation, rng: np.random.Generator, *, 
     if rng.random() < how.noise:
         x = x + rng.normal(0, rng.uniform(2, 10), x.shape).astype(np.float32)
     return np.clip(x, 0, 255).astype(np.uint8)
+
+
+def _toned(x: Anything, rng: np.random.Generator) -> Anything:
+    """(H, W, 3) 0 to 255 through a power of the grey values, brighter here and darker there by up to a quarter."""
+    curved = 255 * (np.clip(x, 0, 255) / 255) ** np.exp(rng.uniform(-0.7, 0.7))
+    coarse = rng.normal(0, rng.uniform(0, 25), (3, 3)).astype(np.float32)
+    uneven = cv2.resize(coarse, x.shape[1::-1], interpolation=cv2.INTER_CUBIC)
+    return curved + uneven[:, :, None]
