@@ -174,6 +174,9 @@ def quantise(
             "--float", help="Leave a part in float: backbone, neck, proposals, backbone/_blocks.0. Can be repeated."
         ),
     ] = None,
+    weight_bits: Annotated[
+        int, typer.Option(min=7, max=8, help="7 is safe from overflow on CPUs without VNNI, and rounds a little more.")
+    ] = 8,
 ) -> None:
     """Make a model that is smaller and quicker, in whole numbers of eight bits. Measure both before you trust it.
 
@@ -181,7 +184,10 @@ def quantise(
 
     Example: sorvolo models quantise mine.onnx --pictures flights/ --out mine-int8.onnx
     """
-    made = quantise_model(find_model(model), pictures, out, most=most, float_parts=float_parts or ())
+    made = quantise_model(
+        find_model(model), pictures, out, most=most, float_parts=float_parts or (),
+        weight_bits=7 if weight_bits == 7 else 8,
+    )
     typer.echo(
         f"{out}: {made.convolutions} of {made.of} convolutions in eight bits, {len(made.model) / 1e6:.1f} MB; "
         "compare it with `sorvolo evaluate detector`"

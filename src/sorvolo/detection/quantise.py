@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -36,17 +36,20 @@ class Quantised:
     of: int
 
 
-def quantise(path: Path, pictures: Iterable[ImageRGB], *, float_parts: Sequence[str] = ()) -> Quantised:
+def quantise(
+    path: Path, pictures: Iterable[ImageRGB], *, float_parts: Sequence[str] = (), weight_bits: Literal[7, 8] = 8
+) -> Quantised:
     """The model file `path` with its convolutions in int8, by the same contract (its metadata says so).
 
     `pictures` (H, W, 3) are what it will have to see: all lights and grounds, some dozens. Weights are scaled per
     channel, activations by the least and the greatest value that occurs (static quantisation, Q and DQ nodes:
-    Jacob et al. 2018). In float remain the last convolutions of each branch, which say how likely and where, and all
-    that handles boxes, and the network's parts that `float_parts` names ("neck", "proposals", or a piece of one,
-    "backbone/_blocks.0"): what is narrow gains little speed and loses most. Whether it is good enough must be
-    measured: `sorvolo evaluate detector` on both. Raises InputError for a file that is no model of ours or is in eight
-    bits already and for too few pictures, SettingsError where the package onnx is not installed and for a part that
-    the model does not have.
+    Jacob et al. 2018). CPUs without VNNI instructions add two products in 16 bits, which eight-bit weights may
+    overflow without a word; those of `weight_bits` 7 never do, and round a little more. In float remain the last
+    convolutions of each branch, which say how likely and where, and all that handles boxes, and the network's parts
+    that `float_parts` names ("neck", "proposals", or a piece of one, "backbone/_blocks.0"): what is narrow gains
+    little speed and loses most. Whether it is good enough must be measured: `sorvolo evaluate detector` on both.
+    Raises InputError for a file that is no model of ours or is in eight bits already and for too few pictures,
+    SettingsError where the package onnx is not installed and for a part that the model does not have.
     """
     try:
         import onnx
@@ -73,7 +76,8 @@ def quantise(path: Path, pictures: Iterable[ImageRGB], *, float_parts: Sequence[
         quantization.quantize_static(
             model, out, samples, quant_format=quantization.QuantFormat.QDQ, per_channel=True,
             activation_type=quantization.QuantType.QUInt8, weight_type=quantization.QuantType.QInt8,
-            nodes_to_quantize=chosen, op_types_to_quantize=sorted(_CARRIERS - _FLOAT),
+            reduce_range=weight_bits == 7, nodes_to_quantize=chosen,
+            op_types_to_quantize=sorted(_CARRIERS - _FLOAT),
         )
         quantised = onnx.load_model(out)
     if samples.count < LEAST_PICTURES:

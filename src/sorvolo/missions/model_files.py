@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Literal
 
 from sorvolo.capture.photos import PHOTO_SUFFIXES, read_picture
 from sorvolo.detection.models import (
@@ -65,12 +66,13 @@ def fetch_model(source: str, sha256: str, *, name: str = "") -> InstalledModel:
 
 
 def quantise_model(
-    model: Path, pictures: Path, out: Path, *, most: int, float_parts: Sequence[str] = ()
+    model: Path, pictures: Path, out: Path, *, most: int, float_parts: Sequence[str] = (),
+    weight_bits: Literal[7, 8] = 8,
 ) -> Quantised:
     """Write `model` in eight bits to `out`, its ranges from at most `most` pictures of a folder, evenly chosen.
 
-    `float_parts` is for `quantise`, which raises what is raised, besides InputError for a folder without pictures and
-    StoreError where `out` cannot be written.
+    `float_parts` and `weight_bits` are for `quantise`, which raises what is raised, besides InputError for a folder
+    without pictures and StoreError where `out` cannot be written.
     """
     if out.suffix.lower() != ".onnx":
         raise SettingsError(f"--out {out}: a model's file ends in .onnx")
@@ -81,7 +83,7 @@ def quantise_model(
         raise InputError(f"there are no pictures in {pictures}; needed are {', '.join(sorted(PHOTO_SUFFIXES))}")
     count = min(most, len(paths))
     chosen = [paths[index * len(paths) // count] for index in range(count)]
-    result = quantise(model, _pictures(chosen), float_parts=float_parts)
+    result = quantise(model, _pictures(chosen), float_parts=float_parts, weight_bits=weight_bits)
     atomic_write_bytes(out, result.model)
     return result
 
