@@ -26,7 +26,8 @@ def says(*things: tuple[int, float]) -> Difference:
         (0.9, [0.3, 0.3], True),
         (0.9, [0.9, None], False),
         (None, [0.9, 0.3], True),
-        (None, [0.9], False),
+        (None, [0.85], False),
+        (None, [0.95], True),
         (0.3, [0.9], True),
         (0.4, [0.4, 0.4], False),
     ],
@@ -50,6 +51,14 @@ def test_who_does_not_see_the_place_is_not_asked():
 def test_what_lies_a_few_pixels_beside_is_the_same_and_told_once():
     found = believed((says((30, 0.9)), ALL), [(says((34, 0.9)), ALL), (says((28, 0.8)), ALL)])
     assert found.boxes.tolist() == [[30, 20, 10, 10]]
+
+
+def test_neighbours_whose_boxes_overlap_are_both_told():
+    mask = np.zeros(SHAPE, np.uint8)
+    mask[20:40, 20:34] = mask[10:30, 34:40] = 255
+    both = Difference(mask, np.array([[20, 20, 20, 20], [34, 10, 6, 20]]), np.array([0.9, 0.8]))
+    found = believed((both, ALL), [(both, ALL)])
+    assert len(found.boxes) == 2 and np.array_equal(found.mask, mask)
 
 
 def test_nothing_is_found_where_the_map_knows_no_ground():

@@ -22,7 +22,7 @@ MATCH_MARGIN_PX = 3
 MATCH_REACH_PX = 6
 DETAIL_PX = 11
 LOOKED_AT_PX = WIDE_PX + DETAIL_PX  # around regions: what is farther away changes nothing in what is measured of them
-MOST_REGIONS = 64  # a byte holds their labels
+MOST_REGIONS = 250  # a byte holds their labels
 
 FEATURES = (
     "log area", "log length", "aspect", "fill", "difference", "difference spread", "chroma share", "sharpness",

@@ -164,14 +164,19 @@ class GatheredChange:
         self._asked_px += cv2.warpPerspective(valid.view(np.uint8), patch_from_image, size, flags=cv2.INTER_NEAREST) > 0
 
     def take_over(self, younger: "GatheredChange") -> None:
-        """Become one with a younger change; its pictures are forgotten."""
-        self.first_seen_ns = min(self.first_seen_ns, younger.first_seen_ns)
-        self.last_seen_ns = max(self.last_seen_ns, younger.last_seen_ns)
-        self.whole = min(self.whole, younger.whole)
-        if younger.is_told and not self.is_told:
-            self.is_told, self.announced_ns = True, younger.announced_ns
-        if self.cells is not None and younger.cells is not None:
-            self.cells = self.cells.joined(younger.cells)
+        """Become one with a younger change. What views said of the surer of both, and its pictures, count for both."""
+        first_seen_ns = min(self.first_seen_ns, younger.first_seen_ns)
+        last_seen_ns = max(self.last_seen_ns, younger.last_seen_ns)
+        cells = younger.cells if self.cells is None else self.cells
+        if cells is not None and younger.cells is not None:
+            cells = cells.joined(younger.cells)
+        number, told = self.number, self if self.is_told else younger
+        is_told, announced_ns, is_taken_back = told.is_told, told.announced_ns, told.is_taken_back
+        if younger.score > self.score:
+            vars(self).update(vars(younger))
+        self.number, self.cells = number, cells
+        self.is_told, self.announced_ns, self.is_taken_back = is_told, announced_ns, is_taken_back
+        self.first_seen_ns, self.last_seen_ns = first_seen_ns, last_seen_ns
 
     def outline_m(self, cells: Mask, cell_m: float, join_m: float) -> PointsM | None:
         """(N, 2) its outline: what most masks call changed, on or beside its cells; by its cells alone if that is

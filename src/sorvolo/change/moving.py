@@ -25,6 +25,7 @@ _UNLIKELY_PARALLAX = 0.5  # no thing that came is a third as high as the camera 
 _POINTS = 12  # of a track, that its velocity is fitted to
 _NEAR_PX = 8  # what is looked at around a place to tell shadows
 _RIGID_POINTS, _RIGID_LENGTHS, _RIGID_LENGTH_M = 5, 2.0, 2.5
+_FLOATS_LENGTH_M = 1.3
 _PHOTOS_APART_S = 0.7  # at least, on average
 _ONE_THING_M = 0.4  # two that move alike so near each other are one thing, seen now with its shadow, now without
 _LOST_FOR_S = 45.0  # a thing that moves steadily is known again after so long: on the next strip, too
@@ -212,7 +213,7 @@ class BlobTracker:
             track.count >= (settings.least_photos if self._are_photos(track) else settings.least_views)
             and settings.least_length_m <= length_m
             and speed_m_s <= settings.fastest_m_s(length_m)
-            and (is_own or _is_rigid(track, length_m))
+            and (is_own or _is_rigid(track, length_m) or (self._are_photos(track) and _floats(track, move, length_m)))
             and float(np.hypot(*(move.velocity_m_s - move.camera_m_s))) > 0.3 * float(np.hypot(*move.camera_m_s))
             and move.error_m < 0.05 + 0.03 * speed_m_s * track.seconds
             and not _is_still_there(track.points[0], view)
@@ -264,6 +265,23 @@ def _is_rigid(track: Track, length_m: float) -> bool:
         and max(areas) < 1.7 * min(areas)
         and max(lengths) < 1.35 * min(lengths)
     )
+
+
+def _floats(track: Track, move: Motion, length_m: float) -> bool:
+    """Whether a small blob of steady size is far from where anything tall enough to move so would stand.
+
+    What leans is seen from its foot to its top; the foot of a thing whose top moves against the camera's way with a
+    share k of its speed lies (top + k camera) / (1 + k). Photos show it too seldom to see it grow.
+    """
+    areas = [each.blob.area_m2 for each in track.points]
+    lengths = [each.blob.length_m for each in track.points]
+    if length_m > _FLOATS_LENGTH_M or max(areas) > 1.7 * min(areas) or max(lengths) > 1.35 * min(lengths):
+        return False
+    camera_m_s = float(np.hypot(*move.camera_m_s))
+    k = -float(move.velocity_m_s @ move.camera_m_s) / max(camera_m_s, 1e-6) ** 2
+    way_m = float(np.hypot(*(track.last.blob.place_m - track.points[0].blob.place_m)))
+    apart_m = [k / (1 + k) * float(np.hypot(*(each.blob.place_m - each.camera_m))) for each in track.points]
+    return way_m > _RIGID_LENGTHS * length_m and float(np.median(apart_m)) > length_m
 
 
 def _may_move(track: Track, move: Motion) -> bool:

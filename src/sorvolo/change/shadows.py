@@ -19,6 +19,7 @@ _LEAST_PX = 6
 _LEAST_PIECE = 0.15  # of the largest lit piece: smaller ones are specks of the shadow's rim
 _TOLERANCE_PX = 0.7
 _APART_M = 0.5  # things so far from each other are two ...
+_NECK_M, _GAP_M = 0.25, 0.4  # what hangs together by less, or lies so far apart, is not one piece
 _LEAST_THING_M2 = 0.06  # ... if each is as large as a football at least ...
 _COMPACT, _CAR_M = 0.8, (1.2, 6.0)  # ... and both together do not fill what may be one dark car with bright parts
 _CAR_WIDTH_M, _BRIGHT = 2.7, 0.5  # at most; share of a dark car that its bright parts are at most
@@ -89,6 +90,42 @@ def things_of(patch: Patch, kind: ChangeKind, changed: Mask) -> list[tuple[Mask,
     `changed` alone where it is but one thing. A dark car has bright parts far from each other: what fills a rectangle
     of about its size stays whole, unless something left beside what came.
     """
+    groups = _groups(patch, changed)
+    if len(groups) > 1:
+        found = [each for group, own in groups for each in _things_of_group(patch, own, group)]
+        return sorted(found, key=lambda each: -np.count_nonzero(each[0]))
+    return _things_of_group(patch, kind, changed)
+
+
+def _groups(patch: Patch, changed: Mask) -> list[tuple[Mask, ChangeKind]]:
+    """The pieces of a change that lie apart, or where one came and the other left hang together by a neck, with their
+    kinds; nothing where it is but one piece. What is all shadow is no piece of its own."""
+    side = 2 * round(_NECK_M / 2 / patch.m_per_px) + 1
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    count, labels = cv2.connectedComponents(cv2.morphologyEx(changed.view(np.uint8), cv2.MORPH_OPEN, disk))
+    if count < 3 or _may_be_a_car(changed, patch.m_per_px):
+        return []
+    new_shade, old_shade = _shades(patch)
+    bare_m2 = np.bincount(labels[~(new_shade | old_shade)], minlength=count) * patch.m_per_px**2
+    pieces = [labels == each for each in range(1, count) if bare_m2[each] >= _LEAST_THING_M2]
+    if len(pieces) < 2:
+        return []
+    kinds = [kind_of(replace(patch, changed=each)) for each in pieces]
+    distances = [cv2.distanceTransform((~each).view(np.uint8), cv2.DIST_L2, 5) * patch.m_per_px for each in pieces]
+    group = list(range(len(pieces)))
+    for first, second in combinations(range(len(pieces)), 2):
+        is_contrary = _CONTRARY.get(kinds[first]) is kinds[second]
+        if not is_contrary and float(distances[first][pieces[second]].min()) < _GAP_M:
+            group = [group[first] if each == group[second] else each for each in group]
+    if len(set(group)) < 2:
+        return []
+    nearest = np.array(group)[np.argmin(distances, axis=0)]
+    found = [changed & (nearest == each) for each in dict.fromkeys(group)]
+    return [(each, kind_of(replace(patch, changed=each))) for each in found]
+
+
+def _things_of_group(patch: Patch, kind: ChangeKind, changed: Mask) -> list[tuple[Mask, ChangeKind]]:
+    """The things in one piece of a change, as `things_of` gives them."""
     shadow = changed & _shadow(patch, kind)
     lit = (changed & ~shadow).view(np.uint8)
     lit = np.asarray(cv2.morphologyEx(lit, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), np.uint8)

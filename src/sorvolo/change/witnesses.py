@@ -9,7 +9,7 @@ import numpy as np
 from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
 
 LEAST_SURENESS = 0.2  # a picture that shows a difference so surely bears out one that shows it surely
-_SURE = 0.5
+_SURE, _VERY_SURE = 0.5, 0.9
 _NEAR_PX = 9  # what leans a little another way lies a few pixels beside
 _SHOWN, _SEEN = 0.3, 0.95  # shares of a difference that another picture shows, and must see to be asked
 _MAP = 0  # the first of the opinions
@@ -28,7 +28,7 @@ def believed(by_map: tuple[Difference, Mask], earlier: Sequence[tuple[Difference
 
     Each opinion comes with the ground (h, w) that it sees, all in the frame's pixels, and with all differences from
     `LEAST_SURENESS` on. One opinion must show a difference surely; all earlier pictures that see its place must show
-    it as well; what the map does not show needs two of them. Nothing is believed where the map knows no ground.
+    it as well; what the map does not show needs two of them, or a single one that is very sure. Nothing is believed where the map knows no ground.
     """
     opinions = [by_map, *earlier]
     known = by_map[1]
@@ -37,12 +37,13 @@ def believed(by_map: tuple[Difference, Mask], earlier: Sequence[tuple[Difference
     mask = np.zeros_like(by_map[0].mask)
     boxes, scores = [], []
     for own, (opinion, _) in enumerate(opinions):
+        told = mask > 0  # by others: two regions of one opinion are two things, though boxes overlap
         for k in np.flatnonzero(opinion.scores >= _SURE):
             x, y, w, h = opinion.boxes[k]
             part = np.s_[y : y + h, x : x + w]
             shown = (opinion.mask[part] > 0) & known[part]
             count = int(np.count_nonzero(shown))
-            if count == 0 or np.count_nonzero(shown & (mask[part] > 0)) > _SHOWN * count:
+            if count == 0 or np.count_nonzero(shown & told[part]) > _SHOWN * count:
                 continue  # believed already
             answers = {
                 other: np.count_nonzero(shown & near[other][part]) > _SHOWN * count
@@ -50,7 +51,7 @@ def believed(by_map: tuple[Difference, Mask], earlier: Sequence[tuple[Difference
                 if other != own and np.count_nonzero(shown & sees[part]) > _SEEN * count
             }
             is_on_map = answers.pop(_MAP, own == _MAP)
-            if all(answers.values()) and (is_on_map or answers):
+            if all(answers.values()) and (is_on_map or answers or opinion.scores[k] >= _VERY_SURE):
                 mask[part] |= shown.view(np.uint8) * np.uint8(255)
                 boxes.append(opinion.boxes[k])
                 scores.append(opinion.scores[k])
