@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
+from sorvolo.change.gathering import GatheredChange
 from sorvolo.errors import SettingsError
 from sorvolo.survey.findings import Change, ChangeKind
 
@@ -47,6 +48,30 @@ def test_it_is_told_within_a_second_of_being_in_view_whatever_the_frame_rate():
         whole_in_view_s = (2 + 0.5 + 8 - 8) / 3  # the view reaches 8 m ahead of a drone that starts at -8 m
         assert index / fps < whole_in_view_s + 1.0
         assert change.announced_ns == START_NS + round(index / fps * 1e9)
+
+
+def gathered(number: int, shown: int, missed: int) -> GatheredChange:
+    change = GatheredChange(number, START_NS)
+    for each in range(shown):
+        change.see(START_NS + each, 0.9, None, None, 1.0)
+        change.from_camera(np.array([each, 0, CAMERA_HEIGHT_M]))
+    change.whole = shown
+    for _ in range(missed):
+        change.miss(1.0)
+    return change
+
+
+@pytest.mark.parametrize("older_is_surer", [True, False])
+def test_of_two_changes_that_join_the_surer_ones_record_counts(older_is_surer):
+    flickers, stands = gathered(1, 3, 12), gathered(2, 12, 0)
+    stands.is_told, stands.announced_ns = True, 7
+    if older_is_surer:
+        flickers.number, stands.number = 2, 1
+    older, younger = sorted([flickers, stands], key=lambda each: each.number)
+    score = stands.score
+    older.take_over(younger)
+    assert (older.number, older.views, older.asked, older.score) == (1, 12, 12, score)
+    assert older.is_told and older.announced_ns == 7
 
 
 def test_the_patch_shows_both_dates_north_up():

@@ -128,6 +128,15 @@ def test_a_walker_in_three_photos_moves_and_a_standing_thing_beside_does_not():
     assert sorted(each.kind for each in final) == [ChangeKind.APPEARED, ChangeKind.MOVING]
 
 
+def test_a_walker_straight_against_three_photos_way_moves_and_what_leans_does_not():
+    walks, leans = Thing(3, 4, (0.5, 0.5), velocity_m_s=(-0.9, 0)), Thing(2, -3, (0.5, 0.5), 5, (40, 60, 220))
+    photos = [view_of(i, 1.4 * i, (-3 + 2.5 * i, 0, CAMERA_HEIGHT_M), [walks, leans]) for i in range(3)]
+    _, final = events(photos)
+    (mover,) = [each for each in final if each.kind is ChangeKind.MOVING]
+    assert mover.velocity_m_s[0] == pytest.approx(-0.9, abs=0.2)
+    assert mover.outline_m[:, 1].mean() > 3
+
+
 def test_settings_are_checked():
     with pytest.raises(SettingsError):
         MovingSettings(least_views=2)

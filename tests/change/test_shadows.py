@@ -77,6 +77,24 @@ def test_a_shadow_that_went_round_its_thing_is_not_two_things():
     assert len(things_of(patch, ChangeKind.REPLACED, patch.changed)) == 1
 
 
+@pytest.mark.parametrize("gap_px, count", [(20, 2), (4, 1)])
+def test_dark_pieces_far_enough_apart_are_things_of_their_own(gap_px, count):
+    patch = patch_with(
+        (np.s_[20:80], np.s_[20:110], (200, 200, 190)),
+        (np.s_[44:54], np.s_[110 + gap_px : 122 + gap_px], (70, 20, 20)),
+    )
+    assert len(things_of(patch, ChangeKind.APPEARED, patch.changed)) == count
+
+
+def test_what_came_hangs_on_what_left_by_a_neck_and_is_another_thing():
+    patch = patch_with((np.s_[50:54], np.s_[110:122], SHADOW), (np.s_[44:58], np.s_[122:134], (70, 20, 20)))
+    patch.before[20:80, 20:110, :3] = (215, 215, 210)
+    patch.changed[20:80, 20:110] = True
+    things = {kind: mask for mask, kind in things_of(patch, ChangeKind.DISAPPEARED, patch.changed)}
+    assert things.keys() == {ChangeKind.APPEARED, ChangeKind.DISAPPEARED}
+    assert things[ChangeKind.APPEARED][50, 128] and things[ChangeKind.DISAPPEARED][50, 60]
+
+
 def test_the_bright_ends_of_a_dark_car_beside_another_thing_are_one_thing():
     car = (np.s_[30:66], np.s_[20:108], (25, 25, 25))
     ends = [(np.s_[32:64], np.s_[x : x + 6], (230, 60, 60)) for x in (21, 101)]

@@ -28,7 +28,8 @@ def believed(by_map: tuple[Difference, Mask], earlier: Sequence[tuple[Difference
 
     Each opinion comes with the ground (h, w) that it sees, all in the frame's pixels, and with all differences from
     `LEAST_SURENESS` on. One opinion must show a difference surely; all earlier pictures that see its place must show
-    it as well; what the map does not show needs two of them, or a single one that is very sure. Nothing is believed where the map knows no ground.
+    it as well; what the map does not show needs two of them, or a single one that is very sure. Nothing is believed
+    where the map knows no ground.
     """
     opinions = [by_map, *earlier]
     known = by_map[1]
