@@ -114,7 +114,8 @@ def test_settling_finds_a_shift_whatever_the_light(ground: np.ndarray) -> None:
 
 
 def test_trees_know_their_features() -> None:
-    trees = Trees(("a", "b"), 0.0, np.array([[0, 1]]), np.array([[1.0, 5.0]]), np.array([[-3.0, -1.0, 1.0, 3.0]]))
+    asked, thresholds, leaves = np.array([[0, 1]], np.int32), np.array([[1.0, 5.0]]), np.array([[-3.0, -1.0, 1.0, 3.0]])
+    trees = Trees(("a", "b"), 0.0, asked, thresholds, leaves)
     sure = how_sure(np.array([[0.0, 0.0], [0.0, 6.0], [2.0, 0.0], [2.0, 6.0]]), ("a", "b"), trees)
     np.testing.assert_allclose(sure, 1 / (1 + np.exp([3.0, 1.0, -1.0, -3.0])))
     with pytest.raises(SettingsError):
@@ -178,6 +179,28 @@ def test_measures_agree(rng: np.random.Generator, height: int, width: int, chann
         kernels.measure_regions(labels, boxes, stack, margin),
         reference_robust.measure_regions(labels, boxes, stack, margin),
     )
+
+
+@given(
+    st.integers(0, 9).map(np.random.default_rng), st.integers(0, 30), st.integers(1, 40), st.integers(1, 6),
+    st.integers(1, 9),
+)
+@settings(max_examples=40)
+def test_trees_agree(rng: np.random.Generator, rows: int, trees: int, depth: int, width: int) -> None:
+    features = rng.integers(0, 5, (rows, width)).astype(float)
+    asked = rng.integers(0, width, (trees, depth)).astype(np.int32)
+    thresholds, leaves = rng.integers(0, 5, (trees, depth)).astype(float), rng.normal(size=(trees, 2**depth))
+    expected = reference_robust.tree_margins(features, asked, thresholds, leaves)
+    assert np.array_equal(kernels.tree_margins(features, asked, thresholds, leaves), expected)
+
+
+def test_trees_that_do_not_fit_are_refused() -> None:
+    asked, thresholds, leaves = np.zeros((2, 1), np.int32), np.zeros((2, 1)), np.zeros((2, 2))
+    for wrong in ((np.zeros((1, 0)), asked), (np.zeros((1, 3)), asked + 3), (np.zeros((1, 3)), asked - 1)):
+        with pytest.raises(ValueError, match="tree_margins"):
+            kernels.tree_margins(*wrong, thresholds, leaves)
+    with pytest.raises(ValueError, match="tree_margins"):
+        kernels.tree_margins(np.zeros((1, 3)), asked, thresholds, np.zeros((2, 3)))
 
 
 def test_boxes_outside_are_refused() -> None:

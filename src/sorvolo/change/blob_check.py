@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats
+from sorvolo.kernels import tree_margins
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,7 +19,7 @@ class Trees:
 
     names: tuple[str, ...]
     prior: float
-    features: NDArray[np.int64]
+    features: NDArray[np.int32]
     thresholds: Floats
     leaves: Floats
 
@@ -33,10 +34,7 @@ def how_sure(features: Floats, names: tuple[str, ...], trees: Trees | None = Non
         raise SettingsError("the trees of blob_check.json were trained on other features; train them again")
     if len(features) == 0:
         return np.zeros(0)
-    answers = features[:, trees.features] > trees.thresholds
-    powers = 1 << np.arange(trees.features.shape[1])[::-1]
-    leaf = answers @ powers
-    margin = trees.prior + trees.leaves[np.arange(len(trees.leaves)), leaf].sum(axis=1)
+    margin = trees.prior + tree_margins(features, trees.features, trees.thresholds, trees.leaves)
     return np.asarray(1 / (1 + np.exp(-margin)))
 
 
@@ -45,6 +43,6 @@ def trained_trees() -> Trees:
     """The trees that come with the package."""
     stored = json.loads(files("sorvolo.change").joinpath("blob_check.json").read_text())
     return Trees(
-        tuple(stored["names"]), float(stored["prior"]), np.array(stored["features"], np.int64),
+        tuple(stored["names"]), float(stored["prior"]), np.array(stored["features"], np.int32),
         np.array(stored["thresholds"]), np.array(stored["leaves"]),
     )

@@ -220,6 +220,25 @@ def rim_balance(
     return balance
 
 
+def tree_margins(
+    rows: NDArray[np.float64], asked: NDArray[np.int32], thresholds: NDArray[np.float64], leaves: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """What trees say of rows (N, F), (N,): see reference_robust."""
+    trees, depth = asked.shape
+    if thresholds.shape != asked.shape or leaves.shape != (trees, 1 << depth) or trees < 1 or rows.ndim != 2:
+        raise ValueError(
+            f"tree_margins: rows {rows.shape}, asked {asked.shape}, thresholds {thresholds.shape} and leaves "
+            f"{leaves.shape} do not fit"
+        )
+    if int(asked.min()) < 0 or int(asked.max()) >= rows.shape[1]:
+        raise ValueError(f"tree_margins: rows have {rows.shape[1]} columns, asked is one of {int(asked.max())}")
+    margins: NDArray[np.float64] = _robust.tree_margins(
+        np.ascontiguousarray(rows, np.float64), np.ascontiguousarray(asked, np.int32),
+        np.ascontiguousarray(thresholds, np.float64), np.ascontiguousarray(leaves, np.float64),
+    )
+    return margins
+
+
 def core_regions(
     values: NDArray[np.uint8], thresholds: NDArray[np.uint8], strong: float, core: float, least_area: int, most: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:

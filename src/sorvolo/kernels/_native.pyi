@@ -41,6 +41,9 @@ def measure_regions(
 def match_regions(
     query: NDArray[np.uint8], reference: NDArray[np.uint8], boxes: NDArray[np.int32], reach: int
 ) -> NDArray[np.float64]: ...
+def tree_margins(
+    rows: NDArray[np.float64], asked: NDArray[np.int32], thresholds: NDArray[np.float64], leaves: NDArray[np.float64]
+) -> NDArray[np.float64]: ...
 def slopes(before: NDArray[np.float32], after: NDArray[np.float32], prior: float) -> NDArray[np.float64]: ...
 def fit_moves(
     rows_x: NDArray[np.float64], rows_y: NDArray[np.float64], moves: NDArray[np.float64], trust: NDArray[np.float64],

@@ -452,6 +452,28 @@ Doubles match_regions(const Bytes &query, const Bytes &reference, const Integers
     return found;
 }
 
+Doubles tree_margins(const Doubles &rows, const Integers32 &asked, const Doubles &thresholds, const Doubles &leaves) {
+    const std::ptrdiff_t width = rows.shape(1), trees = asked.shape(0), depth = asked.shape(1);
+    Doubles margins({rows.shape(0)});
+    const double *row = rows.data(), *first_threshold = thresholds.data(), *first_leaf = leaves.data();
+    const std::int32_t *first_asked = asked.data();
+    double *to = margins.mutable_data();
+    pybind11::gil_scoped_release released;
+    for (pybind11::ssize_t each = 0; each < margins.shape(0); ++each, row += width) {
+        const std::int32_t *column = first_asked;
+        const double *threshold = first_threshold, *leaf = first_leaf;
+        double margin = 0.0;
+        for (std::ptrdiff_t tree = 0; tree < trees; ++tree, leaf += std::ptrdiff_t{1} << depth) {
+            std::ptrdiff_t place = 0;
+            for (std::ptrdiff_t level = 0; level < depth; ++level, ++column, ++threshold)
+                place = 2 * place + (row[*column] > *threshold);
+            margin += leaf[place];
+        }
+        to[each] = margin;
+    }
+    return margins;
+}
+
 }  // namespace
 
 void bind_robust(pybind11::module_ &module) {
@@ -469,6 +491,8 @@ void bind_robust(pybind11::module_ &module) {
                arg("channels"), arg("margin"));
     module.def("match_regions", &match_regions, arg("query").noconvert(), arg("reference").noconvert(),
                arg("boxes").noconvert(), arg("reach"));
+    module.def("tree_margins", &tree_margins, arg("rows").noconvert(), arg("asked").noconvert(),
+               arg("thresholds").noconvert(), arg("leaves").noconvert());
 }
 
 }  // namespace sorvolo

@@ -227,3 +227,16 @@ def _correlation(q: NDArray[np.int64], t: NDArray[np.int64]) -> float:
         return 0.0
     common = int(q.size * (q * t).sum() - q.sum() * t.sum())
     return float(common / (np.sqrt(float(spread_q)) * np.sqrt(float(spread_t))))
+
+
+def tree_margins(
+    rows: NDArray[np.float64], asked: NDArray[np.int32], thresholds: NDArray[np.float64], leaves: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(N,) sums over oblivious trees of the leaf that each of `rows` (N, F) comes to, in the order of the trees.
+
+    Level by level a tree asks whether the column `asked` (T, D) passes `thresholds` (T, D); the answers, the first as
+    the highest bit, number its `leaves` (T, 2**D).
+    """
+    answers = rows[:, asked] > thresholds
+    place = answers @ (1 << np.arange(asked.shape[1])[::-1])
+    return np.asarray(np.cumsum(leaves[np.arange(len(leaves)), place], axis=1)[:, -1])
