@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
-from sorvolo.change.gathering import GatheredChange
+from sorvolo.change.gathering import GatheredChange, joined
 from sorvolo.errors import SettingsError
 from sorvolo.survey.findings import Change, ChangeKind
 
@@ -69,9 +69,9 @@ def test_of_two_changes_that_join_the_surer_ones_record_counts(older_is_surer):
         flickers.number, stands.number = 2, 1
     older, younger = sorted([flickers, stands], key=lambda each: each.number)
     score = stands.score
-    older.take_over(younger)
-    assert (older.number, older.views, older.asked, older.score) == (1, 12, 12, score)
-    assert older.is_told and older.announced_ns == 7
+    change = joined(older, younger)
+    assert (change.number, change.views, change.asked, change.score) == (1, 12, 12, score)
+    assert change.is_told and change.announced_ns == 7
 
 
 def test_the_patch_shows_both_dates_north_up():

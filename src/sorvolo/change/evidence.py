@@ -20,7 +20,7 @@ from sorvolo.change.cells import (
     lay,
     pieces,
 )
-from sorvolo.change.gathering import GatheredChange, upright_weight
+from sorvolo.change.gathering import GatheredChange, joined, upright_weight
 from sorvolo.change.movers import Movers
 from sorvolo.change.moving import BlobTracker, MovingSettings
 from sorvolo.change.parts import Parts
@@ -246,7 +246,7 @@ class EvidenceMap:
             else:
                 change = self._found[owners[0]]
                 for younger in owners[1:]:
-                    self._merge(change, self._found[younger])
+                    change = self._merge(change, self._found[younger])
             window = laid.window.part(part)
             change.cells = window if change.cells is None else change.cells.joined(window)
             self._grid.own(window, cells, change.number)
@@ -411,15 +411,17 @@ class EvidenceMap:
         """What a view counts in a change's share; nothing if the camera stands where it stood before."""
         return upright_weight(witness.camera_m, np.mean(window.box_m(self._cell_m), axis=0)) * witness.counts
 
-    def _merge(self, older: GatheredChange, younger: GatheredChange) -> None:
-        if younger.cells is not None:
-            self._grid.own(younger.cells, self._cells_of(younger), older.number)
+    def _merge(self, older: GatheredChange, younger: GatheredChange) -> GatheredChange:
+        number, gone = older.number, younger.number
         if younger.is_told:
-            self._parts.setdefault(older.number, Parts()).join(self._records(younger))
-        older.take_over(younger)
-        self._parts.pop(younger.number, None)
-        self._merged[younger.number] = older.number
-        del self._found[younger.number]
+            self._parts.setdefault(number, Parts()).join(self._records(younger))
+        if younger.cells is not None:
+            self._grid.own(younger.cells, self._cells_of(younger), number)
+        self._parts.pop(gone, None)
+        self._merged[gone] = number
+        del self._found[gone]
+        self._found[number] = joined(older, younger)
+        return self._found[number]
 
     def _current(self, number: int) -> int:
         while number in self._merged:

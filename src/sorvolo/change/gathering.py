@@ -28,7 +28,7 @@ _ONE_PLACE = 0.05  # of the flying height: seen from no wider apart, a ghost of 
 
 
 class GatheredChange:
-    """All that views told of one change. `see`, `vote`, `show` and `take_over` change it."""
+    """All that views told of one change. `see`, `vote` and `show` change it."""
 
     def __init__(self, number: int, first_seen_ns: int) -> None:
         self.number = number
@@ -163,21 +163,6 @@ class GatheredChange:
         self._yes += cv2.warpPerspective(changed, patch_from_image, size, flags=cv2.INTER_LINEAR) >= 128
         self._asked_px += cv2.warpPerspective(valid.view(np.uint8), patch_from_image, size, flags=cv2.INTER_NEAREST) > 0
 
-    def take_over(self, younger: "GatheredChange") -> None:
-        """Become one with a younger change. What views said of the surer of both, and its pictures, count for both."""
-        first_seen_ns = min(self.first_seen_ns, younger.first_seen_ns)
-        last_seen_ns = max(self.last_seen_ns, younger.last_seen_ns)
-        cells = younger.cells if self.cells is None else self.cells
-        if cells is not None and younger.cells is not None:
-            cells = cells.joined(younger.cells)
-        number, told = self.number, self if self.is_told else younger
-        is_told, announced_ns, is_taken_back = told.is_told, told.announced_ns, told.is_taken_back
-        if younger.score > self.score:
-            vars(self).update(vars(younger))
-        self.number, self.cells = number, cells
-        self.is_told, self.announced_ns, self.is_taken_back = is_told, announced_ns, is_taken_back
-        self.first_seen_ns, self.last_seen_ns = first_seen_ns, last_seen_ns
-
     def outline_m(self, cells: Mask, cell_m: float, join_m: float) -> PointsM | None:
         """(N, 2) its outline: what most masks call changed, on or beside its cells; by its cells alone if that is
         nothing. `cells` is the raster of its own cells in its window."""
@@ -246,6 +231,23 @@ class GatheredChange:
             f"{id_prefix}-{self.number}", self._kind, self.score, outline_m, self.first_seen_ns, self.last_seen_ns,
             self.views, size.area_m2, size.length_m, float(sigma_m), patch, announced_ns=self.announced_ns,
         )
+
+
+def joined(older: GatheredChange, younger: GatheredChange) -> GatheredChange:
+    """The one change that two have become, under the older one's number; neither is to be used any more.
+
+    What views said of the surer of both, and its pictures, count for it; what was told of either stays told.
+    """
+    surer, other = (younger, older) if younger.score > older.score else (older, younger)
+    told = older if older.is_told else younger
+    surer.number, surer.is_told, surer.announced_ns = older.number, told.is_told, told.announced_ns
+    surer.first_seen_ns = min(older.first_seen_ns, younger.first_seen_ns)
+    surer.last_seen_ns = max(older.last_seen_ns, younger.last_seen_ns)
+    if surer.cells is None or other.cells is None:
+        surer.cells = surer.cells or other.cells
+    else:
+        surer.cells = surer.cells.joined(other.cells)
+    return surer
 
 
 def upright_weight(camera_m: Floats, place_m: Floats) -> float:
