@@ -257,14 +257,7 @@ def _is_rigid(track: Track, length_m: float) -> bool:
     """
     if len(track.points) < _RIGID_POINTS or length_m > _RIGID_LENGTH_M:
         return False
-    way_m = float(np.hypot(*(track.last.blob.place_m - track.points[0].blob.place_m)))
-    areas = [each.blob.area_m2 for each in track.points]
-    lengths = [each.blob.length_m for each in track.points]
-    return (
-        way_m > max(1.0, _RIGID_LENGTHS * length_m)
-        and max(areas) < 1.7 * min(areas)
-        and max(lengths) < 1.35 * min(lengths)
-    )
+    return _way_m(track) > max(1.0, _RIGID_LENGTHS * length_m) and _keeps_its_size(track)
 
 
 def _floats(track: Track, move: Motion, length_m: float) -> bool:
@@ -273,15 +266,23 @@ def _floats(track: Track, move: Motion, length_m: float) -> bool:
     What leans is seen from its foot to its top; the foot of a thing whose top moves against the camera's way with a
     share k of its speed lies (top + k camera) / (1 + k). Photos show it too seldom to see it grow.
     """
-    areas = [each.blob.area_m2 for each in track.points]
-    lengths = [each.blob.length_m for each in track.points]
-    if length_m > _FLOATS_LENGTH_M or max(areas) > 1.7 * min(areas) or max(lengths) > 1.35 * min(lengths):
-        return False
     camera_m_s = float(np.hypot(*move.camera_m_s))
     k = -float(move.velocity_m_s @ move.camera_m_s) / max(camera_m_s, 1e-6) ** 2
-    way_m = float(np.hypot(*(track.last.blob.place_m - track.points[0].blob.place_m)))
+    if length_m > _FLOATS_LENGTH_M or k <= 0 or not _keeps_its_size(track):
+        return False  # where k is not above 0, no height explains it
     apart_m = [k / (1 + k) * float(np.hypot(*(each.blob.place_m - each.camera_m))) for each in track.points]
-    return way_m > _RIGID_LENGTHS * length_m and float(np.median(apart_m)) > length_m
+    return _way_m(track) > _RIGID_LENGTHS * length_m and float(np.median(apart_m)) > length_m
+
+
+def _way_m(track: Track) -> float:
+    """How far a track's last points lead over the ground."""
+    return float(np.hypot(*(track.last.blob.place_m - track.points[0].blob.place_m)))
+
+
+def _keeps_its_size(track: Track) -> bool:
+    areas = [each.blob.area_m2 for each in track.points]
+    lengths = [each.blob.length_m for each in track.points]
+    return max(areas) < 1.7 * min(areas) and max(lengths) < 1.35 * min(lengths)
 
 
 def _may_move(track: Track, move: Motion) -> bool:
