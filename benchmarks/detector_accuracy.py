@@ -26,7 +26,7 @@ from sorvolo.simulation.pictures import LEAST_VISIBLE, SMALLEST_PX, PictureSetti
 from sorvolo.simulation.presets import preset
 from sorvolo.simulation.truth import coco_boxes
 from sorvolo.store.datasets import read_dataset
-from sorvolo.store.detector_files import FoundSets
+from sorvolo.store.detector_files import FoundSet
 from sorvolo.store.exports import plain_json
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
@@ -62,7 +62,7 @@ def main() -> None:
             measured = evaluate_detector([[options.model]], [labelled], settings)
         runs[name] = figures(measured.sets[0]) | {
             "seconds_per_picture": measured.found.seconds_per_picture,
-            "people_by_centre": people_by_centre(labelled, measured.found),
+            "people_by_centre": people_by_centre(labelled, measured.found.sets[labelled.name]),
         }
         print(name, json.dumps(plain_json(runs[name]["classes"])), flush=True)
         if options.out is not None:
@@ -151,7 +151,7 @@ def figures(scores) -> dict[str, object]:
     }
 
 
-def people_by_centre(labelled: LabelledSet, found: FoundSets) -> dict[str, float | int] | None:
+def people_by_centre(labelled: LabelledSet, found: FoundSet) -> dict[str, float | int] | None:
     """How many people are found if a told box's centre within the label is enough, for sets with loose boxes.
 
     At the model's own threshold; None where no person is labelled. `found` and `right` are shares of the labels and of
@@ -159,7 +159,7 @@ def people_by_centre(labelled: LabelledSet, found: FoundSets) -> dict[str, float
     """
     own, told = labelled.classes.index("person"), found.classes.index("person")
     labels = hits = boxes = right = 0
-    for picture, seen in zip(labelled.pictures, found.sets[labelled.name][1]):
+    for picture, seen in zip(labelled.pictures, found.detections):
         people = picture.boxes_px[picture.labels == own]
         is_told = (seen.labels == told) & (seen.scores >= found.thresholds["person"])
         centres = (seen.boxes_px[is_told][:, :2] + seen.boxes_px[is_told][:, 2:]) / 2

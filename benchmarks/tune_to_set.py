@@ -26,7 +26,7 @@ from sorvolo.detection.session import Seen
 from sorvolo.detection.suppression import SeenTile, merge_tiles
 from sorvolo.detection.tiling import plan_tiles
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.store.detector_files import FoundSets
+from sorvolo.store.detector_files import FoundSet
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES, Detections
 from sorvolo.training.drawing import batches_from
@@ -71,7 +71,7 @@ def main() -> None:
     held_out = LabelledSet(wishes.name, CLASSES, tuple(pictures), unlabelled)
     told = dict.fromkeys(CLASSES, 0.5)
     scores = score_set(held_out, found, CLASSES, told)
-    centres = people_by_centre(held_out, FoundSets("tuned", CLASSES, told, {wishes.name: ((), tuple(found))}))
+    centres = people_by_centre(held_out, FoundSet((), tuple(found), told))
     document = {
         "benchmark": "tune_to_set", "set": wishes.name, "machine": machine(), "commit": commit(), "seed": wishes.seed,
         "steps": wishes.steps, "scale": wishes.scale, "look": wishes.look, "tiles": wishes.tiles,

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from toy_models import rectangle_model
 
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError
@@ -21,7 +22,7 @@ from sorvolo.missions.evaluate_detector import (
     write_evaluation,
 )
 from sorvolo.missions.holding_out import hold_out
-from sorvolo.store.detector_files import FoundSets, read_found, write_found
+from sorvolo.store.detector_files import FoundSet, FoundSets, read_found, write_found
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES, Detections
 
@@ -32,10 +33,7 @@ THRESHOLDS = dict.fromkeys(CLASSES, 0.5)
 @pytest.fixture(scope="session")
 def toy(tmp_path_factory):
     """A real model that finds bright rectangles: red is the score, green the class."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parents[1] / "detection"))
-        import toy_models
-    return toy_models.rectangle_model(tmp_path_factory.mktemp("models") / "toy.onnx")
+    return rectangle_model(tmp_path_factory.mktemp("models") / "toy.onnx")
 
 
 def paint(path, rectangles):
@@ -94,6 +92,27 @@ def test_a_model_is_measured_and_its_report_stands_alone(toy, labelled, tmp_path
     assert its["seconds_per_picture"] != its["seconds_per_picture"]  # unknown: nothing was run
 
 
+def test_each_set_is_reported_from_the_scores_of_the_model_that_looks_at_its_light(labelled, tmp_path, monkeypatch):
+    monkeypatch.setenv("SORVOLO_MODELS", str(tmp_path / "models"))
+    (tmp_path / "models").mkdir()
+    night_scores, day_scores = dict.fromkeys(CLASSES, 0.7), dict.fromkeys(CLASSES, 0.4)
+    rectangle_model(tmp_path / "models" / "night.onnx", name="night", thermal=True, thresholds=night_scores)
+    day = rectangle_model(
+        tmp_path / "day.onnx", name="day", thermal=True, thermal_by="night", thresholds=day_scores
+    )
+    grey = tmp_path / "grey.png"
+    Image.fromarray(np.array(Image.open(labelled.pictures[0].path).convert("L"))).save(grey)
+    night = replace(labelled, name="night", pictures=(replace(labelled.pictures[0], path=str(grey)),))
+    evaluation = evaluate_detector([[str(day)]], [labelled, night], QUICK)
+    assert [dict(each.thresholds) for each in evaluation.found.sets.values()] == [day_scores, night_scores]
+    assert [each.classes[0].reported.score for each in evaluation.sets] == [0.4, 0.7]
+    assert not any("another light" in text for text in evaluation.notices)
+    both = replace(labelled, pictures=(*labelled.pictures, *night.pictures))
+    evaluation = evaluate_detector([[str(day)]], [both], QUICK)
+    assert evaluation.sets[0].classes[0].reported.score == 0.4
+    assert any("painted: 1 of 5 pictures are of another light" in text for text in evaluation.notices)
+
+
 def random_arm(folder, name, labelled, skill, seed):
     """detections.json of a detector that finds each label with this chance."""
     rng = np.random.default_rng(seed)
@@ -105,7 +124,7 @@ def random_arm(folder, name, labelled, skill, seed):
         found.append(Detections(boxes, scores, np.append(picture.labels[hit], 0), CLASSES))
     names = tuple(Path(each.path).name for each in labelled.pictures)
     path = folder / f"{name}{seed}.json"
-    write_found(path, FoundSets(name, CLASSES, THRESHOLDS, {labelled.name: (names, tuple(found))}))
+    write_found(path, FoundSets(name, CLASSES, {labelled.name: FoundSet(names, tuple(found), THRESHOLDS)}))
     return str(path)
 
 
@@ -146,8 +165,8 @@ def test_detections_of_other_pictures_are_refused(many, labelled, tmp_path):
     fewer = LabelledSet(many.name, many.classes, many.pictures[5:10], many.unlabelled)
     assert evaluate_detector([[mine]], [fewer], QUICK).sets[0].pictures == 5
     found = read_found(Path(mine))
-    names, detections = found.sets["many"]
-    half = FoundSets(found.name, CLASSES, THRESHOLDS, {"many": (names[:9], detections[:9])})
+    whole = found.sets["many"]
+    half = FoundSets(found.name, CLASSES, {"many": FoundSet(whole.files[:9], whole.detections[:9], THRESHOLDS)})
     write_found(tmp_path / "half.json", half)
     with pytest.raises(InputError, match=r"51 are missing, such as 9\.png"):
         evaluate_detector([[str(tmp_path / "half.json")]], [many], QUICK)
@@ -213,7 +232,7 @@ def test_a_damaged_picture_is_left_out_for_all_models_and_named(toy, coco, tmp_p
     numbers = json.loads((tmp_path / "cut" / NUMBERS).read_text())
     assert numbers["sets"][0]["pictures"] == 3 and "1 pictures cannot be read" in numbers["notices"]
     assert numbers["comparisons"][0]["arms"][0]["mean"] == numbers["comparisons"][0]["arms"][1]["mean"]
-    assert read_found(tmp_path / "cut" / FOUND).sets["coco"][0] == ("0.png", "2.png", "3.png")
+    assert read_found(tmp_path / "cut" / FOUND).sets["coco"].files == ("0.png", "2.png", "3.png")
     # what was measured without it can be compared without it
     assert main([*command, "--compare", str(tmp_path / "cut" / FOUND)]) == 0
     for path in folder.glob("*.png"):

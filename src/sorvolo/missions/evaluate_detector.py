@@ -21,7 +21,7 @@ from sorvolo.geometry.arrays import BoxesPx, ImageRGB
 from sorvolo.missions.holding_out import hold_out
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.datasets import read_datasets
-from sorvolo.store.detector_files import FoundSets, mistake_picture, read_found, write_found
+from sorvolo.store.detector_files import FoundSet, FoundSets, mistake_picture, read_found, write_found
 from sorvolo.store.detector_page import detector_page
 from sorvolo.store.exports import json_bytes
 from sorvolo.survey.flight import Notice
@@ -135,15 +135,14 @@ def evaluate_detector(
     labelled = [_readable(each, damaged) for each in labelled]
     first = seen[0][0]
     scores = tuple(
-        score_set(each, first.sets[each.name][1], first.classes, first.thresholds, draws=settings.draws,
-                  seed=settings.seed)
-        for each in labelled
+        score_set(each, mine.detections, first.classes, mine.thresholds, draws=settings.draws, seed=settings.seed)
+        for each, mine in ((each, first.sets[each.name]) for each in labelled)
     )
     comparisons: tuple[SetComparison, ...] = ()
     if len(seen) > 1:
         comparisons = tuple(_side_by_side(each, seen, settings) for each in labelled)
     worst = {
-        each.name: tuple(_worst(each, score, first.sets[each.name][1], first.thresholds))
+        each.name: tuple(_worst(each, score, first.sets[each.name]))
         for each, score in zip(labelled, scores)
     }
     return DetectorEvaluation(first, scores, comparisons, worst, (*_told_of_damaged(damaged), *first.notices))
@@ -168,10 +167,10 @@ def evaluation_numbers(evaluation: DetectorEvaluation, description: Mapping[str,
     """The content of detector.json: all numbers, without the list of every mistake."""
     return {
         "made_by": "sorvolo evaluate detector", "format": 1, **description, "model": evaluation.found.name,
-        "classes": list(evaluation.found.classes), "thresholds": dict(evaluation.found.thresholds),
-        "seconds_per_picture": evaluation.found.seconds_per_picture,
+        "classes": list(evaluation.found.classes), "seconds_per_picture": evaluation.found.seconds_per_picture,
         "sets": [
             {key: value for key, value in asdict(each).items() if key != "mistakes"}
+            | {"thresholds": dict(evaluation.found.sets[each.name].thresholds)}
             | {"mistakes": {kind: sum(row.kind == kind for row in each.mistakes) for kind in _KINDS}}
             for each in evaluation.sets
         ],
@@ -201,10 +200,12 @@ def _found(
     detector = Detector.load(place)
     for each in labelled:
         judged_classes(each, detector.classes)  # before an hour of looking
-    sets: dict[str, tuple[tuple[str, ...], tuple[Detections, ...]]] = {}
+    sets: dict[str, FoundSet] = {}
+    mixed: list[str] = []
     seconds, count = 0.0, 0
     for each in labelled:
         detections = []
+        lights: list[Mapping[str, float]] = []
         for picture in each.pictures:
             image = _picture(picture.path, damaged)
             if image is None:
@@ -216,11 +217,18 @@ def _found(
                 ))
                 seconds += time.perf_counter() - started
                 count += 1
+                lights.append(detector.thresholds_for(image))
             told(EvaluationProgress(detector.info.name, each.name, len(detections), len(each)))
-        sets[each.name] = _names(each), tuple(detections)
+        usual = max(lights, key=lights.count, default=detector.info.thresholds)
+        if others := len(lights) - lights.count(usual):
+            mixed.append(
+                f"{each.name}: {others} of {len(lights)} pictures are of another light than most and are told from "
+                "other scores on; what is reported is counted by the thresholds of most"
+            )
+        sets[each.name] = FoundSet(_names(each), tuple(detections), usual)
     return FoundSets(
-        _arm_name(place), detector.classes, dict(detector.info.thresholds), sets, seconds / max(count, 1),
-        tuple(notice.text for notice in detector.notices),
+        _arm_name(place), detector.classes, sets, seconds / max(count, 1),
+        (*(notice.text for notice in detector.notices), *mixed),
     )
 
 
@@ -254,9 +262,11 @@ def _without(found: FoundSets, labelled: Sequence[LabelledSet], damaged: Mapping
     """What was found, without the pictures that no model could be shown."""
     sets = {}
     for each in labelled:
-        files, detections = found.sets[each.name]
+        one = found.sets[each.name]
         rows = [row for row, picture in enumerate(each.pictures) if picture.path not in damaged]
-        sets[each.name] = tuple(files[row] for row in rows), tuple(detections[row] for row in rows)
+        sets[each.name] = replace(
+            one, files=tuple(one.files[row] for row in rows), detections=tuple(one.detections[row] for row in rows)
+        )
     return replace(found, sets=sets)
 
 
@@ -277,44 +287,44 @@ def _names(labelled: LabelledSet) -> tuple[str, ...]:
 
 def _same_pictures(
     place: str, found: FoundSets, labelled: LabelledSet, damaged: dict[str, str]
-) -> tuple[tuple[str, ...], tuple[Detections, ...]]:
+) -> FoundSet:
     """The file's detections in the order of the set's pictures; those that it lacks must be damaged ones."""
     if labelled.name not in found.sets:
         raise InputError(f"{place}: holds detections of {', '.join(found.sets)}, none of {labelled.name}")
-    files, detections = found.sets[labelled.name]
+    one = found.sets[labelled.name]
     wanted = _names(labelled)
-    if files == wanted:
-        return files, detections
-    by_name = dict(zip(files, detections))
+    if one.files == wanted:
+        return one
+    by_name = dict(zip(one.files, one.detections))
     missing = [
         name for name, picture in zip(wanted, labelled.pictures)
         if name not in by_name and _picture(picture.path, damaged) is not None
     ]
-    if missing or len(by_name) < len(files) or len(set(wanted)) < len(wanted):
+    if missing or len(by_name) < len(one.files) or len(set(wanted)) < len(wanted):
         raise InputError(
             f"{place}: made on other pictures of {labelled.name}"
             + (f"; {len(missing)} are missing, such as {missing[0]}" if missing else "")
         )
     nothing = _nothing(found.classes)
-    return wanted, tuple(by_name.get(name, nothing) for name in wanted)
+    return replace(one, files=wanted, detections=tuple(by_name.get(name, nothing) for name in wanted))
 
 
 def _side_by_side(
     labelled: LabelledSet, seen: Sequence[Sequence[FoundSets]], settings: EvaluationSettings
 ) -> SetComparison:
     names = [arm[0].name + (f" and {len(arm) - 1} more seeds" if len(arm) > 1 else "") for arm in seen]
-    arms = [
-        Arm(
+    arms = []
+    for place, (name, arm) in enumerate(zip(names, seen), start=1):
+        seeds = [each.sets[labelled.name] for each in arm]
+        arms.append(Arm(
             name if names.count(name) == 1 else f"{name} ({place})", arm[0].classes,
-            tuple(each.sets[labelled.name][1] for each in arm), tuple(each.thresholds for each in arm),
-        )
-        for place, (name, arm) in enumerate(zip(names, seen), start=1)
-    ]
+            tuple(each.detections for each in seeds), tuple(each.thresholds for each in seeds),
+        ))
     return compare_arms(labelled, arms, draws=settings.draws, seed=settings.seed)
 
 
 def _worst(
-    labelled: LabelledSet, scores: SetScores, found: Sequence[Detections], thresholds: Mapping[str, float]
+    labelled: LabelledSet, scores: SetScores, found: FoundSet
 ) -> Iterator[tuple[Mistake, str, ImageRGB]]:
     """The surest false alarms and confusions and the largest misses, with the picture's name and a crop."""
     for kind in _KINDS:
@@ -322,7 +332,7 @@ def _worst(
         mistakes.sort(key=_area_px if kind == "miss" else lambda each: each.score, reverse=True)
         for mistake in _few_of_each_picture(mistakes):
             picture = labelled.pictures[mistake.picture]
-            reported = _reported(found[mistake.picture], thresholds)
+            reported = _reported(found.detections[mistake.picture], found.thresholds)
             image = _picture(picture.path, {})
             if image is not None:  # of detections.json the pictures were not needed so far
                 crop = mistake_picture(image, mistake.box_px, _judged_boxes(picture, labelled, scores), reported)

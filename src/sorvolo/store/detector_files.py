@@ -15,21 +15,31 @@ from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.survey.objects import Detections
 
 _MADE_BY = "sorvolo evaluate detector"
+_FORMAT = 2
 _CROP_PX = 220
 _LABEL_COLOUR, _FOUND_COLOUR = (40, 220, 90), (255, 150, 30)
 
 
 @dataclass(frozen=True, eq=False)
+class FoundSet:
+    """What a model found in one set: its pictures' file names, one Detections a picture, and from which score on each
+    class is told there; a model may have other thresholds for thermal frames."""
+
+    files: tuple[str, ...]
+    detections: tuple[Detections, ...]
+    thresholds: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
 class FoundSets:
-    """What one model found: of each set, by name, its pictures' file names and one Detections a picture.
+    """What one model found, by the sets' names.
 
     `seconds_per_picture` is NaN where it was not measured; `notices` are what the detector had to say.
     """
 
     name: str
     classes: tuple[str, ...]
-    thresholds: Mapping[str, float]
-    sets: Mapping[str, tuple[tuple[str, ...], tuple[Detections, ...]]]
+    sets: Mapping[str, FoundSet]
     seconds_per_picture: float = float("nan")
     notices: tuple[str, ...] = ()
 
@@ -37,17 +47,19 @@ class FoundSets:
 def write_found(path: Path, found: FoundSets) -> None:
     """Write detections.json (docs/formats.md): boxes to 0.01 px, scores to 1e-5. Raises StoreError on a full disk."""
     content = {
-        "made_by": _MADE_BY, "format": 1, "model": found.name, "classes": list(found.classes),
-        "thresholds": dict(found.thresholds),
+        "made_by": _MADE_BY, "format": _FORMAT, "model": found.name, "classes": list(found.classes),
         "sets": {
-            name: [
-                {
-                    "file": file, "boxes_px": np.round(each.boxes_px.astype(float), 2).tolist(),
-                    "scores": np.round(each.scores, 5).tolist(), "labels": each.labels.tolist(),
-                }
-                for file, each in zip(files, detections)
-            ]
-            for name, (files, detections) in found.sets.items()
+            name: {
+                "thresholds": dict(one.thresholds),
+                "pictures": [
+                    {
+                        "file": file, "boxes_px": np.round(each.boxes_px.astype(float), 2).tolist(),
+                        "scores": np.round(each.scores, 5).tolist(), "labels": each.labels.tolist(),
+                    }
+                    for file, each in zip(one.files, one.detections)
+                ],
+            }
+            for name, one in found.sets.items()
         },
     }
     atomic_write_bytes(path, (json.dumps(content, separators=(",", ":")) + "\n").encode())
@@ -57,15 +69,18 @@ def read_found(path: Path) -> FoundSets:
     """Read what `write_found` wrote. Raises InputError for any other file."""
     try:
         content = json.loads(path.read_bytes())
-        if content["format"] != 1:
-            raise ValueError(f"format {content['format']!r}")
+        if content["format"] != _FORMAT:
+            raise ValueError(f"format {content['format']!r}, not {_FORMAT}")
         classes = tuple(str(name) for name in content["classes"])
         sets = {
-            str(name): (tuple(str(row["file"]) for row in rows), tuple(_detections(row, classes) for row in rows))
-            for name, rows in content["sets"].items()
+            str(name): FoundSet(
+                tuple(str(row["file"]) for row in one["pictures"]),
+                tuple(_detections(row, classes) for row in one["pictures"]),
+                {each: float(one["thresholds"][each]) for each in classes},
+            )
+            for name, one in content["sets"].items()
         }
-        thresholds = {name: float(content["thresholds"][name]) for name in classes}
-        return FoundSets(str(content["model"]), classes, thresholds, sets)
+        return FoundSets(str(content["model"]), classes, sets)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
