@@ -263,6 +263,21 @@ def test_low_scores_are_kept_but_not_told():
     assert told == [] and evidence.conclude() == ()
 
 
+@pytest.mark.parametrize(("velocity_m_s", "stays"), [((0, 0), True), ((0, -3.5), False)])
+def test_a_thing_seen_shortly_and_in_other_pieces_each_time_is_told_if_its_ground_stays_the_same(velocity_m_s, stays):
+    car = Thing(0, 2, (4.5, 1.8), velocity_m_s=velocity_m_s)
+    views = []
+    for view in flight([car], seconds=1.4, start_m=(-2, 0)):
+        if view.index % 2 and len(view.boxes) == 1:
+            x, y, w, h = view.boxes[0]
+            halves = [[x, y, w // 2, h], [x + w // 2, y, w - w // 2, h]]
+            view = replace(view, boxes=np.array(halves), scores=np.full(2, 0.95))
+        views.append(view)
+    evidence, _ = collect(views)
+    final = evidence.conclude()
+    assert [each.kind for each in final] == [ChangeKind.APPEARED] * stays
+
+
 def test_something_seen_for_a_while_only_is_taken_back():
     thing = Thing(-4, 0)
     views = [view_of(i, i / 5, (-6 + 0.2 * i, 0, CAMERA_HEIGHT_M), [thing] if i < 6 else []) for i in range(30)]

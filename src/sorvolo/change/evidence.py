@@ -44,6 +44,8 @@ _MOVED_HEIGHTS = 0.01  # the camera's way, in flying heights, after which a view
 _ALL_CHANGED = 0.5  # share of the frame beyond which nothing in it can be followed
 _PASSING, _PASSING_VIEWS = 0.5, 8  # flagged in so much smaller a share of at least so many views than ...
 _SUREST = 97  # ... the surest of a change's cells, in per cent of them, cells are no part of it
+_NEARLY_ALL, _MOST_STAY = 0.8, 0.6
+_GONE_VIEWS = 2  # that saw the ground without it
 _STANDS_S = 2.0  # what the same ground shows for so long stands there, however unsteady its blobs look
 
 
@@ -163,11 +165,18 @@ class EvidenceMap:
         for change in self._found.values():
             if not change.is_told:
                 self._told(change, -1)
-            elif not (self._is_sure(change) and self._is_thing(change)):
+            elif not (self._is_sure(change) and self._is_thing(change)) or self._passed(change):
                 change.is_taken_back = True
             else:
                 self._part(change, -1)
         return self.changes()
+
+    def _passed(self, change: GatheredChange) -> bool:
+        """Whether a change is what a moving thing left in the evidence before it was known to move."""
+        is_gone = change.asked >= change.views + _GONE_VIEWS
+        if change.cells is None or not is_gone:
+            return False
+        return self._movers.were_at(*change.cells.box_m(self._cell_m), change.first_seen_ns, change.last_seen_ns)
 
     def _part(self, change: GatheredChange, now_ns: int) -> list[Change]:
         """Tell the things in a change from each other as its pictures now show them; those told for the first time."""
@@ -506,11 +515,13 @@ class EvidenceMap:
     def _grow_late(self, seed: GatheredChange) -> None:
         """Tell what fewer than n views could see: the same share of them must show it as k of n."""
         settings = self._settings
-        has_moved = seed.held > 2 and (seed.last_seen_ns - seed.first_seen_ns) * 1e-9 < _STANDS_S
-        if seed.cells is None or has_moved:
+        if seed.cells is None:
             return
         evidence = self._grid.read(seed.cells)
         seen, changed = evidence.seen.astype(float), evidence.changed
+        is_short = (seed.last_seen_ns - seed.first_seen_ns) * 1e-9 < _STANDS_S
+        if seed.held > 2 and is_short and not _stays(evidence):
+            return
         needed = np.maximum(settings.least_views, np.ceil(settings.k * np.minimum(seen, settings.n) / settings.n))
         free = evidence.owner == 0
         late = free & (((changed >= needed) & (seen < settings.n)) | (evidence.votes >= settings.k))
@@ -545,6 +556,13 @@ class EvidenceMap:
         seed.number = self._next_number()
         self._grid.own(seed.cells, cells, seed.number)
         self._found[seed.number] = seed
+
+
+def _stays(evidence: CellEvidence) -> bool:
+    """Whether most cells that any view flagged were flagged by nearly all views: what moves leaves them."""
+    ever = evidence.changed > 0
+    steady = np.count_nonzero(evidence.changed[ever] >= _NEARLY_ALL * evidence.seen[ever])
+    return bool(steady >= _MOST_STAY * np.count_nonzero(ever))
 
 
 def _number_of(change: Change) -> int:

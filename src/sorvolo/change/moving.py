@@ -23,8 +23,10 @@ from sorvolo.survey.findings import ComparedView
 _MOST_PARALLAX = 0.6 / (1 - 0.6)  # h / (H - h) of a thing 0.6 times as high as the camera flies
 _UNLIKELY_PARALLAX = 0.5  # no thing that came is a third as high as the camera flies
 _POINTS = 12  # of a track, that its velocity is fitted to
+_MUCH_LARGER = 4.0
 _NEAR_PX = 8  # what is looked at around a place to tell shadows
 _RIGID_POINTS, _RIGID_LENGTHS, _RIGID_LENGTH_M = 5, 2.0, 2.5
+_STEADY_POINTS, _STEADY_LENGTHS, _VERY_STEADY = 8, 1.2, (1.3, 1.15)  # what leans changes its size on less of a way
 _FLOATS_LENGTH_M = 1.3
 _PHOTOS_APART_S = 0.7  # at least, on average
 _ONE_THING_M = 0.4  # two that move alike so near each other are one thing, seen now with its shadow, now without
@@ -38,7 +40,7 @@ class MovingSettings:
     least_views: int = 5
     least_photos: int = 3  # of views so far apart in time as photos are: chance seldom fits three of them
     least_move_m: float = 1.0  # beyond what alignment and a swaying crown do
-    least_lengths: float = 1.2  # of its own: then its places do not overlap, and nothing that grew explains it
+    least_lengths: float = 1.0  # of its own: then its places do not overlap, and nothing that grew explains it
     least_length_m: float = 0.3  # a person from above; smaller specks jump about
     most_speed_m_s: float = 3.0  # of something small ...
     most_lengths_s: float = 4.0  # ... and lengths a second more: a car of 4 m may go 19 m/s
@@ -215,8 +217,8 @@ class BlobTracker:
             and speed_m_s <= settings.fastest_m_s(length_m)
             and (is_own or _is_rigid(track, length_m) or (self._are_photos(track) and _floats(track, move, length_m)))
             and float(np.hypot(*(move.velocity_m_s - move.camera_m_s))) > 0.3 * float(np.hypot(*move.camera_m_s))
-            and move.error_m < 0.05 + 0.03 * speed_m_s * track.seconds
-            and not _is_still_there(track.points[0], view)
+            and move.error_m < 0.05 + 0.03 * (speed_m_s * track.seconds + length_m)
+            and not _is_still_there(track, view)
         )
 
     def _are_photos(self, track: Track) -> bool:
@@ -257,7 +259,9 @@ def _is_rigid(track: Track, length_m: float) -> bool:
     """
     if len(track.points) < _RIGID_POINTS or length_m > _RIGID_LENGTH_M:
         return False
-    return _way_m(track) > max(1.0, _RIGID_LENGTHS * length_m) and _keeps_its_size(track)
+    is_very_steady = len(track.points) >= _STEADY_POINTS and _keeps_its_size(track, *_VERY_STEADY)
+    lengths = _STEADY_LENGTHS if is_very_steady else _RIGID_LENGTHS
+    return _way_m(track) > max(1.0, lengths * length_m) and _keeps_its_size(track)
 
 
 def _floats(track: Track, move: Motion, length_m: float) -> bool:
@@ -279,10 +283,11 @@ def _way_m(track: Track) -> float:
     return float(np.hypot(*(track.last.blob.place_m - track.points[0].blob.place_m)))
 
 
-def _keeps_its_size(track: Track) -> bool:
+def _keeps_its_size(track: Track, most_area: float = 1.7, most_length: float = 1.35) -> bool:
+    """Whether a track's largest area and length are less than so many times the smallest."""
     areas = [each.blob.area_m2 for each in track.points]
     lengths = [each.blob.length_m for each in track.points]
-    return max(areas) < 1.7 * min(areas) and max(lengths) < 1.35 * min(lengths)
+    return max(areas) < most_area * min(areas) and max(lengths) < most_length * min(lengths)
 
 
 def _may_move(track: Track, move: Motion) -> bool:
@@ -318,13 +323,22 @@ def _follow_over_rim(
                 is_moving[index] |= bool(track.mover)
 
 
-def _is_still_there(first: TrackPoint, view: ComparedView) -> bool:
-    """Whether the view still shows a change where the track began; not if it cannot tell."""
-    pixel = apply_homography(np.linalg.inv(view.site_from_image), first.blob.place_m[None])[0]
+def _is_still_there(track: Track, view: ComparedView) -> bool:
+    """Whether the view still shows a change where the track began; not if it cannot tell.
+
+    What is much larger than what the track shows now is another thing, which it set out from or passed.
+    """
+    pixel = apply_homography(np.linalg.inv(view.site_from_image), track.points[0].blob.place_m[None])[0]
     height, width = view.changed.shape
     if not np.isfinite(pixel).all() or not (0 <= pixel[0] < width - 1 and 0 <= pixel[1] < height - 1):
         return False
     x, y = round(pixel[0]), round(pixel[1])
+    own = track.last.blob.box
+    sizes = view.boxes[:, 2] * view.boxes[:, 3]
+    corners, sides = view.boxes[:, :2], view.boxes[:, 2:]
+    holds = np.all((corners <= [x, y]) & ([x, y] < corners + sides), axis=1)
+    if holds.any() and not holds[own] and (sizes[holds] > _MUCH_LARGER * sizes[own]).all():
+        return False
     window = slice(max(y - _NEAR_PX, 0), y + _NEAR_PX), slice(max(x - _NEAR_PX, 0), x + _NEAR_PX)
     changed = view.changed[window] > 0
     dark = shadow_of_arrival(view.reference[window], view.image[window], changed)

@@ -52,12 +52,13 @@ def without_shadow(change: Change) -> Change:
 def is_speck_of_shade(change: Change) -> bool:
     """Whether a change is so small, dark and unsure that it is a piece of a shadow rather than a thing.
 
-    Most of it is ground that grew darker, or brighter, all colours alike: where a shadow of something that stays
-    came, or left.
+    Most of it is ground that grew darker or brighter, all colours alike: where a shadow of something that stays came,
+    left, or both, for it moved.
     """
     if change.area_m2 >= _SPECK_M2 or change.score >= _SPECK_SCORE:
         return False
-    return any(_is_part(change.patch.changed, each) for each in _shades(change.patch))
+    came, left = _shades(change.patch)
+    return _is_part(change.patch.changed, came | left)
 
 
 def _shades(patch: Patch) -> tuple[Mask, Mask]:

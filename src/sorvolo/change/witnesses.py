@@ -28,8 +28,9 @@ def believed(by_map: tuple[Difference, Mask], earlier: Sequence[tuple[Difference
 
     Each opinion comes with the ground (h, w) that it sees, all in the frame's pixels, and with all differences from
     `LEAST_SURENESS` on. One opinion must show a difference surely; all earlier pictures that see its place must show
-    it as well; what the map does not show needs two of them, or a single one that is very sure. Nothing is believed
-    where the map knows no ground.
+    it as well, but one that ends right beside it is not asked: what leans out of a picture has no outline there. What
+    the map does not show needs two of them, or a single one that is very sure. Nothing is believed where the map knows
+    no ground.
     """
     opinions = [by_map, *earlier]
     known = by_map[1]
@@ -46,14 +47,23 @@ def believed(by_map: tuple[Difference, Mask], earlier: Sequence[tuple[Difference
             count = int(np.count_nonzero(shown))
             if count == 0 or np.count_nonzero(shown & told[part]) > _SHOWN * count:
                 continue  # believed already
-            answers = {
-                other: np.count_nonzero(shown & near[other][part]) > _SHOWN * count
-                for other, (_, sees) in enumerate(opinions)
-                if other != own and np.count_nonzero(shown & sees[part]) > _SEEN * count
-            }
+            answers = {}
+            for other, (_, sees) in enumerate(opinions):
+                if other != own and np.count_nonzero(shown & sees[part]) > _SEEN * count:
+                    shows = np.count_nonzero(shown & near[other][part]) > _SHOWN * count
+                    if shows or other == _MAP or _ends_far_from(sees, opinion.boxes[k]):
+                        answers[other] = shows
             is_on_map = answers.pop(_MAP, own == _MAP)
             if all(answers.values()) and (is_on_map or answers or opinion.scores[k] >= _VERY_SURE):
                 mask[part] |= shown.view(np.uint8) * np.uint8(255)
                 boxes.append(opinion.boxes[k])
                 scores.append(opinion.scores[k])
     return Difference(mask, np.array(boxes, np.int64).reshape(-1, 4), np.array(scores, np.float64))
+
+
+def _ends_far_from(sees: Mask, box: Sequence[int]) -> bool:
+    """Whether what a picture sees (h, w) reaches beyond a box x, y, w, h by half of its longer side all around."""
+    x, y, w, h = (int(each) for each in box)
+    beside = max(w, h) // 2
+    around = sees[max(0, y - beside) : y + h + beside, max(0, x - beside) : x + w + beside]
+    return bool(np.count_nonzero(around) > _SEEN * around.size)
