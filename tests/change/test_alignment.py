@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.change.alignment import Aligned, Aligner, NotAligned
+from sorvolo.change.alignment import Aligned, Aligner, AlignmentSettings, NotAligned, _nearer
 from sorvolo.change.reference import ReferenceMap, level_for
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic
@@ -130,11 +130,26 @@ def test_other_ground_does_not_fit_and_says_so(tiles):
     assert found.reason
 
 
+def test_a_fit_that_is_too_bad_keeps_the_residual_of_the_best_try(tiles):
+    pose = Pose(turned(0.0), np.array([0.0, 0.0, 30.0]))
+    strict = AlignmentSettings(most_residual_px=0.01, doubtful_px=0.01)
+    found = Aligner(ReferenceMap(tiles, SITE_GRID.grid), SITE_GRID, strict).align(
+        photographed(pose, gain=0.7), CAMERA, prior_at(pose), 0
+    )
+    assert isinstance(found, NotAligned)
+    assert found.reason == "its points fit the map badly"
+    assert 0.01 < found.residual_px < 0.7
+    unlike = NotAligned("no plane fits", np.nan)
+    bad, worse = NotAligned("bad", 3.0), NotAligned("worse", 5.0)
+    assert _nearer(_nearer(_nearer(unlike, worse), bad), unlike) is bad
+
+
 def test_beyond_the_map_is_outside(tiles):
     pose = Pose(turned(0.0), np.array([200.0, 0.0, 30.0]))
     found = aligner(tiles).align(photographed(pose), CAMERA, prior_at(pose), 0)
     assert isinstance(found, NotAligned)
     assert found.is_outside
+    assert found.reason == "less than 10% of it lies on the map"
 
 
 def test_the_map_is_seen_as_the_camera_saw_it_and_holes_are_unknown(tiles):

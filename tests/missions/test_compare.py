@@ -14,16 +14,20 @@ import numpy as np
 import pytest
 
 from sorvolo.capture.calibration import camera_from_option, guess_camera
+from sorvolo.capture.source import opened_sources
+from sorvolo.change.reference import ReferenceMap
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.missions.compare_flights import compare_flights
-from sorvolo.missions.compare_views import ViewMaker
+from sorvolo.missions.compare_views import ViewMaker, ViewOutcome
 from sorvolo.missions.evaluate_changes import evaluate_changes
+from sorvolo.missions.flight_setup import prepare
 from sorvolo.missions.known_camera import known_camera
 from sorvolo.missions.map_flight import map_flights
 from sorvolo.missions.settings import CompareSettings, MapSettings
 from sorvolo.missions.simulate_site import simulate_site
+from sorvolo.mosaic.selection import every
 from sorvolo.simulation.settings import (
     ImagingSettings,
     LaterSettings,
@@ -35,6 +39,8 @@ from sorvolo.simulation.settings import (
 )
 from sorvolo.store.archive import Archive
 from sorvolo.survey.findings import CompareUpdate, Verdict, ViewStatus
+from sorvolo.survey.flight import PosedFrame
+from sorvolo.survey.mosaic import Status
 
 _PAIR = SimulationSettings(
     seed=41, flights=2,
@@ -324,6 +330,21 @@ def test_other_ground_in_the_same_place_is_refused_and_leaves_no_trace(flown, si
     with pytest.raises(InputError, match="no frame of flight1-2 fits the map"):
         list(compare_flights([folder / "flight1"], site, _COMPARE, camera=folder / "camera.xml"))
     assert not (site / "flights" / "flight1-2").exists()
+
+
+def test_a_frame_that_does_not_fit_is_recorded_with_its_residual(flown, site):
+    with (
+        Archive.open(site, write=False) as archive,
+        opened_sources([flown / "flight2"], camera=flown / "camera.xml") as sources,
+    ):
+        setup = prepare(sources[0], _MAP, archive.site(), telemetry_named=False, finds_itself=True)
+        grid = archive.site_grid()
+        views = ViewMaker(setup, ReferenceMap(archive.tiles(), grid.grid), grid, _COMPARE, None)
+        frame = next(iter(sources[0].frames(every(1.0))))
+        outcome = ViewOutcome(ViewStatus.NOT_ALIGNED, "its points fit the map badly", 3.5, 0.0)
+        placed = views.placed(PosedFrame(frame, setup.prior(frame, first=True)), outcome, 0.3)
+    assert placed.status is Status.REJECTED
+    assert (placed.reason, placed.residual_px) == ("its points fit the map badly", 3.5)
 
 
 def test_ground_beside_the_map_extends_it(flown, tmp_path):

@@ -111,24 +111,26 @@ class Aligner:
         def told_inside() -> Matrix3 | None:
             return told if share_known() >= self._settings.least_known else None
 
-        worst = NotAligned("its features are found nowhere in the map where it could be", np.nan)
+        nearest = NotAligned("its features are found nowhere in the map where it could be", np.nan)
         for guess, followed in self._guesses(new, small_camera, prior, time_ns, told_inside):
             found = self._fit(new, guess, self._settings.doubtful_px if followed else self._settings.most_residual_px)
             if isinstance(found, NotAligned):
-                worst = found
+                nearest = _nearer(nearest, found)
                 continue
             site_from_small, residual_px = found
             pose = pose_from_homography(site_from_small, small_camera)
             if pose is None:
-                worst = NotAligned("the fit is none that a camera above the ground could have", np.nan)
+                nearest = _nearer(
+                    nearest, NotAligned("the fit is none that a camera above the ground could have", np.nan)
+                )
                 continue
             self._remember(time_ns, pose, prior, site_from_small, small_camera)
             self._misses = 0
             small_from_full = resized(size[0] / image.shape[1], size[1] / image.shape[0])
             return Aligned(site_from_small @ small_from_full, pose.translation_m, residual_px / scale, followed)
         is_outside = share_known() < self._settings.least_known
-        reason = f"only {share_known():.0%} of it lies on the map" if is_outside else worst.reason
-        return NotAligned(reason, worst.residual_px / scale, is_outside)
+        reason = self._beside() if is_outside else nearest.reason
+        return NotAligned(reason, nearest.residual_px / scale, is_outside)
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
@@ -302,6 +304,10 @@ class Aligner:
             return None
         return site_from_image @ np.linalg.inv(fitted[0])
 
+    def _beside(self) -> str:
+        """The reason of frames beside the map: the same words for all, for reports count them."""
+        return f"less than {self._settings.least_known:.0%} of it lies on the map"
+
     def _share_known(self, site_from_image: Matrix3, camera: Camera) -> float:
         seen = self._seen(site_from_image, camera)
         return 0.0 if seen is None else float(seen[1].mean())
@@ -313,7 +319,7 @@ class Aligner:
             return NotAligned("it would look at the horizon", np.nan)
         share = float(seen[1].mean())
         if share < self._settings.least_known:
-            return NotAligned(f"only {share:.0%} of it lies on the map", np.nan)
+            return NotAligned(self._beside(), np.nan)
         old = self._keyframe(new.camera, normalised(*seen))
         links = self._settings.links
         found = refine(new, old, np.eye(3), links, LinkCache(links.features, 2))
@@ -324,6 +330,13 @@ class Aligner:
             return NotAligned("its points fit the map badly", residual_px)
         fit: Matrix3 = guess @ np.linalg.inv(found.new_from_old)
         return _stiffened(fit, found, guess, new.camera), residual_px
+
+
+def _nearer(first: NotAligned, second: NotAligned) -> NotAligned:
+    """The try with the smaller residual; the later one where neither has any."""
+    if not np.isfinite(first.residual_px):
+        return second
+    return second if second.residual_px < first.residual_px else first
 
 
 def _stiffened(site_from_image: Matrix3, link: Link, site_from_old: Matrix3, camera: Camera) -> Matrix3:

@@ -140,7 +140,7 @@ class CompareRun:
         with self._log.stage(Stage.COMPARE):
             outcome = looking.outcome.result()
         self._end(outcome.status, outcome.reason)
-        if np.isfinite(outcome.residual_px):
+        if outcome.site_from_image is not None:
             self._residuals_px.append(outcome.residual_px)
         self._placed[posed.frame.index] = self._views.placed(posed, outcome, self._map_sigma_m)
         self._look(posed, outcome)

@@ -84,7 +84,7 @@ class ViewMaker:
         valid = known & self._lens_sees
         share = np.count_nonzero(valid) / np.count_nonzero(self._lens_sees)
         if share < _KNOWN_ENOUGH:
-            reason = f"only {share:.0%} of it lies on the map"
+            reason = f"less than {_KNOWN_ENOUGH:.0%} of it lies on the map"
             return ViewOutcome(ViewStatus.OUTSIDE, reason, residual_px, share, site_from_full)
         query = as_bgr(image)
         found = self._difference(as_bgr(reference), query, valid, learns=True)
@@ -105,7 +105,8 @@ class ViewMaker:
         frame, camera = posed.frame, self._full
         time_ns = self._setup.utc_ns(frame.time_ns)
         if outcome.site_from_image is None:
-            return rejected(frame.index, frame.name, time_ns, outcome.reason, camera)
+            nowhere = rejected(frame.index, frame.name, time_ns, outcome.reason, camera)
+            return replace(nowhere, residual_px=outcome.residual_px)
         pose = pose_from_homography(outcome.site_from_image, camera.undistorted())
         outline_m = self.outline_m(outcome.site_from_image)
         if pose is None or not np.isfinite(outline_m).all():
