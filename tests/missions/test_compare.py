@@ -403,9 +403,18 @@ def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(com
     assert not list(site.glob("flights/flight2/staged"))
 
 
-def test_a_flight_in_the_dark_is_told_to_show_less(site, tmp_path):
-    later = replace(_PAIR.later, weather=replace(_PAIR.later.weather, brightness=0.2))
-    for _ in simulate_site(tmp_path / "dark", replace(_PAIR, later=later)):
+@pytest.mark.parametrize(("brightness", "told"), [(0.3, "dark or of the ground's colour"), (0.06, "means little")])
+def test_a_flight_in_the_dark_is_told_to_show_less_and_paints_no_black_ground(site, tmp_path, brightness, told):
+    weather = replace(_PAIR.later.weather, brightness=brightness)
+    dark = replace(_PAIR, later=replace(_PAIR.later, weather=weather))
+    for _ in simulate_site(tmp_path / "dark", dark):
         pass
     compare(tmp_path / "dark", site)
-    assert any("times as bright as the map" in warning for warning in report(site)["warnings"])
+    (warning,) = (each for each in report(site)["warnings"] if "times as bright as the map" in each)
+    assert told in warning
+    with Archive.open(site, write=False) as archive:
+        before, after = (archive.tiles(version.id) for version in archive.versions())
+        grown = after.keys() != before.keys() or any(
+            np.count_nonzero(after[index][..., 3]) > np.count_nonzero(before[index][..., 3]) for index in before
+        )
+    assert grown == (told != "means little")

@@ -44,6 +44,7 @@ _NEW_GROUND = 0.05  # share of a frame beyond the map: with less it is not worth
 _EXTENSION_OVERLAP = 0.7
 _LOOK_OVERLAP = 0.75  # of frames that are searched for objects
 _DARK = 0.4  # times the map's brightness: less hides things
+_NIGHT = 0.25  # less hides most of them (at 0.22, 3 of 14 changes were found), and would paint new ground black
 _CELL_M = 1.0  # of the record of what was compared
 
 
@@ -225,7 +226,7 @@ class CompareRun:
 
     def _extend(self, posed: PosedFrame, outcome: ViewOutcome) -> None:
         """Frames that show new ground go on to be mapped, as a first flight's would."""
-        if not self._settings.updates_map or self._setup.track is None:
+        if not self._settings.updates_map or self._setup.track is None or self._views.brightness < _NIGHT:
             return
         outline_m = self._outline_m(posed, outcome)
         last_m = self._last_outline_m if self._setup.source.kind == "video" else None
@@ -301,7 +302,12 @@ class CompareRun:
         """What makes this comparison say less than a user would expect of it."""
         warnings = []
         views, brightness = max(1, self.views), self._views.brightness
-        if brightness < _DARK or brightness > 1 / _DARK:
+        if brightness < _NIGHT:
+            warnings.append(
+                f"the flight is {brightness:.2f} times as bright as the map: most changes are missed, so that finding "
+                "none means little, and new ground is not added to the map; compare flights by daylight"
+            )
+        elif brightness < _DARK or brightness > 1 / _DARK:
             warnings.append(
                 f"the flight is {brightness:.2f} times as bright as the map: what is small, dark or of the ground's "
                 "colour is missed; compare flights by daylight"
