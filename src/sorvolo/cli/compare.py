@@ -106,7 +106,7 @@ def compare_and_read_results(
         )
         # closed even when the bar is stopped: then the site is as it was
         with closing(comparing) as updates:
-            told_ids = _show_progress(updates, Console(stderr=True))
+            told_ids = _show_progress(updates, site, Console(stderr=True))
     with Archive.open(site, write=False) as archive:
         compared = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
         return [_result(archive.flight_folder(flight_id), told_ids) for flight_id in compared]
@@ -122,20 +122,22 @@ def show_results(results: Sequence[Mapping[str, Any]], site: Path, console: Cons
     tell_path("map", site / "preview.png", console)
 
 
-def _show_progress(updates: Any, console: Console) -> list[str]:
+def _show_progress(updates: Any, site: Path, console: Console) -> list[str]:
     """Take all updates, telling each change as it is announced; the ids of these."""
     columns = (
         SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=30),
         TextColumn("{task.fields[told]}"), TimeRemainingColumn(),
     )
     told_ids: list[str] = []
+    unit = ""
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("opening", total=None, told="")
         update: CompareUpdate
         for update in updates:
             for change in update.announced:
                 told_ids.append(change.id)
-                console.print(_words_of(change), highlight=False)
+                unit = unit or _unit_of(site)
+                console.print(_words_of(change, unit), highlight=False)
             rate = f"{update.frames_read / update.seconds:.1f} frames/s, " if update.seconds > 0 else ""
             progress.update(
                 task, description="comparing",
@@ -145,14 +147,21 @@ def _show_progress(updates: Any, console: Console) -> list[str]:
     return told_ids
 
 
-def _words_of(change: Change) -> str:
+def _unit_of(site: Path) -> str:
+    """Metres, or the units of a map that has none."""
+    with Archive.open(site, write=False) as archive:
+        return "units" if archive.site().is_local else "m"
+
+
+def _words_of(change: Change, unit: str) -> str:
     colour = _COLOURS[change.kind]
     centre_m = change.outline_m.mean(axis=0)
     named = " to ".join(escape(name) for name in (change.class_before, change.class_after) if name)
     what = f"{named}, " if named else ""
     return (
-        f"[{colour}]{change.kind.value:>11}[/{colour}]  {escape(change.id)}: {what}{change.length_m:.1f} m long, "
-        f"{centre_m[0]:+.1f} m east {centre_m[1]:+.1f} m north of the site's origin, within {change.sigma_m:.2f} m"
+        f"[{colour}]{change.kind.value:>11}[/{colour}]  {escape(change.id)}: {what}{change.length_m:.1f} {unit} long, "
+        f"{centre_m[0]:+.1f} {unit} east {centre_m[1]:+.1f} {unit} north of the site's origin, "
+        f"within {change.sigma_m:.2f} {unit}"
     )
 
 
@@ -174,14 +183,17 @@ def _show_result(result: Mapping[str, Any], console: Console) -> None:
     comparison = result["comparison"]
     console.print(f"Flight {escape(result['flight'])}: {len(result['changes']['features'])} changes", style="bold")
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in ("id", "kind", "long m", "latitude, longitude", "within m", "views", "score"):
+    is_local = result["changes"].get("crs", "WGS84") is None  # no place on Earth, no metres
+    unit, place, digits = ("units", "north, east", 1) if is_local else ("m", "latitude, longitude", 6)
+    for name in ("id", "kind", f"long {unit}", place, f"within {unit}", "views", "score"):
         table.add_column(name, no_wrap=True)
     for feature in result["changes"]["features"][:_MOST_ROWS]:
         each = feature["properties"]
         longitude, latitude = _middle(feature["geometry"]["coordinates"][0])
         table.add_row(
-            escape(each["id"]), _kind_words(each), f"{each['length_m']:.2f}", f"{latitude:.6f}, {longitude:.6f}",
-            f"{each['sigma_m']:.2f}", str(each["views"]), f"{each['score']:.2f}",
+            escape(each["id"]), _kind_words(each), f"{each['length_m']:.2f}",
+            f"{latitude:.{digits}f}, {longitude:.{digits}f}", f"{each['sigma_m']:.2f}", str(each["views"]),
+            f"{each['score']:.2f}",
         )
     if table.row_count:
         console.print(table)
@@ -189,7 +201,8 @@ def _show_result(result: Mapping[str, Any], console: Console) -> None:
         console.print(f"and {len(result['changes']['features']) - _MOST_ROWS} more in changes.geojson")
     views = comparison["views"]
     console.print(
-        f"{views['compared']} of {sum(views.values())} views compared over {comparison['compared_area_m2']:.0f} m2, "
+        f"{views['compared']} of {sum(views.values())} views compared over {comparison['compared_area_m2']:.0f} "
+        f"{'square units' if is_local else 'm2'}, "
         f"in {result['seconds']:.1f} s, {result['peak_memory_mb']:.0f} MB at most"
     )
     if result["taken_back"]:
