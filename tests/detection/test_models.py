@@ -248,3 +248,8 @@ def test_the_packaged_model_hands_thermal_frames_to_the_thermal_one() -> None:
     detector.detect(np.zeros((64, 64, 3), np.uint8))
     (notice,) = detector.notices
     assert notice.code == "thermal_model" and "'thermal'" in notice.text
+
+
+def test_the_help_of_quantise_names_the_extra_that_it_needs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["models", "quantise", "--help"]) == 0
+    assert "extra `training`" in capsys.readouterr().out  # words in square brackets are taken for markup

@@ -180,7 +180,7 @@ def quantise(
 ) -> None:
     """Make a model that is smaller and quicker, in whole numbers of eight bits. Measure both before you trust it.
 
-    Needs the package onnx: pip install 'sorvolo[training]'.
+    Needs the package onnx, which comes with the extra `training`.
 
     Example: sorvolo models quantise mine.onnx --pictures flights/ --out mine-int8.onnx
     """
