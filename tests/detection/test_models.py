@@ -212,6 +212,10 @@ def test_verify_finds_changed_damaged_and_unknown_files(
     assert "CHANGED" in capsys.readouterr().out
     assert cli.main(["models", "verify", str(path), "--sha256", _hash(path)]) == 0
     assert cli.main(["models", "verify", str(path), "--sha256", "0" * 64]) == 1
+    capsys.readouterr()
+    assert cli.main(["models", "verify", str(path), "--sha256", _hash(path)[:12]]) == 1
+    told = capsys.readouterr()
+    assert "64 hexadecimal digits" in told.err and "CHANGED" not in told.out
     path.with_suffix(".json").unlink()
     capsys.readouterr()
     assert cli.main(["models", "verify", "coast"]) == 0

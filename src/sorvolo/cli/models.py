@@ -25,7 +25,7 @@ from sorvolo.detection.models import (
 )
 from sorvolo.detection.session import read_info
 from sorvolo.errors import InputError
-from sorvolo.missions.model_files import fetch_model, quantise_model
+from sorvolo.missions.model_files import fetch_model, parse_sha256, quantise_model
 
 models_app = typer.Typer(no_args_is_help=True)
 
@@ -149,9 +149,10 @@ def verify(
         chosen = installed_models()
     if sha256 and not model:
         raise typer.BadParameter("say which model has this hash", param_hint="--sha256")
+    wanted = parse_sha256(sha256) if sha256 else ""
     bad = 0
     for each in chosen:
-        words, is_bad = _verdict(each, sha256.strip().lower())
+        words, is_bad = _verdict(each, wanted)
         bad += is_bad
         typer.echo(f"{each.name}: {words}")
     if not chosen:
@@ -255,7 +256,8 @@ def _verdict(model: InstalledModel, sha256: str) -> tuple[str, bool]:
         else:
             state = integrity(model)
         if state is Integrity.CHANGED:
-            return "CHANGED: its SHA-256 is not the recorded one; do not use it, fetch it again", True
+            said = "the given" if sha256 else "the recorded"
+            return f"CHANGED: its SHA-256 is not {said} one; do not use it, fetch it again", True
         read_info(model.path)
     except InputError as error:
         return f"BAD: {error}", True

@@ -38,9 +38,7 @@ def fetch_model(source: str, sha256: str, *, name: str = "") -> InstalledModel:
     Raises SettingsError for a hash or a name that cannot be, InputError where it cannot be had, is another file, or is
     no model, StoreError where it cannot be written.
     """
-    wanted = sha256.strip().lower()
-    if not _SHA256.fullmatch(wanted):
-        raise SettingsError(f"--sha256 {sha256!r}: a SHA-256 has 64 hexadecimal digits; ask whoever gives the model")
+    wanted = parse_sha256(sha256)
     address = _address_of(source)
     own = name or re.sub(r"(?i)\.onnx$", "", re.split(r"[/\\]", address.split("?")[0])[-1])
     if not _NAME.fullmatch(own):
@@ -63,6 +61,14 @@ def fetch_model(source: str, sha256: str, *, name: str = "") -> InstalledModel:
         card = {HASH_KEY: wanted, "source": address, "fetched": datetime.now(UTC).isoformat(timespec="seconds")}
         atomic_write_bytes(path.with_suffix(".json"), json.dumps(card, indent=1).encode())
     return installed_model(own)
+
+
+def parse_sha256(text: str) -> str:
+    """A SHA-256 as a person gives it, in small letters. Raises SettingsError where it cannot be one."""
+    wanted = text.strip().lower()
+    if not _SHA256.fullmatch(wanted):
+        raise SettingsError(f"--sha256 {text!r}: a SHA-256 has 64 hexadecimal digits; ask whoever gives the model")
+    return wanted
 
 
 def quantise_model(
