@@ -1,5 +1,7 @@
 """People and cars that move while they are seen: told once as moving, never as changes of the ground."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from blob_world import CAMERA_HEIGHT_M, M_PER_PX, Thing, flight, view_of
@@ -105,6 +107,18 @@ def test_a_walker_seen_now_with_the_shadow_and_now_without_is_one():
     views = [view_of(i, i / 5, (-4 + 0.5 * i / 5, 0, CAMERA_HEIGHT_M), [things[i % 2]]) for i in range(24)]
     told, final = events(views)
     assert len(told) == len(final) == 1 and final[0].kind == ChangeKind.MOVING
+
+
+def test_a_car_that_is_told_whole_and_in_part_is_one():
+    views = []
+    for view in flight([Thing(-6, 2, (4.5, 1.8), velocity_m_s=(5, 0))]):
+        if len(view.boxes) == 1 and view.boxes[0][2] > 60:
+            x, y, w, h = view.boxes[0]
+            boxes = np.array([[x, y, w, h], [x + 30, y, w - 30, h]])
+            view = replace(view, boxes=boxes, scores=np.full(2, 0.95))
+        views.append(view)
+    _, final = events(views)
+    assert [each.kind for each in final] == [ChangeKind.MOVING]
 
 
 def test_two_who_walk_side_by_side_are_two():

@@ -1,11 +1,13 @@
 """Things told from the shadows they throw, and from neighbours that a shadow joins to them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from blob_world import M_PER_PX, START_NS, Thing, flight
 
 from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
-from sorvolo.change.shadows import is_speck_of_shade, thing_of, things_of
+from sorvolo.change.shadows import is_of_shade, thing_of, things_of
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 
 SHADOW = (58, 58, 58)  # of ground as bright as 110
@@ -108,10 +110,27 @@ def test_the_bright_ends_of_a_dark_car_beside_another_thing_are_one_thing():
 ])
 def test_a_small_dark_unsure_change_is_a_speck_of_shade(side_px, score, colour, is_speck):
     patch = patch_with((np.s_[40 : 40 + side_px], np.s_[60 : 60 + side_px], colour))
-    side_m = side_px * M_PER_PX
+    assert is_of_shade(told(patch, score, side_px * M_PER_PX)) is is_speck
+
+
+def told(patch, score, side_m):
+    """A change of the patch with the outline of a square."""
     square = np.array([[0, 0], [side_m, 0], [side_m, side_m], [0, side_m]])
-    change = Change("f-1", ChangeKind.APPEARED, score, square, 0, 0, 5, side_m**2, side_m, 0.1, patch)
-    assert is_speck_of_shade(change) is is_speck
+    return Change("f-1", ChangeKind.APPEARED, score, square, 0, 0, 5, side_m**2, side_m, 0.1, patch)
+
+
+@pytest.mark.parametrize("score, after_colour, is_of_shadow", [
+    (0.5, (170, 120, 60), True), (0.7, (170, 120, 60), False), (0.5, (40, 60, 200), False),
+])
+def test_a_box_whose_shadow_moved_is_no_change(score, after_colour, is_of_shadow):
+    patch = patch_with((np.s_[40:60], np.s_[40:60], SHADOW), (np.s_[40:60], np.s_[60:80], after_colour))
+    before = patch.before.copy()
+    before[40:60, 60:80, :3] = (170, 120, 60)
+    before[40:60, 80:100, :3] = SHADOW
+    changed = np.zeros_like(patch.changed)
+    changed[40:60, 40:100] = True
+    patch = replace(patch, before=before, changed=changed)
+    assert is_of_shade(told(patch, score, 0.7)) is is_of_shadow
 
 
 @pytest.mark.parametrize("gap_m", [1.2, 2.0])

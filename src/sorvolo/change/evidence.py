@@ -25,7 +25,7 @@ from sorvolo.change.movers import Movers
 from sorvolo.change.moving import BlobTracker, MovingSettings
 from sorvolo.change.parts import Parts
 from sorvolo.change.restlessness import calmness, restlessness
-from sorvolo.change.shadows import is_speck_of_shade
+from sorvolo.change.shadows import is_of_shade
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageGray, Mask, Matrix3
 from sorvolo.survey.findings import Change, ComparedView
@@ -37,7 +37,7 @@ _SHOWS = 0.12  # share of a change's cells that a view must flag: from above a p
 _PICTURES_A_VIEW, _MOST_PICTURES = 6, 30  # cut anew at most, which bounds the time a view takes ...
 _VIEWS_S = 5.0  # ... where so many come in a second; where they are seldom there is more time
 _MOST_SEEDS = 256
-_FEW_VIEWS_SCORE = 0.6  # of what fewer than k views show: two views of a tree often agree
+_FEW_VIEWS_SCORE = 0.62  # of what fewer than k views show: two views of a tree often agree
 _DOUBT = 2.0  # restless ground counts in full where half of the score is missing
 _CALM = 0.9  # of the score is left on calm ground
 _MOVED_HEIGHTS = 0.01  # the camera's way, in flying heights, after which a view is a new witness
@@ -316,7 +316,7 @@ class EvidenceMap:
 
     def _is_thing(self, change: GatheredChange) -> bool:
         whole = self._change(change)
-        return whole is not None and not is_speck_of_shade(whole)
+        return whole is not None and not is_of_shade(whole)
 
     def _is_sure(self, change: GatheredChange) -> bool:
         calm = change.calmness = 1.0
@@ -327,7 +327,9 @@ class EvidenceMap:
             change.calmness = calm ** min(1.0, _DOUBT * (1 - change.score))
         # nothing tall leans over calm ground: there views from aside say as much as those from above
         share = max(change.share, change.views / change.asked) if calm > _CALM else change.share
-        return change.score >= self._settings.least_score and share >= self._settings.least_share
+        is_of_few = 1 < change.views < self._settings.k
+        least_score = _FEW_VIEWS_SCORE if is_of_few else self._settings.least_score
+        return change.score >= least_score and share >= self._settings.least_share
 
     def _answer(self, laid: LaidView, window: CellWindow, cells: Mask) -> tuple[float, float, float, Floats]:
         """What a view says of some cells: the shares of them it saw and flagged, how sure, where the flagged lie."""
@@ -550,9 +552,6 @@ class EvidenceMap:
             return
         for _ in range(int(seen[cells].max()) - seed.asked):
             seed.miss(1.0)
-        shown = max(seed.views, int(np.median(changed[cells])))
-        if cells is late and shown < settings.k and seed.score < _FEW_VIEWS_SCORE:
-            return
         seed.number = self._next_number()
         self._grid.own(seed.cells, cells, seed.number)
         self._found[seed.number] = seed

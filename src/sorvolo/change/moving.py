@@ -26,10 +26,12 @@ _POINTS = 12  # of a track, that its velocity is fitted to
 _MUCH_LARGER = 4.0
 _NEAR_PX = 8  # what is looked at around a place to tell shadows
 _RIGID_POINTS, _RIGID_LENGTHS, _RIGID_LENGTH_M = 5, 2.0, 2.5
-_STEADY_POINTS, _STEADY_LENGTHS, _VERY_STEADY = 8, 1.2, (1.3, 1.15)  # what leans changes its size on less of a way
+_VERY_STEADY = 1.3, 1.15  # largest by smallest area and length: what leans changes more on less of a way
+_STEADY_POINTS, _STEADY_LENGTHS, _STEADY_MOVE = 8, 1.2, 0.5
 _FLOATS_LENGTH_M = 1.3
 _PHOTOS_APART_S = 0.7  # at least, on average
-_ONE_THING_M = 0.4  # two that move alike so near each other are one thing, seen now with its shadow, now without
+# two that move alike so near each other, in metres or lengths, are one thing, seen now with its shadow, now without
+_ONE_THING_M, _ONE_THING_LENGTHS = 0.4, 0.3
 _LOST_FOR_S = 45.0  # a thing that moves steadily is known again after so long: on the next strip, too
 
 
@@ -208,7 +210,8 @@ class BlobTracker:
     def _moves(self, track: Track, move: Motion, view: ComparedView) -> bool:
         settings = self._settings
         length_m = float(np.median([each.blob.length_m for each in track.points]))
-        needed_m = max(settings.least_move_m, settings.least_lengths * length_m)
+        lengths = _STEADY_MOVE if _is_very_steady(track) else settings.least_lengths
+        needed_m = max(settings.least_move_m, lengths * length_m)
         speed_m_s = float(np.hypot(*move.velocity_m_s))
         is_own = move.path_m > needed_m and float(np.hypot(*move.own_m_s)) > 0.35 * speed_m_s
         return (
@@ -231,7 +234,8 @@ class BlobTracker:
         now_ns, start = track.last.time_ns, track.points[0]
         for other in others:
             expected_m = other.last.blob.place_m + (now_ns - other.last.time_ns) * 1e-9 * other.velocity_m_s
-            is_there = float(np.hypot(*(track.last.blob.place_m - expected_m))) < _ONE_THING_M
+            reach_m = max(_ONE_THING_M, _ONE_THING_LENGTHS * other.last.blob.length_m)
+            is_there = float(np.hypot(*(track.last.blob.place_m - expected_m))) < reach_m
             if other.mover and is_there and _goes_with(move, other):
                 return other.mover
         for lost in self._lost:
@@ -259,8 +263,8 @@ def _is_rigid(track: Track, length_m: float) -> bool:
     """
     if len(track.points) < _RIGID_POINTS or length_m > _RIGID_LENGTH_M:
         return False
-    is_very_steady = len(track.points) >= _STEADY_POINTS and _keeps_its_size(track, *_VERY_STEADY)
-    lengths = _STEADY_LENGTHS if is_very_steady else _RIGID_LENGTHS
+    is_steady = len(track.points) >= _STEADY_POINTS and _is_very_steady(track)
+    lengths = _STEADY_LENGTHS if is_steady else _RIGID_LENGTHS
     return _way_m(track) > max(1.0, lengths * length_m) and _keeps_its_size(track)
 
 
@@ -281,6 +285,11 @@ def _floats(track: Track, move: Motion, length_m: float) -> bool:
 def _way_m(track: Track) -> float:
     """How far a track's last points lead over the ground."""
     return float(np.hypot(*(track.last.blob.place_m - track.points[0].blob.place_m)))
+
+
+def _is_very_steady(track: Track) -> bool:
+    """Whether a track's size has hardly changed over enough views: nothing that grew explains its motion."""
+    return len(track.points) >= _RIGID_POINTS and _keeps_its_size(track, *_VERY_STEADY)
 
 
 def _keeps_its_size(track: Track, most_area: float = 1.7, most_length: float = 1.35) -> bool:

@@ -28,6 +28,8 @@ _LEAST_HALF_M = 0.12  # ... how far its middle lies from its rim: a painted line
 _SOLID, _MOST_SHARED = 0.45, 0.05  # ... how much of its hull it fills, and of the smaller hull the other's shares
 _CLEARLY, _SHADE = 0.8, 0.7  # of the light: darker is a shadow's core; and so much of a piece of shade is
 _SPECK_M2, _SPECK_SCORE = 0.2, 0.6  # smaller and less sure it is taken for one
+_LEAST_SHADE, _LEAST_SAME = 0.15, 0.2  # of a change, where a shadow left and where it came; where nothing changed
+_SAME = 1.1  # of the light
 _COARSE_M = 0.05  # a pixel: finer shows no more of what came and what left
 _CONTRARY = {ChangeKind.APPEARED: ChangeKind.DISAPPEARED, ChangeKind.DISAPPEARED: ChangeKind.APPEARED}
 
@@ -49,16 +51,30 @@ def without_shadow(change: Change) -> Change:
     return replace(change, outline_m=outline_m, area_m2=size.area_m2, length_m=size.length_m)
 
 
-def is_speck_of_shade(change: Change) -> bool:
-    """Whether a change is so small, dark and unsure that it is a piece of a shadow rather than a thing.
+def is_of_shade(change: Change) -> bool:
+    """Whether a change is so unsure, and so much of it shade, that it is a shadow of something that stays.
 
-    Most of it is ground that grew darker or brighter, all colours alike: where a shadow of something that stays came,
-    left, or both, for it moved.
+    Most of something small is ground that grew darker or brighter, all colours alike: where a shadow came, left, or
+    both, for it moved. Of something larger a shadow left one side and came on another, and what is between is the same.
     """
-    if change.area_m2 >= _SPECK_M2 or change.score >= _SPECK_SCORE:
+    if change.score >= _SPECK_SCORE:
         return False
+    changed = change.patch.changed
     came, left = _shades(change.patch)
-    return _is_part(change.patch.changed, came | left)
+    if change.area_m2 < _SPECK_M2 and _is_part(changed, came | left):
+        return True
+    same = changed & _same(change.patch)
+    of_moved = (came, _LEAST_SHADE), (left, _LEAST_SHADE), (same, _LEAST_SAME)
+    has_moved = all(np.count_nonzero(each) >= least * np.count_nonzero(changed) for each, least in of_moved)
+    return has_moved and _is_part(changed, came | left | same)
+
+
+def _same(patch: Patch) -> Mask:
+    """Where (h, w) both dates show about the same, up to a pixel beside."""
+    before, after, known = _in_one_light(patch)
+    window = np.ones((3, 3), np.uint8)
+    lowest, highest = cv2.erode(before, window) / _SAME, cv2.dilate(before, window) * _SAME
+    return np.asarray(((after >= lowest) & (after <= highest)).all(axis=-1) & known)
 
 
 def _shades(patch: Patch) -> tuple[Mask, Mask]:

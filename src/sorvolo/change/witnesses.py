@@ -11,6 +11,7 @@ from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
 LEAST_SURENESS = 0.2  # a picture that shows a difference so surely bears out one that shows it surely
 _SURE, _VERY_SURE = 0.5, 0.9
 _NEAR_PX = 9  # what leans a little another way lies a few pixels beside
+_LEANS_PX = 16  # what leans out of an earlier picture lies so far beside
 _SHOWN, _SEEN = 0.3, 0.95  # shares of a difference that another picture shows, and must see to be asked
 _MAP = 0  # the first of the opinions
 
@@ -62,8 +63,7 @@ def believed(by_map: tuple[Difference, Mask], earlier: Sequence[tuple[Difference
 
 
 def _ends_far_from(sees: Mask, box: Sequence[int]) -> bool:
-    """Whether what a picture sees (h, w) reaches beyond a box x, y, w, h by half of its longer side all around."""
+    """Whether what a picture sees (h, w) reaches `_LEANS_PX` beyond a box x, y, w, h all around."""
     x, y, w, h = (int(each) for each in box)
-    beside = max(w, h) // 2
-    around = sees[max(0, y - beside) : y + h + beside, max(0, x - beside) : x + w + beside]
+    around = sees[max(0, y - _LEANS_PX) : y + h + _LEANS_PX, max(0, x - _LEANS_PX) : x + w + _LEANS_PX]
     return bool(np.count_nonzero(around) > _SEEN * around.size)
