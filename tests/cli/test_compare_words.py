@@ -22,6 +22,17 @@ def test_what_was_told_live_and_did_not_last_is_named(tmp_path: Path) -> None:
     assert "taken back" not in console.export_text()
 
 
+def test_how_much_the_map_grew_is_told(tmp_path: Path) -> None:
+    comparison = {"views": {"compared": 7, "outside": 5}, "compared_area_m2": 100.0, "reasons": {}}
+    result = {
+        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "changes": {"features": []},
+        "comparison": comparison | {"extension": {"frames": 3, "shown_as_well": 2, "area_m2": 350.4}}, "taken_back": [],
+    }
+    console = Console(record=True, width=120, file=StringIO())
+    show_results([result], tmp_path, console)
+    assert "the map grew by 350 m2: 3 frames extended it; 2 more show the same ground" in console.export_text()
+
+
 @pytest.mark.parametrize(("georeference", "shown", "not_shown"), [
     ({}, ["long m", "latitude, longitude", "204.250000, 289.500000", "100 m2"], ["units"]),
     ({"crs": None}, ["long units", "north, east", "204.2, 289.5", "100 square units"], ["latitude", " m2"]),

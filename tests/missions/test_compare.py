@@ -371,6 +371,16 @@ def test_ground_beside_the_map_extends_it(flown, tmp_path):
             for version, tiles in (("before", before), ("after", after))}
     assert area["after"] > 1.3 * area["before"]
     assert features(tmp_path / "site")
+    told = report(tmp_path / "site")
+    extension = told["comparison"]["extension"]
+    with Archive.open(tmp_path / "site", write=False) as archive:
+        grown_m2 = (area["after"] - area["before"]) * archive.site().m_per_px ** 2
+    assert extension["frames"] > 2 and extension["shown_as_well"] > 0
+    assert extension["area_m2"] == pytest.approx(grown_m2, rel=1e-6)
+    assert not any("have no place" in warning for warning in told["warnings"])
+    assert told["frames"]["rejected"] == told["comparison"]["views"]["not-aligned"], "who extends the map does not fail"
+    page = (tmp_path / "site" / "flights" / "flight2" / "changes.html").read_text()
+    assert f"{extension['frames']} of the frames showed ground beside it" in page
 
 
 def test_the_command_tells_the_changes_as_json(flown, site, capsys):

@@ -205,6 +205,12 @@ def _show_result(result: Mapping[str, Any], console: Console) -> None:
         f"{'square units' if is_local else 'm2'}, "
         f"in {result['seconds']:.1f} s, {result['peak_memory_mb']:.0f} MB at most"
     )
+    extension = comparison.get("extension") or {}
+    if extension.get("frames"):
+        as_well = f"; {extension['shown_as_well']} more show the same ground" if extension["shown_as_well"] else ""
+        console.print(
+            f"the map grew by {extension['area_m2']:.0f} m2: {extension['frames']} frames extended it{as_well}"
+        )
     if result["taken_back"]:
         console.print(
             f"taken back, since what the whole flight showed does not bear them out: {', '.join(result['taken_back'])}",

@@ -19,7 +19,8 @@ from sorvolo.change.shadows import without_shadow
 from sorvolo.change.thesis import thesis_steps
 from sorvolo.change.updating import is_painted, patched
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import PointsM
+from sorvolo.geometry.arrays import ImageRGBA, PointsM
+from sorvolo.geometry.grid import TileIndex
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.missions.change_classes import ChangeClasses
 from sorvolo.missions.compare_views import ViewMaker, ViewOutcome, as_bgr
@@ -91,6 +92,8 @@ class CompareRun:
         self._log = FlightLog()
         self._extension: PlanarRun | None = None
         self._last_outline_m: PointsM | None = None
+        self._last_extending = -1
+        self._shown_by: dict[int, int] = {}  # frames that show new ground as another, which extends the map, shows it
         self._placed: dict[int, PlacedFrame] = {}
         self._statuses: Counter[ViewStatus] = Counter()
         self._reasons: Counter[str] = Counter()
@@ -174,11 +177,12 @@ class CompareRun:
             found = self._evidence.conclude()
             changes = self._told(found)
         images: Mapping[int, str] = {}
+        extending: list[PlacedFrame] = []
         if self._extension is not None and self._settings.updates_map:
-            for each in self._extension.complete():
-                if each.status is not Status.REJECTED:
-                    self._placed[each.index] = each
+            extending = [each for each in self._extension.complete() if each.status is not Status.REJECTED]
+            self._placed |= {each.index: each for each in extending}
             images = self._extension.images
+        shown_as_well = self._leave_to(extending)
         with self._log.stage(Stage.PAINT):
             if self._settings.updates_map:
                 self._paint(changes)
@@ -200,6 +204,9 @@ class CompareRun:
         )
         report["warnings"] = [*report["warnings"], *self._warnings()]
         comparison = self._summary(changes, suppressed=len(found) - len(changes))
+        comparison["extension"] = {
+            "frames": len(extending), "shown_as_well": shown_as_well, "area_m2": self._grown_m2(extending),
+        }
         seconds = 0.0 if self._finder is None else self._finder.seconds
         report |= {
             "method": f"compare-{self._settings.method}", "comparison": comparison,
@@ -231,12 +238,33 @@ class CompareRun:
         outline_m = self._outline_m(posed, outcome)
         last_m = self._last_outline_m if self._setup.source.kind == "video" else None
         if outline_m is not None and last_m is not None and _overlap(last_m, outline_m) > _EXTENSION_OVERLAP:
+            self._shown_by[posed.frame.index] = self._last_extending
             return
-        self._last_outline_m = outline_m
+        self._last_outline_m, self._last_extending = outline_m, posed.frame.index
         if self._extension is None:
             self._extension = PlanarRun(self._setup, self._archive, self._settings.mapping, writer=self._writer)
         with self._log.stage(Stage.REGISTER):
             self._extension.add(posed)
+
+    def _leave_to(self, extending: Sequence[PlacedFrame]) -> int:
+        """Leave frames that fit no known ground to those that extend the map with what they show: not being needed,
+        they are not selected frames, as in a first flight. How many."""
+        extend = {each.index for each in extending}
+        left = [
+            index for index, by in self._shown_by.items()
+            if by in extend and self._placed[index].status is Status.REJECTED
+        ]
+        for index in left:
+            del self._placed[index]
+        return len(left)
+
+    def _grown_m2(self, extending: Sequence[PlacedFrame]) -> float:
+        """Ground under these frames that the map shows now and did not before."""
+        site_grid, before = self._archive.site_grid(), self._archive.tiles(self._base_version)
+        outlines = [site_grid.grid_from_site(each.outline_m) for each in extending]
+        touched = frozenset[TileIndex]().union(*(site_grid.grid.tiles_touched(outline) for outline in outlines))
+        grown = sum(_seen_px(self._writer.tiles, each) - _seen_px(before, each) for each in touched)
+        return grown * site_grid.grid.m_per_px**2
 
     def _look(self, posed: PosedFrame, outcome: ViewOutcome) -> None:
         """Have frames that fit the map searched for objects, each stretch of ground in a few of them."""
@@ -344,6 +372,10 @@ class CompareRun:
             "chosen": self._views.chosen(),
             "map_updated": self._settings.updates_map,
         }
+
+
+def _seen_px(tiles: Mapping[TileIndex, ImageRGBA], index: TileIndex) -> int:
+    return int(np.count_nonzero(tiles[index][..., 3])) if index in tiles else 0
 
 
 def _overlap(a_m: PointsM, b_m: PointsM) -> float:

@@ -47,7 +47,7 @@ _KIND_WORDS = {
 _VIEW_WORDS = {
     ViewStatus.COMPARED: "laid over the map and compared",
     ViewStatus.NOT_ALIGNED: "did not fit the map well enough: says nothing of its ground",
-    ViewStatus.OUTSIDE: "shows ground that the map did not know: extends it",
+    ViewStatus.OUTSIDE: "shows ground that the map did not know: nothing to compare it with",
     ViewStatus.ALL_CHANGED: "nearly all of it differs (snow, flood, another place): a list of changes would mislead",
     ViewStatus.LOST: "could not be used: blurred, damaged or without a place",
 }
@@ -122,6 +122,9 @@ def _second_sentence(report: Mapping[str, Any], changes: Sequence[StoredChange])
         parts.append(f"A change counts when {escaped(votes)} of {escaped(voters)} views of its ground show it.")
     if unknown is not None:
         parts.append(f"{unknown:.1%} of the ground under these views was unknown on a date and is not judged.")
+    grown_m2, extending = (number_at(report, "comparison", "extension", key) for key in ("area_m2", "frames"))
+    if grown_m2 and extending:
+        parts.append(f"The map grew by {area_words(grown_m2)}: {extending:.0f} of the frames showed ground beside it.")
     reviewed = Counter(each.verdict for each in changes if each.verdict is not None)
     if reviewed:
         said = " and ".join(f"{reviewed[verdict]} {verdict.value}" for verdict in Verdict if reviewed[verdict])
