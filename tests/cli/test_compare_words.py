@@ -11,7 +11,8 @@ from sorvolo.cli.compare import show_results
 
 def test_what_was_told_live_and_did_not_last_is_named(tmp_path: Path) -> None:
     result = {
-        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "changes": {"features": []},
+        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [],
+        "changes": {"features": []},
         "comparison": {"views": {"compared": 7}, "compared_area_m2": 100.0, "reasons": {}},
         "taken_back": ["b-4", "b-7"],
     }
@@ -22,10 +23,24 @@ def test_what_was_told_live_and_did_not_last_is_named(tmp_path: Path) -> None:
     assert "taken back" not in console.export_text()
 
 
+def test_notices_and_the_report_are_told_as_by_map(tmp_path: Path) -> None:
+    result = {
+        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "changes": {"features": []}, "taken_back": [],
+        "comparison": {"views": {"compared": 7}, "compared_area_m2": 100.0, "reasons": {}},
+        "notices": [{"code": "no_date", "count": 1, "text": "the table has no date"}], "warnings": ["look here"],
+    }
+    console = Console(record=True, width=300, file=StringIO())
+    show_results([result], tmp_path, console)
+    text = console.export_text()
+    assert "note     the table has no date" in text and "warning  look here" in text
+    assert f"report  {tmp_path / 'flights' / 'b' / 'report.html'}" in text
+
+
 def test_how_much_the_map_grew_is_told(tmp_path: Path) -> None:
     comparison = {"views": {"compared": 7, "outside": 5}, "compared_area_m2": 100.0, "reasons": {}}
     result = {
-        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "changes": {"features": []},
+        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [],
+        "changes": {"features": []},
         "comparison": comparison | {"extension": {"frames": 3, "shown_as_well": 2, "area_m2": 350.4}}, "taken_back": [],
     }
     console = Console(record=True, width=120, file=StringIO())
@@ -49,7 +64,7 @@ def test_a_map_without_metres_is_not_told_in_metres(
         },
     }
     result = {
-        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "taken_back": [],
+        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [], "taken_back": [],
         "changes": {"features": [change]} | georeference,
         "comparison": {"views": {"compared": 7}, "compared_area_m2": 100.0, "reasons": {}},
     }

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRe
 from rich.table import Table
 
 from sorvolo.capture.live.reconnect import LiveSettings
-from sorvolo.cli.map import ended_by_signal, newest_version, read_json, tell_path
+from sorvolo.cli.map import ended_by_signal, newest_version, read_json, tell_notices_and_warnings, tell_path
 from sorvolo.missions.compare_flights import compare_flights
 from sorvolo.missions.settings import CompareSettings
 from sorvolo.store.archive import Archive
@@ -119,6 +119,7 @@ def show_results(results: Sequence[Mapping[str, Any]], site: Path, console: Cons
         folder = site / "flights" / result["flight"]
         tell_path("page", folder / "changes.html", console)
         tell_path("GeoJSON", folder / "changes.geojson", console)
+        tell_path("report", folder / "report.html", console)
     tell_path("map", site / "preview.png", console)
 
 
@@ -218,8 +219,7 @@ def _show_result(result: Mapping[str, Any], console: Console) -> None:
         )
     for reason, count in list(comparison["reasons"].items())[:6]:
         console.print(f"  {count} x {escape(reason)}", highlight=False)
-    for warning in result["warnings"]:
-        console.print(f"[yellow]warning[/yellow]  {escape(warning)}")
+    tell_notices_and_warnings(result, console)
 
 
 def _kind_words(properties: Mapping[str, Any]) -> str:

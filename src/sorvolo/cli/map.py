@@ -176,10 +176,7 @@ def _show_report(report: Mapping[str, Any], console: Console) -> None:
         if text:
             table.add_row(name, text)
     console.print(table)
-    for notice in report["notices"]:
-        console.print(f"[blue]note[/blue]     {escape(notice['text'])}")
-    for warning in report["warnings"]:
-        console.print(f"[yellow]warning[/yellow]  {escape(warning)}")
+    tell_notices_and_warnings(report, console)
 
 
 def _size(report: Mapping[str, Any]) -> str:
@@ -204,6 +201,14 @@ def _clock_offset(offset: Mapping[str, Any]) -> str:
 
 def _with_unit(pattern: str, number: float | None) -> str:
     return "" if number is None else pattern.format(number)
+
+
+def tell_notices_and_warnings(report: Mapping[str, Any], console: Console) -> None:
+    """Print what was found and survived, and what to look at first."""
+    for notice in report["notices"]:
+        console.print(f"[blue]note[/blue]     {escape(notice['text'])}")
+    for warning in report["warnings"]:
+        console.print(f"[yellow]warning[/yellow]  {escape(warning)}")
 
 
 def tell_path(name: str, path: Path, console: Console) -> None:
