@@ -270,7 +270,16 @@ def test_a_guessed_camera_becomes_the_one_that_mapping_found(flown, tmp_path):
         calibrated = camera_from_option(str(flown / "camera.xml"), 640, 360)
         assert known_camera(calibrated, archive) is calibrated
         other = guess_camera(1280, 720)
-        assert known_camera(other, archive) is other
+        assert known_camera(other, archive) == other
+
+
+def test_a_guessed_camera_is_told_of_one_that_was_given_for_pictures_of_its_size(site):
+    with Archive.open(site, write=False) as archive:
+        guess = known_camera(guess_camera(640, 360), archive)
+        assert guess.camera.fx_px == guess_camera(640, 360).camera.fx_px, "another camera may have the same size"
+        assert "flight flight1 of this site had one" in guess.origin and "camera.xml" in guess.origin
+        another = guess_camera(1280, 720)
+        assert known_camera(another, archive).origin == another.origin
 
 
 def test_the_thesis_method_compares_too_and_shows_its_steps(flown, site, tmp_path):
