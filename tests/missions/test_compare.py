@@ -428,12 +428,22 @@ def test_a_flight_in_the_dark_is_told_to_show_less_and_paints_no_black_ground(si
     dark = replace(_PAIR, later=replace(_PAIR.later, weather=weather))
     for _ in simulate_site(tmp_path / "dark", dark):
         pass
+    shutil.copytree(site, tmp_path / "thesis")
     compare(tmp_path / "dark", site)
     (warning,) = (each for each in report(site)["warnings"] if "times as bright as the map" in each)
     assert told in warning
+    is_night = told == "means little"
+    assert report(site)["comparison"]["most_missed"] == is_night
+    assert ("too dark" in (site / "flights" / "flight2" / "changes.html").read_text().lower()) == is_night
+    assert has_grown(site) != is_night
+    if is_night:
+        compare(tmp_path / "dark", tmp_path / "thesis", CompareSettings(model="none", method="thesis"))
+        assert not has_grown(tmp_path / "thesis")
+
+
+def has_grown(site: Path) -> bool:
     with Archive.open(site, write=False) as archive:
         before, after = (archive.tiles(version.id) for version in archive.versions())
-        grown = after.keys() != before.keys() or any(
+        return after.keys() != before.keys() or any(
             np.count_nonzero(after[index][..., 3]) > np.count_nonzero(before[index][..., 3]) for index in before
         )
-    assert grown == (told != "means little")

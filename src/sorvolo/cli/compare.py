@@ -182,7 +182,10 @@ def _result(folder: Path, told_ids: Sequence[str]) -> dict[str, Any]:
 
 def _show_result(result: Mapping[str, Any], console: Console) -> None:
     comparison = result["comparison"]
-    console.print(f"Flight {escape(result['flight'])}: {len(result['changes']['features'])} changes", style="bold")
+    dark = ", and most would be missed: it was too dark" if comparison.get("most_missed") else ""
+    console.print(
+        f"Flight {escape(result['flight'])}: {len(result['changes']['features'])} changes{dark}", style="bold"
+    )
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     is_local = result["changes"].get("crs", "WGS84") is None  # no place on Earth, no metres
     unit, place, digits = ("units", "north, east", 1) if is_local else ("m", "latitude, longitude", 6)

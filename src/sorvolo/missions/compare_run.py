@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -46,6 +47,7 @@ _EXTENSION_OVERLAP = 0.7
 _LOOK_OVERLAP = 0.75  # of frames that are searched for objects
 _DARK = 0.4  # times the map's brightness: less hides things
 _NIGHT = 0.25  # less hides most of them (at 0.22, 3 of 14 changes were found), and would paint new ground black
+_LEVEL_TILES = 20
 _CELL_M = 1.0  # of the record of what was compared
 
 
@@ -233,7 +235,7 @@ class CompareRun:
 
     def _extend(self, posed: PosedFrame, outcome: ViewOutcome) -> None:
         """Frames that show new ground go on to be mapped, as a first flight's would."""
-        if not self._settings.updates_map or self._setup.track is None or self._views.brightness < _NIGHT:
+        if not self._settings.updates_map or self._setup.track is None or self._is_night(posed):
             return
         outline_m = self._outline_m(posed, outcome)
         last_m = self._last_outline_m if self._setup.source.kind == "video" else None
@@ -245,6 +247,22 @@ class CompareRun:
             self._extension = PlanarRun(self._setup, self._archive, self._settings.mapping, writer=self._writer)
         with self._log.stage(Stage.REGISTER):
             self._extension.add(posed)
+
+    def _is_night(self, posed: PosedFrame) -> bool:
+        """Whether new ground would be painted black. Where no ground was compared in its light yet (and method thesis
+        never does), the frame's middle grey says it, against the map's."""
+        brightness = self._views.brightness
+        if np.isnan(brightness):
+            brightness = float(np.median(posed.frame.image[::16, ::16])) / max(self._map_level, 1.0)
+        return brightness < _NIGHT
+
+    @cached_property
+    def _map_level(self) -> float:
+        """The middle grey of the map, by a few of its tiles."""
+        tiles = self._archive.tiles(self._base_version)
+        some = [tiles[index][::16, ::16] for index in sorted(tiles)[:: -(-len(tiles) // _LEVEL_TILES)]]
+        levels = np.concatenate([tile[tile[..., 3] > 0][:, :3].ravel() for tile in some])
+        return float(np.median(levels)) if len(levels) else 0.0
 
     def _leave_to(self, extending: Sequence[PlacedFrame]) -> int:
         """Leave frames that fit no known ground to those that extend the map with what they show: not being needed,
@@ -371,6 +389,7 @@ class CompareRun:
             "votes": self._settings.votes, "voters": self._settings.voters,
             "chosen": self._views.chosen(),
             "map_updated": self._settings.updates_map,
+            "most_missed": bool(self._views.brightness < _NIGHT),
         }
 
 

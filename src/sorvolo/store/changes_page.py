@@ -103,11 +103,14 @@ def _headline(report: Mapping[str, Any], changes: Sequence[StoredChange]) -> str
     moving = sum(each.kind is ChangeKind.MOVING for each in changes)
     also = f"; {moving} moving {'thing' if moving == 1 else 'things'} besides" if moving else ""
     total = sum(kinds.values())
+    is_dark = at(report, "comparison", "most_missed") is True
+    if is_dark and not total:
+        return f"Too dark to tell: most changes{ground} would be missed, and none was found{also}."
     if not total:
         return f"No change was found{ground}{also}."
     named = ", ".join(f"{kinds[kind]} {kind.value}" for kind in ChangeKind if kinds[kind])
     words = "1 change" if total == 1 else f"{total} changes"
-    return f"{words}{ground}: {named}{also}."
+    return f"{words}{ground}: {named}{also}{'; it was too dark to find most others' if is_dark else ''}."
 
 
 def _second_sentence(report: Mapping[str, Any], changes: Sequence[StoredChange]) -> str:
