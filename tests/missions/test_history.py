@@ -50,12 +50,16 @@ def test_a_version_that_was_made_again_keeps_its_counts(site: Path) -> None:
     assert not third.is_replaced and third.changes == {} and third.over == 1 and third.tiles_changed == 0
 
 
-def test_a_date_means_its_whole_day_and_a_moment_itself(site: Path) -> None:
+def test_a_date_means_its_whole_day_and_a_time_its_minute_or_second(site: Path) -> None:
     with Archive.open(site, write=False) as archive:
         made = [datetime.fromisoformat(version.created_utc) for version in archive.versions()]
         assert find_version(archive, "1").id == 1
         assert find_version(archive, made[1].date().isoformat()).id == 2
         assert find_version(archive, made[1].strftime("%Y%m%d")).id == 2
+        for spec in ("minutes", "seconds"):  # a list shows a version's time without the rest
+            assert find_version(archive, made[1].isoformat(timespec=spec)).id == 2
+            assert find_version(archive, made[1].isoformat(" ", spec).replace("+00:00", "")).id == 2
+        assert find_version(archive, made[1].strftime("%Y%m%dT%H%MZ")).id == 2
         assert find_version(archive, made[0].isoformat()).id == 1
         east = made[0].astimezone(tz=None).isoformat()
         assert find_version(archive, east).id == 1
@@ -63,6 +67,7 @@ def test_a_date_means_its_whole_day_and_a_moment_itself(site: Path) -> None:
             find_version(archive, (made[0] - timedelta(days=1)).date().isoformat())
         with pytest.raises(InputError, match=r"no version 9.* 1, 2"):
             find_version(archive, "9")
+        assert find_version(archive, made[1].isoformat("_")).id == 2
         with pytest.raises(SettingsError, match="yesterday"):
             find_version(archive, "yesterday")
 

@@ -19,7 +19,7 @@ from sorvolo.store.exports import plain_json
 def history(
     site: Annotated[Path, typer.Argument(help="The site folder.")],
     at: Annotated[
-        str | None, typer.Option(help="Version number, or date (UTC): the newest version complete by then.")
+        str | None, typer.Option(help="Version number, or date or time (UTC): the newest version complete by its end.")
     ] = None,
     export: Annotated[Path | None, typer.Option(help="Write the map as it was: FILE.tif, .png or .kmz.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,

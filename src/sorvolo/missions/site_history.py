@@ -1,8 +1,9 @@
 """The map of a site as it was: its versions listed, one found by number or date, one written as a file."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, date, datetime, time
+from datetime import UTC, date, datetime, time, timedelta
 from pathlib import Path
 
 from sorvolo.errors import InputError, SettingsError, StoreError
@@ -12,6 +13,7 @@ from sorvolo.store.exports import write_kmz, write_preview
 from sorvolo.store.geotiff import write_cog
 from sorvolo.survey.findings import Verdict
 
+_STEPS = {2: timedelta(hours=1), 4: timedelta(minutes=1), 6: timedelta(seconds=1)}  # by digits of a time of day
 _ENDINGS = (".tif", ".tiff", ".png", ".kmz")
 
 
@@ -62,7 +64,8 @@ def site_history(site: Path) -> list[HistoryEntry]:
 
 
 def find_version(archive: Archive, at: str) -> VersionEntry:
-    """The version of a number; or the newest one that was complete at an ISO date (its whole day) or date-time, UTC.
+    """The version of a number; or the newest one complete by the end of an ISO date, or of the minute or second that
+    an ISO date-time names; UTC.
 
     Raises InputError when there is none, SettingsError when `at` is neither.
     """
@@ -105,14 +108,20 @@ def export_version(site: Path, at: str | None, path: Path) -> VersionEntry:
 
 
 def _moment(text: str) -> datetime:
-    """The end of an ISO date, or an ISO date-time, UTC unless it names a zone."""
+    """The end of an ISO date, or of the hour, minute or second that an ISO date-time names, UTC unless it names a zone.
+
+    A list shows times without their seconds: what it says was complete at a minute was so at the minute's end.
+    """
     try:
         return datetime.combine(date.fromisoformat(text), time.max, UTC)
     except ValueError:
         pass
     try:
-        return datetime.fromisoformat(text)
+        moment = datetime.fromisoformat(text)
     except ValueError as error:
         raise SettingsError(
             f"{text!r} is no version and no date; give a number, 2026-05-31, or 2026-05-31T12:00"
         ) from error
+    time_of_day = re.search(r"[Tt ]([\d:.,]+)", text)
+    step = _STEPS.get(sum(letter.isdecimal() for letter in time_of_day[1])) if time_of_day else None
+    return moment if step is None else moment + step - timedelta(microseconds=1)
