@@ -141,8 +141,12 @@ def test_the_camera_fits_the_frames_as_delivered(tmp_path: Path) -> None:
 def test_what_is_missing_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no input"):
         open_sources([])
-    with pytest.raises(InputError, match="no such file or folder"):
+    with pytest.raises(InputError, match=r"no such file or folder: .*nowhere; a video, a folder of photos.*rtsp://"):
         open_sources([tmp_path / "nowhere"])
+    with pytest.raises(InputError, match=r"^foo://x: no such file, and no address that is known; give rtsp://"):
+        open_sources(["foo://me:secret@x"])
+    with pytest.raises(InputError, match="serial:/dev/x: a receiver gives telemetry"):
+        open_sources(["serial:/dev/x"])
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="holds no pictures or videos"):
         open_sources([tmp_path / "empty"])

@@ -239,7 +239,7 @@ def test_what_cannot_be_measured_says_why(site, simulated, tmp_path):
     for found, truth, words in (
         (tmp_path / "nothing", simulated, "no such folder"),
         (empty, small, "no masks in it"),
-        (small, empty, "neither the truth"),
+        (small, empty, "neither the truth"), (small, empty / "nosuch", "no such folder: .*nosuch; give the folder"),
         (small, other, "no mask in"),
         (small, simulated, "differ in size"),
         (site, small, "--masks"),

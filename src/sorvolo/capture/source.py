@@ -13,7 +13,14 @@ from typing import Protocol
 import numpy as np
 
 from sorvolo.capture.calibration import camera_from_option, guess_camera
-from sorvolo.capture.live.addresses import FollowedPath, StreamAddress, is_live_address, live_address
+from sorvolo.capture.live.addresses import (
+    ADDRESS_FORMS,
+    FollowedPath,
+    StreamAddress,
+    is_live_address,
+    live_address,
+    shown_address,
+)
 from sorvolo.capture.live.growing_folder import GrowingFolder, open_growing_folder
 from sorvolo.capture.live.klv_telemetry import FileMetadata, camera_of, read_klv_file
 from sorvolo.capture.live.links import LINK_FORMS, is_link
@@ -107,7 +114,11 @@ def open_sources(
     if not inputs:
         raise InputError("no input; give a video file, a folder of photos, photos, or a live stream's address")
     addresses = [live_address(text) for text in map(str, inputs) if is_live_address(text)]
-    paths = [Path(each) for each in inputs if not is_live_address(str(each))]
+    recorded = [str(each) for each in inputs if not is_live_address(str(each))]
+    for text in recorded:
+        if not Path(text).exists():
+            raise InputError(_nothing_at(text))
+    paths = [Path(text) for text in recorded]
     videos, albums = _sort_inputs(paths)
     names = _distinct_names([*(path.resolve() for path in videos), *(album.place for album in albums)])
     if telemetry is not None and len(names) + len(addresses) > 1:
@@ -169,8 +180,6 @@ def _sort_inputs(inputs: Sequence[Path]) -> tuple[list[Path], list[_AlbumInput]]
     albums: list[_AlbumInput] = []
     single: list[Path] = []
     for path in dict.fromkeys(inputs):
-        if not path.exists():
-            raise InputError(f"no such file or folder: {path}")
         if not path.is_dir():
             (single if path.suffix.lower() in PHOTO_SUFFIXES else videos).append(path)
             continue
@@ -187,6 +196,18 @@ def _sort_inputs(inputs: Sequence[Path]) -> tuple[list[Path], list[_AlbumInput]]
         place = single[0].resolve() if len(single) == 1 else single[0].resolve().parent
         albums.append(_AlbumInput(place, single))
     return videos, albums
+
+
+def _nothing_at(text: str) -> str:
+    """What to do about an input that is neither there nor a live source's address."""
+    if is_link(text):
+        return f"{text}: a receiver gives telemetry, but no pictures; give it as --telemetry beside a live source"
+    if re.match("[a-z][a-z0-9+.-]+:", text, re.IGNORECASE):
+        return f"{shown_address(text)}: no such file, and no address that is known; give {ADDRESS_FORMS}"
+    return (
+        f"no such file or folder: {text}; a video, a folder of photos, photos, or a live source was needed "
+        f"({ADDRESS_FORMS})"
+    )
 
 
 def _nothing_in(folder: Path, files: int) -> str:

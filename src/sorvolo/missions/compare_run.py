@@ -172,8 +172,8 @@ class CompareRun:
         if not self.compared and (self._extension is None or not self._extension.images):
             reason = self._reasons.most_common(1)[0][0] if self._reasons else "there is none"
             raise InputError(
-                f"no frame of {self._setup.source.name} fits the map: {reason}; is it another place, another season, "
-                "or night? `sorvolo inspect` tells what the flight holds"
+                f"no frame of {self._setup.source.name} could be compared: {reason}; is it another place, another "
+                "season, or night? `sorvolo inspect` tells what the flight holds"
             )
         with self._log.stage(Stage.EVIDENCE):
             found = self._evidence.conclude()

@@ -155,6 +155,10 @@ def _true_flights(truth: Path) -> dict[str, Path]:
             if not later:
                 raise InputError(f"{truth}: this simulation has no second flight; simulate one with --flights 2")
             return later
+    if not truth.is_dir():
+        raise InputError(
+            f"no such folder: {truth}; give the folder that `sorvolo simulate` made, or a folder with one mask a frame"
+        )
     if not has_masks(truth):
         raise InputError(
             f"{truth}: holds neither the truth of a simulation nor masks; give the folder that `sorvolo simulate` "

@@ -13,6 +13,9 @@ from sorvolo.errors import InputError
 STREAM_SCHEMES = ("rtsp", "rtsps", "rtmp", "rtmps", "udp", "rtp", "tcp", "srt", "http", "https")
 """Addresses of streams, as `scheme://...`."""
 
+ADDRESS_FORMS = "rtsp://HOST/live, rtmp://HOST/live, udp://:PORT, tcp://:PORT, http://HOST/live, webcam:0, follow:PATH"
+"""What a live source looks like, for messages."""
+
 _WAITING = frozenset({"udp", "rtp"})  # a sender may begin at any time; nothing has to be dialled
 # without a host: the usual port, and how FFmpeg is told to be the server that a drone pushes its video to
 _LISTENING: Mapping[str, tuple[int, Mapping[str, str]]] = {
