@@ -5,13 +5,14 @@ from pathlib import Path
 
 import pytest
 from fake_changes import fake_change
-from fake_flights import SITE, frame, map_flight
+from fake_flights import LOCAL_SITE, SITE, frame, map_flight
 
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, StoreError
 from sorvolo.missions.review_changes import list_changes, review_changes
 from sorvolo.store.archive import Archive
 from sorvolo.survey.findings import Verdict
+from sorvolo.survey.flight import Site
 
 
 @pytest.fixture
@@ -61,6 +62,20 @@ def test_an_unknown_change_is_named_and_nothing_is_said(
     with pytest.raises(InputError, match=words):
         review_changes(site, ids, Verdict.REJECTED, flight=flight)
     assert verdicts(site) == {}
+
+
+@pytest.mark.parametrize(("place", "unit"), [(SITE, "m"), (LOCAL_SITE, "units")])
+def test_sizes_are_listed_in_the_units_of_the_map(
+    place: Site, unit: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    with Archive.open(tmp_path / "site", write=True) as archive:
+        archive.create_site(place)
+        map_flight(archive, "a", 20, count=1)
+        with archive.begin_flight("b", "", {}) as writer:
+            writer.commit([frame(0)], {}, {}, "<html></html>", changes=[fake_change(1)])
+    assert main(["review", str(tmp_path / "site")]) == 0
+    assert f" size {unit} " in capsys.readouterr().out
 
 
 def test_a_folder_that_is_no_site_is_not_made_one(tmp_path: Path) -> None:

@@ -137,7 +137,7 @@ def _show_progress(updates: Any, site: Path, console: Console) -> list[str]:
         for update in updates:
             for change in update.announced:
                 told_ids.append(change.id)
-                unit = unit or _unit_of(site)
+                unit = unit or unit_of(site)
                 console.print(_words_of(change, unit), highlight=False)
             rate = f"{update.frames_read / update.seconds:.1f} frames/s, " if update.seconds > 0 else ""
             progress.update(
@@ -148,7 +148,7 @@ def _show_progress(updates: Any, site: Path, console: Console) -> list[str]:
     return told_ids
 
 
-def _unit_of(site: Path) -> str:
+def unit_of(site: Path) -> str:
     """Metres, or the units of a map that has none."""
     with Archive.open(site, write=False) as archive:
         return "units" if archive.site().is_local else "m"

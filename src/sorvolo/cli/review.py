@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sorvolo.cli.compare import unit_of
 from sorvolo.errors import SettingsError
 from sorvolo.missions.review_changes import list_changes, review_changes
 from sorvolo.store.change_records import StoredChange
@@ -53,15 +54,15 @@ def review(
     if as_json:
         typer.echo(json.dumps({"site": str(site), "changes": [_plain(each) for each in changes]}, indent=1))
     else:
-        _show(changes, Console())
+        _show(changes, unit_of(site), Console())
 
 
-def _show(changes: Sequence[StoredChange], console: Console) -> None:
+def _show(changes: Sequence[StoredChange], unit: str, console: Console) -> None:
     if not changes:
         console.print("no changes were found, or no flight was compared yet")
         return
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in ("id", "kind", "score", "size m", "views", "first seen (UTC)", "verdict"):
+    for name in ("id", "kind", "score", f"size {unit}", "views", "first seen (UTC)", "verdict"):
         table.add_column(name, no_wrap=name != "verdict", overflow="fold")
     for each in changes:
         verdict = ""
