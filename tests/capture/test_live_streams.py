@@ -68,6 +68,24 @@ def test_frames_come_in_order_with_the_times_of_their_metadata() -> None:
     assert "field of view" in source.camera.origin and not source.notices()
 
 
+def test_the_first_frames_of_a_sender_that_begins_late_are_kept() -> None:
+    port = free_port()
+    opened: list[LiveStream] = []
+    opening = threading.Thread(target=lambda: opened.append(open_live(f"udp://:{port}")))
+    opening.start()
+    time.sleep(1.0)
+    with sending(udp_url(port)) as sender:
+        opening.join(20)
+        (source,) = opened
+        time.sleep(0.3)  # a mission prepares itself
+        frames = taken(source.arrivals(lambda index, _: index % 2 == 0), 30)
+        late_s = time.monotonic() - sender.sent_s[number_of(frames[0][1].image) + 58]
+        source.close()
+    assert number_of(frames[0][1].image) <= 2  # 30 where what came while it was opened is lost
+    assert [frame.index for _, frame in frames] == list(range(0, 60, 2))
+    assert late_s < 0.5 and not any(notice.code == "skipped_frame" for notice in source.notices())
+
+
 def test_without_metadata_frames_are_timed_by_when_they_came() -> None:
     port = free_port()
     with sending(udp_url(port)) as sender:

@@ -22,9 +22,10 @@ _LISTENING: Mapping[str, tuple[int, Mapping[str, str]]] = {
     "rtmp": (1935, {"listen": "1"}), "tcp": (0, {"listen": "1"}),
     "rtsp": (554, {"rtsp_flags": "listen", "listen_timeout": "3"}),
 }
-# live: nothing is held back for a smoother picture, and a damaged packet does not end the stream
+# live: nothing is held back for a smoother picture, and a damaged packet does not end the stream; not `nobuffer`, which
+# throws away what came while the stream was looked at, and makes what comes later no sooner
 _COMMON = {
-    "fflags": "nobuffer+discardcorrupt", "flags": "low_delay", "analyzeduration": "1000000", "probesize": "5000000",
+    "fflags": "discardcorrupt", "flags": "low_delay", "analyzeduration": "1000000", "probesize": "5000000",
 }
 _BY_SCHEME: Mapping[str, Mapping[str, str]] = {
     "rtsp": {"rtsp_transport": "tcp"},

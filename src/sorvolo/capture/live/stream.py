@@ -54,9 +54,10 @@ class _Held:
 class LiveStream:
     """A flight that is going on; fulfils `capture.source.Source`, and what it says grows while it is read.
 
-    A thread reads and decodes from the moment it is opened; what comes before `frames` is asked for is passed over
-    (a growing file waits instead). Close it, or exhaust or close `frames`, to end it. `until`, when set from any
-    thread, ends the frames as the end of the stream would. Made by `open_stream`.
+    A thread reads and decodes from the moment it is opened; what comes before `frames` is asked for waits where all
+    frames are kept, and is passed over where the newest wins (a growing file waits itself). Close it, or exhaust or
+    close `frames`, to end it. `until`, when set from any thread, ends the frames as the end of the stream would. Made
+    by `open_stream`.
     """
 
     kind = "video"
@@ -85,6 +86,7 @@ class LiveStream:
         self._is_ready = threading.Event()
         self._wanted: Callable[[int, int], bool] | None = None
         self._is_asked = threading.Event()
+        self._asking = threading.Lock()  # `wanted` is asked of one frame after the other
         self._count = self._resized = self._lost = self._zooms = 0
         self._arrived_s = time.monotonic()
         self._size_px = (0, 0)
@@ -200,7 +202,9 @@ class LiveStream:
 
     def arrivals(self, wanted: Callable[[int, int], bool]) -> Iterator[tuple[float, Frame | LostFrame]]:
         """The same as `frames`, each with when it was there (monotonic clock)."""
-        self._wanted = wanted
+        with self._asking:
+            self._queue.sift(lambda arrived: wanted(arrived.index, arrived.time_ns))
+            self._wanted = wanted
         self._is_asked.set()
         try:
             while not self._is_ended:
@@ -348,11 +352,13 @@ class LiveStream:
         time_ns = self._clock.frame_utc_ns(held.stamp_ns)
         if self._is_file:
             self._is_asked.wait()
-        if self._wanted is None or self._closing.is_set():
-            return  # a stream goes on whether or not it is looked at
-        index, self._count = self._count, self._count + 1
-        if self._wanted(index, time_ns):
-            self._queue.put(Arrived(index, time_ns, held.arrived_s, held.decoded))
+        with self._asking:
+            is_passed_over = self._wanted is None and not self._settings.keeps_all
+            if is_passed_over or self._closing.is_set():
+                return  # a stream goes on whether or not it is looked at
+            index, self._count = self._count, self._count + 1
+            if self._wanted is None or self._wanted(index, time_ns):
+                self._queue.put(Arrived(index, time_ns, held.arrived_s, held.decoded))
 
     def ended(self) -> None:
         """See `reader.Hearer`."""
