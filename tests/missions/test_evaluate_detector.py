@@ -113,6 +113,24 @@ def test_each_set_is_reported_from_the_scores_of_the_model_that_looks_at_its_lig
     assert any("painted: 1 of 5 pictures are of another light" in text for text in evaluation.notices)
 
 
+def test_no_other_model_is_measured_in_the_place_of_one_that_knows_daylight_alone(labelled, tmp_path, monkeypatch):
+    monkeypatch.setenv("SORVOLO_MODELS", str(tmp_path / "models"))
+    (tmp_path / "models").mkdir()
+    blind, seeing = dict.fromkeys(CLASSES, 0.99), dict.fromkeys(CLASSES, 0.4)
+    rectangle_model(tmp_path / "models" / "night.onnx", name="night", thermal=True, thresholds=seeing)
+    day = rectangle_model(tmp_path / "day.onnx", name="day", thermal=False, thresholds=blind)
+    both = rectangle_model(tmp_path / "both.onnx", name="both", thermal=True)
+    grey = tmp_path / "grey.png"
+    Image.fromarray(np.array(Image.open(labelled.pictures[0].path).convert("L"))).save(grey)
+    night = replace(labelled, pictures=(replace(labelled.pictures[0], path=str(grey)),))
+    evaluation = evaluate_detector([[str(day)]], [night], QUICK)
+    assert dict(evaluation.found.sets["painted"].thresholds) == blind
+    (notice,) = evaluation.notices
+    assert notice.startswith("1 frames are thermal, but the model 'day' was trained on daylight alone")
+    rival = evaluate_detector([[str(both)], [str(day)]], [night], QUICK)
+    assert dict(rival.comparisons[0].arms[1].mean) and rival.notices == (notice,)
+
+
 def random_arm(folder, name, labelled, skill, seed):
     """detections.json of a detector that finds each label with this chance."""
     rng = np.random.default_rng(seed)

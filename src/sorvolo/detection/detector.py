@@ -23,8 +23,11 @@ from sorvolo.survey.objects import Detections
 class Detector:
     """A model that is ready to look at pictures. `load` opens one; `detect` is called after, by any threads."""
 
-    def __init__(self, session: Session, *, provider: Provider = "auto", threads: int | None = None) -> None:
+    def __init__(
+        self, session: Session, *, provider: Provider = "auto", threads: int | None = None, stand_in: bool = True
+    ) -> None:
         self._session, self._wanted_provider, self._threads = session, provider, threads
+        self._any_may_stand_in = stand_in
         self._at_night: Session | None = None
         self._night_was_sought = False
         self._seeking = threading.Lock()
@@ -32,15 +35,19 @@ class Detector:
 
     @classmethod
     def load(
-        cls, name_or_path: str | Path = "default", *, provider: Provider = "auto", threads: int | None = None
+        cls, name_or_path: str | Path = "default", *, provider: Provider = "auto", threads: int | None = None,
+        stand_in: bool = True,
     ) -> "Detector":
         """Open an installed model by its name (`sorvolo models list`), or a model file.
 
         `provider` "auto" takes CUDA where there is one, else OpenVINO where it is installed, else the CPU; `threads`
-        None takes as many as the process may use. Raises InputError for a name that is not installed and for a file
-        that is missing, damaged or no model of Sorvolo's, SettingsError for a provider that is not there.
+        None takes as many as the process may use. `stand_in`: where a model knows daylight alone and names no other,
+        any installed one that knows thermal frames looks at those; False to measure the model itself. Raises InputError
+        for a name that is not installed and for a file that is missing, damaged or no model of Sorvolo's, SettingsError
+        for a provider that is not there.
         """
-        return cls(Session(find_model(name_or_path), provider, threads), provider=provider, threads=threads)
+        session = Session(find_model(name_or_path), provider, threads)
+        return cls(session, provider=provider, threads=threads, stand_in=stand_in)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -67,9 +74,10 @@ class Detector:
             text = f"{count} thermal frames were seen by the model '{night}', {why}"
             told.append(Notice("thermal_model", count, text))
         elif count and not self.info.thermal:
+            known = "daylight and no installed one on thermal frames" if self._any_may_stand_in else "daylight alone"
             text = (
-                f"{count} frames are thermal, but the model '{own}' was trained on daylight and no installed one on "
-                "thermal frames: little of what it says of them holds"
+                f"{count} frames are thermal, but the model '{own}' was trained on {known}: little of what it says of "
+                "them holds"
             )
             told.append(Notice("thermal_untrained", count, text))
         if count := self._daylight_frames:
@@ -153,7 +161,7 @@ class Detector:
         return Detections(seen.boxes_px[told], seen.scores[told], labels, self.classes)
 
     def _session_for(self, thermal: bool) -> Session:
-        """This model, or for a thermal frame an installed one: the one it names, or if it knows none, any that does."""
+        """This model, or for a thermal frame an installed one: the one it names, or any where one may stand in."""
         self._daylight_frames += not (thermal or self.info.daylight)
         if self._is_own(thermal=thermal):
             return self._session
@@ -168,7 +176,8 @@ class Detector:
         """What looks at thermal frames in this model's place; threads that ask at once wait for it."""
         with self._seeking:
             if not self._night_was_sought:
-                found = thermal_model(self.classes, self.info.thermal_by)
+                named = self.info.thermal_by
+                found = thermal_model(self.classes, named) if named or self._any_may_stand_in else None
                 self._at_night = None if found is None else Session(found, self._wanted_provider, self._threads)
                 self._night_was_sought = True
         return self._at_night or self._session

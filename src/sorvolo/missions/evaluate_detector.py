@@ -63,7 +63,7 @@ class DetectorEvaluation:
     """One model's scores on each set, and, with rivals, all of them side by side; of several seeds the first is scored.
 
     `found` are the first model's detections; `worst` each set's worst mistakes with their pictures; `notices` say what
-    was left out, and what the first model had to say.
+    was left out, and what the models had to say.
     """
 
     found: FoundSets
@@ -121,7 +121,8 @@ def evaluate_detector(
     """Measure `arms[0]` on each set, and the other arms beside it.
 
     An arm is one model, or the same one trained with several seeds: names or files of models, or detections.json of
-    earlier evaluations, which were made on the same pictures. Raises InputError for models and files that cannot be
+    earlier evaluations, which were made on the same pictures. Measured is the model that was asked for, with the one
+    that it names for thermal frames, if any. Raises InputError for models and files that cannot be
     used, for sets that label none of a model's classes, and for those of which no picture can be read; one picture
     that cannot be read is left out for all models, and named in `notices`.
     """
@@ -145,7 +146,8 @@ def evaluate_detector(
         each.name: tuple(_worst(each, score, first.sets[each.name]))
         for each, score in zip(labelled, scores)
     }
-    return DetectorEvaluation(first, scores, comparisons, worst, (*_told_of_damaged(damaged), *first.notices))
+    told_by_models = dict.fromkeys(text for arm in seen for each in arm for text in each.notices)
+    return DetectorEvaluation(first, scores, comparisons, worst, (*_told_of_damaged(damaged), *told_by_models))
 
 
 def write_evaluation(evaluation: DetectorEvaluation, folder: Path, description: Mapping[str, Any]) -> None:
@@ -197,7 +199,7 @@ def _found(
     if Path(place).suffix == ".json":
         found = read_found(Path(place))
         return replace(found, sets={each.name: _same_pictures(place, found, each, damaged) for each in labelled})
-    detector = Detector.load(place)
+    detector = Detector.load(place, stand_in=False)
     for each in labelled:
         judged_classes(each, detector.classes)  # before an hour of looking
     sets: dict[str, FoundSet] = {}
