@@ -168,6 +168,30 @@ def test_what_was_remarked_is_told_on_the_terminal_too(
     assert all(" ".join(each.split()) in told for each in notices)
 
 
+def _greyed(place: Path, count: int) -> Path:
+    """Every so manieth picture of the folder without its colours."""
+    paths = sorted((place / "images").glob("*.png"))
+    for path in paths[:: len(paths) // count][:count]:
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    return place
+
+
+@pytest.mark.parametrize(("thermal", "lights"), [
+    (0, (False, True)), (1, (False, True)), (6, (True, True)), (20, (True, True)), (40, (True, False)),
+])
+def test_a_light_is_known_of_which_a_tenth_of_the_pictures_are(
+    tmp_path: Path, thermal: int, lights: tuple[bool, bool]
+) -> None:
+    place = labelled_squares(tmp_path / "squares", 4, 10)
+    sets = _sets(_greyed(place, thermal) if thermal else place, val="0")
+    assert sets.lights == lights
+    assert sum(len(share.labelled) for share in sets.shares) == 40
+    if all(lights):
+        assert {share.labelled.name: (len(share.labelled), share.thermal) for share in sets.shares} == {
+            "squares": (40 - thermal, False), "squares, thermal": (thermal, True)
+        }
+
+
 def test_one_video_is_split_by_blocks_and_the_score_called_too_good(tmp_path: Path) -> None:
     sets = _sets(labelled_squares(tmp_path / "one", 1, 40))
     assert 0 < len(sets.held_out[0]) < 20 < len(sets.shares[0].labelled)

@@ -251,11 +251,12 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     thresholds = checked.thresholds(classes)
     scores = {name: each.score for name, each in thresholds.items()}
     learnt = [share.labelled for share in run.sets.shares]
+    thermal, by_day = run.sets.lights
     info = {
         "name": run.out.resolve().name or "model", "preset": run.settings.preset, "version": __version__,
         "classes": list(classes), "thresholds": scores, "best_px": best_sizes_px(checked, scores, learnt, classes),
         **_descent(run, ", ".join(each.name for each in learnt)),
-        "thermal": run.sets.is_thermal, "daylight": not all(share.thermal for share in run.sets.shares),
+        "thermal": thermal, "daylight": by_day,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     exported = export_onnx(model, info)

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sorvolo.capture.photos import read_picture
 from sorvolo.detection.light import is_thermal
 from sorvolo.errors import InputError, SettingsError
@@ -14,13 +16,14 @@ from sorvolo.missions.simulate_pictures import simulate_pictures
 from sorvolo.missions.simulation_folder import PICTURES_MARK
 from sorvolo.simulation.pictures import PictureSettings
 from sorvolo.store.datasets import read_dataset, read_datasets
-from sorvolo.survey.labels import LabelledSet
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
 from sorvolo.survey.splits import shared_groups
 from sorvolo.training.samples import Share
 
 _SMALL = CLASSES[2]
-_LOOKED_AT = 9  # pictures of a set by which it is told whether it is thermal
+_LOOKED_AT = 40  # pictures of a set by which it is told whether it is thermal
+_SUBSTANTIAL = 0.1  # share of the samples from which on a light is learnt
 _SYNTHETIC_PICTURES = (4, 1200)  # made at least and at most
 _SYNTHETIC_THERMAL = 0.2
 
@@ -62,9 +65,12 @@ class TrainingSets:
         return digest.hexdigest()[:16]
 
     @property
-    def is_thermal(self) -> bool:
-        """Whether thermal pictures are learnt from."""
-        return any(share.thermal for share in self.shares)
+    def lights(self) -> tuple[bool, bool]:
+        """Whether enough thermal pictures are learnt from for a model to know them, and whether enough by day."""
+        thermal = sum(share.weight for share in self.shares if share.thermal)
+        by_day = sum(share.weight for share in self.shares if not share.thermal)
+        least = _SUBSTANTIAL * (thermal + by_day)
+        return thermal >= least, by_day >= least
 
     def described(self) -> list[dict[str, Any]]:
         """Each set for the report: its part, pictures, videos, boxes of each class."""
@@ -109,9 +115,10 @@ def read_training_sets(
         parts = [hold_out(each, share, seed) for each in whole]
         learnt, held_out = [each[0] for each in parts], [each[1] for each in parts if len(each[1])]
         notices += [text for each in parts for text in each[2]]
-    shares = [Share(each, float(len(each)), thermal=_is_thermal(each)) for each in learnt]
+    shares = [share for each in learnt for share in _by_light(each)]
     if synthetic > 0:
-        shares = _mixed(shares, _simulated(simulated), synthetic)
+        made = replace(read_dataset(simulated, form="coco"), name="simulated")
+        shares = _mixed(shares, _parted(made), synthetic)
     classes = _in_order(name for each in shares for name in each.labelled.classes)
     shares = [replace(each, labelled=_honest(each.labelled, classes)) for each in shares]
     if synthetic > 0:
@@ -163,25 +170,32 @@ def _honest(labelled: LabelledSet, classes: Sequence[str]) -> LabelledSet:
     return replace(labelled, unlabelled=labelled.unlabelled | unknown)
 
 
-def _is_thermal(labelled: LabelledSet) -> bool:
-    """Whether most of a few pictures over the whole set are; damaged ones are asked nothing."""
-    pictures = labelled.pictures[:: max(1, len(labelled) // _LOOKED_AT)][:_LOOKED_AT]
-    seen = []
-    for picture in pictures:
-        try:
-            seen.append(is_thermal(read_picture(Path(picture.path))))
-        except InputError:
-            continue
-    return sum(seen) * 2 > len(seen)
+def _by_light(labelled: LabelledSet) -> list[Share]:
+    """The set as one share, thermal or not by some of its pictures; as two where these are of both kinds."""
+    rows = np.random.default_rng(0).permutation(len(labelled))[:_LOOKED_AT]  # not evenly: lights may take turns
+    told = [_is_thermal(labelled.pictures[row]) for row in rows]
+    known = [each for each in told if each is not None]
+    ratio = sum(known) / max(1, len(known))
+    if not _SUBSTANTIAL <= ratio <= 1 - _SUBSTANTIAL:
+        return [Share(labelled, float(len(labelled)), thermal=ratio > 0.5)]
+    by_day, thermal = _parted(labelled)
+    return [Share(by_day, float(len(by_day))), Share(thermal, float(len(thermal)), thermal=True)]
 
 
-def _simulated(folder: Path) -> tuple[LabelledSet, LabelledSet]:
-    """Simulated pictures by day, and thermal ones."""
-    made = read_dataset(folder, form="coco")
-    night = [is_thermal(read_picture(Path(picture.path))) for picture in made.pictures]
-    by_day = made.only([picture for picture, dark in zip(made.pictures, night) if not dark])
-    thermal = made.only([picture for picture, dark in zip(made.pictures, night) if dark])
-    return replace(by_day, name="simulated"), replace(thermal, name="simulated, thermal")
+def _parted(labelled: LabelledSet) -> tuple[LabelledSet, LabelledSet]:
+    """The set's pictures by day, damaged ones among them, and its thermal ones."""
+    are_thermal = [_is_thermal(picture) for picture in labelled.pictures]
+    by_day = labelled.only([picture for picture, dark in zip(labelled.pictures, are_thermal) if not dark])
+    thermal = labelled.only([picture for picture, dark in zip(labelled.pictures, are_thermal) if dark])
+    return by_day, replace(thermal, name=f"{labelled.name}, thermal")
+
+
+def _is_thermal(picture: LabelledPicture) -> bool | None:
+    """None for a damaged one."""
+    try:
+        return is_thermal(read_picture(Path(picture.path)))
+    except (InputError, OSError):
+        return None
 
 
 def _mixed(shares: Sequence[Share], made: Sequence[LabelledSet], ratio: float) -> list[Share]:
