@@ -22,14 +22,18 @@ check: $(TRAINS)
 bench: $(READY)
 	$(BIN)/python benchmarks/mosaic_methods.py $(SEEDS)
 
-# The packaged model anew: make model DATA=FOLDER LITE0=WEIGHTS, the labelled sets and EfficientNet-Lite0's weights;
-# or learnt on from the one that is there: make model DATA=FOLDER START=default.
+# The packaged models anew: make model DATA=FOLDER LITE0=WEIGHTS, the labelled sets and EfficientNet-Lite0's weights;
+# or learnt on from the one that is there: make model DATA=FOLDER START=default. `thermal` begins with the new `default`.
 STEPS ?= 20000
+THERMAL_STEPS ?= 2600
 model: $(TRAINS)
 	$(BIN)/python benchmarks/train_default_model.py $(DATA) build/model --steps $(STEPS) \
 	  $(if $(START),--start $(START),--weights $(LITE0))
 	$(BIN)/python benchmarks/pack_default_model.py build/model/weights.pt $(DATA) --steps $(STEPS)
 	$(BIN)/python benchmarks/pack_int8_model.py $(DATA)
+	$(BIN)/python benchmarks/train_default_model.py $(DATA) build/model/thermal --steps $(THERMAL_STEPS) \
+	  --thermal --start default --simulated build/model/simulated
+	$(BIN)/python benchmarks/pack_thermal_model.py build/model/thermal/weights.pt $(DATA) --steps $(THERMAL_STEPS)
 
 $(READY): requirements.lock pyproject.toml setup.py $(wildcard src/sorvolo/kernels/*.?pp)
 	$(PYTHON) -m venv $(VENV)

@@ -4,8 +4,8 @@ With --start MODEL instead of --weights it learns on from an exported model, suc
 it learns thermal frames alone, all layers of it: the packaged model `thermal`, which starts from `default`.
 
 DATA is a folder with the labelled sets that detection_data.py names and two flights of photos as ground for composed
-small objects; simulated pictures are made first, into OUT. Held-out parts are never read here. A run that was stopped
-goes on from its last checkpoint.
+small objects; simulated pictures are made first. Held-out parts are never read here. A run that was stopped goes on
+from its last checkpoint.
 """
 
 import argparse
@@ -36,7 +36,7 @@ from sorvolo.training.samples import Augmentation, Sample, Share
 from sorvolo.training.weights import load_lite0
 
 SIMULATED_SEED, SIMULATED_PICTURES = 1, 1800
-SIMULATED = "simulated/boxes.json"
+SIMULATED = "boxes.json"
 STEEP_DEG = 75.0  # from so many degrees below the horizon a picture has no up and down
 SETTLING = 12  # batches by which the norms of a started model are settled
 
@@ -50,6 +50,7 @@ def main() -> None:
     start.add_argument("--weights", type=Path, help="EfficientNet-Lite0's published weights")
     start.add_argument("--start", help="an installed model's name or a model file to learn on from")
     parser.add_argument("--thermal", action="store_true", help="the thermal model: learns thermal frames alone")
+    parser.add_argument("--simulated", type=Path, help="folder of simulated pictures, made once; else OUT/simulated")
     parser.add_argument("--steps", type=int, default=6000)
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--side", type=int, default=384)
@@ -62,7 +63,8 @@ def main() -> None:
     torch.manual_seed(wishes.seed)
     wishes.out.mkdir(parents=True, exist_ok=True)
 
-    shares = (thermal_shares if wishes.thermal else training_shares)(wishes.data, wishes.out)
+    simulated = wishes.simulated or wishes.out / "simulated"
+    shares = (thermal_shares if wishes.thermal else training_shares)(wishes.data, simulated)
     for share in shares:
         boxes = sum(len(each.labels) for each in share.labelled.pictures)
         name, pictures = share.labelled.name, len(share.labelled)
@@ -110,9 +112,9 @@ def main() -> None:
                 torch.save(training.average.state_dict(), wishes.out / "weights.pt")
 
 
-def training_shares(data: Path, out: Path) -> list[Share]:
+def training_shares(data: Path, simulated: Path) -> list[Share]:
     """What is learnt from, and how often each."""
-    made = _simulated(out)
+    made = _made(simulated)
     return [
         *_frames_of_heat(data),
         Share(tinyperson(data)["train"], 1.8, (1.0, 2.8), pastes=SMALL, aslant=True),
@@ -123,10 +125,10 @@ def training_shares(data: Path, out: Path) -> list[Share]:
     ]
 
 
-def thermal_shares(data: Path, out: Path) -> list[Share]:
+def thermal_shares(data: Path, simulated: Path) -> list[Share]:
     """What the thermal model learns from; simulated frames show what HIT-UAV does not: other poses, small things."""
-    made = _simulated(out)
-    is_thermal = {row["file_name"]: row["thermal"] for row in json.loads((out / SIMULATED).read_text())["images"]}
+    made = _made(simulated)
+    is_thermal = {row["file_name"]: row["thermal"] for row in json.loads((simulated / SIMULATED).read_text())["images"]}
     heat = made.only([each for each in made.pictures if is_thermal[f"images/{Path(each.path).name}"]])
     return [*_frames_of_heat(data), Share(heat, 0.6, (0.8, 1.8))]
 
@@ -140,13 +142,13 @@ def _frames_of_heat(data: Path) -> list[Share]:
     ]
 
 
-def _simulated(out: Path) -> LabelledSet:
+def _made(simulated: Path) -> LabelledSet:
     """The simulated pictures, made at the first time."""
-    if not (out / SIMULATED).is_file():
+    if not (simulated / SIMULATED).is_file():
         settings = PictureSettings(pictures=SIMULATED_PICTURES, seed=SIMULATED_SEED, thermal_share=0.2)
-        for _ in simulate_pictures((out / SIMULATED).parent, settings):
+        for _ in simulate_pictures(simulated, settings):
             pass
-    return in_order(read_dataset((out / SIMULATED).parent))
+    return in_order(read_dataset(simulated))
 
 
 def _from(labelled: LabelledSet, fits: Callable[[float], bool]) -> LabelledSet:
