@@ -20,7 +20,7 @@ from sorvolo.detection.detector import Detector  # noqa: E402
 from sorvolo.errors import InputError, SettingsError  # noqa: E402
 from sorvolo.missions.train_detector import TrainingUpdate, train_detector  # noqa: E402
 from sorvolo.missions.train_settings import TrainSettings  # noqa: E402
-from sorvolo.missions.training_sets import DataOptions, read_training_sets, simulate_samples  # noqa: E402
+from sorvolo.missions.training_sets import DataOptions, TrainingSets, read_labels, simulate_samples, training_sets  # noqa: E402
 from sorvolo.store.training_page import training_page  # noqa: E402
 from sorvolo.training.checkpoint import read_checkpoint  # noqa: E402
 
@@ -141,10 +141,9 @@ def test_damaged_pictures_are_passed_over_and_told(tmp_path: Path) -> None:
     assert report["held_out"] is None and report["model"]["thresholds"] == {"car": 0.5}
 
 
-def _sets(*places: Path, val: str = "0.25", **options: object):  # type: ignore[no-untyped-def]
-    return read_training_sets(
-        places, DataOptions(val, **options), synthetic=0.0, seed=1, simulated=Path("none")  # type: ignore[arg-type]
-    )
+def _sets(*places: Path, val: str = "0.25", **options: object) -> TrainingSets:
+    labels = read_labels(places, DataOptions(val, **options), synthetic=0.0, seed=1)  # type: ignore[arg-type]
+    return training_sets(labels, synthetic=0.0, simulated=Path("none"))
 
 
 def test_whole_videos_are_held_out(data: Path) -> None:
@@ -217,7 +216,8 @@ def test_classes_that_a_set_knows_nothing_of_are_unlabelled_there(data: Path, tm
 def test_simulated_pictures_are_mixed_in(data: Path, tmp_path: Path) -> None:
     assert list(simulate_samples(tmp_path / "simulated", 1, seed=1))[-1] == "simulating pictures: 4 of 4"
     assert not list(simulate_samples(tmp_path / "simulated", 1, seed=1))  # kept for a run that goes on
-    sets = read_training_sets([data], DataOptions(), synthetic=0.4, seed=1, simulated=tmp_path / "simulated")
+    labels = read_labels([data], DataOptions(), synthetic=0.4, seed=1)
+    sets = training_sets(labels, synthetic=0.4, simulated=tmp_path / "simulated")
     assert sets.classes == ("person", "car", "small object")
     # small objects are composed onto the ground of the set that has none
     assert sets.shares[0].pastes == "small object" and not sets.shares[1].pastes
@@ -225,6 +225,13 @@ def test_simulated_pictures_are_mixed_in(data: Path, tmp_path: Path) -> None:
     assert weights.pop("squares") == pytest.approx(0.6)
     assert weights and all(name.startswith("simulated") for name in weights)
     assert sum(weights.values()) == pytest.approx(0.4)
+
+
+def test_labels_are_checked_before_anything_is_simulated(data: Path, tmp_path: Path) -> None:
+    options = DataOptions(classes={"Boat": "boat"})
+    with pytest.raises(InputError, match="none of its class names"):
+        list(train_detector([data], tmp_path / "out", _settings(synthetic=0.5), options, device="cpu"))
+    assert not (tmp_path / "out" / "simulated").exists()
 
 
 def test_bad_input_is_told(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,7 +19,7 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.train_settings import TrainSettings
 from sorvolo.missions.training_checks import Checked, best_sizes_px, check_model
-from sorvolo.missions.training_sets import DataOptions, TrainingSets, read_training_sets, simulate_samples
+from sorvolo.missions.training_sets import DataOptions, TrainingSets, read_labels, simulate_samples, training_sets
 from sorvolo.missions.training_start import load_start, told_of_classes
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
 from sorvolo.store.exports import json_bytes, plain_json
@@ -107,14 +107,13 @@ def train_detector(
     _claim(out, resume)
     start = load_start(settings.weights, settings.preset)
     steps = settings.steps
+    yield TrainingUpdate(0, steps, "reading the labels")
+    labels = read_labels(places, options, synthetic=settings.synthetic, seed=settings.seed)
     if settings.synthetic > 0:
         samples = round(steps * settings.batch * settings.synthetic)
         for words in simulate_samples(out / SIMULATED, samples, settings.seed):
             yield TrainingUpdate(0, steps, words)
-    yield TrainingUpdate(0, steps, "reading the labels")
-    sets = read_training_sets(
-        places, options, synthetic=settings.synthetic, seed=settings.seed, simulated=out / SIMULATED
-    )
+    sets = training_sets(labels, synthetic=settings.synthetic, simulated=out / SIMULATED)
     told = sets.notices
     if isinstance(start, ExportedModel):
         told += tuple(told_of_classes(start, sets.classes))

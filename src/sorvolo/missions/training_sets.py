@@ -44,6 +44,15 @@ class DataOptions:
 
 
 @dataclass(frozen=True, eq=False)
+class ReadLabels:
+    """Sets `learnt` from and `held_out`, and what was remarked of them."""
+
+    learnt: tuple[LabelledSet, ...]
+    held_out: tuple[LabelledSet, ...]
+    notices: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class TrainingSets:
     """`shares` to learn from, `held_out` sets to be checked on, the model's `classes`, and what was remarked."""
 
@@ -92,14 +101,11 @@ class TrainingSets:
         ]
 
 
-def read_training_sets(
-    places: Sequence[Path], options: DataOptions, *, synthetic: float, seed: int, simulated: Path
-) -> TrainingSets:
-    """Read and split all sets; `simulated` is the folder of `simulate_samples`, from which `synthetic` of all samples
-    come, with small objects composed onto the ground of the sets that have none.
+def read_labels(places: Sequence[Path], options: DataOptions, *, synthetic: float, seed: int) -> ReadLabels:
+    """Read and split all sets.
 
-    A class that a set knows nothing of is unlabelled there. Raises InputError where a set cannot be read or holds no
-    object to learn, SettingsError where `val` is neither a data set nor a share.
+    Raises InputError where there is nothing to learn from or a set cannot be read, SettingsError where `val` is neither
+    a data set nor a share.
     """
     share = _share_of(options.val)
     if not places and synthetic < 1:
@@ -115,7 +121,17 @@ def read_training_sets(
         parts = [hold_out(each, share, seed) for each in whole]
         learnt, held_out = [each[0] for each in parts], [each[1] for each in parts if len(each[1])]
         notices += [text for each in parts for text in each[2]]
-    shares = [share for each in learnt for share in _by_light(each)]
+    return ReadLabels(tuple(learnt), tuple(held_out), tuple(notices))
+
+
+def training_sets(read: ReadLabels, *, synthetic: float, simulated: Path) -> TrainingSets:
+    """What is learnt from and checked on; `simulated` is the folder of `simulate_samples`, from which `synthetic` of
+    all samples come, with small objects composed onto the ground of the sets that have none.
+
+    A class that a set knows nothing of is unlabelled there. Raises InputError where no set holds an object to learn.
+    """
+    notices = list(read.notices)
+    shares = [share for each in read.learnt for share in _by_light(each)]
     if synthetic > 0:
         made = replace(read_dataset(simulated, form="coco"), name="simulated")
         shares = _mixed(shares, _parted(made), synthetic)
@@ -129,7 +145,7 @@ def read_training_sets(
                          "check the labels, their class names and what is held out with --val")
     notices += _short_classes(shares, classes)
     return TrainingSets(
-        tuple(shares), tuple(_honest(each, classes) for each in held_out), classes, tuple(notices)
+        tuple(shares), tuple(_honest(each, classes) for each in read.held_out), classes, tuple(notices)
     )
 
 
