@@ -270,9 +270,23 @@ def test_pictures_without_any_object_teach_nothing(tmp_path: Path) -> None:
         _sets(place)
 
 
+def test_a_model_that_finds_nothing_is_warned_of(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--weights", "none", "--steps", "1", "--batch", "1", "--side", "64", "--val", "0.25", "--device", "cpu"]
+    assert main(["train", str(data), "--out", str(tmp_path / "out"), *options]) == 0
+    words = "the model finds next to nothing: its AP50 on the held-out pictures is 0.0"
+    assert words in " ".join(capsys.readouterr().out.split())
+    report = json.loads((tmp_path / "out" / "training.json").read_text())
+    assert any(words in each for each in report["notices"])
+    assert report["found_px"] == {} and report["model"]["best_px"]["car"][0] > 20  # of those learnt from
+    page = (tmp_path / "out" / "training.html").read_text()
+    assert words in page and "too few found" in page
+
+
 def test_names_in_the_report_are_text() -> None:
     report = {
-        "model": {"name": "<b>", "best_px": {"<i>": (1, 2)}}, "held_out": {"ap50": 0.5, "classes": {"<i>": 0.5}},
+        "model": {"name": "<b>"}, "found_px": {"<i>": (1, 2)}, "held_out": {"ap50": 0.5, "classes": {"<i>": 0.5}},
         "reported": {"<i>": {"score": 0.5, "precision": None, "recall": 0.25}}, "stopped_early": True, "step": 2,
         "steps": 5, "seconds": 3.0, "device": "cpu", "notices": ["<script>"], "losses": [],
         "checks": [{"step": k, "ap50": 0.1 * k, "classes": {"<i>": None}} for k in (1, 2)], "best_step": 2,

@@ -18,7 +18,7 @@ from sorvolo.capture.photos import read_picture
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.train_settings import TrainSettings
-from sorvolo.missions.training_checks import Checked, best_sizes_px, check_model
+from sorvolo.missions.training_checks import Checked, best_sizes_px, check_model, found_sizes_px
 from sorvolo.missions.training_sets import DataOptions, TrainingSets, read_labels, simulate_samples, training_sets
 from sorvolo.missions.training_start import load_start, told_of_classes
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
@@ -51,6 +51,7 @@ _MOST_CHECKED, _MOST_CHECKED_LAST = 150, 1000  # held-out pictures
 _ROWS = 200  # of losses in the report
 _SAVE_S = 60.0  # a kill costs no more than this and the time between two checks
 _KEPT_PICTURES_BYTES = 2 << 30
+_FINDS_NOTHING_AP50 = 0.05  # below which a model is of no use yet
 _EXPORT_PICTURES, _EXPORT_PX = 4, 1280  # by which the model file is compared with torch
 
 
@@ -262,9 +263,10 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     agreement = check_export(model.cpu(), exported, _some_pictures(run))
     atomic_write_bytes(run.out / MODEL, exported)
     check = checked.check(run.learner.step if best is None else best.step) if run.sets.held_out else None
-    told = _closing_notices(run, agreement)
+    told = _closing_notices(run, agreement, check)
     report = _report(run, info, agreement, len(exported), check, told) | {
-        "reported": {name: asdict(each) for name, each in thresholds.items()}
+        "reported": {name: asdict(each) for name, each in thresholds.items()},
+        "found_px": found_sizes_px(checked, scores, classes),
     }
     atomic_write_bytes(run.out / REPORT, json_bytes(report))
     atomic_write_bytes(run.out / PAGE, training_page(plain_json(report)).encode())
@@ -303,9 +305,14 @@ def _at_least(picture: ImageRGB, side_px: int) -> ImageRGB:
     return np.pad(picture, ((0, down), (0, right), (0, 0)), constant_values=114)
 
 
-def _closing_notices(run: _Run, agreement: ExportCheck) -> tuple[str, ...]:
+def _closing_notices(run: _Run, agreement: ExportCheck, check: Check | None) -> tuple[str, ...]:
     """What is only known in the end."""
     notices = []
+    if check is not None and check.ap50 < _FINDS_NOTHING_AP50:
+        notices.append(
+            f"the model finds next to nothing: its AP50 on the held-out pictures is {check.ap50:.3f}; train longer "
+            "(--steps), begin with --weights auto or a model, or look whether the labels fit the pictures"
+        )
     if run.reader.damaged:
         count, (path, reason) = len(run.reader.damaged), next(iter(run.reader.damaged.items()))
         notices.append(f"{count} pictures cannot be read and were passed over (first: {path}: {reason})")

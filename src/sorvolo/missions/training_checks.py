@@ -89,15 +89,24 @@ def best_sizes_px(
 ) -> dict[str, tuple[float, float]]:
     """Of each class the longer sides between which nine of ten objects lie: of those found where enough were held out,
     else of those learnt from."""
-    ranges = {}
-    for name in classes:
-        sides = checked.found_sides_px(name, thresholds[name])
-        if len(sides) < _FEW:
-            sides = np.concatenate([np.zeros(0), *(_sides_px(each, name) for each in learnt)])
-        low, high = np.percentile(sides, [5, 95]) if len(sides) else (8.0, 256.0)
-        low = max(1.0, round(float(low), 1))
-        ranges[name] = (low, max(low + 1, round(float(high), 1)))
-    return ranges
+    found = found_sizes_px(checked, thresholds, classes)
+    learnt_px = {name: np.concatenate([np.zeros(0), *(_sides_px(each, name) for each in learnt)]) for name in classes}
+    return {name: found.get(name) or _most_of(learnt_px[name]) for name in classes}
+
+
+def found_sizes_px(
+    checked: Checked, thresholds: Mapping[str, float], classes: Sequence[str]
+) -> dict[str, tuple[float, float]]:
+    """Of each class the longer sides between which nine of ten of the held-out objects that were found lie; nothing of
+    a class of which too few were."""
+    sides = {name: checked.found_sides_px(name, thresholds[name]) for name in classes}
+    return {name: _most_of(each) for name, each in sides.items() if len(each) >= _FEW}
+
+
+def _most_of(sides_px: Floats) -> tuple[float, float]:
+    low, high = np.percentile(sides_px, [5, 95]) if len(sides_px) else (8.0, 256.0)
+    low = max(1.0, round(float(low), 1))
+    return low, max(low + 1, round(float(high), 1))
 
 
 def _sides_px(labelled: LabelledSet, name: str) -> Floats:

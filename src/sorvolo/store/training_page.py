@@ -84,10 +84,10 @@ def _reported(report: Mapping[str, Any]) -> str:
     rows = []
     for name, ap50 in classes.items():
         told = report["reported"][name]
-        low, high = report["model"]["best_px"][name]
+        found_px = report["found_px"].get(name)
         rows.append([
             escape(name), _number(ap50), _number(told["score"]), _number(told["precision"]), _number(told["recall"]),
-            f"{low:g} to {high:g} px",
+            f"{found_px[0]:g} to {found_px[1]:g} px" if found_px else "too few found",
         ])
     names = ("class", "AP50", "reported from score", "precision", "recall", "longer sides found")
     return (
