@@ -118,6 +118,20 @@ def test_ctrl_c_waits_for_the_step_and_leaves_a_checkpoint(
     assert read_checkpoint(content, "checkpoint").state["step"] == last
 
 
+@pytest.mark.parametrize("schedule", ["joint", "four-steps"])
+def test_checkpoints_come_between_checks_too(
+    data: Path, tmp_path: Path, schedule: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sorvolo.missions.train_detector._SAVE_S", 0.0)  # else a minute
+    settings = _settings(schedule=schedule, rpn="standard", steps=400)
+    for update in (run := _train(data, tmp_path / "out", settings)):
+        if update.step == 2:  # long before the first check, of four steps in the first
+            break
+    content = (tmp_path / "out" / "checkpoint.pt").read_bytes()
+    assert read_checkpoint(content, "checkpoint").state["step"] == 2
+    run.close()  # type: ignore[attr-defined]
+
+
 def test_other_labels_are_other_data(tmp_path: Path) -> None:
     place = labelled_squares(tmp_path / "squares", 2, 3)
     run = _train(place, tmp_path / "out", _settings())
