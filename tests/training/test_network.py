@@ -1,5 +1,6 @@
 """The network: laws of boxes and regions, Table 3.2, and that a small one learns, goes on and exports."""
 
+from copy import deepcopy
 from itertools import islice
 
 import numpy as np
@@ -22,6 +23,7 @@ from sorvolo.training.heads import TwoLayerHead, pooled_levels, roi_align  # noq
 from sorvolo.training.inception import ExtendedStack, ResidualStack, proposal_stem  # noqa: E402
 from sorvolo.training.joint import JointSettings, JointTraining  # noqa: E402
 from sorvolo.training.losses import Answer, joint_proposal_loss, match_boxes, region_loss  # noqa: E402
+from sorvolo.training.presets import fast  # noqa: E402
 from sorvolo.training.proposals import AnchorSettings, ProposalNetwork  # noqa: E402
 from sorvolo.training.pyramid import Pyramid  # noqa: E402
 from sorvolo.training.samples import Augmentation, Sample, Share, cut_sample  # noqa: E402
@@ -122,6 +124,24 @@ def test_the_exported_graph_says_what_torch_says(trained):
     check = check_export(model, exported, [*(each.image for each in squares(6, 4)), wide])
     assert check.is_good, check
     assert check.detections > 6
+
+
+def test_an_order_of_equal_scores_is_no_difference_of_the_export():
+    model = fast(["square", "disc"]).eval()
+    for layer in model.proposals.scores:  # all anchors are as likely: which are looked at is anyone's guess
+        torch.nn.init.zeros_(layer.weight)
+    pictures = [np.random.default_rng(3).integers(0, 255, (128, 160, 3), dtype=np.uint8)]
+    check = check_export(model, export_onnx(model, {"classes": ["square", "disc"]}), pictures)
+    assert check.is_good and check.undecided > 200, check
+
+
+def test_another_network_s_file_is_no_export_of_this_one(trained):
+    model = deepcopy(trained[0].average)
+    exported = export_onnx(model, {"classes": ["square", "disc"]})
+    with torch.no_grad():
+        model.head.offsets.bias += 0.05
+    check = check_export(model, exported, [each.image for each in squares(4, 4)])
+    assert not check.is_good and check.box_px > 0.5, check
 
 
 def test_an_export_looks_at_as_many_regions_as_it_is_told(trained):

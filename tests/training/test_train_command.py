@@ -307,7 +307,7 @@ def test_names_in_the_report_are_text() -> None:
         "sets": [{"name": "<s>", "part": "learnt from", "pictures": 1, "videos": 1, "boxes": {"<i>": 3},
                   "unlabelled": []}],
         "settings": {"preset": "fast"}, "weights": "none",
-        "export": {"box_px": 0.0, "score": 0.0, "detections": 3, "bytes": 5_000_000},
+        "export": {"box_px": 0.0, "score": 0.0, "detections": 3, "undecided": 0, "bytes": 5_000_000},
     }
     page = training_page(report)
     assert "<i>" not in page and "<script>" not in page and "<s>" not in page and "&lt;i&gt;" in page

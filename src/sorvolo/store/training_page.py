@@ -114,9 +114,10 @@ def _how(report: Mapping[str, Any]) -> str:
     export = report["export"]
     rows = [[escape(key), escaped(value)] for key, value in report["settings"].items()]
     rows.append(["began with", escaped(report["weights"])])
+    undecided = f"; {export['undecided']} more hang on roundings" if export["undecided"] else ""
     rows.append([
         "exported model against torch",
-        f"{export['box_px']:.3f} px, {export['score']:.5f} in score, over {export['detections']} detections",
+        f"{export['box_px']:.3f} px, {export['score']:.5f} in score, over {export['detections']} detections{undecided}",
     ])
     return f"<section><h2>How</h2>{table_of(rows)}</section>"
 
