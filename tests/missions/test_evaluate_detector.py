@@ -174,6 +174,8 @@ def test_arms_of_several_seeds_side_by_side(many, tmp_path):
     write_evaluation(evaluation, tmp_path / "out", {})
     page = (tmp_path / "out" / PAGE).read_text()
     assert "Side by side: many" in page and "extended and 2 more seeds less standard and 2 more seeds" in page
+    fewer = evaluate_detector([standard[:2], extended[:1]], [many], QUICK)
+    assert [arm.name for arm in fewer.comparisons[0].arms] == ["standard and 1 more seed", "extended"]
 
 
 def test_detections_of_other_pictures_are_refused(many, labelled, tmp_path):
@@ -266,6 +268,12 @@ def test_names_that_nothing_has_are_told(toy, coco, capsys):
     assert "ignore: 'Lory' is no name in the labels; there are: Walker, Truck" in capsys.readouterr().err
     assert main([*command, "--unlabelled", "Car"]) == 1
     assert "unlabelled: 'Car' is no class; there are: person, car, small object" in capsys.readouterr().err
+
+
+def test_what_was_left_out_on_reading_is_told_of_chosen_pictures_too(coco):
+    names = {"Walker": "person"}
+    (whole,), (some,) = (read_sets([coco], classes=names, videos=videos) for videos in ("", "coco|.*"))
+    assert whole.notices and [each.text for each in some.notices] == [each.text for each in whole.notices]
 
 
 def test_videos_choose_pictures(coco):

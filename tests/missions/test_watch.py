@@ -330,6 +330,19 @@ def test_a_source_without_a_picture_is_an_error(detector: TruthDetector, tmp_pat
         list(watch(tmp_path / "gone.mp4", detector=detector))
 
 
+def test_a_photo_that_cannot_be_read_is_told_of_once(
+    photographs: Path, detector: TruthDetector, tmp_path: Path
+) -> None:
+    (photographs / "IMG_1.jpg").write_bytes(b"no picture")
+    cut = photographs / "IMG_2.jpg"
+    cut.write_bytes(cut.read_bytes()[:-400])
+    list(watch(
+        photographs, outputs=WatchOutputs(folder=tmp_path / "out"), camera="aov=60", detector=_Squares(detector.info)
+    ))
+    notices = {each["code"]: each["count"] for each in _read(tmp_path / "out" / "report.json")["notices"]}
+    assert notices["lost_frames"] == 2 and not {"unreadable_photo", "corrupt_photo"} & set(notices)
+
+
 class _Squares:
     """A detector that needs no truth: bright squares on dark ground."""
 

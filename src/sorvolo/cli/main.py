@@ -42,9 +42,10 @@ app.add_typer(models_app, name="models")
 
 @dataclass
 class _Wishes:
-    """What the options before the command ask for."""
+    """What the options before the command ask for, and what a command wants to be said when it was stopped."""
 
     debug: bool
+    stop_words: str = "stopped; what was not finished is left out, what was before is as it was"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -55,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else _FAILED
         if code == _STOPPED:
-            _tell("stopped; what was not finished is left out, what was before is as it was")
+            _tell(wishes.stop_words)
         return code
     except Exception as error:
         if wishes.debug:

@@ -47,6 +47,7 @@ class Schedule(StrEnum):
 
 
 def train(
+    context: typer.Context,
     data: Annotated[list[Path] | None, typer.Argument(help="Labelled sets: folders, or their label files.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for the model, the report and the checkpoints.")] = Path("model"),
     preset: Annotated[
@@ -100,7 +101,7 @@ def train(
         preset.value, chosen.value, schedule.value, weights, steps, batch, side, seed, synthetic, patience
     )
     try:
-        from sorvolo.missions.train_detector import train_detector
+        from sorvolo.missions.train_detector import CHECKPOINT, train_detector
         from sorvolo.missions.training_sets import DataOptions
     except ModuleNotFoundError as error:
         raise SettingsError(
@@ -118,7 +119,8 @@ def train(
             _show(updates, wish)
         if wish.is_there:
             cast(Generator[Any], updates).close()  # leaves a checkpoint, once it has learnt at all
-            typer.echo(f"the same command with --resume goes on where {out} is now", err=True)
+            if (out / CHECKPOINT).is_file():
+                context.obj.stop_words = f"stopped; the same command with --resume goes on where {out} is now"
             raise KeyboardInterrupt
     if not as_json:
         typer.echo(f"{out / 'training.html'} tells how it went; sorvolo evaluate detector measures the model on more")

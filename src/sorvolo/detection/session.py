@@ -234,7 +234,7 @@ def _refusal(told: str) -> str:
     if "IR version" in told or "opset" in told.lower():
         return f"it is of a newer ONNX than {runtime} reads ({first}); update onnxruntime, or export with opset 17"
     if "Protobuf" in told or "protobuf" in told:
-        return f"it is damaged or no ONNX file ({first}); copy it again and try `sorvolo models verify`"
+        return f"it is damaged or no ONNX file ({first}); copy or fetch it again"
     return f"{runtime} refuses it ({first}); export it again with opset 17"
 
 

@@ -95,7 +95,8 @@ def read_sets(
         known=known,
     )
     for place, whole in zip(places, read):
-        chosen = whole.only([each for each in whole.pictures if kept.match(each.group)])
+        fitting = [each for each in whole.pictures if kept.match(each.group)]
+        chosen = replace(whole.only(fitting), notices=whole.notices)
         if not len(chosen):
             groups = sorted({each.group for each in whole.pictures})
             raise InputError(f"{place}: no video or flight fits {videos!r}; there are {', '.join(groups[:8])}")
@@ -314,7 +315,7 @@ def _same_pictures(
 def _side_by_side(
     labelled: LabelledSet, seen: Sequence[Sequence[FoundSets]], settings: EvaluationSettings
 ) -> SetComparison:
-    names = [arm[0].name + (f" and {len(arm) - 1} more seeds" if len(arm) > 1 else "") for arm in seen]
+    names = [arm[0].name + _more_seeds(len(arm) - 1) for arm in seen]
     arms = []
     for place, (name, arm) in enumerate(zip(names, seen), start=1):
         seeds = [each.sets[labelled.name] for each in arm]
@@ -323,6 +324,10 @@ def _side_by_side(
             tuple(each.detections for each in seeds), tuple(each.thresholds for each in seeds),
         ))
     return compare_arms(labelled, arms, draws=settings.draws, seed=settings.seed)
+
+
+def _more_seeds(count: int) -> str:
+    return f" and {count} more seed{'s' if count > 1 else ''}" if count else ""
 
 
 def _worst(

@@ -21,6 +21,9 @@ from sorvolo.store.exports import utc_text
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.objects import Detections, Track
 
+# what sources say of frames that cannot be used either, told with the reasons
+_OF_LOST_FRAMES = ("unreadable_photo", "corrupt_photo", "duplicate_photo", "other_size", "other_shape")
+
 
 @dataclass
 class WatchLog:
@@ -129,7 +132,8 @@ def source_notices(source: Source, log: WatchLog) -> tuple[Notice, ...]:
     lost = sum(log.lost.values())
     reasons = "; ".join(f"{count} x {reason}" for reason, count in log.lost.most_common(5))
     unusable = (Notice("lost_frames", lost, f"{lost} frames could not be used: {reasons}"),) if lost else ()
-    return (*source.telemetry.notices, *source.notices(), *unusable)
+    others = [each for each in source.notices() if not (lost and each.code in _OF_LOST_FRAMES)]
+    return (*source.telemetry.notices, *others, *unusable)
 
 
 def _facts(model: ModelInfo) -> Mapping[str, Any]:
