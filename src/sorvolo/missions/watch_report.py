@@ -34,7 +34,7 @@ class WatchLog:
     with_detections: int = 0
     lost: Counter[str] = field(default_factory=Counter)  # reasons of frames that cannot be used
     found: Counter[str] = field(default_factory=Counter)  # detections by class
-    placed: int = 0
+    placed: int = 0  # detections with a place on the ground
     latency_s: list[float] = field(default_factory=list)
     first_ns: int = -1
     last_ns: int = -1

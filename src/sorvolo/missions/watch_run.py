@@ -95,7 +95,8 @@ class WatchRun:
             )
         with log.stage("track"):
             taken = self._places.take(frame, time_ns, found)
-        log.searched(time_ns, found, sum(each is not None for each in taken.sightings))
+        placed = 0 if self._places.site.is_local else sum(each is not None for each in taken.sightings)
+        log.searched(time_ns, found, placed)
         confirmed = [track for track in self._places.tracks() if track.confirmed]
         counts = count_by_class(confirmed)
         with log.stage("hand over"):
