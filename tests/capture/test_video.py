@@ -212,14 +212,29 @@ def test_damage_in_the_middle_does_not_end_the_video(tmp_path: Path) -> None:
     assert codes(source) & {"decode_error", "damaged_frame", "backward_pts"}  # whichever of them the damage hit
 
 
-def test_a_frame_of_another_size_is_lost_with_its_reason(tmp_path: Path) -> None:
-    first = write_video(tmp_path / "1.ts", 20)
-    second = write_video(tmp_path / "2.ts", 20, size=(128, 96))
-    joined = tmp_path / "joined.ts"
-    joined.write_bytes(first.read_bytes() + second.read_bytes())
-    frames = all_frames(open_video(joined))
-    lost = [frame for frame in frames if isinstance(frame, LostFrame)]
-    assert len(lost) >= 15 and lost[0].reason == "size 128x96 differs from the flight's 160x120"
+def _joined(folder: Path, *size_px: tuple[int, int]) -> Path:
+    """Twenty frames of each size, one after another in one file."""
+    parts = [write_video(folder / f"{number}.ts", 20, size=size) for number, size in enumerate(size_px)]
+    joined = folder / "joined.ts"
+    joined.write_bytes(b"".join(part.read_bytes() for part in parts))
+    return joined
+
+
+def test_a_frame_of_another_shape_is_lost_with_its_reason(tmp_path: Path) -> None:
+    source = open_video(_joined(tmp_path, (160, 120), (160, 96)))
+    lost = [frame for frame in all_frames(source) if isinstance(frame, LostFrame)]
+    assert len(lost) >= 15 and lost[0].reason == "size 160x96 differs from the flight's 160x120"
+    assert {each.code: each.count for each in source.notices()}["other_shape"] == len(lost)
+
+
+def test_frames_of_another_size_but_the_same_shape_are_brought_to_the_first_one_s(tmp_path: Path) -> None:
+    source = open_video(_joined(tmp_path, (160, 120), (128, 96)))
+    frames = all_frames(source)
+    assert len(frames) >= 35 and not any(isinstance(frame, LostFrame) for frame in frames)
+    last = frames[-1]
+    assert isinstance(last, Frame) and last.image.shape == (120, 160, 3)
+    assert last.image[10, 20, 0] > 180 and last.image[10, 140, 2] > 180  # red left, blue right, as in all frames
+    assert {each.code: each.count for each in source.notices()}["size_changed"] >= 15
 
 
 def test_what_is_no_video_is_refused_by_name(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ _FALLBACK_RATE_HZ = 25.0
 _GAP_S = 2.0
 _CLOCK_RETURNS_WITHIN = 25  # frames after a backward step in which the old clock may come back
 _DEMUX_RETRIES = 20
+_SAME_ASPECT = 0.01
 
 
 @dataclass(frozen=True)
@@ -87,32 +88,48 @@ class VideoSource:
         """
         clock = _Clock(self.info.frame_rate_hz)
         damage = _Damage()
+        sizes = _Sizes()
         last_ns = 0
         for index, decoded in enumerate(_decoded_frames(self.info.path, damage)):
             last_ns = clock.time_ns(decoded)
-            self._found = self._told(self.info.is_cut, damage, clock)
+            self._found = self._told(self.info.is_cut, damage, sizes, clock)
             time_ns = self.start_ns + last_ns
             if not wanted(index, time_ns):
                 continue
+            width_px, height_px = _upright_size_px(decoded, self.info.turn)
+            is_resized = (width_px, height_px) != (self.info.width_px, self.info.height_px)
+            if is_resized and not self._has_shape(width_px, height_px):
+                sizes.lost += 1
+                usual = f"{self.info.width_px}x{self.info.height_px}"
+                reason = f"size {width_px}x{height_px} differs from the flight's {usual}"
+                yield LostFrame(index, str(index), time_ns, reason)
+                continue
             try:
-                image = upright(decoded.to_ndarray(format="rgb24"), self.info.turn)
+                image = self._image(decoded)
             except (av.FFmpegError, ValueError, MemoryError) as error:
                 damage.unconverted += 1
                 yield LostFrame(index, str(index), time_ns, f"corrupt: {error}")
                 continue
-            height_px, width_px = image.shape[:2]
-            if (width_px, height_px) == (self.info.width_px, self.info.height_px):
-                yield Frame(index, str(index), time_ns, image)
-            else:
-                usual = f"{self.info.width_px}x{self.info.height_px}"
-                reason = f"size {width_px}x{height_px} differs from the flight's {usual}"
-                yield LostFrame(index, str(index), time_ns, reason)
+            sizes.fitted += is_resized
+            yield Frame(index, str(index), time_ns, image)
         missing_s = self.info.duration_s - last_ns / _SECOND_NS
         is_cut = self.info.is_cut or missing_s > max(1.0, 0.05 * self.info.duration_s)
-        self._found = self._told(is_cut, damage, clock)
+        self._found = self._told(is_cut, damage, sizes, clock)
 
-    def _told(self, is_cut: bool, damage: "_Damage", clock: "_Clock") -> tuple[Notice, ...]:
-        return (*_cut_notice(is_cut or damage.stopped), *damage.notices(), *clock.notices())
+    def _told(self, is_cut: bool, damage: "_Damage", sizes: "_Sizes", clock: "_Clock") -> tuple[Notice, ...]:
+        cut = _cut_notice(is_cut or damage.stopped)
+        return (*cut, *damage.notices(), *sizes.notices(), *clock.notices())
+
+    def _has_shape(self, width_px: int, height_px: int) -> bool:
+        """Whether a frame of this size shows the same view as the first one, in more or fewer pixels."""
+        return abs(width_px * self.info.height_px / (height_px * self.info.width_px) - 1) <= _SAME_ASPECT
+
+    def _image(self, decoded: av.VideoFrame) -> ImageRGB:
+        """The frame upright, at the first one's size."""
+        width_px, height_px = self.info.width_px, self.info.height_px
+        if self.info.turn[0]:
+            width_px, height_px = height_px, width_px
+        return upright(decoded.to_ndarray(format="rgb24", width=width_px, height=height_px), self.info.turn)
 
     def glimpses(self, count: int) -> list[Frame]:
         """A few frames spread over the video, found by seeking: quick, but their times are rough."""
@@ -126,7 +143,9 @@ class VideoSource:
                     if part or self.info.duration_s:
                         container.seek(int(target_s / float(stream.time_base or 1)), stream=stream)
                     decoded = next(container.decode(stream))
-                    image = upright(decoded.to_ndarray(format="rgb24"), self.info.turn)
+                    if not self._has_shape(*_upright_size_px(decoded, self.info.turn)):
+                        continue
+                    image = self._image(decoded)
                 except (av.FFmpegError, StopIteration, ValueError, OverflowError, MemoryError):
                     continue  # a glimpse at a damaged place tells nothing; `frames` counts the damage
                 time_s = max(0.0, decoded.time - first_s) if decoded.time is not None else 0.0
@@ -165,7 +184,7 @@ def read_video_info(path: Path) -> VideoInfo:
             "copy it again from the drone, and record as MKV or TS, which survive a cut"
         )
     turn = _turn_of(first)
-    height_px, width_px = upright(np.empty((first.height, first.width, 0), np.uint8), turn).shape[:2]
+    width_px, height_px = _upright_size_px(first, turn)
     pixel_aspect = float(aspect) if aspect else 1.0
     start_ns, start_origin = _start_of(metadata)
     return VideoInfo(
@@ -187,6 +206,10 @@ def upright(image: Anything, turn: tuple[bool, bool, bool]) -> ImageRGB:
     if up_down:
         image = image[::-1]
     return np.ascontiguousarray(image, dtype=np.uint8)
+
+
+def _upright_size_px(decoded: av.VideoFrame, turn: tuple[bool, bool, bool]) -> tuple[int, int]:
+    return (decoded.height, decoded.width) if turn[0] else (decoded.width, decoded.height)
 
 
 class _Clock:
@@ -255,6 +278,20 @@ class _Damage:
         return [
             *notice("decode_error", self.packets, "damaged places in the video, skipped: {}"),
             *notice("damaged_frame", self.corrupt_frames + self.unconverted, "frames damaged in part: {}"),
+        ]
+
+
+@dataclass
+class _Sizes:
+    """Frames of another size than the first one's: those that were brought to it, and those of another shape."""
+
+    fitted: int = 0
+    lost: int = 0
+
+    def notices(self) -> list[Notice]:
+        return [
+            *notice("size_changed", self.fitted, "frames of another size, brought to the first one's: {}"),
+            *notice("other_shape", self.lost, "frames of another shape, not used: {}"),
         ]
 
 
