@@ -94,7 +94,8 @@ def test_nothing_found_is_no_error(model: Path, tmp_path: Path, capsys: pytest.C
     ("extra", "words"),
     [
         (["--classes", "boat"], "knows no 'boat'"), (["--tiles", "big"], "auto, none, or a number"),
-        (["--cot", "tak.local"], "udp://host:port"), (["--cot-type", "person"], "person=a-f-G"),
+        (["--cot", "tak.local"], "udp://host:port"), (["--cot", "udp://tak.invalid"], "'tak.invalid' has no address"),
+        (["--cot-type", "person"], "person=a-f-G"),
         (["--every", "2", "--fps", "3"], "not both"), (["--model", "no-such-model"], "no-such-model"),
         (["--alert-command", "no-such-program"], "no program"), (["--alert-url", "ftp://x"], "web address"),
     ],

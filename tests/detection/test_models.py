@@ -221,6 +221,9 @@ def test_verify_finds_changed_damaged_and_unknown_files(
     assert cli.main(["models", "verify", "coast"]) == 0
     assert _hash(path) in capsys.readouterr().out
     (folder / "broken.onnx").write_bytes(b"nothing")
+    assert cli.main(["models", "verify", "broken"]) == 1
+    told = capsys.readouterr().out
+    assert "copy or fetch it again" in told and "models verify" not in told
     (folder / "broken.json").write_text("{")
     assert cli.main(["models", "verify", "broken"]) == 1
     assert cli.main(["models", "list"]) == 0, "a broken file of another model stops nothing"

@@ -20,6 +20,7 @@ from sorvolo.missions.watch_places import places_of
 from sorvolo.missions.watch_run import WatchRun, WatchUpdate
 from sorvolo.missions.watch_settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
 from sorvolo.mosaic.selection import every
+from sorvolo.store.cursor_on_target import check_host, cot_place
 from sorvolo.store.detection_files import claim_folder
 from sorvolo.survey.flight import Frame, LostFrame
 
@@ -43,6 +44,8 @@ def watch(
     Close the generator, or press Ctrl-C, to end early: all that was found until then is written. Raises InputError,
     SettingsError or StoreError with what to do.
     """
+    if outputs.cot:
+        check_host(cot_place(outputs.cot))
     finder = Detector.load(settings.model) if detector is None else detector
     if unknown := sorted(set(settings.classes) - set(finder.classes)):
         raise SettingsError(f"the model knows no {unknown[0]!r}; it knows {', '.join(finder.classes)}")

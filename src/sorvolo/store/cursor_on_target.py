@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
 
-from sorvolo.errors import SettingsError
+from sorvolo.errors import InputError, SettingsError
 from sorvolo.store.exports import longitude_latitude, utc_text
 from sorvolo.survey.flight import Site
 from sorvolo.survey.objects import Track
@@ -55,6 +55,17 @@ def cot_place(url: str) -> CotPlace:
         raise SettingsError(f"--cot {url} is no place to send events to; {wanted}")
     transport: Literal["udp", "tcp"] = "udp" if parts.scheme == "udp" else "tcp"
     return CotPlace(transport, parts.hostname, port or _DEFAULT_PORTS[transport])
+
+
+def check_host(place: CotPlace) -> None:
+    """Ask for the host's address. Raises InputError where nothing knows it."""
+    try:
+        socket.getaddrinfo(place.host, place.port)
+    except (OSError, UnicodeError) as error:
+        raise InputError(
+            f"--cot {place}: the host {place.host!r} has no address ({error}); check its name and the network, or give "
+            "its IP address"
+        ) from error
 
 
 def cot_type(label: str, types: Mapping[str, str] = COT_TYPES) -> str:
