@@ -217,6 +217,20 @@ class Sees(Knowing):
         return Detections(box_px, np.array([self._score]), np.array([1]), self.classes)
 
 
+def test_what_left_or_came_where_another_thing_stands_was_replaced(simulated: Path) -> None:
+    here, beside = standing("car", 10.2, 20.0, 1.2), standing("car", 10.8, 20.0, 1.2)
+    small, walks = standing("small object", 10.0, 20.0, 0.4), standing("car", 10.2, 20.0, 1.2, moving=True)
+    person = standing("person", 10.0, 20.0, 0.8)
+    left, came = change_at(ChangeKind.DISAPPEARED), change_at(ChangeKind.APPEARED)
+    classes = ChangeClasses(Sees(simulated, 0.1), [person])
+    named = classes.finally_named(left, [here], [])
+    assert (named.kind, named.class_before, named.class_after) == (ChangeKind.REPLACED, "person", "car")
+    assert classes.at_once(came).kind == ChangeKind.REPLACED
+    for other in (beside, small, walks):
+        assert classes.finally_named(left, [other], []).kind == ChangeKind.DISAPPEARED
+    assert ChangeClasses(Sees(simulated, 0.1), []).at_once(came).kind == ChangeKind.APPEARED
+
+
 def test_a_changes_own_pictures_are_the_last_word(simulated: Path) -> None:
     """Where no flight saw an object, the detector looks at the change's pictures; each kind has the side it has."""
     classes = ChangeClasses(Sees(simulated, 0.8), [standing("person", 10.0, 20.0, 0.6)])

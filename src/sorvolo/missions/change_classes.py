@@ -18,6 +18,7 @@ _LONGEST_S = 5.0  # before or after the time at which a moving change was where 
 _TURN = 0.4  # of the way it goes meanwhile: people turn
 _LEAST_SIDE_PX = 160  # of a picture that a detector is shown
 _LEAST_SHARE = 0.5  # of the box or of the change, whichever is smaller, that both have in common
+_LIKE_LENGTHS = 1.6  # times the other's, at most
 _LENIENT = 0.6  # times each class's score: that something is there is known already
 
 _HAS_BEFORE = (ChangeKind.DISAPPEARED, ChangeKind.REPLACED)
@@ -38,8 +39,12 @@ class ChangeClasses:
         """The change with its classes, "" where nothing is recognised: of the objects that were there before or after;
         else of the flight's sightings there; else of what the detector sees in the change's own pictures.
 
-        `found` and `sightings` are those of the flight, by its frames' final places.
+        `found` and `sightings` are those of the flight, by its frames' final places. Where something left and a found
+        object of about its size stands in its outline, or something came where a known one stood, it was replaced.
         """
+        others = {ChangeKind.DISAPPEARED: found, ChangeKind.APPEARED: self._known}.get(change.kind, ())
+        if any(_stands_in(change, each) for each in others):
+            change = replace(change, kind=ChangeKind.REPLACED)
         before = after = ""
         if change.kind in _HAS_BEFORE:
             before = object_at(change, self._known) or self._in_picture(change, change.patch.before)
@@ -67,6 +72,13 @@ class ChangeClasses:
             if score >= _LENIENT * thresholds[name] and share >= _LEAST_SHARE and share * score > best_score:
                 best, best_score = name, share * float(score)
         return best
+
+
+def _stands_in(change: Change, thing: MapObject) -> bool:
+    """Whether an object that does not move stands in a change's outline and is about as long."""
+    if thing.moving or _outside_m(change.outline_m, thing.position_m) > 0:
+        return False
+    return change.length_m / _LIKE_LENGTHS <= thing.length_m <= change.length_m * _LIKE_LENGTHS
 
 
 def object_at(change: Change, objects: Sequence[MapObject]) -> str:
