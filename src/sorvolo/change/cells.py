@@ -99,6 +99,29 @@ class LaidView:
         cut = np.unique(labels[beside & self.flagged])
         return np.isin(labels, cut) if len(cut) else np.zeros_like(self.flagged)
 
+    def answer(self, window: CellWindow, cells: Mask, cell_m: float) -> tuple[float, float, float, Floats]:
+        """What the view says of some `cells` of a window: the shares of them it saw and flagged, how sure it is, and
+        where (2,) the flagged ones lie."""
+        inner = CellWindow(
+            max(window.x0, self.window.x0), max(window.y0, self.window.y0),
+            min(window.x1, self.window.x1), min(window.y1, self.window.y1),
+        )
+        if 0 in inner.shape:
+            return 0.0, 0.0, 0.0, np.zeros(2)
+        here, there = inner.within(window), inner.within(self.window)
+        mine, total = cells[here], max(int(np.count_nonzero(cells)), 1)
+        flagged = mine & self.flagged[there]
+        seen = np.count_nonzero(mine & self.seen[there]) / total
+        if not flagged.any():
+            return seen, 0.0, 0.0, np.zeros(2)
+        rows, columns = np.nonzero(flagged)
+        middle = np.array([columns.mean() + inner.x0 + 0.5, -(rows.mean() + inner.y0 + 0.5)]) * cell_m
+        return seen, len(rows) / total, float(self.score[there][flagged].max()) / 255, middle
+
+    def part_of(self, marked: Mask, window: CellWindow, cells: Mask) -> Mask:
+        """Which of some `cells` of a window the view has `marked`, as far as it reaches."""
+        return marked[window.within(self.window)] & cells[self.window.within(window)]
+
 
 def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask) -> LaidView:
     """The view's answer for every cell of ground that it shows.

@@ -16,27 +16,25 @@ from sorvolo.change.cells import (
     CellEvidence,
     CellGrid,
     CellWindow,
-    LaidView,
     lay,
     pieces,
 )
-from sorvolo.change.gathering import GatheredChange, joined, upright_weight
+from sorvolo.change.gathering import GatheredChange, joined
 from sorvolo.change.movers import Movers
 from sorvolo.change.moving import BlobTracker, MovingSettings
 from sorvolo.change.parts import Parts
 from sorvolo.change.restlessness import calmness, restlessness
+from sorvolo.change.seeds import SHOWS, KeptView, Seeds
 from sorvolo.change.shadows import is_of_shade
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Floats, ImageGray, Mask, Matrix3
+from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.survey.findings import Change, ComparedView
 
 _CELL_PX = 3
 _LEAST_CELL_M = 0.05
 _LASTING = 0.3  # share of all views that must flag a cell
-_SHOWS = 0.12  # share of a change's cells that a view must flag: from above a person covers few of them
 _PICTURES_A_VIEW, _MOST_PICTURES = 6, 30  # cut anew at most, which bounds the time a view takes ...
 _VIEWS_S = 5.0  # ... where so many come in a second; where they are seldom there is more time
-_MOST_SEEDS = 256
 _FEW_VIEWS_SCORE = 0.62  # of what fewer than k views show: two views of a tree often agree
 _DOUBT = 2.0  # restless ground counts in full where half of the score is missing
 _CALM = 0.9  # of the score is left on calm ground
@@ -77,19 +75,6 @@ class EvidenceSettings:
             raise SettingsError("times, areas and gaps of the evidence must not be negative")
 
 
-@dataclass(frozen=True, eq=False)
-class _Witness:
-    """What is kept of one of the last views."""
-
-    time_ns: int
-    laid: LaidView
-    camera_m: Floats
-    site_from_image: Matrix3
-    changed: ImageGray
-    valid: Mask
-    counts: bool
-
-
 class EvidenceMap:
     """The changes of one flight while its views come in. `add` changes it; `conclude` says the last word.
 
@@ -109,8 +94,9 @@ class EvidenceMap:
         self._merged: dict[int, int] = {}
         self._parts: dict[int, Parts] = {}  # the things that a told change holds, by its number
         self._movers = Movers(id_prefix, site_m_per_px, self._cell_m)
-        self._seeds: list[GatheredChange] = []
-        self._recent: deque[_Witness] = deque(maxlen=settings.n)
+        self._least_cells = max(2, settings.least_area_m2 / self._cell_m**2)
+        self._seeds = Seeds(self._grid, self._cell_m, self._gap, self._least_cells, site_m_per_px)
+        self._recent: deque[KeptView] = deque(maxlen=settings.n)
         self._number = 0
         self._last: tuple[int, int, Floats] | None = None  # index, time, camera of the last view that counted
         self._tallied_at_m: Floats | None = None
@@ -131,7 +117,7 @@ class EvidenceMap:
         laid = lay(view, self._cell_m, moving, held)
         counts = self._is_new_place(view)
         evidence = self._grid.record(laid, counts)
-        witness = _Witness(
+        witness = KeptView(
             view.time_ns, laid, view.camera_m, view.site_from_image, view.changed, view.valid, counts
         )
         earlier = list(self._recent)
@@ -142,7 +128,7 @@ class EvidenceMap:
         for each in shown:
             announced += self._told(each, view.time_ns)
         announced += self._movers.see(view, followed.movers, self._next_number)
-        self._keep_seeds(view, witness, evidence, budget)
+        self._seeds.keep(view, witness, evidence, budget[0])
         return tuple(announced)
 
     def changes(self) -> tuple[Change, ...]:
@@ -161,7 +147,6 @@ class EvidenceMap:
         """
         for seed in self._seeds:
             self._grow_late(seed)
-        self._seeds = []
         for change in self._found.values():
             if not change.is_told:
                 self._told(change, -1)
@@ -221,7 +206,7 @@ class EvidenceMap:
         return self._number
 
     def _gather(
-        self, view: ComparedView, witness: _Witness, earlier: Sequence[_Witness], evidence: CellEvidence,
+        self, view: ComparedView, witness: KeptView, earlier: Sequence[KeptView], evidence: CellEvidence,
         budget: list[int],
     ) -> list[GatheredChange]:
         """Give the cells that are certain to the changes that they belong to; the changes that begin with this."""
@@ -231,7 +216,6 @@ class EvidenceMap:
         if not (sure & (evidence.owner == 0)).any():
             return []
         new = []
-        least_cells = max(2, settings.least_area_m2 / self._cell_m**2)
         for piece, part in pieces(sure | (evidence.owner > 0), self._gap):
             cells = sure[part] & piece
             owner = evidence.owner[part]
@@ -242,7 +226,7 @@ class EvidenceMap:
             if owners and self._is_passing(evidence, part, piece & (owner > 0), fresh):
                 continue
             if not owners:
-                if np.count_nonzero(cells) < least_cells:
+                if np.count_nonzero(cells) < self._least_cells:
                     continue
                 if np.mean(laid.held[part][cells]) > 0.5 and not self._stands(witness, earlier, part, cells):
                     continue
@@ -271,20 +255,20 @@ class EvidenceMap:
         return bool(np.median(seen[fresh]) >= _PASSING_VIEWS and np.median(of_fresh) < _PASSING * surest)
 
     def _stands(
-        self, witness: _Witness, earlier: Sequence[_Witness], part: tuple[slice, slice], cells: Mask
+        self, witness: KeptView, earlier: Sequence[KeptView], part: tuple[slice, slice], cells: Mask
     ) -> bool:
         """Whether views over a long enough time show these very cells."""
         window = witness.laid.window.part(part)
         for each in earlier:
             if (witness.time_ns - each.time_ns) * 1e-9 < _STANDS_S:
                 return False  # and so are all later ones
-            _, flagged, _, _ = self._answer(each.laid, window, cells)
+            _, flagged, _, _ = each.laid.answer(window, cells, self._cell_m)
             if flagged > 0.5:
                 return True
         return False
 
     def _begin(
-        self, view: ComparedView, earlier: Sequence[_Witness], witness: _Witness, part: tuple[slice, slice],
+        self, view: ComparedView, earlier: Sequence[KeptView], witness: KeptView, part: tuple[slice, slice],
         cells: Mask, budget: list[int],
     ) -> GatheredChange:
         change = GatheredChange(self._next_number(), view.time_ns)
@@ -294,13 +278,13 @@ class EvidenceMap:
         change.show(view, *box, self._site_m_per_px)
         budget[0] -= 1
         for each in earlier:
-            seen, flagged, score, place_m = self._answer(each.laid, change.cells, cells)
-            if seen >= 0.5 and flagged >= _SHOWS * seen:
-                change.see(each.time_ns, score, place_m, None, self._weight(each, change.cells))
+            seen, flagged, score, place_m = each.laid.answer(change.cells, cells, self._cell_m)
+            if seen >= 0.5 and flagged >= SHOWS * seen:
+                change.see(each.time_ns, score, place_m, None, each.weight(change.cells, self._cell_m))
                 change.from_camera(each.camera_m)
                 change.vote(each.site_from_image, each.changed, each.valid)
             elif seen >= 0.5:
-                change.miss(self._weight(each, change.cells))
+                change.miss(each.weight(change.cells, self._cell_m))
         return change
 
     def _told(self, change: GatheredChange, now_ns: int) -> list[Change]:
@@ -331,26 +315,8 @@ class EvidenceMap:
         least_score = _FEW_VIEWS_SCORE if is_of_few else self._settings.least_score
         return change.score >= least_score and share >= self._settings.least_share
 
-    def _answer(self, laid: LaidView, window: CellWindow, cells: Mask) -> tuple[float, float, float, Floats]:
-        """What a view says of some cells: the shares of them it saw and flagged, how sure, where the flagged lie."""
-        inner = CellWindow(
-            max(window.x0, laid.window.x0), max(window.y0, laid.window.y0),
-            min(window.x1, laid.window.x1), min(window.y1, laid.window.y1),
-        )
-        if 0 in inner.shape:
-            return 0.0, 0.0, 0.0, np.zeros(2)
-        here, there = inner.within(window), inner.within(laid.window)
-        mine, total = cells[here], max(int(np.count_nonzero(cells)), 1)
-        flagged = mine & laid.flagged[there]
-        seen = np.count_nonzero(mine & laid.seen[there]) / total
-        if not flagged.any():
-            return seen, 0.0, 0.0, np.zeros(2)
-        rows, columns = np.nonzero(flagged)
-        middle = np.array([columns.mean() + inner.x0 + 0.5, -(rows.mean() + inner.y0 + 0.5)]) * self._cell_m
-        return seen, len(rows) / total, float(laid.score[there][flagged].max()) / 255, middle
-
     def _update(
-        self, view: ComparedView, witness: _Witness, owner: NDArray[np.int32], new: set[int], budget: list[int]
+        self, view: ComparedView, witness: KeptView, owner: NDArray[np.int32], new: set[int], budget: list[int]
     ) -> list[GatheredChange]:
         """Bring the known changes up to date with this view; those that it shows, in the order of their numbers."""
         if not owner.any():
@@ -363,17 +329,17 @@ class EvidenceMap:
             if change.cells is None:
                 continue
             cells = self._without_passing(change, witness)
-            seen, flagged, score, place_m = self._answer(laid, change.cells, cells)
+            seen, flagged, score, place_m = laid.answer(change.cells, cells, self._cell_m)
             is_large = max(change.cells.shape) * self._cell_m > 0.5 * max(laid.window.shape) * self._cell_m
             if seen < 0.5 and not (is_large and flagged > 0):
                 continue
-            if flagged < _SHOWS * seen:
-                change.miss(self._weight(witness, change.cells))
+            if flagged < SHOWS * seen:
+                change.miss(witness.weight(change.cells, self._cell_m))
                 continue
-            weight = self._weight(witness, change.cells)
+            weight = witness.weight(change.cells, self._cell_m)
             change.see(view.time_ns, score, place_m if seen > 0.99 else None, view, weight)
             change.from_camera(view.camera_m)
-            change.whole += not self._part_of(laid.cut_off, laid, change.cells, cells).any()
+            change.whole += not laid.part_of(laid.cut_off, change.cells, cells).any()
             if change.still_votes and number not in new:
                 change.vote(view.site_from_image, view.changed, view.valid)
             shown.append(change)
@@ -390,7 +356,7 @@ class EvidenceMap:
             change.vote(view.site_from_image, view.changed, view.valid)
         return shown
 
-    def _without_passing(self, change: GatheredChange, witness: _Witness) -> Mask:
+    def _without_passing(self, change: GatheredChange, witness: KeptView) -> Mask:
         """The change's own cells, (rows, columns) of its window, less those that it loses now.
 
         What leaned over a thing's place for a few views joined it and is gone from most later ones, while the thing is
@@ -405,7 +371,7 @@ class EvidenceMap:
             return own
         passing = (share < _PASSING * np.percentile(share, _SUREST)) & (evidence.seen[own] >= _PASSING_VIEWS)
         lost = int(np.count_nonzero(passing))
-        if not lost or len(share) - lost < max(2, self._settings.least_area_m2 / self._cell_m**2):
+        if not lost or len(share) - lost < self._least_cells:
             return own
         loses = np.zeros_like(own)
         loses[own] = passing
@@ -417,10 +383,6 @@ class EvidenceMap:
             if change.number in self._parts:
                 self._parts[change.number].join(())  # with fewer views: look for its things again
         return own
-
-    def _weight(self, witness: _Witness, window: CellWindow) -> float:
-        """What a view counts in a change's share; nothing if the camera stands where it stood before."""
-        return upright_weight(witness.camera_m, np.mean(window.box_m(self._cell_m), axis=0)) * witness.counts
 
     def _merge(self, older: GatheredChange, younger: GatheredChange) -> GatheredChange:
         number, gone = older.number, younger.number
@@ -460,60 +422,6 @@ class EvidenceMap:
         outline_m = change.outline_m(cells, self._cell_m, self._join_m)
         return None if outline_m is None else change.change(self._prefix, outline_m, self._cell_m)
 
-    def _keep_seeds(self, view: ComparedView, witness: _Witness, evidence: CellEvidence, budget: list[int]) -> None:
-        """Keep what is not certain yet, with its pictures: it may never be seen often enough for k of n."""
-        laid = witness.laid
-        weak = laid.flagged & (evidence.owner == 0)
-        kept = []
-        for seed in self._seeds:
-            if seed.cells is None:
-                continue
-            here = seed.cells.within(laid.window)
-            votes, owner = evidence.votes[here], evidence.owner[here]
-            if not votes.size:
-                kept.append(seed)
-            elif (votes > 0).any() and not (owner > 0).any():
-                kept.append(seed)
-                self._ask(seed, view, witness)
-                weak[here] = False
-        self._seeds = kept
-        if budget[0] <= 0 or not weak.any():
-            return
-        least_cells = max(2, self._settings.least_area_m2 / self._cell_m**2)
-        candidates = [
-            (float(laid.score[part][piece & weak[part]].max(initial=0)) / 255, laid.window.part(part))
-            for piece, part in pieces(weak, self._gap)
-            if np.count_nonzero(piece & weak[part]) >= least_cells
-        ]
-        for _, window in sorted(candidates, key=lambda each: -each[0])[: budget[0]]:
-            seed = GatheredChange(0, view.time_ns)
-            seed.cells = window
-            seed.show(view, *window.box_m(self._cell_m), self._site_m_per_px)
-            self._ask(seed, view, witness)
-            self._seeds.append(seed)
-        del self._seeds[:-_MOST_SEEDS]
-
-    def _ask(self, seed: GatheredChange, view: ComparedView, witness: _Witness) -> None:
-        """Count what a view says of a seed's ground."""
-        assert seed.cells is not None
-        laid, cells = witness.laid, self._grid.read(seed.cells).changed > 0
-        seen, flagged, score, place_m = self._answer(laid, seed.cells, cells)
-        weight = self._weight(witness, seed.cells)
-        if flagged >= max(_SHOWS * seen, 1e-9):
-            seed.see(view.time_ns, score, place_m if seen > 0.99 else None, view, weight)
-            seed.from_camera(view.camera_m)
-            seed.vote(view.site_from_image, view.changed, view.valid)
-            seed.whole += not self._part_of(laid.cut_off, laid, seed.cells, cells).any()
-            shown = self._part_of(laid.flagged, laid, seed.cells, cells)
-            seed.held += bool(np.mean(self._part_of(laid.held, laid, seed.cells, cells)[shown]) > 0.5)
-        elif seen >= 0.5:
-            seed.miss(weight)
-
-    @staticmethod
-    def _part_of(marked: Mask, laid: LaidView, window: CellWindow, cells: Mask) -> Mask:
-        """What a view marks of some cells of a window, as far as the view reaches."""
-        return marked[window.within(laid.window)] & cells[laid.window.within(window)]
-
     def _grow_late(self, seed: GatheredChange) -> None:
         """Tell what fewer than n views could see: the same share of them must show it as k of n."""
         settings = self._settings
@@ -528,10 +436,9 @@ class EvidenceMap:
         free = evidence.owner == 0
         late = free & (((changed >= needed) & (seen < settings.n)) | (evidence.votes >= settings.k))
         single = free & (changed == 1) & (seen == 1)
-        least_cells = max(2, settings.least_area_m2 / self._cell_m**2)
-        if np.count_nonzero(late) >= least_cells:
+        if np.count_nonzero(late) >= self._least_cells:
             cells = late
-        elif np.count_nonzero(single) >= least_cells and seed.score * 1.5 >= settings.single_view_score:
+        elif np.count_nonzero(single) >= self._least_cells and seed.score * 1.5 >= settings.single_view_score:
             cells, seed.weakness = single, 0.5
         else:
             return
@@ -548,7 +455,7 @@ class EvidenceMap:
                     self._grid.own(window, fresh, change.number)
                     change.cells = whole
                 cells[part] &= ~piece
-        if np.count_nonzero(cells) < least_cells:
+        if np.count_nonzero(cells) < self._least_cells:
             return
         for _ in range(int(seen[cells].max()) - seed.asked):
             seed.miss(1.0)
