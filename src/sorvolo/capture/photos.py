@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image
 
 from sorvolo.capture.photo_metadata import BROKEN_PICTURE, PhotoMetadata, read_photo_metadata
+from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.telemetry.quality import clean, notice
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
@@ -26,7 +27,6 @@ PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".png"})
 _LOOK_AHEAD = 2
 _STEP_NS = 1_000_000  # between photos of the same second
 _UNTIMED_STEP_NS = 1_000_000_000
-_SAME_ASPECT = 0.01
 _QUARTER_TURN = 6  # EXIF's number for clockwise
 _EDGE_BYTES = 65_536
 _JPEG_START = b"\xff\xd8\xff"
@@ -283,14 +283,10 @@ def _usual_size(photos: Sequence[Photo]) -> tuple[int, int]:
 
 
 def _check_size(photo: Photo, width_px: int, height_px: int) -> Photo:
-    own_width, own_height = photo.metadata.shown_size_px
-    if photo.problem or (own_height, own_width) == (width_px, height_px):
+    own_px, flight_px = photo.metadata.shown_size_px, (width_px, height_px)
+    if photo.problem or own_px[::-1] == flight_px or is_same_shape(own_px, flight_px):
         return photo
-    if abs(own_width * height_px / (own_height * width_px) - 1) <= _SAME_ASPECT:
-        return photo
-    return replace(
-        photo, problem=f"size {own_width}x{own_height} differs from the flight's {width_px}x{height_px}"
-    )
+    return replace(photo, problem=other_size(own_px, flight_px))
 
 
 def _fit(image: ImageRGB, orientation: int, width_px: int, height_px: int) -> ImageRGB:

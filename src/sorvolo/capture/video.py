@@ -10,6 +10,7 @@ import av
 import numpy as np
 
 from sorvolo.capture.containers import ends_early, top_boxes
+from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.telemetry.quality import notice
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Anything, ImageRGB
@@ -29,7 +30,6 @@ _FALLBACK_RATE_HZ = 25.0
 _GAP_S = 2.0
 _CLOCK_RETURNS_WITHIN = 25  # frames after a backward step in which the old clock may come back
 _DEMUX_RETRIES = 20
-_SAME_ASPECT = 0.01
 
 
 @dataclass(frozen=True)
@@ -96,13 +96,10 @@ class VideoSource:
             time_ns = self.start_ns + last_ns
             if not wanted(index, time_ns):
                 continue
-            width_px, height_px = _upright_size_px(decoded, self.info.turn)
-            is_resized = (width_px, height_px) != (self.info.width_px, self.info.height_px)
-            if is_resized and not self._has_shape(width_px, height_px):
+            own_px, flight_px = _upright_size_px(decoded, self.info.turn), (self.info.width_px, self.info.height_px)
+            if not is_same_shape(own_px, flight_px):
                 sizes.lost += 1
-                usual = f"{self.info.width_px}x{self.info.height_px}"
-                reason = f"size {width_px}x{height_px} differs from the flight's {usual}"
-                yield LostFrame(index, str(index), time_ns, reason)
+                yield LostFrame(index, str(index), time_ns, other_size(own_px, flight_px))
                 continue
             try:
                 image = self._image(decoded)
@@ -110,7 +107,7 @@ class VideoSource:
                 damage.unconverted += 1
                 yield LostFrame(index, str(index), time_ns, f"corrupt: {error}")
                 continue
-            sizes.fitted += is_resized
+            sizes.fitted += own_px != flight_px
             yield Frame(index, str(index), time_ns, image)
         missing_s = self.info.duration_s - last_ns / _SECOND_NS
         is_cut = self.info.is_cut or missing_s > max(1.0, 0.05 * self.info.duration_s)
@@ -119,10 +116,6 @@ class VideoSource:
     def _told(self, is_cut: bool, damage: "_Damage", sizes: "_Sizes", clock: "_Clock") -> tuple[Notice, ...]:
         cut = _cut_notice(is_cut or damage.stopped)
         return (*cut, *damage.notices(), *sizes.notices(), *clock.notices())
-
-    def _has_shape(self, width_px: int, height_px: int) -> bool:
-        """Whether a frame of this size shows the same view as the first one, in more or fewer pixels."""
-        return abs(width_px * self.info.height_px / (height_px * self.info.width_px) - 1) <= _SAME_ASPECT
 
     def _image(self, decoded: av.VideoFrame) -> ImageRGB:
         """The frame upright, at the first one's size."""
@@ -143,7 +136,8 @@ class VideoSource:
                     if part or self.info.duration_s:
                         container.seek(int(target_s / float(stream.time_base or 1)), stream=stream)
                     decoded = next(container.decode(stream))
-                    if not self._has_shape(*_upright_size_px(decoded, self.info.turn)):
+                    flight_px = self.info.width_px, self.info.height_px
+                    if not is_same_shape(_upright_size_px(decoded, self.info.turn), flight_px):
                         continue
                     image = self._image(decoded)
                 except (av.FFmpegError, StopIteration, ValueError, OverflowError, MemoryError):

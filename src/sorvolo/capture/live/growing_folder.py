@@ -15,12 +15,12 @@ from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.telemetry_log import TelemetryLog
 from sorvolo.capture.photo_metadata import PhotoMetadata, read_photo_metadata
 from sorvolo.capture.photos import PHOTO_SUFFIXES, read_picture
+from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.telemetry.quality import notice
 from sorvolo.errors import InputError
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
 
 _POLL_S = 0.25
-_SAME_ASPECT = 0.01
 _ENDS = (b"\xff\xd9", b"IEND")  # of a JPEG, of a PNG
 _TAIL_BYTES = 32
 
@@ -179,11 +179,10 @@ class GrowingFolder:
         except (InputError, OSError) as error:
             self._corrupt += 1
             return LostFrame(index, path.name, time_ns, f"corrupt: {error}")
-        width_px, height_px = self.size_px
-        if image.shape[1::-1] != (width_px, height_px):
-            if abs(image.shape[1] * height_px / (image.shape[0] * width_px) - 1) > _SAME_ASPECT:
-                reason = f"size {image.shape[1]}x{image.shape[0]} differs from the flight's {width_px}x{height_px}"
-                return LostFrame(index, path.name, time_ns, reason)
+        own_px = image.shape[1], image.shape[0]
+        if own_px != self.size_px:
+            if not is_same_shape(own_px, self.size_px):
+                return LostFrame(index, path.name, time_ns, other_size(own_px, self.size_px))
             image = np.asarray(cv2.resize(image, self.size_px, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         return Frame(index, path.name, time_ns, image)
 

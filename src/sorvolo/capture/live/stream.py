@@ -25,6 +25,7 @@ from sorvolo.capture.live.links import NmeaLink
 from sorvolo.capture.live.reader import StreamFacts, StreamReader
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.telemetry_log import TelemetryLog
+from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.telemetry.nmea import Epoch
 from sorvolo.capture.telemetry.quality import notice
 from sorvolo.errors import InputError
@@ -37,7 +38,6 @@ _FIRST_FIXES_S = 10.0
 _DATED_NS = 3650 * 86_400 * 10**9  # ten years after 1970: an earlier clock was never set
 _CLOCKS_AGREE_NS = 5_000_000_000
 _DELAYS_KEPT = 60
-_SAME_ASPECT = 0.01
 _ZOOMED = 0.03
 _POLL_S = 0.25
 
@@ -395,12 +395,12 @@ class LiveStream:
         index, name, decoded = arrived.index, str(arrived.index), arrived.decoded
         width_px, height_px = self._size_px
         fitted: dict[str, Any] = {}
-        if (decoded.width, decoded.height) != (width_px, height_px):
+        own_px = decoded.width, decoded.height
+        if own_px != self._size_px:
             # a sender that saves bandwidth shows the same in fewer pixels; another shape is another view
-            if abs(decoded.width * height_px / (decoded.height * width_px) - 1) > _SAME_ASPECT:
+            if not is_same_shape(own_px, self._size_px):
                 self._lost += 1
-                reason = f"size {decoded.width}x{decoded.height} differs from the flight's {width_px}x{height_px}"
-                return LostFrame(index, name, arrived.time_ns, reason)
+                return LostFrame(index, name, arrived.time_ns, other_size(own_px, self._size_px))
             self._resized += 1
             fitted = {"width": width_px, "height": height_px}
         try:
