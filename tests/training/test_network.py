@@ -22,9 +22,15 @@ from sorvolo.training.faster_rcnn import FasterRCNN, Reach  # noqa: E402
 from sorvolo.training.heads import TwoLayerHead, pooled_levels, roi_align  # noqa: E402
 from sorvolo.training.inception import ExtendedStack, ResidualStack, proposal_stem  # noqa: E402
 from sorvolo.training.joint import JointSettings, JointTraining  # noqa: E402
-from sorvolo.training.losses import Answer, joint_proposal_loss, match_boxes, region_loss  # noqa: E402
+from sorvolo.training.losses import (  # noqa: E402
+    Answer,
+    joint_proposal_loss,
+    match_boxes,
+    region_loss,
+    thesis_proposal_loss,
+)
 from sorvolo.training.presets import fast  # noqa: E402
-from sorvolo.training.proposals import AnchorSettings, ProposalNetwork  # noqa: E402
+from sorvolo.training.proposals import AnchorSettings, ProposalNetwork, Proposed  # noqa: E402
 from sorvolo.training.pyramid import Pyramid  # noqa: E402
 from sorvolo.training.samples import Augmentation, Sample, Share, cut_sample  # noqa: E402
 from sorvolo.training.sprites import paste_small_objects  # noqa: E402
@@ -298,6 +304,14 @@ def test_ignored_regions_teach_nothing_and_true_boxes_always_have_an_anchor():
     assert match.target.tolist() == [0, -1, -2]
     strict = match_boxes(anchors, _answer([[0, 0, 24, 24]], [0]), over=0.5, under=0.4, best_too=False)
     assert strict.target.tolist() == [-1, -1, -1]
+
+
+@pytest.mark.parametrize(("wide_px", "is_positive"), [(15, True), (13, False)])
+def test_the_thesis_learns_only_from_anchors_that_overlap_by_more_than_0_7(wide_px, is_positive):
+    anchors = torch.tensor([[0.0, 0, 20, 20], [60, 60, 80, 80]])
+    proposed = Proposed(torch.zeros(1, 2), torch.ones(1, 2, 4), anchors)
+    _, box = thesis_proposal_loss(proposed, [_answer([[0, 0, wide_px, 20]], [0])], torch.Generator().manual_seed(1))
+    assert (float(box) > 0) is is_positive
 
 
 def test_a_class_without_labels_is_not_unlearnt():

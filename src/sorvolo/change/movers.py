@@ -13,6 +13,7 @@ from sorvolo.change.standing import standing_outline_m
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 
+# of its places in a time, how much of that time they span, and how far beside the ground they may lie
 _LEAST_POINTS, _NEARLY_ALL, _BESIDE_M = 3, 0.7, 0.3
 
 

@@ -23,7 +23,7 @@ from sorvolo.survey.findings import ComparedView
 _MOST_PARALLAX = 0.6 / (1 - 0.6)  # h / (H - h) of a thing 0.6 times as high as the camera flies
 _UNLIKELY_PARALLAX = 0.5  # no thing that came is a third as high as the camera flies
 _POINTS = 12  # of a track, that its velocity is fitted to
-_MUCH_LARGER = 4.0
+_MUCH_LARGER = 4.0  # times a blob's box
 _NEAR_PX = 8  # what is looked at around a place to tell shadows
 _RIGID_POINTS, _RIGID_LENGTHS, _RIGID_LENGTH_M = 5, 2.0, 2.5
 _VERY_STEADY = 1.3, 1.15  # largest by smallest area and length: what leans changes more on less of a way

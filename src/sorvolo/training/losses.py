@@ -86,11 +86,12 @@ def thesis_proposal_loss(
 ) -> tuple[Tensor, Tensor]:
     """Eq. 4.2 for the proposals: log loss over sampled anchors and smooth L1 over the positives among them.
 
-    Positives overlap a true box by more than 0.7, background by less than 0.3; half of a sample at most is positive.
+    Positives overlap a true box by more than 0.7, background by less than 0.3; half of a sample at most is positive. Of
+    the two ways that the thesis's 4.3 names it chooses this: a box that no anchor overlaps so far has no positive.
     """
     score_losses, box_losses = [], []
     for index, answer in enumerate(answers):
-        match = match_boxes(proposed.anchors, answer, over=0.7, under=0.3, best_too=True)
+        match = match_boxes(proposed.anchors, answer, over=0.7, under=0.3, best_too=False)
         chosen = sample(match, sampled, 0.5, generator)
         wanted = match.positive[chosen].to(proposed.scores.dtype)
         score_losses.append(functional.binary_cross_entropy_with_logits(proposed.scores[index][chosen], wanted))
