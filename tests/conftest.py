@@ -1,8 +1,13 @@
 """What holds for all tests."""
 
 import os
+import signal
 
 from hypothesis import settings
+
+# a shell's background job ignores Ctrl-C, and so would the programs that tests start and stop
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # how long an example takes depends on what else the machine does: no test is judged by it. Continuous integration (CI
 # is set) draws the same examples every time, others new ones.
