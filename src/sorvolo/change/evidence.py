@@ -42,7 +42,7 @@ _MOVED_HEIGHTS = 0.01  # the camera's way, in flying heights, after which a view
 _ALL_CHANGED = 0.5  # share of the frame beyond which nothing in it can be followed
 _PASSING, _PASSING_VIEWS = 0.5, 8  # flagged in so much smaller a share of at least so many views than ...
 _SUREST = 97  # ... the surest of a change's cells, in per cent of them, cells are no part of it
-_NEARLY_ALL, _MOST_STAY = 0.8, 0.6
+_NEARLY_ALL, _MOST_STAY = 0.8, 0.6  # of the views that see a cell; of the cells that any view flagged
 _GONE_VIEWS = 2  # that saw the ground without it
 _STANDS_S = 2.0  # what the same ground shows for so long stands there, however unsteady its blobs look
 
@@ -117,18 +117,18 @@ class EvidenceMap:
         laid = lay(view, self._cell_m, moving, held)
         counts = self._is_new_place(view)
         evidence = self._grid.record(laid, counts)
-        witness = KeptView(
+        kept_view = KeptView(
             view.time_ns, laid, view.camera_m, view.site_from_image, view.changed, view.valid, counts
         )
         earlier = list(self._recent)
-        self._recent.append(witness)
-        new = self._gather(view, witness, earlier, evidence, budget)
-        shown = self._update(view, witness, evidence.owner, {each.number for each in new}, budget)
+        self._recent.append(kept_view)
+        new = self._gather(view, kept_view, earlier, evidence, budget)
+        shown = self._update(view, kept_view, evidence.owner, {each.number for each in new}, budget)
         announced: list[Change] = []
         for each in shown:
             announced += self._told(each, view.time_ns)
         announced += self._movers.see(view, followed.movers, self._next_number)
-        self._seeds.keep(view, witness, evidence, budget[0])
+        self._seeds.keep(view, kept_view, evidence, budget[0])
         return tuple(announced)
 
     def changes(self) -> tuple[Change, ...]:
@@ -206,11 +206,11 @@ class EvidenceMap:
         return self._number
 
     def _gather(
-        self, view: ComparedView, witness: KeptView, earlier: Sequence[KeptView], evidence: CellEvidence,
+        self, view: ComparedView, kept_view: KeptView, earlier: Sequence[KeptView], evidence: CellEvidence,
         budget: list[int],
     ) -> list[GatheredChange]:
         """Give the cells that are certain to the changes that they belong to; the changes that begin with this."""
-        laid, settings = witness.laid, self._settings
+        laid, settings = kept_view.laid, self._settings
         lasting = evidence.changed >= _LASTING * evidence.seen
         sure = (evidence.votes >= settings.k) & lasting & laid.flagged
         if not (sure & (evidence.owner == 0)).any():
@@ -228,12 +228,12 @@ class EvidenceMap:
             if not owners:
                 if np.count_nonzero(cells) < self._least_cells:
                     continue
-                if np.mean(laid.held[part][cells]) > 0.5 and not self._stands(witness, earlier, part, cells):
+                if np.mean(laid.held[part][cells]) > 0.5 and not self._stands(kept_view, earlier, part, cells):
                     continue
                 if (cells & laid.cut_off[part]).any() and int(evidence.votes[part][cells].max()) < settings.n:
                     continue  # more of it will come into view soon
                 known = self._known_at(laid.window, part, cells)
-                change = self._found[known] if known else self._begin(view, earlier, witness, part, cells, budget)
+                change = self._found[known] if known else self._begin(view, earlier, kept_view, part, cells, budget)
                 if not known:
                     new.append(change)
             else:
@@ -255,12 +255,12 @@ class EvidenceMap:
         return bool(np.median(seen[fresh]) >= _PASSING_VIEWS and np.median(of_fresh) < _PASSING * surest)
 
     def _stands(
-        self, witness: KeptView, earlier: Sequence[KeptView], part: tuple[slice, slice], cells: Mask
+        self, kept_view: KeptView, earlier: Sequence[KeptView], part: tuple[slice, slice], cells: Mask
     ) -> bool:
         """Whether views over a long enough time show these very cells."""
-        window = witness.laid.window.part(part)
+        window = kept_view.laid.window.part(part)
         for each in earlier:
-            if (witness.time_ns - each.time_ns) * 1e-9 < _STANDS_S:
+            if (kept_view.time_ns - each.time_ns) * 1e-9 < _STANDS_S:
                 return False  # and so are all later ones
             _, flagged, _, _ = each.laid.answer(window, cells, self._cell_m)
             if flagged > 0.5:
@@ -268,11 +268,11 @@ class EvidenceMap:
         return False
 
     def _begin(
-        self, view: ComparedView, earlier: Sequence[KeptView], witness: KeptView, part: tuple[slice, slice],
+        self, view: ComparedView, earlier: Sequence[KeptView], kept_view: KeptView, part: tuple[slice, slice],
         cells: Mask, budget: list[int],
     ) -> GatheredChange:
         change = GatheredChange(self._next_number(), view.time_ns)
-        change.cells = witness.laid.window.part(part)
+        change.cells = kept_view.laid.window.part(part)
         self._found[change.number] = change
         box = change.cells.box_m(self._cell_m)
         change.show(view, *box, self._site_m_per_px)
@@ -316,27 +316,27 @@ class EvidenceMap:
         return change.score >= least_score and share >= self._settings.least_share
 
     def _update(
-        self, view: ComparedView, witness: KeptView, owner: NDArray[np.int32], new: set[int], budget: list[int]
+        self, view: ComparedView, kept_view: KeptView, owner: NDArray[np.int32], new: set[int], budget: list[int]
     ) -> list[GatheredChange]:
         """Bring the known changes up to date with this view; those that it shows, in the order of their numbers."""
         if not owner.any():
             return []
-        laid = witness.laid
+        laid = kept_view.laid
         shown = []
         wishes = []
         for number in sorted({self._current(int(each)) for each in np.unique(owner[owner > 0])}):
             change = self._found[number]
             if change.cells is None:
                 continue
-            cells = self._without_passing(change, witness)
+            cells = self._without_passing(change, kept_view)
             seen, flagged, score, place_m = laid.answer(change.cells, cells, self._cell_m)
             is_large = max(change.cells.shape) * self._cell_m > 0.5 * max(laid.window.shape) * self._cell_m
             if seen < 0.5 and not (is_large and flagged > 0):
                 continue
             if flagged < SHOWS * seen:
-                change.miss(witness.weight(change.cells, self._cell_m))
+                change.miss(kept_view.weight(change.cells, self._cell_m))
                 continue
-            weight = witness.weight(change.cells, self._cell_m)
+            weight = kept_view.weight(change.cells, self._cell_m)
             change.see(view.time_ns, score, place_m if seen > 0.99 else None, view, weight)
             change.from_camera(view.camera_m)
             change.whole += not laid.part_of(laid.cut_off, change.cells, cells).any()
@@ -356,7 +356,7 @@ class EvidenceMap:
             change.vote(view.site_from_image, view.changed, view.valid)
         return shown
 
-    def _without_passing(self, change: GatheredChange, witness: KeptView) -> Mask:
+    def _without_passing(self, change: GatheredChange, kept_view: KeptView) -> Mask:
         """The change's own cells, (rows, columns) of its window, less those that it loses now.
 
         What leaned over a thing's place for a few views joined it and is gone from most later ones, while the thing is
@@ -378,7 +378,7 @@ class EvidenceMap:
         self._grid.own(change.cells, loses, 0)
         own &= ~loses
         if lost > len(share) / 2:
-            now = int(witness.counts)  # this view is counted apart
+            now = int(kept_view.counts)  # this view is counted apart
             change.recount(int(np.median(evidence.changed[own])) - now, int(np.median(evidence.seen[own])) - now)
             if change.number in self._parts:
                 self._parts[change.number].join(())  # with fewer views: look for its things again
