@@ -45,6 +45,27 @@ def test_module_tells_its_code_wherever_ctrl_c_strikes(tmp_path: Path) -> None:
     assert subprocess.run(command, env=environment, timeout=60, check=False).returncode == 130
 
 
+_STRUCK_IN_A_CLEAN_UP = """
+import time, typer, sorvolo.cli.main
+class Struck:
+    def __del__(self):
+        raise KeyboardInterrupt
+def work():
+    Struck()
+    time.sleep(30)
+sorvolo.cli.main.app = typer.Typer(add_completion=False)
+sorvolo.cli.main.app.command()(work)
+"""
+
+
+def test_ctrl_c_is_not_lost_where_python_can_raise_nothing(tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text(_STRUCK_IN_A_CLEAN_UP)
+    command, environment = [sys.executable, "-m", "sorvolo"], {**os.environ, "PYTHONPATH": str(tmp_path)}
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert run.returncode == 130
+    assert run.stderr.startswith("stopped; ") and "Exception ignored" not in run.stderr
+
+
 @pytest.mark.parametrize("command", [*_COMMANDS[:4], "evaluate mosaic", *_COMMANDS[5:]])
 def test_help_has_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*command.split(), "--help"]) == 0

@@ -2,10 +2,14 @@
 
 import errno
 import os
+import signal
+import sys
+import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -25,6 +29,9 @@ from sorvolo.cli.train import train
 from sorvolo.cli.watch import watch_command
 from sorvolo.errors import SorvoloError
 
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
+
 _COMMANDS: dict[str, Callable[..., None]] = {
     "inspect": inspect, "plan": plan, "map": map_command, "compare": compare, "watch": watch_command,
     "simulate": simulate, "train": train,
@@ -32,6 +39,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
 }
 _FAILED, _STOPPED = 1, 130
 _FULL = (errno.ENOSPC, errno.EDQUOT)
+_ASKED_AGAIN_S = 0.02
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 for _name, _command in _COMMANDS.items():
@@ -52,7 +60,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command. The exit code: 0 well, 1 an error that was told, 2 wrong usage, 130 stopped."""
     wishes = _Wishes(debug=os.environ.get("SORVOLO_DEBUG", "") not in ("", "0"))
     try:
-        app(args=None if arguments is None else list(arguments), prog_name="sorvolo", obj=wishes)
+        with _no_stop_is_lost():
+            app(args=None if arguments is None else list(arguments), prog_name="sorvolo", obj=wishes)
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else _FAILED
         if code == _STOPPED:
@@ -64,6 +73,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _tell(f"error: {_words_of(error)}")
         return _FAILED
     return 0
+
+
+@contextmanager
+def _no_stop_is_lost() -> Iterator[None]:
+    """A Ctrl-C that strikes where Python can raise nothing, as in the clean-up of a library's object, strikes again."""
+    before = sys.unraisablehook
+
+    def strike_again() -> None:
+        if hasattr(signal, "pthread_kill"):  # wakes a main thread that waits, too
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+        else:
+            signal.raise_signal(signal.SIGINT)
+
+    def look(lost: "UnraisableHookArgs") -> None:
+        if not issubclass(lost.exc_type, KeyboardInterrupt):
+            before(lost)
+            return
+        again = threading.Timer(_ASKED_AGAIN_S, strike_again)
+        again.daemon = True
+        again.start()
+
+    sys.unraisablehook = look
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
 
 
 def _print_version(wanted: bool) -> None:
