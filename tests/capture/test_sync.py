@@ -1,5 +1,7 @@
 """Clocks and tracks: interpolation by eq. 3.18, what lies outside is unknown, and offsets that motion shows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -156,6 +158,12 @@ def test_clocks_some_hours_apart_are_tied_by_their_starts_and_told(hours):
 def test_a_video_that_does_not_know_its_time_is_tied_by_starts():
     clock = tied(straight(ONE_HZ), 0)
     assert clock.sample_s[0] == 0.0 and clock.notices == ()
+
+
+@pytest.mark.parametrize("counts_from_first_frame", [False, True])
+def test_a_log_without_a_date_is_dated_by_the_video(counts_from_first_frame):
+    undated = replace(straight(ONE_HZ, video=counts_from_first_frame), time_ns=np.round(ONE_HZ * 1e9).astype(np.int64))
+    assert tied(undated, START_NS).first_frame_utc_ns == START_NS
 
 
 @pytest.mark.parametrize("days", [3, -40])

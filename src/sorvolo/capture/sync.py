@@ -13,7 +13,8 @@ from sorvolo.survey.flight import CameraPrior, Notice, Telemetry
 
 DEFAULT_HORIZONTAL_SIGMA_M = 1.5  # the thesis's DJI Phantom 3, section 2.2
 _OTHER_FLIGHT_S = 24 * 3600.0  # clocks are set to a wrong zone by up to 14 h; a day apart is another flight
-_DATED_NS = 3650 * 86_400 * 10**9  # ten years after 1970: an earlier clock was never set
+DATED_NS = 3650 * 86_400 * 10**9
+"""Ten years after 1970: an earlier clock was never set."""
 _HEIGHTS = (
     ("height_above_takeoff_m", "above take-off", 1.0),
     ("orthometric_height_m", "orthometric", 3.0),
@@ -71,8 +72,9 @@ def tie_clocks(
         return Clock((telemetry.time_ns - start_ns) / 1e9, "each photo carries its own fix", 0.0, start_ns)
     if (telemetry.video_time_ns >= 0).all():
         zero_ns = int(np.median(telemetry.time_ns - telemetry.video_time_ns))
+        zero_ns = start_ns if zero_ns < DATED_NS else zero_ns  # without a date, as below
         return Clock(telemetry.video_time_ns / 1e9, "telemetry counts from the video's first frame", 0.5, zero_ns)
-    dated = min(first_ns, start_ns) > _DATED_NS
+    dated = min(first_ns, start_ns) > DATED_NS
     if dated:
         lead_s = (first_ns - start_ns) / 1e9
         overlap_s = min(lead_s + float(utc_s[-1]), duration_s) - max(lead_s, 0.0)
@@ -87,7 +89,7 @@ def tie_clocks(
         words = f"the video's clock and the telemetry's are {apart_s / 3600:.1f} h apart: their starts were tied"
         return Clock(utc_s, "first sample tied to first frame", 3.0, first_ns, (Notice("clocks_apart", 1, words),))
     # a log without a date is stamped from 1970: then the video's own start tells when it was
-    return Clock(utc_s, "first sample tied to first frame", 3.0, start_ns if first_ns < _DATED_NS else first_ns)
+    return Clock(utc_s, "first sample tied to first frame", 3.0, start_ns if first_ns < DATED_NS else first_ns)
 
 
 @dataclass(frozen=True, eq=False)

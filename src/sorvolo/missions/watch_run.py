@@ -8,6 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from sorvolo.capture.sync import DATED_NS
 from sorvolo.missions.alerts import Outbox, Pace, alert_command, alert_url
 from sorvolo.missions.detecting import Detects
 from sorvolo.missions.flight_setup import FlightSetup
@@ -23,7 +24,6 @@ from sorvolo.store.watch_page import count_words, watch_page
 from sorvolo.survey.flight import Frame, LostFrame, Notice, Site
 from sorvolo.survey.objects import Detections, Sighting, Track
 
-_DATED_NS = 3650 * 86_400 * 10**9  # ten years after 1970: an earlier clock was never set
 _LAST_ALERTS_S, _LAST_EVENTS_S = 35.0, 5.0  # how long the end waits for what is still on its way
 
 
@@ -153,7 +153,7 @@ class WatchRun:
     def _utc_ns(self, frame: Frame) -> int:
         """A frame's UTC by telemetry's clock; by its own where telemetry's was never set."""
         time_ns = self._setup.utc_ns(frame.time_ns)
-        return time_ns if time_ns >= _DATED_NS else frame.time_ns
+        return time_ns if time_ns >= DATED_NS else frame.time_ns
 
     def _warnings(self, tracks: Sequence[Track]) -> list[str]:
         warnings = []

@@ -26,6 +26,7 @@ from sorvolo.capture.live.reader import StreamFacts, StreamReader
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.telemetry_log import TelemetryLog
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
+from sorvolo.capture.sync import DATED_NS
 from sorvolo.capture.telemetry.nmea import Epoch
 from sorvolo.capture.telemetry.quality import notice
 from sorvolo.errors import InputError
@@ -35,7 +36,6 @@ _HOLD_S = 0.5  # the first frames of a connection come in a burst: only then is 
 _HOLD_FOR_METADATA_S = 2.0  # where the stream has some, it says when and through which lens frames were taken
 _FIRST_FIXES = 2  # that tell where a flight begins, and how fast
 _FIRST_FIXES_S = 10.0
-_DATED_NS = 3650 * 86_400 * 10**9  # ten years after 1970: an earlier clock was never set
 _CLOCKS_AGREE_NS = 5_000_000_000
 _DELAYS_KEPT = 60
 _ZOOMED = 0.03
@@ -272,7 +272,7 @@ class LiveStream:
 
     def reported(self, stamp_ns: int, utc_ns: int) -> None:
         """See `reader.Hearer`."""
-        if utc_ns > _DATED_NS:
+        if utc_ns > DATED_NS:
             self._clock.stated(Tie.SENDER_REPORT, stamp_ns, utc_ns)
 
     def told(self, told: LocalSet, stamp_ns: int) -> None:
