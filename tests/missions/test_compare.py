@@ -6,7 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
@@ -135,6 +135,7 @@ def test_the_files_tell_what_was_found(compared):
     told = report(site)["comparison"]
     assert told["views"]["compared"] == len(updates)
     assert told["compared_area_m2"] > 200
+    assert report(site)["settings"] == asdict(CompareSettings(model="none", writes_masks=True))
     assert "changes.html" in {path.name for path in folder.iterdir()}
 
 

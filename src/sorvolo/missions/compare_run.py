@@ -4,7 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -211,7 +211,7 @@ class CompareRun:
         }
         seconds = 0.0 if self._finder is None else self._finder.seconds
         report |= {
-            "method": f"compare-{self._settings.method}", "comparison": comparison,
+            "method": f"compare-{self._settings.method}", "settings": asdict(self._settings), "comparison": comparison,
             "objects": search_summary(search, seconds, why_not_searched(self._settings.model)),
         }
         page = report_page(report, shown, crops_of(search))
