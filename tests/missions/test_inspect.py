@@ -146,6 +146,17 @@ def test_a_video_with_subtitles_is_tied_to_them(tmp_path: Path) -> None:
     assert "too few" not in texts(found, Level.PROBLEM)
 
 
+def test_a_log_without_a_date_is_shown_without_one(tmp_path: Path) -> None:
+    video = write_video(tmp_path / "a.mp4", metadata={"creation_time": "2026-05-12T09:00:00Z"})
+    rows = [f"{second},{0.5 + second / M_PER_DEG:.7f},10.0,20.0" for second in range(5)]
+    (tmp_path / "a.csv").write_text("offsetTime,latitude,longitude,relativeHeight\n" + "\n".join(rows) + "\n")
+    app = Typer()
+    app.command()(inspect)
+    shown = " ".join(CliRunner().invoke(app, [str(video)]).output.split())
+    assert "1970-01-01 00:00" not in shown and "without a date" in shown
+    assert "the video dates its 5 rows" in shown
+
+
 def test_too_few_frames_a_second_for_the_speed(tmp_path: Path) -> None:
     video = write_video(tmp_path / "a.mp4", rate=1)
     write_srt(tmp_path / "a.SRT", 5, speed_m_s=30)

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sorvolo.capture.sync import DATED_NS
 from sorvolo.missions.inspect_input import Inspection, Level, inspect_input
 
 _COLOURS = {Level.INFO: "blue", Level.WARNING: "yellow", Level.PROBLEM: "red"}
@@ -86,7 +87,8 @@ def _telemetry_rows(inspection: Inspection) -> list[tuple[str, str]]:
         return [("telemetry", "none")]
     first = f"{facts.format}, {facts.samples} samples, {facts.positions} with a position"
     rate = _with_unit(", {:.3g} a second", facts.rate_hz) + f", longest gap {facts.longest_gap_s:.1f} s"
-    span = f"{_utc(facts.start_ns)}to {_utc(facts.end_ns).rstrip(' ,')}"
+    is_dated = facts.start_ns >= DATED_NS
+    span = f"{_utc(facts.start_ns)}to {_utc(facts.end_ns).rstrip(' ,')}" if is_dated else "without a date"
     return [
         ("telemetry", first + rate),
         ("", span),

@@ -120,7 +120,7 @@ def read(data: bytes, name: str) -> Telemetry:
             *notice(
                 "no_date", int((~dated).sum()),
                 "{} cues print no date; they are stamped by their place in the video"
-                + ("" if dated.any() else ", from 1970-01-01"),
+                + ("" if dated.any() else ", which dates them, else they count from 1970-01-01"),
             ),
             *notice(
                 "clock_refined", len(cues) if refined else 0,

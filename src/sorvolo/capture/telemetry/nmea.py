@@ -74,7 +74,7 @@ def read(data: bytes, name: str) -> Telemetry:
             *notice("no_time", counts["no_time"], "{} sentences dropped: no readable time"),
             *notice(
                 "no_date", 0 if dated else len(epochs),
-                "no sentence tells the date: {} samples are stamped from 1970-01-01",
+                "no sentence tells the date: the video dates the {} samples, else they count from 1970-01-01",
             ),
         ],
         position_decimals=_position_decimals(messages),
