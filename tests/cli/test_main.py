@@ -113,6 +113,18 @@ def test_settings_out_of_range_are_errors(
     assert "error: " in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("options", "words"), [
+    (["--thermal", "0.3"], "give their number with --pictures"), (["--ground", "urbn"], "none of dirt, countryside"),
+    (["--pictures", "3", "--preset", "survey", "--fps", "5"], "leave out --preset, --fps"),
+])
+def test_simulate_leaves_no_option_unheard(
+    options: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["simulate", str(tmp_path / "made"), *options]) == 1
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "made").exists()
+
+
 def test_json_is_pure(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["plan", "--camera", "aov=62", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["height_m"] > 0

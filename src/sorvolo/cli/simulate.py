@@ -80,7 +80,18 @@ def simulate(
         typer.echo("\n".join(preset_names()))
         return
     ground_file = None if not ground or ground in list(GroundKind) else Path(ground)
+    if ground_file is not None and not ground_file.exists():
+        raise SettingsError(f"--ground {ground}: no such file, and none of {', '.join(GroundKind)}")
+    if pictures is None and thermal:
+        raise SettingsError("--thermal is a share of single pictures: give their number with --pictures as well")
     if pictures is not None:
+        of_flights = {
+            "--preset": preset_name != "demo", "--flights": flights, "--gps-noise": gps_noise, "--gps-rate": gps_rate,
+            "--clock-offset": clock_offset, "--telemetry": telemetry, "--faults": faults, "--speed": speed,
+            "--length": length, "--strips": strips, "--tilt": tilt, "--fps": fps, "--size": size, "--photos": photos,
+        }
+        if given := [name for name, value in of_flights.items() if value not in (None, False, "")]:
+            raise SettingsError(f"--pictures makes single pictures, no flights: leave out {', '.join(given)}")
         wanted = PictureSettings(
             pictures, 1 if seed is None else seed, ground if ground_file is None else "orthophoto", thermal
         )
