@@ -263,6 +263,13 @@ def test_broken_positions_are_refused(site, tmp_path, text):
         evaluate_mosaic(site, positions=path)
 
 
+def test_positions_without_a_column_say_which_there_are(site, tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("name,longitude_deg,latitude_deg\n1,9.2,45.5\n")
+    with pytest.raises(InputError, match="no column frame, but name, longitude_deg, latitude_deg; needed are"):
+        evaluate_mosaic(site, positions=path)
+
+
 def test_the_command_prints_a_table_and_json(site, truth):
     runner = CliRunner()
     plain = runner.invoke(evaluate_app, ["mosaic", str(site), "--truth", str(truth)], env={"COLUMNS": "160"})

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from truth_detector import TruthDetector
 
-from sorvolo.errors import InputError
+from sorvolo.errors import InputError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.change_classes import ChangeClasses, object_at, seen_at
 from sorvolo.missions.compare_flights import compare_flights
@@ -135,6 +135,8 @@ def test_without_a_model(simulated: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "site/objects.geojson").exists()
     with pytest.raises(InputError, match="no flight of it was searched"):
         evaluate_objects(tmp_path / "site", simulated)
+    with pytest.raises(StoreError, match="no site at"):
+        evaluate_objects(tmp_path / "nowhere", simulated)
     left_over = tmp_path / "site/flights/flight1/objects.geojson"
     left_over.write_text('{"type": "FeatureCollection", "features": []}')
     with pytest.raises(InputError, match="knows of no search of this flight; map it again with --model"):

@@ -38,6 +38,8 @@ from sorvolo.survey.mosaic import Status
 _DEVIATION_FRAMES = 120
 _REFERENCE_PX = 2048
 _FARTHEST_M = 10_000.0
+_POSITION_COLUMNS = ("frame", "longitude_deg", "latitude_deg")
+_POSITIONS_NEED = "needed are the columns frame,longitude_deg,latitude_deg[,height_m][,flight]"
 
 
 @dataclass(frozen=True)
@@ -349,15 +351,19 @@ def _against_positions(
 def _positions(path: Path) -> dict[tuple[str, str], tuple[float, float, float]]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
+            table = csv.DictReader(file)
+            rows = list(table)
+        missing = [name for name in _POSITION_COLUMNS if name not in (table.fieldnames or ())]
+        if missing:
+            columns = ", ".join(table.fieldnames or ()) or "none at all"
+            raise InputError(f"{path}: no column {', '.join(missing)}, but {columns}; {_POSITIONS_NEED}")
         return {
             ((row.get("flight") or "").strip(), row["frame"].strip()): (
                 float(row["longitude_deg"]), float(row["latitude_deg"]), float(row.get("height_m") or "nan"),
             )
             for row in rows
         }
-    except (OSError, UnicodeDecodeError, KeyError, ValueError, AttributeError, TypeError, csv.Error) as error:
+    except (OSError, UnicodeDecodeError, ValueError, AttributeError, TypeError, csv.Error) as error:
         raise InputError(
-            f"{path}: cannot be read as camera positions ({error!r}); "
-            "needed are the columns frame,longitude_deg,latitude_deg[,height_m][,flight]"
+            f"{path}: cannot be read as camera positions ({error}); {_POSITIONS_NEED}"
         ) from error

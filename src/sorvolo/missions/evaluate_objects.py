@@ -94,12 +94,12 @@ def evaluate_objects(site: Path, truth: Path, *, flight: str | None = None) -> t
     """
     frames_file = truth_file(truth)
     folder = frames_file.parent
-    searched = sorted(path.parent.name for path in (site / "flights").glob("*/objects.geojson"))
-    if not searched:
-        raise InputError(f"{site}: no flight of it was searched for objects; run `sorvolo map` with --model")
     with Archive.open(site, write=False) as archive:
         described = archive.site()
         outlines_m = {each.flight_id: each.outlines_m for each in archive.searches()}
+    searched = sorted(path.parent.name for path in (site / "flights").glob("*/objects.geojson"))
+    if not searched:
+        raise InputError(f"{site}: no flight of it was searched for objects; run `sorvolo map` with --model")
     unknown = [name for name in searched if name not in outlines_m]
     if unknown:
         raise InputError(
