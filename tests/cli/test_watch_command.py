@@ -95,7 +95,7 @@ def test_nothing_found_is_no_error(model: Path, tmp_path: Path, capsys: pytest.C
     [
         (["--classes", "boat"], "knows no 'boat'"), (["--tiles", "big"], "auto, none, or a number"),
         (["--cot", "tak.local"], "udp://host:port"), (["--cot", "udp://tak.invalid"], "'tak.invalid' has no address"),
-        (["--cot-type", "person"], "person=a-f-G"),
+        (["--cot-type", "person"], "person=a-f-G"), (["--cot-type", "persn=a-f-G"], "--cot-type persn"),
         (["--every", "2", "--fps", "3"], "not both"), (["--model", "no-such-model"], "no-such-model"),
         (["--alert-command", "no-such-program"], "no program"), (["--alert-url", "ftp://x"], "web address"),
     ],

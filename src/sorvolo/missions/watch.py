@@ -20,7 +20,7 @@ from sorvolo.missions.watch_places import places_of
 from sorvolo.missions.watch_run import WatchRun, WatchUpdate
 from sorvolo.missions.watch_settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
 from sorvolo.mosaic.selection import every
-from sorvolo.store.cursor_on_target import check_host, cot_place
+from sorvolo.store.cursor_on_target import COT_TYPES, check_host, cot_place
 from sorvolo.store.detection_files import claim_folder
 from sorvolo.survey.flight import Frame, LostFrame
 
@@ -49,6 +49,8 @@ def watch(
     finder = Detector.load(settings.model) if detector is None else detector
     if unknown := sorted(set(settings.classes) - set(finder.classes)):
         raise SettingsError(f"the model knows no {unknown[0]!r}; it knows {', '.join(finder.classes)}")
+    if unknown := sorted(set(outputs.cot_types) - {*finder.classes, *COT_TYPES}):
+        raise SettingsError(f"--cot-type {unknown[0]}: no such class; the model knows {', '.join(finder.classes)}")
     sources = open_sources([source], telemetry, camera, live=live)
     with ExitStack() as stack:
         for each in sources:

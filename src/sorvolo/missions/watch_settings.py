@@ -35,7 +35,7 @@ class WatchSettings:
         if isinstance(self.tiles, int) and not 64 <= self.tiles <= 16_384:
             raise SettingsError(f"tiles must be 64 to 16384 px wide, got {self.tiles}")
         if self.every is not None and self.frames_per_second is not None:
-            raise SettingsError("give every so manieth frame or frames a second, not both")
+            raise SettingsError("give every N-th frame (--every) or so many frames a second (--fps), not both")
         if self.every is not None and self.every < 1:
             raise SettingsError(f"every N-th frame: N must be 1 or more, got {self.every}")
         if self.frames_per_second is not None and not 0.001 <= self.frames_per_second <= 1000:
