@@ -103,6 +103,7 @@ def test_the_command_lists_and_says(
 @pytest.mark.parametrize(("arguments", "words"), [
     (["b-1"], "--confirm or --reject"), (["b-1", "--confirm", "--reject"], "contradict"),
     (["--reject"], "which changes"), (["nope", "--reject"], "no change nope"),
+    (["1", "--reject"], "give --flight as well"),
 ])
 def test_the_command_says_what_is_wrong(
     site: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], words: str

@@ -264,6 +264,7 @@ def test_bad_input_is_told(data: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert "holds no checkpoint.pt to go on from" in words(place, "--resume")
     assert "no weights at" in words(place, "--weights", "gone.pth")
     assert "device must be auto, cpu or cuda, got 'tpu'" in words(place, "--device", "tpu")
+    assert "device must be auto, cpu or cuda, got 'cudaa'" in words(place, "--device", "cudaa")
     assert "THEIRS=OURS" in words(place, "--classes", "=car")
     assert "ignore: 'Bicycle' is no name in the labels; there are: car" in words(place, "--ignore", "Bicycle")
     assert "unlabelled: 'persn' is no class; there are: person, car" in words(place, "--unlabelled", "persn")

@@ -35,6 +35,11 @@ def review_changes(
         _require_flight(archive, flight)
         by_number = {str(each.number): each.id for each in archive.changes(flight)} if flight is not None else {}
         wanted = {by_number.get(each, each) for each in ids}
+        if flight is None and (bare := next((each for each in ids if each.isdecimal()), "")):
+            raise InputError(
+                f"{archive.folder} has no change {bare}: a number is one flight's; give --flight as well, or the whole "
+                f"id as `sorvolo review {archive.folder}` lists it"
+            )
         archive.review(wanted, verdict, note)
         return [each for each in archive.changes() if each.id in wanted]
 

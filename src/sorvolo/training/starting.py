@@ -28,10 +28,11 @@ def device_of(wanted: str) -> str:
     """"cpu" or "cuda"; "auto" takes a GPU where there is one. Raises SettingsError for a device that is not there."""
     if wanted == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
-    if wanted.startswith("cuda") and not torch.cuda.is_available():
-        raise SettingsError(f"device {wanted} asked for, but this torch sees no GPU; use --device cpu")
-    if wanted != "cpu" and not wanted.startswith("cuda"):
+    kind, _, number = wanted.partition(":")
+    if wanted != "cpu" and not (kind == "cuda" and (number.isdecimal() or wanted == "cuda")):
         raise SettingsError(f"device must be auto, cpu or cuda, got {wanted!r}")
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise SettingsError(f"device {wanted} asked for, but this torch sees no GPU; use --device cpu")
     return wanted
 
 
