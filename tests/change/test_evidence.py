@@ -263,6 +263,23 @@ def test_low_scores_are_kept_but_not_told():
     assert told == [] and evidence.conclude() == ()
 
 
+@pytest.mark.parametrize(("side_m", "score", "is_told"), [(2.0, 0.45, False), (2.0, 0.7, True), (1.0, 0.45, True)])
+def test_what_is_large_must_be_surer_than_what_is_small(side_m, score, is_told):
+    """Walls that lean into view are large and unsure."""
+    evidence, _ = collect(flight([Thing(0, 0, (side_m, side_m))], score=score))
+    assert len(evidence.conclude()) == is_told
+
+
+@pytest.mark.parametrize(("shown", "of", "is_told"), [(8, 20, False), (12, 20, True)])
+def test_what_less_than_half_of_the_views_show_passed_by(shown, of, is_told):
+    thing = Thing(-4, 0)
+    views = [
+        view_of(i, i / 5, (-6 + 0.2 * i, 0, CAMERA_HEIGHT_M), [thing] if i < shown else []) for i in range(of)
+    ]
+    evidence, _ = collect(views, least_share=0.0, least_score=0.1)
+    assert len(evidence.conclude()) == is_told
+
+
 @pytest.mark.parametrize(("velocity_m_s", "stays"), [((0, 0), True), ((0, -3.5), False)])
 def test_a_thing_seen_shortly_and_in_other_pieces_each_time_is_told_if_its_ground_stays_the_same(velocity_m_s, stays):
     car = Thing(0, 2, (4.5, 1.8), velocity_m_s=velocity_m_s)

@@ -105,6 +105,26 @@ def test_the_bright_ends_of_a_dark_car_beside_another_thing_are_one_thing():
     assert len(things_of(patch, ChangeKind.APPEARED, patch.changed)) == 2
 
 
+def test_lit_specks_of_a_dark_car_are_no_things_of_their_own():
+    specks = [
+        (np.s_[y : y + 4, x : x + 4], (40, 58, 90))
+        for columns in (range(24, 56, 9), range(80, 112, 9)) for x in columns for y in range(30, 60, 9)
+    ]
+    walker = (np.s_[44:54], np.s_[150:156], (240, 240, 60))
+    patch = patch_with((np.s_[20:70], np.s_[20:150], SHADOW), walker)
+    for part, colour in specks:
+        patch.after[(*part, np.s_[:3])] = colour
+    things = things_of(patch, ChangeKind.APPEARED, patch.changed)
+    assert len(things) == 1
+
+
+def test_people_whose_shadows_join_them_are_two():
+    people = [(np.s_[x : x + 4], np.s_[50:54], (240, 240, 240)) for x in (10, 60)]
+    shadows = [(np.s_[x : x + 46], np.s_[51:55], SHADOW) for x in (14, 64)]
+    patch = patch_with(*shadows, *people)
+    assert len(things_of(patch, ChangeKind.APPEARED, patch.changed)) == 2
+
+
 @pytest.mark.parametrize("side_px, score, colour, is_speck", [
     (6, 0.5, SHADOW, True), (6, 0.7, SHADOW, False), (12, 0.5, SHADOW, False), (6, 0.5, (200, 60, 60), False),
 ])

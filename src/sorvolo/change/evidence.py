@@ -36,7 +36,10 @@ _LASTING = 0.3  # share of all views that must flag a cell
 _PICTURES_A_VIEW, _MOST_PICTURES = 6, 30  # cut anew at most, which bounds the time a view takes ...
 _VIEWS_S = 5.0  # ... where so many come in a second; where they are seldom there is more time
 _FEW_VIEWS_SCORE = 0.62  # of what fewer than k views show: two views of a tree often agree
+_LARGE_M2, _LARGE_SCORE = 2.0, 0.52  # what is larger and less sure is a wall that leans, unless it is snow
 _DOUBT = 2.0  # restless ground counts in full where half of the score is missing
+_MOSTLY_THERE = 0.45  # of the views that see it, whatever they count, must show a change: else something passed by
+_MANY_VIEWS = 16  # that agree: no chance, whatever the ground around does
 _CALM = 0.9  # of the score is left on calm ground
 _MOVED_HEIGHTS = 0.01  # the camera's way, in flying heights, after which a view is a new witness
 _ALL_CHANGED = 0.5  # share of the frame beyond which nothing in it can be followed
@@ -300,20 +303,25 @@ class EvidenceMap:
 
     def _is_thing(self, change: GatheredChange) -> bool:
         whole = self._change(change)
-        return whole is not None and not is_of_shade(whole)
+        if whole is None or is_of_shade(whole):
+            return False
+        may_be_a_wall = whole.area_m2 >= _LARGE_M2 and whole.length_m < change.flying_height_m
+        return not may_be_a_wall or change.score >= _LARGE_SCORE or change.is_from_one_place
 
     def _is_sure(self, change: GatheredChange) -> bool:
         calm = change.calmness = 1.0
         if change.cells is not None and change.score >= self._settings.least_score:
             own = self._cells_of(change)
             calm = calmness(restlessness(self._grid, change.cells, own, self._cell_m))
-            # views agree by chance now and then, not nearly all of them and surely
-            change.calmness = calm ** min(1.0, _DOUBT * (1 - change.score))
+            # views agree by chance now and then, not nearly all of them, many or surely
+            agree = (change.views + 1) / (change.asked + 2) if change.views >= _MANY_VIEWS else 0.0
+            change.calmness = calm ** min(1.0, _DOUBT * (1 - max(change.score, agree)))
         # nothing tall leans over calm ground: there views from aside say as much as those from above
         share = max(change.share, change.views / change.asked) if calm > _CALM else change.share
         is_of_few = 1 < change.views < self._settings.k
         least_score = _FEW_VIEWS_SCORE if is_of_few else self._settings.least_score
-        return change.score >= least_score and share >= self._settings.least_share
+        is_mostly_there = change.views >= _MOSTLY_THERE * change.asked
+        return change.score >= least_score and share >= self._settings.least_share and is_mostly_there
 
     def _update(
         self, view: ComparedView, kept_view: KeptView, owner: NDArray[np.int32], new: set[int], budget: list[int]

@@ -108,12 +108,23 @@ class GatheredChange:
         if not self.views:
             return 0.0
         score = self._score_sum / self.views * (self.views + 1) / (self.asked + 2) * self.weakness * self.calmness
-        apart_m = float(np.hypot(*(self._camera_high - self._camera_low)[:2]))
-        height_m = float(self._camera_high[2])
-        is_one_place = self.views > 1 and apart_m < _ONE_PLACE * height_m
-        never_whole = _NEVER_WHOLE * min(apart_m / max(_FAR_APART * height_m, 1e-6), 1.0)
+        never_whole = _NEVER_WHOLE * min(self._heights_apart() / _FAR_APART, 1.0)
         wholeness = never_whole + (1 - never_whole) * min(2 * self.whole / self.views, 1.0)
-        return float(np.clip(score * (0.5 if is_one_place else 1.0) * wholeness, 0, 1))
+        return float(np.clip(score * (0.5 if self.is_from_one_place else 1.0) * wholeness, 0, 1))
+
+    @property
+    def is_from_one_place(self) -> bool:
+        """Whether all of several views that show it looked from one place, as from a drone that hovers."""
+        return self.views > 1 and self._heights_apart() < _ONE_PLACE
+
+    @property
+    def flying_height_m(self) -> float:
+        """The largest of the views that show it."""
+        return max(float(self._camera_high[2]), 1e-6)
+
+    def _heights_apart(self) -> float:
+        """How far apart the views that show it were taken, in flying heights."""
+        return float(np.hypot(*(self._camera_high - self._camera_low)[:2])) / self.flying_height_m
 
     def wants(self, low_m: Floats, high_m: Floats, view: ComparedView) -> float:
         """How much better, as a factor, the view's pictures are than those it has; infinite if it has to grow."""

@@ -20,7 +20,7 @@ _LEAST_PIECE = 0.15  # of the largest lit piece: smaller ones are specks of the 
 _TOLERANCE_PX = 0.7
 _APART_M = 0.5  # things so far from each other are two ...
 _NECK_M, _GAP_M = 0.25, 0.4  # what hangs together by less, or lies so far apart, is not one piece
-_LEAST_THING_M2 = 0.06  # ... if each is as large as a football at least ...
+_LEAST_THING_M2 = 0.035  # ... if each is as large as a football at least ...
 _COMPACT, _CAR_M = 0.8, (1.2, 6.0)  # ... and both together do not fill what may be one dark car with bright parts
 _CAR_WIDTH_M, _BRIGHT = 2.7, 0.5  # at most; share of a dark car that its bright parts are at most
 _SLIVER_M, _LEAST_CONTRARY_M2, _MOSTLY = 0.15, 0.15, 0.5  # what came beside what left: its width, size, and share ...
@@ -154,9 +154,11 @@ def _things_of_group(patch: Patch, kind: ChangeKind, changed: Mask) -> list[tupl
     labels = np.where(of_left > 0, labels.max() + of_left, labels)
     areas_m2 = np.bincount(labels[lit > 0]) * patch.m_per_px**2
     large = [label for label in np.argsort(-areas_m2) if areas_m2[label] >= max(_LEAST_THING_M2, 1e-9)]
-    if len(large) < 2 or (not left.any() and _may_be_a_car(changed, patch.m_per_px)):
-        return [(changed, kind)]
     things = [(labels == each) & (lit > 0) for each in large]
+    if not left.any():  # specks of a dark thing scatter
+        things = [each for each in things if np.count_nonzero(each) >= _SOLID * np.count_nonzero(_hull(each))]
+    if len(things) < 2 or (not left.any() and _may_be_a_car(changed, patch.m_per_px)):
+        return [(changed, kind)]
     if not left.any():
         things = _with_cars_whole(things, changed, patch.m_per_px)
     if len(things) < 2:
