@@ -155,12 +155,12 @@ def _things_of_group(patch: Patch, kind: ChangeKind, changed: Mask) -> list[tupl
     areas_m2 = np.bincount(labels[lit > 0]) * patch.m_per_px**2
     large = [label for label in np.argsort(-areas_m2) if areas_m2[label] >= max(_LEAST_THING_M2, 1e-9)]
     things = [(labels == each) & (lit > 0) for each in large]
-    if not left.any():  # specks of a dark thing scatter
-        things = [each for each in things if np.count_nonzero(each) >= _SOLID * np.count_nonzero(_hull(each))]
-    if len(things) < 2 or (not left.any() and _may_be_a_car(changed, patch.m_per_px)):
-        return [(changed, kind)]
-    if not left.any():
-        things = _with_cars_whole(things, changed, patch.m_per_px)
+    if len(things) > 1 and not left.any():
+        if _may_be_a_car(changed, patch.m_per_px):
+            return [(changed, kind)]
+        # specks of a dark thing scatter
+        solid = [each for each in things if np.count_nonzero(each) >= _SOLID * np.count_nonzero(_hull(each))]
+        things = _with_cars_whole(solid, changed, patch.m_per_px)
     if len(things) < 2:
         return [(changed, kind)]
     distances = [cv2.distanceTransform((~each).view(np.uint8), cv2.DIST_L2, 5) for each in things]
