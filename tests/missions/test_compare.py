@@ -300,6 +300,13 @@ def test_steps_of_another_method_are_refused(flown, site):
         ))
 
 
+def test_steps_within_the_site_folder_are_refused(tmp_path):
+    thesis = CompareSettings(model="none", method="thesis")
+    for steps in (tmp_path / "site" / "flights" / "steps", tmp_path / "other" / ".." / "site"):
+        with pytest.raises(SettingsError, match="lies in the site folder"):
+            list(compare_flights([tmp_path / "later"], tmp_path / "site", thesis, steps=steps))
+
+
 @pytest.mark.parametrize("make", [
     lambda: CompareSettings(votes=4, voters=3), lambda: CompareSettings(views_per_second=0.0),
     lambda: CompareSettings(method="best"),

@@ -41,6 +41,8 @@ def compare_flights(
     """
     if steps is not None and settings.method != "thesis":
         raise SettingsError("the steps are those of the thesis's method: give --method thesis as well")
+    if steps is not None and steps.resolve().is_relative_to(site.resolve()):
+        raise SettingsError(f"{steps} lies in the site folder {site}, which is sorvolo's own; name another folder")
     wanted = None if area is None else read_area(area)
     with Archive.open(site, write=False) as archive:
         if not archive.tiles():
