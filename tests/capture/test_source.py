@@ -155,6 +155,21 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
         open_sources([tmp_path / "empty"])
 
 
+def test_a_site_folder_is_no_flight(tmp_path: Path) -> None:
+    """It holds mosaic.tif and preview.png, which are pictures by their endings."""
+    site = write_photos(tmp_path / "site", 1)
+    (site / "site.db").touch()
+    with pytest.raises(InputError, match=r"a site folder \(it has site\.db\), no flight; give .*--site"):
+        open_sources([site])
+
+
+@pytest.mark.parametrize("name", ["log.srt", "log.csv", "log.mp4"])
+def test_telemetry_given_as_input_is_told_where_it_belongs(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text(SRT)
+    with pytest.raises(InputError, match=r"a telemetry file, no video or photo; .* --telemetry"):
+        open_sources([tmp_path / name])
+
+
 def test_a_playlist_reads_no_other_file(tmp_path: Path) -> None:
     write_video(tmp_path / "secret.ts")
     playlist = tmp_path / "list.mp4"

@@ -28,7 +28,7 @@ from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream, open_stream
 from sorvolo.capture.photo_metadata import PhotoMetadata
 from sorvolo.capture.photos import PHOTO_SUFFIXES, PhotoSource, read_album
-from sorvolo.capture.telemetry import find_telemetry_beside, read_telemetry
+from sorvolo.capture.telemetry import find_telemetry_beside, is_telemetry, read_telemetry
 from sorvolo.capture.telemetry.quality import notice
 from sorvolo.capture.video import VIDEO_SUFFIXES, VideoInfo, VideoSource, read_video_info
 from sorvolo.errors import InputError
@@ -36,6 +36,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry
 
 _HEAD_BYTES = 262_144
+_SITE_MARK = "site.db"  # in a folder whose pictures are a map, no photos
 
 LiveSource = LiveStream | GrowingFolder
 """The sources that grow while they are read: their telemetry does, and frames come when they come."""
@@ -183,6 +184,11 @@ def _sort_inputs(inputs: Sequence[Path]) -> tuple[list[Path], list[_AlbumInput]]
         if not path.is_dir():
             (single if path.suffix.lower() in PHOTO_SUFFIXES else videos).append(path)
             continue
+        if (path / _SITE_MARK).is_file():
+            raise InputError(
+                f"{path}: a site folder (it has {_SITE_MARK}), no flight; give the flight's video or photos (map and "
+                "compare take the site as --site)"
+            )
         inside = [each for each in sorted(path.iterdir()) if each.is_file() and each.name[0] != "."]
         photos = [each for each in inside if each.suffix.lower() in PHOTO_SUFFIXES]
         films = [each for each in inside if each.suffix.lower() in VIDEO_SUFFIXES]
@@ -238,7 +244,7 @@ def _free_name(name: str, fingerprint: str, taken: Mapping[str, str]) -> str:
 
 
 def _open_video(path: Path, name: str, telemetry: Path | None, camera: Path | str | None) -> VideoSource:
-    info = read_video_info(path)
+    info = _video_info(path)
     inside = read_klv_file(path) if info.container == "mpegts" else None
     found, notices = _video_telemetry(path, telemetry, inside)
     told = None if inside is None or inside.lens is None else camera_of(inside.lens, info.width_px, info.height_px)
@@ -250,6 +256,18 @@ def _open_video(path: Path, name: str, telemetry: Path | None, camera: Path | st
     if inside is not None and found is inside.telemetry:
         source.ground_elevation_m = inside.ground_elevation_m
     return source
+
+
+def _video_info(path: Path) -> VideoInfo:
+    try:
+        return read_video_info(path)
+    except InputError as error:
+        if is_telemetry(path):
+            raise InputError(
+                f"{path}: a telemetry file, no video or photo; give the flight's video or photos, and this file as "
+                "--telemetry"
+            ) from error
+        raise
 
 
 def _telemetry_file(telemetry: Path | str | None, *, is_live: bool) -> Path | None:

@@ -51,6 +51,15 @@ def read_telemetry(path: Path) -> Telemetry:
     return TELEMETRY_READERS[reader].read(data, str(path))
 
 
+def is_telemetry(path: Path) -> bool:
+    """Whether a reader recognises the file by its content; what cannot be opened is none."""
+    try:
+        with path.open("rb") as stream:
+            return _reader_for(stream.read(_HEAD_BYTES)) is not None
+    except OSError:
+        return False
+
+
 def find_telemetry_beside(video: Path) -> Path | None:
     """The telemetry file that belongs to a video or to a folder of photos; None where there is no clear one.
 
@@ -70,11 +79,11 @@ def find_telemetry_beside(video: Path) -> Path | None:
     for wanted in (stem, *(pattern.format(stem) for pattern in _BESIDE)):
         for candidate in candidates:
             # "path1.mp4.csv" belongs to path1.mp4 too
-            if candidate.stem.lower() in (wanted, video.name.lower()) and _is_telemetry(candidate):
+            if candidate.stem.lower() in (wanted, video.name.lower()) and is_telemetry(candidate):
                 return candidate
     if any(each.suffix.lower() in _VIDEO_SUFFIXES for each in files):
         return None
-    known = [candidate for candidate in candidates if _is_telemetry(candidate)]
+    known = [candidate for candidate in candidates if is_telemetry(candidate)]
     named = [candidate for candidate in known if "telemetry" in candidate.stem.lower()]
     for group in (named, known):
         if len(group) == 1:
@@ -108,11 +117,3 @@ def _reader_for(head: bytes) -> str | None:
 
 def _is_binary(head: bytes) -> bool:
     return b"\0" in head and head[:2] not in (b"\xff\xfe", b"\xfe\xff")
-
-
-def _is_telemetry(path: Path) -> bool:
-    try:
-        with path.open("rb") as stream:
-            return _reader_for(stream.read(_HEAD_BYTES)) is not None
-    except OSError:
-        return False
