@@ -18,7 +18,9 @@ from sorvolo.geometry.geodesy import Geodetic, Projection
 from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose
+from sorvolo.missions.evaluate_changes import evaluate_changes
 from sorvolo.missions.evaluate_mosaic import evaluate_mosaic
+from sorvolo.missions.evaluate_objects import evaluate_objects
 from sorvolo.mosaic.canvas import Canvas
 from sorvolo.mosaic.canvas_frame import CanvasFrame
 from sorvolo.store.archive import Archive
@@ -182,6 +184,12 @@ def test_wrong_truth_is_refused(site, truth, tmp_path):
         evaluate_mosaic(site, truth=tmp_path / "nothing")
     with pytest.raises(StoreError):
         evaluate_mosaic(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize("measure", [evaluate_mosaic, evaluate_objects, evaluate_changes])
+def test_site_and_truth_that_are_swapped_are_told(site, truth, measure):
+    with pytest.raises(InputError, match=r"a simulation's folder, no site; give the site first, and --truth"):
+        measure(truth, truth=site)
 
 
 def test_the_map_hardly_deviates_from_its_frames(site):

@@ -23,7 +23,14 @@ from sorvolo.change.metrics import (
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Matrix3, PointsM
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.missions.frame_rows import PairedFlights, read_features, site_points, time_ns_of, truth_file
+from sorvolo.missions.frame_rows import (
+    PairedFlights,
+    read_features,
+    refuse_simulation,
+    site_points,
+    time_ns_of,
+    truth_file,
+)
 from sorvolo.missions.mask_folders import MaskScores, compare_mask_folders, has_masks
 from sorvolo.store.archive import Archive
 from sorvolo.store.exports import plain_json
@@ -69,6 +76,7 @@ def evaluate_changes(
     `least_px` how many changed pixels make a frame positive. Raises InputError for folders that hold neither, or not
     the same frames.
     """
+    refuse_simulation(found)
     is_site = (found / "flights").is_dir()
     true_flights = _true_flights(truth)
     if not is_site:

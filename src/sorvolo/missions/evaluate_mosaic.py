@@ -14,7 +14,15 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Anything, Floats, ImageGray, ImageRGBA, Mask, PointsPx
 from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.grid import SiteGrid, TileIndex
-from sorvolo.missions.frame_rows import FrameRow, frame_row, map_frames, read_features, site_points, truth_file
+from sorvolo.missions.frame_rows import (
+    FrameRow,
+    frame_row,
+    map_frames,
+    read_features,
+    refuse_simulation,
+    site_points,
+    truth_file,
+)
 from sorvolo.mosaic.canvas_frame import CanvasFrame, coverage, warp
 from sorvolo.mosaic.quality import (
     DEVIATION_BINS,
@@ -122,6 +130,7 @@ def evaluate_mosaic(
     InputError for files that cannot be read or belong to another place, StoreError for a folder that is no
     site.
     """
+    refuse_simulation(site)
     with Archive.open(site, write=False) as archive:
         described = archive.site()
         flights = map_frames(site, described)

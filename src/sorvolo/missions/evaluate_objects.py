@@ -15,7 +15,14 @@ from scipy.optimize import linear_sum_assignment
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Floats, Matrix3
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.missions.frame_rows import PairedFlights, read_features, site_points, time_ns_of, truth_file
+from sorvolo.missions.frame_rows import (
+    PairedFlights,
+    read_features,
+    refuse_simulation,
+    site_points,
+    time_ns_of,
+    truth_file,
+)
 from sorvolo.store.archive import Archive
 from sorvolo.survey.flight import Site
 from sorvolo.survey.objects import CLASSES
@@ -92,6 +99,7 @@ def evaluate_objects(site: Path, truth: Path, *, flight: str | None = None) -> t
     `flight` is one of the site's flights; None: all that were searched and that the truth knows. Raises InputError for
     folders that do not hold what is needed, SettingsError for a flight that was not searched.
     """
+    refuse_simulation(site)
     frames_file = truth_file(truth)
     folder = frames_file.parent
     with Archive.open(site, write=False) as archive:

@@ -14,6 +14,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, Matrix3
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.store.site_folder import CATALOGUE
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 
@@ -42,6 +43,12 @@ def map_frames(site: Path, described: Site) -> dict[str, list[FrameRow]]:
     return {
         path.parent.name: [frame_row(each, described.frame, path) for each in read_features(path)] for path in files
     }
+
+
+def refuse_simulation(site: Path) -> None:
+    """Raise InputError for the folder of a simulation: the likely slip is that site and truth are swapped."""
+    if not (site / CATALOGUE).is_file() and (site / "truth" / "frames.geojson").is_file():
+        raise InputError(f"{site}: a simulation's folder, no site; give the site first, and --truth {site}")
 
 
 def truth_file(truth: Path) -> Path:
