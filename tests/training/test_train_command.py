@@ -251,7 +251,8 @@ def test_labels_are_checked_before_anything_is_simulated(data: Path, tmp_path: P
 
 def test_bad_input_is_told(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def words(*arguments: str) -> str:
-        assert main(["train", *arguments, "--out", str(tmp_path / "out")]) == 1
+        assert main(["train", *arguments, "--out", str(tmp_path / "new" / "out")]) == 1
+        assert not (tmp_path / "new").exists()
         return " ".join(capsys.readouterr().err.split())
 
     place = str(data)

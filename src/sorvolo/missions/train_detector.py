@@ -4,7 +4,7 @@ import math
 import os
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -105,7 +105,13 @@ def train_detector(
     resuming with other settings or data; StoreError on a full disk.
     """
     device = device_of(device)
-    _claim(out, resume)
+    with _claimed(out, resume):
+        yield from _train(places, out, settings, options, device, resume)
+
+
+def _train(
+    places: Sequence[Path], out: Path, settings: TrainSettings, options: DataOptions, device: str, resume: bool
+) -> Iterator[TrainingUpdate]:
     start = load_start(settings.weights, settings.preset)
     steps = settings.steps
     yield TrainingUpdate(0, steps, "reading the labels")
@@ -137,16 +143,27 @@ def train_detector(
     yield TrainingUpdate(run.learner.step, steps, f"{out / MODEL} is ready", check=check, notices=told)
 
 
-def _claim(out: Path, resume: bool) -> None:
-    """Make the folder; raise SettingsError unless it is free, or holds what is to be gone on from."""
+@contextmanager
+def _claimed(out: Path, resume: bool) -> Iterator[None]:
+    """Make the folder; raise SettingsError unless it is free, or holds what is to be gone on from.
+
+    What was made is gone again when nothing came into it, as after an error before the first step.
+    """
     held = (out / CHECKPOINT).is_file()
     if resume and not held:
         raise SettingsError(f"{out} holds no {CHECKPOINT} to go on from; leave --resume out to start there")
     if held and not resume:
         raise SettingsError(f"{out} already holds a run; --resume goes on with it, another --out starts anew")
+    made = [each for each in (out, *out.parents) if not each.exists()]
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         remove_leftovers([out])
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # a folder that holds something stays
+            for each in made:
+                each.rmdir()
 
 
 class _Reader:
