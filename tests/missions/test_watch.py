@@ -276,9 +276,14 @@ def test_those_who_want_it_are_told(flown: Path, detector: TruthDetector, tmp_pa
 def test_only_the_classes_asked_for_in_the_frames_asked_for(
     flown: Path, detector: TruthDetector, tmp_path: Path
 ) -> None:
-    settings = WatchSettings(classes=("car",), every=2)
+    settings = WatchSettings(classes=("car",), every=7)
     updates = _watch(flown, tmp_path / "watch", detector, settings, save="pictures")
-    assert [int(update.frame_name) % 2 for update in updates] == [0] * len(updates)
+    with av.open(str(_video(flown))) as container:
+        frames = sum(1 for _ in container.decode(video=0))
+    assert frames % 7 != 1, "frames follow the last one that is searched"
+    counts = _read(tmp_path / "watch" / "report.json")["frames"]
+    assert (counts["read"], counts["detected"]) == (frames, len(updates)) == (frames, -(-frames // 7))
+    assert [int(update.frame_name) % 7 for update in updates] == [0] * len(updates)
     lines = [json.loads(line) for line in (tmp_path / "watch" / "detections.jsonl").read_text().splitlines()]
     assert {line["class"] for line in lines} == {"car"}
     pictures = {int(path.stem) for path in (tmp_path / "watch" / "annotated").iterdir()}

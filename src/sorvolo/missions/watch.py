@@ -84,13 +84,16 @@ def _watch_one(
     with WatchRun(setup, places, detector, settings, outputs, folder) as run:
         ended = _STOPPED
         try:
-            with closing(_arrivals(source, _wanted(source, settings))) as arrivals:
+            asked = _Asked(_wanted(source, settings))
+            with closing(_arrivals(source, asked)) as arrivals:
                 for arrived_s, each in arrivals:
                     if isinstance(each, Frame):
                         yield run.add(each, arrived_s)
                     else:
                         run.lose(each)
             ended = "the source ended"
+            if not isinstance(source, LiveSource):
+                run.log.read = asked.frames  # also those after the last one that was searched
         except KeyboardInterrupt:
             pass  # the usual way to end a live watch: what was found is written below
         except Exception as error:
@@ -102,6 +105,18 @@ def _watch_one(
         if not run.log.detected and ended != _STOPPED:
             reason = next(iter(run.log.lost), "the source holds none")
             raise InputError(f"no frame of {source.name} could be searched: {reason}; `sorvolo inspect` tells more")
+
+
+class _Asked:
+    """Which frames are wanted; `frames` counts how many a source has come to when it asks."""
+
+    def __init__(self, wanted: Callable[[int, int], bool]) -> None:
+        self._wanted = wanted
+        self.frames = 0
+
+    def __call__(self, index: int, time_ns: int) -> bool:
+        self.frames = index + 1
+        return self._wanted(index, time_ns)
 
 
 def _arrivals(
