@@ -88,12 +88,20 @@ def test_wrong_usage_is_2(arguments: list[str], capsys: pytest.CaptureFixture[st
     assert told.out == "" and "Usage" in told.err
 
 
-def test_an_error_is_one_line_on_stderr(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    missing = tmp_path / "gone.mp4"
-    assert cli.main(["inspect", str(missing)]) == 1
+@pytest.mark.parametrize("arguments", [
+    ["inspect", "{gone}"], ["map", "{gone}", "--site", "{made}", "--model", "none"], ["watch", "{gone}"],
+    ["compare", "{gone}", "--site", "{made}"], ["simulate", "{file}"],
+    ["simulate", "{file}", "--pictures", "2"], ["simulate", "{file}", "--pictures", "2", "--json"],
+])
+def test_an_error_is_one_line_on_stderr(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = {"gone": tmp_path / "gone.mp4", "made": tmp_path / "made", "file": tmp_path / "file"}
+    names["file"].touch()
+    assert cli.main([each.format(**names) for each in arguments]) == 1
     told = capsys.readouterr()
     assert told.out == ""
-    assert told.err.startswith("error: ") and str(missing) in told.err
+    assert told.err.startswith("error: ") and any(str(path) in told.err for path in names.values())
     assert told.err.count("\n") == 1 and "Traceback" not in told.err
 
 

@@ -28,7 +28,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     """The one line that a command, which must fail with code 1, says on stderr."""
     capsys.readouterr()
     assert cli.main(["map", "--model", "none", *map(str, arguments)]) == 1
-    told = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
+    told = capsys.readouterr().err.splitlines()
     assert len(told) == 1 and told[0].startswith("error: ") and "bug" not in told[0], told
     return told[0]
 

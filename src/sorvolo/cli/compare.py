@@ -11,11 +11,12 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.cli.map import ended_by_signal, newest_version, read_json, tell_notices_and_warnings, tell_path
+from sorvolo.cli.progress import bars
 from sorvolo.missions.compare_flights import compare_flights
 from sorvolo.missions.settings import CompareSettings
 from sorvolo.store.archive import Archive
@@ -131,7 +132,7 @@ def _show_progress(updates: Any, site: Path, console: Console) -> list[str]:
     )
     told_ids: list[str] = []
     unit = ""
-    with Progress(*columns, console=console, transient=True) as progress:
+    with bars(*columns, console=console) as progress:
         task = progress.add_task("opening", total=None, told="")
         update: CompareUpdate
         for update in updates:

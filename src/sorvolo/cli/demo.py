@@ -7,11 +7,12 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from sorvolo import __version__
 from sorvolo.cli.compare import compare_and_read_results, show_results
 from sorvolo.cli.map import map_and_read_reports, show_reports
+from sorvolo.cli.progress import bars
 from sorvolo.missions.evaluate_changes import evaluate_changes
 from sorvolo.missions.evaluate_mosaic import evaluate_mosaic
 from sorvolo.missions.settings import CompareSettings, MapSettings
@@ -81,7 +82,7 @@ def _simulate(folder: Path, settings: SimulationSettings) -> None:
     columns = (
         SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=30), TimeRemainingColumn()
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    with bars(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task("the site", total=None)
         for step in simulate_site(folder, settings):
             if step.stage == "frames":

@@ -12,6 +12,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from sorvolo import __version__
+from sorvolo.cli.progress import bars
 from sorvolo.detection.intervals import Interval
 from sorvolo.detection.scores import SetComparison, SetScores
 from sorvolo.errors import SettingsError
@@ -72,7 +73,7 @@ def detector(
         data, form=form, classes=_pairs(classes) or None, ignore=_names(ignore), unlabelled=_names(unlabelled),
         group_pattern=group_pattern, videos=videos, held_out=held_out, seed=seed, known=known_classes(arms),
     )
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with bars(*Progress.get_default_columns(), console=Console(stderr=True)) as progress:
         bar = progress.add_task("looking", total=None)
         measured = evaluate_detector(
             arms, labelled, settings,

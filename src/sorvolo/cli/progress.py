@@ -1,11 +1,19 @@
-"""How far a mapping is, told on the terminal while it runs."""
+"""Bars on a terminal while something runs, and what they say of a mapping."""
 
 from collections.abc import Iterable
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from sorvolo.survey.mosaic import MosaicUpdate
+
+
+def bars(*columns: ProgressColumn, console: Console, stay: bool = False) -> Progress:
+    """Bars that are gone at the end unless they `stay`; nothing where no terminal shows them.
+
+    rich itself ends bars that nobody sees with an empty line, which would stand before an error's.
+    """
+    return Progress(*columns, console=console, transient=not stay, disable=not console.is_interactive)
 
 
 def show_progress(updates: Iterable[MosaicUpdate], console: Console) -> int:
@@ -18,7 +26,7 @@ def show_progress(updates: Iterable[MosaicUpdate], console: Console) -> int:
         TextColumn("{task.fields[told]}"), TimeRemainingColumn(),
     )
     count, before = 0, None
-    with Progress(*columns, console=console, transient=True) as progress:
+    with bars(*columns, console=console) as progress:
         task = progress.add_task("opening", total=None, told="")
         for update in updates:
             count += 1

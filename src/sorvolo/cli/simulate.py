@@ -11,12 +11,12 @@ from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
-    Progress,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
 
+from sorvolo.cli.progress import bars
 from sorvolo.errors import SettingsError
 from sorvolo.missions.simulate_pictures import simulate_pictures
 from sorvolo.missions.simulate_site import SimulationProgress, simulate_site
@@ -130,7 +130,7 @@ def _picture_folder(
 ) -> None:
     last = None
     console = Console(stderr=as_json)
-    with Progress(*_COLUMNS, console=console) as progress:
+    with bars(*_COLUMNS, console=console, stay=True) as progress:
         bar = progress.add_task("pictures", total=settings.pictures)
         for last in simulate_pictures(folder, settings, ground_file, ground_gsd):
             progress.update(bar, completed=last.pictures_done)
@@ -162,13 +162,13 @@ def _size(text: str) -> dict[str, object]:
 def _show(steps: Iterator[SimulationProgress], folder: Path) -> None:
     console = Console()
     last = None
-    with Progress(*_COLUMNS, console=console) as progress:
-        bars: dict[str, int] = {}
+    with bars(*_COLUMNS, console=console, stay=True) as progress:
+        tasks: dict[str, int] = {}
         for last in steps:
             if last.stage == "frames":
-                if last.flight not in bars:
-                    bars[last.flight] = int(progress.add_task(last.flight, total=last.frames_total))
-                progress.update(progress.task_ids[bars[last.flight]], completed=last.frames_done)
+                if last.flight not in tasks:
+                    tasks[last.flight] = int(progress.add_task(last.flight, total=last.frames_total))
+                progress.update(progress.task_ids[tasks[last.flight]], completed=last.frames_done)
     if last is not None:
         console.print(f"{last.frames_done} frames in {last.seconds:.0f} s: {folder}")
         console.print(f"the truth is in {folder / 'truth'}; the camera in {folder / 'camera.xml'}")

@@ -12,11 +12,12 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.cli.map import read_json, tell_path
+from sorvolo.cli.progress import bars
 from sorvolo.errors import SettingsError
 from sorvolo.missions.watch import watch
 from sorvolo.missions.watch_run import WatchUpdate
@@ -129,7 +130,7 @@ def _show_progress(updates: Iterator[WatchUpdate], console: Console, *, is_quiet
         SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=24),
         TextColumn("{task.fields[told]}"), TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True) as progress:
+    with bars(*columns, console=console) as progress:
         task = progress.add_task("opening", total=None, told="")
         for update in updates:
             for track in update.new if not is_quiet else ():
