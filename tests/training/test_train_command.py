@@ -257,7 +257,7 @@ def test_bad_input_is_told(data: Path, tmp_path: Path, capsys: pytest.CaptureFix
 
     place = str(data)
     assert "neither an existing data set nor a share" in words(place, "--val", "gone")
-    assert "share to check on must lie in 0 to below 1" in words(place, "--val", "1.5")
+    assert "share to check on (--val) must lie in 0 to below 1" in words(place, "--val", "1.5")
     assert "no data to learn from" in words()
     assert "does not exist" in words(str(tmp_path / "gone"))
     assert "side_px must be a multiple of 32, got 100" in words(place, "--side", "100")

@@ -25,13 +25,13 @@ class MapSettings:
         if self.method not in ("planar", "thesis"):
             raise SettingsError(f"method must be planar or thesis, got {self.method!r}")
         if self.m_per_px is not None and not 1e-4 <= self.m_per_px <= 100:
-            raise SettingsError(f"the ground sampling distance must lie in 0.0001 to 100 m, got {self.m_per_px}")
+            raise SettingsError(f"the ground sampling distance (--gsd) must lie in 1e-4 to 100 m, got {self.m_per_px}")
         if not 0 < self.overlap < 1:
             raise SettingsError(f"overlap must lie between 0 and 1, got {self.overlap}")
         if self.crs is not None:
             check_map_crs(self.crs)
         if self.offset_s is not None and not abs(self.offset_s) <= 86_400 * 365:
-            raise SettingsError(f"the clock offset must be a number of seconds, got {self.offset_s}")
+            raise SettingsError(f"the clock offset (--offset) must be at most a year, 31536000 s, got {self.offset_s}")
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class CompareSettings:
         if self.side_px is not None and not 256 <= self.side_px <= 8192:
             raise SettingsError(f"frames are compared at 256 to 8192 px, got {self.side_px}")
         if self.offset_s is not None and not abs(self.offset_s) <= 86_400 * 365:
-            raise SettingsError(f"the clock offset must be a number of seconds, got {self.offset_s}")
+            raise SettingsError(f"the clock offset (--offset) must be at most a year, 31536000 s, got {self.offset_s}")
 
     @property
     def mapping(self) -> MapSettings:

@@ -176,7 +176,7 @@ def _share_of(val: str) -> float | None:
     except ValueError as error:
         raise SettingsError(f"--val {val} is neither an existing data set nor a share such as 0.15") from error
     if not 0 <= share < 1:
-        raise SettingsError(f"the share to check on must lie in 0 to below 1, got {val}")
+        raise SettingsError(f"the share to check on (--val) must lie in 0 to below 1, got {val}")
     return share
 
 
