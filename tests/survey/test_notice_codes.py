@@ -1,0 +1,23 @@
+"""The codes of notices are promised to be stable: each is told in the documentation."""
+
+import re
+from pathlib import Path
+
+import sorvolo
+from sorvolo.store.datasets.parsed import FINDINGS
+
+_DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+def _codes() -> set[str]:
+    source = "\n".join(path.read_text() for path in Path(sorvolo.__file__).parent.rglob("*.py"))
+    told = set(re.findall(r'\b[Nn]otice\(\s*"(\w+)"', source)) | set(re.findall(r'\.notices\("(\w+)"\)', source))
+    outboxes = re.findall(r'Outbox\([^\n]*code="(\w+)"', source)
+    return told | {f"{name}_{end}" for name in outboxes for end in ("failed", "dropped")} | set(FINDINGS)
+
+
+def test_every_code_is_documented() -> None:
+    codes = _codes()
+    assert {"truncated", "ground_unknown", "telemetry_outage", "alert_url_failed"} <= codes
+    docs = "".join((_DOCS / name).read_text() for name in ("formats.md", "formats-in.md"))
+    assert not {code for code in codes if f"`{code}`" not in docs}
