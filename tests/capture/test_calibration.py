@@ -1,8 +1,6 @@
 """Camera files in every dialect, broken ones, presets, EXIF and the honest guess."""
 
 import math
-import os
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,12 +9,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from real_data import real_data
 from sorvolo.capture.calibration import camera_from_option, camera_xml, guess_camera, read_camera
 from sorvolo.capture.camera_presets import CAMERA_PRESETS, find_preset
 from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera
 
-DATA = Path(os.environ.get("SORVOLO_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 LENS = np.array([-0.2, 0.1, 0.001, -0.002, -0.03])  # k1 k2 p1 p2 k3
 CAMERA = Camera(1920, 1080, 1500.0, 1501.5, 955.25, 541.0, LENS)
 
@@ -355,10 +353,7 @@ def test_camera_options_that_mean_nothing(option, message):
 
 
 def test_a_real_phantom_3_photo_is_recognised():
-    photo = DATA / "flights" / "brighton_beach" / "DJI_0018.JPG"
-    if not photo.exists():
-        pytest.skip(f"real photo not here: {photo.name} of brighton_beach")
-    exif = Image.open(photo).getexif()
+    exif = Image.open(real_data("flights/brighton_beach/DJI_0018.JPG")).getexif()
     found = guess_camera(4000, 2250, make=exif[271], model=exif[272], focal_length_mm=3.61)
     assert "Phantom 3" in found.origin
     assert found.camera.fx_px == pytest.approx(2329, abs=1)

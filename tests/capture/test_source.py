@@ -1,12 +1,12 @@
 """Inputs as flights: what becomes a flight, under which name, with which camera and telemetry."""
 
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from real_data import real_data
 from sorvolo.capture.photos import PhotoSource
 from sorvolo.capture.source import open_sources, safe_name
 from sorvolo.errors import InputError
@@ -180,16 +180,8 @@ def test_a_playlist_reads_no_other_file(tmp_path: Path) -> None:
         open_sources([playlist])
 
 
-def real_flight(name: str) -> Path:
-    data = Path(os.environ.get("SORVOLO_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
-    folder = data / "flights" / name
-    if not folder.exists():
-        pytest.skip(f"the real flight {name} is not here")
-    return folder
-
-
 def test_real_phantom_photos() -> None:
-    (source,) = open_sources([real_flight("brighton_beach")])
+    (source,) = open_sources([real_data("flights/brighton_beach")])
     assert isinstance(source, PhotoSource)
     assert source.frame_count == len(source.telemetry) == 18
     assert np.abs(source.telemetry["height_above_takeoff_m"] - 40).max() < 0.5
@@ -202,7 +194,7 @@ def test_real_phantom_photos() -> None:
 
 
 def test_real_canon_photos_are_timed_evenly() -> None:
-    (source,) = open_sources([real_flight("caliterra")])
+    (source,) = open_sources([real_data("flights/caliterra")])
     assert source.frame_count == len(source.telemetry) == 75
     steps_s = np.diff(source.telemetry.time_ns) / 1e9
     assert steps_s.min() >= 2 and np.median(steps_s) == 2
@@ -210,6 +202,6 @@ def test_real_canon_photos_are_timed_evenly() -> None:
 
 
 def test_a_real_video() -> None:
-    (source,) = open_sources([real_flight("pond_video")])
+    (source,) = open_sources([real_data("flights/pond_video")])
     counted = sum(1 for _ in source.frames(lambda index, time_ns: index % 100 == 0))
     assert source.frame_count == 558 and counted == 6 and source.notices() == ()

@@ -1,19 +1,17 @@
 """DJI subtitles: one round trip per dialect, the order of the coordinates, clocks, broken and real files."""
 
-import os
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from real_data import real_data
 from sorvolo.capture.telemetry import dji_srt
 from sorvolo.errors import InputError
 
 SECOND_NS = 1_000_000_000
-DATA = Path(os.environ.get("SORVOLO_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 
 DIALECTS = {
     "brackets": "<font size=\"28\">FrameCnt: {n}, DiffTime: 20ms\n2021-12-25 12:27:{s:02d}.000\n"
@@ -197,10 +195,7 @@ def test_mutated_files_raise_only_input_errors(data):
 
 
 def real(name: str) -> bytes:
-    path = DATA / "telemetry" / "dji_srt" / name
-    if not path.is_file():
-        pytest.skip(f"needs {path.name} of the shared data")
-    return path.read_bytes()
+    return real_data(f"telemetry/dji_srt/{name}").read_bytes()
 
 
 # file, cues, first and last (latitude, longitude, height above take-off), first time

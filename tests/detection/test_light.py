@@ -1,14 +1,11 @@
 """Whether a frame is thermal, and raw heat made visible."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 
+from real_data import real_data
 from sorvolo.detection.light import is_thermal, rgb_from_picture
-
-_DATA = Path(__file__).parents[2].parent / "shared" / "data" / "detection"
 
 
 @pytest.fixture
@@ -55,10 +52,9 @@ def test_a_dead_pixel_does_not_darken_the_frame(heat: np.ndarray) -> None:
     assert np.median(difference) < 3
 
 
-@pytest.mark.skipif(not _DATA.is_dir(), reason="needs ../shared/data/detection")
 def test_real_pictures() -> None:
     for folder, expected in (("hituav", True), ("sdd", False), ("tinyperson", False), ("cats", False)):
-        paths = sorted((_DATA / folder / "images").rglob("*.*"))
+        paths = sorted(real_data(f"detection/{folder}/images").rglob("*.*"))
         for path in paths[:: max(1, len(paths) // 8)]:
             picture = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
             assert is_thermal(picture) is expected, path.name

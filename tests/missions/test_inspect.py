@@ -1,7 +1,6 @@
 """The preflight: numbers that follow from the flight, and findings that say what to do."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from PIL.TiffImagePlugin import IFDRational
 from typer import Typer
 from typer.testing import CliRunner
 
+from real_data import real_data
 from sorvolo.cli.inspect import inspect
 from sorvolo.geometry.track import find_strips, length_m, speeds_m_s
 from sorvolo.missions.inspect_input import Inspection, Level, inspect_input
@@ -233,9 +233,6 @@ def test_a_circle_has_no_strips_and_a_hover_no_speed() -> None:
 
 
 def test_the_real_flight_is_described_as_it_was_flown() -> None:
-    data = Path(os.environ.get("SORVOLO_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
-    if not (folder := data / "flights" / "brighton_beach").exists():
-        pytest.skip("the real flight brighton_beach is not here")
-    flight = one(folder).flight
+    flight = one(real_data("flights/brighton_beach")).flight
     assert flight.height_m == pytest.approx(40.1, abs=0.2) and flight.gsd_m == pytest.approx(0.017, abs=0.001)
     assert flight.strips == 3 and 0.5 < flight.side_overlap < 0.75 and 0.5 < flight.forward_overlap < 0.75

@@ -1,8 +1,6 @@
 """The canvas: seamless tiles, the same picture whatever the order, and no more work than a change needs."""
 
-import os
 import time
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from real_data import real_data
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.grid import Grid
 from sorvolo.geometry.homography import apply_homography
@@ -282,10 +281,7 @@ def test_painting_a_frame_stays_cheap():
 
 
 def test_real_photos_blend_without_visible_seams():
-    data = Path(os.environ.get("SORVOLO_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
-    photos = sorted((data / "flights" / "brighton_beach").rglob("*.[jJ][pP][gG]"))
-    if not photos:
-        pytest.skip("real flight brighton_beach is missing")
+    photos = sorted(real_data("flights/brighton_beach").rglob("*.[jJ][pP][gG]"))
     photo = cv2.cvtColor(cv2.imread(str(photos[0]), cv2.IMREAD_REDUCED_COLOR_4), cv2.COLOR_BGR2RGB)
     photo = photo[:520, :960]
     frames, images = [], {}

@@ -10,13 +10,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from real_data import real_data
 from sorvolo.errors import InputError, SettingsError, SorvoloError
 from sorvolo.store.datasets import READERS, read_dataset, read_datasets
 from sorvolo.store.datasets.checking import turned
 from sorvolo.store.datasets.groups import group_of
 from sorvolo.store.datasets.yolo import names_in_yaml
-
-DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "detection"
 
 FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -563,7 +562,6 @@ def test_names_in_yaml_come_back_in_each_way_of_writing(names):
 # Real sets
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the data folder is not there")
 @pytest.mark.parametrize("name, options, expected", [
     ("hituav", {}, {"person": 9349, "car": 6068}),
     ("aerial_cars", {"classes": {"car": "car", "truck": "car", "minibus": "car"}}, {"car": 935}),
@@ -573,9 +571,7 @@ def test_names_in_yaml_come_back_in_each_way_of_writing(names):
     ("sdd", {}, {"person": 89, "car": 1}),
 ])
 def test_the_real_sets_have_the_boxes_that_their_files_list(name, options, expected):
-    if not (DATA / name).is_dir():
-        pytest.skip(f"{name} is not there")
-    labelled = read_dataset(DATA / name, **options)
+    labelled = read_dataset(real_data(f"detection/{name}"), **options)
     found = Counter(labelled.classes[label] for each in labelled.pictures for label in each.labels)
     assert found == expected
     assert all(os.path.isfile(each.path) for each in labelled.pictures)
