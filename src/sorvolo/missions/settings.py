@@ -31,7 +31,7 @@ class MapSettings:
         if self.crs is not None:
             check_map_crs(self.crs)
         if self.offset_s is not None and not abs(self.offset_s) <= 86_400 * 365:
-            raise SettingsError(f"the clock offset (--offset) must be at most a year, 31536000 s, got {self.offset_s}")
+            raise SettingsError(f"the clock offset (--offset) must be a year of seconds at most, got {self.offset_s}")
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class CompareSettings:
         if self.side_px is not None and not 256 <= self.side_px <= 8192:
             raise SettingsError(f"frames are compared at 256 to 8192 px, got {self.side_px}")
         if self.offset_s is not None and not abs(self.offset_s) <= 86_400 * 365:
-            raise SettingsError(f"the clock offset (--offset) must be at most a year, 31536000 s, got {self.offset_s}")
+            raise SettingsError(f"the clock offset (--offset) must be a year of seconds at most, got {self.offset_s}")
 
     @property
     def mapping(self) -> MapSettings:

@@ -43,7 +43,7 @@ class WatchSettings:
         if self.height_model and self.ground_elevation_m is not None:
             raise SettingsError("give a height model or the ground's elevation, not both")
         if self.offset_s is not None and not abs(self.offset_s) <= 86_400 * 365:
-            raise SettingsError(f"the clock offset (--offset) must be at most a year, 31536000 s, got {self.offset_s}")
+            raise SettingsError(f"the clock offset (--offset) must be a year of seconds at most, got {self.offset_s}")
 
 
 @dataclass(frozen=True)
