@@ -21,6 +21,7 @@ from sorvolo.errors import StoreError
 from sorvolo.missions.map_flight import map_flights
 from sorvolo.missions.settings import MapSettings
 from sorvolo.store.archive import Archive
+from sorvolo.store.site_folder import CATALOGUE
 from sorvolo.survey.mosaic import Status
 
 _COLOURS = {Status.VISION: "green", Status.GPS_ONLY: "yellow", Status.REJECTED: "red"}
@@ -224,7 +225,7 @@ def _map_files(site: Path) -> dict[str, Path]:
 
 def newest_version(site: Path) -> int:
     """The id of the site's newest version; 0 where there is no site yet."""
-    if not (site / "site.db").is_file():
+    if not (site / CATALOGUE).is_file():
         return 0
     with Archive.open(site, write=False) as archive:
         return max((each.id for each in archive.versions() if each.complete), default=0)

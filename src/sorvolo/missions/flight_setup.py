@@ -15,6 +15,7 @@ from sorvolo.geometry.geodesy import Geodetic, LocalFrame, utm_epsg
 from sorvolo.missions.settings import MapSettings
 from sorvolo.mosaic.selection import interval_s
 from sorvolo.store.archive import Archive
+from sorvolo.store.site_folder import CATALOGUE
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import CameraPrior, Frame, Notice, PosedFrame, Site, Telemetry, no_telemetry
 
@@ -189,7 +190,7 @@ def prepare(
 
 def known_flights(site: Path) -> dict[str, str]:
     """The fingerprint of each flight that the site folder has, by name; none where there is no site yet."""
-    if not (site / "site.db").is_file():
+    if not (site / CATALOGUE).is_file():
         return {}
     with Archive.open(site, write=False) as archive:
         return {each.id: each.fingerprint for each in archive.flights()}

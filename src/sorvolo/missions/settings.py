@@ -6,6 +6,14 @@ from typing import Literal
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import check_map_crs
 
+_MOST_OFFSET_S = 86_400 * 365
+
+
+def check_offset(offset_s: float | None) -> None:
+    """Raise SettingsError for a clock offset, s, that no clock has; None leaves it to the clocks."""
+    if offset_s is not None and not abs(offset_s) <= _MOST_OFFSET_S:
+        raise SettingsError(f"the clock offset (--offset) must be a year of seconds at most, got {offset_s}")
+
 
 @dataclass(frozen=True)
 class MapSettings:
@@ -30,8 +38,7 @@ class MapSettings:
             raise SettingsError(f"overlap must lie between 0 and 1, got {self.overlap}")
         if self.crs is not None:
             check_map_crs(self.crs)
-        if self.offset_s is not None and not abs(self.offset_s) <= 86_400 * 365:
-            raise SettingsError(f"the clock offset (--offset) must be a year of seconds at most, got {self.offset_s}")
+        check_offset(self.offset_s)
 
 
 @dataclass(frozen=True)
@@ -61,8 +68,7 @@ class CompareSettings:
             )
         if self.side_px is not None and not 256 <= self.side_px <= 8192:
             raise SettingsError(f"frames are compared at 256 to 8192 px, got {self.side_px}")
-        if self.offset_s is not None and not abs(self.offset_s) <= 86_400 * 365:
-            raise SettingsError(f"the clock offset (--offset) must be a year of seconds at most, got {self.offset_s}")
+        check_offset(self.offset_s)
 
     @property
     def mapping(self) -> MapSettings:

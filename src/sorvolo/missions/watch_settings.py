@@ -7,6 +7,7 @@ from typing import Literal
 
 from sorvolo.errors import SettingsError
 from sorvolo.missions import alerts
+from sorvolo.missions.settings import check_offset
 from sorvolo.store.cursor_on_target import COT_TYPES, cot_place
 
 DEFAULT_FRAMES_PER_SECOND = 10.0
@@ -42,8 +43,7 @@ class WatchSettings:
             raise SettingsError(f"frames a second must lie in 0.001 to 1000, got {self.frames_per_second}")
         if self.height_model and self.ground_elevation_m is not None:
             raise SettingsError("give a height model or the ground's elevation, not both")
-        if self.offset_s is not None and not abs(self.offset_s) <= 86_400 * 365:
-            raise SettingsError(f"the clock offset (--offset) must be a year of seconds at most, got {self.offset_s}")
+        check_offset(self.offset_s)
 
 
 @dataclass(frozen=True)
