@@ -128,6 +128,7 @@ def test_settings_out_of_range_are_errors(
 @pytest.mark.parametrize(("options", "words"), [
     (["--thermal", "0.3"], "give their number with --pictures"), (["--ground", "urbn"], "none of dirt, countryside"),
     (["--pictures", "3", "--preset", "survey", "--fps", "5"], "leave out --preset, --fps"),
+    (["--pictures", "3", "--gps-noise", "0"], "leave out --gps-noise"),
 ])
 def test_simulate_leaves_no_option_unheard(
     options: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

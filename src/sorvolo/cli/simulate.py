@@ -87,10 +87,11 @@ def simulate(
     if pictures is not None:
         of_flights = {
             "--preset": preset_name != "demo", "--flights": flights, "--gps-noise": gps_noise, "--gps-rate": gps_rate,
-            "--clock-offset": clock_offset, "--telemetry": telemetry, "--faults": faults, "--speed": speed,
+            "--clock-offset": clock_offset, "--telemetry": telemetry, "--faults": faults or None, "--speed": speed,
             "--length": length, "--strips": strips, "--tilt": tilt, "--fps": fps, "--size": size, "--photos": photos,
         }
-        if given := [name for name, value in of_flights.items() if value not in (None, False, "")]:
+        given = [name for name, value in of_flights.items() if value is not None and value is not False and value != ""]
+        if given:
             raise SettingsError(f"--pictures makes single pictures, no flights: leave out {', '.join(given)}")
         wanted = PictureSettings(
             pictures, 1 if seed is None else seed, ground if ground_file is None else "orthophoto", thermal
