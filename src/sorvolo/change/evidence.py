@@ -153,10 +153,12 @@ class EvidenceMap:
         for change in self._found.values():
             if not change.is_told:
                 self._told(change, -1)
-            elif not (self._is_sure(change) and self._is_thing(change)) or self._passed(change):
+                continue
+            whole = self._change(change) if self._is_sure(change) else None
+            if whole is None or not self._is_thing(change, whole) or self._passed(change):
                 change.is_taken_back = True
             else:
-                self._part(change, -1)
+                self._part(change, -1, whole)
         return self.changes()
 
     def _passed(self, change: GatheredChange) -> bool:
@@ -166,9 +168,9 @@ class EvidenceMap:
             return False
         return self._movers.were_at(*change.cells.box_m(self._cell_m), change.first_seen_ns, change.last_seen_ns)
 
-    def _part(self, change: GatheredChange, now_ns: int) -> list[Change]:
-        """Tell the things in a change from each other as its pictures now show them; those told for the first time."""
-        whole = self._change(change)
+    def _part(self, change: GatheredChange, now_ns: int, whole: Change | None) -> list[Change]:
+        """Tell the things in a change, whose record is `whole`, from each other as its pictures now show them; those
+        told for the first time."""
         if whole is None:
             return []
         things = change.parted(whole, self._cells_of(change), self._cell_m, self._join_m)
@@ -295,15 +297,17 @@ class EvidenceMap:
         if change.is_told:
             parts = self._parts.get(change.number)
             is_due = now_ns >= 0 and (parts is None or parts.is_due(change.views))
-            return self._part(change, now_ns) if is_due else []
-        if not self._is_sure(change) or not self._is_thing(change):
+            return self._part(change, now_ns, self._change(change)) if is_due else []
+        whole = self._change(change) if self._is_sure(change) else None
+        if whole is None or not self._is_thing(change, whole):
             return []
         change.is_told, change.announced_ns = True, now_ns
-        return self._part(change, now_ns)
+        return self._part(change, now_ns, replace(whole, announced_ns=now_ns))
 
-    def _is_thing(self, change: GatheredChange) -> bool:
-        whole = self._change(change)
-        if whole is None or is_of_shade(whole):
+    @staticmethod
+    def _is_thing(change: GatheredChange, whole: Change) -> bool:
+        """Whether the record of a change is of a thing: neither of shade nor large and unsure."""
+        if is_of_shade(whole):
             return False
         may_be_a_wall = whole.area_m2 >= _LARGE_M2 and whole.length_m < change.flying_height_m
         return not may_be_a_wall or change.score >= _LARGE_SCORE or change.is_from_one_place
