@@ -65,6 +65,13 @@ def test_a_car_that_left_right_beside_one_that_came_is_another_thing(whole):
     assert things[ChangeKind.DISAPPEARED][50, 100] and not things[ChangeKind.DISAPPEARED][50, 55]
 
 
+def test_a_car_that_came_touching_the_place_of_one_that_left_has_replaced_it():
+    patch = patch_with((np.s_[10:95], np.s_[40:75], (30, 60, 150)))
+    patch.before[10:95, 77:112, :3] = (215, 215, 210)
+    patch.changed[10:95, 40:112] = True
+    assert len(things_of(patch, ChangeKind.REPLACED, patch.changed)) == 1
+
+
 def test_a_car_in_the_place_of_another_stays_one_replacement():
     patch = patch_with((np.s_[10:95], np.s_[40:75], (30, 60, 150)))
     patch.before[14:98, 44:78, :3] = (215, 215, 210)

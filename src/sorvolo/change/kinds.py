@@ -8,6 +8,7 @@ place. How much each sign counts was fitted (logistic regression) to changes of 
 import cv2
 import numpy as np
 
+from sorvolo.change.medians import middle_and_deviation
 from sorvolo.geometry.arrays import Anything, Floats, ImageRGBA, Mask
 from sorvolo.survey.findings import ChangeKind, Patch
 
@@ -50,19 +51,20 @@ def stands_out(picture: ImageRGBA, changed: Mask) -> Floats:
     around = (cv2.dilate(marked, np.ones((2 * reach + 7, 2 * reach + 7), np.uint8)) > 0) & ~near & known
     if not inside.any() or not around.any():
         return np.zeros(_SIGNS)
-    lab = cv2.cvtColor(cv2.blur(np.ascontiguousarray(picture[..., :3]), (3, 3)), cv2.COLOR_RGB2LAB).astype(np.float32)
-    middle, spread = _middle_and_spread(lab[around])
+    lab8 = _lab(cv2.blur(_rgb(picture), (3, 3)))
+    middle, spread = _middle_and_spread(lab8, around)
+    lab = lab8.astype(np.float32)
     far = np.minimum(_length((lab[inside] - middle) / spread), 12.0)
-    shift = float(np.linalg.norm((np.median(lab[inside], axis=0) - middle) / spread))
+    shift = float(np.linalg.norm((middle_and_deviation(lab8, inside)[0] - middle) / spread))
     across_x, across_y = _outwards(marked)
     slope_x, slope_y = cv2.Sobel(lab, cv2.CV_32F, 1, 0, scale=0.25), cv2.Sobel(lab, cv2.CV_32F, 0, 1, scale=0.25)
-    slope = _length(np.hypot(slope_x, slope_y))
-    outward = _length(slope_x * across_x[..., None] + slope_y * across_y[..., None])
+    slope = _length(cv2.magnitude(slope_x, slope_y))
     rim = near & (cv2.erode(marked, np.ones((5, 5), np.uint8)) == 0) & known
+    outward = _length(slope_x[rim] * across_x[rim, None] + slope_y[rim] * across_y[rim, None])
     rest = float(np.mean(slope[around])) + 1.0
     signs = [
         float(np.mean(far)), shift, float(np.mean(far > 3.0)) + 0.02,
-        float(np.mean(slope[rim])) / rest, float(np.mean(outward[rim])) / rest, float(np.mean(slope[inside])) / rest,
+        float(np.mean(slope[rim])) / rest, float(np.mean(outward)) / rest, float(np.mean(slope[inside])) / rest,
     ]
     return np.log(np.array(signs) + 0.05)
 
@@ -77,15 +79,23 @@ def unlike_ground(picture: ImageRGBA, changed: Mask) -> Mask:
     around = known & grown & ~near
     if not around.any():
         return np.zeros(changed.shape, bool)
-    lab = cv2.cvtColor(cv2.medianBlur(np.ascontiguousarray(picture[..., :3]), 5), cv2.COLOR_RGB2LAB).astype(np.float32)
-    middle, spread = _middle_and_spread(lab[around])
+    lab = _lab(cv2.medianBlur(_rgb(picture), 5))
+    middle, spread = _middle_and_spread(lab, around)
     return np.asarray((_length((lab - middle) / spread) > _FAR) & known)
 
 
-def _middle_and_spread(ring: Anything) -> tuple[Anything, Anything]:
-    """The median (3,) of colours (N, 3) of ground, and how far it strays from it, (3,)."""
-    middle = np.median(ring, axis=0)
-    return middle, 1.4826 * np.median(np.abs(ring - middle), axis=0) + 3.0
+def _rgb(picture: ImageRGBA) -> Anything:
+    return cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB)
+
+
+def _lab(rgb: Anything) -> Anything:
+    return cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)
+
+
+def _middle_and_spread(lab: Anything, around: Mask) -> tuple[Anything, Anything]:
+    """The median (3,) of the ground's colours `around` in a picture (h, w, 3), and how far they stray from it, (3,)."""
+    middle, deviation = middle_and_deviation(lab, around)
+    return middle, np.float32(1.4826) * deviation + np.float32(3)
 
 
 def _reach_px(changed: Mask) -> int:

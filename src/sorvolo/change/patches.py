@@ -84,13 +84,12 @@ def cut(view: ComparedView, window: PatchWindow) -> Cut:
             [shrink, 0, (shrink - 1) / 2], [0, shrink, (shrink - 1) / 2], [0, 0, 1.0]
         ])
     known = cv2.warpPerspective(valid, patch_from_image, window.size_px, flags=cv2.INTER_LINEAR) >= 250
-    alpha = known.astype(np.uint8) * np.uint8(255)
 
     def laid(image: ImageRGB) -> ImageRGBA:
         rgb = cv2.warpPerspective(
             image, patch_from_image, window.size_px, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
-        return np.dstack([rgb * known[..., None], alpha])
+        return np.asarray(cv2.copyTo(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), known.view(np.uint8)), np.uint8)
 
     return Cut(laid(before), laid(after))
 

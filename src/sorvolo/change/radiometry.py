@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sorvolo.change.medians import middle
 from sorvolo.change.shades import STEPS, moved_shades
 from sorvolo.geometry.arrays import Anything, Floats, Mask
 from sorvolo.kernels import detail_products, relight, slopes
@@ -198,12 +199,3 @@ def _smaller(image: NDArray[Any], size: tuple[int, int]) -> NDArray[np.uint8]:
 def _surely(known: Mask | None, size: tuple[int, int]) -> Mask | None:
     """Which pixels of a picture of `size` (w, h) lie on known ground alone; None where everything does."""
     return None if known is None else _smaller(known.astype(np.uint8) * 255, size) > 250
-
-
-def middle(values: NDArray[Any]) -> Any:
-    """The median of values (N,), N > 0, in their own type, without the care that np.median takes."""
-    half = len(values) // 2
-    if len(values) % 2:
-        return np.partition(values, half)[half]
-    low, high = np.partition(values, (half - 1, half))[half - 1 : half + 1]
-    return (low + high) / values.dtype.type(2)

@@ -1,6 +1,7 @@
 """Things told from the shadows they throw: a shadow is part of what changed, but not where the thing is."""
 
 from dataclasses import replace
+from functools import cached_property
 from itertools import combinations
 
 import cv2
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.change.kinds import kind_of, unlike_ground
+from sorvolo.change.medians import median_ratio
 from sorvolo.change.outlines import measures, outline_of
 from sorvolo.geometry.arrays import Anything, ImageRGB, Mask
 from sorvolo.survey.findings import Change, ChangeKind, Patch
@@ -16,6 +18,8 @@ _DARK = 1.08  # of the light before: what is no brighter and of the same colour 
 _ALIKE = 0.22  # a shadow takes about the same share of each colour
 _LEAST_SHARE = 0.02  # of the change: if less is no shadow, all of it is a dark thing
 _LEAST_PX = 6
+_RIM_PX = 4  # around a change: outlines are drawn a little beside the masks that they are drawn of
+_BLACK = 8.0  # grey levels: light that black has, so that ratios of dark pictures say something
 _LEAST_PIECE = 0.15  # of the largest lit piece: smaller ones are specks of the shadow's rim
 _TOLERANCE_PX = 0.7
 _APART_M = 0.5  # things so far from each other are two ...
@@ -26,6 +30,7 @@ _CAR_WIDTH_M, _BRIGHT = 2.7, 0.5  # at most; share of a dark car that its bright
 _SLIVER_M, _LEAST_CONTRARY_M2, _MOSTLY = 0.15, 0.15, 0.5  # what came beside what left: its width, size, and share ...
 _LEAST_HALF_M = 0.12  # ... how far its middle lies from its rim: a painted line is narrower ...
 _SOLID, _MOST_SHARED = 0.45, 0.05  # ... how much of its hull it fills, and of the smaller hull the other's shares
+_LEAST_CAR_M2, _MOST_UNLIKE, _TOUCHING_M = 3.0, 2.0, 0.2  # a car; sizes of two that are alike; no gap is seen
 _CLEARLY, _SHADE = 0.8, 0.7  # of the light: darker is a shadow's core; and so much of a piece of shade is
 _SPECK_M2, _SPECK_SCORE = 0.2, 0.6  # smaller and less sure it is taken for one
 _LEAST_SHADE, _LEAST_SAME = 0.15, 0.2  # of a change, where a shadow left and where it came; where nothing changed
@@ -41,7 +46,7 @@ def without_shadow(change: Change) -> Change:
     a few bright parts stays whole. The patch keeps the shadow: it belongs into the map.
     """
     patch = change.patch
-    thing = thing_of(patch.changed, _shadow(patch, change.kind))
+    thing = thing_of(patch.changed, _OneLight(patch).shadow(change.kind))
     if thing is patch.changed:
         return change
     outline_m = outline_of(thing, patch.site_from_patch, _TOLERANCE_PX, 3.0)
@@ -60,30 +65,14 @@ def is_of_shade(change: Change) -> bool:
     if change.score >= _SPECK_SCORE:
         return False
     changed = change.patch.changed
-    came, left = _shades(change.patch)
+    light = _OneLight(change.patch)
+    came, left = light.shades()
     if change.area_m2 < _SPECK_M2 and _is_part(changed, came | left):
         return True
-    same = changed & _same(change.patch)
+    same = changed & light.same()
     of_moved = (came, _LEAST_SHADE), (left, _LEAST_SHADE), (same, _LEAST_SAME)
     has_moved = all(np.count_nonzero(each) >= least * np.count_nonzero(changed) for each, least in of_moved)
     return has_moved and _is_part(changed, came | left | same)
-
-
-def _same(patch: Patch) -> Mask:
-    """Where (h, w) both dates show about the same, up to a pixel beside."""
-    before, after, known = _in_one_light(patch)
-    window = np.ones((3, 3), np.uint8)
-    lowest, highest = cv2.erode(before, window) / _SAME, cv2.dilate(before, window) * _SAME
-    return np.asarray(((after >= lowest) & (after <= highest)).all(axis=-1) & known)
-
-
-def _shades(patch: Patch) -> tuple[Mask, Mask]:
-    """Where (h, w) what changed is clearly darker on the later date, all colours alike, and where on the earlier."""
-    before, after, known = _in_one_light(patch)
-    inside = known & patch.changed
-    ratios = after / before, before / after
-    came, left = (_is_dark(each) & (each.max(axis=-1) < _CLEARLY) & inside for each in ratios)
-    return came, left
 
 
 def thing_of(changed: Mask, shadow: Mask) -> Mask:
@@ -107,14 +96,13 @@ def things_of(patch: Patch, kind: ChangeKind, changed: Mask) -> list[tuple[Mask,
     `changed` alone where it is but one thing. A dark car has bright parts far from each other: what fills a rectangle
     of about its size stays whole, unless something left beside what came.
     """
-    groups = _groups(patch, changed)
-    if len(groups) > 1:
-        found = [each for group, own in groups for each in _things_of_group(patch, own, group)]
-        return sorted(found, key=lambda each: -np.count_nonzero(each[0]))
-    return _things_of_group(patch, kind, changed)
+    light = _OneLight(patch)
+    groups = _groups(patch, changed, light)
+    found = [each for group, own in groups or [(changed, kind)] for each in _things_of_group(patch, own, group, light)]
+    return sorted(found, key=lambda each: -np.count_nonzero(each[0]))
 
 
-def _groups(patch: Patch, changed: Mask) -> list[tuple[Mask, ChangeKind]]:
+def _groups(patch: Patch, changed: Mask, light: "_OneLight") -> list[tuple[Mask, ChangeKind]]:
     """The pieces of a change that lie apart, or where one came and the other left hang together by a neck, with their
     kinds; nothing where it is but one piece. What is all shadow is no piece of its own."""
     side = 2 * round(_NECK_M / 2 / patch.m_per_px) + 1
@@ -122,7 +110,7 @@ def _groups(patch: Patch, changed: Mask) -> list[tuple[Mask, ChangeKind]]:
     count, labels = cv2.connectedComponents(cv2.morphologyEx(changed.view(np.uint8), cv2.MORPH_OPEN, disk))
     if count < 3 or _may_be_a_car(changed, patch.m_per_px):
         return []
-    new_shade, old_shade = _shades(patch)
+    new_shade, old_shade = light.shades()
     bare_m2 = np.bincount(labels[~(new_shade | old_shade)], minlength=count) * patch.m_per_px**2
     pieces = [labels == each for each in range(1, count) if bare_m2[each] >= _LEAST_THING_M2]
     if len(pieces) < 2:
@@ -141,12 +129,14 @@ def _groups(patch: Patch, changed: Mask) -> list[tuple[Mask, ChangeKind]]:
     return [(each, kind_of(replace(patch, changed=each))) for each in found]
 
 
-def _things_of_group(patch: Patch, kind: ChangeKind, changed: Mask) -> list[tuple[Mask, ChangeKind]]:
+def _things_of_group(
+    patch: Patch, kind: ChangeKind, changed: Mask, light: "_OneLight"
+) -> list[tuple[Mask, ChangeKind]]:
     """The things in one piece of a change, as `things_of` gives them."""
-    shadow = changed & _shadow(patch, kind)
+    shadow = changed & light.shadow(kind)
     lit = (changed & ~shadow).view(np.uint8)
     lit = np.asarray(cv2.morphologyEx(lit, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), np.uint8)
-    left, came = _contraries(patch, changed)
+    left, came = _contraries(patch, changed, light)
     lit |= (left | came).view(np.uint8)
     shadow &= ~left
     of_left = np.where(came, 0, _joined(left, patch.m_per_px))
@@ -186,7 +176,7 @@ def _joined(mask: Mask, m_per_px: float) -> NDArray[np.int32]:
     return np.asarray(cv2.connectedComponents(joined[reach:-reach, reach:-reach], connectivity=8)[1], np.int32)
 
 
-def _contraries(patch: Patch, changed: Mask) -> tuple[Mask, Mask]:
+def _contraries(patch: Patch, changed: Mask, light: "_OneLight") -> tuple[Mask, Mask]:
     """What left and what came beside it (h, w), part of what `changed`; both empty where not both happened.
 
     What only the earlier picture tells from the ground around left, what only the later one does came; each must be
@@ -220,10 +210,21 @@ def _contraries(patch: Patch, changed: Mask) -> tuple[Mask, Mask]:
         if is_solid and np.count_nonzero(hulls[0] & hulls[1]) <= _MOST_SHARED * min(sizes):
             left, came = (changed & (cv2.resize(each.view(np.uint8), changed.shape[::-1]) > 0) for each in (left, came))
             # the shadow of something that stays leaves one side and comes on another
-            new_shade, old_shade = _shades(patch)
+            if _are_one_place(left, came, patch.m_per_px):
+                return nothing, nothing
+            new_shade, old_shade = light.shades()
             if not (_is_part(left, old_shade) and _is_part(came, new_shade)):
                 return left, came & ~left
     return nothing, nothing
+
+
+def _are_one_place(left: Mask, came: Mask, m_per_px: float) -> bool:
+    """Whether a car left and one of about its size came so close that it took its place."""
+    sizes_m2 = sorted(np.count_nonzero(each) * m_per_px**2 for each in (left, came))
+    if sizes_m2[0] < max(_LEAST_CAR_M2, sizes_m2[1] / _MOST_UNLIKE):
+        return False
+    distance = cv2.distanceTransform((~left).view(np.uint8), cv2.DIST_L2, 5)
+    return float(distance[came].min()) * m_per_px < _TOUCHING_M
 
 
 def _is_part(mask: Mask, other: Mask) -> bool:
@@ -253,32 +254,63 @@ def _may_be_a_car(changed: Mask, m_per_px: float) -> bool:
 
 def shadow_of_arrival(before: ImageRGB, after: ImageRGB, changed: Mask) -> Mask:
     """Where what came is dark as its shadow is, in a piece of two aligned pictures of about the same light."""
-    ratio = (after.astype(np.float32) + 8) / (before.astype(np.float32) + 8)
+    ratio = (after.astype(np.float32) + _BLACK) / (before.astype(np.float32) + _BLACK)
     if not changed.all():
-        ratio = ratio / np.median(ratio[~changed], axis=0)
-    return _is_dark(ratio)
+        ratio = ratio / median_ratio(after, before, ~changed, _BLACK)
+    return _darkest(ratio)[0]
 
 
-def _shadow(patch: Patch, kind: ChangeKind) -> Mask:
-    """Where the change is dark as a shadow is: on the later date where something came, on the earlier where it went."""
-    before, after, known = _in_one_light(patch)
-    nothing = np.zeros(patch.changed.shape, bool)
-    came = _is_dark(after / before) if kind is not ChangeKind.DISAPPEARED else nothing
-    went = _is_dark(before / after) if kind in (ChangeKind.DISAPPEARED, ChangeKind.REPLACED) else nothing
-    return (came | went) & known
+class _OneLight:
+    """Both pictures of a patch in and close around what changed, the earlier in the later one's light.
+
+    Masks are (h, w) of the patch, nothing where they do not reach.
+    """
+
+    def __init__(self, patch: Patch) -> None:
+        self._changed = patch.changed
+        known = (patch.before[..., 3] == 255) & (patch.after[..., 3] == 255)
+        x, y, wide, high = cv2.boundingRect(patch.changed.view(np.uint8))
+        margin = _RIM_PX
+        self._part = np.s_[max(0, y - margin) : y + high + margin, max(0, x - margin) : x + wide + margin]
+        self._known = known[self._part]
+        self._before, self._after = (
+            np.ascontiguousarray(each[self._part][..., :3]).astype(np.float32) + _BLACK
+            for each in (patch.before, patch.after)
+        )
+        around = known & ~patch.changed
+        if np.count_nonzero(around) >= _LEAST_PX:
+            self._before *= median_ratio(patch.after, patch.before, around, _BLACK)
+
+    def shadow(self, kind: ChangeKind) -> Mask:
+        """Where it is dark as a shadow is: on the later date where something came, on the earlier where it went."""
+        came, went = (dark for dark, _ in self._dark)
+        if kind is ChangeKind.DISAPPEARED:
+            return self._whole(went)
+        return self._whole(came | went if kind is ChangeKind.REPLACED else came)
+
+    def shades(self) -> tuple[Mask, Mask]:
+        """Where what changed is clearly darker on the later date, all colours alike, and where on the earlier."""
+        came, left = (self._whole(dark & (most < _CLEARLY)) & self._changed for dark, most in self._dark)
+        return came, left
+
+    def same(self) -> Mask:
+        """Where both dates show about the same, up to a pixel beside."""
+        window = np.ones((3, 3), np.uint8)
+        lowest, highest = cv2.erode(self._before, window) / _SAME, cv2.dilate(self._before, window) * _SAME
+        return self._whole(np.asarray(((self._after >= lowest) & (self._after <= highest)).all(axis=-1)))
+
+    @cached_property
+    def _dark(self) -> tuple[tuple[Mask, Anything], tuple[Mask, Anything]]:
+        return _darkest(self._after / self._before), _darkest(self._before / self._after)
+
+    def _whole(self, mask: Mask) -> Mask:
+        whole = np.zeros(self._changed.shape, bool)
+        whole[self._part] = mask & self._known
+        return whole
 
 
-def _in_one_light(patch: Patch) -> tuple[Anything, Anything, Mask]:
-    """Both pictures (h, w, 3), the earlier in the later one's light around the change, and where both show ground."""
-    known = (patch.before[..., 3] == 255) & (patch.after[..., 3] == 255)
-    around = known & ~patch.changed
-    before, after = (each[..., :3].astype(np.float32) + 8 for each in (patch.before, patch.after))
-    if np.count_nonzero(around) >= _LEAST_PX:
-        before = before * np.median(after[around] / before[around], axis=0)
-    return before, after, known
-
-
-def _is_dark(ratio: Anything) -> Mask:
-    red, green, blue = np.moveaxis(ratio, -1, 0)
-    most, least = np.maximum(np.maximum(red, green), blue), np.minimum(np.minimum(red, green), blue)
-    return (most < _DARK) & (most - least < _ALIKE)
+def _darkest(ratio: Anything) -> tuple[Mask, Anything]:
+    """Where (h, w) pictures of a ratio (h, w, 3) have a shadow, and the ratio of the colour it takes least of."""
+    red, green, blue = cv2.split(ratio)
+    most, least = cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue)
+    return np.asarray((most < _DARK) & (most - least < _ALIKE)), most
