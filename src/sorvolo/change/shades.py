@@ -54,7 +54,7 @@ def moved_shades(before: Image, after: Image, known: Mask | None) -> NDArray[np.
             details = details or (_details(before), _details(after))
             kept = pieces.are_shadows()
             if kept.any():
-                kept &= pieces.show_the_same(*details)
+                kept = pieces.show_the_same(kept, *details)
                 shaded |= pieces.like_the_rest(kept)
         if shaded.any():
             if octaves is None:
@@ -85,7 +85,9 @@ class _Pieces:
         places = _places(cv2.erode(self._opened, np.ones((3, 3), np.uint8)))
         step = max(1, -(-len(places) // MOST_ASKED))
         self._places, self._share = places[::step], step / self.labels.size
-        self._own = self.labels.ravel()[self._places]
+        own = self.labels.ravel()[self._places]
+        order = np.argsort(own, kind="stable")  # piece by piece
+        self._places, self._own = self._places[order], own[order]
         held = np.bincount(self._own, minlength=self.count)
         self._is_held, self._number = held > 0, np.maximum(held, 1)
         self._middle, self._steps = middle, _steps(middle, self._places)
@@ -115,32 +117,42 @@ class _Pieces:
         lowest, highest = (
             np.rint(ALIKE + self._depth + off).clip(0, 255).astype(np.uint8) for off in (-MOST_OFF, MOST_OFF)
         )
-        lowest[~kept], highest[~kept] = 255, 0
-        return cv2.bitwise_and(
-            cv2.compare(self._middle, lowest[self.labels], cv2.CMP_GE),
-            cv2.compare(self._middle, highest[self.labels], cv2.CMP_LE),
-        )
+        alike = np.zeros(self.labels.shape, np.uint8)
+        if not kept.any():
+            return alike
+        places = np.flatnonzero(kept[self.labels])
+        own, steps = self.labels.ravel()[places], self._middle.ravel()[places]
+        alike.ravel()[places] = np.uint8(255) * ((steps >= lowest[own]) & (steps <= highest[own]))
+        return alike
 
-    def show_the_same(self, before: Image, after: Image) -> NDArray[np.bool_]:
-        """Which (count,) show the same structure in the details (h, w) of both pictures, up to `APART` pixels apart."""
-        a = self._centred(_steps(after, self._places))
-        energy = self._mean(a * a)
-        best = np.full(self.count, -1.0)
+    def show_the_same(self, asked: NDArray[np.bool_], before: Image, after: Image) -> NDArray[np.bool_]:
+        """Which (count,) of those `asked` show the same structure in the details (h, w) of both pictures.
+
+        They may be up to `APART` pixels apart.
+        """
+        chosen = asked[self._own]
+        places, own = self._places[chosen], self._own[chosen]
+        kept, starts = np.unique(own, return_index=True)
+        number = np.diff(np.append(starts, len(own)))
+
+        def centred(values: Floats) -> Floats:
+            means = np.add.reduceat(values, starts, axis=-1) / number
+            return values - np.repeat(means, number, axis=-1)
+
         padded = cv2.copyMakeBorder(before, APART, APART, APART, APART, cv2.BORDER_REPLICATE)
-        rows, columns = np.divmod(self._places, before.shape[1])
-        corner = rows * padded.shape[1] + columns
-        for shift in (y * padded.shape[1] + x for y in range(2 * APART + 1) for x in range(2 * APART + 1)):
-            b = self._centred(_steps(padded, corner + shift))
-            best = np.maximum(best, self._mean(a * b) / np.sqrt(energy * self._mean(b * b) + 1e-9))
-        return np.asarray(best > LEAST_ALIKE + ALIKE_OF_FEW / np.sqrt(self._number))
+        rows, columns = np.divmod(places, before.shape[1])
+        shifts = np.array([y * padded.shape[1] + x for y in range(2 * APART + 1) for x in range(2 * APART + 1)])
+        a = centred(_steps(after, places))
+        b = centred(_steps(padded, rows * padded.shape[1] + columns + shifts[:, None]))
+        energies = np.add.reduceat(a * a, starts) * np.add.reduceat(b * b, starts, axis=1)
+        alike = np.add.reduceat(a * b, starts, axis=1) / np.sqrt(energies + 1e-9)
+        same = np.zeros(self.count, bool)
+        same[kept] = alike.max(axis=0) > LEAST_ALIKE + ALIKE_OF_FEW / np.sqrt(number)
+        return same
 
     def _mean(self, values: Floats) -> Floats:
         """(count,) means of values (N,) over the pixels of each piece."""
         return np.asarray(np.bincount(self._own, values, self.count) / self._number)
-
-    def _centred(self, values: Floats) -> Floats:
-        """Values (N,) less the mean of their own piece."""
-        return np.asarray(values - self._mean(values)[self._own])
 
 
 def _places(image: Image) -> NDArray[np.int64]:
