@@ -41,6 +41,20 @@ def test_a_straightened_picture_is_the_perfect_lens_s():
     assert not lens.camera.is_distorted
 
 
+@pytest.mark.parametrize("camera", [BARREL, PERFECT])
+@pytest.mark.parametrize("share", [1.0, 2 / 3, 0.4])
+def test_pictures_are_straightened_and_made_smaller_in_one(camera, share):
+    small = camera.resized(round(480 * share), round(320 * share))
+    seen = camera.pixels_from_points(camera.undistorted().rays_from_pixels(GRID_PX))
+    lens = Undistorter(small, camera)
+    straight = cv2.resize(lens.undistort(dotted(seen)), (480, 320), interpolation=cv2.INTER_LINEAR)
+    assert np.abs(dots(straight, GRID_PX) - GRID_PX).max() < 0.1
+    bright = lens.undistort(np.full((320, 480, 3), 200, np.uint8))
+    assert bright.shape == (small.height_px, small.width_px, 3) and (bright == 200).all()
+    mask = lens.valid(small.width_px, small.height_px)
+    assert mask is None or mask.mean() > 0.9
+
+
 def test_a_perfect_lens_leaves_pictures_alone():
     lens = Undistorter(PERFECT)
     image = dotted(GRID_PX)

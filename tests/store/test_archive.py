@@ -313,10 +313,11 @@ def test_a_folder_on_a_read_only_disk_can_be_read_but_not_written(folder: Path, 
 def test_a_damaged_or_missing_tile_is_named(folder: Path) -> None:
     with Archive.open(folder, write=True) as archive:
         map_flight(archive, "a", 20, count=1)
-        (blob,) = folder.glob("tiles/*/*.png")
-        data = bytearray(blob.read_bytes())
-        data[len(data) // 2] ^= 1
-        blob.write_bytes(data)
+    (blob,) = folder.glob("tiles/*/*.png")
+    data = bytearray(blob.read_bytes())
+    data[len(data) // 2] ^= 1
+    blob.write_bytes(data)
+    with Archive.open(folder, write=False) as archive:
         with pytest.raises(StoreError, match="damaged"):
             archive.tiles()[-1, 0]
         blob.unlink()

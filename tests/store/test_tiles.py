@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sorvolo.errors import StoreError
 from sorvolo.geometry.grid import TileIndex
-from sorvolo.store.images import ImageCache, image_from_jpeg, jpeg_from_image, png_from_rgba, rgba_from_png
+from sorvolo.store.images import ImageCache, image_from_jpeg, jpeg_from_image, png_from_rgba, rgba_from_png, weighted
 from sorvolo.store.tiles import GrowingTiles, TileBlobs
 
 SIDE = 16
@@ -62,6 +62,38 @@ def test_growing_tiles_are_a_dict(steps: list[tuple[str, TileIndex, int]], limit
             assert set(tiles) == set(truth) and len(tiles) == len(truth)
         assert {key: int(tile[0, 0, 0]) for key, tile in tiles.items()} == truth
         blobs.sync()
+
+
+def test_tiles_read_lately_are_kept_until_they_are_removed(tmp_path: Path) -> None:
+    blobs = TileBlobs(tmp_path)
+    sha256 = blobs.save(flat(5))
+    tile = blobs.load(sha256)
+    assert blobs.load(sha256) is tile
+    with pytest.raises(ValueError, match="read-only"):
+        tile[0, 0] = 1  # it is everybody's
+    blobs.remove({sha256})
+    with pytest.raises(FileNotFoundError):
+        blobs.load(sha256)
+
+
+def test_no_more_tiles_are_kept_than_memory_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sorvolo.store.tiles._CACHE_BYTES", 2 * flat(1).nbytes)
+    blobs = TileBlobs(tmp_path)
+    first, second, third = (blobs.save(flat(colour)) for colour in (1, 2, 3))
+    kept = blobs.load(first)
+    for each in (second, third):
+        blobs.load(each)
+    assert blobs.load(third) is blobs.load(third)
+    assert blobs.load(first) is not kept and np.array_equal(blobs.load(first), kept)
+
+
+@pytest.mark.parametrize("alphas", [(0, 255), (0, 90, 255)])
+def test_what_is_unseen_darkens_nothing(alphas: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(2)
+    rgba = np.dstack([rng.integers(0, 256, (8, 8, 3)), rng.choice(alphas, (8, 8))]).astype(np.uint8)
+    expected = rgba.astype(np.float32)
+    expected[..., :3] *= expected[..., 3:] / 255
+    assert np.array_equal(weighted(rgba), expected)
 
 
 def test_png_keeps_every_value_under_transparency() -> None:

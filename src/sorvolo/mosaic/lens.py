@@ -9,15 +9,30 @@ from sorvolo.geometry.camera import Camera
 _VISIBLE_PX = 0.5
 
 
-class Undistorter:
-    """Makes pictures of `camera` as a perfect lens would have; its maps are made once."""
+_AVERAGED = 2.0  # times as large at most: a mean of 2 x 2 pixels is enough for what is left out between
 
-    def __init__(self, camera: Camera) -> None:
+
+class Undistorter:
+    """Makes pictures of `camera` as a perfect lens would have; its maps are made once.
+
+    With `taken` the pictures are that camera's, which differs in size alone: they are made smaller on the way.
+    """
+
+    def __init__(self, camera: Camera, taken: Camera | None = None) -> None:
         self.camera = camera.undistorted()
+        taken = taken or camera
+        self._size = camera.width_px, camera.height_px
+        self._taken_size = taken.width_px, taken.height_px
+        self._averages = camera.is_distorted and 1.0 < taken.width_px / camera.width_px < _AVERAGED
         self._maps: tuple[Anything, Anything] | None = None
-        if camera.is_distorted:
+        if self._averages:
+            x, y = cv2.initUndistortRectifyMap(
+                taken.matrix, taken.distortion, None, camera.matrix, self._size, cv2.CV_32FC1
+            )
+            self._maps = cv2.convertMaps(x + 0.5, y + 0.5, cv2.CV_16SC2)  # the mean lies half a pixel before its last
+        elif camera.is_distorted:
             self._maps = cv2.initUndistortRectifyMap(
-                camera.matrix, camera.distortion, None, camera.matrix, (camera.width_px, camera.height_px), cv2.CV_16SC2
+                camera.matrix, camera.distortion, None, camera.matrix, self._size, cv2.CV_16SC2
             )
 
     @classmethod
@@ -36,6 +51,10 @@ class Undistorter:
 
     def undistort(self, image: ImageRGB) -> ImageRGB:
         """The picture, (H, W, 3), of the perfect lens; its edge repeated where it would see beyond the real one."""
+        if self._averages:
+            image = cv2.blur(image, (2, 2))  # type: ignore[assignment]
+        elif image.shape[1::-1] != self._size:
+            image = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
         if self._maps is None:
             return image
         return cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[return-value]
@@ -44,7 +63,7 @@ class Undistorter:
         """Which pixels of the perfect picture, resampled to this size, exist; None = all."""
         if self._maps is None:
             return None
-        white = np.full((self.camera.height_px, self.camera.width_px), 255, np.uint8)
+        white = np.full((self._taken_size if self._averages else self._size)[::-1], 255, np.uint8)
         seen = cv2.remap(white, *self._maps, cv2.INTER_LINEAR)
         seen = cv2.erode(seen, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
         mask = cv2.resize(seen, (width_px, height_px), interpolation=cv2.INTER_AREA) == 255

@@ -18,7 +18,7 @@ from sorvolo.geometry.arrays import Floats, ImageRGBA
 from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.pose import gimbal_angles_from_rotation
-from sorvolo.store.atomic import atomic_path, atomic_write_bytes, scratch_folder
+from sorvolo.store.atomic import atomic_path, atomic_write_bytes
 from sorvolo.store.images import png_from_rgba, shrink, unweighted, weighted
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame
@@ -175,29 +175,23 @@ def write_kmz(tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, name: s
     latitudes = np.linspace(north, south, counts[1] + 1)
     simplekml.Kml.resetidcounter()
     kml = simplekml.Kml(name=name)
-    with scratch_folder(path.parent) as scratch:
-        for row in range(counts[1]):
-            for column in range(counts[0]):
-                box = (longitudes[column], latitudes[row + 1], longitudes[column + 1], latitudes[row])
-                rgba = _north_up(small, site_grid, box, *(int(side) for side in -(-size // counts)))
-                if not rgba[..., 3].any():
-                    continue
-                image = scratch / f"{name_safe(name)}_{row}_{column}.png"
-                image.write_bytes(png_from_rgba(rgba))
-                overlay = kml.newgroundoverlay(name=f"{name} {row}-{column}")
-                overlay.icon.href = kml.addfile(str(image))
-                overlay.latlonbox.west, overlay.latlonbox.south = _wrapped_deg(box[0]), box[1]
-                overlay.latlonbox.east, overlay.latlonbox.north = _wrapped_deg(box[2]), box[3]
-        kml.savekmz(str(scratch / "map.kmz"), format=False)
-        with atomic_path(path) as temporary:
-            _timeless(scratch / "map.kmz", temporary)
-
-
-def _timeless(archive: Path, out: Path) -> None:
-    """Copy a ZIP without the times at which its files were made: the same map gives the same bytes."""
-    with zipfile.ZipFile(archive) as made, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as copy:
-        for name in made.namelist():
-            copy.writestr(zipfile.ZipInfo(name), made.read(name), zipfile.ZIP_DEFLATED)
+    images: dict[str, bytes] = {}
+    for row in range(counts[1]):
+        for column in range(counts[0]):
+            box = (longitudes[column], latitudes[row + 1], longitudes[column + 1], latitudes[row])
+            rgba = _north_up(small, site_grid, box, *(int(side) for side in -(-size // counts)))
+            if not rgba[..., 3].any():
+                continue
+            overlay = kml.newgroundoverlay(name=f"{name} {row}-{column}")
+            overlay.icon.href = f"files/{name_safe(name)}_{row}_{column}.png"
+            overlay.latlonbox.west, overlay.latlonbox.south = _wrapped_deg(box[0]), box[1]
+            overlay.latlonbox.east, overlay.latlonbox.north = _wrapped_deg(box[2]), box[3]
+            images[overlay.icon.href] = png_from_rgba(rgba)
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        # without the time at which it was made: the same map gives the same bytes
+        archive.writestr(zipfile.ZipInfo("doc.kml"), kml.kml(format=False), zipfile.ZIP_DEFLATED)
+        for file, data in images.items():
+            archive.writestr(zipfile.ZipInfo(file), data, zipfile.ZIP_STORED)
 
 
 def name_safe(name: str) -> str:

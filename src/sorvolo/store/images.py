@@ -73,6 +73,10 @@ def shrink(rgba: ImageRGBA, width: int, height: int) -> ImageRGBA:
 
 def weighted(rgba: ImageRGBA) -> Anything:
     """Float colours times alpha (and alpha as it is): in this form neighbouring pixels may be averaged."""
+    alpha = rgba[..., 3]
+    is_partly_seen = (alpha != 0) & (alpha != 255)
+    if not is_partly_seen.any():
+        return cv2.copyTo(rgba, alpha).astype(np.float32)
     result = rgba.astype(np.float32)
     result[..., :3] *= result[..., 3:] / 255
     return result

@@ -1,6 +1,7 @@
 """The map's tiles on disk: blobs named by their content, and mappings over them to read and to write."""
 
 import hashlib
+import threading
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, MutableMapping
 from pathlib import Path
@@ -13,13 +14,21 @@ from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, sync_file
 from sorvolo.store.images import png_from_rgba, rgba_from_png
 
+_CACHE_BYTES = 96 << 20  # the tiles of a map of some hectares, which half a dozen exports read one after the other
+
 
 class TileBlobs:
-    """The folder `tiles/<aa>/<sha256>.png`; a blob is never overwritten, so versions of a map share it."""
+    """The folder `tiles/<aa>/<sha256>.png`; a blob is never overwritten, so versions of a map share it.
+
+    The tiles read last are kept in memory. Threads may share it.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._unsynced: set[str] = set()
+        self._read: OrderedDict[str, ImageRGBA] = OrderedDict()
+        self._read_bytes = 0
+        self._reading = threading.Lock()
 
     def save(self, rgba: ImageRGBA) -> str:
         """Write a tile unless its very bytes are there already, and return the SHA-256 of its PNG."""
@@ -34,16 +43,28 @@ class TileBlobs:
         return sha256
 
     def load(self, sha256: str) -> ImageRGBA:
-        """Read a tile.
+        """Read a tile, not to be written to.
 
         Raises FileNotFoundError when the blob is gone (a writer dropped its version) and StoreError when its
         bytes are not the ones that were written.
         """
+        with self._reading:
+            if sha256 in self._read:
+                self._read.move_to_end(sha256)
+                return self._read[sha256]
         path = self._path(sha256)
         data = path.read_bytes()
         if hashlib.sha256(data).hexdigest() != sha256:
             raise StoreError(f"the tile {path} is damaged; restore it from a copy of the site, or map again")
-        return rgba_from_png(data, str(path))
+        tile = rgba_from_png(data, str(path))
+        tile.setflags(write=False)
+        with self._reading:
+            self._forget(sha256)
+            self._read[sha256] = tile
+            self._read_bytes += tile.nbytes
+            while self._read_bytes > _CACHE_BYTES:
+                self._forget(next(iter(self._read)))
+        return tile
 
     def sync(self) -> None:
         """Wait until every blob written so far is on the disk."""
@@ -60,6 +81,8 @@ class TileBlobs:
         """Delete blobs that no version refers to."""
         for sha256 in hashes:
             self._path(sha256).unlink(missing_ok=True)
+            with self._reading:
+                self._forget(sha256)
         self._unsynced.difference_update(hashes)
 
     def stored(self) -> set[str]:
@@ -74,6 +97,10 @@ class TileBlobs:
     def remove_leftovers(self) -> int:
         """Delete the half-written blobs of killed writers and count them."""
         return remove_leftovers(self._folder.glob("??"))
+
+    def _forget(self, sha256: str) -> None:
+        tile = self._read.pop(sha256, None)
+        self._read_bytes -= 0 if tile is None else tile.nbytes
 
     def _path(self, sha256: str) -> Path:
         return self._folder / sha256[:2] / f"{sha256}.png"
@@ -142,7 +169,7 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
             return self._loaded[index]
         sha256 = self._hashes[index]
         try:
-            tile: ImageRGBA = frozen(self._blobs.load(sha256), np.uint8)
+            tile = self._blobs.load(sha256)
         except FileNotFoundError as error:
             raise _missing(error) from error
         self._keep(index, tile)
