@@ -81,14 +81,14 @@ class EvidenceSettings:
 class EvidenceMap:
     """The changes of one flight while its views come in. `add` changes it; `conclude` says the last word.
 
-    `site_m_per_px` is the map's pixel, `id_prefix` begins every change's id: the flight's name. Views must come in
+    `m_per_px` is the map's pixel, `id_prefix` begins every change's id: the flight's name. Views must come in
     order of time; the same views give the same changes and ids.
     """
 
-    def __init__(self, site_m_per_px: float, settings: EvidenceSettings, id_prefix: str) -> None:
+    def __init__(self, m_per_px: float, settings: EvidenceSettings, id_prefix: str) -> None:
         self._settings, self._prefix = settings, id_prefix
-        self._site_m_per_px = site_m_per_px
-        self._cell_m = max(_LEAST_CELL_M, _CELL_PX * site_m_per_px)
+        self._m_per_px = m_per_px
+        self._cell_m = max(_LEAST_CELL_M, _CELL_PX * m_per_px)
         self._join_m = max(settings.join_m, 3 * self._cell_m) if settings.join_m else 0.0
         self._gap = int(np.ceil(self._join_m / self._cell_m))
         self._grid = CellGrid(settings.n)
@@ -96,9 +96,9 @@ class EvidenceMap:
         self._found: dict[int, GatheredChange] = {}  # by number, in order
         self._merged: dict[int, int] = {}
         self._parts: dict[int, Parts] = {}  # the things that a told change holds, by its number
-        self._movers = Movers(id_prefix, site_m_per_px, self._cell_m)
+        self._movers = Movers(id_prefix, m_per_px, self._cell_m)
         self._least_cells = max(2, settings.least_area_m2 / self._cell_m**2)
-        self._seeds = Seeds(self._grid, self._cell_m, self._gap, self._least_cells, site_m_per_px)
+        self._seeds = Seeds(self._grid, self._cell_m, self._gap, self._least_cells, m_per_px)
         self._recent: deque[KeptView] = deque(maxlen=settings.n)
         self._number = 0
         self._last: tuple[int, int, Floats] | None = None  # index, time, camera of the last view that counted
@@ -280,7 +280,7 @@ class EvidenceMap:
         change.cells = kept_view.laid.window.part(part)
         self._found[change.number] = change
         box = change.cells.box_m(self._cell_m)
-        change.show(view, *box, self._site_m_per_px)
+        change.show(view, *box, self._m_per_px)
         budget[0] -= 1
         for each in earlier:
             seen, flagged, score, place_m = each.laid.answer(change.cells, cells, self._cell_m)
@@ -361,7 +361,7 @@ class EvidenceMap:
                 break
             change = self._found[-minus_number]
             if change.cells is not None:
-                change.show(view, *change.cells.box_m(self._cell_m), self._site_m_per_px)
+                change.show(view, *change.cells.box_m(self._cell_m), self._m_per_px)
                 budget[0] -= 1
         for number in new:
             change = self._found[number]

@@ -139,11 +139,11 @@ class GatheredChange:
         """Whether more masks would make the outline better."""
         return self._votes < _VOTING_VIEWS
 
-    def show(self, view: ComparedView, low_m: Floats, high_m: Floats, site_m_per_px: float) -> None:
+    def show(self, view: ComparedView, low_m: Floats, high_m: Floats, m_per_px: float) -> None:
         """Take the view's pictures of the box of ground if they are better, or wherever there were none."""
         old = self._window
         if old is None or not old.holds(low_m, high_m):
-            self._window = PatchWindow.around(low_m, high_m, site_m_per_px, _MOST_PX)
+            self._window = PatchWindow.around(low_m, high_m, m_per_px, _MOST_PX)
             if old is not None and self._pictures is not None:
                 self._yes = moved(self._yes, self._window, old)
                 self._asked_px = moved(self._asked_px, self._window, old)

@@ -20,11 +20,11 @@ _LEAST_POINTS, _NEARLY_ALL, _BESIDE_M = 3, 0.7, 0.3
 class Movers:
     """What moved during one flight. `see` changes it.
 
-    `id_prefix` begins every change's id, `site_m_per_px` is the map's pixel, `cell_m` the side of the evidence's cells.
+    `id_prefix` begins every change's id, `m_per_px` is the map's pixel, `cell_m` the side of the evidence's cells.
     """
 
-    def __init__(self, id_prefix: str, site_m_per_px: float, cell_m: float) -> None:
-        self._prefix, self._site_m_per_px, self._cell_m = id_prefix, site_m_per_px, cell_m
+    def __init__(self, id_prefix: str, m_per_px: float, cell_m: float) -> None:
+        self._prefix, self._m_per_px, self._cell_m = id_prefix, m_per_px, cell_m
         self._known: dict[int, Change] = {}  # by the tracker's number
         self._ways: dict[int, dict[int, Floats]] = {}  # by the same number: places (2,) by time, ns
 
@@ -69,7 +69,7 @@ class Movers:
         outline_m = standing_outline_m(view, track.last.blob)
         if outline_m is None:
             outline_m = _square(track.last.blob.place_m, self._cell_m)
-        window = PatchWindow.around(outline_m.min(axis=0), outline_m.max(axis=0), self._site_m_per_px, 512)
+        window = PatchWindow.around(outline_m.min(axis=0), outline_m.max(axis=0), self._m_per_px, 512)
         size = measures(outline_m)
         residual_m = view.residual_px * m_per_px if np.isfinite(view.residual_px) else 0.0
         score = track.score_sum / track.count * (track.count + 1) / (track.count + 2)

@@ -39,9 +39,9 @@ class Seeds:
     `grid` holds the evidence; seeds are at least `least_cells` cells of `cell_m` and `gap` cells apart.
     """
 
-    def __init__(self, grid: CellGrid, cell_m: float, gap: int, least_cells: float, site_m_per_px: float) -> None:
+    def __init__(self, grid: CellGrid, cell_m: float, gap: int, least_cells: float, m_per_px: float) -> None:
         self._grid, self._cell_m, self._gap, self._least_cells = grid, cell_m, gap, least_cells
-        self._site_m_per_px = site_m_per_px
+        self._m_per_px = m_per_px
         self._seeds: list[GatheredChange] = []
 
     def __iter__(self) -> Iterator[GatheredChange]:
@@ -75,7 +75,7 @@ class Seeds:
         for _, window in sorted(candidates, key=lambda each: -each[0])[:budget]:
             seed = GatheredChange(0, view.time_ns)
             seed.cells = window
-            seed.show(view, *window.box_m(self._cell_m), self._site_m_per_px)
+            seed.show(view, *window.box_m(self._cell_m), self._m_per_px)
             self._ask(seed, view, kept_view)
             self._seeds.append(seed)
         del self._seeds[:-_MOST_SEEDS]

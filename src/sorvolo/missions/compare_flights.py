@@ -71,7 +71,7 @@ def _compare_one(
     if not is_newest:
         settings = replace(settings, updates_map=False)  # what later flights painted stays
     with CompareRun(setup, archive, settings, base, steps, detector) as run:
-        ahead = 0 if isinstance(source, LiveSource) else 1  # a live view's changes are told at once
+        ahead = 0 if isinstance(source, LiveSource) else 2  # a live view's changes are told at once
         for each in _looked_at(source.frames(every(step_s)), setup, inside, run, ahead):
             if isinstance(each, Looking):
                 outcome, announced = run.add(each)

@@ -76,8 +76,10 @@ class CompareRun:
             setup, ReferenceMap(archive.tiles(base_version), site_grid.grid), site_grid, settings,
             EarlierPictures(archive, [source.name]) if settings.method == "robust" else None,
         )
+        # pictures of changes finer than the views would be drawn from nothing
+        finest_m_per_px = float(np.fmax(site_grid.grid.m_per_px, self._views.m_per_px))
         self._evidence = EvidenceMap(
-            site_grid.grid.m_per_px, EvidenceSettings(k=settings.votes, n=settings.voters), source.name
+            finest_m_per_px, EvidenceSettings(k=settings.votes, n=settings.voters), source.name
         )
         self._rejected = [
             KnownPlace(each.outline_m, each.kind) for each in archive.reviews()
@@ -101,12 +103,15 @@ class CompareRun:
         self._reasons: Counter[str] = Counter()
         self._residuals_px: list[float] = []
         self._unknown: list[float] = []
-        self._ground: set[tuple[int, int]] = set()
+        self._ground: set[int] = set()  # cells of the site, each as one number
         sigmas_m = np.array([each.sigma_m for each in archive.keyframes() if each.flight_id != source.name])
         self._map_sigma_m = float(np.nanmedian(sigmas_m)) if np.isfinite(sigmas_m).any() else 0.0
-        self._eyes = ThreadPoolExecutor(1, thread_name_prefix="looking")
+        # two threads at different frames: OpenCV's own in each frame would only wait for each other
+        self._eyes, self._witnesses = (ThreadPoolExecutor(1, thread_name_prefix=each) for each in ("looking", "asking"))
+        self._opencv_threads = cv2.getNumThreads()
 
     def __enter__(self) -> Self:
+        cv2.setNumThreads(1)
         return self
 
     def __exit__(
@@ -114,6 +119,8 @@ class CompareRun:
     ) -> None:
         try:
             self._eyes.shutdown(cancel_futures=True)
+            self._witnesses.shutdown(cancel_futures=True)
+            cv2.setNumThreads(self._opencv_threads)
             if self._finder is not None:
                 self._finder.close()
         finally:  # also when Ctrl-C strikes again meanwhile
@@ -137,8 +144,9 @@ class CompareRun:
         self._placed[lost.index] = rejected(lost.index, lost.name, time_ns, lost.reason, camera)
 
     def look(self, posed: PosedFrame) -> Looking:
-        """Begin to compare a frame, in a thread beside what `add` does with those before it."""
-        return Looking(posed, self._eyes.submit(self._views.look, posed))
+        """Begin to compare a frame, in threads beside what `add` does with those before it."""
+        looked = self._eyes.submit(self._views.look, posed)
+        return Looking(posed, self._witnesses.submit(lambda: self._views.ask(looked.result())))
 
     def add(self, looking: Looking) -> tuple[ViewOutcome, tuple[Change, ...]]:
         """Take one frame's comparison in; how that ended, and the changes that it was the last missing witness of."""
@@ -235,7 +243,7 @@ class CompareRun:
 
     def _extend(self, posed: PosedFrame, outcome: ViewOutcome) -> None:
         """Frames that show new ground go on to be mapped, as a first flight's would."""
-        if not self._settings.updates_map or self._setup.track is None or self._is_night(posed):
+        if not self._settings.updates_map or self._setup.track is None or self._is_night(posed, outcome):
             return
         outline_m = self._outline_m(posed, outcome)
         last_m = self._last_outline_m if self._setup.source.kind == "video" else None
@@ -248,10 +256,10 @@ class CompareRun:
         with self._log.stage(Stage.REGISTER):
             self._extension.add(posed)
 
-    def _is_night(self, posed: PosedFrame) -> bool:
+    def _is_night(self, posed: PosedFrame, outcome: ViewOutcome) -> bool:
         """Whether new ground would be painted black. Where no ground was compared in its light yet (and method thesis
         never does), the frame's middle grey says it, against the map's."""
-        brightness = self._views.brightness
+        brightness = outcome.brightness
         if np.isnan(brightness):
             brightness = float(np.median(posed.frame.image[::16, ::16])) / max(self._map_level, 1.0)
         return brightness < _NIGHT
@@ -316,8 +324,8 @@ class CompareRun:
         ys, xs = np.mgrid[8:height:16, 8:width:16]
         seen = view.valid[ys, xs]
         points_m = apply_homography(view.site_from_image, np.column_stack([xs[seen], ys[seen]]).astype(float))
-        cells = np.unique(np.floor(points_m / _CELL_M).astype(np.int64), axis=0)
-        self._ground.update(map(tuple, cells.tolist()))
+        cells = np.floor(points_m / _CELL_M).astype(np.int64)
+        self._ground.update(np.unique(cells @ [1 << 32, 1]).tolist())  # unique rows would take ten times as long
 
     def _write_masks(self, view: ComparedView) -> None:
         if self._settings.writes_masks:

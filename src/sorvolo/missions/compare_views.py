@@ -8,7 +8,7 @@ import numpy as np
 
 from sorvolo.change.alignment import Aligned, Aligner
 from sorvolo.change.reference import ReferenceMap
-from sorvolo.change.robust import compare_robust
+from sorvolo.change.robust import RobustSettings, compare_robust
 from sorvolo.change.thesis import compare_thesis
 from sorvolo.change.tuning import FlightTuning
 from sorvolo.change.witnesses import LEAST_SURENESS, Difference, believed
@@ -37,7 +37,8 @@ _ALL_CHANGED = 0.5  # share of a view: more is snow, a flood or another place, n
 @dataclass(frozen=True, eq=False)
 class ViewOutcome:
     """How one frame's comparison ended. `view` exists when it was compared, `site_from_image` (of the full undistorted
-    frame) when it was aligned. `known` is the share of the frame that lies on known ground."""
+    frame) when it was aligned. `known` is the share of the frame that lies on known ground, `brightness` how many times
+    as bright as the map the flight is so far, NaN where that is not known."""
 
     status: ViewStatus
     reason: str
@@ -45,10 +46,33 @@ class ViewOutcome:
     known: float
     site_from_image: Matrix3 | None = None
     view: ComparedView | None = None
+    brightness: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class OneSided:
+    """A frame compared with the map, before earlier pictures are asked; `image` is RGB, `query` the same as BGR.
+
+    `settings` are those by which earlier pictures are to be compared, `told` is what is known of its outcome.
+    """
+
+    posed: PosedFrame
+    aligned: Aligned
+    image: ImageRGB
+    reference: ImageRGB
+    query: Anything
+    valid: Mask
+    found: Difference
+    settings: RobustSettings | None
+    told: ViewOutcome
 
 
 class ViewMaker:
-    """Compares the frames of one flight with one version of the map, in order of time."""
+    """Compares the frames of one flight with one version of the map, in order of time.
+
+    `look` says what differs from the map, `ask` what earlier pictures say of that. Either is to be called for the
+    frames in their order; one may run while the other does, in another thread.
+    """
 
     def __init__(
         self, setup: FlightSetup, reference: ReferenceMap, site_grid: SiteGrid, settings: CompareSettings,
@@ -58,7 +82,7 @@ class ViewMaker:
         self._full = setup.source.camera.camera
         side_px = settings.side_px or (_VIDEO_SIDE_PX if setup.source.kind == "video" else _PHOTO_SIDE_PX)
         self._camera = _comparison_camera(self._full, setup, site_grid.grid.m_per_px, side_px)
-        self._lens = Undistorter(self._camera)
+        self._lens = Undistorter(self._camera, self._full)
         size = self._camera.width_px, self._camera.height_px
         seen = self._lens.valid(*size)
         self._lens_sees: Mask = np.ones(size[::-1], bool) if seen is None else seen
@@ -67,15 +91,15 @@ class ViewMaker:
         self._tuning = FlightTuning() if settings.method == "robust" else None
         self._frame_maps: tuple[Anything, Anything] | None = None
 
-    def look(self, posed: PosedFrame) -> ViewOutcome:
-        """Align and compare one frame."""
+    def look(self, posed: PosedFrame) -> ViewOutcome | OneSided:
+        """Align one frame and compare it with the map; a `ViewOutcome` if that ended it."""
         frame = posed.frame
-        image = self._undistorted(frame.image)
+        image = self._lens.undistort(frame.image)
         aligned = self._aligner.align(image, self._lens.camera, posed.prior, frame.time_ns)
         to_full = self._full.width_px / self._camera.width_px
         if not isinstance(aligned, Aligned):
             status = ViewStatus.OUTSIDE if aligned.is_outside else ViewStatus.NOT_ALIGNED
-            return ViewOutcome(status, aligned.reason, aligned.residual_px * to_full, 0.0)
+            return ViewOutcome(status, aligned.reason, aligned.residual_px * to_full, 0.0, brightness=self.brightness)
         residual_px = aligned.residual_px * to_full
         site_from_full = aligned.site_from_image @ self._small_from_full()
         reference, known = self._reference.seen_from(
@@ -85,20 +109,30 @@ class ViewMaker:
         share = np.count_nonzero(valid) / np.count_nonzero(self._lens_sees)
         if share < _KNOWN_ENOUGH:
             reason = f"less than {_KNOWN_ENOUGH:.0%} of it lies on the map"
-            return ViewOutcome(ViewStatus.OUTSIDE, reason, residual_px, share, site_from_full)
+            return ViewOutcome(
+                ViewStatus.OUTSIDE, reason, residual_px, share, site_from_full, brightness=self.brightness
+            )
         query = as_bgr(image)
-        found = self._difference(as_bgr(reference), query, valid, learns=True)
-        if self._pictures is not None:
-            found = self._attested(found, aligned, query, valid)
+        found = self._difference(as_bgr(reference), query, valid)
+        told = ViewOutcome(
+            ViewStatus.COMPARED, "", residual_px, share, site_from_full, brightness=self.brightness
+        )
+        return OneSided(posed, aligned, image, reference, query, valid, found, self._settings_now(), told)
+
+    def ask(self, looked: ViewOutcome | OneSided) -> ViewOutcome:
+        """Ask earlier pictures what they say of a frame's differences: how its comparison ended."""
+        if isinstance(looked, ViewOutcome):
+            return looked
+        frame, aligned, valid, told = looked.posed.frame, looked.aligned, looked.valid, looked.told
+        found = self._attested(looked)
         changed = np.count_nonzero(found.mask) / max(1, int(np.count_nonzero(valid)))
         if changed > _ALL_CHANGED:
             reason = f"{changed:.0%} of it looks changed: snow, a flood, night or another place?"
-            return ViewOutcome(ViewStatus.ALL_CHANGED, reason, residual_px, share, site_from_full)
-        view = ComparedView(
+            return replace(told, status=ViewStatus.ALL_CHANGED, reason=reason)
+        return replace(told, view=ComparedView(
             frame.index, frame.name, self._setup.utc_ns(frame.time_ns), aligned.site_from_image, aligned.camera_m,
-            image, reference, valid, found.mask, found.boxes, found.scores, aligned.residual_px,
-        )
-        return ViewOutcome(ViewStatus.COMPARED, "", residual_px, share, site_from_full, view)
+            looked.image, looked.reference, valid, found.mask, found.boxes, found.scores, aligned.residual_px,
+        ))
 
     def placed(self, posed: PosedFrame, outcome: ViewOutcome, map_sigma_m: float) -> PlacedFrame:
         """The frame's record: placed by the map it fits, or rejected with the reason."""
@@ -160,17 +194,16 @@ class ViewMaker:
         return {} if self._tuning is None else self._tuning.chosen()
 
     @property
+    def m_per_px(self) -> float:
+        """Ground metres of a compared picture's pixel, at the flight's usual height; NaN where that is not known."""
+        return _usual_height_m(self._setup) / self._camera.fx_px
+
+    @property
     def brightness(self) -> float:
         """How many times as bright as the map the flight is; NaN where that is not known."""
         return float("nan") if self._tuning is None else self._tuning.brightness
 
     # ---- inside -----------------------------------------------------------------------------------------------
-
-    def _undistorted(self, image: ImageRGB) -> ImageRGB:
-        size = self._camera.width_px, self._camera.height_px
-        if image.shape[1::-1] != size:
-            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-        return self._lens.undistort(image)
 
     def _small_from_full(self) -> Matrix3:
         sx, sy = self._camera.width_px / self._full.width_px, self._camera.height_px / self._full.height_px
@@ -180,26 +213,33 @@ class ViewMaker:
         centre = site_from_image @ np.array([self._camera.cx_px, self._camera.cy_px, 1.0])
         return self._site_grid.grid_from_site_affine(centre[:2] / centre[2], 50.0) @ site_from_image
 
-    def _attested(self, found: Difference, aligned: Aligned, query: Anything, valid: Mask) -> Difference:
+    def _attested(self, looked: OneSided) -> Difference:
         """What differs from the map or from one of the earlier pictures taken nearest, as far as they bear it out."""
-        assert self._pictures is not None
-        height, width = valid.shape
+        if self._pictures is None or looked.settings is None:
+            return looked.found
+        height, width = looked.valid.shape
         earlier = []
         for picture, sees in self._pictures.seen_from(
-            aligned.site_from_image, aligned.camera_m, width, height, _WITNESSES
+            looked.aligned.site_from_image, looked.aligned.camera_m, width, height, _WITNESSES
         ):
             sees &= self._lens_sees
-            earlier.append((self._difference(as_bgr(picture), query, sees, learns=False), sees))
-        return believed((found, valid), earlier)
+            found = compare_robust(picture, looked.query, sees, looked.settings)
+            earlier.append((Difference(found.mask, found.boxes, found.scores), sees))
+        return believed((looked.found, looked.valid), earlier)
 
-    def _difference(self, reference: Anything, query: Anything, valid: Mask, *, learns: bool) -> Difference:
-        if self._tuning is None:
+    def _difference(self, reference: Anything, query: Anything, valid: Mask) -> Difference:
+        """What differs from the map; the flight's tuning learns of it."""
+        settings = self._settings_now()
+        if self._tuning is None or settings is None:
             thesis = compare_thesis(reference, query, valid)
             return Difference(thesis.mask, thesis.boxes, np.full(len(thesis.boxes), 0.5))
-        found = compare_robust(reference, query, valid, replace(self._tuning.settings(), least_score=LEAST_SURENESS))
-        if learns:
-            self._tuning.observe(found)
+        found = compare_robust(reference, query, valid, settings)
+        self._tuning.observe(found)
         return Difference(found.mask, found.boxes, found.scores)
+
+    def _settings_now(self) -> RobustSettings | None:
+        """Those of the robust method as the flight has set them so far; None for method thesis."""
+        return None if self._tuning is None else replace(self._tuning.settings(), least_score=LEAST_SURENESS)
 
 
 def as_bgr(image: ImageRGB) -> Anything:
@@ -211,11 +251,15 @@ def _comparison_camera(full: Camera, setup: FlightSetup, map_m_per_px: float, si
     """The frame's camera, made so small that the frame is no finer than the map and no larger than asked for."""
     side = max(full.width_px, full.height_px)
     share = min(1.0, side_px / side)
-    if setup.track is not None:
-        height_m = float(np.nanmedian(setup.track.up_m))
-        if height_m > 1.0:
-            share = min(share, max(height_m / full.fx_px / map_m_per_px, _LEAST_SIDE_PX / side))
+    height_m = _usual_height_m(setup)
+    if height_m > 1.0:
+        share = min(share, max(height_m / full.fx_px / map_m_per_px, _LEAST_SIDE_PX / side))
     share = min(share, 1.0)
     return full.resized(round(full.width_px * share), round(full.height_px * share)) if share < 1 else full
+
+
+def _usual_height_m(setup: FlightSetup) -> float:
+    """The median of the camera's height above the ground; NaN where the telemetry does not tell."""
+    return float("nan") if setup.track is None else float(np.nanmedian(setup.track.up_m))
 
 

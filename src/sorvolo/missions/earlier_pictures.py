@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, ImageRGB, ImageRGBA, Mask, Matrix3, PointsM, Vector3
+from sorvolo.geometry.arrays import Anything, ImageRGBA, Mask, Matrix3, PointsM, Vector3
 from sorvolo.geometry.homography import apply_homography, pose_from_homography
 from sorvolo.store.archive import Archive
 from sorvolo.store.images import ImageCache
@@ -39,8 +39,9 @@ class EarlierPictures:
 
     def seen_from(
         self, site_from_image: Matrix3, camera_m: Vector3, width_px: int, height_px: int, most: int
-    ) -> Iterator[tuple[ImageRGB, Mask]]:
-        """The `most` keyframes taken nearest to `camera_m`, one from each side along the way, in an image's pixels."""
+    ) -> Iterator[tuple[Anything, Mask]]:
+        """The `most` keyframes taken nearest to `camera_m`, one from each side along the way, in an image's pixels:
+        BGR (`height_px`, `width_px`, 3), and where they see."""
         for index in self._nearest(camera_m, most):
             keyframe = self._keyframes[index]
             picture = self._images.get(index)
@@ -55,7 +56,7 @@ class EarlierPictures:
                 continue
             size = width_px, height_px
             seen: Anything = cv2.warpPerspective(picture, image_from_picture, size, flags=cv2.INTER_LINEAR)
-            yield cv2.cvtColor(seen, cv2.COLOR_RGBA2RGB), cv2.extractChannel(seen, 3) == 255  # type: ignore[misc]
+            yield cv2.cvtColor(seen, cv2.COLOR_RGBA2BGR), np.asarray(cv2.extractChannel(seen, 3) == 255)
 
     def _nearest(self, camera_m: Vector3, most: int) -> list[int]:
         """The nearest keyframe and then the nearest ones that lie on the other sides of the camera."""

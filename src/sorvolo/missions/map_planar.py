@@ -117,7 +117,7 @@ class PlanarRun(FlightRun):
         self._dirty |= outcome.moved | {keyframe_id}
         with self._log.stage(Stage.STORE):
             self._keep(keyframe_id, image)
-        return outcome.status, outcome.reason, self._show(force=False)
+        return outcome.status, outcome.reason, self._show()
 
     def complete(self) -> list[PlacedFrame]:
         """Solve once more, find the clock offset, paint what moved: every selected frame as it ends, in their order.
@@ -132,7 +132,7 @@ class PlanarRun(FlightRun):
             self._exposure = self._mapper.exposure()
             self._straighten()
             self._start_over()
-            self._show(force=True)
+            self._paint()
         return self._placed()
 
     def finish(self, notices: Sequence[Notice], started_s: float) -> None:
@@ -243,30 +243,36 @@ class PlanarRun(FlightRun):
         refined = camera.with_focal_px(camera.fx_px * self._mapper.focal_scale)
         return site_from_image_homography(refined, self._mapper.pose(keyframe_id))
 
-    def _show(self, *, force: bool) -> int:
-        """Paint what moved and let readers see it, now and then or at once."""
+    def _show(self) -> int:
+        """Paint what moved and let readers see it, now and then; how many tiles were painted."""
         if self._canvas is None or self._writer is None:
             return 0
         started_s = time.monotonic()
-        if not force and (len(self._frames) - self._painted_at < _PAINT_EVERY or started_s < self._paint_again_s):
+        if len(self._frames) - self._painted_at < _PAINT_EVERY or started_s < self._paint_again_s:
             return 0
+        with self._log.stage(Stage.PAINT):
+            self._exposure = self._mapper.exposure()
+        painted = self._paint()
+        self._paint_again_s = time.monotonic() + _PAINT_REST * (time.monotonic() - started_s)
+        if time.monotonic() - self._shown_s > self._settings.live_s:
+            with self._log.stage(Stage.STORE):
+                self._writer.flush()
+                write_live_preview(self._writer.tiles, self._archive.live_preview_path)
+            self._shown_s = time.monotonic()
+        return painted
+
+    def _paint(self) -> int:
+        """Paint what moved; how many tiles were painted."""
+        assert self._canvas is not None
         self._painted_at = len(self._frames)
         site_grid = self._archive.site_grid()
         with self._log.stage(Stage.PAINT):
-            if not force:
-                self._exposure = self._mapper.exposure()
             painted = {each: self._canvas_frame(each, site_grid) for each in sorted(self._dirty)}
             tiles = self._canvas.paint(
                 [frame for frame in painted.values() if frame is not None],
                 forget=[each for each, frame in painted.items() if frame is None],
             )
             self._dirty.clear()
-        self._paint_again_s = time.monotonic() + _PAINT_REST * (time.monotonic() - started_s)
-        if force or time.monotonic() - self._shown_s > self._settings.live_s:
-            with self._log.stage(Stage.STORE):
-                self._writer.flush()
-                write_live_preview(self._writer.tiles, self._archive.live_preview_path)
-            self._shown_s = time.monotonic()
         return len(tiles)
 
     def _canvas_frame(self, keyframe_id: int, site_grid: SiteGrid) -> CanvasFrame | None:
