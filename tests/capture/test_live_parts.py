@@ -81,9 +81,10 @@ def test_every_frame_waits_until_memory_ends() -> None:
     queue = FrameQueue(holds_all=True, most_bytes=45_000, blocks=False)
     for index in range(5):
         queue.put(arrived(index))
+    assert queue.holds_any
     queue.end()
     assert [each.index for each in iter(lambda: queue.take(0), None)] == [2, 3, 4]
-    assert queue.skipped == 2 and queue.is_over
+    assert queue.skipped == 2 and queue.is_over and not queue.holds_any
 
 
 def test_a_file_waits_for_its_reader() -> None:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ from sorvolo.change.reference import ReferenceMap
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.geodesy import Geodetic
-from sorvolo.missions.compare_flights import compare_flights
+from sorvolo.missions.compare_flights import _looked_at, compare_flights
 from sorvolo.missions.compare_views import ViewMaker, ViewOutcome
 from sorvolo.missions.evaluate_changes import evaluate_changes
 from sorvolo.missions.flight_setup import prepare
@@ -39,7 +40,7 @@ from sorvolo.simulation.settings import (
 )
 from sorvolo.store.archive import Archive
 from sorvolo.survey.findings import CompareUpdate, Verdict, ViewStatus
-from sorvolo.survey.flight import PosedFrame
+from sorvolo.survey.flight import Frame, PosedFrame
 from sorvolo.survey.mosaic import Status
 
 _PAIR = SimulationSettings(
@@ -219,6 +220,28 @@ def test_a_view_that_fails_beside_the_rest_is_told_and_leaves_the_site_as_it_was
     after = files(site)
     assert {name for name in after if "flight2" in name} == set()
     assert all(after[name] == content for name, content in before.items() if name.endswith((".tif", ".geojson")))
+
+
+@pytest.mark.parametrize("waiting, told_at", [
+    ([False] * 5, [0, 1, 2, 3, 4]),  # each before the next frame is asked for
+    ([True] * 5, [2, 3, 4, 5, 5]),  # three at work at once; the rest when no frame comes any more
+    ([True, True, False, False, False], [2, 2, 2, 3, 4]),
+])
+def test_a_live_view_is_told_at_once_unless_the_next_one_waits_already(waiting, told_at):
+    asked = []
+
+    def frames():
+        for index in range(5):
+            asked.append(index)
+            yield Frame(index, str(index), index, np.zeros((2, 2, 3), np.uint8))
+        asked.append(5)
+
+    setup = SimpleNamespace(prior=lambda frame, first: None)
+    run = SimpleNamespace(look=lambda posed: posed.frame.index, lose=None)
+    looked_at = _looked_at(frames(), setup, lambda posed: True, run, lambda: 2 * waiting[asked[-1]])
+    found = [(each, asked[-1]) for each in looked_at]
+    assert [each for each, _ in found] == [0, 1, 2, 3, 4]
+    assert [last for _, last in found] == told_at
 
 
 def test_a_rejected_change_does_not_come_back_with_the_next_flight(flown, site, tmp_path):

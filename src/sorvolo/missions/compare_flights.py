@@ -23,6 +23,8 @@ from sorvolo.survey.area import Area
 from sorvolo.survey.findings import CompareUpdate, ViewStatus
 from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
 
+_AHEAD = 2  # frames that are looked at while the evidence of one is gathered: a thread for each
+
 
 def compare_flights(
     inputs: Sequence[Path | str], site: Path, settings: CompareSettings = CompareSettings(), *,  # noqa: B008 (frozen)
@@ -71,7 +73,10 @@ def _compare_one(
     if not is_newest:
         settings = replace(settings, updates_map=False)  # what later flights painted stays
     with CompareRun(setup, archive, settings, base, steps, detector) as run:
-        ahead = 0 if isinstance(source, LiveSource) else 2  # a live view's changes are told at once
+
+        def ahead() -> int:  # a live view's changes are told at once, unless the next view waits already
+            return 0 if isinstance(source, LiveSource) and not source.is_behind else _AHEAD
+
         for each in _looked_at(source.frames(every(step_s)), setup, inside, run, ahead):
             if isinstance(each, Looking):
                 outcome, announced = run.add(each)
@@ -89,16 +94,16 @@ def _compare_one(
 
 def _looked_at(
     frames: Iterable[Frame | LostFrame], setup: FlightSetup, inside: Callable[[PosedFrame], bool], run: CompareRun,
-    ahead: int,
+    ahead: Callable[[], int],
 ) -> Iterator[Looking | LostFrame]:
-    """The frames inside of the area, in order, while the run looks at them and up to `ahead` of those after."""
+    """The frames inside of the area, in order, while the run looks at them and up to `ahead()` of those after."""
     waiting: deque[Looking | LostFrame] = deque()
     for each in frames:
         if isinstance(each, LostFrame):
             waiting.append(each)
         elif inside(posed := PosedFrame(each, setup.prior(each, first=False))):
             waiting.append(run.look(posed))
-        if len(waiting) > ahead:
+        while len(waiting) > ahead():
             yield waiting.popleft()
     yield from waiting
 

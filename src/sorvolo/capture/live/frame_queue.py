@@ -75,6 +75,12 @@ class FrameQueue:
             self._changed.notify_all()
 
     @property
+    def holds_any(self) -> bool:
+        """Whether a frame waits for its turn."""
+        with self._changed:
+            return bool(self._waiting)
+
+    @property
     def is_over(self) -> bool:
         """Whether nothing waits and nothing will come."""
         with self._changed:

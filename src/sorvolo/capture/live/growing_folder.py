@@ -76,6 +76,11 @@ class GrowingFolder:
         return time.monotonic() - self._heard_s
 
     @property
+    def is_behind(self) -> bool:
+        """Whether the next photo is there already, for whoever looks at them is slower than they come."""
+        return bool(self._ready)
+
+    @property
     def skipped(self) -> int:
         """No photo is skipped."""
         return 0

@@ -159,6 +159,11 @@ class LiveStream:
         return self._reader.outages.silent_s
 
     @property
+    def is_behind(self) -> bool:
+        """Whether the next frame is there already, for whoever looks at them is slower than they come."""
+        return self._queue.holds_any
+
+    @property
     def skipped(self) -> int:
         """Wanted frames that nobody looked at, because newer ones came or memory ran out."""
         return self._queue.skipped
