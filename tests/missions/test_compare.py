@@ -222,6 +222,23 @@ def test_a_view_that_fails_beside_the_rest_is_told_and_leaves_the_site_as_it_was
     assert all(after[name] == content for name, content in before.items() if name.endswith((".tif", ".geojson")))
 
 
+def test_the_pictures_of_changes_are_no_finer_than_the_views(flown, compared, tmp_path):
+    fine = tmp_path / "fine"
+    with Archive.open(compared[0], write=False) as archive:
+        own_m_per_px = archive.site_grid().grid.m_per_px
+    for _ in map_flights(
+        [flown / "flight1"], fine, replace(_MAP, m_per_px=own_m_per_px / 2), camera=flown / "camera.xml"
+    ):
+        pass
+    compare(flown, fine)
+    assert len(features(fine)) == len(features(compared[0]))
+
+    def rows(site):
+        return sum(len(cv2.imread(str(each))) for each in (site / "flights/flight2/changes").glob("*-after.png"))
+
+    assert rows(fine) == pytest.approx(rows(compared[0]), rel=0.2), "twice as many were there to be drawn"
+
+
 @pytest.mark.parametrize("waiting, told_at", [
     ([False] * 5, [0, 1, 2, 3, 4]),  # each before the next frame is asked for
     ([True] * 5, [2, 3, 4, 5, 5]),  # three at work at once; the rest when no frame comes any more

@@ -81,8 +81,8 @@ class EvidenceSettings:
 class EvidenceMap:
     """The changes of one flight while its views come in. `add` changes it; `conclude` says the last word.
 
-    `m_per_px` is the map's pixel, `id_prefix` begins every change's id: the flight's name. Views must come in
-    order of time; the same views give the same changes and ids.
+    `m_per_px` is a pixel of changes' pictures, `id_prefix` begins every change's id: the flight's name. Views must come
+    in order of time; the same views give the same changes and ids.
     """
 
     def __init__(self, m_per_px: float, settings: EvidenceSettings, id_prefix: str) -> None:

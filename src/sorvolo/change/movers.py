@@ -20,7 +20,8 @@ _LEAST_POINTS, _NEARLY_ALL, _BESIDE_M = 3, 0.7, 0.3
 class Movers:
     """What moved during one flight. `see` changes it.
 
-    `id_prefix` begins every change's id, `m_per_px` is the map's pixel, `cell_m` the side of the evidence's cells.
+    `id_prefix` begins every change's id, `m_per_px` is a pixel of changes' pictures, `cell_m` a side of the evidence's
+    cells.
     """
 
     def __init__(self, id_prefix: str, m_per_px: float, cell_m: float) -> None:

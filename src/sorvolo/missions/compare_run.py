@@ -13,6 +13,7 @@ from typing import Any, Self
 import cv2
 import numpy as np
 
+from sorvolo.change.cells import scale_m_per_px
 from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
 from sorvolo.change.outlines import KnownPlace, is_known
 from sorvolo.change.reference import ReferenceMap
@@ -48,6 +49,7 @@ _LOOK_OVERLAP = 0.75  # of frames that are searched for objects
 _DARK = 0.4  # times the map's brightness: less hides things
 _NIGHT = 0.25  # less hides most of them (at 0.22, 3 of 14 changes were found), and would paint new ground black
 _LEVEL_TILES = 20
+_COARSER = 1.25  # times the map's pixels: views less coarse than that have its pixels
 _CELL_M = 1.0  # of the record of what was compared
 
 
@@ -76,11 +78,7 @@ class CompareRun:
             setup, ReferenceMap(archive.tiles(base_version), site_grid.grid), site_grid, settings,
             EarlierPictures(archive, [source.name]) if settings.method == "robust" else None,
         )
-        # pictures of changes finer than the views would be drawn from nothing
-        finest_m_per_px = float(np.fmax(site_grid.grid.m_per_px, self._views.m_per_px))
-        self._evidence = EvidenceMap(
-            finest_m_per_px, EvidenceSettings(k=settings.votes, n=settings.voters), source.name
-        )
+        self._evidence: EvidenceMap | None = None
         self._rejected = [
             KnownPlace(each.outline_m, each.kind) for each in archive.reviews()
             if each.verdict is Verdict.REJECTED and each.flight_id != source.name
@@ -161,6 +159,8 @@ class CompareRun:
         announced: tuple[Change, ...] = ()
         if outcome.view is not None:
             with self._log.stage(Stage.EVIDENCE):
+                if self._evidence is None:
+                    self._evidence = self._begin_evidence(outcome.view)
                 announced = tuple(self._told(self._evidence.add(outcome.view)))
             if announced and self._classes is not None:
                 with self._log.stage(Stage.DETECT):
@@ -184,7 +184,7 @@ class CompareRun:
                 "season, or night? `sorvolo inspect` tells what the flight holds"
             )
         with self._log.stage(Stage.EVIDENCE):
-            found = self._evidence.conclude()
+            found = () if self._evidence is None else self._evidence.conclude()
             changes = self._told(found)
         images: Mapping[int, str] = {}
         extending: list[PlacedFrame] = []
@@ -226,6 +226,18 @@ class CompareRun:
         self._writer.commit(placed, images, report, page, changes=changes, search=search)
 
     # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _begin_evidence(self, first: ComparedView) -> EvidenceMap:
+        """Evidence in the map's pixels, or in the views' where these are coarser: finer would be drawn from nothing.
+
+        How coarse they are, the first view says, or the telemetry's heights, whichever says less: either may be wrong.
+        """
+        settings, map_m_per_px = self._settings, self._archive.site_grid().grid.m_per_px
+        views_m_per_px = float(np.fmin(self._views.m_per_px, scale_m_per_px(first)))
+        return EvidenceMap(
+            views_m_per_px if views_m_per_px > _COARSER * map_m_per_px else map_m_per_px,
+            EvidenceSettings(k=settings.votes, n=settings.voters), self._setup.source.name,
+        )
 
     def _told(self, changes: Sequence[Change]) -> list[Change]:
         """The changes around the things alone, their places as uncertain as the map's own; not those that a person
