@@ -382,6 +382,14 @@ def test_a_flight_over_another_place_is_refused(site, tmp_path):
         list(compare_flights([folder / "flight1"], site, _COMPARE, camera=folder / "camera.xml"))
 
 
+def test_a_flight_that_only_extends_the_map_is_warned_of(site, tmp_path):
+    """Its telemetry may as well be off: then the same ground lies in the map twice."""
+    folder = next(elsewhere(tmp_path, 150))
+    updates = list(compare_flights([folder / "flight1"], site, _COMPARE, camera=folder / "camera.xml"))
+    assert {each.status for each in updates} == {ViewStatus.OUTSIDE}
+    assert any("none of" in warning and "metres off" in warning for warning in report(site, "flight1-2")["warnings"])
+
+
 def test_other_ground_in_the_same_place_is_refused_and_leaves_no_trace(flown, site, tmp_path):
     folder = next(elsewhere(tmp_path, 0))
     with pytest.raises(InputError, match="no frame of flight1-2 could be compared: it"):

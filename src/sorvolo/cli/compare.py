@@ -60,7 +60,7 @@ def compare(
     ] = None,
     masks: Annotated[bool, typer.Option("--masks", help="Write each frame's change mask and boxes, too.")] = False,
     steps: Annotated[
-        Path | None, typer.Option(help="Folder for method thesis's eight pictures a view (its Figure 3.14), some 4 MB.")
+        Path | None, typer.Option(help="Folder for method thesis's eight pictures a view (its Figure 3.14), 4-8 MB.")
     ] = None,
     update: Annotated[
         bool, typer.Option("--update/--no-update", help="Bring the map up to date where the ground changed or is new.")

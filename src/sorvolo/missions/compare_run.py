@@ -378,6 +378,11 @@ class CompareRun:
                 f"the flight is {brightness:.2f} times as bright as the map: what is small, dark or of the ground's "
                 "colour is missed; compare flights by daylight"
             )
+        if not self.compared:  # the flight only extended the map, or it would not be here
+            warnings.append(
+                f"none of {self.views} views lies on the map, which grew beside what it showed: if the flight was over "
+                "the same ground, its telemetry is metres off; `sorvolo history` has the map from before"
+            )
         lost = self._statuses[ViewStatus.NOT_ALIGNED] + self._statuses[ViewStatus.LOST]
         if lost > 0.3 * views:
             warnings.append(f"{lost} of {views} views do not fit the map and told nothing; `reasons` says why")
