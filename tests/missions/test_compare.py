@@ -23,7 +23,7 @@ from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.missions.compare_flights import _looked_at, compare_flights
 from sorvolo.missions.compare_views import ViewMaker, ViewOutcome
 from sorvolo.missions.evaluate_changes import evaluate_changes
-from sorvolo.missions.flight_setup import prepare
+from sorvolo.missions.flight_setup import _check_place, prepare
 from sorvolo.missions.known_camera import known_camera
 from sorvolo.missions.map_flight import map_flights
 from sorvolo.missions.settings import CompareSettings, MapSettings
@@ -376,10 +376,24 @@ def elsewhere(tmp_path: Path, metres_east: float) -> Iterator[Path]:
     yield tmp_path / "elsewhere"
 
 
-def test_a_flight_over_another_place_is_refused(site, tmp_path):
-    folder = next(elsewhere(tmp_path, 60_000))
+@pytest.mark.parametrize("metres_east", [3_000, 60_000])
+def test_a_flight_over_another_place_is_refused(site, tmp_path, metres_east):
+    folder = next(elsewhere(tmp_path, metres_east))
     with pytest.raises(InputError, match="km from the site"):
         list(compare_flights([folder / "flight1"], site, _COMPARE, camera=folder / "camera.xml"))
+
+
+@pytest.mark.parametrize("shown_east_m, is_there", [(8_000.0, True), (6_000.0, False)])
+def test_a_place_is_another_one_far_from_the_ground_that_is_shown_not_from_where_it_began(site, shown_east_m, is_there):
+    with Archive.open(site, write=False) as archive:
+        known = archive.site()
+    track = SimpleNamespace(east_north_m=np.array([[np.nan, np.nan], [9_000.0, 0.0], [9_500.0, 0.0]]))
+    shown_m = np.array([[0.0, 0.0], [shown_east_m, 0.0]])
+    if is_there:
+        _check_place(known, track, "next", shown_m)
+    else:
+        with pytest.raises(InputError, match="is 3 km from the site"):
+            _check_place(known, track, "next", shown_m)
 
 
 def test_a_flight_that_only_extends_the_map_is_warned_of(site, tmp_path):

@@ -84,6 +84,20 @@ def test_overviews_do_not_darken_the_rim_of_what_is_seen(tmp_path: Path, site_gr
     assert (red[alpha > 0] >= 199).all()
 
 
+def test_what_is_empty_between_two_places_is_left_out_of_the_overviews_alone(
+    tmp_path: Path, site_grid: SiteGrid, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(4)
+    tiles = {}
+    for index in ((-3, -2), (-2, -2), (2, 4), (3, 1)):
+        tiles[index] = rng.integers(0, 256, tile(0).shape, dtype=np.uint8)
+        tiles[index][..., 3] = 255
+    write_cog(tiles, site_grid, tmp_path / "skipped.tif")
+    monkeypatch.setattr("sorvolo.store.geotiff._filled_blocks", lambda tiles: None)
+    write_cog(tiles, site_grid, tmp_path / "whole.tif")
+    assert (tmp_path / "skipped.tif").read_bytes() == (tmp_path / "whole.tif").read_bytes()
+
+
 @pytest.mark.parametrize("crs", ["EPSG:3857", "EPSG:4326", "EPSG:25833"])
 def test_another_crs_keeps_the_place_and_the_alpha(tmp_path: Path, site_grid: SiteGrid, crs: str) -> None:
     pixel = (120, -77)

@@ -13,7 +13,7 @@ from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.compare_run import CompareRun, Looking
 from sorvolo.missions.detecting import Detects
-from sorvolo.missions.flight_setup import FlightSetup, known_flights, prepare
+from sorvolo.missions.flight_setup import FlightSetup, known_flights, known_ground_m, prepare
 from sorvolo.missions.known_camera import known_camera
 from sorvolo.missions.map_objects import open_detector
 from sorvolo.missions.settings import CompareSettings
@@ -66,7 +66,10 @@ def _compare_one(
     detector: Detects | None, *, telemetry_named: bool,
 ) -> Generator[CompareUpdate]:
     started_s = time.monotonic()
-    setup = prepare(source, settings.mapping, archive.site(), telemetry_named=telemetry_named, finds_itself=True)
+    setup = prepare(
+        source, settings.mapping, archive.site(), telemetry_named=telemetry_named, finds_itself=True,
+        ground_m=known_ground_m(archive),
+    )
     inside = setup.inside(area)
     step_s = 0.0 if source.kind == "photos" else 1.0 / settings.views_per_second
     base, is_newest = _base_version(archive, source)

@@ -12,6 +12,7 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame, utm_epsg
+from sorvolo.geometry.homography import apply_homography
 from sorvolo.missions.settings import MapSettings
 from sorvolo.mosaic.selection import interval_s
 from sorvolo.store.archive import Archive
@@ -19,7 +20,8 @@ from sorvolo.store.site_folder import CATALOGUE
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import CameraPrior, Frame, Notice, PosedFrame, Site, Telemetry, no_telemetry
 
-_ANOTHER_PLACE_M = 20_000.0
+_ANOTHER_PLACE_M = 2_000.0  # from known ground: a map's files hold all between, which takes minutes where it is far
+_PLACES_ASKED = 200  # of a flight
 _UNTIMED_STEP_S = 0.2  # candidates of a video without telemetry, or live: five a second, the pictures decide
 _LIVE_SPEED_M_S = 5.0  # a flight that has just begun does not show yet how fast it will be
 
@@ -96,12 +98,14 @@ class FlightSetup:
 
 
 def prepare(
-    source: Source, settings: MapSettings, site: Site | None, *, telemetry_named: bool, finds_itself: bool = False
+    source: Source, settings: MapSettings, site: Site | None, *, telemetry_named: bool, finds_itself: bool = False,
+    ground_m: PointsM | None = None,
 ) -> FlightSetup:
     """Tie clocks, lay the flight into the site frame and foresee its keyframes.
 
-    `finds_itself`: the flight's frames are looked for in the site's map, so that they need no GPS. Raises InputError
-    when the flight belongs to another place than the site, or the telemetry to another flight.
+    `ground_m` (N, 2) are places all over the ground that the site shows, see `known_ground_m`. `finds_itself`: the
+    flight's frames are looked for in the site's map, so that they need no GPS. Raises InputError when the flight is of
+    another place than the site, or the telemetry of another flight.
     """
     is_live = isinstance(source, LiveSource)
     if isinstance(source, LiveSource):
@@ -150,12 +154,12 @@ def prepare(
     origin = site.origin if site is not None else site_origin(telemetry)
     assert origin is not None  # has_fixes
     frame = LocalFrame(origin)
-    ground_m = settings.ground_elevation_m
-    if ground_m is None and np.isfinite(source.ground_elevation_m):
-        ground_m = source.ground_elevation_m
-    track, notices = track_from_telemetry(telemetry, clock, frame, ground_elevation_m=ground_m)
+    elevation_m = settings.ground_elevation_m
+    if elevation_m is None and np.isfinite(source.ground_elevation_m):
+        elevation_m = source.ground_elevation_m
+    track, notices = track_from_telemetry(telemetry, clock, frame, ground_elevation_m=elevation_m)
     if site is not None:
-        _check_place(site, track, source.name)
+        _check_place(site, track, source.name, np.zeros((1, 2)) if ground_m is None else ground_m)
     if settings.offset_s is not None:
         track = shifted(track, settings.offset_s)
     known = np.isfinite(track.east_north_m[:, 0])
@@ -184,7 +188,7 @@ def prepare(
     smooth_s = 0.5 * keyframe_s if source.kind == "video" and settings.method == "planar" else 0.0
     return FlightSetup(
         source, frame, clock, track, step_s, keyframe_s, smooth_s, expected, site, (*clock.notices, *notices),
-        settings.offset_s or 0.0, ground_m, telemetry, telemetry_version,
+        settings.offset_s or 0.0, elevation_m, telemetry, telemetry_version,
     )
 
 
@@ -216,9 +220,19 @@ def new_site(setup: FlightSetup, name: str, m_per_px: float, ground_up_m: float)
     return Site(name, origin, crs, m_per_px, height_reference=reference)
 
 
-def _check_place(site: Site, track: Track, name: str) -> None:
+def known_ground_m(archive: Archive) -> PointsM | None:
+    """(N, 2) places on the ground that a site shows, one for each tile of its map, site metres; None without any."""
+    if not archive.has_site or not (tiles := archive.tiles()):
+        return None
+    site_grid = archive.site_grid()
+    site_from_grid = np.linalg.inv(site_grid.grid_from_site_affine(np.zeros(2), 50.0))
+    return apply_homography(site_from_grid, (np.array(sorted(tiles)) + 0.5) * site_grid.grid.tile_px)
+
+
+def _check_place(site: Site, track: Track, name: str, ground_m: PointsM) -> None:
     known = track.east_north_m[np.isfinite(track.east_north_m[:, 0])]
-    nearest_m = float(np.hypot(*known.T).min())
+    some = known[:: -(-len(known) // _PLACES_ASKED)]
+    nearest_m = min(float(np.hypot(*(ground_m - place).T).min()) for place in some)
     if nearest_m > _ANOTHER_PLACE_M:
         raise InputError(
             f"the flight {name} is {nearest_m / 1000:.0f} km from the site {site.name} at "

@@ -10,7 +10,7 @@ from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import Source, opened_sources
 from sorvolo.missions.detecting import Detects
 from sorvolo.missions.flight_run import FlightRun
-from sorvolo.missions.flight_setup import known_flights, prepare
+from sorvolo.missions.flight_setup import known_flights, known_ground_m, prepare
 from sorvolo.missions.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.map_planar import PlanarRun
 from sorvolo.missions.map_thesis import ThesisRun
@@ -52,7 +52,10 @@ def _map_one(
     telemetry_named: bool,
 ) -> Generator[MosaicUpdate]:
     started_s = time.monotonic()
-    setup = prepare(source, settings, archive.site() if archive.has_site else None, telemetry_named=telemetry_named)
+    setup = prepare(
+        source, settings, archive.site() if archive.has_site else None, telemetry_named=telemetry_named,
+        ground_m=known_ground_m(archive),
+    )
     make = ThesisRun if settings.method == "thesis" else PlanarRun
     finder = None if detector is None else ObjectFinder(detector, source.camera.camera)
     with make(setup, archive, settings, finder=finder) as run:

@@ -5,7 +5,7 @@ starts at that pixel's outer corner.
 """
 
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,7 +74,8 @@ def write_cog(
         _write_plain(tiles, grid, plain)
         if target is not None:
             plain = _warped(plain, target)
-        with rasterio.open(_pyramid(plain), driver="VRT") as source:
+        filled = None if target is not None else _filled_blocks(tiles)
+        with rasterio.open(_pyramid(plain, filled), driver="VRT") as source:
             rasterio.shutil.copy(source, temporary, **_COG)
         with rasterio.open(plain, driver="GTiff") as source:
             _verify(temporary, source)
@@ -152,14 +153,22 @@ def _warped(plain: Path, target: CRS) -> Path:
     return warped
 
 
-def _pyramid(plain: Path) -> Path:
+def _filled_blocks(tiles: Collection[TileIndex]) -> set[TileIndex]:
+    """Which blocks, column and row, of the scratch file the tiles fill: of the same size as they, from its corner."""
+    left, top = np.array(sorted(tiles)).min(axis=0)
+    return {(column - int(left), row - int(top)) for column, row in tiles}
+
+
+def _pyramid(plain: Path, filled: set[TileIndex] | None) -> Path:
     """Halve the scratch file until it fits one block; return a VRT of it with the halves as its overviews.
 
-    GDAL's own averaging under an alpha band takes twice as long as all the rest of the export.
+    Of places far apart most blocks between them are empty: where it is known which are `filled` the others are left
+    out. GDAL's own averaging under an alpha band takes twice as long as all the rest of the export.
     """
     levels = [plain]
-    while (halved := _halved(levels[-1], plain.with_name(f"half{len(levels)}.tif"))) is not None:
+    while (halved := _halved(levels[-1], plain.with_name(f"half{len(levels)}.tif"), filled)) is not None:
         levels.append(halved)
+        filled = None if filled is None else {(column // 2, row // 2) for column, row in filled}
     with rasterio.open(plain, driver="GTiff") as source:
         transform = ",".join(repr(number) for number in source.transform.to_gdal())
         place = f"<SRS>{escape(source.crs.to_wkt())}</SRS>" if source.crs else ""
@@ -184,8 +193,11 @@ def _vrt_source(level: Path, band: int) -> str:
     )
 
 
-def _halved(larger: Path, path: Path) -> Path | None:
-    """The next overview of a scratch file, at `path`; None when that one fits a block already."""
+def _halved(larger: Path, path: Path, filled: set[TileIndex] | None) -> Path | None:
+    """The next overview of a scratch file, at `path`; None when that one fits a block already.
+
+    Blocks of the larger one that are not `filled` are empty.
+    """
     with rasterio.open(larger, driver="GTiff") as source:
         if max(source.width, source.height) <= _BLOCK_PX:
             return None
@@ -196,7 +208,10 @@ def _halved(larger: Path, path: Path) -> Path | None:
         whole = Window(0, 0, source.width, source.height)
         with rasterio.open(path, "w", **profile) as sink:
             sink.colorinterp = source.colorinterp
-            for _, small in sink.block_windows(1):
+            wanted = None if filled is None else {(row // 2, column // 2) for column, row in filled}
+            for place, small in sink.block_windows(1):
+                if wanted is not None and place not in wanted:
+                    continue
                 large = Window(2 * small.col_off, 2 * small.row_off, 2 * small.width, 2 * small.height)
                 rgba = np.moveaxis(source.read(window=large.intersection(whole)), 0, 2)
                 if not rgba[..., 3].any():
