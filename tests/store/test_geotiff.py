@@ -93,7 +93,7 @@ def test_what_is_empty_between_two_places_is_left_out_of_the_overviews_alone(
         tiles[index] = rng.integers(0, 256, tile(0).shape, dtype=np.uint8)
         tiles[index][..., 3] = 255
     write_cog(tiles, site_grid, tmp_path / "skipped.tif")
-    monkeypatch.setattr("sorvolo.store.geotiff._filled_blocks", lambda tiles: None)
+    monkeypatch.setattr("sorvolo.store.geotiff._filled_blocks", lambda tiles, grid: None)
     write_cog(tiles, site_grid, tmp_path / "whole.tif")
     assert (tmp_path / "skipped.tif").read_bytes() == (tmp_path / "whole.tif").read_bytes()
 

@@ -209,9 +209,9 @@ def _contraries(patch: Patch, changed: Mask, light: "_OneLight") -> tuple[Mask, 
         is_solid = all(np.count_nonzero(own) >= _SOLID * size for own, size in zip((left, came), sizes, strict=True))
         if is_solid and np.count_nonzero(hulls[0] & hulls[1]) <= _MOST_SHARED * min(sizes):
             left, came = (changed & (cv2.resize(each.view(np.uint8), changed.shape[::-1]) > 0) for each in (left, came))
-            # the shadow of something that stays leaves one side and comes on another
             if _are_one_place(left, came, patch.m_per_px):
                 return nothing, nothing
+            # the shadow of something that stays leaves one side and comes on another
             new_shade, old_shade = light.shades()
             if not (_is_part(left, old_shade) and _is_part(came, new_shade)):
                 return left, came & ~left

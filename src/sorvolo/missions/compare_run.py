@@ -118,10 +118,10 @@ class CompareRun:
         try:
             self._eyes.shutdown(cancel_futures=True)
             self._witnesses.shutdown(cancel_futures=True)
-            cv2.setNumThreads(self._opencv_threads)
             if self._finder is not None:
                 self._finder.close()
         finally:  # also when Ctrl-C strikes again meanwhile
+            cv2.setNumThreads(self._opencv_threads)
             self._writer.__exit__(kind, error, trace)
 
     @property
@@ -378,7 +378,7 @@ class CompareRun:
                 f"the flight is {brightness:.2f} times as bright as the map: what is small, dark or of the ground's "
                 "colour is missed; compare flights by daylight"
             )
-        if not self.compared:  # the flight only extended the map, or it would not be here
+        if self._statuses[ViewStatus.OUTSIDE] == self.views - self._statuses[ViewStatus.LOST]:
             warnings.append(
                 f"none of {self.views} views lies on the map, which grew beside what it showed: if the flight was over "
                 "the same ground, its telemetry is metres off; `sorvolo history` has the map from before"

@@ -22,8 +22,8 @@ class Undistorter:
         self.camera = camera.undistorted()
         taken = taken or camera
         self._size = camera.width_px, camera.height_px
-        self._taken_size = taken.width_px, taken.height_px
         self._averages = camera.is_distorted and 1.0 < taken.width_px / camera.width_px < _AVERAGED
+        self._mapped_size = (taken.width_px, taken.height_px) if self._averages else self._size
         self._maps: tuple[Anything, Anything] | None = None
         if self._averages:
             x, y = cv2.initUndistortRectifyMap(
@@ -63,7 +63,7 @@ class Undistorter:
         """Which pixels of the perfect picture, resampled to this size, exist; None = all."""
         if self._maps is None:
             return None
-        white = np.full((self._taken_size if self._averages else self._size)[::-1], 255, np.uint8)
+        white = np.full(self._mapped_size[::-1], 255, np.uint8)
         seen = cv2.remap(white, *self._maps, cv2.INTER_LINEAR)
         seen = cv2.erode(seen, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
         mask = cv2.resize(seen, (width_px, height_px), interpolation=cv2.INTER_AREA) == 255

@@ -74,7 +74,7 @@ def write_cog(
         _write_plain(tiles, grid, plain)
         if target is not None:
             plain = _warped(plain, target)
-        filled = None if target is not None else _filled_blocks(tiles)
+        filled = None if target is not None else _filled_blocks(tiles, grid)
         with rasterio.open(_pyramid(plain, filled), driver="VRT") as source:
             rasterio.shutil.copy(source, temporary, **_COG)
         with rasterio.open(plain, driver="GTiff") as source:
@@ -153,10 +153,15 @@ def _warped(plain: Path, target: CRS) -> Path:
     return warped
 
 
-def _filled_blocks(tiles: Collection[TileIndex]) -> set[TileIndex]:
-    """Which blocks, column and row, of the scratch file the tiles fill: of the same size as they, from its corner."""
-    left, top = np.array(sorted(tiles)).min(axis=0)
-    return {(column - int(left), row - int(top)) for column, row in tiles}
+def _filled_blocks(tiles: Collection[TileIndex], grid: Grid) -> set[TileIndex]:
+    """Which blocks, column and row, of the scratch file the tiles fill."""
+    left, top = np.array(sorted(tiles)).min(axis=0) * grid.tile_px
+    found = set()
+    for index in tiles:
+        x0, y0, x1, y1 = np.array(grid.tile_window(index)) - [left, top, left, top]
+        columns, rows = (range(int(low) // _BLOCK_PX, -(-int(high) // _BLOCK_PX)) for low, high in ((x0, x1), (y0, y1)))
+        found |= {(column, row) for column in columns for row in rows}
+    return found
 
 
 def _pyramid(plain: Path, filled: set[TileIndex] | None) -> Path:
@@ -166,9 +171,12 @@ def _pyramid(plain: Path, filled: set[TileIndex] | None) -> Path:
     out. GDAL's own averaging under an alpha band takes twice as long as all the rest of the export.
     """
     levels = [plain]
-    while (halved := _halved(levels[-1], plain.with_name(f"half{len(levels)}.tif"), filled)) is not None:
-        levels.append(halved)
+    while True:
         filled = None if filled is None else {(column // 2, row // 2) for column, row in filled}
+        halved = _halved(levels[-1], plain.with_name(f"half{len(levels)}.tif"), filled)
+        if halved is None:
+            break
+        levels.append(halved)
     with rasterio.open(plain, driver="GTiff") as source:
         transform = ",".join(repr(number) for number in source.transform.to_gdal())
         place = f"<SRS>{escape(source.crs.to_wkt())}</SRS>" if source.crs else ""
@@ -196,7 +204,7 @@ def _vrt_source(level: Path, band: int) -> str:
 def _halved(larger: Path, path: Path, filled: set[TileIndex] | None) -> Path | None:
     """The next overview of a scratch file, at `path`; None when that one fits a block already.
 
-    Blocks of the larger one that are not `filled` are empty.
+    Its blocks that are not `filled` are empty.
     """
     with rasterio.open(larger, driver="GTiff") as source:
         if max(source.width, source.height) <= _BLOCK_PX:
@@ -208,9 +216,8 @@ def _halved(larger: Path, path: Path, filled: set[TileIndex] | None) -> Path | N
         whole = Window(0, 0, source.width, source.height)
         with rasterio.open(path, "w", **profile) as sink:
             sink.colorinterp = source.colorinterp
-            wanted = None if filled is None else {(row // 2, column // 2) for column, row in filled}
-            for place, small in sink.block_windows(1):
-                if wanted is not None and place not in wanted:
+            for (row, column), small in sink.block_windows(1):
+                if filled is not None and (column, row) not in filled:
                     continue
                 large = Window(2 * small.col_off, 2 * small.row_off, 2 * small.width, 2 * small.height)
                 rgba = np.moveaxis(source.read(window=large.intersection(whole)), 0, 2)
