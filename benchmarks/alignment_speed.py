@@ -22,14 +22,14 @@ from sorvolo.capture.source import open_sources
 from sorvolo.change.alignment import Aligned, Aligner
 from sorvolo.change.reference import ReferenceMap
 from sorvolo.geometry.homography import apply_homography, fit_similarity
-from sorvolo.missions.flight_setup import prepare
-from sorvolo.missions.map_flight import map_flights
-from sorvolo.missions.settings import MapSettings
-from sorvolo.missions.simulate_site import simulate_site
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.flight.setup import prepare
+from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.mosaic.lens import Undistorter
 from sorvolo.mosaic.selection import every
 from sorvolo.simulation.presets import preset
-from sorvolo.store.archive import Archive
+from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Frame
 
 RESULTS = Path(__file__).parent / "results" / "alignment_speed.json"

@@ -26,11 +26,11 @@ from rich.console import Console
 from rich.table import Table
 
 from mosaic_methods import commit, machine
-from sorvolo.missions.compare_flights import compare_flights
-from sorvolo.missions.evaluate_changes import as_json, evaluate_changes
-from sorvolo.missions.map_flight import map_flights
-from sorvolo.missions.settings import CompareSettings, MapSettings
-from sorvolo.missions.simulate_site import simulate_site
+from sorvolo.missions.compare.flights import compare_flights
+from sorvolo.missions.evaluate.changes import as_json, evaluate_changes
+from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.presets import preset
 from sorvolo.simulation.settings import ImagingSettings
 

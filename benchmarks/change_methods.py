@@ -23,8 +23,8 @@ from rich.table import Table
 
 from change_suites import SUITES, Ground, Pair, grounds, pairs, views
 from mosaic_methods import commit, machine
-from sorvolo.change.robust import compare_robust
-from sorvolo.change.thesis import ThesisSettings, compare_thesis
+from sorvolo.change.pair.robust import compare_robust
+from sorvolo.change.pair.thesis import ThesisSettings, compare_thesis
 
 RESULTS = Path(__file__).parent / "results" / "change_methods.json"
 VIEWS, NEEDED = 5, 3

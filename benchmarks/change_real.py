@@ -27,11 +27,11 @@ from mosaic_methods import commit, machine
 from sorvolo.change.compared_ground import ComparedGround, compared_ground
 from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.polygons import points_inside
-from sorvolo.missions.compare_flights import compare_flights
-from sorvolo.missions.frame_rows import map_frames, site_points
-from sorvolo.missions.map_flight import map_flights
-from sorvolo.missions.settings import CompareSettings, MapSettings
-from sorvolo.store.archive import Archive
+from sorvolo.missions.compare.flights import compare_flights
+from sorvolo.missions.evaluate.frame_rows import map_frames, site_points
+from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+from sorvolo.missions.map.flights import map_flights
+from sorvolo.store.site.archive import Archive
 
 RESULTS = Path(__file__).parent / "results" / "change_real.json"
 METHODS = ("thesis", "robust")

@@ -28,8 +28,8 @@ from rich.table import Table
 from change_suites import grounds, pairs
 from mosaic_methods import commit, machine
 from sorvolo import kernels
-from sorvolo.change.compare import compare_images
-from sorvolo.change.thesis import prepare_reference
+from sorvolo.change.pair.compare import compare_images
+from sorvolo.change.pair.thesis import prepare_reference
 
 SIZES = ((960, 540), (1280, 720), (1920, 1080))
 SUITES = ("plain", "illumination", "cloud", "hard")

@@ -19,8 +19,8 @@ import numpy as np
 
 import detection_data
 from mosaic_methods import commit, machine
-from sorvolo.missions.evaluate_detector import EvaluationSettings, evaluate_detector, write_evaluation
-from sorvolo.missions.simulate_pictures import simulate_pictures
+from sorvolo.missions.evaluate.detector import EvaluationSettings, evaluate_detector, write_evaluation
+from sorvolo.missions.simulate.pictures import simulate_pictures
 from sorvolo.simulation.flight import simulate_flight
 from sorvolo.simulation.pictures import LEAST_VISIBLE, SMALLEST_PX, PictureSettings
 from sorvolo.simulation.presets import preset

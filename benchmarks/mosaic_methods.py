@@ -27,10 +27,10 @@ from rich.table import Table
 
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
-from sorvolo.missions.evaluate_mosaic import evaluate_mosaic
-from sorvolo.missions.map_flight import map_flights
-from sorvolo.missions.settings import MapSettings
-from sorvolo.missions.simulate_site import simulate_site
+from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.mosaic.quality import corner_errors
 from sorvolo.simulation.presets import preset
 

@@ -21,7 +21,7 @@ import torch
 from detection_data import hituav, in_order, tinyperson
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.metrics import ClassMatch, counts_at, judged_classes, match_pictures
-from sorvolo.missions.simulate_pictures import simulate_pictures
+from sorvolo.missions.simulate.pictures import simulate_pictures
 from sorvolo.simulation.pictures import PictureSettings
 from sorvolo.store.datasets import read_dataset
 from sorvolo.survey.labels import LabelledSet

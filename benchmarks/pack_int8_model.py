@@ -17,7 +17,7 @@ from pack_default_model import HOME
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.quantise import quantise
 from sorvolo.detection.scores import score_set
-from sorvolo.missions.simulate_pictures import simulate_pictures
+from sorvolo.missions.simulate.pictures import simulate_pictures
 from sorvolo.simulation.pictures import PictureSettings
 from sorvolo.store.datasets import read_dataset
 from sorvolo.survey.labels import LabelledSet

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from detection_data import hituav, in_order
 from pack_default_model import VALIDATION_PICTURES, VALIDATION_SEED, Recipe, pack
-from sorvolo.missions.simulate_pictures import simulate_pictures
+from sorvolo.missions.simulate.pictures import simulate_pictures
 from sorvolo.simulation.pictures import PictureSettings
 from sorvolo.store.datasets import read_dataset
 from sorvolo.survey.labels import LabelledSet

@@ -19,8 +19,8 @@ from PIL import Image
 from mosaic_methods import commit, machine
 from sorvolo.capture.photo_metadata import read_photo_metadata
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
-from sorvolo.missions.map_flight import map_flights
-from sorvolo.missions.settings import MapSettings
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.map.flights import map_flights
 
 RESULTS = Path(__file__).parent / "results" / "real_flights.json"
 _GPS_IFD = 0x8825

@@ -23,7 +23,7 @@ import torch
 from detection_data import SMALL, aerial_cars, hituav, in_order, mannequin, tinyperson
 from sorvolo.detection.models import find_model
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.missions.simulate_pictures import simulate_pictures
+from sorvolo.missions.simulate.pictures import simulate_pictures
 from sorvolo.simulation.pictures import PictureSettings
 from sorvolo.store.datasets import read_dataset
 from sorvolo.survey.labels import LabelledPicture, LabelledSet

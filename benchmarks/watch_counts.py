@@ -24,9 +24,9 @@ from scipy.optimize import linear_sum_assignment
 
 from mosaic_methods import commit, machine
 from sorvolo.geometry.geodesy import LocalFrame
-from sorvolo.missions.simulate_site import simulate_site
-from sorvolo.missions.watch import watch
-from sorvolo.missions.watch_settings import WatchOutputs
+from sorvolo.missions.simulate.site import simulate_site
+from sorvolo.missions.watch.flights import watch
+from sorvolo.missions.watch.settings import WatchOutputs
 from sorvolo.simulation.settings import (
     DEFAULT_ORIGIN,
     ImagingSettings,

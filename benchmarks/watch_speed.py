@@ -16,9 +16,9 @@ import numpy as np
 
 from mosaic_methods import commit, machine
 from sorvolo.detection.detector import Detector
-from sorvolo.missions.simulate_site import simulate_site
-from sorvolo.missions.watch import watch
-from sorvolo.missions.watch_settings import WatchOutputs, WatchSettings
+from sorvolo.missions.simulate.site import simulate_site
+from sorvolo.missions.watch.flights import watch
+from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.simulation.settings import (
     ImagingSettings,
     OutputSettings,

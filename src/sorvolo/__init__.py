@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sorvolo.capture.areas import read_area
-    from sorvolo.change.compare import Comparison, compare_images
-    from sorvolo.change.robust import RobustSettings
-    from sorvolo.change.thesis import ThesisSettings, prepare_reference, thesis_steps
+    from sorvolo.change.pair.compare import Comparison, compare_images
+    from sorvolo.change.pair.robust import RobustSettings
+    from sorvolo.change.pair.thesis import ThesisSettings, prepare_reference, thesis_steps
     from sorvolo.detection.detector import Detector
     from sorvolo.errors import GeometryError, InputError, SettingsError, SorvoloError, StoreError
     from sorvolo.missions.calibrate_camera import (
@@ -20,13 +20,14 @@ if TYPE_CHECKING:
         parse_board,
         write_calibration,
     )
-    from sorvolo.missions.compare_flights import compare_flights
-    from sorvolo.missions.evaluate_changes import evaluate_changes
-    from sorvolo.missions.evaluate_detector import EvaluationSettings, evaluate_detector, read_sets, write_evaluation
-    from sorvolo.missions.evaluate_mosaic import evaluate_mosaic
-    from sorvolo.missions.evaluate_objects import evaluate_objects
-    from sorvolo.missions.inspect_input import inspect_input
-    from sorvolo.missions.map_flight import map_flights
+    from sorvolo.missions.compare.flights import compare_flights
+    from sorvolo.missions.evaluate.changes import evaluate_changes
+    from sorvolo.missions.evaluate.detector import EvaluationSettings, evaluate_detector, read_sets, write_evaluation
+    from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
+    from sorvolo.missions.evaluate.objects import evaluate_objects
+    from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+    from sorvolo.missions.inspect import inspect_input
+    from sorvolo.missions.map.flights import map_flights
     from sorvolo.missions.plan_flight import (
         PlanSettings,
         answer_questions,
@@ -34,20 +35,19 @@ if TYPE_CHECKING:
         plan_over,
         write_plan,
     )
-    from sorvolo.missions.settings import CompareSettings, MapSettings
-    from sorvolo.missions.simulate_pictures import simulate_pictures
-    from sorvolo.missions.simulate_site import simulate_site
-    from sorvolo.missions.train_detector import train_detector
-    from sorvolo.missions.train_settings import TrainSettings
-    from sorvolo.missions.training_sets import DataOptions
-    from sorvolo.missions.watch import watch
-    from sorvolo.missions.watch_run import WatchUpdate
-    from sorvolo.missions.watch_settings import WatchOutputs, WatchSettings
+    from sorvolo.missions.simulate.pictures import simulate_pictures
+    from sorvolo.missions.simulate.site import simulate_site
+    from sorvolo.missions.train.detector import train_detector
+    from sorvolo.missions.train.sets import DataOptions
+    from sorvolo.missions.train.settings import TrainSettings
+    from sorvolo.missions.watch.flights import watch
+    from sorvolo.missions.watch.run import WatchUpdate
+    from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
     from sorvolo.simulation.pictures import PictureSettings
     from sorvolo.simulation.presets import preset, preset_names
     from sorvolo.simulation.settings import SimulationSettings
-    from sorvolo.store.archive import Archive
     from sorvolo.store.datasets import read_dataset
+    from sorvolo.store.site.archive import Archive
     from sorvolo.survey.findings import Verdict
     from sorvolo.survey.objects import Detections
 
@@ -110,35 +110,35 @@ __all__ = [
 
 _HOMES = {
     "capture.areas": ("read_area",),
-    "change.compare": ("Comparison", "compare_images"),
-    "change.robust": ("RobustSettings",),
-    "change.thesis": ("ThesisSettings", "prepare_reference", "thesis_steps"),
+    "change.pair.compare": ("Comparison", "compare_images"),
+    "change.pair.robust": ("RobustSettings",),
+    "change.pair.thesis": ("ThesisSettings", "prepare_reference", "thesis_steps"),
     "detection.detector": ("Detector",),
     "errors": ("GeometryError", "InputError", "SettingsError", "SorvoloError", "StoreError"),
     "missions.calibrate_camera": ("calibrate_camera", "find_views", "parse_board", "write_calibration"),
-    "missions.compare_flights": ("compare_flights",),
-    "missions.evaluate_changes": ("evaluate_changes",),
-    "missions.evaluate_detector": ("EvaluationSettings", "evaluate_detector", "read_sets", "write_evaluation"),
-    "missions.evaluate_mosaic": ("evaluate_mosaic",),
-    "missions.evaluate_objects": ("evaluate_objects",),
-    "missions.inspect_input": ("inspect_input",),
-    "missions.map_flight": ("map_flights",),
+    "missions.compare.flights": ("compare_flights",),
+    "missions.evaluate.changes": ("evaluate_changes",),
+    "missions.evaluate.detector": ("EvaluationSettings", "evaluate_detector", "read_sets", "write_evaluation"),
+    "missions.evaluate.mosaic": ("evaluate_mosaic",),
+    "missions.evaluate.objects": ("evaluate_objects",),
+    "missions.inspect": ("inspect_input",),
+    "missions.map.flights": ("map_flights",),
     "missions.plan_flight": (
         "PlanSettings", "answer_questions", "camera_to_plan_with", "plan_over", "write_plan",
     ),
-    "missions.settings": ("CompareSettings", "MapSettings"),
-    "missions.simulate_pictures": ("simulate_pictures",),
-    "missions.simulate_site": ("simulate_site",),
-    "missions.train_detector": ("train_detector",),
-    "missions.train_settings": ("TrainSettings",),
-    "missions.training_sets": ("DataOptions",),
-    "missions.watch": ("watch",),
-    "missions.watch_run": ("WatchUpdate",),
-    "missions.watch_settings": ("WatchOutputs", "WatchSettings"),
+    "missions.flight.settings": ("CompareSettings", "MapSettings"),
+    "missions.simulate.pictures": ("simulate_pictures",),
+    "missions.simulate.site": ("simulate_site",),
+    "missions.train.detector": ("train_detector",),
+    "missions.train.settings": ("TrainSettings",),
+    "missions.train.sets": ("DataOptions",),
+    "missions.watch.flights": ("watch",),
+    "missions.watch.run": ("WatchUpdate",),
+    "missions.watch.settings": ("WatchOutputs", "WatchSettings"),
     "simulation.pictures": ("PictureSettings",),
     "simulation.presets": ("preset", "preset_names"),
     "simulation.settings": ("SimulationSettings",),
-    "store.archive": ("Archive",),
+    "store.site.archive": ("Archive",),
     "store.datasets": ("read_dataset",),
     "survey.findings": ("Verdict",),
     "survey.objects": ("Detections",),

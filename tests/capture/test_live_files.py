@@ -18,8 +18,8 @@ from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import open_sources
 from sorvolo.errors import InputError
-from sorvolo.missions.flight_setup import prepare
-from sorvolo.missions.settings import MapSettings
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.flight.setup import prepare
 from sorvolo.survey.flight import Frame, LostFrame
 
 S = 10**9

@@ -19,8 +19,8 @@ from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import open_sources
 from sorvolo.capture.telemetry.nmea import Epoch
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.missions.flight_setup import prepare
-from sorvolo.missions.settings import MapSettings
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.flight.setup import prepare
 
 S = 10**9
 SETTINGS = LiveSettings(keeps_all=True, silent_s=0.4, give_up_s=20.0)

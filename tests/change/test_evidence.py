@@ -8,8 +8,8 @@ from blob_world import CAMERA_HEIGHT_M, M_PER_PX, START_NS, Thing, flight, view_
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
-from sorvolo.change.gathering import GatheredChange, joined
+from sorvolo.change.evidence.candidate import GatheredChange, joined
+from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
 from sorvolo.errors import SettingsError
 from sorvolo.survey.findings import Change, ChangeKind
 

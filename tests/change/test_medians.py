@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sorvolo.change.medians import median_ratio, middle, middle_and_deviation
+from sorvolo.change.shape.medians import median_ratio, middle, middle_and_deviation
 
 
 @settings(max_examples=60, deadline=None)

@@ -8,8 +8,8 @@ from blob_world import CAMERA_HEIGHT_M, M_PER_PX, Thing, flight, view_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
-from sorvolo.change.moving import Blob, BlobTracker, MovingSettings, TrackPoint, motion
+from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
+from sorvolo.change.motion.blob_tracker import Blob, BlobTracker, MovingSettings, TrackPoint, motion
 from sorvolo.errors import SettingsError
 from sorvolo.survey.findings import ChangeKind
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo import kernels
-from sorvolo.change.radiometry import fit_light, relit
+from sorvolo.change.pair.light import fit_light, relit
 from sorvolo.kernels import reference_robust
 
 

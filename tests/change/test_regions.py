@@ -8,9 +8,9 @@ from blob_world import CAMERA_HEIGHT_M, Thing, view_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sorvolo.change.cells import CellGrid, CellWindow, LaidView, lay
-from sorvolo.change.outlines import KnownPlace, is_known, mask_of, measures, outline_of, overlap
-from sorvolo.change.patches import PatchWindow, cut, moved
+from sorvolo.change.evidence.cells import CellGrid, CellWindow, LaidView, lay
+from sorvolo.change.shape.outlines import KnownPlace, is_known, mask_of, measures, outline_of, overlap
+from sorvolo.change.shape.patches import PatchWindow, cut, moved
 from sorvolo.survey.findings import ChangeKind
 
 SITE_FROM_MASK = np.array([[0.1, 0, 5], [0, -0.1, 9], [0, 0, 1.0]])

@@ -3,9 +3,9 @@
 import numpy as np
 from blob_world import CAMERA_HEIGHT_M, M_PER_PX, Thing, view_of
 
-from sorvolo.change.cells import CellGrid, CellWindow, LaidView
-from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
-from sorvolo.change.restlessness import calmness, restlessness
+from sorvolo.change.evidence.cells import CellGrid, CellWindow, LaidView
+from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
+from sorvolo.change.evidence.restlessness import calmness, restlessness
 
 CELL_M = 0.1
 GROUND = CellWindow(-100, -100, 100, 100)

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from sensor_noise import camera
 
 from sorvolo import kernels
-from sorvolo.change.blob_check import Trees, how_sure
-from sorvolo.change.blobs import FEATURES
-from sorvolo.change.robust import RobustSettings, compare_robust
-from sorvolo.change.settling import settle
-from sorvolo.change.tuning import FlightTuning
+from sorvolo.change.pair.flight_tuning import FlightTuning
+from sorvolo.change.pair.region_score import Trees, how_sure
+from sorvolo.change.pair.regions import FEATURES
+from sorvolo.change.pair.residual_alignment import settle
+from sorvolo.change.pair.robust import RobustSettings, compare_robust
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.kernels import reference_robust
 

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.change.radiometry import fit_light, relit
-from sorvolo.change.robust import compare_robust
-from sorvolo.change.shades import STEPS, moved_shades
+from sorvolo.change.pair.light import fit_light, relit
+from sorvolo.change.pair.moved_shadows import STEPS, moved_shades
+from sorvolo.change.pair.robust import compare_robust
 
 SUN_OVER_SHADE = np.array([0.52, 0.45, 0.4])  # blue green red: a shadow is a little blue
 

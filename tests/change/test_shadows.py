@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from blob_world import M_PER_PX, START_NS, Thing, flight
 
-from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
-from sorvolo.change.shadows import is_of_shade, thing_of, things_of
+from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
+from sorvolo.change.shape.shadows import is_of_shade, thing_of, things_of
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 
 SHADOW = (58, 58, 58)  # of ground as bright as 110

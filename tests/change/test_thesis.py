@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo import kernels
-from sorvolo.change.thesis import (
+from sorvolo.change.pair.thesis import (
     ThesisSettings,
     bhattacharyya_distances,
     compare_thesis,

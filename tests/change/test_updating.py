@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sorvolo.change.updating import is_painted, patched
+from sorvolo.change.map_update import is_painted, patched
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 
 GRID_FROM_SITE = np.array([[20.0, 0, 0], [0, -20.0, 0], [0, 0, 1]])  # 0.05 m a pixel, pixel (0, 0) at the origin

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sorvolo.change.witnesses import Difference, believed
+from sorvolo.change.pair.corroboration import Difference, believed
 
 SHAPE = (60, 80)
 ALL = np.ones(SHAPE, bool)

@@ -12,7 +12,7 @@ import pytest
 import sorvolo
 from sorvolo.cli import main as cli
 from sorvolo.errors import InputError
-from sorvolo.missions.map_flight import map_flights
+from sorvolo.missions.map.flights import map_flights
 
 _COMMANDS = ("inspect", "plan", "map", "simulate", "evaluate", "calibrate", "demo")
 

@@ -15,10 +15,10 @@ import pytest
 from sorvolo.cli import main as cli
 from sorvolo.cli.demo import _is_simulated
 from sorvolo.cli.progress import words_of
-from sorvolo.missions.simulate_site import simulate_site
+from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.presets import preset
 from sorvolo.simulation.settings import SimulationSettings
-from sorvolo.store.archive import Archive
+from sorvolo.store.site.archive import Archive
 from sorvolo.survey.mosaic import MosaicUpdate, Status
 
 

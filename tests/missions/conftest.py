@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sorvolo.missions.simulate_site import simulate_site
+from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.settings import (
     ImagingSettings,
     OutputSettings,

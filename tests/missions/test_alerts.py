@@ -12,7 +12,7 @@ from typing import ClassVar
 import pytest
 
 from sorvolo.errors import SettingsError, StoreError
-from sorvolo.missions.alerts import Outbox, Pace, alert_command, alert_url
+from sorvolo.missions.watch.alerts import Outbox, Pace, alert_command, alert_url
 
 _ALERT = {"id": 3, "class": "small object", "score": 0.9, "latitude": 41.9, "longitude": None, "crop": "/a b/3.jpg"}
 

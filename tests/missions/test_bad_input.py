@@ -19,7 +19,7 @@ import pytest
 from PIL import Image
 
 from sorvolo.cli import main as cli
-from sorvolo.store.archive import Archive
+from sorvolo.store.site.archive import Archive
 
 _GPS_IFD, _ORIENTATION = 34853, 274
 

@@ -20,14 +20,14 @@ from sorvolo.change.reference import ReferenceMap
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.geodesy import Geodetic
-from sorvolo.missions.compare_flights import _looked_at, compare_flights
-from sorvolo.missions.compare_views import ViewMaker, ViewOutcome
-from sorvolo.missions.evaluate_changes import evaluate_changes
-from sorvolo.missions.flight_setup import _check_place, prepare
-from sorvolo.missions.known_camera import known_camera
-from sorvolo.missions.map_flight import map_flights
-from sorvolo.missions.settings import CompareSettings, MapSettings
-from sorvolo.missions.simulate_site import simulate_site
+from sorvolo.missions.compare.flights import _looked_at, compare_flights
+from sorvolo.missions.compare.views import ViewMaker, ViewOutcome
+from sorvolo.missions.evaluate.changes import evaluate_changes
+from sorvolo.missions.flight.known_camera import known_camera
+from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+from sorvolo.missions.flight.setup import _check_place, prepare
+from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.mosaic.selection import every
 from sorvolo.simulation.settings import (
     ImagingSettings,
@@ -38,7 +38,7 @@ from sorvolo.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
-from sorvolo.store.archive import Archive
+from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import CompareUpdate, Verdict, ViewStatus
 from sorvolo.survey.flight import Frame, PosedFrame
 from sorvolo.survey.mosaic import Status

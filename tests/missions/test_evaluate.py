@@ -18,12 +18,12 @@ from sorvolo.geometry.geodesy import Geodetic, Projection
 from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose
-from sorvolo.missions.evaluate_changes import evaluate_changes
-from sorvolo.missions.evaluate_mosaic import evaluate_mosaic
-from sorvolo.missions.evaluate_objects import evaluate_objects
+from sorvolo.missions.evaluate.changes import evaluate_changes
+from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
+from sorvolo.missions.evaluate.objects import evaluate_objects
 from sorvolo.mosaic.canvas import Canvas
 from sorvolo.mosaic.canvas_frame import CanvasFrame
-from sorvolo.store.archive import Archive
+from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame, Status
 

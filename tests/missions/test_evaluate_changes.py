@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 from sorvolo.change.compared_ground import compared_ground
 from sorvolo.cli.evaluate import evaluate_app
 from sorvolo.errors import InputError, SettingsError, StoreError
-from sorvolo.missions.evaluate_changes import evaluate_changes
-from sorvolo.missions.frame_rows import time_ns_of
-from sorvolo.missions.simulate_site import simulate_site
+from sorvolo.missions.evaluate.changes import evaluate_changes
+from sorvolo.missions.evaluate.frame_rows import time_ns_of
+from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.settings import (
     ImagingSettings,
     LaterSettings,
@@ -23,8 +23,8 @@ from sorvolo.simulation.settings import (
     SceneSettings,
     SimulationSettings,
 )
-from sorvolo.store.archive import Archive
 from sorvolo.store.exports import utc_text
+from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Site
 
 SETTINGS = SimulationSettings(

@@ -11,7 +11,7 @@ from toy_models import rectangle_model
 
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.missions.evaluate_detector import (
+from sorvolo.missions.evaluate.detector import (
     FOUND,
     NUMBERS,
     PAGE,
@@ -21,7 +21,7 @@ from sorvolo.missions.evaluate_detector import (
     read_sets,
     write_evaluation,
 )
-from sorvolo.missions.holding_out import hold_out
+from sorvolo.missions.train.holding_out import hold_out
 from sorvolo.store.detector_files import FoundSet, FoundSets, read_found, write_found
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES, Detections

@@ -13,8 +13,8 @@ from fake_flights import LOCAL_SITE, SITE, frame, map_flight, tile
 
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError, StoreError
-from sorvolo.missions.site_history import export_version, find_version, site_history
-from sorvolo.store.archive import Archive
+from sorvolo.missions.site.history import export_version, find_version, site_history
+from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import ChangeKind, Verdict
 
 

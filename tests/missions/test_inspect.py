@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from real_data import real_data
 from sorvolo.cli.inspect import inspect
 from sorvolo.geometry.track import find_strips, length_m, speeds_m_s
-from sorvolo.missions.inspect_input import Inspection, Level, inspect_input
+from sorvolo.missions.inspect import Inspection, Level, inspect_input
 
 M_PER_DEG = 111_132.0
 XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">

@@ -15,10 +15,10 @@ from sorvolo.capture.source import open_sources
 from sorvolo.cli import main as cli
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
-from sorvolo.missions.flight_setup import prepare
-from sorvolo.missions.map_planar import PlanarRun
-from sorvolo.missions.settings import MapSettings
-from sorvolo.store.archive import Archive
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.flight.setup import prepare
+from sorvolo.missions.map.planar_run import PlanarRun
+from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Frame, PosedFrame
 from sorvolo.survey.mosaic import Status
 
@@ -316,10 +316,10 @@ def test_the_map_does_not_depend_on_when_it_was_shown_while_it_grew(
 ) -> None:
     film = tmp_path / "film.mp4"
     shutil.copy(_film(filmed), film)  # without telemetry, whose offsets would move every frame at last
-    monkeypatch.setattr("sorvolo.missions.map_planar._PAINT_REST", 0)
+    monkeypatch.setattr("sorvolo.missions.map.planar_run._PAINT_REST", 0)
     maps = []
     for paint_every in (1, 1000):  # keyframes
-        monkeypatch.setattr("sorvolo.missions.map_planar._PAINT_EVERY", paint_every)
+        monkeypatch.setattr("sorvolo.missions.map.planar_run._PAINT_EVERY", paint_every)
         run_map(tmp_path / f"every {paint_every}", film, "--camera", filmed / "camera.xml")
         maps.append((tmp_path / f"every {paint_every}" / "mosaic.tif").read_bytes())
     assert maps[0] == maps[1]

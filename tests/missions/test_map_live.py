@@ -20,10 +20,10 @@ from sorvolo.capture.source import open_sources
 from sorvolo.cli import main as cli
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.pose import gimbal_angles_from_rotation, site_from_gimbal_rotation
-from sorvolo.missions.compare_flights import compare_flights
-from sorvolo.missions.inspect_input import inspect_input
-from sorvolo.missions.map_flight import map_flights
-from sorvolo.missions.settings import CompareSettings, MapSettings
+from sorvolo.missions.compare.flights import compare_flights
+from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+from sorvolo.missions.inspect import inspect_input
+from sorvolo.missions.map.flights import map_flights
 from sorvolo.survey.findings import ViewStatus
 from sorvolo.survey.flight import Frame
 

@@ -11,14 +11,14 @@ from truth_detector import TruthDetector
 
 from sorvolo.errors import InputError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.missions.change_classes import ChangeClasses, object_at, seen_at
-from sorvolo.missions.compare_flights import compare_flights
-from sorvolo.missions.evaluate_changes import evaluate_changes
-from sorvolo.missions.evaluate_objects import evaluate_objects
-from sorvolo.missions.map_flight import map_flights
-from sorvolo.missions.map_objects import open_detector
-from sorvolo.missions.settings import CompareSettings, MapSettings
-from sorvolo.missions.simulate_site import simulate_site
+from sorvolo.missions.compare.change_classes import ChangeClasses, object_at, seen_at
+from sorvolo.missions.compare.flights import compare_flights
+from sorvolo.missions.evaluate.changes import evaluate_changes
+from sorvolo.missions.evaluate.objects import evaluate_objects
+from sorvolo.missions.flight.map_objects import open_detector
+from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.settings import (
     ImagingSettings,
     OutputSettings,
@@ -27,7 +27,7 @@ from sorvolo.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
-from sorvolo.store.archive import Archive
+from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 from sorvolo.survey.map_objects import MapObject
 from sorvolo.survey.objects import Detections, Sighting, no_detections

@@ -9,8 +9,8 @@ from fake_flights import LOCAL_SITE, SITE, frame, map_flight
 
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, StoreError
-from sorvolo.missions.review_changes import list_changes, review_changes
-from sorvolo.store.archive import Archive
+from sorvolo.missions.site.review import list_changes, review_changes
+from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Verdict
 from sorvolo.survey.flight import Site
 

@@ -20,10 +20,10 @@ from truth_detector import TruthDetector
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.missions.simulate_site import simulate_site
-from sorvolo.missions.watch import watch
-from sorvolo.missions.watch_run import WatchUpdate
-from sorvolo.missions.watch_settings import WatchOutputs, WatchSettings
+from sorvolo.missions.simulate.site import simulate_site
+from sorvolo.missions.watch.flights import watch
+from sorvolo.missions.watch.run import WatchUpdate
+from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.simulation.settings import (
     ImagingSettings,
     OutputSettings,

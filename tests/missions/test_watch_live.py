@@ -15,8 +15,8 @@ from sorvolo.detection.contract import ModelInfo
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
-from sorvolo.missions.watch import watch
-from sorvolo.missions.watch_settings import WatchOutputs
+from sorvolo.missions.watch.flights import watch
+from sorvolo.missions.watch.settings import WatchOutputs
 from sorvolo.survey.objects import Detections
 
 _LIVE = LiveSettings(silent_s=1.0, give_up_s=1.5, first_s=15.0)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sorvolo.errors import SettingsError
-from sorvolo.missions.simulate_site import simulate_site
+from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.events import JOINED_GAP_M, event_features, true_events
 from sorvolo.simulation.flight import has_changed, simulate_flights
 from sorvolo.simulation.presets import preset

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from sorvolo.errors import SettingsError
-from sorvolo.missions.simulate_pictures import simulate_pictures
+from sorvolo.missions.simulate.pictures import simulate_pictures
 from sorvolo.simulation.ground import orthophoto_ground
 from sorvolo.simulation.pictures import SMALLEST_PX, PictureSettings, simulate_picture
 

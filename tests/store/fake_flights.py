@@ -19,7 +19,7 @@ from sorvolo.geometry.geodesy import Geodetic, utm_epsg
 from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
-from sorvolo.store.archive import Archive
+from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame, Status
 

@@ -14,8 +14,8 @@ from fake_flights import CAMERA, LOCAL_SITE, SITE, frame, image, map_flight, til
 
 from sorvolo.errors import GeometryError, SettingsError, StoreError
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.store.archive import Archive
-from sorvolo.store.schema import SCHEMA_VERSION
+from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.schema import SCHEMA_VERSION
 from sorvolo.survey.mosaic import Status
 
 
@@ -203,7 +203,7 @@ def test_a_tile_must_have_the_sites_size_and_comes_out_read_only(folder: Path) -
 
 def test_another_process_reads_the_growing_map(folder: Path) -> None:
     program = (
-        "import sys; from pathlib import Path; from sorvolo.store.archive import Archive\n"
+        "import sys; from pathlib import Path; from sorvolo.store.site.archive import Archive\n"
         "with Archive.open(Path(sys.argv[1]), write=False) as archive:\n"
         "    live, whole = archive.live_tiles(), archive.tiles()\n"
         "    print(len(live), int(live[0, 0][0, 0, 0]), len(whole), int(whole[0, 0][0, 0, 0]))\n"

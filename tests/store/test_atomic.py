@@ -9,8 +9,8 @@ import pytest
 from fake_flights import SITE, image, map_flight
 
 from sorvolo.errors import StoreError
-from sorvolo.store.archive import Archive
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes, remove_leftovers, scratch_folder
+from sorvolo.store.site.archive import Archive
 
 
 def test_a_file_is_replaced_and_nothing_else_is_left(tmp_path: Path) -> None:

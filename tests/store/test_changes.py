@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 
 from sorvolo.errors import InputError, StoreError
 from sorvolo.geometry.polygons import signed_area
-from sorvolo.store import schema
-from sorvolo.store.archive import Archive
-from sorvolo.store.change_records import StoredChange, stored_changes
 from sorvolo.store.changes import changes_geojson, mask_name, write_view_masks
+from sorvolo.store.site import schema
+from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.change_records import StoredChange, stored_changes
 from sorvolo.survey.findings import Change, ChangeKind, Verdict
 
 

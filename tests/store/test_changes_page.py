@@ -15,10 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.store.change_records import StoredChange, stored_changes
-from sorvolo.store.changes_page import changes_page
-from sorvolo.store.changes_style import SCRIPT
 from sorvolo.store.exports import Picture
+from sorvolo.store.pages.changes import changes_page
+from sorvolo.store.pages.changes_style import SCRIPT
+from sorvolo.store.site.change_records import StoredChange, stored_changes
 from sorvolo.survey.findings import Change, ChangeKind, Verdict
 
 KINDS = list(ChangeKind)

@@ -202,7 +202,7 @@ def test_coco_scaled_labels_are_scaled_and_those_of_another_shape_left_out(tmp_p
 
 
 def test_simulated_pictures_read_as_they_were_written(tmp_path):
-    from sorvolo.missions.simulate_pictures import simulate_pictures
+    from sorvolo.missions.simulate.pictures import simulate_pictures
     from sorvolo.simulation.pictures import PictureSettings
 
     wanted = PictureSettings(pictures=2, seed=4, ground="sand", empty_share=0, m_per_px=(0.08, 0.1))

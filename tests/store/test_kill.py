@@ -8,7 +8,7 @@ from pathlib import Path
 import fake_flights
 import pytest
 
-from sorvolo.store.archive import Archive
+from sorvolo.store.site.archive import Archive
 
 
 @pytest.mark.parametrize(("moments", "rounds"), [("random", 5), ("steps", 6)])

@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sorvolo.store.exports import plain_json
-from sorvolo.store.report_page import report_page
-from sorvolo.store.report_plots import Scale, TrackColumns, round_length, track_plan
+from sorvolo.store.pages.flight import report_page
+from sorvolo.store.pages.plots import Scale, TrackColumns, round_length, track_plan
 
 
 def _words(page: str) -> str:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from sorvolo.errors import StoreError
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.images import ImageCache, image_from_jpeg, jpeg_from_image, png_from_rgba, rgba_from_png, weighted
-from sorvolo.store.tiles import GrowingTiles, TileBlobs
+from sorvolo.store.site.tiles import GrowingTiles, TileBlobs
 
 SIDE = 16
 INDICES = st.tuples(st.integers(-1, 1), st.integers(-1, 1))
@@ -77,7 +77,7 @@ def test_tiles_read_lately_are_kept_until_they_are_removed(tmp_path: Path) -> No
 
 
 def test_no_more_tiles_are_kept_than_memory_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sorvolo.store.tiles._CACHE_BYTES", 2 * flat(1).nbytes)
+    monkeypatch.setattr("sorvolo.store.site.tiles._CACHE_BYTES", 2 * flat(1).nbytes)
     blobs = TileBlobs(tmp_path)
     first, second, third = (blobs.save(flat(colour)) for colour in (1, 2, 3))
     kept = blobs.load(first)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from html_checker import checked
 
-from sorvolo.store.watch_page import count_words, watch_page
+from sorvolo.store.pages.watch import count_words, watch_page
 
 _REPORT: dict[str, Any] = {
     "sorvolo": "0.1.0", "flight": "DJI<1>", "georeferenced": True, "first_frame": "2026-05-01T10:00:00Z",

@@ -18,10 +18,10 @@ from square_pictures import labelled_squares  # noqa: E402
 from sorvolo.cli.main import main  # noqa: E402
 from sorvolo.detection.detector import Detector  # noqa: E402
 from sorvolo.errors import InputError, SettingsError  # noqa: E402
-from sorvolo.missions.train_detector import TrainingUpdate, train_detector  # noqa: E402
-from sorvolo.missions.train_settings import TrainSettings  # noqa: E402
-from sorvolo.missions.training_sets import DataOptions, TrainingSets, read_labels, simulate_samples, training_sets  # noqa: E402
-from sorvolo.store.training_page import training_page  # noqa: E402
+from sorvolo.missions.train.detector import TrainingUpdate, train_detector  # noqa: E402
+from sorvolo.missions.train.sets import DataOptions, TrainingSets, read_labels, simulate_samples, training_sets  # noqa: E402
+from sorvolo.missions.train.settings import TrainSettings  # noqa: E402
+from sorvolo.store.pages.training import training_page  # noqa: E402
 from sorvolo.training.checkpoint import read_checkpoint  # noqa: E402
 
 
@@ -123,7 +123,7 @@ def test_ctrl_c_waits_for_the_step_and_leaves_a_checkpoint(
 def test_checkpoints_come_between_checks_too(
     data: Path, tmp_path: Path, schedule: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sorvolo.missions.train_detector._SAVE_S", 0.0)  # else a minute
+    monkeypatch.setattr("sorvolo.missions.train.detector._SAVE_S", 0.0)  # else a minute
     settings = _settings(schedule=schedule, rpn="standard", steps=400)
     for update in (run := _train(data, tmp_path / "out", settings)):
         if update.step == 2:  # long before the first check, of four steps in the first

@@ -16,7 +16,7 @@ torch = pytest.importorskip("torch")
 from safetensors.torch import save_file  # noqa: E402
 
 from sorvolo.errors import InputError  # noqa: E402
-from sorvolo.missions.training_start import fetch_weights, load_start, load_weights  # noqa: E402
+from sorvolo.missions.train.start import fetch_weights, load_start, load_weights  # noqa: E402
 from sorvolo.training import weights as module  # noqa: E402
 from sorvolo.training.backbone import EfficientNetLite0  # noqa: E402
 from sorvolo.training.resnet import IMAGENET_STD, ResNet50  # noqa: E402

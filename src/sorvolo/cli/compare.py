@@ -17,9 +17,9 @@ from rich.table import Table
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.cli.map import ended_by_signal, newest_version, read_json, tell_notices_and_warnings, tell_path
 from sorvolo.cli.progress import bars
-from sorvolo.missions.compare_flights import compare_flights
-from sorvolo.missions.settings import CompareSettings
-from sorvolo.store.archive import Archive
+from sorvolo.missions.compare.flights import compare_flights
+from sorvolo.missions.flight.settings import CompareSettings
+from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Change, ChangeKind, CompareUpdate
 
 _COLOURS = {

@@ -13,11 +13,11 @@ from sorvolo import __version__
 from sorvolo.cli.compare import compare_and_read_results, show_results
 from sorvolo.cli.map import map_and_read_reports, show_reports
 from sorvolo.cli.progress import bars
-from sorvolo.missions.evaluate_changes import evaluate_changes
-from sorvolo.missions.evaluate_mosaic import evaluate_mosaic
-from sorvolo.missions.settings import CompareSettings, MapSettings
-from sorvolo.missions.simulate_site import simulate_site
-from sorvolo.missions.simulation_folder import MARK
+from sorvolo.missions.evaluate.changes import evaluate_changes
+from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
+from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+from sorvolo.missions.simulate.folder import MARK
+from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.presets import preset
 from sorvolo.simulation.settings import SimulationSettings
 from sorvolo.store.exports import plain_json

@@ -11,10 +11,10 @@ from rich.table import Table
 
 from sorvolo.change.metrics import EventScores
 from sorvolo.cli.evaluate_detector import detector
-from sorvolo.missions.evaluate_changes import FlightChanges, evaluate_changes
-from sorvolo.missions.evaluate_changes import as_json as measures_as_json
-from sorvolo.missions.evaluate_mosaic import MosaicEvaluation, evaluate_mosaic
-from sorvolo.missions.evaluate_objects import FlightObjects, evaluate_objects
+from sorvolo.missions.evaluate.changes import FlightChanges, evaluate_changes
+from sorvolo.missions.evaluate.changes import as_json as measures_as_json
+from sorvolo.missions.evaluate.mosaic import MosaicEvaluation, evaluate_mosaic
+from sorvolo.missions.evaluate.objects import FlightObjects, evaluate_objects
 from sorvolo.mosaic.quality import Spread
 from sorvolo.store.exports import plain_json
 

@@ -16,7 +16,7 @@ from sorvolo.cli.progress import bars
 from sorvolo.detection.intervals import Interval
 from sorvolo.detection.scores import SetComparison, SetScores
 from sorvolo.errors import SettingsError
-from sorvolo.missions.evaluate_detector import (
+from sorvolo.missions.evaluate.detector import (
     PAGE,
     EvaluationSettings,
     evaluate_detector,

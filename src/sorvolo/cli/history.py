@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.errors import SettingsError
-from sorvolo.missions.site_history import HistoryEntry, export_version, site_history
+from sorvolo.missions.site.history import HistoryEntry, export_version, site_history
 from sorvolo.store.exports import plain_json
 
 

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.capture.sync import DATED_NS
-from sorvolo.missions.inspect_input import Inspection, Level, inspect_input
+from sorvolo.missions.inspect import Inspection, Level, inspect_input
 
 _COLOURS = {Level.INFO: "blue", Level.WARNING: "yellow", Level.PROBLEM: "red"}
 _MOST_NAMES = 4

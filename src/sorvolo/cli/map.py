@@ -18,10 +18,10 @@ from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.cli.progress import show_progress
 from sorvolo.errors import StoreError
-from sorvolo.missions.map_flight import map_flights
-from sorvolo.missions.settings import MapSettings
-from sorvolo.store.archive import Archive
-from sorvolo.store.site_folder import CATALOGUE
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.map.flights import map_flights
+from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.folder import CATALOGUE
 from sorvolo.survey.mosaic import Status
 
 _COLOURS = {Status.VISION: "green", Status.GPS_ONLY: "yellow", Status.REJECTED: "red"}

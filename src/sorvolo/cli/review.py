@@ -13,9 +13,9 @@ from rich.table import Table
 
 from sorvolo.cli.compare import unit_of
 from sorvolo.errors import SettingsError
-from sorvolo.missions.review_changes import list_changes, review_changes
-from sorvolo.store.change_records import StoredChange
+from sorvolo.missions.site.review import list_changes, review_changes
 from sorvolo.store.exports import time_words, utc_text
+from sorvolo.store.site.change_records import StoredChange
 from sorvolo.survey.findings import Verdict
 
 _COLOURS = {Verdict.CONFIRMED: "green", Verdict.REJECTED: "red"}

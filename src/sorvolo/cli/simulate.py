@@ -18,8 +18,8 @@ from rich.progress import (
 
 from sorvolo.cli.progress import bars
 from sorvolo.errors import SettingsError
-from sorvolo.missions.simulate_pictures import simulate_pictures
-from sorvolo.missions.simulate_site import SimulationProgress, simulate_site
+from sorvolo.missions.simulate.pictures import simulate_pictures
+from sorvolo.missions.simulate.site import SimulationProgress, simulate_site
 from sorvolo.simulation.ground import GroundKind
 from sorvolo.simulation.pictures import PictureSettings
 from sorvolo.simulation.presets import preset, preset_names

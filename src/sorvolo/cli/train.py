@@ -16,11 +16,11 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from sorvolo.errors import SettingsError
-from sorvolo.missions.train_settings import TrainSettings
+from sorvolo.missions.train.settings import TrainSettings
 from sorvolo.store.exports import plain_json
 
 if TYPE_CHECKING:  # torch is an extra, and slow to import: only this command needs it
-    from sorvolo.missions.train_detector import TrainingUpdate
+    from sorvolo.missions.train.detector import TrainingUpdate
 
 
 class Preset(StrEnum):
@@ -101,8 +101,8 @@ def train(
         preset.value, chosen.value, schedule.value, weights, steps, batch, side, seed, synthetic, patience
     )
     try:
-        from sorvolo.missions.train_detector import CHECKPOINT, train_detector
-        from sorvolo.missions.training_sets import DataOptions
+        from sorvolo.missions.train.detector import CHECKPOINT, train_detector
+        from sorvolo.missions.train.sets import DataOptions
     except ModuleNotFoundError as error:
         raise SettingsError(
             f"training needs packages that are not here ({error.name}); install them: pip install 'sorvolo[training]'"

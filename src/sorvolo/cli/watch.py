@@ -19,12 +19,12 @@ from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.cli.map import read_json, tell_path
 from sorvolo.cli.progress import bars
 from sorvolo.errors import SettingsError
-from sorvolo.missions.watch import watch
-from sorvolo.missions.watch_run import WatchUpdate
-from sorvolo.missions.watch_settings import WatchOutputs, WatchSettings
+from sorvolo.missions.watch.flights import watch
+from sorvolo.missions.watch.run import WatchUpdate
+from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.store.cursor_on_target import COT_TYPES
 from sorvolo.store.exports import longitude_latitude
-from sorvolo.store.watch_page import count_words
+from sorvolo.store.pages.watch import count_words
 from sorvolo.survey.flight import Site
 from sorvolo.survey.objects import Track
 

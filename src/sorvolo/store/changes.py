@@ -10,9 +10,9 @@ import numpy as np
 from sorvolo.geometry.arrays import Anything, Boxes, Floats, ImageGray, Mask
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.store.atomic import atomic_write_bytes, writing
-from sorvolo.store.change_records import StoredChange
 from sorvolo.store.exports import longitude_latitude, rounded, utc_text
 from sorvolo.store.images import png_from_rgba
+from sorvolo.store.site.change_records import StoredChange
 from sorvolo.survey.findings import Change
 from sorvolo.survey.flight import Site
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from sorvolo.store.exports import longitude_latitude, rounded, utc_text
-from sorvolo.store.object_records import StoredObject
+from sorvolo.store.site.object_records import StoredObject
 from sorvolo.survey.flight import Site
 from sorvolo.survey.map_objects import MapObject
 

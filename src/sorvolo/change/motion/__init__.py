@@ -1,0 +1,1 @@
+"""What moves: regions followed over views."""

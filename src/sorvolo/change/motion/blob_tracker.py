@@ -1,0 +1,392 @@
+"""What moves while it is seen: changed blobs followed over views in ground metres, and which of them really move.
+
+A thing of height h stands in the picture where its top hides the ground: seen from a camera at height H that flies with
+v, its blob moves over the ground with -v h / (H - h). So what a blob moves against the camera's own way proves nothing
+as long as some h below 0.6 H explains it; only the rest of its motion counts.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.change.evidence.cells import scale_m_per_px
+from sorvolo.change.motion.blobs import RIM_PX, Blob, blobs_of
+from sorvolo.change.shape.shadows import shadow_of_arrival
+from sorvolo.errors import SettingsError
+from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.survey.findings import ComparedView
+
+_MOST_PARALLAX = 0.6 / (1 - 0.6)  # h / (H - h) of a thing 0.6 times as high as the camera flies
+_UNLIKELY_PARALLAX = 0.5  # no thing that came is a third as high as the camera flies
+_POINTS = 12  # of a track, that its velocity is fitted to
+_MUCH_LARGER = 4.0  # times a blob's box
+_NEAR_PX = 8  # what is looked at around a place to tell shadows
+_RIGID_POINTS, _RIGID_LENGTHS, _RIGID_LENGTH_M = 5, 2.0, 2.5
+_VERY_STEADY = 1.3, 1.15  # largest by smallest area and length: what leans changes more on less of a way
+_STEADY_POINTS, _STEADY_LENGTHS, _STEADY_MOVE = 8, 1.2, 0.5
+_FLOATS_LENGTH_M = 1.3
+_PHOTOS_APART_S = 0.7  # at least, on average
+# two that move alike so near each other, in metres or lengths, are one thing, seen now with its shadow, now without
+_ONE_THING_M, _ONE_THING_LENGTHS = 0.4, 0.3
+_LOST_FOR_S = 45.0  # a thing that moves steadily is known again after so long: on the next strip, too
+
+
+@dataclass(frozen=True)
+class MovingSettings:
+    """When something counts as moving."""
+
+    least_views: int = 5
+    least_photos: int = 3  # of views so far apart in time as photos are: chance seldom fits three of them
+    least_move_m: float = 1.0  # beyond what alignment and a swaying crown do
+    least_lengths: float = 1.0  # of its own: then its places do not overlap, and nothing that grew explains it
+    least_length_m: float = 0.3  # a person from above; smaller specks jump about
+    most_speed_m_s: float = 3.0  # of something small ...
+    most_lengths_s: float = 4.0  # ... and lengths a second more: a car of 4 m may go 19 m/s
+    most_step_m: float = 6.0  # between two views: further away anything could be it
+    forget_s: float = 2.5  # a track without a blob for so long has ended ...
+    forget_views: int = 2  # ... and so many views
+
+    def __post_init__(self) -> None:
+        if not 3 <= self.least_photos <= self.least_views:
+            raise SettingsError(
+                "moving needs at least 3 views to see a steady velocity, of photos no more than of a video, "
+                f"got {self.least_views} and {self.least_photos}"
+            )
+        if min(self.least_move_m, self.least_lengths, self.most_speed_m_s, self.most_step_m, self.forget_s) <= 0:
+            raise SettingsError("moving: distances, speeds and times must be above 0")
+
+    def fastest_m_s(self, length_m: float) -> float:
+        """The greatest speed that something of this length may have."""
+        return self.most_speed_m_s + self.most_lengths_s * length_m
+
+
+@dataclass(frozen=True, eq=False)
+class TrackPoint:
+    """A blob at a time, with the camera's place (2,) then."""
+
+    time_ns: int
+    blob: Blob
+    camera_m: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How a track moves: `velocity_m_s` (2,) as fitted, `own_m_s` (2,) what no parallax explains.
+
+    `camera_m_s` (2,) is the camera's velocity meanwhile. `path_m` is how far the thing's own motion took it, `error_m`
+    the rms distance of its points from steady motion.
+    """
+
+    velocity_m_s: Floats
+    camera_m_s: Floats
+    own_m_s: Floats
+    path_m: float
+    error_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One blob over time: its first point, its last few, how many, and the sum of their scores.
+
+    `mover` is the number of the moving thing that it is, 0 = not known to move.
+    """
+
+    first: TrackPoint
+    points: tuple[TrackPoint, ...]
+    count: int
+    score_sum: float
+    velocity_m_s: Floats  # (2,) over its last points; zeros while there is but one
+    mover: int = 0
+
+    @property
+    def last(self) -> TrackPoint:
+        """Where it was seen last."""
+        return self.points[-1]
+
+    @property
+    def seconds(self) -> float:
+        """The time over which its last points are spread."""
+        return (self.points[-1].time_ns - self.points[0].time_ns) * 1e-9
+
+    def with_point(self, point: TrackPoint) -> "Track":
+        """The track, one view longer."""
+        points = (*self.points, point)[-_POINTS:]
+        return Track(
+            self.first, points, self.count + 1, self.score_sum + point.blob.score, motion(points).velocity_m_s,
+            self.mover,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """What one view says about motion. For each box of the view: whether it shows something that moves, and whether
+    it may (so that nobody should call it a change of the ground yet). `movers` are the tracks that moved in this view.
+    """
+
+    is_moving: NDArray[np.bool_]
+    may_move: NDArray[np.bool_]
+    movers: tuple[Track, ...]
+
+
+def motion(points: Sequence[TrackPoint]) -> Motion:
+    """The steady motion that fits a track's points best (least squares), N >= 2, less what parallax explains."""
+    # plain numbers: a dozen points are too few for arrays to be faster
+    start_ns, count = points[0].time_ns, len(points)
+    times = [(each.time_ns - start_ns) * 1e-9 for each in points]
+    middle_s = sum(times) / count
+    spread = [each - middle_s for each in times]
+    weight = max(sum(each * each for each in spread), 1e-12)
+    places = [complex(each.blob.place_m[0], each.blob.place_m[1]) for each in points]
+    cameras = [complex(each.camera_m[0], each.camera_m[1]) for each in points]
+    velocity = sum(s * place for s, place in zip(spread, places)) / weight
+    camera = sum(s * place for s, place in zip(spread, cameras)) / weight
+    centre = sum(places) / count
+    rest = sum(abs(place - centre - s * velocity) ** 2 for s, place in zip(spread, places))
+    against = -(velocity * camera.conjugate()).real
+    parallax = min(max(against / abs(camera) ** 2, 0.0), _MOST_PARALLAX) if abs(camera) > 1e-2 else 0.0
+    own = velocity + parallax * camera
+    return Motion(
+        np.array([velocity.real, velocity.imag]), np.array([camera.real, camera.imag]),
+        np.array([own.real, own.imag]), abs(own) * times[-1], (rest / count) ** 0.5,
+    )
+
+
+class BlobTracker:
+    """The blobs of a flight's views while they come. Only `follow` changes it."""
+
+    def __init__(self, settings: MovingSettings = MovingSettings()) -> None:
+        self._settings = settings
+        self._tracks: list[Track] = []
+        self._lost: list[Track] = []
+        self._movers = 0
+        self._times_ns: deque[int] = deque(maxlen=settings.forget_views + 1)  # of the last views
+
+    def follow(self, view: ComparedView) -> Followed:
+        """Take the next view's blobs; views come in order of time."""
+        now_ns, settings = view.time_ns, self._settings
+        oldest_ns = min([now_ns - round(settings.forget_s * 1e9), *self._times_ns])
+        self._times_ns.append(now_ns)
+        gone = [each for each in self._tracks if each.last.time_ns < oldest_ns]
+        self._lost += [each for each in gone if each.mover]
+        self._lost = [each for each in self._lost if (now_ns - each.last.time_ns) * 1e-9 <= _LOST_FOR_S]
+        tracks = [each for each in self._tracks if each not in gone]
+        blobs = blobs_of(view)
+        is_moving, may_move = np.zeros(len(view.boxes), bool), np.zeros(len(view.boxes), bool)
+        movers: list[Track] = []
+        pairs = _pairs(tracks, blobs, now_ns, settings)
+        taken = {blob for _, blob in pairs}
+        for index, blob_index in pairs:
+            blob = blobs[blob_index]
+            track = tracks[index].with_point(TrackPoint(now_ns, blob, np.array(view.camera_m[:2])))
+            move = motion(track.points)
+            if not track.mover and self._moves(track, move, view):
+                track = replace(track, mover=self._number_of(track, move, tracks))
+            if track.mover:
+                movers.append(track)
+            # a thing that stopped is a change of the ground, whatever it was before
+            recent = motion(track.points[-5:])
+            may_move[blob.box] = _may_move(track, recent)
+            is_moving[blob.box] = bool(track.mover) and may_move[blob.box]
+            tracks[index] = track
+        camera_m = np.array(view.camera_m[:2])
+        for blob_index, blob in enumerate(blobs):
+            if blob_index not in taken:
+                point = TrackPoint(now_ns, blob, camera_m)
+                tracks.append(Track(point, (point,), 1, blob.score, np.zeros(2)))
+                may_move[blob.box] = True  # nobody knows yet
+        whole = {blob.box for blob in blobs}
+        unsteady = [
+            each for each in tracks
+            if each.mover or (each.count > 2 and _may_move(each, motion(each.points[-5:])))
+        ]
+        _follow_over_rim(view, unsteady, whole, is_moving, may_move)
+        self._tracks = tracks
+        return Followed(is_moving, may_move, tuple(movers))
+
+    def _moves(self, track: Track, move: Motion, view: ComparedView) -> bool:
+        settings = self._settings
+        length_m = float(np.median([each.blob.length_m for each in track.points]))
+        lengths = _STEADY_MOVE if _is_very_steady(track) else settings.least_lengths
+        needed_m = max(settings.least_move_m, lengths * length_m)
+        speed_m_s = float(np.hypot(*move.velocity_m_s))
+        is_own = move.path_m > needed_m and float(np.hypot(*move.own_m_s)) > 0.35 * speed_m_s
+        return (
+            track.count >= (settings.least_photos if self._are_photos(track) else settings.least_views)
+            and settings.least_length_m <= length_m
+            and speed_m_s <= settings.fastest_m_s(length_m)
+            and (is_own or _is_rigid(track, length_m) or (self._are_photos(track) and _floats(track, move, length_m)))
+            and float(np.hypot(*(move.velocity_m_s - move.camera_m_s))) > 0.3 * float(np.hypot(*move.camera_m_s))
+            and move.error_m < 0.05 + 0.03 * (speed_m_s * track.seconds + length_m)
+            and not _is_still_there(track, view)
+        )
+
+    def _are_photos(self, track: Track) -> bool:
+        """Whether the views were taken seldom while the track lasted."""
+        seen = [each for each in self._times_ns if each >= track.points[0].time_ns]
+        return len(seen) > 1 and (seen[-1] - seen[0]) * 1e-9 >= _PHOTOS_APART_S * (len(seen) - 1)
+
+    def _number_of(self, track: Track, move: Motion, others: Sequence[Track]) -> int:
+        """The number of the mover that the track shows: of one of `others` at the same place, of a lost one, or new."""
+        now_ns, start = track.last.time_ns, track.points[0]
+        for other in others:
+            expected_m = other.last.blob.place_m + (now_ns - other.last.time_ns) * 1e-9 * other.velocity_m_s
+            reach_m = max(_ONE_THING_M, _ONE_THING_LENGTHS * other.last.blob.length_m)
+            is_there = float(np.hypot(*(track.last.blob.place_m - expected_m))) < reach_m
+            if other.mover and is_there and _goes_with(move, other):
+                return other.mover
+        for lost in self._lost:
+            gap_s = (start.time_ns - lost.last.time_ns) * 1e-9
+            expected_m = lost.last.blob.place_m + gap_s * lost.velocity_m_s
+            speed_m_s = float(np.hypot(*move.velocity_m_s))
+            is_near = float(np.hypot(*(start.blob.place_m - expected_m))) < 1.0 + 0.4 * gap_s * speed_m_s
+            if gap_s > 0 and is_near and _goes_with(move, lost) and _alike(lost.last.blob, start.blob):
+                self._lost.remove(lost)
+                return lost.mover
+        self._movers += 1
+        return self._movers
+
+
+def _goes_with(move: Motion, track: Track) -> bool:
+    """Whether the track's velocity is about that of `move`."""
+    apart_m_s = float(np.hypot(*(move.velocity_m_s - track.velocity_m_s)))
+    return apart_m_s < 0.3 + 0.5 * float(np.hypot(*move.velocity_m_s))
+
+
+def _is_rigid(track: Track, length_m: float) -> bool:
+    """Whether a blob went far without changing its size, so that no parallax explains it after all.
+
+    What leans over the ground stands on it: its ghost grows and shrinks with the camera's way, down to nothing.
+    """
+    if len(track.points) < _RIGID_POINTS or length_m > _RIGID_LENGTH_M:
+        return False
+    is_steady = len(track.points) >= _STEADY_POINTS and _is_very_steady(track)
+    lengths = _STEADY_LENGTHS if is_steady else _RIGID_LENGTHS
+    return _way_m(track) > max(1.0, lengths * length_m) and _keeps_its_size(track)
+
+
+def _floats(track: Track, move: Motion, length_m: float) -> bool:
+    """Whether a small blob of steady size is far from where anything tall enough to move so would stand.
+
+    What leans is seen from its foot to its top; the foot of a thing whose top moves against the camera's way with a
+    share k of its speed lies (top + k camera) / (1 + k). Photos show it too seldom to see it grow.
+    """
+    camera_m_s = float(np.hypot(*move.camera_m_s))
+    k = -float(move.velocity_m_s @ move.camera_m_s) / max(camera_m_s, 1e-6) ** 2
+    if length_m > _FLOATS_LENGTH_M or k <= 0 or not _keeps_its_size(track):
+        return False  # where k is not above 0, no height explains it
+    apart_m = [k / (1 + k) * float(np.hypot(*(each.blob.place_m - each.camera_m))) for each in track.points]
+    return _way_m(track) > _RIGID_LENGTHS * length_m and float(np.median(apart_m)) > length_m
+
+
+def _way_m(track: Track) -> float:
+    """How far a track's last points lead over the ground."""
+    return float(np.hypot(*(track.last.blob.place_m - track.points[0].blob.place_m)))
+
+
+def _is_very_steady(track: Track) -> bool:
+    """Whether a track's size has hardly changed over enough views: nothing that grew explains its motion."""
+    return len(track.points) >= _RIGID_POINTS and _keeps_its_size(track, *_VERY_STEADY)
+
+
+def _keeps_its_size(track: Track, most_area: float = 1.7, most_length: float = 1.35) -> bool:
+    """Whether a track's largest area and length are less than so many times the smallest."""
+    areas = [each.blob.area_m2 for each in track.points]
+    lengths = [each.blob.length_m for each in track.points]
+    return max(areas) < most_area * min(areas) and max(lengths) < most_length * min(lengths)
+
+
+def _may_move(track: Track, move: Motion) -> bool:
+    if track.count < 3:
+        return True
+    recent = track.points[-5:]
+    camera_m = recent[-1].camera_m - recent[0].camera_m
+    way_m = move.velocity_m_s * (recent[-1].time_ns - recent[0].time_ns) * 1e-9
+    camera_way_m = float(np.hypot(*camera_m))
+    against_m = -float(way_m @ camera_m) / camera_way_m if camera_way_m > 0.1 else 0.0
+    is_ghost = against_m > max(_UNLIKELY_PARALLAX * camera_way_m, 0.25)
+    return bool(move.path_m > max(0.25, 2 * move.error_m) or is_ghost)
+
+
+def _follow_over_rim(
+    view: ComparedView, tracks: Sequence[Track], whole: set[int], is_moving: NDArray[np.bool_],
+    may_move: NDArray[np.bool_],
+) -> None:
+    """Mark the boxes that are cut by the view's rim, thus no blobs, and lie where an unsteady thing must be by now."""
+    if not tracks:
+        return
+    m_per_px = scale_m_per_px(view)
+    image_from_site = np.linalg.inv(view.site_from_image)
+    for track in tracks:
+        ahead_s = (view.time_ns - track.last.time_ns) * 1e-9
+        expected_m = track.last.blob.place_m + ahead_s * track.velocity_m_s
+        pixel = apply_homography(image_from_site, expected_m[None])[0]
+        reach_px = 0.75 * track.last.blob.length_m / m_per_px + RIM_PX
+        for index, (x, y, w, h) in enumerate(view.boxes):
+            nearest = np.clip(pixel, [x, y], [x + w, y + h])
+            if index not in whole and float(np.hypot(*(pixel - nearest))) < reach_px:
+                may_move[index] = True
+                is_moving[index] |= bool(track.mover)
+
+
+def _is_still_there(track: Track, view: ComparedView) -> bool:
+    """Whether the view still shows a change where the track began; not if it cannot tell.
+
+    What is much larger than what the track shows now is another thing, which it set out from or passed.
+    """
+    pixel = apply_homography(np.linalg.inv(view.site_from_image), track.points[0].blob.place_m[None])[0]
+    height, width = view.changed.shape
+    if not np.isfinite(pixel).all() or not (0 <= pixel[0] < width - 1 and 0 <= pixel[1] < height - 1):
+        return False
+    x, y = round(pixel[0]), round(pixel[1])
+    own = track.last.blob.box
+    sizes = view.boxes[:, 2] * view.boxes[:, 3]
+    corners, sides = view.boxes[:, :2], view.boxes[:, 2:]
+    holds = np.all((corners <= [x, y]) & ([x, y] < corners + sides), axis=1)
+    if holds.any() and not holds[own] and (sizes[holds] > _MUCH_LARGER * sizes[own]).all():
+        return False
+    window = slice(max(y - _NEAR_PX, 0), y + _NEAR_PX), slice(max(x - _NEAR_PX, 0), x + _NEAR_PX)
+    changed = view.changed[window] > 0
+    dark = shadow_of_arrival(view.reference[window], view.image[window], changed)
+    # the shadow of what walked on may lie where it set out
+    return bool((changed & ~dark)[y - window[0].start, x - window[1].start])
+
+
+def _alike(a: Blob, b: Blob) -> bool:
+    sizes = sorted([a.area_m2, b.area_m2])
+    return sizes[1] < 3 * sizes[0] + 0.1 and float(np.abs(a.colour - b.colour).max()) < 70
+
+
+def _pairs(
+    tracks: Sequence[Track], blobs: Sequence[Blob], now_ns: int, settings: MovingSettings
+) -> list[tuple[int, int]]:
+    """Track and blob that go together: the best pair first, each used once."""
+    if not tracks or not blobs:
+        return []
+    places = np.array([each.place_m for each in blobs])
+    areas = np.array([each.area_m2 for each in blobs])
+    colours = np.array([each.colour for each in blobs])
+    costs = np.full((len(tracks), len(blobs)), np.inf)
+    for row, track in enumerate(tracks):
+        ahead_s = (now_ns - track.last.time_ns) * 1e-9
+        velocity = track.velocity_m_s
+        if len(track.points) == 1:
+            fastest_m_s = settings.fastest_m_s(track.last.blob.length_m)
+            gate_m = 0.3 + min(fastest_m_s * ahead_s, settings.most_step_m)
+        else:
+            gate_m = 0.3 + 0.25 * float(np.hypot(*velocity)) * ahead_s
+        distance = np.hypot(*(places - track.last.blob.place_m - velocity * ahead_s).T)
+        growth = np.abs(np.log((areas + 0.02) / (track.last.blob.area_m2 + 0.02)))
+        tint = np.abs(colours - track.last.blob.colour).max(axis=1)
+        fits = (distance < gate_m) & (growth < np.log(2.5)) & (tint < 45)
+        costs[row] = np.where(fits, distance + 0.3 * growth + tint / 100, np.inf)
+    found = []
+    for flat in np.argsort(costs, axis=None, kind="stable"):
+        row, column = divmod(int(flat), len(blobs))
+        if np.isfinite(costs[row, column]):
+            found.append((row, column))
+            costs[row], costs[:, column] = np.inf, np.inf
+    return found

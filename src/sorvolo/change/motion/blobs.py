@@ -1,0 +1,122 @@
+"""The changed blobs of one view as they stand on the ground, less the shadows that they throw and what leans."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sorvolo.change.evidence.cells import scale_m_per_px
+from sorvolo.change.shape.shadows import shadow_of_arrival, thing_of
+from sorvolo.geometry.arrays import Floats, Mask, PointsM
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.polygons import signed_area
+from sorvolo.survey.findings import ComparedView
+
+RIM_PX = 2  # a blob that comes nearer to the view's rim may be cut by it
+_MOST_BOXES = 64
+_AROUND_PX = 4
+_UPRIGHT_M, _PERSON_M = 1.0, 1.9  # narrower than this it may be a person, who leans as this height does at most
+
+
+@dataclass(frozen=True, eq=False)
+class Blob:
+    """One changed piece of a view: where it stands on the ground (2,), its size, and its mean colour (3,)."""
+
+    box: int  # row of the view's boxes
+    place_m: Floats
+    length_m: float
+    area_m2: float
+    colour: Floats
+    score: float
+
+
+def blobs_of(view: ComparedView) -> list[Blob]:
+    """The blobs that lie whole inside the view; one cut by its rim would seem to move with the camera."""
+    height, width = view.changed.shape
+    m_per_px = scale_m_per_px(view)
+    blobs = []
+    for index in np.argsort(-view.scores, kind="stable")[:_MOST_BOXES]:
+        x, y, w, h = (int(each) for each in view.boxes[index])
+        if x < RIM_PX or y < RIM_PX or x + w > width - RIM_PX or y + h > height - RIM_PX:
+            continue
+        if w * h > 0.15 * width * height or not _is_known_around(view.valid, x, y, w, h):
+            continue
+        left, top, _, thing = _around(view, index)
+        ys, xs = np.nonzero(thing)
+        if not len(xs):
+            continue
+        x, y, w, h = left + int(xs.min()), top + int(ys.min()), int(np.ptp(xs)) + 1, int(np.ptp(ys)) + 1
+        part = thing[ys.min():ys.max() + 1, xs.min():xs.max() + 1].view(np.uint8) * np.uint8(255)
+        moments = cv2.moments(part, binaryImage=True)
+        if moments["m00"] <= 0:
+            continue
+        hull = cv2.convexHull(cv2.findNonZero(part)).reshape(-1, 2) + np.array([x, y])
+        hull_m = apply_homography(view.site_from_image, hull.astype(np.float64))
+        middle = np.array([[x + moments["m10"] / moments["m00"], y + moments["m01"] / moments["m00"]]])
+        place_m = apply_homography(view.site_from_image, middle)[0]
+        if not (np.isfinite(hull_m).all() and np.isfinite(place_m).all()):
+            continue
+        foot_m = _foot_m(hull_m, hull_m, view.camera_m, m_per_px)
+        place_m = place_m if foot_m is None else foot_m.mean(axis=0)
+        colour = np.array(cv2.mean(view.image[y : y + h, x : x + w], part)[:3])
+        area_m2 = moments["m00"] * m_per_px**2
+        score = float(view.scores[index])
+        blobs.append(Blob(int(index), place_m, max(w, h) * m_per_px, area_m2, colour, score))
+    return blobs
+
+
+def standing_outline_m(view: ComparedView, blob: Blob) -> PointsM | None:
+    """(N, 2) where a blob of the view stands on the ground, without its shadow and, if it may be a person, without the
+    body that leans away from the camera; None where nothing of it is left."""
+    left, top, changed, thing = _around(view, blob.box)
+    if not thing.any():
+        return None
+    all_m, thing_m = (
+        apply_homography(view.site_from_image, np.argwhere(mask)[:, ::-1] + [left, top]) for mask in (changed, thing)
+    )
+    if not np.isfinite(all_m).all():
+        return None
+    outline_m = _foot_m(thing_m, all_m, view.camera_m, scale_m_per_px(view))
+    if outline_m is None:
+        outline_m = np.asarray(cv2.convexHull(thing_m.astype(np.float32)).reshape(-1, 2), np.float64)
+    return outline_m if len(outline_m) >= 3 and abs(signed_area(outline_m)) > 0 else None
+
+
+def _around(view: ComparedView, box: int) -> tuple[int, int, Mask, Mask]:
+    """What changed in one of the view's boxes and close around it, and the thing in that: left, top, both masks."""
+    x, y, w, h = (int(each) for each in view.boxes[box])
+    window = slice(max(y - _AROUND_PX, 0), y + h + _AROUND_PX), slice(max(x - _AROUND_PX, 0), x + w + _AROUND_PX)
+    changed = view.changed[window] > 0
+    thing = thing_of(changed, shadow_of_arrival(view.reference[window], view.image[window], changed))
+    return window[1].start, window[0].start, changed, thing
+
+
+def _foot_m(thing_m: PointsM, changed_m: PointsM, camera_m: Floats, m_per_px: float) -> PointsM | None:
+    """(4, 2) the ground under something narrow that leans away from the camera; None for what does not.
+
+    The feet are at its near end, no nearer than a person's would be, and a person is about as long as wide from above.
+    `thing_m` are points of the lit thing: dark trousers may be missing, so `changed_m` says how near it begins.
+    """
+    away = thing_m.mean(axis=0) - camera_m[:2]
+    distance_m = float(np.hypot(*away))
+    if distance_m < 1e-6:
+        return None
+    site_from_lean = np.array([away, [-away[1], away[0]]]) / distance_m
+    thing, changed = ((each - camera_m[:2]) @ site_from_lean.T for each in (thing_m, changed_m))
+    (_, left), (far, right) = thing.min(axis=0), thing.max(axis=0)
+    width_m = right - left + m_per_px
+    nearest = far * (1 - _PERSON_M / max(float(camera_m[2]), 2 * _PERSON_M)) - width_m
+    behind = changed[(changed[:, 1] >= left) & (changed[:, 1] <= right) & (changed[:, 0] >= nearest), 0]
+    near = float(behind.min(initial=far))
+    if width_m > _UPRIGHT_M or far - near <= width_m:
+        return None
+    middle = near + width_m - m_per_px
+    corners = np.array([[near, left], [middle, left], [middle, right], [near, right]])
+    return np.asarray(corners @ site_from_lean + camera_m[:2])
+
+
+def _is_known_around(valid: Mask, x: int, y: int, w: int, h: int) -> bool:
+    rim = 2 * (w + h)
+    part = valid[max(y - 1, 0) : y + h + 1, max(x - 1, 0) : x + w + 1]
+    unknown = part.size - int(np.count_nonzero(part))
+    return unknown < 0.1 * rim

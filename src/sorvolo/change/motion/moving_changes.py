@@ -1,0 +1,86 @@
+"""The moving things of a flight as they are told: one change each, brought up to date while it is seen."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sorvolo.change.evidence.cells import scale_m_per_px
+from sorvolo.change.motion.blob_tracker import Track
+from sorvolo.change.motion.blobs import standing_outline_m
+from sorvolo.change.shape.outlines import measures
+from sorvolo.change.shape.patches import PatchWindow, cut, patch_of
+from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.survey.findings import Change, ChangeKind, ComparedView
+
+# of its places in a time, how much of that time they span, and how far beside the ground they may lie
+_LEAST_POINTS, _NEARLY_ALL, _BESIDE_M = 3, 0.7, 0.3
+
+
+class Movers:
+    """What moved during one flight. `see` changes it.
+
+    `id_prefix` begins every change's id, `m_per_px` is a pixel of changes' pictures, `cell_m` a side of the evidence's
+    cells.
+    """
+
+    def __init__(self, id_prefix: str, m_per_px: float, cell_m: float) -> None:
+        self._prefix, self._m_per_px, self._cell_m = id_prefix, m_per_px, cell_m
+        self._known: dict[int, Change] = {}  # by the tracker's number
+        self._ways: dict[int, dict[int, Floats]] = {}  # by the same number: places (2,) by time, ns
+
+    @property
+    def changes(self) -> tuple[Change, ...]:
+        """All of them as they were seen last."""
+        return tuple(self._known.values())
+
+    def see(self, view: ComparedView, tracks: Sequence[Track], next_number: Callable[[], int]) -> list[Change]:
+        """Bring what moves in this view up to date; those told for the first time, which `next_number` gives an id."""
+        told = []
+        for track in tracks:
+            known = self._known.get(track.mover)
+            if known is None:
+                change = self._change(view, track, f"{self._prefix}-{next_number()}")
+                told.append(change)
+            else:
+                change = self._change(view, track, known.id)
+                change = replace(
+                    change, first_seen_ns=known.first_seen_ns, views=max(change.views, known.views + 1),
+                    announced_ns=known.announced_ns,
+                )
+            self._known[track.mover] = change
+            way = self._ways.setdefault(track.mover, {})
+            way |= {each.time_ns: each.blob.place_m for each in track.points}
+        return told
+
+    def were_at(self, low_m: Floats, high_m: Floats, first_ns: int, last_ns: int) -> bool:
+        """Whether one of them was in a box of ground, or right beside it, for nearly all of a time."""
+        for way in self._ways.values():
+            times = [each for each in way if first_ns <= each <= last_ns]
+            if len(times) < _LEAST_POINTS or max(times) - min(times) < _NEARLY_ALL * (last_ns - first_ns):
+                continue
+            places = np.array([way[each] for each in times])
+            if ((places > low_m - _BESIDE_M) & (places < high_m + _BESIDE_M)).all():
+                return True
+        return False
+
+    def _change(self, view: ComparedView, track: Track, change_id: str) -> Change:
+        """A moving thing as this view shows it."""
+        m_per_px = scale_m_per_px(view)
+        outline_m = standing_outline_m(view, track.last.blob)
+        if outline_m is None:
+            outline_m = _square(track.last.blob.place_m, self._cell_m)
+        window = PatchWindow.around(outline_m.min(axis=0), outline_m.max(axis=0), self._m_per_px, 512)
+        size = measures(outline_m)
+        residual_m = view.residual_px * m_per_px if np.isfinite(view.residual_px) else 0.0
+        score = track.score_sum / track.count * (track.count + 1) / (track.count + 2)
+        return Change(
+            change_id, ChangeKind.MOVING, float(np.clip(score, 0, 1)), outline_m, track.first.time_ns,
+            track.last.time_ns, track.count, size.area_m2, size.length_m,
+            float(np.hypot(residual_m, self._cell_m / np.sqrt(12))), patch_of(window, cut(view, window), outline_m),
+            track.velocity_m_s, announced_ns=view.time_ns,
+        )
+
+
+def _square(place_m: Floats, side_m: float) -> PointsM:
+    return place_m + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side_m / 2

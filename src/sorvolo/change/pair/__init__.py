@@ -1,0 +1,1 @@
+"""Two aligned pictures of one ground: which pixels and regions changed."""

@@ -1,0 +1,83 @@
+"""The robust method's parameters, set for each flight by what does not change in it."""
+
+from collections import deque
+from dataclasses import dataclass, replace
+from statistics import median
+
+from sorvolo.change.pair.robust import RobustResult, RobustSettings
+
+MEMORY_FRAMES = 50  # light and wind change within minutes: older frames tell nothing about now
+LEAST_KNOWN = 0.05  # share of a frame that must be known for its measures to count
+
+
+@dataclass(frozen=True)
+class TuningLimits:
+    """What the measures of unchanged ground decide; lengths in px of the half size pictures that are compared."""
+
+    calm_px: float = 0.12  # rest of the flow below: values count as known one pixel around
+    restless_px: float = 0.9  # rest of the flow above: three pixels around
+    frames_to_settle: int = 10  # frames that must agree before less is tolerated than at first
+
+
+class FlightTuning:
+    """What a flight's unchanged ground says about noise, misalignment, parallax and light. Only `observe` changes it.
+
+    Every pair of pictures adapts itself already; this makes what they have in common a property of the flight, so
+    that one odd frame (a gust, a cloud, a frame changed all over) does not decide for itself.
+    """
+
+    def __init__(self, settings: RobustSettings | None = None, limits: TuningLimits | None = None) -> None:
+        self._base = settings or RobustSettings()
+        self._limits = limits or TuningLimits()
+        self._seen: deque[RobustResult] = deque(maxlen=MEMORY_FRAMES)
+        self._frames = 0
+
+    def observe(self, result: RobustResult) -> bool:
+        """Learn from a comparison; says whether the settings are others now. Pictures are not kept."""
+        before = self.settings()
+        self._frames += 1
+        if result.known >= LEAST_KNOWN:
+            self._seen.append(replace(result, mask=result.mask[:0, :0]))
+        return self.settings() != before
+
+    def settings(self) -> RobustSettings:
+        """The settings for the next frame; the ones given at first until something was seen."""
+        if not self._seen:
+            return self._base
+        rest_px = median(each.settling.rest_px for each in self._seen)
+        reach_px = self._base.regions.reach_px
+        if rest_px > self._limits.restless_px:
+            reach_px += 1
+        elif rest_px < self._limits.calm_px and len(self._seen) >= self._limits.frames_to_settle:
+            reach_px = max(1, reach_px - 1)
+        regions = replace(self._base.regions, reach_px=reach_px, least_noise=round(self._noise() / 2, 1))
+        return replace(self._base, regions=regions)
+
+    def chosen(self) -> dict[str, float | int | str]:
+        """What was measured and chosen, for a report: grey levels, px of the pictures given, octaves of brightness."""
+        settings = self.settings()
+        if not self._seen:
+            return {"frames": self._frames, "settings": "those given: nothing was compared yet"}
+        brightness = [float(median(float(each.light.brightness[band]) for each in self._seen)) for band in range(3)]
+        return {
+            "frames": self._frames,
+            "noise_levels": round(self._noise(), 1),
+            "misaligned_px": round(2 * median(each.settling.moved_px for each in self._seen), 2),
+            "parallax_px": round(2 * median(each.settling.rest_px for each in self._seen), 2),
+            "brightness_blue_green_red": " ".join(f"{each:.2f}" for each in brightness),
+            "clouds_octaves": round(median(each.light.unevenness for each in self._seen), 2),
+            "search_px": 2 * settings.regions.reach_px,
+            "least_difference_levels": round(
+                settings.regions.least_difference
+                + settings.regions.noise_factor * max(self._noise(), settings.regions.least_noise), 1
+            ),
+            "least_score": settings.least_score,
+        }
+
+    @property
+    def brightness(self) -> float:
+        """How many times as bright as the reference a middle grey is on this flight; NaN while nothing was seen."""
+        return float(median(float(each.light.brightness.mean()) for each in self._seen)) if self._seen else float("nan")
+
+    def _noise(self) -> float:
+        return float(median(each.noise for each in self._seen))

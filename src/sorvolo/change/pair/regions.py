@@ -1,0 +1,234 @@
+"""Where two pictures in the same light differ: regions, and what is measured of each to tell changes from the rest."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.change.pair.scratch import Scratch
+from sorvolo.geometry.arrays import Anything, Floats, Mask
+from sorvolo.kernels import core_regions, differences, match_regions, measure_regions, rim_balance, tint
+
+RING_PX = 4
+WIDE_PX = 20  # what the ground does around a region and its neighbours, wind among it
+NEIGHBOUR_PX = 100
+GREEN_CELL_PX = 4
+SPECK_PX = 9
+NEAR_PX = 31
+WEAK_PART = 0.1  # of the largest difference near: what is weaker belongs to clouds and shadows, not to the thing
+MOST_SPECK = 48.0
+MATCH_MARGIN_PX = 3
+MATCH_REACH_PX = 6
+DETAIL_PX = 11
+LOOKED_AT_PX = WIDE_PX + DETAIL_PX  # around regions: what is farther away changes nothing in what is measured of them
+MOST_REGIONS = 250  # a byte holds their labels
+
+FEATURES = (
+    "log area", "log length", "aspect", "fill", "difference", "difference spread", "chroma share", "sharpness",
+    "difference over activity", "difference over noise", "ratio", "ratio step", "ratio spread", "ratio spread outside",
+    "edges after", "edges before", "edges outside", "edge contrast", "detail difference", "detail outside",
+    "alike in place", "alike best", "alike gain", "match length", "match rest", "match gain", "level", "activity",
+    "came", "colour step", "colour spread", "structure kept", "structure kept outside", "structure before",
+    "structure after", "rim light", "rim difference", "wide ratio", "wide ratio spread", "wide detail", "green before",
+    "green after", "part of strongest", "part of neighbours", "neighbours", "noise", "rest", "unevenness", "regions",
+)
+
+_LOG = np.clip(np.rint(np.log2((np.arange(256) + 8) / 8) * 50), 0, 255).astype(np.uint8)
+_SCRATCH = Scratch()
+Image = Anything
+"""uint8, (h, w) or (h, w, 3)."""
+
+
+@dataclass(frozen=True)
+class RegionSettings:
+    """What is looked at as a possible change. Lengths in px of the (half size) pictures."""
+
+    reach_px: int = 2  # a value counts as known where it occurs this near in the other picture
+    chroma_weight: int = 2
+    least_difference: float = 9.0  # grey levels, weak threshold where nothing disturbs
+    noise_factor: float = 0.8  # of the frame's own 95 % quantile of differences
+    activity_factor: float = 1.4  # of the mean difference around
+    strong_factor: float = 1.5  # strong over weak threshold
+    core: float = 0.45  # a region keeps what exceeds this part of its own height
+    least_area_px: int = 6
+    least_noise: float = 0.0  # what the flight shows elsewhere: a frame is not taken for quieter than this
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """Regions 1 .. N of `labels` (h, w) uint8: `boxes` (N, 4) int32 x, y, w, h and `features` (N, len(FEATURES)).
+
+    `strength` (h, w) uint8 is how much the pictures differ, until the thread compares others; `weak` (h, w) uint8 is
+    255 wherever they differ at all, `noise` the 95 % quantile of small differences.
+    Outside of `known` (h, w), None where everything is, nothing is found. `came` (N,) is positive where the query shows
+    a thing on the reference's ground, negative where it is the other way round.
+    """
+
+    labels: NDArray[np.uint8]
+    boxes: NDArray[np.int32]
+    features: Floats
+    strength: Image
+    weak: Image
+    noise: float
+    known: Mask | None
+    came: Floats
+
+
+def find_regions(
+    reference: Image, query: Image, known: Mask | None, settings: RegionSettings, rest_px: float, unevenness: float
+) -> Regions:
+    """Regions that differ between two pictures (h, w, 3) uint8 BGR in the same light; none where not `known`."""
+    size = reference.shape[0], reference.shape[1]
+    planes = differences(
+        reference, query, known, settings.reach_px, settings.chroma_weight, _SCRATCH.stack("planes", size, 6)
+    )
+    difference, chroma, came, went, light_before, light_after = planes
+    spare, specks, smooth, threshold = _SCRATCH.stack("thresholds", size, 4)
+    # a large thing's inside is no clutter: only what is small among the differences raises the thresholds around it
+    window = np.ones((SPECK_PX, SPECK_PX), np.uint8)
+    cv2.subtract(difference, cv2.morphologyEx(difference, cv2.MORPH_OPEN, window, dst=spare), dst=specks)
+    some: Anything = cv2.calcHist([np.ascontiguousarray(specks[::4, ::4])], [0], None, [256], [0, 256])
+    counts = some.ravel().cumsum(dtype=np.float64)
+    noise = float(np.searchsorted(counts, 0.95 * counts[-1]))
+    cv2.blur(difference, (3, 3), dst=smooth)
+    cv2.threshold(specks, MOST_SPECK, MOST_SPECK, cv2.THRESH_TRUNC, dst=specks)
+    activity = cv2.blur(specks, (41, 41), dst=spare)
+    base = settings.least_difference + settings.noise_factor * max(noise, settings.least_noise)
+    cv2.addWeighted(activity, settings.activity_factor, activity, 0.0, base, dst=threshold)
+    near = np.ones((NEAR_PX, NEAR_PX), np.uint8)
+    low = cv2.addWeighted(cv2.dilate(smooth, near, dst=specks), WEAK_PART, smooth, 0.0, 0.0, dst=specks)
+    weak = np.asarray(cv2.compare(smooth, cv2.max(threshold, low, dst=low), cv2.CMP_GT), np.uint8)
+    labels, boxes = core_regions(
+        smooth, threshold, settings.strong_factor, settings.core, settings.least_area_px, MOST_REGIONS
+    )
+    if len(boxes) == 0:
+        return Regions(labels, boxes, np.zeros((0, len(FEATURES))), smooth, weak, noise, known, np.zeros(0))
+    # a shadow takes from all colours alike: red over blue stays
+    colour = tint(reference, query, _LOG, boxes, RING_PX, _SCRATCH.take("tint", size))
+    channels = [difference, chroma, activity, light_before, light_after, came, went, colour]
+    frame = np.array([noise, rest_px, unevenness, np.log1p(len(boxes))])
+    green = _green(reference, boxes), _green(query, boxes)
+    features = _measured(labels, boxes, channels, green, frame)
+    # along its outline a thing's values are new, while the ground's are still to be seen near
+    balance = rim_balance(labels, boxes, came, went).astype(np.float64)
+    return Regions(labels, boxes, features, smooth, weak, noise, known, balance)
+
+
+def _measured(
+    labels: NDArray[np.uint8], boxes: NDArray[np.int32], channels: list[Image], green: tuple[Floats, Floats],
+    frame: NDArray[np.float64],
+) -> Floats:
+    planes = _SCRATCH.stack("measured", (labels.shape[0], labels.shape[1]), 10)
+    searched = _SCRATCH.take("searched", (labels.shape[0], labels.shape[1]), margin_px=MATCH_REACH_PX)
+    part, corner = _looked_at(boxes, labels.shape)
+    labels, *channels = (np.ascontiguousarray(each[part]) for each in (labels, *channels))
+    difference, chroma, activity, light_before, level, came, went, colour = channels
+    boxes = boxes - corner
+    height, width = labels.shape
+    (
+        log_before, log_after, detail_before, detail_after, ratio, edges_after, edges_before, detail, sharp, steep
+    ) = planes.reshape(-1)[: 10 * labels.size].reshape(10, height, width)
+    cv2.LUT(light_before, _LOG, dst=log_before)
+    cv2.LUT(level, _LOG, dst=log_after)
+    _details(log_before, detail_before)
+    _details(log_after, detail_after)
+    window = np.ones((3, 3), np.uint8)
+    cv2.addWeighted(log_after, 0.5, log_before, -0.5, 128, dst=ratio)
+    cv2.morphologyEx(log_after, cv2.MORPH_GRADIENT, window, dst=edges_after)
+    cv2.morphologyEx(log_before, cv2.MORPH_GRADIENT, window, dst=edges_before)
+    cv2.absdiff(detail_after, detail_before, dst=detail)
+    stack = [difference, chroma, activity, level, ratio, edges_after, edges_before, detail, came, went, colour]
+    sums = measure_regions(labels, boxes, [*stack, detail_before, detail_after], RING_PX)
+    means, spreads = _moments(sums)
+    within, around = means[:, 0], means[:, 1]
+    kept, had, has = _structure(means[..., (7, 11, 12)], spreads[..., (7, 11, 12)])
+    cv2.morphologyEx(ratio, cv2.MORPH_GRADIENT, window, dst=sharp)
+    cv2.morphologyEx(difference, cv2.MORPH_GRADIENT, window, dst=steep)
+    rim = _moments(measure_regions(_rims(labels), boxes, [sharp, steep], 0))[0][:, 0]
+    wide, wide_spreads = (each[:, 1] for each in _moments(measure_regions(labels, boxes, [ratio, detail], WIDE_PX)))
+    reach = MATCH_REACH_PX
+    searched = searched.reshape(-1)[: (height + 2 * reach) * (width + 2 * reach)].reshape(height + 2 * reach, -1)
+    cv2.copyMakeBorder(detail_before, reach, reach, reach, reach, cv2.BORDER_REFLECT, dst=searched)
+    matched = match_regions(detail_after, searched, _grown(boxes, labels.shape), reach)
+    long, short = boxes[:, 2:].max(axis=1), boxes[:, 2:].min(axis=1)
+    area = sums[:, 0, 0].astype(np.float64)
+    difference_in, noise = within[:, 0], frame[0]
+    step = within[:, 4] - wide[:, 0]
+    columns = [
+        np.log(area), np.log(long), short / long, area / (boxes[:, 2] * boxes[:, 3]),
+        difference_in, spreads[:, 0, 0], 2 * within[:, 1] / np.maximum(difference_in, 1),
+        around[:, 0] / np.maximum(difference_in, 1), difference_in / (within[:, 2] + 2), difference_in / (noise + 4),
+        within[:, 4] - 128, within[:, 4] - around[:, 4], spreads[:, 0, 4], spreads[:, 1, 4],
+        within[:, 5], within[:, 6], np.maximum(around[:, 5], around[:, 6]),
+        (within[:, 5] - within[:, 6]) / (within[:, 5] + within[:, 6] + 4), within[:, 7], around[:, 7],
+        matched[:, 0], matched[:, 1], matched[:, 1] - matched[:, 0], np.hypot(matched[:, 2], matched[:, 3]),
+        matched[:, 5], matched[:, 5] / np.maximum(matched[:, 4], 1), within[:, 3], within[:, 2],
+        (within[:, 8] - within[:, 9]) / np.maximum(difference_in, 1), within[:, 10] - around[:, 10], spreads[:, 0, 10],
+        kept[:, 0], kept[:, 1], had[:, 0], has[:, 0], rim[:, 0] / (np.abs(step) + 4), rim[:, 1] / (difference_in + 4),
+        step / (wide_spreads[:, 0] + 2), wide_spreads[:, 0], wide[:, 1], *green,
+        *_standing_out(boxes, area * difference_in),
+    ]
+    return np.column_stack(columns + [np.full(len(boxes), value) for value in frame])
+
+
+def _moments(sums: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Means and standard deviations (N, 2, C) of channels within regions and around them, 0 where there is no pixel."""
+    channels = sums.shape[2] // 2
+    count = np.maximum(sums[:, :, :1], 1).astype(np.float64)
+    means = sums[:, :, 1 : 1 + channels] / count
+    return means, np.sqrt(np.maximum(sums[:, :, 1 + channels :] / count - means**2, 0))
+
+
+def _structure(means: Floats, spreads: Floats) -> tuple[Floats, Floats, Floats]:
+    """How alike (N, 2) the details before and after are, -1 to 1, within and around; and how strong before and after.
+
+    From the moments (N, 2, 3) of what they are apart, of the details before and after: a correlation.
+    """
+    apart = spreads[..., 0] ** 2 + means[..., 0] ** 2 - (means[..., 2] - means[..., 1]) ** 2
+    before, after = spreads[..., 1] ** 2, spreads[..., 2] ** 2
+    alike = (before + after - apart) / (2 * np.sqrt((before + 1) * (after + 1)))
+    return alike, spreads[..., 1], spreads[..., 2]
+
+
+def _standing_out(boxes: NDArray[np.int32], strength: Floats) -> tuple[Floats, Floats, Floats]:
+    """Each region's strength (N,) against the strongest, and against all near, in logarithms; how many are near."""
+    middles = boxes[:, :2] + boxes[:, 2:] / 2
+    near = np.abs(middles[:, None] - middles[None]).max(axis=2) < NEIGHBOUR_PX
+    strength = strength + 1.0
+    return np.log(strength / strength.max()), np.log(strength / (near @ strength)), np.log(near.sum(axis=1))
+
+
+def _looked_at(boxes: NDArray[np.int32], shape: tuple[int, ...]) -> tuple[tuple[slice, slice], NDArray[np.int32]]:
+    """The part of a picture of `shape` (h, w) that says what is to be known of regions in boxes (N, 4); its corner."""
+    corner = np.maximum(boxes[:, :2].min(axis=0) - LOOKED_AT_PX, 0)
+    right, bottom = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) + LOOKED_AT_PX
+    part = np.s_[int(corner[1]) : min(int(bottom), shape[0]), int(corner[0]) : min(int(right), shape[1])]
+    return part, np.array([*corner, 0, 0], np.int32)
+
+
+def _rims(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The labels (h, w) of pixels next to pixels of no region, 0 elsewhere."""
+    return labels * (cv2.erode(labels, np.ones((3, 3), np.uint8)) == 0)
+
+
+def _green(image: Image, boxes: NDArray[np.int32]) -> Floats:
+    """How much greener (N,) than red and blue a BGR picture (h, w, 3) is in the middle of boxes, grey levels."""
+    columns, rows = ((boxes[:, :2] + boxes[:, 2:] // 2) // GREEN_CELL_PX * GREEN_CELL_PX).T
+    y, x = np.mgrid[:GREEN_CELL_PX, :GREEN_CELL_PX]
+    y, x = (np.minimum(start[:, None, None] + step, side - 1)
+            for start, step, side in ((rows, y, image.shape[0]), (columns, x, image.shape[1])))
+    blue, green, red = image[y, x].mean(axis=(1, 2)).T
+    return np.asarray(green - (red + blue) / 2)
+
+
+def _details(logarithm: Image, to: Image) -> None:
+    cv2.blur(logarithm, (DETAIL_PX, DETAIL_PX), dst=to)
+    cv2.addWeighted(logarithm, 1, to, -1, 128, dst=to)
+
+
+def _grown(boxes: NDArray[np.int32], shape: tuple[int, ...]) -> NDArray[np.int32]:
+    """Boxes with a margin, inside the picture."""
+    low = np.maximum(boxes[:, :2] - MATCH_MARGIN_PX, 0)
+    high = np.minimum(boxes[:, :2] + boxes[:, 2:] + MATCH_MARGIN_PX, [shape[1], shape[0]])
+    return np.ascontiguousarray(np.hstack([low, high - low]), np.int32)

@@ -1,0 +1,295 @@
+"""The robust change method: two aligned pictures -> what changed, whatever the light, leaves and leaning trees do."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.change.pair.light import Light, fit_light, relit
+from sorvolo.change.pair.region_extent import Piece, Views, grown, without_halos
+from sorvolo.change.pair.region_score import how_sure
+from sorvolo.change.pair.regions import FEATURES, Regions, RegionSettings, find_regions
+from sorvolo.change.pair.residual_alignment import Settling, settle
+from sorvolo.change.pair.scratch import Scratch
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Anything, Boxes, Floats, ImageGray, Mask
+from sorvolo.kernels import looked_up
+
+LEAST_SIDE_PX = 32
+CLOSES_PX = 9
+LEAST_CONVEXITY = 0.5
+SEVERAL_CONVEXITY = 0.85  # where two whole things touch, what lies between them is none
+LEAST_GROWN = 0.5  # sureness: what is doubted is shown as it differs, and takes no ground from around
+SAME_PLACE_PX = 0.6  # half size pixels
+ALL_KNOWN = 0x0101  # two True side by side
+CALM_PX = 0.4  # rest of the flow below: values are looked for one pixel less far around
+RIM_WIDTH_PX = 5  # a thing's outline runs where half of the difference within this is left ...
+SLACK, LEAST_SHARE = 5.0, 0.4  # ... of what it was before the ground's own range was taken off, at least this share
+RIM_PX = 4  # around the unknown, in half size pixels: resampling mixes the unknown into it
+
+
+_SCRATCH = Scratch()
+
+
+@dataclass(frozen=True)
+class RobustSettings:
+    """How sure a change must be, and what is looked at; the rest each pair of pictures sets itself."""
+
+    least_score: float = 0.69  # for a pair on its own; where several views vote less will do
+    settles: bool = True  # take out the last pixels of misalignment
+    regions: RegionSettings = field(default_factory=RegionSettings)
+
+
+@dataclass(frozen=True, eq=False)
+class RobustResult:
+    """What changed: `mask` (h, w) uint8 0 or 255, `boxes` (N, 4) x, y, width, height and `scores` (N,) from 0 to 1.
+
+    `light`, `settling` and `noise` tell what the pair set itself: the light, the misalignment, and the 95 % quantile
+    of differences where nothing changed; lengths of `settling` are in half size pixels. `known` is the share compared.
+    """
+
+    mask: ImageGray
+    boxes: Boxes
+    scores: Floats
+    light: Light
+    settling: Settling
+    noise: float
+    known: float
+
+
+def compare_robust(
+    reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask | None = None,
+    settings: RobustSettings | None = None,
+) -> RobustResult:
+    """Compare two aligned BGR pictures (h, w, 3) uint8 of at least 32 px; up to about 5 px apart is fine.
+
+    Where `valid` (h, w) is False the answer is unknown: nothing is found there, nor in a thin rim around it. Raises
+    InputError where the pictures do not fit together.
+    """
+    _check(reference, query, valid)
+    settings = settings or RobustSettings()
+    examined = examine(reference, query, valid, settings)
+    scores = how_sure(examined.regions.features, FEATURES)
+    return _result(examined, scores, scores >= settings.least_score, query.shape[1::-1])
+
+
+class Examined(NamedTuple):
+    """The regions that differ at half size, before anything is said about them; and what the pair set itself."""
+
+    regions: Regions
+    light: Light
+    settling: Settling
+    known: float  # share of the picture
+    views: Views
+
+
+def examine(
+    reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask | None, settings: RobustSettings
+) -> Examined:
+    """Look at a pair of pictures as `compare_robust` does."""
+    height, width = query.shape[:2]
+    half = width // 2, height // 2
+    size = half[::-1]
+    before, after, spare = (_SCRATCH.take(name, size, (3,)) for name in ("before", "after", "spare"))
+    cv2.resize(reference, half, dst=before, interpolation=cv2.INTER_AREA)
+    cv2.resize(query, half, dst=after, interpolation=cv2.INTER_AREA)
+    known = _half_known(valid, half)
+    if known is not None:
+        cv2.copyTo(after, np.logical_not(known).view(np.uint8), before)
+    settling = Settling(np.eye(3), 0.0, 0.0)
+    if settings.settles:
+        grays = _SCRATCH.stack("grays", size, 2)
+        for image, gray in zip((before, after), grays, strict=True):
+            cv2.cvtColor(image, cv2.COLOR_BGR2GRAY, dst=gray)
+        settling = settle(grays[0], grays[1], known)
+    if settling.moved_px > 0:
+        # OpenCV resamples four bands in half the time that three take it
+        four, moved = (_SCRATCH.take(name, size, (4,)) for name in ("four", "moved"))
+        cv2.cvtColor(before, cv2.COLOR_BGR2BGRA, dst=four)
+        cv2.warpPerspective(
+            four, settling.reference_from_query, half, dst=moved, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        cv2.cvtColor(moved, cv2.COLOR_BGRA2BGR, dst=before)
+    light = fit_light(before, after, known)
+    rim = None if known is None else _without_rim(known, RIM_PX + int(np.ceil(settling.moved_px)))
+    lit = relit(before, light, spare)
+    for_pair = _for_pair(settings.regions, settling)
+    regions = find_regions(lit, after, rim, for_pair, settling.rest_px, light.unevenness)
+    share = 1.0 if rim is None else cv2.countNonZero(rim.view(np.uint8)) / rim.size
+    return Examined(regions, light, settling, share, Views(before, after, lit, rim, for_pair))
+
+
+def _for_pair(settings: RegionSettings, settling: Settling) -> RegionSettings:
+    """Where hardly anything moves values need not be looked for as far around, and less is hidden by them."""
+    is_calm = settling.rest_px < CALM_PX and settings.reach_px > 1
+    return replace(settings, reach_px=settings.reach_px - 1) if is_calm else settings
+
+
+def _check(reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask | None) -> None:
+    for name, image in (("reference", reference), ("query", query)):
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+            raise InputError(f"{name}: found {image.dtype} of shape {image.shape}; give a BGR picture, (h, w, 3) uint8")
+    if reference.shape != query.shape:
+        raise InputError(f"the reference is {reference.shape}, the query {query.shape}; align them to the same pixels")
+    height, width = query.shape[:2]
+    if min(height, width) < LEAST_SIDE_PX:
+        raise InputError(f"the pictures are {width} x {height} px; at least {LEAST_SIDE_PX} px are needed each way")
+    if valid is not None and (valid.shape != query.shape[:2] or valid.dtype != np.bool_):
+        raise InputError(f"valid: found {valid.dtype} of shape {valid.shape}; give a bool mask of {query.shape[:2]}")
+
+
+def _half_known(valid: Mask | None, half: tuple[int, int]) -> Mask | None:
+    if valid is None or valid.all():
+        return None
+    height, width = valid.shape
+    if height % 2 == 0 and width % 2 == 0:
+        pairs = np.ascontiguousarray(valid).view(np.uint16) == ALL_KNOWN
+        return np.logical_and(pairs[::2], pairs[1::2])
+    return np.asarray(cv2.resize(valid.astype(np.uint8) * 255, half, interpolation=cv2.INTER_AREA) == 255)
+
+
+def _without_rim(known: Mask, rim_px: int) -> Mask:
+    window = np.ones((2 * rim_px + 1,) * 2, np.uint8)
+    return np.asarray(cv2.erode(known.astype(np.uint8), window, borderValue=1) > 0)
+
+
+def _result(examined: Examined, scores: Floats, sure: Mask, size: tuple[int, int]) -> RobustResult:
+    """The answer at full `size` (w, h): the `sure` (N,) among the regions."""
+    regions, light, settling, known, views = examined
+    if not sure.any():
+        nothing = np.zeros(size[::-1], np.uint8), np.zeros((0, 4), np.int64), np.zeros(0)
+        return RobustResult(*nothing, light, settling, regions.noise, known)
+    count, parts = cv2.connectedComponents(regions.weak, connectivity=8)
+    went = _went(regions, parts)
+    grows = sure & (scores >= LEAST_GROWN)
+    pieces: dict[int, Piece] = {}
+    if grows.any():
+        regions, views = without_halos(regions, grows, views, light)
+    for region in np.flatnonzero(grows):
+        piece = grown(regions, int(region), not went[region], views)
+        if piece is not None:
+            pieces[int(region)] = piece
+    half = regions.labels.shape[::-1]
+    boxes_px = np.array([_around(box, pieces.get(each)) for each, box in enumerate(regions.boxes)], np.float64)
+    if settling.moved_px < SAME_PLACE_PX or not (sure & went).any():
+        half_mask = _filled(sure, regions, pieces, parts, count)
+    else:  # what disappeared is seen in the reference: it keeps the reference's pixels
+        gone: Anything = _filled(sure & went, regions, pieces, parts, count)
+        gone = cv2.warpPerspective(gone, settling.reference_from_query, half, flags=cv2.INTER_LINEAR)
+        stays = sure & ~went
+        half_mask = _filled(stays, regions, pieces, parts, count) if stays.any() else np.zeros(half[::-1], np.uint8)
+        half_mask = np.asarray(cv2.max(half_mask, gone), np.uint8)
+        middle = boxes_px[:, :2] + boxes_px[:, 2:] / 2
+        moved = np.column_stack([middle, np.ones(len(middle))]) @ settling.reference_from_query.T
+        boxes_px[went, :2] += (moved[:, :2] / moved[:, 2:] - middle)[went]
+    mask = _enlarged(half_mask, size)
+    factor = np.array([size[0] / half[0], size[1] / half[1]])
+    corners = np.clip(np.rint(boxes_px[sure, :2] * factor), 0, np.array(size) - 1).astype(np.int64)
+    sides = np.rint(boxes_px[sure, 2:] * factor).astype(np.int64)
+    boxes = np.hstack([corners, np.minimum(sides, np.array(size) - corners)])
+    return RobustResult(mask, boxes, scores[sure], light, settling, regions.noise, known)
+
+
+def _around(box: Anything, piece: Piece | None) -> tuple[int, int, int, int]:
+    """x, y, width, height of what holds a region's box and what it has grown to."""
+    x, y, wide, high = (int(each) for each in box)
+    if piece is None:
+        return x, y, wide, high
+    left, top, piece_wide, piece_high = piece.box
+    right, bottom = max(x + wide, left + piece_wide), max(y + high, top + piece_high)
+    return min(x, left), min(y, top), right - min(x, left), bottom - min(y, top)
+
+
+def _enlarged(half_mask: ImageGray, size: tuple[int, int]) -> ImageGray:
+    """The mask at full `size` (w, h), 255 where the half size one passes 127; only around things where size is even."""
+    mask = np.zeros(size[::-1], np.uint8)
+    x, y, wide, high = cv2.boundingRect(half_mask)
+    top, left, bottom, right = max(0, y - 1), max(0, x - 1), y + high + 1, x + wide + 1
+    window, place = half_mask, mask
+    if size[0] % 2 == 0 and size[1] % 2 == 0:
+        window, place = half_mask[top:bottom, left:right], mask[2 * top : 2 * bottom, 2 * left : 2 * right]
+    larger = cv2.resize(window, place.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    place[:] = cv2.threshold(larger, 127, 255, cv2.THRESH_BINARY)[1]
+    return mask
+
+
+def _went(regions: Regions, parts: Anything) -> Mask:
+    """Which regions (N,) are things that the reference shows; what touches is one thing."""
+    part = np.zeros(len(regions.boxes), np.int64)
+    for region, (x, y, wide, high) in enumerate(regions.boxes):
+        place = slice(y, y + high), slice(x, x + wide)
+        part[region] = parts[place].flat[(regions.labels[place] == region + 1).argmax()]
+    came = np.bincount(part, regions.came, minlength=1)
+    return np.asarray(came[part] < 0)
+
+
+def _filled(
+    chosen: Mask, regions: Regions, pieces: Mapping[int, Piece], parts: Anything, count: int
+) -> ImageGray:
+    """The things of the `chosen` (N,) regions: their `pieces`, and where there is none the region with what weakly
+    differs around its core, less a rim of blur; without gaps.
+
+    `parts` (h, w) are the weakly differing pieces, 0 .. `count` - 1, 0 none. Where a thing has the ground's own colour
+    nothing differs: what is nearly convex is taken to be so. The outline runs, to a part of a pixel, where the result
+    passes 127.
+    """
+    size = regions.labels.shape[0], regions.labels.shape[1]
+    cores, around, whole = _SCRATCH.stack("filled", size, 3)
+    alone = np.array([bool(is_chosen) and each not in pieces for each, is_chosen in enumerate(chosen)], bool)
+    if alone.any():
+        shown = np.zeros(256, np.uint8)
+        shown[1 : len(alone) + 1] = alone * np.uint8(255)
+        cv2.LUT(regions.labels, shown, dst=cores)
+        held = np.zeros(count, bool)
+        for region in np.flatnonzero(alone):
+            x, y, wide, high = regions.boxes[region]
+            place = slice(y, y + high), slice(x, x + wide)
+            held[parts[place][regions.labels[place] == region + 1]] = True
+        held[0] = False
+        looked_up(parts, held.astype(np.uint8) * np.uint8(255), whole)
+        cv2.erode(whole, np.ones((5, 5), np.uint8), dst=around)  # two blurs of 3 px reach two pixels out
+        np.multiply(around, regions.labels == 0, out=around)
+        cv2.max(cores, around, dst=around)
+    else:
+        around[:] = 0
+    for region in np.flatnonzero(chosen & ~alone):
+        piece = pieces[int(region)]
+        around[piece.window][piece.mask] = 255
+    x, y, wide, high = cv2.boundingRect(around)
+    things = np.s_[max(0, y - CLOSES_PX) : y + high + CLOSES_PX, max(0, x - CLOSES_PX) : x + wide + CLOSES_PX]
+    closed: Anything = cv2.morphologyEx(around[things], cv2.MORPH_CLOSE, np.ones((CLOSES_PX, CLOSES_PX), np.uint8))
+    outlines, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    inner = [_inner_px(pieces[int(each)], things) for each in np.flatnonzero(chosen & ~alone)]
+    for outline in outlines:
+        hull = cv2.convexHull(outline)
+        held_pieces = sum(cv2.pointPolygonTest(outline, place, False) >= 0 for place in inner)
+        least = LEAST_CONVEXITY if held_pieces < 2 else SEVERAL_CONVEXITY
+        is_full = cv2.contourArea(outline) > least * cv2.contourArea(hull)
+        cv2.drawContours(closed, [hull if is_full else outline], -1, 255.0, cv2.FILLED)
+    outlined = np.zeros(size, np.uint8)
+    outlined[things] = _outlined(closed, regions.strength[things])
+    if regions.known is not None:
+        outlined[~regions.known] = 0
+    return outlined
+
+
+def _inner_px(piece: Piece, window: tuple[slice, slice]) -> tuple[float, float]:
+    """x, y of one of a piece's pixels in a window of the picture."""
+    rows, columns = np.nonzero(piece.mask)
+    middle = len(rows) // 2
+    x, y = columns[middle] + piece.window[1].start, rows[middle] + piece.window[0].start
+    return float(x - window[1].start), float(y - window[0].start)
+
+
+def _outlined(thing: ImageGray, strength: Anything) -> ImageGray:
+    """Things (h, w) 0 or 255 whose rim is drawn anew where the difference falls below a part of its height nearby."""
+    near = np.ones((RIM_WIDTH_PX, RIM_WIDTH_PX), np.uint8)
+    height = np.maximum(cv2.dilate(cv2.min(thing, strength), near), 1).astype(np.float32)
+    limit = np.maximum(np.float32(0.5) * height - np.float32(SLACK), np.float32(LEAST_SHARE) * height)
+    rim = np.clip(127.5 + 255 * (strength - limit) / height, 0, 255).astype(np.uint8)
+    rim[cv2.dilate(thing, np.ones((3, 3), np.uint8)) == 0] = 0
+    return np.asarray(cv2.max(rim, cv2.erode(thing, near)), np.uint8)

@@ -1,0 +1,1 @@
+"""What a change looks like: its kind, outline, parts, shadows and pictures."""

@@ -1,0 +1,69 @@
+"""The things that one piece of changed ground holds, each told under an id of its own that stays."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from sorvolo.change.shape.outlines import overlap
+from sorvolo.survey.findings import Change
+
+_MORE_VIEWS = 1.2  # so many times as many views may show another thing beside the first
+_SAME = 0.4  # of the union of two outlines of one thing lies in both
+
+
+class Parts:
+    """Neighbours that lie so near to each other that their ground is one. `take` and `join` change it."""
+
+    def __init__(self) -> None:
+        self.things: tuple[Change, ...] = ()
+        self._told: dict[str, Change] = {}  # by id, also those that do not show any more
+        self._seen: tuple[Change, ...] = ()  # when last looked at, told or not
+        self._views = 0
+
+    def is_due(self, views: int) -> bool:
+        """Whether, with so many views, it is time to look again for things to part."""
+        return views >= _MORE_VIEWS * self._views
+
+    def join(self, told: Sequence[Change]) -> None:
+        """Remember what was told of a change that has become one with this: its things keep their ids."""
+        self._told |= {each.id: each for each in told}
+        self._views = 0
+
+    def take(
+        self, things: Sequence[Change], views: int, now_ns: int, next_id: Callable[[], str]
+    ) -> list[Change]:
+        """The things as they are seen after so many views, the largest first; those told for the first time, now.
+
+        All come under the id of the whole. Each keeps the id that what lies under it was told with; the largest of the
+        others keeps that of the whole. Any more are new and get ids from `next_id`, if they were there already when
+        last looked at: pictures of few views may show anything. At the end, `now_ns` = -1, all of them do.
+        """
+        self._views = views
+        whole = things[0].id
+        named = dict(enumerate(things[:1])) if len(things) == 1 else self._known_again(things)
+        new = []
+        for row, thing in enumerate(things):
+            if row not in named:
+                if all(each.id != whole for each in named.values()):
+                    named[row] = thing
+                elif now_ns < 0 or any(_is_same(thing, each) for each in self._seen):
+                    named[row] = replace(thing, id=next_id(), announced_ns=now_ns)
+            if row in named and named[row].id not in self._told:
+                new.append(named[row])
+        self._seen = tuple(things)
+        self.things = tuple(named[row] for row in sorted(named))
+        self._told |= {each.id: each for each in self.things}
+        return new
+
+    def _known_again(self, things: Sequence[Change]) -> dict[int, Change]:
+        """Those things, by row, that lie where something was told already, under its id; each id once."""
+        found: dict[int, Change] = {}
+        free = dict(self._told)
+        for row, thing in enumerate(things):
+            same = next((each for each in free.values() if _is_same(thing, each)), None)
+            if same is not None:
+                found[row] = replace(thing, id=same.id, announced_ns=free.pop(same.id).announced_ns)
+        return found
+
+
+def _is_same(a: Change, b: Change) -> bool:
+    return overlap(a.outline_m, b.outline_m)[0] > _SAME

@@ -1,0 +1,112 @@
+"""Pictures of a piece of ground on both dates, cut from the views that show it."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.change.evidence.cells import scale_m_per_px
+from sorvolo.change.shape.outlines import mask_of
+from sorvolo.geometry.arrays import ImageRGB, ImageRGBA, Matrix3, PointsM
+from sorvolo.survey.findings import ComparedView, Patch
+
+_LEAST_MARGIN_M = 0.5
+_MARGIN_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class PatchWindow:
+    """A piece of ground as a raster, north up; see `Patch`. Its edges lie on whole multiples of `m_per_px`."""
+
+    west_m: float
+    north_m: float
+    m_per_px: float
+    width_px: int
+    height_px: int
+
+    @classmethod
+    def around(cls, low_m: PointsM, high_m: PointsM, m_per_px: float, most_px: int) -> "PatchWindow":
+        """The window of a box and of some ground around it; coarser than asked for where it would grow too large."""
+        margin_m = max(_LEAST_MARGIN_M, _MARGIN_SHARE * float((high_m - low_m).max()))
+        low_m, high_m = low_m - margin_m, high_m + margin_m
+        coarse = m_per_px
+        while float((high_m - low_m).max()) / coarse > most_px - 2:
+            coarse *= 2
+        west, south = np.floor(low_m / coarse)
+        east, north = np.ceil(high_m / coarse)
+        return cls(float(west * coarse), float(north * coarse), coarse, int(east - west), int(north - south))
+
+    @property
+    def site_from_patch(self) -> Matrix3:
+        """(3, 3) affine map from the window's pixels to site metres."""
+        s = self.m_per_px
+        return np.array([[s, 0.0, self.west_m + s / 2], [0.0, -s, self.north_m - s / 2], [0.0, 0.0, 1.0]])
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width, height."""
+        return self.width_px, self.height_px
+
+    def holds(self, low_m: PointsM, high_m: PointsM) -> bool:
+        """Whether a box lies inside, with a little ground around it."""
+        spare_m = 0.3 * max(_LEAST_MARGIN_M, _MARGIN_SHARE * float((high_m - low_m).max()))
+        west, north = self.west_m, self.north_m
+        east, south = west + self.width_px * self.m_per_px, north - self.height_px * self.m_per_px
+        return bool(
+            low_m[0] - spare_m >= west and low_m[1] - spare_m >= south
+            and high_m[0] + spare_m <= east and high_m[1] + spare_m <= north
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """Both dates' pictures of a window, as one view has them; alpha 0 where the view knows nothing."""
+
+    before: ImageRGBA
+    after: ImageRGBA
+
+    def over(self, older: "Cut") -> "Cut":
+        """This cut, and the older one where this one knows nothing."""
+        known = self.after[..., 3:] > 0
+        return Cut(np.where(known, self.before, older.before), np.where(known, self.after, older.after))
+
+
+def cut(view: ComparedView, window: PatchWindow) -> Cut:
+    """The view's pictures of both dates, resampled to a window of the ground."""
+    shrink = max(1, int(window.m_per_px / scale_m_per_px(view)))
+    patch_from_image = np.linalg.inv(window.site_from_patch) @ view.site_from_image
+    valid = view.valid.view(np.uint8) * np.uint8(255)
+    before, after = view.reference, view.image
+    if shrink > 1:
+        before, after, valid = (_shrunk(each, shrink) for each in (before, after, valid))
+        patch_from_image = patch_from_image @ np.array([
+            [shrink, 0, (shrink - 1) / 2], [0, shrink, (shrink - 1) / 2], [0, 0, 1.0]
+        ])
+    known = cv2.warpPerspective(valid, patch_from_image, window.size_px, flags=cv2.INTER_LINEAR) >= 250
+
+    def laid(image: ImageRGB) -> ImageRGBA:
+        rgb = cv2.warpPerspective(
+            image, patch_from_image, window.size_px, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        return np.asarray(cv2.copyTo(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), known.view(np.uint8)), np.uint8)
+
+    return Cut(laid(before), laid(after))
+
+
+def moved(image: NDArray[np.uint8], new: PatchWindow, old: PatchWindow) -> NDArray[np.uint8]:
+    """A raster of one window as another window has it, 0 where they do not overlap."""
+    new_from_old = np.linalg.inv(new.site_from_patch) @ old.site_from_patch
+    return np.asarray(cv2.warpAffine(image, new_from_old[:2], new.size_px, flags=cv2.INTER_NEAREST), np.uint8)
+
+
+def patch_of(window: PatchWindow, pictures: Cut, outline_m: PointsM) -> Patch:
+    """The record of a change's pictures; the change itself is what lies inside its outline."""
+    changed = mask_of(outline_m, window.site_from_patch, (window.height_px, window.width_px))
+    return Patch(window.west_m, window.north_m, window.m_per_px, pictures.before, pictures.after, changed)
+
+
+def _shrunk(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    rows, columns = image.shape[0] // factor, image.shape[1] // factor
+    part = image[: rows * factor, : columns * factor]
+    return np.asarray(cv2.resize(part, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)

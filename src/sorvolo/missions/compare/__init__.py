@@ -1,0 +1,1 @@
+"""`sorvolo compare`: a later flight against the map."""

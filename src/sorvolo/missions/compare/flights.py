@@ -1,0 +1,124 @@
+"""Mode 1, later flights: sources against the map in a site folder, frame by frame."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from sorvolo.capture.areas import read_area
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.capture.source import LiveSource, Source, opened_sources
+from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.missions.compare.run import CompareRun, Looking
+from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.known_camera import known_camera
+from sorvolo.missions.flight.map_objects import open_detector
+from sorvolo.missions.flight.settings import CompareSettings
+from sorvolo.missions.flight.setup import FlightSetup, known_flights, known_ground_m, prepare
+from sorvolo.mosaic.selection import every
+from sorvolo.store.site.archive import Archive
+from sorvolo.survey.area import Area
+from sorvolo.survey.findings import CompareUpdate, ViewStatus
+from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
+
+_AHEAD = 2  # frames that are looked at while the evidence of one is gathered: a thread for each
+
+
+def compare_flights(
+    inputs: Sequence[Path | str], site: Path, settings: CompareSettings = CompareSettings(), *,  # noqa: B008 (frozen)
+    telemetry: Path | str | None = None, camera: Path | str | None = None, area: Path | None = None,
+    steps: Path | None = None, detector: Detects | None = None,
+    live: LiveSettings = LiveSettings(keeps_all=True), until: threading.Event | None = None,  # noqa: B008 (frozen)
+) -> Generator[CompareUpdate]:
+    """Compare one or more later flights with the map in the site folder, yielding an update for each frame compared.
+
+    `inputs`, `telemetry`, `camera`, `area`, `detector`, `live` and `until` are those of `map_flights`. An update
+    carries the changes that its frame made sure of. `steps` is a folder for the intermediate pictures of method thesis
+    (its Figure 3.14). The flights' findings and the new version of the map are part of the site when a flight's last
+    update was yielded.
+    Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
+    to stop early: the flight that is being compared is left out, those before it are in.
+    """
+    if steps is not None and settings.method != "thesis":
+        raise SettingsError("the steps are those of the thesis's method: give --method thesis as well")
+    if steps is not None and steps.resolve().is_relative_to(site.resolve()):
+        raise SettingsError(f"{steps} lies in the site folder {site}, which is sorvolo's own; name another folder")
+    wanted = None if area is None else read_area(area)
+    with Archive.open(site, write=False) as archive:
+        if not archive.tiles():
+            raise StoreError(f"{site} holds no map yet; make one of an earlier flight: sorvolo map INPUT --site {site}")
+    looks = open_detector(settings.model) if detector is None else detector
+    opened = opened_sources(
+        inputs, telemetry, camera, known_flights(site), live=live, until=until,
+        better_camera=lambda guess: known_camera(guess, archive),
+    )
+    with Archive.open(site, write=True) as archive, opened as sources:
+        for source in sources:
+            yield from _compare_one(
+                source, archive, settings, wanted, steps, looks, telemetry_named=telemetry is not None
+            )
+
+
+def _compare_one(
+    source: Source, archive: Archive, settings: CompareSettings, area: Area | None, steps: Path | None,
+    detector: Detects | None, *, telemetry_named: bool,
+) -> Generator[CompareUpdate]:
+    started_s = time.monotonic()
+    setup = prepare(
+        source, settings.mapping, archive.site(), telemetry_named=telemetry_named, finds_itself=True,
+        ground_m=known_ground_m(archive),
+    )
+    inside = setup.inside(area)
+    step_s = 0.0 if source.kind == "photos" else 1.0 / settings.views_per_second
+    base, is_newest = _base_version(archive, source)
+    if not is_newest:
+        settings = replace(settings, updates_map=False)  # what later flights painted stays
+    with CompareRun(setup, archive, settings, base, steps, detector) as run:
+
+        def ahead() -> int:  # a live view's changes are told at once, unless the next view waits already
+            return 0 if isinstance(source, LiveSource) and not source.is_behind else _AHEAD
+
+        for each in _looked_at(source.frames(every(step_s)), setup, inside, run, ahead):
+            if isinstance(each, Looking):
+                outcome, announced = run.add(each)
+                frame: Frame | LostFrame = each.posed.frame
+                status, reason, residual_px = outcome.status, outcome.reason, outcome.residual_px
+            else:
+                run.lose(each)
+                frame, status, reason, residual_px, announced = each, ViewStatus.LOST, each.reason, float("nan"), ()
+            yield CompareUpdate(
+                frame.name, setup.utc_ns(frame.time_ns), status, reason, residual_px, announced, frame.index + 1,
+                source.frame_count, run.views, run.compared, time.monotonic() - started_s,
+            )
+        run.finish(source.notices(), started_s)
+
+
+def _looked_at(
+    frames: Iterable[Frame | LostFrame], setup: FlightSetup, inside: Callable[[PosedFrame], bool], run: CompareRun,
+    ahead: Callable[[], int],
+) -> Iterator[Looking | LostFrame]:
+    """The frames inside of the area, in order, while the run looks at them and up to `ahead()` of those after."""
+    waiting: deque[Looking | LostFrame] = deque()
+    for each in frames:
+        if isinstance(each, LostFrame):
+            waiting.append(each)
+        elif inside(posed := PosedFrame(each, setup.prior(each, first=False))):
+            waiting.append(run.look(posed))
+        while len(waiting) > ahead():
+            yield waiting.popleft()
+    yield from waiting
+
+
+def _base_version(archive: Archive, source: Source) -> tuple[int, bool]:
+    """The version to compare with, and whether the flight may paint: the newest, or the one before its own."""
+    complete = [version for version in archive.versions() if version.complete]
+    own = next((version for version in reversed(complete) if version.flight_id == source.name), None)
+    if own is None:
+        return complete[-1].id, True
+    if own.parent_id == 0:
+        raise InputError(
+            f"the map of the site is flight {source.name}'s own; compare a later flight, or map an earlier one first"
+        )
+    return own.parent_id, own.id == complete[-1].id

@@ -1,0 +1,1 @@
+"""`sorvolo evaluate`: how good maps, changes, objects and detectors are."""

@@ -1,0 +1,1 @@
+"""What every mission over a flight shares: setup, report, detections, settings."""

@@ -1,0 +1,202 @@
+"""What stands on the map: a detector looks at the frames beside the mapping; in the end each object is told once."""
+
+import math
+import time
+from collections import Counter, deque
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sorvolo.detection.detector import Detector
+from sorvolo.detection.models import installed_models
+from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.geometry.camera import Camera
+from sorvolo.missions.flight.detects import Detects
+from sorvolo.store.detection_files import crop_around
+from sorvolo.store.exports import plain_json
+from sorvolo.store.images import jpeg_from_image
+from sorvolo.survey.flight import Frame, Notice, PosedFrame
+from sorvolo.survey.map_objects import MapObject, ObjectSearch
+from sorvolo.survey.mosaic import PlacedFrame, Status
+from sorvolo.survey.objects import Detections, Sighting
+from sorvolo.tracking.laying import LaidSighting, lay_on_ground
+from sorvolo.tracking.standing import Standing, fuse
+
+NO_MODEL, DEFAULT_MODEL = "none", "default"
+"""The model that looks for nothing, and the one that comes with the package."""
+
+_AHEAD = 3  # frames that may wait for the detector before the mapping waits for it
+_CROP_PX = 256
+_MOST_CROPS = 60  # of one frame, the surest
+
+
+def open_detector(model: str) -> Detects | None:
+    """The detector of this name or file; None for "none", and for "default" where no default model is installed.
+
+    Raises InputError for any other model that is not there or cannot be used.
+    """
+    if model == NO_MODEL:
+        return None
+    if model == DEFAULT_MODEL and all(each.name != DEFAULT_MODEL for each in installed_models()):
+        return None
+    return Detector.load(model)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What the detector said of one frame, the crops (JPEG) around the surest, and how long it took."""
+
+    index: int
+    found: Detections
+    crops: tuple[bytes, ...]
+    seconds: float
+
+
+class ObjectFinder:
+    """Looks for objects in the frames of one flight, one frame after another, in a thread beside the mapping.
+
+    A context manager: leaving it ends the thread.
+    """
+
+    def __init__(self, detector: Detects, camera: Camera) -> None:
+        self._detector, self._camera = detector, camera
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="detector")
+        self._waiting: deque[Future[_Seen]] = deque()
+        self._seen: dict[int, _Seen] = {}
+        self._sightings: tuple[Sighting, ...] = ()
+
+    def close(self) -> None:
+        """End the thread; frames that still wait are not looked at."""
+        self._thread.shutdown(wait=True, cancel_futures=True)
+
+    @property
+    def notices(self) -> tuple[Notice, ...]:
+        """What the detector would have a user know of the frames."""
+        return self._detector.notices
+
+    @property
+    def sightings(self) -> tuple[Sighting, ...]:
+        """All that was seen, by the frames' final places, once that is concluded."""
+        return self._sightings
+
+    @property
+    def seconds(self) -> float:
+        """How long the detector worked, beside everything else."""
+        return sum(each.seconds for each in self._seen.values())
+
+    def look(self, posed: PosedFrame) -> None:
+        """Have a frame looked at; waits when the detector is some frames behind."""
+        height_m, sigma_m = posed.prior.position_m[2], posed.prior.position_sigma_m[2]
+        knows_height = math.isfinite(sigma_m) and height_m > 1.0
+        m_per_px = float(height_m) / self._camera.fx_px if knows_height else None
+        self._waiting.append(self._thread.submit(self._look, posed.frame, m_per_px))
+        self._take(_AHEAD)
+
+    def conclude(self, placed: Sequence[PlacedFrame], flight_id: str, *, has_metres: bool) -> ObjectSearch:
+        """Lay all that was seen on the ground by the frames' final places, and tell each object once."""
+        self._take(0)
+        frames = [each for each in placed if each.index in self._seen and each.status is not Status.REJECTED]
+        laid: list[LaidSighting] = []
+        crops: list[bytes] = []
+        for frame in frames:
+            seen = self._seen[frame.index]
+            for each, crop in zip(lay_on_ground(seen.found, frame, has_metres=has_metres), seen.crops):
+                if each is not None:
+                    laid.append(each)
+                    crops.append(crop)
+        self._sightings = tuple(each.sighting for each in laid)
+        fused = fuse(laid, frames)
+        flight_sigma_m = _gps_sigma_m(frames)
+        sigmas_m = {each.index: each.sigma_m if math.isfinite(each.sigma_m) else flight_sigma_m for each in frames}
+        objects = [
+            _told(each, f"{flight_id}-o{number}", laid, crops, sigmas_m, has_metres=has_metres)
+            for number, each in enumerate(fused.objects, start=1)
+        ]
+        return ObjectSearch(
+            self._detector.info.name, self._detector.classes, tuple(objects),
+            np.array([each.outline_m for each in frames]), len(self._seen), len(laid), fused.dropped,
+        )
+
+    def _take(self, left: int) -> None:
+        """Collect what was seen until so many frames still wait."""
+        while self._waiting and (len(self._waiting) > left or self._waiting[0].done()):
+            seen = self._waiting.popleft().result()
+            self._seen[seen.index] = seen
+
+    def _look(self, frame: Frame, m_per_px: float | None) -> _Seen:
+        started_s = time.monotonic()
+        found = self._detector.detect(frame.image, tiles="auto", m_per_px=m_per_px)
+        surest = found.only(np.argsort(-found.scores, kind="stable")[:_MOST_CROPS])
+        crops = tuple(_crop(frame.image, box) for box in surest.boxes_px)
+        return _Seen(frame.index, surest, crops, time.monotonic() - started_s)
+
+
+def search_summary(search: ObjectSearch | None, seconds: float, why_not: str = "") -> dict[str, Any]:
+    """The report's part on objects; specified in docs/formats.md. `why_not` says why nothing was looked for."""
+    if search is None:
+        return {"model": None, "why_not": why_not, "count": 0, "classes": {}, "list": []}
+    counts = Counter(each.label for each in search.objects)
+    return dict(plain_json({
+        "model": search.model, "looked_for": search.classes, "frames": search.looked,
+        "sightings": search.sightings, "dropped": search.dropped, "seconds": round(seconds, 3),
+        "count": len(search.objects), "moving": sum(each.moving for each in search.objects),
+        "classes": {name: counts[name] for name in search.classes},
+        "list": [_row(each) for each in search.objects],
+    }))
+
+
+def why_not_searched(model: str) -> str:
+    """Why nothing was looked for, in words."""
+    if model == NO_MODEL:
+        return "no model was wanted"
+    return "no default model is installed; `sorvolo models` tells how to get one"
+
+
+def crops_of(search: ObjectSearch | None) -> dict[str, bytes]:
+    """The JPEG around each object's best view, by the object's id."""
+    return {} if search is None else {each.id: each.crop_jpeg for each in search.objects}
+
+
+def _row(each: MapObject) -> dict[str, Any]:
+    return {
+        "id": each.id, "class": each.label, "score": round(each.score, 3), "east_m": each.position_m[0],
+        "north_m": each.position_m[1], "sigma_m": each.sigma_m, "length_m": each.length_m, "width_m": each.width_m,
+        "views": each.views, "possible_views": each.possible_views, "moving": each.moving,
+    }
+
+
+def _told(
+    each: Standing, object_id: str, laid: Sequence[LaidSighting], crops: Sequence[bytes], sigmas_m: dict[int, float], *,
+    has_metres: bool,
+) -> MapObject:
+    sightings = [laid[k].sighting for k in each.members]
+    frames = {sighting.frame_index for sighting in sightings}
+    shared_m = float(np.median([sigmas_m[index] for index in frames]))
+    length_m, width_m = each.size_m if has_metres else (math.nan, math.nan)
+    sigma_m = math.hypot(shared_m, each.sigma_m) if has_metres else math.nan
+    return MapObject(
+        object_id, each.label, each.score, each.position_m, sigma_m, float(length_m), float(width_m), len(frames),
+        each.possible_views,
+        min(sighting.time_ns for sighting in sightings), max(sighting.time_ns for sighting in sightings),
+        each.moves, each.velocity_m_s, each.class_scores, laid[each.best].sighting.frame_name, crops[each.best],
+    )
+
+
+def _gps_sigma_m(frames: Sequence[PlacedFrame]) -> float:
+    """How far the frames lie from their fixes, per axis: what is known of a place where the method tells none."""
+    apart_m: Floats = np.array([each.gps_residual_m[:2] for each in frames]).reshape(-1, 2)
+    apart_m = apart_m[np.isfinite(apart_m).all(axis=1)]
+    return float(np.sqrt((apart_m**2).sum(axis=1).mean() / 2)) if len(apart_m) else math.nan
+
+
+def _crop(image: ImageRGB, box_px: Any) -> bytes:
+    crop = crop_around(image, box_px)
+    longest = max(crop.shape[:2])
+    if longest > _CROP_PX:
+        size = tuple(max(1, round(side * _CROP_PX / longest)) for side in crop.shape[1::-1])
+        crop = np.asarray(cv2.resize(crop, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return jpeg_from_image(np.ascontiguousarray(crop))

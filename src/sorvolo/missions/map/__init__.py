@@ -1,0 +1,1 @@
+"""`sorvolo map`: flights into a map."""

@@ -1,0 +1,109 @@
+"""What the methods' runs share: a flight on its way into a site, its log and its writer."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any, Self
+
+from sorvolo.missions.flight.map_objects import ObjectFinder, search_summary, why_not_searched
+from sorvolo.missions.flight.report import FlightLog, Stage
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.flight.setup import FlightSetup, new_site
+from sorvolo.store.site.archive import Archive, FlightWriter
+from sorvolo.survey.flight import Notice, PosedFrame
+from sorvolo.survey.map_objects import ObjectSearch
+from sorvolo.survey.mosaic import PlacedFrame, Status
+
+
+class FlightRun(ABC):
+    """A flight on its way into a site. A context manager: leaving without `finish` leaves the site as it was.
+
+    `writer` is one that was begun before for this flight; whoever began it ends it. `finder` looks for objects in the
+    frames; None: nobody does.
+    """
+
+    def __init__(
+        self, setup: FlightSetup, archive: Archive, settings: MapSettings, writer: FlightWriter | None = None,
+        finder: ObjectFinder | None = None,
+    ) -> None:
+        self._setup, self._archive, self._settings, self._finder = setup, archive, settings, finder
+        self._log = FlightLog()
+        self._writer = writer
+        self._began_writer = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._finder is not None:
+            self._finder.close()
+        if self._writer is not None and self._began_writer:
+            self._writer.__exit__(kind, error, trace)
+
+    @property
+    def selected(self) -> int:
+        """Frames taken so far, lost ones included."""
+        return len(self._log.endings)
+
+    @property
+    def by_vision(self) -> int:
+        """Frames placed by vision so far."""
+        return self._log.count(Status.VISION)
+
+    def lose(self, index: int, name: str, time_ns: int, reason: str) -> tuple[Status, str, int]:
+        """A selected frame that cannot be used."""
+        self._log.end(index, name, time_ns, Status.REJECTED, reason)
+        return Status.REJECTED, reason, 0
+
+    def look(self, posed: PosedFrame) -> None:
+        """Have a selected frame searched for objects while it is being placed."""
+        if self._finder is not None:
+            with self._log.stage(Stage.DETECT):
+                self._finder.look(posed)
+
+    @abstractmethod
+    def add(self, posed: PosedFrame) -> tuple[Status, str, int]:
+        """Place one frame; what became of it, in words if not by vision, and how many tiles were painted meanwhile."""
+
+    @abstractmethod
+    def finish(self, notices: Sequence[Notice], started_s: float) -> None:
+        """Place the flight for good, paint it and make it part of the site.
+
+        `started_s` is when the flight's mapping began, by the monotonic clock. Raises InputError, and leaves the site
+        as it was, when no frame has a place.
+        """
+
+    def _search(self, placed: Sequence[PlacedFrame]) -> ObjectSearch | None:
+        """What stands on the ground by the frames' final places; None where nobody looked."""
+        if self._finder is None:
+            return None
+        with self._log.stage(Stage.DETECT):
+            return self._finder.conclude(
+                placed, self._setup.source.name, has_metres=not self._archive.site().is_local
+            )
+
+    def _search_summary(self, search: ObjectSearch | None) -> dict[str, Any]:
+        """The report's part on objects."""
+        seconds = 0.0 if self._finder is None else self._finder.seconds
+        return search_summary(search, seconds, why_not_searched(self._settings.model))
+
+    @property
+    def _detector_notices(self) -> tuple[Notice, ...]:
+        return () if self._finder is None else self._finder.notices
+
+    def _make_site(self, m_per_px: float, ground_up_m: float) -> None:
+        """Make the site if there is none; see `new_site`."""
+        if not self._archive.has_site:
+            name = self._archive.folder.resolve().name or "site"
+            self._archive.create_site(new_site(self._setup, name, m_per_px, ground_up_m))
+
+    def _begin_flight(self) -> FlightWriter:
+        """The writer, begun when it is first asked for."""
+        if self._writer is None:
+            source = self._setup.source
+            settings: dict[str, Any] = {"method": self._settings.method, **vars(self._settings)}
+            self._writer = self._archive.begin_flight(source.name, source.fingerprint, settings)
+            self._began_writer = True
+        return self._writer

@@ -1,0 +1,1 @@
+"""`sorvolo simulate`: flights and pictures with known truth."""

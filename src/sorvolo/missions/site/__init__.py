@@ -1,0 +1,1 @@
+"""What a site remembers: its versions and the reviews of its changes."""

@@ -1,0 +1,127 @@
+"""The map of a site as it was: its versions listed, one found by number or date, one written as a file."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, time, timedelta
+from pathlib import Path
+
+from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.store.exports import write_kmz, write_preview
+from sorvolo.store.geotiff import write_cog
+from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue import VersionEntry
+from sorvolo.survey.findings import Verdict
+
+_STEPS = {2: timedelta(hours=1), 4: timedelta(minutes=1), 6: timedelta(seconds=1)}  # by digits of a time of day
+_ENDINGS = (".tif", ".tiff", ".png", ".kmz")
+
+
+@dataclass(frozen=True)
+class HistoryEntry:
+    """One version of the map. `changes` counts by kind, `{}` for a version that mapping made.
+
+    `over` is the version it was painted over (0: none), `tiles_changed` and `bytes_changed` what it has that that one
+    has not. `confirmed` and `rejected` count the verdicts on the changes its flight has now; 0 for a version whose
+    flight was mapped or compared again since (`is_replaced`).
+    """
+
+    version: int
+    date_utc: str
+    flight: str
+    kind: str  # map | compare
+    over: int
+    tiles: int
+    tiles_changed: int
+    tiles_removed: int
+    bytes_changed: int
+    changes: Mapping[str, int]
+    confirmed: int
+    rejected: int
+    is_replaced: bool
+
+
+def site_history(site: Path) -> list[HistoryEntry]:
+    """Every complete version of the map, oldest first. Raises StoreError when the folder is no site."""
+    with Archive.open(site, write=False) as archive:
+        versions = [version for version in archive.versions() if version.complete]
+        last_of = {version.flight_id: version.id for version in versions}
+        comparisons = archive.comparisons()
+        verdicts = [(each.flight_id, each.verdict) for each in archive.changes()]
+        result = []
+        for version in versions:
+            difference = archive.tile_difference(version)
+            is_last = last_of[version.flight_id] == version.id
+            result.append(HistoryEntry(
+                version.id, version.created_utc, version.flight_id, "compare" if version.id in comparisons else "map",
+                version.parent_id, version.tiles, difference.changed, difference.removed, difference.changed_bytes,
+                {kind: count for kind, count in comparisons.get(version.id, {}).items() if count},
+                verdicts.count((version.flight_id, Verdict.CONFIRMED)) if is_last else 0,
+                verdicts.count((version.flight_id, Verdict.REJECTED)) if is_last else 0,
+                not is_last,
+            ))
+        return result
+
+
+def find_version(archive: Archive, at: str) -> VersionEntry:
+    """The version of a number; or the newest one complete by the end of an ISO date, or of the minute or second that
+    an ISO date-time names; UTC.
+
+    Raises InputError when there is none, SettingsError when `at` is neither.
+    """
+    if at.isdecimal() and len(at) < 8:  # eight digits are an ISO date without dashes
+        found = [version for version in archive.versions() if version.complete and version.id == int(at)]
+        if not found:
+            numbers = [str(version.id) for version in archive.versions() if version.complete]
+            raise InputError(f"{archive.folder} has no version {at} of its map; it has {', '.join(numbers) or 'none'}")
+        return found[0]
+    return archive.version_at(_moment(at))
+
+
+def export_version(site: Path, at: str | None, path: Path) -> VersionEntry:
+    """Write the map as it was at a version or date (see `find_version`; None: now) to a .tif, .png or .kmz file.
+
+    Returns the version. Raises SettingsError for another ending, InputError when there was no map or the file's
+    folder does not exist, StoreError on a full disk.
+    """
+    ending = path.suffix.lower()
+    if ending not in _ENDINGS:
+        raise SettingsError(f"{path.name}: the map is written as .tif, .png or .kmz; end the file's name so")
+    if not path.resolve().parent.is_dir():
+        raise InputError(f"no folder {path.resolve().parent} to write {path.name} to; make it first")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder, a file was needed; choose another name")
+    with Archive.open(site, write=False) as archive:
+        version = archive.version_at(datetime.now(UTC)) if at is None else find_version(archive, at)
+        tiles, current = archive.tiles(version.id), archive.site()
+        if not tiles:
+            raise StoreError(f"version {version.id} of the map of {site} is empty; there is nothing to write")
+        if ending == ".png":
+            write_preview(tiles, path)
+        elif ending == ".kmz":
+            if current.is_local:
+                raise SettingsError(f"{site} has no place on Earth, so its map cannot be a KMZ; write .tif or .png")
+            write_kmz(tiles, archive.site_grid(), current.name, path)
+        else:
+            write_cog(tiles, archive.site_grid(), path, crs=version.export_crs or None)
+    return version
+
+
+def _moment(text: str) -> datetime:
+    """The end of an ISO date, or of the hour, minute or second that an ISO date-time names, UTC unless it names a zone.
+
+    A list shows times without their seconds: what it says was complete at a minute was so at the minute's end.
+    """
+    try:
+        return datetime.combine(date.fromisoformat(text), time.max, UTC)
+    except ValueError:
+        pass
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise SettingsError(
+            f"{text!r} is no version and no date; give a number, 2026-05-31, or 2026-05-31T12:00"
+        ) from error
+    time_of_day = re.search(r"[Tt ]([\d:.,]+)", text)
+    step = _STEPS.get(sum(letter.isdecimal() for letter in time_of_day[1])) if time_of_day else None
+    return moment if step is None else moment + step - timedelta(microseconds=1)

@@ -1,0 +1,1 @@
+"""`sorvolo train`: a detector from labelled pictures."""

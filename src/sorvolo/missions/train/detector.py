@@ -1,0 +1,361 @@
+"""Train the detector: labelled pictures and weights in, checkpoints on the way, a model file and a report out."""
+
+import math
+import os
+import time
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sorvolo import __version__
+from sorvolo.capture.photos import read_picture
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.missions.train.checks import Checked, best_sizes_px, check_model, found_sizes_px
+from sorvolo.missions.train.sets import DataOptions, TrainingSets, read_labels, simulate_samples, training_sets
+from sorvolo.missions.train.settings import TrainSettings
+from sorvolo.missions.train.start import load_start, told_of_classes
+from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
+from sorvolo.store.exports import json_bytes, plain_json
+from sorvolo.store.pages.training import training_page
+from sorvolo.training.checkpoint import (
+    checkpoint_bytes,
+    load_weights_bytes,
+    read_checkpoint,
+    restore,
+    weights_bytes,
+)
+from sorvolo.training.drawing import batches_from
+from sorvolo.training.export import ExportCheck, check_export, export_onnx
+from sorvolo.training.exported import ExportedModel
+from sorvolo.training.faster_rcnn import FasterRCNN
+from sorvolo.training.four_steps import STEP_NAMES, FourStepTraining
+from sorvolo.training.joint import Progress
+from sorvolo.training.progress import Check, History, Learner, seconds_left
+from sorvolo.training.samples import Augmentation, Sample
+from sorvolo.training.starting import device_of, start_learner, without_denormals
+from sorvolo.training.weights import ImageNetWeights
+
+MODEL, REPORT, PAGE = "model.onnx", "training.json", "training.html"
+CHECKPOINT, BEST, SIMULATED = "checkpoint.pt", "best.safetensors", "simulated"
+"""What a run leaves in its folder; the last only where simulated pictures were asked for."""
+
+_CHECKS, _CHECK_STEPS = 20, 50  # a run is checked so often, evenly over its steps, but not after fewer of them
+_MOST_CHECKED, _MOST_CHECKED_LAST = 150, 1000  # held-out pictures
+_ROWS = 200  # of losses in the report
+_SAVE_S = 60.0  # a kill costs no more than this and the time between two checks
+_KEPT_PICTURES_BYTES = 2 << 30
+_FINDS_NOTHING_AP50 = 0.05  # below which a model is of no use yet
+_EXPORT_PICTURES, _EXPORT_PX = 4, 1280  # by which the model file is compared with torch
+
+
+@dataclass(frozen=True)
+class TrainingUpdate:
+    """Where a run stands. Before its first step `step` is 0 and `words` says what is done."""
+
+    step: int
+    steps: int
+    words: str
+    losses: Progress | None = None  # of the last step
+    steps_per_s: float = float("nan")
+    left_s: float = float("nan")
+    check: Check | None = None  # the one made just now
+    notices: tuple[str, ...] = ()  # what is to be known, each told once
+
+
+@dataclass(eq=False)
+class _Run:
+    """A run on its way: `learner` and `history` change with every step."""
+
+    out: Path
+    settings: TrainSettings
+    sets: TrainingSets
+    learner: Learner
+    reader: "_Reader"
+    device: str
+    start: ImageNetWeights | ExportedModel | None
+    notices: tuple[str, ...]  # told before the first step
+    history: History = field(default_factory=History)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What a run must share with the one that it goes on from."""
+        settings = {key: value for key, value in asdict(self.settings).items() if key != "patience"}
+        if isinstance(self.start, ExportedModel):
+            begun = f"model with SHA-256 {self.start.sha256[:16]}"
+        else:
+            begun = "none" if self.start is None else f"ImageNet{', original strides' if self.start.original else ''}"
+        return {**settings, "weights": begun, "classes": list(self.sets.classes), "data": self.sets.fingerprint}
+
+
+def train_detector(
+    places: Sequence[Path], out: Path, settings: TrainSettings, options: DataOptions, *, device: str = "auto",
+    resume: bool = False,
+) -> Iterator[TrainingUpdate]:
+    """Train on the sets at `places` and leave model.onnx, training.html, training.json and checkpoints in `out`.
+
+    Closing the iterator early leaves a checkpoint, from which `resume` goes on. Raises InputError for data or weights
+    that cannot be used, SettingsError for a device that is not there, for an `out` that holds another run, and for
+    resuming with other settings or data; StoreError on a full disk.
+    """
+    device = device_of(device)
+    with _claimed(out, resume):
+        yield from _train(places, out, settings, options, device, resume)
+
+
+def _train(
+    places: Sequence[Path], out: Path, settings: TrainSettings, options: DataOptions, device: str, resume: bool
+) -> Iterator[TrainingUpdate]:
+    start = load_start(settings.weights, settings.preset)
+    steps = settings.steps
+    yield TrainingUpdate(0, steps, "reading the labels")
+    labels = read_labels(places, options, synthetic=settings.synthetic, seed=settings.seed)
+    if settings.synthetic > 0:
+        samples = round(steps * settings.batch * settings.synthetic)
+        for words in simulate_samples(out / SIMULATED, samples, settings.seed):
+            yield TrainingUpdate(0, steps, words)
+    sets = training_sets(labels, synthetic=settings.synthetic, simulated=out / SIMULATED)
+    told = sets.notices
+    if isinstance(start, ExportedModel):
+        told += tuple(told_of_classes(start, sets.classes))
+    yield TrainingUpdate(0, steps, f"preparing the network ({settings.preset})", notices=told)
+    reader = _Reader(sets)
+    with without_denormals():
+        with closing(_batches(sets, reader, settings)) as first:
+            learner = start_learner(
+                settings.preset, sets.classes, settings.rpn, settings.schedule, start, first, steps=steps,
+                batch=settings.batch, seed=settings.seed, device=device,
+            )
+        run = _Run(out, settings, sets, learner, reader, device, start, told)
+        if resume:
+            checkpoint = read_checkpoint((out / CHECKPOINT).read_bytes(), str(out / CHECKPOINT))
+            restore(run.learner, checkpoint, run.identity)
+            run.history = checkpoint.history
+        yield from _learn(run)
+        yield TrainingUpdate(run.learner.step, steps, "measuring and writing the model")
+        check, told = _finish(run)
+    yield TrainingUpdate(run.learner.step, steps, f"{out / MODEL} is ready", check=check, notices=told)
+
+
+@contextmanager
+def _claimed(out: Path, resume: bool) -> Iterator[None]:
+    """Make the folder; raise SettingsError unless it is free, or holds what is to be gone on from.
+
+    What was made is gone again when nothing came into it, as after an error before the first step.
+    """
+    held = (out / CHECKPOINT).is_file()
+    if resume and not held:
+        raise SettingsError(f"{out} holds no {CHECKPOINT} to go on from; leave --resume out to start there")
+    if held and not resume:
+        raise SettingsError(f"{out} already holds a run; --resume goes on with it, another --out starts anew")
+    made = [each for each in (out, *out.parents) if not each.exists()]
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+        remove_leftovers([out])
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # a folder that holds something stays
+            for each in made:
+                each.rmdir()
+
+
+class _Reader:
+    """Reads pictures, keeping as many as a bounded part of the memory holds; `damaged` are those that cannot be."""
+
+    def __init__(self, sets: TrainingSets) -> None:
+        pictures = [picture for share in sets.shares for picture in share.labelled.pictures]
+        size = sum(3 * each.width_px * each.height_px for each in pictures) / len(pictures)
+        self.damaged: dict[str, str] = {}
+        self._kept = lru_cache(maxsize=int(_KEPT_PICTURES_BYTES / size))(self._read)
+
+    def __call__(self, path: str) -> ImageRGB:
+        """The picture's pixels. Raises InputError when it is damaged or gone."""
+        return self._kept(path)
+
+    def _read(self, path: str) -> ImageRGB:
+        try:
+            return read_picture(Path(path))
+        except (InputError, OSError) as error:
+            self.damaged[path] = str(error)
+            raise InputError(f"{path}: {error}") from error
+
+
+def _batches(
+    sets: TrainingSets, reader: _Reader, settings: TrainSettings, start: int = 0
+) -> Generator[list[Sample], None, None]:
+    """What is learnt from, batch by batch, from number `start` on."""
+    return batches_from(
+        sets.shares, sets.classes, reader, Augmentation(side_px=settings.side_px), seed=settings.seed,
+        batch=settings.batch, start=start, threads=max(1, min(8, (os.cpu_count() or 1) - 1)),
+    )
+
+
+def _learn(run: _Run) -> Iterator[TrainingUpdate]:
+    """All steps that are left, with checks and checkpoints; ends early where checks no longer get better."""
+    settings, learner = run.settings, run.learner
+    batches = _batches(run.sets, run.reader, settings, learner.step)
+    first, before_s, started_s = learner.step, run.history.seconds, time.monotonic()
+    saved_s = started_s
+    try:
+        while learner.step < settings.steps and run.history.is_worth_going_on(settings.patience):
+            progress = learner.learn(next(batches))
+            if not math.isfinite(progress.loss):
+                raise SettingsError(
+                    f"the loss of step {progress.step} is no number: learning has come apart. Take larger batches, "
+                    f"--weights auto or another --seed; {run.out / CHECKPOINT} is from before"
+                )
+            here_s = time.monotonic() - started_s
+            run.history = run.history.after(progress, before_s + here_s, every=max(1, settings.steps // _ROWS))
+            check = _check(run) if _is_check_due(run) else None
+            if check is not None or time.monotonic() - saved_s > _SAVE_S:
+                _save(run)
+                saved_s = time.monotonic()
+            yield TrainingUpdate(
+                learner.step, settings.steps, _stage(learner), progress, (learner.step - first) / here_s,
+                seconds_left(learner.step, settings.steps, learner.step - first, here_s), check,
+            )
+    except GeneratorExit:
+        _save(run)
+        raise
+    finally:
+        batches.close()
+    _save(run)
+
+
+def _is_check_due(run: _Run) -> bool:
+    """At even distances and in the end; of the four steps only in the last: before, the parts do not fit together."""
+    step, steps = run.learner.step, run.settings.steps
+    if not run.sets.held_out or (isinstance(run.learner, FourStepTraining) and run.learner.stage < 3):
+        return False
+    return step % max(_CHECK_STEPS, steps // _CHECKS) == 0 or step == steps
+
+
+def _check(run: _Run) -> Check:
+    """Look at held-out pictures; the best weights so far are kept."""
+    check = _look(run, run.learner.average, _MOST_CHECKED).check(run.learner.step)
+    run.history = run.history.checked(check)
+    if run.history.best is check:
+        atomic_write_bytes(run.out / BEST, weights_bytes(run.learner.average))
+    return check
+
+
+def _stage(learner: Learner) -> str:
+    return STEP_NAMES[learner.stage] if isinstance(learner, FourStepTraining) else "learning"
+
+
+def _save(run: _Run) -> None:
+    atomic_write_bytes(run.out / CHECKPOINT, checkpoint_bytes(run.learner, run.identity, run.history))
+
+
+def _look(run: _Run, model: FasterRCNN, most: int) -> Checked:
+    return check_model(model, run.sets.classes, run.sets.held_out, run.reader, device=run.device, most=most)
+
+
+def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
+    """The best weights as a model file, checked against torch, with the report; its last check, and what is new to
+    say."""
+    model, classes, best = run.learner.average, run.sets.classes, run.history.best
+    if best is not None:
+        load_weights_bytes(model, (run.out / BEST).read_bytes(), str(run.out / BEST))
+    checked = _look(run, model, _MOST_CHECKED_LAST) if run.sets.held_out else Checked({}, {})
+    thresholds = checked.thresholds(classes)
+    scores = {name: each.score for name, each in thresholds.items()}
+    learnt = [share.labelled for share in run.sets.shares]
+    thermal, by_day = run.sets.lights
+    info = {
+        "name": run.out.resolve().name or "model", "preset": run.settings.preset, "version": __version__,
+        "classes": list(classes), "thresholds": scores, "best_px": best_sizes_px(checked, scores, learnt, classes),
+        **_descent(run, ", ".join(each.name for each in learnt)),
+        "thermal": thermal, "daylight": by_day,
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    exported = export_onnx(model, info)
+    agreement = check_export(model.cpu(), exported, _some_pictures(run))
+    atomic_write_bytes(run.out / MODEL, exported)
+    check = checked.check(run.learner.step if best is None else best.step) if run.sets.held_out else None
+    told = _closing_notices(run, agreement, check)
+    report = _report(run, info, agreement, len(exported), check, told) | {
+        "reported": {name: asdict(each) for name, each in thresholds.items()},
+        "found_px": found_sizes_px(checked, scores, classes),
+    }
+    atomic_write_bytes(run.out / REPORT, json_bytes(report))
+    atomic_write_bytes(run.out / PAGE, training_page(plain_json(report)).encode())
+    return check, told
+
+
+def _descent(run: _Run, learnt: str) -> dict[str, str]:
+    """The model file's licence and what it was trained on: of a tuned one also those of the model before."""
+    licence = "as the data that it was trained on"
+    if not isinstance(run.start, ExportedModel):
+        return {"licence": licence, "trained_on": learnt}
+    before = run.start.trained_on or "what is not said"
+    return {
+        "licence": f"{licence}; {run.start.origin} before: {run.start.licence or 'not said'}",
+        "trained_on": f"{learnt}; {run.start.origin} before: {before}",
+    }
+
+
+def _some_pictures(run: _Run) -> list[ImageRGB]:
+    """A few that can be read, held-out ones first, padded where a side is shorter than the network's stride."""
+    sets = (*run.sets.held_out, *(share.labelled for share in run.sets.shares))
+    found: list[ImageRGB] = []
+    for picture in (each for labelled in sets for each in labelled.pictures):
+        if len(found) == _EXPORT_PICTURES:
+            break
+        try:
+            found.append(_at_least(run.reader(picture.path)[:_EXPORT_PX, :_EXPORT_PX], run.learner.model.stride))
+        except InputError:
+            continue
+    return found
+
+
+def _at_least(picture: ImageRGB, side_px: int) -> ImageRGB:
+    """The picture, padded where a side is shorter than the network's stride."""
+    down, right = (max(0, side_px - side) for side in picture.shape[:2])
+    return np.pad(picture, ((0, down), (0, right), (0, 0)), constant_values=114)
+
+
+def _closing_notices(run: _Run, agreement: ExportCheck, check: Check | None) -> tuple[str, ...]:
+    """What is only known in the end."""
+    notices = []
+    if check is not None and check.ap50 < _FINDS_NOTHING_AP50:
+        notices.append(
+            f"the model finds next to nothing: its AP50 on the held-out pictures is {check.ap50:.3f}; train longer "
+            "(--steps), begin with --weights auto or a model, or look whether the labels fit the pictures"
+        )
+    if run.reader.damaged:
+        count, (path, reason) = len(run.reader.damaged), next(iter(run.reader.damaged.items()))
+        notices.append(f"{count} pictures cannot be read and were passed over (first: {path}: {reason})")
+    if not run.sets.held_out:
+        notices.append("nothing was held out: how good the model is, and from which score to report, is not known")
+    if not agreement.is_good:
+        notices.append(
+            f"the exported model differs from torch by {agreement.box_px:.2f} px, {agreement.score:.4f} in score, "
+            f"{agreement.unmatched} of {agreement.detections} detections unmatched"
+        )
+    return tuple(notices)
+
+
+def _report(
+    run: _Run, info: Mapping[str, Any], agreement: ExportCheck, size_bytes: int, check: Check | None,
+    closing_notices: Sequence[str],
+) -> dict[str, Any]:
+    """The content of training.json."""
+    step, steps, history = run.learner.step, run.settings.steps, run.history
+    return {
+        "made_by": "sorvolo train", "format": 1, "model": dict(info), "settings": asdict(run.settings),
+        "device": run.device, "weights": "none" if run.start is None else run.start.origin,
+        "sets": run.sets.described(), "notices": [*run.notices, *closing_notices],
+        "step": step, "steps": steps, "stopped_early": step < steps, "seconds": history.seconds,
+        "losses": [asdict(row) for row in history.rows], "checks": [asdict(each) for each in history.checks],
+        "best_step": None if history.best is None else history.best.step,
+        "held_out": None if check is None else asdict(check),
+        "export": {**asdict(agreement), "good": agreement.is_good, "bytes": size_bytes},
+    }

@@ -1,0 +1,1 @@
+"""`sorvolo watch`: people, cars and objects in a flight or a live stream."""

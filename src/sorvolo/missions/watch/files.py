@@ -1,0 +1,238 @@
+"""What a watch writes while it runs: lines, crops, annotated frames and labels, in a thread beside the detector."""
+
+import queue
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.missions.watch.settings import WatchOutputs
+from sorvolo.store.annotated import AnnotatedVideo, annotated, write_annotated
+from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.detection_files import (
+    ANNOTATED_PICTURES,
+    ANNOTATED_VIDEO,
+    LABELS,
+    TRACKS,
+    DetectionLines,
+    crop_around,
+    detection_row,
+    tracks_geojson,
+    write_crop,
+)
+from sorvolo.store.exports import geojson_bytes
+from sorvolo.store.images import jpeg_from_image
+from sorvolo.store.label_files import picture_of_detections, write_coco, write_yolo
+from sorvolo.survey.flight import Frame, Site
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
+from sorvolo.survey.objects import Detections, Sighting, Track
+from sorvolo.tracking.joining import frame_doubles
+
+_MOST_WAITING = 4  # frames; a disk that is slower than the detector slows the watch, it does not fill the memory
+_TRACKS_EVERY_S = 5.0
+_LABELS_EVERY_NS = 1_000_000_000  # frames nearer in time show the same again
+_CROPS_BYTES = 96_000_000  # of the latest sightings, one of which may become a track's best
+
+
+@dataclass(frozen=True, eq=False)
+class SeenFrame:
+    """One searched frame: what was seen, where, and by which track it was taken (0: by none)."""
+
+    frame: Frame
+    time_ns: int
+    detections: Detections
+    sightings: Sequence[Sighting | None]  # one for each detection
+    track_ids: Sequence[int]  # one for each detection
+    confirmed: frozenset[int]
+    headline: str
+    segment: int  # of a flight that is followed in the picture, 0 on the ground
+
+
+class WatchFiles:
+    """The folder of one watch while it grows. A context manager; leaving it closes every file."""
+
+    def __init__(self, folder: Path, outputs: WatchOutputs, site: Site) -> None:
+        self.folder = folder
+        self._outputs, self._site = outputs, site
+        self._crops: OrderedDict[tuple[int, bytes], ImageRGB] = OrderedDict()
+        self._crops_bytes = 0
+        self._best: dict[int, Sighting] = {}
+        self.crop_names: dict[int, str] = {}
+        self._segments: dict[int, int] = {}  # by track
+        self._forgotten: list[str] = []
+        self._told_s = time.monotonic()
+        self._labelled: list[tuple[LabelledPicture, Floats]] = []
+        self._classes: tuple[str, ...] = ()
+        self._label_due_ns = -1
+        self._queue: queue.Queue[SeenFrame | None] = queue.Queue(_MOST_WAITING)
+        self._error: BaseException | None = None
+        self._stack = ExitStack()
+        self._lines = self._stack.enter_context(DetectionLines(folder))
+        self._video = (
+            self._stack.enter_context(AnnotatedVideo(folder / ANNOTATED_VIDEO)) if outputs.save == "video" else None
+        )
+        self.seconds = 0.0
+        self._thread = threading.Thread(target=self._run, name="watch files", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def add(self, seen: SeenFrame) -> None:
+        """Write one frame's part soon. Raises what went wrong with an earlier one (StoreError on a full disk)."""
+        self._raise_earlier()
+        self._segments |= dict.fromkeys(seen.track_ids, seen.segment)
+        for sighting in seen.sightings:
+            if sighting is not None:
+                self._keep_crop(sighting, crop_around(seen.frame.image, sighting.box_px))
+        self._queue.put(seen)
+
+    def crop_of(self, track: Track) -> str | None:
+        """Write the crop of the track's best view if that is new; its file's name within the folder."""
+        if self._best.get(track.id) is not track.best:
+            crop = self._crops.get(_key(track.best))
+            if crop is not None:
+                self.crop_names[track.id] = write_crop(self.folder, track.id, crop)
+                self._best[track.id] = track.best
+        return self.crop_names.get(track.id)
+
+    def forget(self, track_ids: Iterable[int]) -> None:
+        """The crops of tracks that turned out to be others belong to nothing any more; `clear` removes them."""
+        self._forgotten += [name for each in track_ids if (name := self.crop_names.pop(each, None)) is not None]
+
+    def clear(self) -> None:
+        """Remove the crops that were forgotten; not earlier, for whom an alert told may still be looking at them."""
+        for name in self._forgotten:
+            (self.folder / name).unlink(missing_ok=True)
+
+    def show(self, tracks: Iterable[Track]) -> None:
+        """Bring `tracks.geojson` up to date, unless that was done within the last seconds."""
+        if time.monotonic() - self._told_s >= _TRACKS_EVERY_S:
+            self._told_s = time.monotonic()
+            self.write_tracks(tracks)
+
+    def write_tracks(self, tracks: Iterable[Track]) -> list[dict[str, Any]]:
+        """Replace `tracks.geojson`: readers see the old one or the new one. Returns each track's properties there."""
+        collection = tracks_geojson(tracks, self._site, self.crop_names)
+        rows = [each["properties"] for each in collection["features"]]
+        if self._site.is_local:
+            for row in rows:
+                row["segment"] = self._segments[row["id"]]
+        atomic_write_bytes(self.folder / TRACKS, geojson_bytes(collection), durable=False)
+        return rows
+
+    def close(self) -> None:
+        """Write what waits and close the files. Raises what went wrong with it."""
+        if self._thread.is_alive():
+            self._queue.put(None)
+            self._thread.join()
+        self._stack.close()
+        self._raise_earlier()
+        self._write_labels()
+
+    # ---- in the thread ----------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while (seen := self._queue.get()) is not None:
+            if self._error is not None:
+                continue  # the queue is emptied, so that nobody waits for it
+            started_s = time.monotonic()
+            try:
+                self._write(seen)
+            except Exception as error:  # told by the next `add`, or by `close`
+                self._error = error
+            self.seconds += time.monotonic() - started_s
+
+    def _write(self, seen: SeenFrame) -> None:
+        self._lines.append(_rows(seen, self._site))
+        if self._video is not None:
+            self._video.add(_drawn(seen), seen.time_ns)
+        elif self._outputs.save == "pictures" and len(seen.detections):
+            write_annotated(self.folder / ANNOTATED_PICTURES, _file_name(seen.frame), _drawn(seen))
+        if self._outputs.labels and seen.time_ns >= self._label_due_ns:
+            self._label_due_ns = seen.time_ns + _LABELS_EVERY_NS
+            self._label(seen)
+
+    def _label(self, seen: SeenFrame) -> None:
+        """Keep a frame as a picture, and what was seen in it for the files of labels."""
+        images = self.folder / LABELS / "images"
+        with writing(images):
+            images.mkdir(parents=True, exist_ok=True)
+        name = f"{self._site.name}_{_file_name(seen.frame)}.jpg"
+        atomic_write_bytes(images / name, jpeg_from_image(seen.frame.image), durable=False)
+        height, width = seen.frame.image.shape[:2]
+        picture = picture_of_detections(f"images/{name}", width, height, self._site.name, seen.detections)
+        self._labelled.append((picture, seen.detections.scores))
+        self._classes = seen.detections.classes
+
+    def _write_labels(self) -> None:
+        if not self._labelled:
+            return
+        found = LabelledSet(self._site.name, self._classes, tuple(picture for picture, _ in self._labelled))
+        if "coco" in self._outputs.labels:
+            write_coco(self.folder / LABELS / "coco.json", found, [scores for _, scores in self._labelled])
+        if "yolo" in self._outputs.labels:
+            write_yolo(self.folder / LABELS, found)
+        self._labelled = []
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _raise_earlier(self) -> None:
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+
+    def _keep_crop(self, sighting: Sighting, crop: ImageRGB) -> None:
+        self._crops[_key(sighting)] = crop
+        self._crops_bytes += crop.nbytes
+        while self._crops_bytes > _CROPS_BYTES and len(self._crops) > 1:
+            _, dropped = self._crops.popitem(last=False)
+            self._crops_bytes -= dropped.nbytes
+
+
+def _file_name(frame: Frame) -> str:
+    """The frame's name without ending; a video's frames are numbered, and sort by it."""
+    stem = Path(frame.name).stem
+    return f"{int(stem):06d}" if stem.isdecimal() else stem
+
+
+def _key(sighting: Sighting) -> tuple[int, bytes]:
+    return sighting.frame_index, sighting.box_px.tobytes()
+
+
+def _rows(seen: SeenFrame, site: Site) -> list[dict[str, Any]]:
+    found = seen.detections
+    segment = {"segment": seen.segment} if site.is_local else {}
+    return [
+        detection_row(
+            seen.frame, seen.time_ns, found.names[row], float(found.scores[row]), found.boxes_px[row].tolist(),
+            seen.sightings[row], seen.track_ids[row] or None, site,
+        ) | segment
+        for row in range(len(found))
+    ]
+
+
+def _drawn(seen: SeenFrame) -> ImageRGB:
+    """The frame with a box for each object, the surest of those that show it."""
+    doubles = frame_doubles(seen.detections.boxes_px, seen.detections.names, seen.detections.scores)
+    rows = [row for row in range(len(seen.detections)) if row not in doubles]
+    found, track_ids = seen.detections.only(np.array(rows, int)), [seen.track_ids[row] for row in rows]
+    counted = [track_id in seen.confirmed for track_id in track_ids]
+    words = [
+        f"{name} {track_id} {score:.2f}" if is_counted else ""
+        for name, track_id, score, is_counted in zip(found.names, track_ids, found.scores, counted)
+    ]
+    return annotated(seen.frame.image, found.boxes_px, found.labels.tolist(), words, counted, seen.headline)

@@ -1,0 +1,184 @@
+"""Mode 2: people, cars and small objects found while the drone flies, or in what it brought home; no map is needed."""
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack, closing, suppress
+from dataclasses import replace
+from pathlib import Path
+
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.capture.source import LiveSource, Source, open_sources
+from sorvolo.detection.detector import Detector
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.flight.setup import FlightSetup, prepare
+from sorvolo.missions.watch.ground import over_heights
+from sorvolo.missions.watch.places import places_of
+from sorvolo.missions.watch.run import WatchRun, WatchUpdate
+from sorvolo.missions.watch.settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
+from sorvolo.mosaic.selection import every
+from sorvolo.store.cursor_on_target import COT_TYPES, check_host, cot_place
+from sorvolo.store.detection_files import claim_folder
+from sorvolo.survey.flight import Frame, LostFrame
+
+_AHEAD = 4  # decoded frames that wait for the detector
+_STOPPED = "stopped on demand"
+
+
+def watch(
+    source: Path | str, settings: WatchSettings = WatchSettings(), outputs: WatchOutputs = WatchOutputs(), *,  # noqa: B008 (frozen)
+    telemetry: Path | str | None = None, camera: Path | str | None = None, detector: Detects | None = None,
+    live: LiveSettings = LiveSettings(),  # noqa: B008 (frozen)
+) -> Generator[WatchUpdate]:
+    """Search a flight, yielding an update for each frame searched.
+
+    `source`, `telemetry` and `camera` are those of `map_flights`; a folder of several videos is watched one after
+    another, each into a folder of its own. `detector` is one that is loaded already; else `settings.model` is. Every
+    wanted frame of a recorded flight is searched; of a live one, read as `live` says, the newest, so that latency stays
+    bounded, and the others are counted. Objects are placed on the ground where telemetry allows it, else followed in
+    the picture.
+
+    Close the generator, or press Ctrl-C, to end early: all that was found until then is written. Raises InputError,
+    SettingsError or StoreError with what to do.
+    """
+    if outputs.cot:
+        check_host(cot_place(outputs.cot))
+    finder = Detector.load(settings.model) if detector is None else detector
+    if unknown := sorted(set(settings.classes) - set(finder.classes)):
+        raise SettingsError(f"the model knows no {unknown[0]!r}; it knows {', '.join(finder.classes)}")
+    if unknown := sorted(set(outputs.cot_types) - {*finder.classes, *COT_TYPES}):
+        raise SettingsError(f"--cot-type {unknown[0]}: no such class; the model knows {', '.join(finder.classes)}")
+    sources = open_sources([source], telemetry, camera, live=live)
+    with ExitStack() as stack:
+        for each in sources:
+            if isinstance(each, LiveSource):
+                stack.callback(each.close)
+        for each in sources:
+            folder = outputs.folder or Path(f"{each.name}-watch")
+            if len(sources) > 1 and outputs.folder is not None:
+                folder = outputs.folder / each.name
+            yield from _watch_one(
+                each, finder, settings, replace(outputs, folder=folder), folder, telemetry_named=telemetry is not None
+            )
+
+
+def _watch_one(
+    source: Source, detector: Detects, settings: WatchSettings, outputs: WatchOutputs, folder: Path, *,
+    telemetry_named: bool,
+) -> Generator[WatchUpdate]:
+    mapping = MapSettings(offset_s=settings.offset_s, ground_elevation_m=settings.ground_elevation_m)
+
+    def prepared(mapping: MapSettings) -> FlightSetup:
+        return prepare(source, mapping, None, telemetry_named=telemetry_named)
+
+    if settings.height_model:
+        setup, ground = over_heights(prepared, mapping, Path(settings.height_model))
+    else:
+        setup, ground = prepared(mapping), None
+    least = settings.least_score if settings.least_score is not None else min(detector.info.thresholds.values())
+    places = places_of(setup, least, ground)
+    claim_folder(folder, source.name, source.fingerprint, replaces=not isinstance(source, LiveSource))
+    with WatchRun(setup, places, detector, settings, outputs, folder) as run:
+        ended = _STOPPED
+        try:
+            asked = _Asked(_wanted(source, settings))
+            with closing(_arrivals(source, asked)) as arrivals:
+                for arrived_s, each in arrivals:
+                    if isinstance(each, Frame):
+                        yield run.add(each, arrived_s)
+                    else:
+                        run.lose(each)
+            ended = "the source ended"
+            if not isinstance(source, LiveSource):
+                run.log.read = asked.frames  # also those after the last one that was searched
+        except KeyboardInterrupt:
+            pass  # the usual way to end a live watch: what was found is written below
+        except Exception as error:
+            ended = f"stopped by an error: {error}"
+            raise
+        finally:
+            if run.log.detected or ended == _STOPPED:
+                run.finish(ended=ended, skipped=source.skipped if isinstance(source, LiveSource) else 0)
+        if not run.log.detected and ended != _STOPPED:
+            reason = next(iter(run.log.lost), "the source holds none")
+            raise InputError(f"no frame of {source.name} could be searched: {reason}; `sorvolo inspect` tells more")
+
+
+class _Asked:
+    """Which frames are wanted; `frames` counts how many a source has come to when it asks."""
+
+    def __init__(self, wanted: Callable[[int, int], bool]) -> None:
+        self._wanted = wanted
+        self.frames = 0
+
+    def __call__(self, index: int, time_ns: int) -> bool:
+        self.frames = index + 1
+        return self._wanted(index, time_ns)
+
+
+def _arrivals(
+    source: Source, wanted: Callable[[int, int], bool]
+) -> Generator[tuple[float, Frame | LostFrame]]:
+    """The frames, each with when it came, or when its turn came, by the monotonic clock.
+
+    A live source has a thread of its own, in which newer frames take the place of older ones.
+    """
+    if isinstance(source, LiveSource):
+        yield from source.arrivals(wanted)
+    else:
+        with closing(read_ahead(source.frames(wanted), _AHEAD)) as frames:
+            for each in frames:
+                yield time.monotonic(), each
+
+
+def read_ahead(frames: Iterator[Frame | LostFrame], most: int) -> Generator[Frame | LostFrame]:
+    """The frames, read in a thread of their own, at most so many before they are asked for.
+
+    What the reading raises is raised here.
+    """
+    waiting: queue.Queue[Frame | LostFrame | BaseException | None] = queue.Queue(most)
+    is_over = threading.Event()
+
+    def put(item: Frame | LostFrame | BaseException | None) -> None:
+        while not is_over.is_set():
+            with suppress(queue.Full):
+                waiting.put(item, timeout=0.2)
+                return
+
+    def read() -> None:
+        try:
+            for each in frames:
+                put(each)
+                if is_over.is_set():
+                    return
+            put(None)
+        except BaseException as error:  # raised anew where the frames are taken
+            put(error)
+
+    thread = threading.Thread(target=read, name="decoding", daemon=True)
+    thread.start()
+    try:
+        while (item := waiting.get()) is not None:
+            if isinstance(item, BaseException):
+                raise item
+            yield item
+    finally:
+        is_over.set()
+        thread.join()
+
+
+def _wanted(source: Source, settings: WatchSettings) -> Callable[[int, int], bool]:
+    """Which frames are searched: all photos, every so manieth frame, or so many a second of flight.
+
+    Of a live source all may be: those that nobody has time for give way to newer ones.
+    """
+    if settings.every is not None:
+        step = settings.every
+        return lambda index, _: index % step == 0
+    if settings.frames_per_second is not None:
+        return every(1 / settings.frames_per_second)
+    takes_all = source.kind == "photos" or isinstance(source, LiveSource)
+    return every(0.0 if takes_all else 1 / DEFAULT_FRAMES_PER_SECOND)

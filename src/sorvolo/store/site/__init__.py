@@ -1,0 +1,1 @@
+"""The site folder: its files, catalogue, tiles and exports."""

@@ -1,0 +1,477 @@
+"""The catalogue `site.db`: one SQLite file that is the truth about a site (docs/formats.md)."""
+
+import sqlite3
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection, Row, Table, delete, func, insert, literal, select, update
+from sqlalchemy.exc import DBAPIError
+
+from sorvolo.errors import StoreError
+from sorvolo.geometry.arrays import Floats, Matrix3
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.geodesy import Geodetic
+from sorvolo.geometry.grid import TileIndex
+from sorvolo.geometry.pose import Pose
+from sorvolo.store.atomic import atomic_path
+from sorvolo.store.site import schema
+from sorvolo.store.site.schema import SCHEMA_VERSION
+from sorvolo.survey.flight import Site
+from sorvolo.survey.mosaic import Status
+
+
+@dataclass(frozen=True)
+class FlightEntry:
+    """A flight of the catalogue: its complete run, or the run that is mapping it for the first time.
+
+    `rank` counts flights in the order they were first mapped; `frames` is the number of frames by status;
+    times are ISO 8601 UTC, `finished_utc` "" while mapping.
+    """
+
+    id: str
+    rank: int
+    fingerprint: str
+    status: str
+    started_utc: str
+    finished_utc: str
+    method: str
+    frames: Mapping[str, int]
+    settings: Mapping[str, Any]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class VersionEntry:
+    """One state of the map; versions share the tiles in which they agree."""
+
+    id: int
+    parent_id: int
+    flight_id: str
+    created_utc: str
+    tiles: int
+    complete: bool
+    export_crs: str
+    run_id: int
+
+
+@dataclass(frozen=True)
+class TileDifference:
+    """How a version's tiles differ from those it was painted over: new or other ones, their bytes, ones taken away."""
+
+    changed: int
+    removed: int
+    changed_bytes: int
+
+
+@dataclass(frozen=True, eq=False)
+class StoredKeyframe:
+    """A keyframe of a complete run. Its image is undistorted and may be smaller than the frame was.
+
+    `camera` and `site_from_image` (3, 3) are those of the stored image; `gains` (3,) multiply its RGB
+    once the lens's `vignette` (2,) is undone (mosaic.exposure);
+    `site_from_camera` is None where the method knows no 6-DoF pose.
+    """
+
+    flight_id: str
+    index: int
+    name: str
+    time_ns: int
+    status: Status
+    image_path: str
+    camera: Camera
+    site_from_image: Matrix3
+    site_from_camera: Pose | None
+    gains: Floats
+    sigma_m: float
+    residual_px: float
+    vignette: Floats = field(default_factory=lambda: np.zeros(2))
+
+
+class Catalogue:
+    """The open database; `reading` and `changing` give one transaction each, the functions below use them."""
+
+    def __init__(self, path: Path, *, write: bool) -> None:
+        """Open, and bring an older format up to date if it is to be written.
+
+        Raises StoreError when the file is damaged, no catalogue, or of a format that is not known.
+        """
+        self._path, self._write = path, write
+        self._engine = schema.open_engine(path, write=write)
+        try:
+            self._check()
+        except BaseException:
+            self._engine.dispose()
+            raise
+
+    @staticmethod
+    def create(path: Path) -> None:
+        """Put an empty catalogue at `path`, whole from its first moment."""
+        with atomic_path(path) as temporary:
+            schema.create_tables(temporary)
+
+    def close(self) -> None:
+        """Close every connection; the last writer folds the write-ahead log into the file."""
+        self._engine.dispose()
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A transaction that sees one state of the catalogue."""
+        with self._naming_faults(), self._engine.begin() as connection:
+            yield connection
+
+    @contextmanager
+    def changing(self) -> Iterator[Connection]:
+        """A transaction that happens whole, on the disk, or not at all."""
+        with self._naming_faults(), self._engine.begin() as connection:
+            yield connection
+
+    def fold_log(self) -> None:
+        """Move the write-ahead log into the file and empty it: on a full disk, its space is needed again."""
+        connection = self._engine.raw_connection()
+        try:
+            connection.cursor().execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        except sqlite3.OperationalError as error:
+            raise StoreError(f"disk full: could not tidy {self._path} ({error}); free some space") from error
+        finally:
+            connection.close()
+
+    def _check(self) -> None:
+        with self.reading() as connection:
+            application = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
+            version = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
+            if application != schema.APPLICATION_ID:
+                raise StoreError(f"{self._path} is not a Sorvolo catalogue; choose another site folder")
+            if not schema.OLDEST_VERSION <= version <= SCHEMA_VERSION:
+                raise StoreError(
+                    f"the site {self._path.parent} has format version {version}, this Sorvolo works with "
+                    f"version {SCHEMA_VERSION}; use the Sorvolo that made it, or map into a new folder"
+                )
+            if self._write:
+                fault = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one()
+                if fault != "ok":
+                    raise StoreError(_damaged(self._path, fault))
+        if self._write and version < SCHEMA_VERSION:
+            with self.changing() as connection:
+                schema.upgrade(connection, version)
+
+    @contextmanager
+    def _naming_faults(self) -> Iterator[None]:
+        try:
+            yield
+        except DBAPIError as error:
+            fault = str(error.orig)
+            if "full" in fault:
+                raise StoreError(
+                    f"disk full: could not write {self._path} ({fault}); free some space and run it again"
+                ) from error
+            if "readonly" in fault or "locked" in fault or "unable to open" in fault or "disk I/O" in fault:
+                raise StoreError(
+                    f"cannot use {self._path}: {fault}; check the disk and its permissions"
+                ) from error
+            raise StoreError(_damaged(self._path, fault)) from error
+
+
+def utc_now() -> str:
+    """The time, ISO 8601 UTC to the millisecond."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def load_site(connection: Connection) -> Site | None:
+    """The site, None before it was created."""
+    row = connection.execute(select(schema.site)).one_or_none()
+    if row is None:
+        return None
+    origin = Geodetic(row.latitude_deg, row.longitude_deg, row.height_m)
+    return Site(row.name, origin, row.crs, row.m_per_px, row.is_local, row.height_reference)
+
+
+def add_site(connection: Connection, site: Site) -> None:
+    """Write the site's one row."""
+    connection.execute(insert(schema.site).values(
+        id=1, name=site.name, latitude_deg=site.origin.latitude_deg, longitude_deg=site.origin.longitude_deg,
+        height_m=site.origin.height_m, height_reference=site.height_reference, crs=site.crs,
+        m_per_px=site.m_per_px, is_local=site.is_local, created_utc=utc_now(), derived_version=0,
+    ))
+
+
+def list_flights(connection: Connection) -> list[FlightEntry]:
+    """Every flight by rank; a complete run hides the run that is about to replace it."""
+    rows = connection.execute(
+        select(schema.flights.c.rank, schema.runs)
+        .join(schema.runs, schema.runs.c.flight_id == schema.flights.c.id)
+        # "mapping" before "complete": the last one stays
+        .order_by(schema.flights.c.rank, schema.runs.c.status.desc())
+    )
+    return list({
+        row.flight_id: FlightEntry(
+            row.flight_id, row.rank, row.fingerprint, row.status, row.started_utc, row.finished_utc,
+            row.method, row.frames, row.settings, tuple(row.notes),
+        )
+        for row in rows
+    }.values())
+
+
+def list_versions(connection: Connection) -> list[VersionEntry]:
+    """Every version, oldest first."""
+    tiles = func.count(schema.version_tiles.c.sha256)
+    rows = connection.execute(
+        select(schema.versions, tiles.label("tiles"))
+        .outerjoin(schema.version_tiles, schema.version_tiles.c.version_id == schema.versions.c.id)
+        .group_by(schema.versions.c.id)
+        .order_by(schema.versions.c.id)
+    )
+    return [
+        VersionEntry(
+            row.id, row.parent_id, row.flight_id, row.created_utc, row.tiles, row.complete, row.export_crs, row.run_id
+        )
+        for row in rows
+    ]
+
+
+def newest_version(connection: Connection, *, complete: bool = True) -> int:
+    """The id of the newest complete (or incomplete) version; 0 when there is none."""
+    newest = select(func.max(schema.versions.c.id)).where(schema.versions.c.complete == complete)
+    return connection.execute(newest).scalar() or 0
+
+
+def tile_hashes(connection: Connection, version_id: int) -> dict[TileIndex, str]:
+    """SHA-256 of every tile of a version; empty for a version that does not exist."""
+    rows = connection.execute(select(schema.version_tiles).where(schema.version_tiles.c.version_id == version_id))
+    return {(row.tile_column, row.tile_row): row.sha256 for row in rows}
+
+
+def tile_changes(connection: Connection, version: VersionEntry) -> tuple[list[str], int]:
+    """SHA-256 of each tile that differs from the parent's at its place, and the number that only the parent has."""
+    now, then = tile_hashes(connection, version.id), tile_hashes(connection, version.parent_id)
+    return [sha256 for index, sha256 in now.items() if then.get(index) != sha256], len(then.keys() - now.keys())
+
+
+def used_hashes(connection: Connection, among: Collection[str] | None = None) -> set[str]:
+    """The SHA-256 of every tile that some version has, of those `among` when given."""
+    query = select(schema.version_tiles.c.sha256).distinct()
+    if among is None:
+        return set(connection.execute(query).scalars())
+    wanted = sorted(among)
+    return {
+        sha256
+        for start in range(0, len(wanted), 500)  # SQLite bounds the number of values in a query
+        for sha256 in connection.execute(
+            query.where(schema.version_tiles.c.sha256.in_(wanted[start:start + 500]))
+        ).scalars()
+    }
+
+
+def begin_run(
+    connection: Connection, flight_id: str, fingerprint: str, method: str, settings: Mapping[str, Any]
+) -> tuple[int, int]:
+    """Start a run and its incomplete version over the right earlier one; return both ids."""
+    known = connection.execute(select(schema.flights.c.rank).where(schema.flights.c.id == flight_id)).scalar()
+    if known is None:
+        last = connection.execute(select(func.max(schema.flights.c.rank))).scalar()
+        connection.execute(insert(schema.flights).values(id=flight_id, rank=0 if last is None else last + 1))
+    run_id = _inserted(connection, schema.runs, {
+        "flight_id": flight_id, "fingerprint": fingerprint, "status": "mapping", "started_utc": utc_now(),
+        "finished_utc": "", "method": method, "settings": dict(settings), "frames": {}, "notes": [],
+        "files_written": False,
+    })
+    newest = next((v for v in reversed(list_versions(connection)) if v.complete), None)
+    base_id = 0 if newest is None else newest.parent_id if newest.flight_id == flight_id else newest.id
+    version_id = _inserted(connection, schema.versions, {
+        "parent_id": base_id, "flight_id": flight_id, "run_id": run_id, "created_utc": utc_now(),
+        "complete": False, "export_crs": "",
+    })
+    tiles = schema.version_tiles
+    base = select(literal(version_id), tiles.c.tile_column, tiles.c.tile_row, tiles.c.sha256)
+    columns = list(tiles.c.keys())
+    connection.execute(insert(tiles).from_select(columns, base.where(tiles.c.version_id == base_id)))
+    return run_id, version_id
+
+
+def change_tiles(connection: Connection, version_id: int, changed: Mapping[TileIndex, str | None]) -> None:
+    """Give tiles of a version other content; None removes one."""
+    for (column, row), sha256 in changed.items():
+        connection.execute(delete(schema.version_tiles).where(
+            schema.version_tiles.c.version_id == version_id,
+            schema.version_tiles.c.tile_column == column,
+            schema.version_tiles.c.tile_row == row,
+        ))
+        if sha256 is not None:
+            connection.execute(insert(schema.version_tiles).values(
+                version_id=version_id, tile_column=column, tile_row=row, sha256=sha256
+            ))
+
+
+def complete_run(
+    connection: Connection,
+    run_id: int,
+    version_id: int,
+    keyframes: Sequence[StoredKeyframe],
+    documents: Mapping[str, bytes],
+    frames: Mapping[str, int],
+    notes: Sequence[str],
+    export_crs: str,
+) -> None:
+    """Switch a flight from its former run to this one, and the map to this version."""
+    this_run = schema.runs.c.id == run_id
+    flight_id = connection.execute(select(schema.runs.c.flight_id).where(this_run)).scalar_one()
+    former = (schema.runs.c.flight_id == flight_id, schema.runs.c.id != run_id)
+    gone = {
+        name
+        for table in (schema.documents, schema.leftovers)
+        for name in connection.execute(
+            select(table.c.name).join(schema.runs, schema.runs.c.id == table.c.run_id).where(*former)
+        ).scalars()
+    } - documents.keys()
+    connection.execute(delete(schema.runs).where(*former))
+    if gone:
+        connection.execute(insert(schema.leftovers), [{"run_id": run_id, "name": name} for name in sorted(gone)])
+    connection.execute(update(schema.runs).where(this_run).values(
+        status="complete", finished_utc=utc_now(), frames=dict(frames), notes=list(notes)
+    ))
+    connection.execute(update(schema.versions).where(schema.versions.c.id == version_id).values(
+        complete=True, created_utc=utc_now(), export_crs=export_crs
+    ))
+    if keyframes:
+        connection.execute(insert(schema.keyframes), [_row_of(keyframe, run_id) for keyframe in keyframes])
+    if documents:
+        connection.execute(insert(schema.documents), [
+            {"run_id": run_id, "name": name, "content": content} for name, content in documents.items()
+        ])
+
+
+def drop_unfinished(connection: Connection) -> None:
+    """Forget every run that was not committed, with its version, and flights that have no other.
+
+    A site that such a run made is forgotten as well when nothing was ever committed: its place, its ground sampling
+    distance and its height are that run's, and need not suit the next one.
+    """
+    connection.execute(delete(schema.versions).where(schema.versions.c.complete.is_(False)))
+    dropped = connection.execute(delete(schema.runs).where(schema.runs.c.status == "mapping")).rowcount
+    if dropped and newest_version(connection) == 0:
+        connection.execute(delete(schema.site))
+    connection.execute(delete(schema.flights).where(
+        schema.flights.c.id.not_in(select(schema.runs.c.flight_id)),
+        schema.flights.c.id.not_in(select(schema.versions.c.flight_id)),
+    ))
+
+
+def owe_documents(connection: Connection, flight_ids: Collection[str]) -> None:
+    """Let the next repair write the files of these flights again."""
+    connection.execute(
+        update(schema.runs).where(schema.runs.c.flight_id.in_(list(flight_ids))).values(files_written=False)
+    )
+
+
+def run_ids(connection: Connection) -> dict[str, set[int]]:
+    """The runs of each flight."""
+    runs: dict[str, set[int]] = {}
+    for row in connection.execute(select(schema.runs.c.flight_id, schema.runs.c.id)):
+        runs.setdefault(row.flight_id, set()).add(row.id)
+    return runs
+
+
+def load_keyframes(connection: Connection, flight_id: str | None) -> list[StoredKeyframe]:
+    """Keyframes of complete runs by flight rank and index, of one flight when its id is given."""
+    query = (
+        select(schema.keyframes, schema.runs.c.flight_id)
+        .join(schema.runs, schema.runs.c.id == schema.keyframes.c.run_id)
+        .join(schema.flights, schema.flights.c.id == schema.runs.c.flight_id)
+        .where(schema.runs.c.status == "complete")
+        .order_by(schema.flights.c.rank, schema.keyframes.c.frame_index)
+    )
+    if flight_id is not None:
+        query = query.where(schema.flights.c.id == flight_id)
+    return [_keyframe_of(row) for row in connection.execute(query)]
+
+
+@dataclass(frozen=True)
+class OwedFiles:
+    """What a complete run owes its flight's folder: text files by name (empty: already there), names to remove."""
+
+    flight_id: str
+    run_id: int
+    documents: Mapping[str, bytes]
+    leftovers: tuple[str, ...]
+
+
+def owed_files(connection: Connection) -> list[OwedFiles]:
+    """The files of each complete run that were not all written."""
+    runs = connection.execute(
+        select(schema.runs.c.flight_id, schema.runs.c.id)
+        .where(schema.runs.c.status == "complete", schema.runs.c.files_written.is_(False))
+    ).all()
+    documents, leftovers = schema.documents, schema.leftovers
+    return [
+        OwedFiles(
+            flight_id, run_id,
+            {
+                row.name: row.content
+                for row in connection.execute(select(documents).where(documents.c.run_id == run_id))
+            },
+            tuple(connection.execute(select(leftovers.c.name).where(leftovers.c.run_id == run_id)).scalars()),
+        )
+        for flight_id, run_id in runs
+    ]
+
+
+def mark_written(connection: Connection, run_ids: Sequence[int], derived_version: int) -> None:
+    """Note that these runs' files, and the map's files for this version, are on the disk: documents are emptied."""
+    connection.execute(update(schema.runs).where(schema.runs.c.id.in_(run_ids)).values(files_written=True))
+    connection.execute(update(schema.documents).where(schema.documents.c.run_id.in_(run_ids)).values(content=b""))
+    connection.execute(delete(schema.leftovers).where(schema.leftovers.c.run_id.in_(run_ids)))
+    connection.execute(update(schema.site).values(derived_version=derived_version))
+
+
+def derived_version(connection: Connection) -> int:
+    """The version that the map's derived files show; 0 for none."""
+    return connection.execute(select(schema.site.c.derived_version)).scalar() or 0
+
+
+def _inserted(connection: Connection, table: Table, values: Mapping[str, Any]) -> int:
+    key = connection.execute(insert(table).values(**values)).inserted_primary_key
+    assert key is not None  # SQLite gives one for each inserted row
+    return int(key[0])
+
+
+def _damaged(path: Path, fault: object) -> str:
+    return (
+        f"{path} is damaged or not a Sorvolo catalogue ({fault}); nothing was changed: "
+        "restore it from a copy, or map into a new folder"
+    )
+
+
+def _row_of(keyframe: StoredKeyframe, run_id: int) -> dict[str, Any]:
+    camera, pose = keyframe.camera, keyframe.site_from_camera
+    return {
+        "run_id": run_id, "frame_index": keyframe.index, "name": keyframe.name, "time_ns": keyframe.time_ns,
+        "status": keyframe.status.value, "image_path": keyframe.image_path,
+        "camera": {
+            "width_px": camera.width_px, "height_px": camera.height_px,
+            "fx_px": camera.fx_px, "fy_px": camera.fy_px, "cx_px": camera.cx_px, "cy_px": camera.cy_px,
+        },
+        "site_from_image": keyframe.site_from_image.tolist(),
+        "rotation": [] if pose is None else pose.rotation.tolist(),
+        "translation_m": [] if pose is None else pose.translation_m.tolist(),
+        "gains": keyframe.gains.tolist(),
+        "vignette": keyframe.vignette.tolist(),
+        "sigma_m": keyframe.sigma_m if np.isfinite(keyframe.sigma_m) else None,
+        "residual_px": keyframe.residual_px if np.isfinite(keyframe.residual_px) else None,
+    }
+
+
+def _keyframe_of(row: Row[Any]) -> StoredKeyframe:
+    return StoredKeyframe(
+        row.flight_id, row.frame_index, row.name, row.time_ns, Status(row.status), row.image_path,
+        Camera(**row.camera),
+        np.array(row.site_from_image),
+        Pose(row.rotation, row.translation_m) if row.rotation else None,
+        np.array(row.gains),
+        np.nan if row.sigma_m is None else row.sigma_m,
+        np.nan if row.residual_px is None else row.residual_px,
+        np.array(row.vignette),
+    )

@@ -1,0 +1,252 @@
+"""Changes and what people said of them, in the catalogue."""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection, Row, delete, func, insert, select
+
+from sorvolo.errors import StoreError
+from sorvolo.geometry.arrays import Floats, PointsM, frozen
+from sorvolo.store.site import schema
+from sorvolo.store.site.catalogue import utc_now
+from sorvolo.survey.findings import Change, ChangeKind, Verdict
+
+_FORBIDDEN = set('/\\:*?"<>|\0\n\r\t')
+
+
+@dataclass(frozen=True)
+class CropPlace:
+    """Where a change's crops lie: the outer corner of their first pixel in site metres, north up; their size."""
+
+    west_m: float
+    north_m: float
+    m_per_px: float
+    width_px: int
+    height_px: int
+
+
+@dataclass(frozen=True, eq=False)
+class StoredChange:
+    """A change of a flight's complete run, and the verdict on it, if any.
+
+    The fields are those of `survey.findings.Change`; `number` counts within the flight. The crops are
+    `<id>-before.png` and `<id>-after.png` in the flight's folder `changes`, on the ground as `crop` says.
+    """
+
+    id: str
+    flight_id: str
+    number: int
+    kind: ChangeKind
+    score: float
+    outline_m: PointsM
+    first_seen_ns: int
+    last_seen_ns: int
+    views: int
+    area_m2: float
+    length_m: float
+    sigma_m: float
+    velocity_m_s: Floats
+    class_before: str
+    class_after: str
+    announced_ns: int
+    crop: CropPlace
+    verdict: Verdict | None = None
+    note: str = ""
+
+    @property
+    def centre_m(self) -> PointsM:
+        """(2,) the middle of the outline's box, site metres."""
+        return _centre(self.outline_m)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredReview:
+    """What a person said of a change, with the kind and outline that the change had when it was said."""
+
+    change_id: str
+    flight_id: str
+    verdict: Verdict
+    at_utc: str
+    note: str
+    kind: ChangeKind
+    outline_m: PointsM
+
+    @property
+    def centre_m(self) -> PointsM:
+        """(2,) the middle of the outline's box, site metres."""
+        return _centre(self.outline_m)
+
+
+def stored_changes(flight_id: str, changes: Sequence[Change]) -> list[StoredChange]:
+    """The changes as they are stored, by number: the one that ends the id, or all by their places in the list.
+
+    Raises StoreError when two have the same id, or an id cannot name a file.
+    """
+    ids = [each.id for each in changes]
+    for change_id in ids:
+        if ids.count(change_id) > 1:
+            raise StoreError(f"two changes have the id {change_id!r}; each needs its own")
+        if not change_id or change_id.startswith(".") or not set(change_id).isdisjoint(_FORBIDDEN):
+            raise StoreError(f"{change_id!r} cannot name a change's pictures; choose letters, digits and dashes")
+    endings = [re.search(r"[0-9]{1,9}$", change_id) for change_id in ids]
+    numbers = [int(ending.group()) for ending in endings if ending is not None]
+    if len(set(numbers)) < len(ids):
+        numbers = list(range(1, len(ids) + 1))
+    result = [_stored(flight_id, number, each) for number, each in zip(numbers, changes)]
+    return sorted(result, key=lambda change: change.number)
+
+
+def add_comparison(
+    connection: Connection, run_id: int, version_id: int, changes: Sequence[StoredChange]
+) -> None:
+    """Note that this run compared its flight with the map and found these changes, perhaps none.
+
+    Raises StoreError when another flight has a change of the same id.
+    """
+    taken = known_ids(connection, [each.id for each in changes])
+    if taken:
+        raise StoreError(f"another flight of this site has a change {min(taken)!r} already; ids must differ")
+    kinds = {kind.value: sum(each.kind is kind for each in changes) for kind in ChangeKind}
+    connection.execute(insert(schema.comparisons).values(version_id=version_id, run_id=run_id, kinds=kinds))
+    if changes:
+        connection.execute(insert(schema.changes), [_row_of(each, run_id) for each in changes])
+
+
+def known_ids(connection: Connection, ids: Iterable[str]) -> set[str]:
+    """Those of these ids that a change has."""
+    wanted = sorted(set(ids))
+    return {
+        change_id
+        for start in range(0, len(wanted), 500)  # SQLite bounds the number of values in a query
+        for change_id in connection.execute(
+            select(schema.changes.c.id).where(schema.changes.c.id.in_(wanted[start:start + 500]))
+        ).scalars()
+    }
+
+
+def load_changes(connection: Connection, flight_id: str | None = None) -> list[StoredChange]:
+    """The changes of complete runs by flight rank and number, with their verdicts; of one flight if its id is given.
+
+    A verdict belongs to a change of its id whose box still meets the one that was looked at: other settings may
+    have given the id to another piece of ground.
+    """
+    if _is_older(connection):
+        return []
+    query = (
+        select(schema.changes, schema.runs.c.flight_id)
+        .join(schema.runs, schema.runs.c.id == schema.changes.c.run_id)
+        .join(schema.flights, schema.flights.c.id == schema.runs.c.flight_id)
+        .where(schema.runs.c.status == "complete")
+        .order_by(schema.flights.c.rank, schema.changes.c.number, schema.changes.c.id)
+    )
+    if flight_id is not None:
+        query = query.where(schema.flights.c.id == flight_id)
+    said = {review.change_id: review for review in load_reviews(connection)}
+    return [_change_of(row, said.get(row.id)) for row in connection.execute(query)]
+
+
+def load_reviews(connection: Connection) -> list[StoredReview]:
+    """Everything that was said, in the order of saying."""
+    if _is_older(connection):
+        return []
+    rows = connection.execute(select(schema.reviews).order_by(schema.reviews.c.at_utc, schema.reviews.c.change_id))
+    return [
+        StoredReview(
+            row.change_id, row.flight_id, Verdict(row.verdict), row.at_utc, row.note, ChangeKind(row.kind),
+            frozen(row.outline_m),
+        )
+        for row in rows
+    ]
+
+
+def put_reviews(connection: Connection, changes: Sequence[StoredChange], verdict: Verdict, note: str) -> None:
+    """Say the same of each of these changes; an earlier word on one is replaced."""
+    now = utc_now()
+    for each in changes:
+        connection.execute(delete(schema.reviews).where(schema.reviews.c.change_id == each.id))
+        connection.execute(insert(schema.reviews).values(
+            change_id=each.id, flight_id=each.flight_id, verdict=verdict.value, at_utc=now, note=note,
+            kind=each.kind.value, outline_m=each.outline_m.tolist(),
+        ))
+
+
+def compared_versions(connection: Connection) -> dict[int, Mapping[str, int]]:
+    """The versions that comparisons made: the number of changes of each kind."""
+    if _is_older(connection):
+        return {}
+    return {row.version_id: row.kinds for row in connection.execute(select(schema.comparisons))}
+
+
+def is_compared(connection: Connection, run_id: int) -> bool:
+    """Whether the run compared its flight with the map."""
+    query = select(func.count()).select_from(schema.comparisons).where(schema.comparisons.c.run_id == run_id)
+    return not _is_older(connection) and connection.execute(query).scalar_one() > 0
+
+
+def outlines_meet(one_m: PointsM, other_m: PointsM) -> bool:
+    """Whether the boxes around two outlines, (N, 2) each, have a point in common."""
+    return bool(np.all((one_m.min(axis=0) <= other_m.max(axis=0)) & (other_m.min(axis=0) <= one_m.max(axis=0))))
+
+
+def _is_older(connection: Connection) -> bool:
+    """Whether the file, opened to be read, is of a format that knew no changes."""
+    version: int = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
+    return version < 2
+
+
+def _centre(outline_m: PointsM) -> PointsM:
+    return (outline_m.min(axis=0) + outline_m.max(axis=0)) / 2
+
+
+def _stored(flight_id: str, number: int, change: Change) -> StoredChange:
+    patch = change.patch
+    height_px, width_px = patch.changed.shape
+    return StoredChange(
+        change.id, flight_id, number, change.kind, change.score, change.outline_m, change.first_seen_ns,
+        change.last_seen_ns, change.views, change.area_m2, change.length_m, change.sigma_m, change.velocity_m_s,
+        change.class_before, change.class_after, change.announced_ns,
+        CropPlace(patch.west_m, patch.north_m, patch.m_per_px, width_px, height_px),
+    )
+
+
+def _row_of(change: StoredChange, run_id: int) -> dict[str, Any]:
+    crop = change.crop
+    return {
+        "id": change.id, "run_id": run_id, "number": change.number, "kind": change.kind.value,
+        "properties": {
+            "score": float(change.score), "outline_m": change.outline_m.tolist(),
+            "first_seen_ns": int(change.first_seen_ns), "last_seen_ns": int(change.last_seen_ns),
+            "announced_ns": int(change.announced_ns), "views": int(change.views),
+            "area_m2": _finite(change.area_m2), "length_m": _finite(change.length_m),
+            "sigma_m": _finite(change.sigma_m), "velocity_m_s": change.velocity_m_s.tolist(),
+            "class_before": change.class_before, "class_after": change.class_after,
+            "crop": [*map(float, (crop.west_m, crop.north_m, crop.m_per_px)), crop.width_px, crop.height_px],
+        },
+    }
+
+
+def _change_of(row: Row[Any], review: StoredReview | None) -> StoredChange:
+    values = row.properties
+    outline_m = frozen(values["outline_m"])
+    is_reviewed = review is not None and outlines_meet(outline_m, review.outline_m)
+    return StoredChange(
+        row.id, row.flight_id, row.number, ChangeKind(row.kind), values["score"], outline_m,
+        values["first_seen_ns"], values["last_seen_ns"], values["views"],
+        _number(values["area_m2"]), _number(values["length_m"]), _number(values["sigma_m"]),
+        frozen(values["velocity_m_s"]), values["class_before"], values["class_after"],
+        values["announced_ns"], CropPlace(*values["crop"]),
+        review.verdict if review is not None and is_reviewed else None,
+        review.note if review is not None and is_reviewed else "",
+    )
+
+
+def _number(stored: float | None) -> float:
+    return np.nan if stored is None else stored
+
+
+def _finite(number: float) -> float | None:
+    return float(number) if np.isfinite(number) else None
+

@@ -1,0 +1,236 @@
+"""A flight on its way into a site: what is saved while it lasts, and the commit that makes it whole."""
+
+import shutil
+from collections.abc import Mapping, MutableMapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from sorvolo.errors import StoreError
+from sorvolo.geometry.arrays import Boxes, ImageGray, ImageRGB, ImageRGBA, Mask
+from sorvolo.geometry.grid import TileIndex
+from sorvolo.store.atomic import atomic_write_bytes, sync_file, writing
+from sorvolo.store.changes import BOXES_FILE, boxes_json, crop_files, mask_name, write_view_masks
+from sorvolo.store.exports import frames_geojson, geojson_bytes, json_bytes
+from sorvolo.store.geotiff import parse_crs
+from sorvolo.store.images import ImageCache, jpeg_from_image, read_keyframe
+from sorvolo.store.objects import CROPS, object_crops
+from sorvolo.store.site import catalogue as records
+from sorvolo.store.site import change_records, object_records
+from sorvolo.store.site.catalogue import StoredKeyframe
+from sorvolo.store.site.derived import STAGED, STAGED_FOLDERS
+from sorvolo.store.site.tiles import GrowingTiles
+from sorvolo.survey.findings import Change
+from sorvolo.survey.map_objects import ObjectSearch
+from sorvolo.survey.mosaic import PlacedFrame, Status
+
+if TYPE_CHECKING:
+    from sorvolo.store.site.archive import Archive
+
+
+class FlightWriter:
+    """A flight on its way into the site; a context manager. Without `commit` the site stays as it was.
+
+    Made by `Archive.begin_flight`. `tiles` is the map as it grows, over the newest complete version (over
+    that one's parent when this very flight made it). Frames whose image is not saved are counted and listed, but no
+    keyframes of the site: a flight over known ground need not store its pictures. Not for several threads at once.
+    """
+
+    def __init__(
+        self,
+        archive: "Archive",
+        flight_id: str,
+        run_id: int,
+        version_id: int,
+        tiles: GrowingTiles,
+        cache_bytes: int,
+    ) -> None:
+        self.tiles: MutableMapping[TileIndex, ImageRGBA] = tiles
+        self._archive, self._growing = archive, tiles
+        self._flight_id, self._run_id, self._version_id = flight_id, run_id, version_id
+        self._sizes: dict[str, tuple[int, int]] = {}  # path of each saved image: width, height
+        self._cache = ImageCache(
+            lambda index: read_keyframe(archive.folder / self._image_path(index)), cache_bytes
+        )
+        self._boxes: dict[str, list[list[int]]] = {}  # of each mask saved
+        self._is_open = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if not self._is_open:
+            return
+        self._is_open = False
+        self._archive._writer = None
+        try:
+            # files that no reader can see go first: on a full disk, forgetting the run needs their space
+            shutil.rmtree((self._archive.folder / self._image_path(0)).parent, ignore_errors=True)
+            shutil.rmtree(self._staged, ignore_errors=True)
+            self._archive._remove_unused()
+            self._archive._catalogue.fold_log()
+            self._archive._forget_unfinished()
+        except StoreError:
+            # if the disk is still full, the next opening does it, and the first error is the one to tell
+            if error is None:
+                raise
+
+    def save_image(self, index: int, image: ImageRGB) -> str:
+        """Store an undistorted keyframe, (H, W, 3), as JPEG and return its path relative to the site folder.
+
+        Raises StoreError on a full disk.
+        """
+        relative = self._image_path(index)
+        path = self._archive.folder / relative
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write_bytes(path, jpeg_from_image(image), durable=False)
+        self._cache.forget(index)
+        self._sizes[relative] = (image.shape[1], image.shape[0])
+        return relative
+
+    def image(self, index: int) -> ImageRGB:
+        """A keyframe saved earlier, as it will be read later; read-only. StoreError if there is none."""
+        return self._cache.get(index)
+
+    def save_masks(self, frame_name: str, changed: ImageGray, valid: Mask, boxes: Boxes) -> None:
+        """Store one view's mask and boxes (N, 4), to appear as masks/<frame>.png and in masks/boxes.json on commit.
+
+        `changed` (H, W) is 0 or more, `valid` (H, W) where it is known. Raises StoreError on a full disk.
+        """
+        folder = self._make_staged("masks")
+        name = mask_name(frame_name, self._boxes)
+        write_view_masks(folder, name, changed, valid)
+        self._boxes[name] = boxes_json(boxes)
+
+    def take_back_tiles(self) -> None:
+        """Make `tiles` what they were before the flight; readers see it with the next `flush`."""
+        self._growing.take_back()
+
+    def flush(self) -> None:
+        """Let readers see the map as it is now."""
+        changed = self._growing.save()
+        catalogue = self._archive._catalogue
+        with catalogue.changing() as connection:
+            records.change_tiles(connection, self._version_id, changed)
+            dropped = self._growing.take_superseded()
+            dropped -= records.used_hashes(connection, dropped)
+        self._archive._blobs.remove(dropped)
+
+    def commit(
+        self,
+        placed: Sequence[PlacedFrame],
+        image_paths: Mapping[int, str],
+        report: Mapping[str, Any],
+        report_html: str,
+        *,
+        crs: str | None = None,
+        notes: Sequence[str] = (),
+        changes: Sequence[Change] | None = None,
+        search: ObjectSearch | None = None,
+        documents: Mapping[str, bytes] | None = None,
+    ) -> int:
+        """Make the flight and its map part of the site in one transaction; return the map's version.
+
+        `image_paths` are what `save_image` returned, by frame index. Then the derived files are written,
+        `crs` being that of mosaic.tif (the site's own by default); a kill or a full disk in between is made
+        good by the next opening.
+
+        `changes` is None for a flight that was mapped only; with changes, or with () for a comparison that found
+        none, changes.geojson, changes.html and the crops are written, too, changes.html from `report`
+        (docs/formats.md). `search` is what the frames were searched for and what was found, None when they were not:
+        with it objects.geojson and the crops are written, too. `documents` are further files of the flight's folder by
+        name, not empty. Raises SettingsError for a bad `crs`, StoreError on a full disk, an unknown image path, or an
+        id that two changes have.
+        """
+        archive = self._archive
+        if crs is not None:
+            parse_crs(crs, archive.site_grid().grid)
+        keyframes = [
+            self._keyframe(frame, image_paths[frame.index])
+            for frame in placed
+            if frame.index in image_paths and frame.status is not Status.REJECTED
+        ]
+        found = change_records.stored_changes(self._flight_id, changes or ())
+        texts = {
+            **(documents or {}),
+            "frames.geojson": geojson_bytes(frames_geojson(placed, archive.site())),
+            "report.json": json_bytes(report),
+            "report.html": report_html.encode(),
+        }
+        frames = {status.value: sum(frame.status is status for frame in placed) for status in Status}
+        self.flush()
+        self._stage(changes or (), search)
+        self._sync()
+        with archive._catalogue.changing() as connection:
+            records.complete_run(
+                connection, self._run_id, self._version_id, keyframes, texts, frames, notes, crs or ""
+            )
+            if changes is not None:
+                change_records.add_comparison(connection, self._run_id, self._version_id, found)
+            if search is not None:
+                object_records.add_search(connection, self._run_id, search)
+        self._is_open = False
+        archive._writer = None
+        archive.repair()
+        archive._remove_unused()
+        return self._version_id
+
+    @property
+    def _staged(self) -> Path:
+        return self._archive.flight_folder(self._flight_id) / STAGED / str(self._run_id)
+
+    def _make_staged(self, name: str) -> Path:
+        folder = self._staged / name
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    def _stage(self, changes: Sequence[Change], search: ObjectSearch | None) -> None:
+        """Put the pictures where a repair finds them; an empty folder takes away what a former run left."""
+        flight_folder = self._archive.flight_folder(self._flight_id)
+        for name in STAGED_FOLDERS:
+            if (flight_folder / name).is_dir():
+                self._make_staged(name)
+        for name, data in crop_files(changes).items():
+            atomic_write_bytes(self._make_staged("changes") / name, data, durable=False)
+        for name, data in object_crops(search.objects if search is not None else ()).items():
+            atomic_write_bytes(self._make_staged(CROPS) / name, data, durable=False)
+        if self._boxes:
+            atomic_write_bytes(self._staged / "masks" / BOXES_FILE, json_bytes(self._boxes), durable=False)
+
+    def _sync(self) -> None:
+        """What the transaction names must reach the disk before it does."""
+        self._archive._blobs.sync()
+        for relative in self._sizes:
+            sync_file(self._archive.folder / relative)
+        if self._sizes:
+            images = (self._archive.folder / next(iter(self._sizes))).parent
+            for folder in (images, images.parent, images.parent.parent, images.parent.parent.parent):
+                sync_file(folder)
+        if self._staged.is_dir():
+            for path in (*self._staged.rglob("*"), self._staged, *list(self._staged.parents)[:3]):
+                sync_file(path)
+        sync_file(self._archive.folder)
+
+    def _image_path(self, index: int) -> str:
+        return f"flights/{self._flight_id}/keyframes/{self._run_id}/{index:06d}.jpg"
+
+    def _keyframe(self, frame: PlacedFrame, image_path: str) -> StoredKeyframe:
+        if image_path not in self._sizes:
+            raise StoreError(f"the image {image_path} of frame {frame.name} was never saved; save it first")
+        width_px, height_px = self._sizes[image_path]
+        camera = frame.camera.undistorted()
+        sx, sy = camera.width_px / width_px, camera.height_px / height_px
+        # centres of pixels lie half a pixel inside: frame = (stored + 1/2) s - 1/2
+        frame_from_stored = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
+        return StoredKeyframe(
+            self._flight_id, frame.index, frame.name, frame.time_ns, frame.status, image_path,
+            camera.resized(width_px, height_px), frame.site_from_image @ frame_from_stored,
+            frame.site_from_camera, np.asarray(frame.gains), frame.sigma_m, frame.residual_px,
+            np.asarray(frame.vignette),
+        )

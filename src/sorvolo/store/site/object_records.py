@@ -1,0 +1,159 @@
+"""What stands on the map, as rows of the catalogue: each flight's search, its objects, and the newest of each place."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from sqlalchemy import Connection, insert, select
+
+from sorvolo.geometry.arrays import Floats, PointsM, frozen
+from sorvolo.store.site import schema
+from sorvolo.survey.map_objects import MapObject, ObjectSearch
+
+_SAME_PLACE_M = 0.5  # beside what both places may err: a car parked again, a person who stood up
+_LOOKS = 2  # frames of a later flight that must show a place before what it did not find there is gone
+
+
+@dataclass(frozen=True, eq=False)
+class StoredSearch:
+    """A complete run's search: its flight and rank, the model, and the outlines (N, 4, 2) of the frames looked at."""
+
+    flight_id: str
+    rank: int
+    model: str
+    outlines_m: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class StoredObject:
+    """An object of a flight's complete run; its crop is `objects/<id>.jpg` in the flight's folder.
+
+    `flights` are all that saw it there, in order of rank, this one last.
+    """
+
+    flight_id: str
+    rank: int
+    thing: MapObject
+    flights: tuple[str, ...]
+
+
+def add_search(connection: Connection, run_id: int, search: ObjectSearch) -> None:
+    """Note that this run's frames were searched for objects, and what was found."""
+    connection.execute(insert(schema.searches).values(
+        run_id=run_id, model=search.model, outlines_m=np.round(search.outlines_m, 3).tolist(),
+    ))
+    if search.objects:
+        connection.execute(insert(schema.objects), [
+            {"run_id": run_id, "number": number, "id": each.id, "properties": _properties(each)}
+            for number, each in enumerate(search.objects, start=1)
+        ])
+
+
+def load_searches(connection: Connection) -> list[StoredSearch]:
+    """The searches of complete runs, by flight rank."""
+    if _is_older(connection):
+        return []
+    rows = connection.execute(_of_complete_runs(schema.searches).order_by(schema.flights.c.rank))
+    return [
+        StoredSearch(row.flight_id, row.rank, row.model, frozen(np.reshape(row.outlines_m, (-1, 4, 2))))
+        for row in rows
+    ]
+
+
+def load_objects(connection: Connection, flight_id: str | None = None) -> list[StoredObject]:
+    """The objects of complete runs by flight rank and number; of one flight if its id is given."""
+    if _is_older(connection):
+        return []
+    query = _of_complete_runs(schema.objects).order_by(schema.flights.c.rank, schema.objects.c.number)
+    if flight_id is not None:
+        query = query.where(schema.flights.c.id == flight_id)
+    return [
+        StoredObject(row.flight_id, row.rank, _object_of(row.id, row.properties), (row.flight_id,))
+        for row in connection.execute(query)
+    ]
+
+
+def newest_objects(objects: Sequence[StoredObject], searches: Sequence[StoredSearch]) -> list[StoredObject]:
+    """What stands on the site by the newest look at each piece of ground.
+
+    What an earlier flight found where two frames of a later one looked is replaced by what that one found. What stands
+    there still keeps the time at which it was first seen, and names all flights that saw it.
+    """
+    result: list[StoredObject] = []
+    for search in sorted(searches, key=lambda each: each.rank):
+        own = [each for each in objects if each.flight_id == search.flight_id]
+        seen_again = _looked_at(np.array([each.thing.position_m for each in result]).reshape(-1, 2), search)
+        before = [each for each, again in zip(result, seen_again) if again]
+        result = [each for each, again in zip(result, seen_again) if not again]
+        result += [_since(each, before) for each in own]
+    return result
+
+
+def is_searched(connection: Connection, run_id: int) -> bool:
+    """Whether the run's frames were searched for objects."""
+    if _is_older(connection):
+        return False
+    query = select(schema.searches.c.run_id).where(schema.searches.c.run_id == run_id)
+    return connection.execute(query).first() is not None
+
+
+def _of_complete_runs(table: Any) -> Any:
+    return (
+        select(table, schema.runs.c.flight_id, schema.flights.c.rank)
+        .join(schema.runs, schema.runs.c.id == table.c.run_id)
+        .join(schema.flights, schema.flights.c.id == schema.runs.c.flight_id)
+        .where(schema.runs.c.status == "complete")
+    )
+
+
+def _looked_at(places_m: PointsM, search: StoredSearch) -> list[bool]:
+    """Which places (N, 2) lie in enough of the search's outlines."""
+    needed = min(_LOOKS, len(search.outlines_m))
+    counts = np.zeros(len(places_m), int)
+    for outline_m in search.outlines_m:
+        low_m, high_m = outline_m.min(axis=0), outline_m.max(axis=0)
+        ring = np.ascontiguousarray(outline_m - low_m, np.float32)
+        for k in np.flatnonzero(((places_m >= low_m) & (places_m <= high_m)).all(axis=1)):
+            east, north = places_m[k] - low_m
+            counts[k] += cv2.pointPolygonTest(ring, (float(east), float(north)), False) >= 0
+    return [bool(count >= needed > 0) for count in counts]
+
+
+def _since(found: StoredObject, before: Sequence[StoredObject]) -> StoredObject:
+    """The object with the time since which it has stood there, where an earlier flight found the same."""
+    thing = found.thing
+    for each in before:
+        other = each.thing
+        reach_m = _SAME_PLACE_M + 2 * float(np.nan_to_num(np.hypot(thing.sigma_m, other.sigma_m)))
+        near = float(np.hypot(*(thing.position_m - other.position_m))) <= reach_m
+        if near and other.label == thing.label and not thing.moving and not other.moving:
+            kept = replace(thing, first_seen_ns=min(thing.first_seen_ns, other.first_seen_ns))
+            return replace(found, thing=kept, flights=(*each.flights, found.flight_id))
+    return found
+
+
+def _properties(each: MapObject) -> dict[str, Any]:
+    return {
+        "label": each.label, "score": each.score, "class_scores": each.class_scores,
+        "position_m": each.position_m.tolist(), "sigma_m": _finite(each.sigma_m), "length_m": _finite(each.length_m),
+        "width_m": _finite(each.width_m), "views": each.views, "possible_views": each.possible_views,
+        "first_seen_ns": int(each.first_seen_ns), "last_seen_ns": int(each.last_seen_ns), "moving": each.moving,
+        "velocity_m_s": each.velocity_m_s.tolist(), "best_frame": each.best_frame,
+    }
+
+
+def _object_of(object_id: str, values: dict[str, Any]) -> MapObject:
+    numbers = {name: np.nan if values[name] is None else values[name] for name in ("sigma_m", "length_m", "width_m")}
+    return MapObject(object_id, **{**values, **numbers})
+
+
+def _finite(number: float) -> float | None:
+    return float(number) if np.isfinite(number) else None
+
+
+def _is_older(connection: Connection) -> bool:
+    """Whether the file, opened to be read, is of a format that knew no objects."""
+    version: int = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
+    return version < 3
