@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 TRAINS := $(VENV)/.trains
 SEEDS ?= 101 102 103
 
-.PHONY: demo test check bench model
+.PHONY: demo test check bench model wheel docs
 
 demo: $(READY)
 	$(BIN)/sorvolo demo demo-site
@@ -22,6 +22,19 @@ check: $(TRAINS)
 bench: $(READY)
 	$(BIN)/python benchmarks/mosaic_methods.py $(SEEDS)
 
+# dist/: an sdist, and a wheel made from it. The wheel holds the compiled kernels where there is a C++ compiler; an
+# install without one works on their NumPy twins, slower, and warns of it once.
+PACKING := build/packing
+wheel: requirements-build.lock
+	$(PYTHON) -m venv $(PACKING)
+	$(PACKING)/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-build.lock
+	$(PACKING)/bin/python -m build --no-isolation --outdir dist .
+
+# build/site/: this documentation as web pages; a broken link ends it with an error.
+WRITING := build/docs-env
+docs: $(WRITING)/.ready
+	$(WRITING)/bin/python -m mkdocs build --quiet --strict --site-dir build/site
+
 # The packaged models anew: make model DATA=FOLDER LITE0=WEIGHTS, the labelled sets and EfficientNet-Lite0's weights;
 # or learnt on from the one that is there: make model DATA=FOLDER START=default. `thermal` begins with the new `default`.
 STEPS ?= 20000
@@ -34,6 +47,11 @@ model: $(TRAINS)
 	$(BIN)/python benchmarks/train_default_model.py $(DATA) build/model/thermal --steps $(THERMAL_STEPS) \
 	  --thermal --start default --simulated build/model/simulated
 	$(BIN)/python benchmarks/pack_thermal_model.py build/model/thermal/weights.pt $(DATA) --steps $(THERMAL_STEPS)
+
+$(WRITING)/.ready: requirements-docs.lock
+	$(PYTHON) -m venv $(WRITING)
+	$(WRITING)/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-docs.lock
+	touch $@
 
 $(READY): requirements.lock pyproject.toml setup.py $(wildcard src/sorvolo/kernels/*.?pp)
 	$(PYTHON) -m venv $(VENV)
