@@ -2,19 +2,14 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from sorvolo.capture.checkerboard import BoardView, Calibration
-from sorvolo.missions.calibrate_camera import (
-    calibrate_camera,
-    find_views,
-    parse_board,
-    write_calibration,
-)
+if TYPE_CHECKING:
+    from sorvolo.capture.checkerboard import Calibration
 
 
 def calibrate(
@@ -28,6 +23,9 @@ def calibrate(
 
     Example: sorvolo calibrate board_video.mp4 --board 9x6 -o camera.xml
     """
+    from sorvolo.capture.checkerboard import BoardView
+    from sorvolo.missions.calibrate_camera import calibrate_camera, find_views, parse_board, write_calibration
+
     chessboard = parse_board(board, square)
     looked = []
     with Console(stderr=True).status("looking for the board") as status:
@@ -44,7 +42,7 @@ def calibrate(
         _show(result, out)
 
 
-def _show(result: Calibration, out: Path) -> None:
+def _show(result: "Calibration", out: Path) -> None:
     camera, table = result.camera, Table("view", "error, px", title="Reprojection error")
     for name, error_px in result.view_errors_px.items():
         table.add_row(name, f"{error_px:.3f}")
@@ -63,7 +61,7 @@ def _show(result: Calibration, out: Path) -> None:
     )
 
 
-def _as_json(result: Calibration, out: Path) -> dict[str, object]:
+def _as_json(result: "Calibration", out: Path) -> dict[str, object]:
     camera = result.camera
     return {
         "written": str(out),

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -14,18 +14,15 @@ from rich.markup import escape
 from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.cli.map import ended_by_signal, newest_version, read_json, tell_notices_and_warnings, tell_path
 from sorvolo.cli.progress import bars
-from sorvolo.missions.compare.flights import compare_flights
-from sorvolo.missions.flight.settings import CompareSettings
-from sorvolo.store.site.archive import Archive
-from sorvolo.survey.findings import Change, ChangeKind, CompareUpdate
 
-_COLOURS = {
-    ChangeKind.APPEARED: "green", ChangeKind.DISAPPEARED: "red", ChangeKind.REPLACED: "yellow",
-    ChangeKind.MOVING: "cyan",
-}
+if TYPE_CHECKING:
+    from sorvolo.capture.live.reconnect import LiveSettings
+    from sorvolo.missions.flight.settings import CompareSettings
+    from sorvolo.survey.findings import Change, CompareUpdate
+
+_COLOURS = {"appeared": "green", "disappeared": "red", "replaced": "yellow", "moving": "cyan"}
 _MOST_ROWS = 40
 
 
@@ -80,6 +77,9 @@ def compare(
 
     Example: sorvolo compare photos/ --site field --masks --json
     """
+    from sorvolo.capture.live.reconnect import LiveSettings
+    from sorvolo.missions.flight.settings import CompareSettings
+
     settings = CompareSettings(
         method.value, views_per_second, votes, voters, offset, ground_elevation, updates_map=update, writes_masks=masks,
         model=model,
@@ -95,15 +95,20 @@ def compare(
 
 
 def compare_and_read_results(
-    inputs: Sequence[Path | str], site: Path, settings: CompareSettings, *, telemetry: Path | str | None = None,
+    inputs: Sequence[Path | str], site: Path, settings: "CompareSettings", *, telemetry: Path | str | None = None,
     camera: str | None = None, area: Path | None = None, steps: Path | None = None,
-    live: LiveSettings = LiveSettings(keeps_all=True),  # noqa: B008 (frozen)
+    live: "LiveSettings | None" = None,
 ) -> list[dict[str, Any]]:
     """Compare with a bar and each change as it is announced on stderr; report and changes of each flight, in order."""
+    from sorvolo.capture.live.reconnect import LiveSettings
+    from sorvolo.missions.compare.flights import compare_flights
+    from sorvolo.store.site.archive import Archive
+
     before = newest_version(site)
     with ended_by_signal(inputs) as until:
         comparing = compare_flights(
-            inputs, site, settings, telemetry=telemetry, camera=camera, area=area, steps=steps, live=live, until=until
+            inputs, site, settings, telemetry=telemetry, camera=camera, area=area, steps=steps,
+            live=live or LiveSettings(keeps_all=True), until=until,
         )
         # closed even when the bar is stopped: then the site is as it was
         with closing(comparing) as updates:
@@ -151,11 +156,13 @@ def _show_progress(updates: Any, site: Path, console: Console) -> list[str]:
 
 def unit_of(site: Path) -> str:
     """Metres, or the units of a map that has none."""
+    from sorvolo.store.site.archive import Archive
+
     with Archive.open(site, write=False) as archive:
         return "units" if archive.site().is_local else "m"
 
 
-def _words_of(change: Change, unit: str) -> str:
+def _words_of(change: "Change", unit: str) -> str:
     colour = _COLOURS[change.kind]
     centre_m = change.outline_m.mean(axis=0)
     named = " to ".join(escape(name) for name in (change.class_before, change.class_after) if name)

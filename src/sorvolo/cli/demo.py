@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -13,14 +13,9 @@ from sorvolo import __version__
 from sorvolo.cli.compare import compare_and_read_results, show_results
 from sorvolo.cli.map import map_and_read_reports, show_reports
 from sorvolo.cli.progress import bars
-from sorvolo.missions.evaluate.changes import evaluate_changes
-from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
-from sorvolo.missions.flight.settings import CompareSettings, MapSettings
-from sorvolo.missions.simulate.folder import MARK
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.presets import preset
-from sorvolo.simulation.settings import SimulationSettings
-from sorvolo.store.exports import plain_json
+
+if TYPE_CHECKING:
+    from sorvolo.simulation.settings import SimulationSettings
 
 _DEFAULT_FOLDER = Path("demo-site")
 _FLIGHT = Path("flight1") / "flight1.mp4"
@@ -36,6 +31,11 @@ def demo(
 
     Example: sorvolo demo
     """
+    from sorvolo.missions.evaluate.changes import evaluate_changes
+    from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
+    from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+    from sorvolo.simulation.presets import preset
+
     simulation, site = folder / "simulation", folder / "site"
     console = Console()
     settings = preset("demo")
@@ -78,7 +78,9 @@ def demo(
         console.print(f"  {command}", soft_wrap=True, highlight=False, markup=False)
 
 
-def _simulate(folder: Path, settings: SimulationSettings) -> None:
+def _simulate(folder: Path, settings: "SimulationSettings") -> None:
+    from sorvolo.missions.simulate.site import simulate_site
+
     columns = (
         SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=30), TimeRemainingColumn()
     )
@@ -91,8 +93,11 @@ def _simulate(folder: Path, settings: SimulationSettings) -> None:
                 )
 
 
-def _is_simulated(folder: Path, settings: SimulationSettings) -> bool:
+def _is_simulated(folder: Path, settings: "SimulationSettings") -> bool:
     """Whether an earlier run of this version left the very flights that are wanted."""
+    from sorvolo.missions.simulate.folder import MARK
+    from sorvolo.store.exports import plain_json
+
     try:
         told = json.loads((folder / MARK).read_text(encoding="utf-8"))
         same = told["settings"] == plain_json(asdict(settings)) and told["versions"]["sorvolo"] == __version__

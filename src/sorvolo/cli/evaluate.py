@@ -3,20 +3,20 @@
 import json
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from sorvolo.change.metrics import EventScores
 from sorvolo.cli.evaluate_detector import detector
-from sorvolo.missions.evaluate.changes import FlightChanges, evaluate_changes
-from sorvolo.missions.evaluate.changes import as_json as measures_as_json
-from sorvolo.missions.evaluate.mosaic import MosaicEvaluation, evaluate_mosaic
-from sorvolo.missions.evaluate.objects import FlightObjects, evaluate_objects
-from sorvolo.mosaic.quality import Spread
-from sorvolo.store.exports import plain_json
+
+if TYPE_CHECKING:
+    from sorvolo.change.metrics import EventScores
+    from sorvolo.missions.evaluate.changes import FlightChanges
+    from sorvolo.missions.evaluate.mosaic import MosaicEvaluation
+    from sorvolo.missions.evaluate.objects import FlightObjects
+    from sorvolo.mosaic.quality import Spread
 
 evaluate_app = typer.Typer(no_args_is_help=True)
 evaluate_app.command()(detector)
@@ -43,6 +43,9 @@ def mosaic(
 
     Example: sorvolo evaluate mosaic field-map --reference orthophoto.tif --json
     """
+    from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
+    from sorvolo.store.exports import plain_json
+
     measured = evaluate_mosaic(site, truth=truth, reference=reference, positions=positions)
     if as_json:
         typer.echo(json.dumps(plain_json(measured), indent=1))
@@ -66,6 +69,9 @@ def changes(
 
     Example: sorvolo evaluate changes my-masks --truth dataset/masks --json
     """
+    from sorvolo.missions.evaluate.changes import as_json as measures_as_json
+    from sorvolo.missions.evaluate.changes import evaluate_changes
+
     measured = evaluate_changes(found, truth, flight=flight, least_px=least_px)
     if as_json:
         typer.echo(json.dumps(measures_as_json(measured), indent=1))
@@ -86,6 +92,9 @@ def objects(
 
     Example: sorvolo evaluate objects field-map --truth simulated-field
     """
+    from sorvolo.missions.evaluate.objects import evaluate_objects
+    from sorvolo.store.exports import plain_json
+
     measured = evaluate_objects(site, truth, flight=flight)
     if as_json:
         typer.echo(json.dumps(plain_json(measured), indent=1))
@@ -95,7 +104,7 @@ def objects(
         _show_objects(console, each)
 
 
-def _show_objects(console: Console, measured: FlightObjects) -> None:
+def _show_objects(console: Console, measured: "FlightObjects") -> None:
     table = Table("objects", "to find", "found", "named right", "reported twice", "false")
     for name, counts in (*measured.by_class.items(), ("all", measured.all)):
         numbers = counts.must_find, counts.found, counts.named_right, counts.twice, counts.false
@@ -117,7 +126,7 @@ def _show_objects(console: Console, measured: FlightObjects) -> None:
         console.print(f"{measured.flight}: missed {each}", highlight=False)
 
 
-def show_changes(console: Console, measured: FlightChanges) -> None:
+def show_changes(console: Console, measured: "FlightChanges") -> None:
     """The tables of one flight's changes."""
     if measured.masks is not None:
         masks = measured.masks
@@ -144,7 +153,7 @@ def show_changes(console: Console, measured: FlightChanges) -> None:
         console.print(f"{measured.flight}: {remark}")
 
 
-def _show_events(console: Console, flight: str, scores: EventScores, map_shift_m: float) -> None:
+def _show_events(console: Console, flight: str, scores: "EventScores", map_shift_m: float) -> None:
     table = Table("events", "to find", "found", "named right", "late", "reported twice", "false")
     for name, kind in scores.by_kind.items():
         numbers = kind.must_find, kind.found, kind.named_right, kind.late, kind.twice, kind.false
@@ -172,7 +181,7 @@ def _share(value: float, decimals: int = 1) -> str:
     return f"{value:.{decimals}%}" if math.isfinite(value) else "-"
 
 
-def _show(measured: MosaicEvaluation) -> None:
+def _show(measured: "MosaicEvaluation") -> None:
     console = Console()
     frames = Table("flight", "selected", "by vision", "by GPS alone", "rejected", "unknown to the truth")
     for each in measured.flights:
@@ -214,7 +223,7 @@ def _show(measured: MosaicEvaluation) -> None:
         )
 
 
-def _add(table: Table, name: str, spread: Spread) -> None:
+def _add(table: Table, name: str, spread: "Spread") -> None:
     if spread.count:
         table.add_row(
             name, f"{spread.rms_m:.3f}", f"{spread.p95_m:.3f}", f"{spread.max_m:.3f}", f"{spread.rms_px:.2f}",

@@ -3,7 +3,7 @@
 import json
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -13,19 +13,11 @@ from rich.table import Table
 
 from sorvolo import __version__
 from sorvolo.cli.progress import bars
-from sorvolo.detection.intervals import Interval
-from sorvolo.detection.scores import SetComparison, SetScores
 from sorvolo.errors import SettingsError
-from sorvolo.missions.evaluate.detector import (
-    PAGE,
-    EvaluationSettings,
-    evaluate_detector,
-    evaluation_numbers,
-    known_classes,
-    read_sets,
-    write_evaluation,
-)
-from sorvolo.store.exports import plain_json
+
+if TYPE_CHECKING:
+    from sorvolo.detection.intervals import Interval
+    from sorvolo.detection.scores import SetComparison, SetScores
 
 
 def detector(
@@ -67,6 +59,17 @@ def detector(
 
     Example: sorvolo evaluate detector a1.onnx,a2.onnx data --compare b1.onnx,b2.onnx --out side-by-side
     """
+    from sorvolo.missions.evaluate.detector import (
+        PAGE,
+        EvaluationSettings,
+        evaluate_detector,
+        evaluation_numbers,
+        known_classes,
+        read_sets,
+        write_evaluation,
+    )
+    from sorvolo.store.exports import plain_json
+
     settings = EvaluationSettings(_tiles(tiles), draws, seed)
     arms = [_names(each) for each in (model, *(compare or ()))]
     labelled = read_sets(
@@ -125,7 +128,7 @@ def _tiles(text: str) -> Literal["auto"] | int | None:
     raise SettingsError(f"--tiles {text!r}: choose none, auto, or a number of pixels a side")
 
 
-def _show(console: Console, scores: SetScores) -> None:
+def _show(console: Console, scores: "SetScores") -> None:
     table = Table(title=scores.name, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for name in ("class", "labels", "AP", "AP50", "precision", "recall", "from", "thesis AP"):
         table.add_column(name, no_wrap=True, justify="left" if name == "class" else "right")
@@ -147,7 +150,7 @@ def _show(console: Console, scores: SetScores) -> None:
         console.print(f"{scores.name}: {remark}")
 
 
-def _show_comparison(console: Console, each: SetComparison) -> None:
+def _show_comparison(console: Console, each: "SetComparison") -> None:
     first = each.arms[0].name
     head = [arm.name for arm in each.arms] + [f"{arm.name} less {first}" for arm in each.arms[1:]]
     table = Table("measure", *head, title=f"side by side: {each.name} (differences in percentage points)")
@@ -163,7 +166,7 @@ def _show_comparison(console: Console, each: SetComparison) -> None:
     console.print(table)
 
 
-def _between(told: Interval) -> str:
+def _between(told: "Interval") -> str:
     bounds = f"\n{100 * told.low:.1f}-{100 * told.high:.1f}" if math.isfinite(told.low) else ""
     return _share(told.value) + bounds
 

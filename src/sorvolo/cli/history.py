@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -12,8 +12,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.errors import SettingsError
-from sorvolo.missions.site.history import HistoryEntry, export_version, site_history
-from sorvolo.store.exports import plain_json
+
+if TYPE_CHECKING:
+    from sorvolo.missions.site.history import HistoryEntry
 
 
 def history(
@@ -30,6 +31,9 @@ def history(
 
     Example: sorvolo history field --at 2026-05-31 --export may.tif
     """
+    from sorvolo.missions.site.history import export_version, site_history
+    from sorvolo.store.exports import plain_json
+
     if at is not None and export is None:
         raise SettingsError("--at says which map to write; give --export FILE.tif, FILE.png or FILE.kmz as well")
     entries = site_history(site)
@@ -47,7 +51,7 @@ def history(
         typer.echo(f"{export}: version {version.id}, flight {version.flight_id}, {version.created_utc}")
 
 
-def _show(entries: Sequence[HistoryEntry], console: Console) -> None:
+def _show(entries: Sequence["HistoryEntry"], console: Console) -> None:
     if not entries:
         console.print("no map yet")
         return

@@ -3,17 +3,17 @@
 import json
 import math
 from datetime import UTC, datetime
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.capture.sync import DATED_NS
-from sorvolo.missions.inspect import Inspection, Level, inspect_input
+if TYPE_CHECKING:
+    from sorvolo.missions.inspect import Inspection
 
-_COLOURS = {Level.INFO: "blue", Level.WARNING: "yellow", Level.PROBLEM: "red"}
+_COLOURS = {"info": "blue", "warning": "yellow", "problem": "red"}
 _MOST_NAMES = 4
 
 
@@ -31,6 +31,8 @@ def inspect(
 
     Example: sorvolo inspect photos/ --camera phantom.xml --json
     """
+    from sorvolo.missions.inspect import inspect_input
+
     inspections = inspect_input(inputs, telemetry, camera or None)
     if as_json:
         plain = [inspection.as_json() for inspection in inspections]
@@ -47,14 +49,14 @@ def inspect(
             console.print("[green]nothing is missing or suspicious[/green]")
 
 
-def _table_of(inspection: Inspection) -> Table:
+def _table_of(inspection: "Inspection") -> Table:
     table = Table(title=f"{inspection.name} ({inspection.kind})", show_header=False, title_justify="left")
     for name, text in _rows(inspection):
         table.add_row(name, escape(text))
     return table
 
 
-def _rows(inspection: Inspection) -> list[tuple[str, str]]:
+def _rows(inspection: "Inspection") -> list[tuple[str, str]]:
     frames, camera, flight = inspection.frames, inspection.camera, inspection.flight
     names = ", ".join(inspection.inputs[:_MOST_NAMES])
     more = len(inspection.inputs) - _MOST_NAMES
@@ -81,7 +83,9 @@ def _rows(inspection: Inspection) -> list[tuple[str, str]]:
     ]
 
 
-def _telemetry_rows(inspection: Inspection) -> list[tuple[str, str]]:
+def _telemetry_rows(inspection: "Inspection") -> list[tuple[str, str]]:
+    from sorvolo.capture.sync import DATED_NS
+
     facts = inspection.telemetry
     if not facts.samples:
         return [("telemetry", "none")]
@@ -96,7 +100,7 @@ def _telemetry_rows(inspection: Inspection) -> list[tuple[str, str]]:
     ]
 
 
-def _overlap(inspection: Inspection) -> str:
+def _overlap(inspection: "Inspection") -> str:
     flight = inspection.flight
     parts = [
         _with_unit("{:.0f} % from photo to photo", 100 * flight.forward_overlap),

@@ -41,7 +41,7 @@ _FAILED, _STOPPED = 1, 130
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _ASKED_AGAIN_S = 0.02
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 for _name, _command in _COMMANDS.items():
     app.command(_name)(_command)
 app.add_typer(evaluate_app, name="evaluate")

@@ -7,24 +7,21 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.capture.live.addresses import is_live_address
-from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.cli.progress import show_progress
 from sorvolo.errors import StoreError
-from sorvolo.missions.flight.settings import MapSettings
-from sorvolo.missions.map.flights import map_flights
-from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.folder import CATALOGUE
-from sorvolo.survey.mosaic import Status
 
-_COLOURS = {Status.VISION: "green", Status.GPS_ONLY: "yellow", Status.REJECTED: "red"}
+if TYPE_CHECKING:
+    from sorvolo.capture.live.reconnect import LiveSettings
+    from sorvolo.missions.flight.settings import MapSettings
+
+_COLOURS = {"vision": "green", "gps_only": "yellow", "rejected": "red"}
 _MOST_REASONS = 6
 
 
@@ -84,6 +81,9 @@ def map_command(
 
     Example: sorvolo map rtsp://192.168.1.10/live --telemetry serial:/dev/ttyUSB0 --site field
     """
+    from sorvolo.capture.live.reconnect import LiveSettings
+    from sorvolo.missions.flight.settings import MapSettings
+
     settings = MapSettings(
         method.value, gsd, overlap, offset, ground_elevation, crs or None, transform.value, model=model,
     )
@@ -100,15 +100,20 @@ def map_command(
 
 
 def map_and_read_reports(
-    inputs: Sequence[Path | str], site: Path, settings: MapSettings, *, telemetry: Path | str | None = None,
+    inputs: Sequence[Path | str], site: Path, settings: "MapSettings", *, telemetry: Path | str | None = None,
     camera: str | None = None, area: Path | None = None,
-    live: LiveSettings = LiveSettings(keeps_all=True),  # noqa: B008 (frozen)
+    live: "LiveSettings | None" = None,
 ) -> list[dict[str, Any]]:
     """Map with a bar on stderr; the reports of the flights that were mapped, in order."""
+    from sorvolo.capture.live.reconnect import LiveSettings
+    from sorvolo.missions.map.flights import map_flights
+    from sorvolo.store.site.archive import Archive
+
     before = newest_version(site)
     with ended_by_signal(inputs) as until:
         mapping = map_flights(
-            inputs, site, settings, telemetry=telemetry, camera=camera, area=area, live=live, until=until
+            inputs, site, settings, telemetry=telemetry, camera=camera, area=area,
+            live=live or LiveSettings(keeps_all=True), until=until,
         )
         # closed even when the bar is stopped: then the site is as it was
         with closing(mapping) as updates:
@@ -121,6 +126,8 @@ def map_and_read_reports(
 @contextmanager
 def ended_by_signal(inputs: Sequence[Path | str]) -> Iterator[threading.Event]:
     """An event that Ctrl-C or SIGTERM sets once where an input is live; the next one stops the command as ever."""
+    from sorvolo.capture.live.addresses import is_live_address
+
     until = threading.Event()
     if not any(is_live_address(str(each)) for each in inputs):
         yield until
@@ -158,8 +165,8 @@ def _show_report(report: Mapping[str, Any], console: Console) -> None:
     table = Table(title=f"Flight {escape(report['flight'])}", show_header=False, title_justify="left")
     table.add_row("frames", f"{frames['selected']} selected of {frames['total']}")
     for status, colour in _COLOURS.items():
-        if frames[status.value]:
-            table.add_row(f"[{colour}]{status.value}[/{colour}]", str(frames[status.value]))
+        if frames[status]:
+            table.add_row(f"[{colour}]{status}[/{colour}]", str(frames[status]))
     for reason, count in list(frames["reasons"].items())[:_MOST_REASONS]:
         table.add_row("", escape(f"{count} x {reason}"))
     unit = "m" if report["georeferenced"] else "units"
@@ -225,6 +232,9 @@ def _map_files(site: Path) -> dict[str, Path]:
 
 def newest_version(site: Path) -> int:
     """The id of the site's newest version; 0 where there is no site yet."""
+    from sorvolo.store.site.archive import Archive
+    from sorvolo.store.site.folder import CATALOGUE
+
     if not (site / CATALOGUE).is_file():
         return 0
     with Archive.open(site, write=False) as archive:

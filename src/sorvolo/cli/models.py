@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -11,21 +11,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.detection.contract import ModelInfo
-from sorvolo.detection.models import (
-    InstalledModel,
-    Integrity,
-    file_sha256,
-    find_model,
-    hidden_models,
-    installed_models,
-    integrity,
-    models_folder,
-    read_card,
-)
-from sorvolo.detection.session import read_info
 from sorvolo.errors import InputError
-from sorvolo.missions.model_files import fetch_model, parse_sha256, quantise_model
+
+if TYPE_CHECKING:
+    from sorvolo.detection.contract import ModelInfo
+    from sorvolo.detection.models import InstalledModel
 
 models_app = typer.Typer(no_args_is_help=True)
 
@@ -48,6 +38,8 @@ def list_models(
 
     Example: sorvolo models list
     """
+    from sorvolo.detection.models import installed_models, models_folder
+
     rows = [_row(each) for each in installed_models()]
     if as_json:
         typer.echo(json.dumps(rows, indent=1))
@@ -75,6 +67,8 @@ def list_models(
 
 
 def _tell_hidden() -> None:
+    from sorvolo.detection.models import hidden_models
+
     for each in hidden_models():
         typer.echo(f"{each.path} is not used: '{each.name}' is the name of a packaged model; rename the file")
 
@@ -88,6 +82,9 @@ def show(
 
     Example: sorvolo models show default
     """
+    from sorvolo.detection.models import InstalledModel, file_sha256, find_model, read_card
+    from sorvolo.detection.session import read_info
+
     path = find_model(model)
     info, card = read_info(path), read_card(InstalledModel(path.stem, path, False))
     told = _told(info) | {"path": str(path), "sha256": file_sha256(path), "card": card}
@@ -127,6 +124,8 @@ def fetch(
 
     Example without network: sorvolo models fetch /media/usb/coast.onnx --sha256 9f86d081884c7d65...
     """
+    from sorvolo.missions.model_files import fetch_model
+
     model = fetch_model(source, sha256, name=name)
     typer.echo(f"{model.name}: installed in {model.path}; use it with --model {model.name}")
 
@@ -142,6 +141,9 @@ def verify(
 
     Example of a file: sorvolo models verify coast.onnx --sha256 9f86d081884c7d65...
     """
+    from sorvolo.detection.models import InstalledModel, find_model, installed_models
+    from sorvolo.missions.model_files import parse_sha256
+
     if model:
         path = find_model(model)
         chosen = [each for each in installed_models() if each.path == path] or [InstalledModel(path.stem, path, False)]
@@ -185,6 +187,9 @@ def quantise(
 
     Example: sorvolo models quantise mine.onnx --pictures flights/ --out mine-int8.onnx
     """
+    from sorvolo.detection.models import find_model
+    from sorvolo.missions.model_files import quantise_model
+
     made = quantise_model(
         find_model(model), pictures, out, most=most, float_parts=float_parts or (),
         weight_bits=7 if weight_bits == 7 else 8,
@@ -227,7 +232,9 @@ def _interval(told: Any) -> str:
     return f"{known[0]} ({known[1]}-{known[2]})" if len(known) == 3 else known[0] if known else "-"
 
 
-def _row(model: InstalledModel) -> dict[str, Any]:
+def _row(model: "InstalledModel") -> dict[str, Any]:
+    from sorvolo.detection.session import read_info
+
     row: dict[str, Any] = {"name": model.name, "path": str(model.path), "is_packaged": model.is_packaged}
     try:
         return row | _told(read_info(model.path)) | {"name": model.name, "bytes": model.path.stat().st_size}
@@ -235,7 +242,7 @@ def _row(model: InstalledModel) -> dict[str, Any]:
         return row | {"error": str(error)}
 
 
-def _told(info: ModelInfo) -> dict[str, Any]:
+def _told(info: "ModelInfo") -> dict[str, Any]:
     return {key: dict(value) if isinstance(value, Mapping) else value for key, value in vars(info).items()}
 
 
@@ -248,8 +255,11 @@ def _light(told: Mapping[str, Any]) -> str:
     return f"day; thermal by {told['thermal_by']}" if told["thermal_by"] else "day and thermal"
 
 
-def _verdict(model: InstalledModel, sha256: str) -> tuple[str, bool]:
-    """What to say of a model, and whether it is bad."""
+def _verdict(model: "InstalledModel", sha256: str) -> tuple[str, bool]:
+    """What to report of a model, and whether it is bad."""
+    from sorvolo.detection.models import Integrity, file_sha256, integrity
+    from sorvolo.detection.session import read_info
+
     try:
         if sha256:
             state = Integrity.GOOD if file_sha256(model.path) == sha256 else Integrity.CHANGED

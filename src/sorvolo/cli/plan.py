@@ -5,26 +5,27 @@ import math
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from sorvolo.capture.areas import read_area
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.planning import FlightPlan, Task
-from sorvolo.missions.plan_flight import (
-    FlightAnswers,
-    PlanSettings,
-    answer_questions,
-    camera_to_plan_with,
-    critical_dimension_m,
-    plan_over,
-    write_plan,
-)
+
+if TYPE_CHECKING:
+    from sorvolo.geometry.planning import FlightPlan
+    from sorvolo.missions.plan_flight import FlightAnswers, PlanSettings
 
 _LEGAL_CEILING_M = 120.0
+
+
+class Purpose(StrEnum):
+    """What must be made out of an object: the names of `geometry.planning.Task`."""
+
+    DETECTION = "detection"
+    RECOGNITION = "recognition"
+    IDENTIFICATION = "identification"
 
 
 class Facing(StrEnum):
@@ -39,7 +40,7 @@ def plan(
     focal_mm: Annotated[float, typer.Option(help="Focal length, mm.", show_default="of --camera")] = math.nan,
     pixel_um: Annotated[float, typer.Option(help="Sensor pixel, um.", show_default="of --camera")] = math.nan,
     size: Annotated[str, typer.Option(help="Frame size, such as 1920x1080.")] = "",
-    task: Annotated[Task, typer.Option(help="What must be made out of an object.")] = Task.RECOGNITION,
+    task: Annotated[Purpose, typer.Option(help="What must be made out of an object.")] = Purpose.RECOGNITION,
     facing: Annotated[Facing, typer.Option(help="Side of a person that is seen.")] = Facing.BOTTOM,
     critical_m: Annotated[float, typer.Option(help="Critical size, m.", show_default="person")] = math.nan,
     height: Annotated[float, typer.Option(help="Height above ground, m.", show_default="task")] = math.nan,
@@ -57,8 +58,19 @@ def plan(
 
     Example without area: sorvolo plan --focal-mm 1.7 --pixel-um 6.97 --task detection --facing front
     """
+    from sorvolo.capture.areas import read_area
+    from sorvolo.geometry.planning import Task
+    from sorvolo.missions.plan_flight import (
+        PlanSettings,
+        answer_questions,
+        camera_to_plan_with,
+        critical_dimension_m,
+        plan_over,
+        write_plan,
+    )
+
     settings = PlanSettings(
-        task, critical_dimension_m(facing.value, critical_m), height, speed, overlap, side_overlap, bearing
+        Task(task.value), critical_dimension_m(facing.value, critical_m), height, speed, overlap, side_overlap, bearing
     )
     if out and area is None:
         raise SettingsError("--out writes waypoints over an area: give --area FILE too")
@@ -84,7 +96,9 @@ def _size(text: str) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-def _show(answers: FlightAnswers, flight: FlightPlan | None, out: list[Path], settings: PlanSettings) -> None:
+def _show(
+    answers: "FlightAnswers", flight: "FlightPlan | None", out: list[Path], settings: "PlanSettings"
+) -> None:
     console = Console()
     camera = answers.camera.camera
     table = Table("", "", title="Flight plan", show_header=False, title_justify="left")
@@ -116,7 +130,7 @@ def _show(answers: FlightAnswers, flight: FlightPlan | None, out: list[Path], se
         console.print(f"Note: {warning}")
 
 
-def _warnings(answers: FlightAnswers, settings: PlanSettings) -> list[str]:
+def _warnings(answers: "FlightAnswers", settings: "PlanSettings") -> list[str]:
     warnings = []
     if settings.task.value not in answers.fulfilled_tasks:
         warnings.append(
@@ -131,7 +145,7 @@ def _warnings(answers: FlightAnswers, settings: PlanSettings) -> list[str]:
     return warnings
 
 
-def _as_json(answers: FlightAnswers, flight: FlightPlan | None, out: list[Path]) -> dict[str, Any]:
+def _as_json(answers: "FlightAnswers", flight: "FlightPlan | None", out: list[Path]) -> dict[str, Any]:
     camera = answers.camera
     result = asdict(answers) | {
         "camera": {

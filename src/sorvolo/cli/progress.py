@@ -1,11 +1,13 @@
 """Bars on a terminal while something runs, and what they say of a mapping."""
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
 
-from sorvolo.survey.mosaic import MosaicUpdate
+if TYPE_CHECKING:
+    from sorvolo.survey.mosaic import MosaicUpdate
 
 
 def bars(*columns: ProgressColumn, console: Console, stay: bool = False) -> Progress:
@@ -16,7 +18,7 @@ def bars(*columns: ProgressColumn, console: Console, stay: bool = False) -> Prog
     return Progress(*columns, console=console, transient=not stay, disable=not console.is_interactive)
 
 
-def show_progress(updates: Iterable[MosaicUpdate], console: Console) -> int:
+def show_progress(updates: Iterable["MosaicUpdate"], console: Console) -> int:
     """Take all updates, drawing a bar for each flight; return how many there were.
 
     The bar tells frames a second, frames placed by vision of those selected, and the time left.
@@ -41,7 +43,7 @@ def show_progress(updates: Iterable[MosaicUpdate], console: Console) -> int:
     return count
 
 
-def words_of(update: MosaicUpdate) -> str:
+def words_of(update: "MosaicUpdate") -> str:
     """What the bar says of an update."""
     rate = f"{update.frames_read / update.seconds:.1f} frames/s, " if update.seconds > 0 else ""
     return f"{rate}{update.by_vision} of {update.keyframes} placed by vision"

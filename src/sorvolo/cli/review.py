@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -13,12 +13,11 @@ from rich.table import Table
 
 from sorvolo.cli.compare import unit_of
 from sorvolo.errors import SettingsError
-from sorvolo.missions.site.review import list_changes, review_changes
-from sorvolo.store.exports import time_words, utc_text
-from sorvolo.store.site.change_records import StoredChange
-from sorvolo.survey.findings import Verdict
 
-_COLOURS = {Verdict.CONFIRMED: "green", Verdict.REJECTED: "red"}
+if TYPE_CHECKING:
+    from sorvolo.store.site.change_records import StoredChange
+
+_COLOURS = {"confirmed": "green", "rejected": "red"}
 
 
 def review(
@@ -40,6 +39,9 @@ def review(
 
     Example: sorvolo review field DJI_0043-3 DJI_0043-7 --reject --note "shadows"
     """
+    from sorvolo.missions.site.review import list_changes, review_changes
+    from sorvolo.survey.findings import Verdict
+
     if confirm and reject:
         raise SettingsError("--confirm and --reject contradict each other; give one of them")
     if ids and not (confirm or reject):
@@ -57,7 +59,9 @@ def review(
         _show(changes, unit_of(site), Console())
 
 
-def _show(changes: Sequence[StoredChange], unit: str, console: Console) -> None:
+def _show(changes: Sequence["StoredChange"], unit: str, console: Console) -> None:
+    from sorvolo.store.exports import time_words
+
     if not changes:
         console.print("no changes were found, or no flight was compared yet")
         return
@@ -76,7 +80,9 @@ def _show(changes: Sequence[StoredChange], unit: str, console: Console) -> None:
     console.print(table)
 
 
-def _plain(change: StoredChange) -> dict[str, Any]:
+def _plain(change: "StoredChange") -> dict[str, Any]:
+    from sorvolo.store.exports import utc_text
+
     return {
         "id": change.id, "flight": change.flight_id, "number": change.number, "kind": change.kind.value,
         "score": change.score, "first_seen": utc_text(change.first_seen_ns), "last_seen": utc_text(change.last_seen_ns),

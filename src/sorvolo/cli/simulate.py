@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -18,12 +18,11 @@ from rich.progress import (
 
 from sorvolo.cli.progress import bars
 from sorvolo.errors import SettingsError
-from sorvolo.missions.simulate.pictures import simulate_pictures
-from sorvolo.missions.simulate.site import SimulationProgress, simulate_site
-from sorvolo.simulation.ground import GroundKind
-from sorvolo.simulation.pictures import PictureSettings
-from sorvolo.simulation.presets import preset, preset_names
-from sorvolo.simulation.settings import SimulationSettings
+
+if TYPE_CHECKING:
+    from sorvolo.missions.simulate.site import SimulationProgress
+    from sorvolo.simulation.pictures import PictureSettings
+    from sorvolo.simulation.settings import SimulationSettings
 
 _COLUMNS = (
     TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
@@ -76,6 +75,11 @@ def simulate(
 
     Example: sorvolo simulate labelled --pictures 500 --thermal 0.3 --seed 7
     """
+    from sorvolo.missions.simulate.site import simulate_site
+    from sorvolo.simulation.ground import GroundKind
+    from sorvolo.simulation.pictures import PictureSettings
+    from sorvolo.simulation.presets import preset, preset_names
+
     if list_presets:
         typer.echo("\n".join(preset_names()))
         return
@@ -127,8 +131,10 @@ def simulate(
 
 
 def _picture_folder(
-    folder: Path, settings: PictureSettings, ground_file: Path | None, ground_gsd: float | None, as_json: bool
+    folder: Path, settings: "PictureSettings", ground_file: Path | None, ground_gsd: float | None, as_json: bool
 ) -> None:
+    from sorvolo.missions.simulate.pictures import simulate_pictures
+
     last = None
     console = Console(stderr=as_json)
     with bars(*_COLUMNS, console=console, stay=True) as progress:
@@ -142,8 +148,8 @@ def _picture_folder(
 
 
 def _with_options(
-    settings: SimulationSettings, top: dict[str, object], **parts: dict[str, object]
-) -> SimulationSettings:
+    settings: "SimulationSettings", top: dict[str, object], **parts: dict[str, object]
+) -> "SimulationSettings":
     """The settings with every option that was given; None was not."""
     for name, options in parts.items():
         given = {key: value for key, value in options.items() if value is not None}
@@ -160,7 +166,7 @@ def _size(text: str) -> dict[str, object]:
     return {"width_px": int(width), "height_px": int(height)}
 
 
-def _show(steps: Iterator[SimulationProgress], folder: Path) -> None:
+def _show(steps: Iterator["SimulationProgress"], folder: Path) -> None:
     console = Console()
     last = None
     with bars(*_COLUMNS, console=console, stay=True) as progress:

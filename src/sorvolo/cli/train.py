@@ -16,8 +16,6 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from sorvolo.errors import SettingsError
-from sorvolo.missions.train.settings import TrainSettings
-from sorvolo.store.exports import plain_json
 
 if TYPE_CHECKING:  # torch is an extra, and slow to import: only this command needs it
     from sorvolo.missions.train.detector import TrainingUpdate
@@ -96,6 +94,9 @@ def train(
 
     Example: sorvolo train my-labels --out my-model --resume
     """
+    from sorvolo.missions.train.settings import TrainSettings
+    from sorvolo.store.exports import plain_json
+
     chosen = rpn or (Rpn.EXTENDED if preset == Preset.THESIS else Rpn.RESIDUAL)
     settings = TrainSettings(
         preset.value, chosen.value, schedule.value, weights, steps, batch, side, seed, synthetic, patience

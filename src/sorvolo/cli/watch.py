@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -15,18 +15,14 @@ from rich.markup import escape
 from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.cli.map import read_json, tell_path
 from sorvolo.cli.progress import bars
 from sorvolo.errors import SettingsError
-from sorvolo.missions.watch.flights import watch
-from sorvolo.missions.watch.run import WatchUpdate
-from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
-from sorvolo.store.cursor_on_target import COT_TYPES
-from sorvolo.store.exports import longitude_latitude
-from sorvolo.store.pages.watch import count_words
-from sorvolo.survey.flight import Site
-from sorvolo.survey.objects import Track
+
+if TYPE_CHECKING:
+    from sorvolo.missions.watch.run import WatchUpdate
+    from sorvolo.survey.flight import Site
+    from sorvolo.survey.objects import Track
 
 _MOST_ROWS = 40
 
@@ -85,6 +81,11 @@ def watch_command(
 
     Example: sorvolo watch rtsp://192.168.1.10/live --telemetry udp://:10110 --cot udp://239.2.3.1:6969
     """
+    from sorvolo.capture.live.reconnect import LiveSettings
+    from sorvolo.missions.watch.flights import watch
+    from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
+    from sorvolo.store.cursor_on_target import COT_TYPES
+
     settings = WatchSettings(
         model, _names(classes), least_score, _tiles(tiles), every, fps, offset, ground_elevation, height_model
     )
@@ -124,8 +125,10 @@ def _stopped_by_signals() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _show_progress(updates: Iterator[WatchUpdate], console: Console, *, is_quiet: bool) -> Iterator[Path]:
+def _show_progress(updates: Iterator["WatchUpdate"], console: Console, *, is_quiet: bool) -> Iterator[Path]:
     """Take all updates, telling each new object; the folder of each."""
+    from sorvolo.store.pages.watch import count_words
+
     columns = (
         SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=24),
         TextColumn("{task.fields[told]}"), TimeRemainingColumn(),
@@ -145,7 +148,9 @@ def _show_progress(updates: Iterator[WatchUpdate], console: Console, *, is_quiet
             yield update.folder
 
 
-def _words_of(track: Track, site: Site) -> str:
+def _words_of(track: "Track", site: "Site") -> str:
+    from sorvolo.store.exports import longitude_latitude
+
     name = f"[bold]{escape(track.label)} {track.id}[/bold]"
     if site.is_local:
         return f"{name}  score {track.score:.2f}, {track.views} views"
@@ -162,6 +167,8 @@ def _result(folder: Path) -> dict[str, Any]:
 
 
 def _show_result(result: Mapping[str, Any], console: Console) -> None:
+    from sorvolo.store.pages.watch import count_words
+
     tracks = [each["properties"] for each in result["tracks"]["features"]]
     console.print(
         f"Watch of {escape(result['flight'])}: {escape(count_words(result['objects']['by_class']))}", style="bold"
