@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 TRAINS := $(VENV)/.trains
-SEEDS ?= 101 102 103
+SEEDS ?=  # of the flights that `make bench` simulates; else drawn from the commit
 
 .PHONY: demo test check bench model wheel docs
 

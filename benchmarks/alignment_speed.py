@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mosaic_methods import commit, machine
+from provenance import commit, machine
 from sorvolo.capture.source import open_sources
 from sorvolo.change.alignment import Aligned, Aligner
 from sorvolo.change.reference import ReferenceMap

@@ -1,6 +1,7 @@
 """Which method tells changes from disturbances: robust, thesis, plain difference and SSIM on the same pairs.
 
-python benchmarks/change_methods.py --seeds 1 2 3 --split test [--count 30] [--suites hard none] [--data ../shared/data]
+python benchmarks/change_methods.py [--seeds 1 2 3] --split test
+  [--count 30] [--suites hard none] [--data ../shared/data]
 
 Each suite of change_suites.py isolates one nuisance; half of its pairs have no change. Counts are over all pixels and
 all frames of a suite (thesis, Tables 4.3-4.5); a frame is positive where it has any change, and taken for positive
@@ -22,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from change_suites import SUITES, Ground, Pair, grounds, pairs, views
-from mosaic_methods import commit, machine
+from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.change.pair.robust import compare_robust
 from sorvolo.change.pair.thesis import ThesisSettings, compare_thesis
 
@@ -34,7 +35,7 @@ Images = tuple[np.ndarray, np.ndarray, np.ndarray]
 def main() -> None:
     """Run the suites, print a table, write the numbers."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[], help="else two drawn from the commit's hash")
     parser.add_argument("--split", choices=("dev", "test"), default="dev")
     parser.add_argument("--count", type=int, default=30, help="pairs of each suite and seed")
     parser.add_argument("--suites", nargs="+", choices=list(SUITES), default=list(SUITES))
@@ -43,6 +44,8 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
+    options.seeds = seeds_or_drawn("change_methods", options.seeds, 2)
+    scoring = note_scoring(f"change_methods, {options.split} grounds")
     places = grounds(options.data, options.split)
     sources = sorted({each.source for each in places})
     if sources == ["procedural"]:
@@ -57,7 +60,7 @@ def main() -> None:
     options.output.parent.mkdir(exist_ok=True)
     options.output.write_text(json.dumps({
         "benchmark": "change_methods", "split": options.split, "seeds": options.seeds, "pairs": options.count,
-        "sources": sources, "machine": machine(), "commit": commit(), "summary": summary, "runs": runs,
+        **scoring, "sources": sources, "machine": machine(), "commit": commit(), "summary": summary, "runs": runs,
     }, indent=1) + "\n")
     show(summary, options.methods)
 

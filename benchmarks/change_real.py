@@ -23,7 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mosaic_methods import commit, machine
+from provenance import commit, machine, note_scoring
 from sorvolo.change.compared_ground import ComparedGround, compared_ground
 from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.polygons import points_inside
@@ -88,6 +88,7 @@ def main() -> None:
     if options.run:
         compare(options.run[0], Path(options.run[1]), Path(options.run[2]))
         return
+    scoring = note_scoring("change_real, brighton_beach and caliterra")
     runs = []
     for name in options.flights:
         for parity in (0, 1):
@@ -110,7 +111,8 @@ def main() -> None:
                       for method in options.methods} for name in options.flights}
     summary["all"] = {method: pooled([run for run in runs if run["method"] == method]) for method in options.methods}
     options.output.write_text(json.dumps({
-        "benchmark": "change_real", "machine": machine(), "commit": commit(), "summary": summary, "runs": runs,
+        "benchmark": "change_real", "machine": machine(), "commit": commit(), **scoring,
+        "summary": summary, "runs": runs,
     }, indent=1) + "\n")
     print(json.dumps(summary, indent=1))
 

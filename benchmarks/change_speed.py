@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 from change_suites import grounds, pairs
-from mosaic_methods import commit, machine
+from provenance import commit, machine
 from sorvolo import kernels
 from sorvolo.change.pair.compare import compare_images
 from sorvolo.change.pair.thesis import prepare_reference

@@ -9,8 +9,6 @@ and, after +-, half the range; everything is written to results/mosaic_methods.j
 
 import argparse
 import json
-import os
-import platform
 import resource
 import subprocess
 import sys
@@ -25,6 +23,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from provenance import commit, machine, seeds_or_drawn
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
@@ -48,7 +47,7 @@ def main() -> None:
     """Run the benchmark, or one method in the child process."""
     layout = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
-    parser.add_argument("seeds", type=int, nargs="*", default=[101])
+    parser.add_argument("seeds", type=int, nargs="*", help="else three drawn from the commit's hash")
     parser.add_argument("--preset", default="survey")
     parser.add_argument("--length", type=float, help="length of a strip, m, for a shorter flight")
     parser.add_argument("--repeats", type=int, default=1, help="runs of each method on each flight")
@@ -60,6 +59,7 @@ def main() -> None:
     if options.run:
         run_method(options.run[0], Path(options.run[1]), Path(options.run[2]))
         return
+    options.seeds = seeds_or_drawn("mosaic_methods", options.seeds, 3)
     runs = []
     for seed in options.seeds:
         with tempfile.TemporaryDirectory() as folder:
@@ -234,27 +234,6 @@ def show(summary: dict[str, dict[str, dict[str, float]]]) -> None:
             cells.append(f"{middle} +- {spread:.2g}" if spread else middle)
         table.add_row(title, *cells)
     Console().print(table)
-
-
-def machine() -> dict[str, str | int]:
-    """The processor and its cores, and nothing that names the machine."""
-    model = platform.processor()
-    if Path("/proc/cpuinfo").is_file():
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                model = line.partition(":")[2].strip()
-                break
-    return {
-        "cpu": model, "cores": os.cpu_count() or 0, "python": platform.python_version(),
-        "opencv": cv2.__version__,
-    }
-
-
-def commit() -> str:
-    """The commit that was measured."""
-    command = ["git", "rev-parse", "--short", "HEAD"]
-    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
-    return done.stdout.strip()
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from mosaic_methods import commit, machine
+from provenance import commit, machine
 from sorvolo.capture.photo_metadata import read_photo_metadata
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.missions.flight.settings import MapSettings

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from mosaic_methods import commit, machine
+from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.missions.watch.flights import watch
@@ -49,17 +49,19 @@ _REACH_M = 8.0
 def main() -> None:
     """Fly the patrols and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(304, 316)))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[], help="else twelve drawn from the commit's hash")
     parser.add_argument("--height", type=float, default=60.0)
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
+    options.seeds = seeds_or_drawn("watch_counts", options.seeds, 12)
+    scoring = note_scoring(f"watch_counts, seeds {' '.join(map(str, options.seeds))}")
     patrols = [patrol(seed, options.height) for seed in options.seeds]
     seen, counted = (sum(each[key] for each in patrols) for key in ("seen", "counted"))
     errors_m = np.array([error for each in patrols for error in each["errors_m"]])
     standing_m = np.array([error for each in patrols for error in each["standing_errors_m"]])
     inside = [each for one in patrols for each in one["inside"]]
     result: dict[str, Any] = {
-        "benchmark": "watch_counts", "machine": machine(), "commit": commit(), "height_m": options.height,
+        "benchmark": "watch_counts", "machine": machine(), "commit": commit(), "height_m": options.height, **scoring,
         "seen": seen, "counted": counted, "count_error": abs(counted - seen) / seen,
         "mean_count_error_of_a_patrol": float(np.mean([
             abs(one["counted"] - one["seen"]) / one["seen"] for one in patrols

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mosaic_methods import commit, machine
+from provenance import commit, machine
 from sorvolo.detection.detector import Detector
 from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.missions.watch.flights import watch
