@@ -35,8 +35,9 @@ WRITING := build/docs-env
 docs: $(WRITING)/.ready
 	$(WRITING)/bin/python -m mkdocs build --quiet --strict --site-dir build/site
 
-# The packaged models anew: make model DATA=FOLDER LITE0=WEIGHTS, the labelled sets and EfficientNet-Lite0's weights;
-# or learnt on from the one that is there: make model DATA=FOLDER START=default. `thermal` begins with the new `default`.
+# New models in the packaged ones' place: make model DATA=FOLDER LITE0=WEIGHTS, the labelled sets and EfficientNet-Lite0's
+# weights; or trained on from the one that is there: make model DATA=FOLDER START=default. `thermal` begins with the new
+# `default`. Models of the same kind, not the same ones: see "Not reproducible" in docs/detector.md.
 STEPS ?= 20000
 THERMAL_STEPS ?= 2600
 model: $(TRAINS)

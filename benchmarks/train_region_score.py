@@ -1,8 +1,11 @@
-"""Train the check of regions: python benchmarks/train_region_score.py [--data ../shared/data] [--count 120]
+"""Train the region score: python benchmarks/train_region_score.py [--data ../shared/data] [--count 120]
 
-Answers are exact: the suites of change_suites.py over the caliterra flight's photos (CC0), grounds painted over them
+Answers are exact: the suites of change_suites.py over the photos of caliterra (CC0), grounds painted over them
 (painted_grounds.py) and procedural ones, and simulated flights (simulated_pairs.py), with random numbers that no score
 uses. Boosted oblivious trees, written to src/sorvolo/change/pair/region_score.json.
+
+Not reproducible: the packaged trees come from many rounds on older states of the code, each trained `--onto` the trees
+before (the file's `trained` and `onto` list their commands). One run makes a score of the same kind, not the same one.
 """
 
 import argparse
