@@ -26,8 +26,8 @@ from sorvolo.simulation.pictures import LEAST_VISIBLE, SMALLEST_PX, PictureSetti
 from sorvolo.simulation.presets import preset
 from sorvolo.simulation.truth import coco_boxes
 from sorvolo.store.datasets import read_dataset
-from sorvolo.store.detector_files import FoundSet
-from sorvolo.store.exports import plain_json
+from sorvolo.store.exports.detector_files import FoundSet
+from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES

@@ -31,7 +31,7 @@ from sorvolo.detection.quantise import quantise
 from sorvolo.mosaic.selection import every
 from sorvolo.simulation.flight import simulate_flight
 from sorvolo.simulation.presets import preset
-from sorvolo.store.flight_files import video_writer
+from sorvolo.store.exports.flight_files import video_writer
 from sorvolo.survey.flight import Frame
 from sorvolo.survey.objects import CLASSES
 

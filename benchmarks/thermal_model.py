@@ -23,7 +23,7 @@ from sorvolo.detection.contract import METADATA_KEY
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
 from sorvolo.detection.scores import Arm, compare_arms
-from sorvolo.store.exports import plain_json
+from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
 from sorvolo.training.export import export_onnx

@@ -26,7 +26,7 @@ from sorvolo.detection.session import Seen
 from sorvolo.detection.suppression import SeenTile, merge_tiles
 from sorvolo.detection.tiling import plan_tiles
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.store.detector_files import FoundSet
+from sorvolo.store.exports.detector_files import FoundSet
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES, Detections
 from sorvolo.training.drawing import batches_from

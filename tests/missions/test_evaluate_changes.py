@@ -23,7 +23,7 @@ from sorvolo.simulation.settings import (
     SceneSettings,
     SimulationSettings,
 )
-from sorvolo.store.exports import utc_text
+from sorvolo.store.exports.plain import utc_text
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Site
 

@@ -22,7 +22,7 @@ from sorvolo.missions.evaluate.detector import (
     write_evaluation,
 )
 from sorvolo.missions.train.holding_out import hold_out
-from sorvolo.store.detector_files import FoundSet, FoundSets, read_found, write_found
+from sorvolo.store.exports.detector_files import FoundSet, FoundSets, read_found, write_found
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES, Detections
 

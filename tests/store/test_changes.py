@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from sorvolo.errors import InputError, StoreError
 from sorvolo.geometry.polygons import signed_area
-from sorvolo.store.changes import changes_geojson, mask_name, write_view_masks
+from sorvolo.store.exports.change_files import changes_geojson, mask_name, write_view_masks
 from sorvolo.store.site import schema
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.change_records import StoredChange, stored_changes

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.store.exports import Picture
+from sorvolo.store.exports.map_pictures import Picture
 from sorvolo.store.pages.changes import changes_page
 from sorvolo.store.pages.changes_style import SCRIPT
 from sorvolo.store.site.change_records import StoredChange, stored_changes

@@ -16,8 +16,8 @@ import pytest
 
 from sorvolo.errors import StoreError
 from sorvolo.geometry.geodesy import Geodetic
-from sorvolo.store.annotated import AnnotatedVideo, annotated, write_annotated
-from sorvolo.store.detection_files import (
+from sorvolo.store.exports.annotated import AnnotatedVideo, annotated, write_annotated
+from sorvolo.store.exports.detection_files import (
     DetectionLines,
     claim_folder,
     crop_around,
@@ -130,7 +130,7 @@ def test_tracks_carry_path_and_crop(tmp_path: Path) -> None:
 def test_a_kill_leaves_every_line_written(tmp_path: Path) -> None:
     script = (
         "import sys, time; from pathlib import Path\n"
-        "from sorvolo.store.detection_files import DetectionLines\n"
+        "from sorvolo.store.exports.detection_files import DetectionLines\n"
         "with DetectionLines(Path(sys.argv[1])) as lines:\n"
         "    lines.append([{'frame': '1'}, {'frame': '2'}]); print('written', flush=True); time.sleep(60)\n"
     )

@@ -15,17 +15,9 @@ from fake_flights import LOCAL_SITE, ORIGIN, SITE, frame, tile
 
 from sorvolo.geometry.geodesy import Geodetic, Projection
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.store.exports import (
-    frames_geojson,
-    geojson_bytes,
-    picture,
-    pictures,
-    plain_json,
-    utc_text,
-    write_kmz,
-    write_live_preview,
-    write_preview,
-)
+from sorvolo.store.exports.frame_files import frames_geojson
+from sorvolo.store.exports.map_pictures import picture, pictures, write_kmz, write_live_preview, write_preview
+from sorvolo.store.exports.plain import geojson_bytes, plain_json, utc_text
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 

@@ -14,7 +14,7 @@ from rasterio.enums import ColorInterp
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.geodesy import Geodetic, utm_epsg
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.store.geotiff import read_raster, write_cog
+from sorvolo.store.rasters.geotiff import read_raster, write_cog
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def test_what_is_empty_between_two_places_is_left_out_of_the_overviews_alone(
         tiles[index] = rng.integers(0, 256, tile(0).shape, dtype=np.uint8)
         tiles[index][..., 3] = 255
     write_cog(tiles, site_grid, tmp_path / "skipped.tif")
-    monkeypatch.setattr("sorvolo.store.geotiff._filled_blocks", lambda tiles, grid: None)
+    monkeypatch.setattr("sorvolo.store.rasters.geotiff._filled_blocks", lambda tiles, grid: None)
     write_cog(tiles, site_grid, tmp_path / "whole.tif")
     assert (tmp_path / "skipped.tif").read_bytes() == (tmp_path / "whole.tif").read_bytes()
 

@@ -10,8 +10,8 @@ from pyproj import Transformer
 from rasterio.transform import Affine
 
 from sorvolo.errors import InputError
-from sorvolo.store import height_model
-from sorvolo.store.height_model import read_height_model
+from sorvolo.store.rasters import height_model
+from sorvolo.store.rasters.height_model import read_height_model
 
 _BOUNDS_DEG = (12.60, 41.89, 12.61, 41.90)
 _LONGITUDES, _LATITUDES = np.array([12.602, 12.6071]), np.array([41.8931, 41.8982])

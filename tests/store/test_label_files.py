@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sorvolo.errors import InputError
 from sorvolo.store.datasets import read_dataset
-from sorvolo.store.label_files import coco_document, picture_of_detections, write_coco, write_yolo, yolo_text
+from sorvolo.store.exports.label_files import coco_document, picture_of_detections, write_coco, write_yolo, yolo_text
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES, Detections
 

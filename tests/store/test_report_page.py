@@ -13,7 +13,7 @@ from html_checker import checked
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sorvolo.store.exports import plain_json
+from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.pages.plots import Scale, TrackColumns, round_length, track_plan
 

@@ -44,7 +44,7 @@ def mosaic(
     Example: sorvolo evaluate mosaic field-map --reference orthophoto.tif --json
     """
     from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
-    from sorvolo.store.exports import plain_json
+    from sorvolo.store.exports.plain import plain_json
 
     measured = evaluate_mosaic(site, truth=truth, reference=reference, positions=positions)
     if as_json:
@@ -93,7 +93,7 @@ def objects(
     Example: sorvolo evaluate objects field-map --truth simulated-field
     """
     from sorvolo.missions.evaluate.objects import evaluate_objects
-    from sorvolo.store.exports import plain_json
+    from sorvolo.store.exports.plain import plain_json
 
     measured = evaluate_objects(site, truth, flight=flight)
     if as_json:

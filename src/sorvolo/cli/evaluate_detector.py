@@ -68,7 +68,7 @@ def detector(
         read_sets,
         write_evaluation,
     )
-    from sorvolo.store.exports import plain_json
+    from sorvolo.store.exports.plain import plain_json
 
     settings = EvaluationSettings(_tiles(tiles), draws, seed)
     arms = [_names(each) for each in (model, *(compare or ()))]

@@ -32,7 +32,7 @@ def history(
     Example: sorvolo history field --at 2026-05-31 --export may.tif
     """
     from sorvolo.missions.site.history import export_version, site_history
-    from sorvolo.store.exports import plain_json
+    from sorvolo.store.exports.plain import plain_json
 
     if at is not None and export is None:
         raise SettingsError("--at says which map to write; give --export FILE.tif, FILE.png or FILE.kmz as well")

@@ -60,7 +60,7 @@ def review(
 
 
 def _show(changes: Sequence["StoredChange"], unit: str, console: Console) -> None:
-    from sorvolo.store.exports import time_words
+    from sorvolo.store.exports.plain import time_words
 
     if not changes:
         console.print("no changes were found, or no flight was compared yet")
@@ -81,7 +81,7 @@ def _show(changes: Sequence["StoredChange"], unit: str, console: Console) -> Non
 
 
 def _plain(change: "StoredChange") -> dict[str, Any]:
-    from sorvolo.store.exports import utc_text
+    from sorvolo.store.exports.plain import utc_text
 
     return {
         "id": change.id, "flight": change.flight_id, "number": change.number, "kind": change.kind.value,

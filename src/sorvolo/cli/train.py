@@ -95,7 +95,7 @@ def train(
     Example: sorvolo train my-labels --out my-model --resume
     """
     from sorvolo.missions.train.settings import TrainSettings
-    from sorvolo.store.exports import plain_json
+    from sorvolo.store.exports.plain import plain_json
 
     chosen = rpn or (Rpn.EXTENDED if preset == Preset.THESIS else Rpn.RESIDUAL)
     settings = TrainSettings(

@@ -84,7 +84,7 @@ def watch_command(
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.watch.flights import watch
     from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
-    from sorvolo.store.cursor_on_target import COT_TYPES
+    from sorvolo.store.exports.cursor_on_target import COT_TYPES
 
     settings = WatchSettings(
         model, _names(classes), least_score, _tiles(tiles), every, fps, offset, ground_elevation, height_model
@@ -149,7 +149,7 @@ def _show_progress(updates: Iterator["WatchUpdate"], console: Console, *, is_qui
 
 
 def _words_of(track: "Track", site: "Site") -> str:
-    from sorvolo.store.exports import longitude_latitude
+    from sorvolo.store.exports.places import longitude_latitude
 
     name = f"[bold]{escape(track.label)} {track.id}[/bold]"
     if site.is_local:

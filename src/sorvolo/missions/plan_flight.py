@@ -24,7 +24,7 @@ from sorvolo.geometry.planning import (
     required_px_per_m,
     scene_length_m,
 )
-from sorvolo.store.waypoints import write_waypoints
+from sorvolo.store.exports.waypoints import write_waypoints
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import CameraModel
 

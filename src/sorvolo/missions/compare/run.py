@@ -34,8 +34,8 @@ from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.mosaic.placing import rejected
-from sorvolo.store.changes import write_pictures
-from sorvolo.store.exports import picture
+from sorvolo.store.exports.change_files import write_pictures
+from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Verdict, ViewStatus

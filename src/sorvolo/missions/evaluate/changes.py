@@ -32,7 +32,7 @@ from sorvolo.missions.evaluate.frame_rows import (
     truth_file,
 )
 from sorvolo.missions.evaluate.mask_folders import MaskScores, compare_mask_folders, has_masks
-from sorvolo.store.exports import plain_json
+from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import ChangeKind
 from sorvolo.survey.flight import Site

@@ -21,8 +21,8 @@ from sorvolo.geometry.arrays import BoxesPx, ImageRGB
 from sorvolo.missions.train.holding_out import hold_out
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.datasets import read_datasets
-from sorvolo.store.detector_files import FoundSet, FoundSets, mistake_picture, read_found, write_found
-from sorvolo.store.exports import json_bytes
+from sorvolo.store.exports.detector_files import FoundSet, FoundSets, mistake_picture, read_found, write_found
+from sorvolo.store.exports.plain import json_bytes
 from sorvolo.store.pages.detector import detector_page
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.labels import LabelledPicture, LabelledSet

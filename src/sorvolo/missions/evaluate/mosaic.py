@@ -37,7 +37,7 @@ from sorvolo.mosaic.quality import (
     residual_shift,
     spread_of,
 )
-from sorvolo.store.geotiff import Raster, read_raster
+from sorvolo.store.rasters.geotiff import Raster, read_raster
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.survey.flight import Site

@@ -16,8 +16,8 @@ from sorvolo.detection.models import installed_models
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.missions.flight.detects import Detects
-from sorvolo.store.detection_files import crop_around
-from sorvolo.store.exports import plain_json
+from sorvolo.store.exports.detection_files import crop_around
+from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.flight import Frame, Notice, PosedFrame
 from sorvolo.survey.map_objects import MapObject, ObjectSearch

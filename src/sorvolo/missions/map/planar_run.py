@@ -25,7 +25,7 @@ from sorvolo.mosaic.lens import Undistorter, refined_camera
 from sorvolo.mosaic.placing import canvas_frame, rejected
 from sorvolo.mosaic.planar import KnownKeyframe, PlanarMapper
 from sorvolo.mosaic.pose_graph import PoseGraphSettings
-from sorvolo.store.exports import picture, write_live_preview
+from sorvolo.store.exports.map_pictures import picture, write_live_preview
 from sorvolo.store.images import ImageCache
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter

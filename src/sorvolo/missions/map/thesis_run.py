@@ -19,7 +19,7 @@ from sorvolo.missions.map.run import FlightRun
 from sorvolo.mosaic.lens import Undistorter
 from sorvolo.mosaic.placing import rejected
 from sorvolo.mosaic.roi_stitching import RoiStitcher, RoiStitchingSettings, Stitched, georeference
-from sorvolo.store.exports import picture
+from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.survey.flight import Notice, PosedFrame

@@ -15,7 +15,7 @@ import numpy as np
 from sorvolo import __version__
 from sorvolo.errors import SettingsError
 from sorvolo.store.atomic import writing
-from sorvolo.store.flight_files import write_json
+from sorvolo.store.exports.flight_files import write_json
 
 MARK = "simulation.json"
 """The file that says that a folder holds simulated flights, and may be replaced by another simulation."""

@@ -14,7 +14,7 @@ from sorvolo.simulation.ground import PaintedGround, orthophoto_ground
 from sorvolo.simulation.pictures import PictureSettings, SimulatedPicture, simulate_picture
 from sorvolo.simulation.truth import coco_categories
 from sorvolo.store.atomic import atomic_write_bytes, writing
-from sorvolo.store.flight_files import read_orthophoto, write_json
+from sorvolo.store.exports.flight_files import read_orthophoto, write_json
 from sorvolo.store.images import jpeg_from_image
 
 

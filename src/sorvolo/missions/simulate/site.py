@@ -26,7 +26,7 @@ from sorvolo.simulation.truth import (
 )
 from sorvolo.simulation.world import orthophoto
 from sorvolo.store.atomic import writing
-from sorvolo.store.flight_files import (
+from sorvolo.store.exports.flight_files import (
     read_orthophoto,
     video_writer,
     write_camera,
@@ -35,7 +35,7 @@ from sorvolo.store.flight_files import (
     write_photo,
     write_telemetry,
 )
-from sorvolo.store.geotiff import write_cog
+from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.survey.flight import Frame
 
 _SUFFIXES = {"csv": ".csv", "srt": ".srt", "nmea": ".nmea", "gpx": ".gpx"}

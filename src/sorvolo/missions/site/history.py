@@ -7,8 +7,8 @@ from datetime import UTC, date, datetime, time, timedelta
 from pathlib import Path
 
 from sorvolo.errors import InputError, SettingsError, StoreError
-from sorvolo.store.exports import write_kmz, write_preview
-from sorvolo.store.geotiff import write_cog
+from sorvolo.store.exports.map_pictures import write_kmz, write_preview
+from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import VersionEntry
 from sorvolo.survey.findings import Verdict

@@ -22,7 +22,7 @@ from sorvolo.missions.train.sets import DataOptions, TrainingSets, read_labels, 
 from sorvolo.missions.train.settings import TrainSettings
 from sorvolo.missions.train.start import load_start, told_of_classes
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
-from sorvolo.store.exports import json_bytes, plain_json
+from sorvolo.store.exports.plain import json_bytes, plain_json
 from sorvolo.store.pages.training import training_page
 from sorvolo.training.checkpoint import (
     checkpoint_bytes,

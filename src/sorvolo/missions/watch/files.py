@@ -15,9 +15,9 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.missions.watch.settings import WatchOutputs
-from sorvolo.store.annotated import AnnotatedVideo, annotated, write_annotated
 from sorvolo.store.atomic import atomic_write_bytes, writing
-from sorvolo.store.detection_files import (
+from sorvolo.store.exports.annotated import AnnotatedVideo, annotated, write_annotated
+from sorvolo.store.exports.detection_files import (
     ANNOTATED_PICTURES,
     ANNOTATED_VIDEO,
     LABELS,
@@ -28,9 +28,9 @@ from sorvolo.store.detection_files import (
     tracks_geojson,
     write_crop,
 )
-from sorvolo.store.exports import geojson_bytes
+from sorvolo.store.exports.label_files import picture_of_detections, write_coco, write_yolo
+from sorvolo.store.exports.plain import geojson_bytes
 from sorvolo.store.images import jpeg_from_image
-from sorvolo.store.label_files import picture_of_detections, write_coco, write_yolo
 from sorvolo.survey.flight import Frame, Site
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections, Sighting, Track

@@ -15,13 +15,14 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
+from sorvolo.missions.watch.cot_sender import check_host, cot_place
 from sorvolo.missions.watch.ground import over_heights
 from sorvolo.missions.watch.places import places_of
 from sorvolo.missions.watch.run import WatchRun, WatchUpdate
 from sorvolo.missions.watch.settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
 from sorvolo.mosaic.selection import every
-from sorvolo.store.cursor_on_target import COT_TYPES, check_host, cot_place
-from sorvolo.store.detection_files import claim_folder
+from sorvolo.store.exports.cursor_on_target import COT_TYPES
+from sorvolo.store.exports.detection_files import claim_folder
 from sorvolo.survey.flight import Frame, LostFrame
 
 _AHEAD = 4  # decoded frames that wait for the detector

@@ -10,7 +10,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
-from sorvolo.store.height_model import read_height_model
+from sorvolo.store.rasters.height_model import read_height_model
 from sorvolo.tracking.locate import GroundHeight
 
 _AROUND_M = 2000.0  # of the flight's fixes, so far the model is read

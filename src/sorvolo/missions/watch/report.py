@@ -17,7 +17,7 @@ from sorvolo.capture.source import Source
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
-from sorvolo.store.exports import utc_text
+from sorvolo.store.exports.plain import utc_text
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.objects import Detections, Track
 

@@ -12,14 +12,15 @@ from sorvolo.capture.sync import DATED_NS
 from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.watch.alerts import Outbox, Pace, alert_command, alert_url
+from sorvolo.missions.watch.cot_sender import CotSender, cot_place
 from sorvolo.missions.watch.files import SeenFrame, WatchFiles
 from sorvolo.missions.watch.places import Places
 from sorvolo.missions.watch.report import WatchLog, build_watch_report, count_by_class, source_notices
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.store.atomic import atomic_write_bytes
-from sorvolo.store.cursor_on_target import CotSender, cot_event, cot_place, cot_removal, cot_type
-from sorvolo.store.detection_files import track_properties, write_detections_geojson
-from sorvolo.store.exports import json_bytes
+from sorvolo.store.exports.cursor_on_target import cot_event, cot_removal, cot_type
+from sorvolo.store.exports.detection_files import track_properties, write_detections_geojson
+from sorvolo.store.exports.plain import json_bytes
 from sorvolo.store.pages.watch import count_words, watch_page
 from sorvolo.survey.flight import Frame, LostFrame, Notice, Site
 from sorvolo.survey.objects import Detections, Sighting, Track

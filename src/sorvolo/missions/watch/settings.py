@@ -8,7 +8,8 @@ from typing import Literal
 from sorvolo.errors import SettingsError
 from sorvolo.missions.flight.settings import check_offset
 from sorvolo.missions.watch import alerts
-from sorvolo.store.cursor_on_target import COT_TYPES, cot_place
+from sorvolo.missions.watch.cot_sender import cot_place
+from sorvolo.store.exports.cursor_on_target import COT_TYPES
 
 DEFAULT_FRAMES_PER_SECOND = 10.0
 """Frames searched a second of a recorded flight: what a camera sees for half a second only is seen five times."""

@@ -12,7 +12,7 @@ from sorvolo.geometry.arrays import Floats
 from sorvolo.store.datasets.groups import group_of
 from sorvolo.store.datasets.naming import Naming, nothing_maps, of_one_unnamed
 from sorvolo.store.datasets.parsed import SHARES, Findings, ParsedPicture, ParsedSet
-from sorvolo.store.datasets.pictures import shown_size_px
+from sorvolo.store.datasets.picture_files import shown_size_px
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 

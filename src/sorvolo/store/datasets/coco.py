@@ -9,7 +9,7 @@ from typing import Any
 
 from sorvolo.errors import InputError
 from sorvolo.store.datasets.parsed import Findings, ParsedBox, ParsedPicture, ParsedSet, joined
-from sorvolo.store.datasets.pictures import PICTURE_ENDINGS, pictures_below
+from sorvolo.store.datasets.picture_files import PICTURE_ENDINGS, pictures_below
 from sorvolo.store.datasets.text_files import read_text
 
 FORM = "COCO"

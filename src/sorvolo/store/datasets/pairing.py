@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sorvolo.errors import InputError
 from sorvolo.store.datasets.groups import group_of
-from sorvolo.store.datasets.pictures import PICTURE_ENDINGS, pictures_below
+from sorvolo.store.datasets.picture_files import PICTURE_ENDINGS, pictures_below
 from sorvolo.survey.splits import frame_number
 
 _PICTURE_FOLDERS = frozenset({"images", "jpegimages", "sequences", "pictures", "frames", "photos"})

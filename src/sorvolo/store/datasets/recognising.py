@@ -4,7 +4,7 @@ from pathlib import Path
 
 from sorvolo.store.datasets.coco import coco_files
 from sorvolo.store.datasets.okutama import looks_like_okutama
-from sorvolo.store.datasets.pictures import files_below
+from sorvolo.store.datasets.picture_files import files_below
 from sorvolo.store.datasets.text_files import is_label_file, read_text
 from sorvolo.store.datasets.umcd import looks_like_umcd
 from sorvolo.store.datasets.visdrone import looks_like_visdrone

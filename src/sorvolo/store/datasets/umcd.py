@@ -8,7 +8,7 @@ from pathlib import Path
 from sorvolo.errors import InputError
 from sorvolo.store.datasets.pairing import frames_by_video, no_frames, pictures_around
 from sorvolo.store.datasets.parsed import Findings, ParsedBox, ParsedPicture, ParsedSet
-from sorvolo.store.datasets.pictures import files_below
+from sorvolo.store.datasets.picture_files import files_below
 from sorvolo.store.datasets.text_files import read_text
 
 FORM = "UMCD"

@@ -11,7 +11,7 @@ from defusedxml.common import DefusedXmlException
 from sorvolo.errors import InputError
 from sorvolo.store.datasets.pairing import labels_of_pictures, pictures_around
 from sorvolo.store.datasets.parsed import Findings, ParsedBox, ParsedPicture, ParsedSet
-from sorvolo.store.datasets.pictures import files_below
+from sorvolo.store.datasets.picture_files import files_below
 from sorvolo.store.datasets.text_files import read_text
 
 FORM = "Pascal VOC"

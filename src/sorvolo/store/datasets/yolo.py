@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sorvolo.errors import InputError
 from sorvolo.store.datasets.parsed import SHARES, Findings, ParsedBox, ParsedPicture, ParsedSet
-from sorvolo.store.datasets.pictures import PICTURE_ENDINGS, files_below, pictures_below
+from sorvolo.store.datasets.picture_files import PICTURE_ENDINGS, files_below, pictures_below
 from sorvolo.store.datasets.text_files import is_label_file, read_text
 
 FORM = "YOLO"

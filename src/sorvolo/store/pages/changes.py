@@ -12,11 +12,14 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, ImageRGBA, PointsPx
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.store.exports import Picture, longitude_latitude, time_words
+from sorvolo.store.exports.map_pictures import Picture
+from sorvolo.store.exports.places import longitude_latitude
+from sorvolo.store.exports.plain import time_words
 from sorvolo.store.images import shrink
 from sorvolo.store.pages.changes_style import SCRIPT
 from sorvolo.store.pages.changes_style import STYLE as CHANGES_STYLE
-from sorvolo.store.pages.parts import (
+from sorvolo.store.pages.report_style import STYLE
+from sorvolo.store.pages.words import (
     area_words,
     at,
     bullet_list,
@@ -28,7 +31,6 @@ from sorvolo.store.pages.parts import (
     table_of,
     with_unit,
 )
-from sorvolo.store.pages.report_style import STYLE
 from sorvolo.store.site.change_records import StoredChange
 from sorvolo.survey.findings import ChangeKind, Verdict, ViewStatus
 from sorvolo.survey.flight import Site

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from sorvolo.geometry.arrays import Anything, ImageRGB
-from sorvolo.store.pages.parts import bullet_list, escaped, page_of, picture_uri, table_of
 from sorvolo.store.pages.plots import Scale
 from sorvolo.store.pages.report_style import STYLE
+from sorvolo.store.pages.words import bullet_list, escaped, page_of, picture_uri, table_of
 
 _STYLE = """
 .crops{display:grid;grid-template-columns:repeat(auto-fill,minmax(150px,1fr));gap:12px}

@@ -9,7 +9,16 @@ import numpy as np
 
 from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.store.pages.objects import OBJECTS_STYLE, objects_section
-from sorvolo.store.pages.parts import (
+from sorvolo.store.pages.plots import (
+    TrackColumns,
+    gps_along,
+    gps_scatter,
+    residuals_along,
+    round_length,
+    track_plan,
+)
+from sorvolo.store.pages.report_style import STYLE
+from sorvolo.store.pages.words import (
     area_words,
     at,
     bullet_list,
@@ -24,15 +33,6 @@ from sorvolo.store.pages.parts import (
     table_of,
     with_unit,
 )
-from sorvolo.store.pages.plots import (
-    TrackColumns,
-    gps_along,
-    gps_scatter,
-    residuals_along,
-    round_length,
-    track_plan,
-)
-from sorvolo.store.pages.report_style import STYLE
 from sorvolo.survey.mosaic import Status
 
 _TRACK_NUMBERS = (

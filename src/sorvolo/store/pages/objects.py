@@ -4,7 +4,7 @@ import base64
 from collections.abc import Mapping
 from typing import Any
 
-from sorvolo.store.pages.parts import at, escaped, finite_or_none, number_at, seconds_words, table_of
+from sorvolo.store.pages.words import at, escaped, finite_or_none, number_at, seconds_words, table_of
 
 _MOST_CROP_BYTES = 250_000  # of all pictures together: the page stays one that can be mailed
 _MOST_ROWS = 200

@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from sorvolo.store.pages.parts import at, bullet_list, escaped, page_of, seconds_words, table_of
 from sorvolo.store.pages.plots import Scale
 from sorvolo.store.pages.report_style import STYLE
+from sorvolo.store.pages.words import at, bullet_list, escaped, page_of, seconds_words, table_of
 
 _STYLE = """
 .key.c0{background:var(--east)}.key.c1{background:var(--gps)}.key.c2{background:var(--vision)}

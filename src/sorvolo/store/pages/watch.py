@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats
-from sorvolo.store.pages.parts import (
+from sorvolo.store.pages.plots import round_length
+from sorvolo.store.pages.report_style import STYLE
+from sorvolo.store.pages.words import (
     at,
     bullet_list,
     escaped,
@@ -24,8 +26,6 @@ from sorvolo.store.pages.parts import (
     table_of,
     with_unit,
 )
-from sorvolo.store.pages.plots import round_length
-from sorvolo.store.pages.report_style import STYLE
 
 _WIDE_PX, _HIGH_PX, _RIM_PX = 940.0, 560.0, 36.0
 _LETTER_PX, _LINE_PX = 7.5, 12.0  # of the map's labels

@@ -12,9 +12,9 @@ from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB, ImageRGBA
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
-from sorvolo.store.exports import plain_json
+from sorvolo.store.exports.object_files import OBJECTS
+from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.images import read_keyframe
-from sorvolo.store.objects import OBJECTS
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
 from sorvolo.store.site.catalogue import Catalogue, FlightEntry, OwedFiles, StoredKeyframe, TileDifference, VersionEntry

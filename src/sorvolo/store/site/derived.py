@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 
 from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes, sync_file, writing
-from sorvolo.store.changes import changes_geojson, crop_names
-from sorvolo.store.exports import geojson_bytes, pictures, write_kmz, write_preview
-from sorvolo.store.geotiff import write_cog
+from sorvolo.store.exports.change_files import changes_geojson, crop_names
+from sorvolo.store.exports.map_pictures import pictures, write_kmz, write_preview
+from sorvolo.store.exports.object_files import CROPS, OBJECTS, objects_geojson
+from sorvolo.store.exports.plain import geojson_bytes
 from sorvolo.store.images import rgba_from_png
-from sorvolo.store.objects import CROPS, OBJECTS, objects_geojson
 from sorvolo.store.pages.changes import changes_page
+from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.store.site.catalogue import VersionEntry
 
 if TYPE_CHECKING:

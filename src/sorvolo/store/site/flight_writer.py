@@ -12,11 +12,12 @@ from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import Boxes, ImageGray, ImageRGB, ImageRGBA, Mask
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.atomic import atomic_write_bytes, sync_file, writing
-from sorvolo.store.changes import BOXES_FILE, boxes_json, crop_files, mask_name, write_view_masks
-from sorvolo.store.exports import frames_geojson, geojson_bytes, json_bytes
-from sorvolo.store.geotiff import parse_crs
+from sorvolo.store.exports.change_files import BOXES_FILE, boxes_json, crop_files, mask_name, write_view_masks
+from sorvolo.store.exports.frame_files import frames_geojson
+from sorvolo.store.exports.object_files import CROPS, object_crops
+from sorvolo.store.exports.plain import geojson_bytes, json_bytes
 from sorvolo.store.images import ImageCache, jpeg_from_image, read_keyframe
-from sorvolo.store.objects import CROPS, object_crops
+from sorvolo.store.rasters.geotiff import parse_crs
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
 from sorvolo.store.site.catalogue import StoredKeyframe

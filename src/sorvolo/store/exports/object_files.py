@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from sorvolo.store.exports import longitude_latitude, rounded, utc_text
+from sorvolo.store.exports.places import longitude_latitude
+from sorvolo.store.exports.plain import rounded, utc_text
 from sorvolo.store.site.object_records import StoredObject
 from sorvolo.survey.flight import Site
 from sorvolo.survey.map_objects import MapObject

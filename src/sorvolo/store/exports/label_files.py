@@ -11,7 +11,7 @@ import numpy as np
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Anything, BoxesPx, Floats
 from sorvolo.store.atomic import atomic_write_bytes, writing
-from sorvolo.store.exports import json_bytes
+from sorvolo.store.exports.plain import json_bytes
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections
 

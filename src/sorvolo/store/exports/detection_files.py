@@ -12,7 +12,8 @@ import numpy as np
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, TimesNs
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes, remove_leftovers, writing
-from sorvolo.store.exports import json_bytes, longitude_latitude, plain_json, rounded, utc_text
+from sorvolo.store.exports.places import longitude_latitude
+from sorvolo.store.exports.plain import json_bytes, plain_json, rounded, utc_text
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.flight import Frame, Site
 from sorvolo.survey.objects import Sighting, Track

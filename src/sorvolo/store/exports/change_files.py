@@ -10,7 +10,8 @@ import numpy as np
 from sorvolo.geometry.arrays import Anything, Boxes, Floats, ImageGray, Mask
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.store.atomic import atomic_write_bytes, writing
-from sorvolo.store.exports import longitude_latitude, rounded, utc_text
+from sorvolo.store.exports.places import longitude_latitude
+from sorvolo.store.exports.plain import rounded, utc_text
 from sorvolo.store.images import png_from_rgba
 from sorvolo.store.site.change_records import StoredChange
 from sorvolo.survey.findings import Change

@@ -1,0 +1,79 @@
+"""Records as plain JSON and GeoJSON text, and times as text."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, is_dataclass
+from datetime import UTC, datetime
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_DAY_NS = 86_400_000_000_000
+
+
+def plain_json(value: Any) -> Any:
+    """The value as JSON can say it: records as objects, arrays as lists, NaN and infinities as null.
+
+    Raises TypeError for what has no such form.
+    """
+    if value is None or isinstance(value, bool | str):
+        return value.value if isinstance(value, Enum) else value
+    if isinstance(value, np.generic | np.ndarray):
+        return plain_json(value.tolist())
+    if isinstance(value, int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): plain_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain_json(item) for item in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain_json(asdict(value))
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"a {type(value).__name__} cannot be written as JSON")
+
+
+def json_bytes(value: Any) -> bytes:
+    """The value as UTF-8 JSON text, laid out for people."""
+    text = json.dumps(plain_json(value), indent=1, ensure_ascii=False, allow_nan=False)
+    return text.encode() + b"\n"
+
+
+def geojson_bytes(collection: Mapping[str, Any]) -> bytes:
+    """A FeatureCollection as UTF-8 JSON text, one feature a line."""
+    head = {key: value for key, value in collection.items() if key != "features"}
+    opening = json.dumps(plain_json(head), ensure_ascii=False, allow_nan=False)[:-1]
+    features = [
+        json.dumps(plain_json(feature), ensure_ascii=False, allow_nan=False)
+        for feature in collection["features"]
+    ]
+    return (opening + ', "features": [\n' + ",\n".join(features) + "\n]}\n").encode()
+
+
+def utc_text(time_ns: int) -> str:
+    """ISO 8601 UTC of nanoseconds since 1970, to the microsecond, or to the nanosecond where it matters."""
+    seconds, rest_ns = divmod(time_ns, 1_000_000_000)
+    day = datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%S")
+    return f"{day}.{rest_ns // 1000:06d}Z" if rest_ns % 1000 == 0 else f"{day}.{rest_ns:09d}Z"
+
+
+def time_words(time_ns: int) -> str:
+    """UTC to the second for people; the time into the flight where no clock told the date."""
+    if 0 <= time_ns < _DAY_NS:
+        return f"{time_ns // 60_000_000_000}:{time_ns // 1_000_000_000 % 60:02d} into the flight"
+    return utc_text(time_ns)[:19].replace("T", " ")
+
+
+def rounded(number: float, digits: int) -> float | None:
+    """The number for JSON; None when it is not finite."""
+    return round(float(number), digits) if np.isfinite(number) else None
+
+
+def name_safe(name: str) -> str:
+    """The name with everything but letters, digits, dash and underscore replaced by an underscore."""
+    return "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in name)

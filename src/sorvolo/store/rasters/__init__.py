@@ -1,0 +1,1 @@
+"""GeoTIFFs, the only files that GDAL opens: the map written, reference maps and height models read."""
