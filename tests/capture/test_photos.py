@@ -17,8 +17,9 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import GPS, IFD, Base
 from PIL.TiffImagePlugin import IFDRational
 
+from sorvolo.capture.decoding import decode_photo
 from sorvolo.capture.photo_metadata import read_photo_metadata
-from sorvolo.capture.photos import PhotoSource, decode_photo, read_album
+from sorvolo.capture.photos import PhotoSource, read_album
 from sorvolo.capture.source import open_sources
 from sorvolo.errors import InputError
 from sorvolo.geometry.pose import site_from_body_nadir_rotation, site_from_gimbal_rotation

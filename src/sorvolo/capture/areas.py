@@ -8,10 +8,10 @@ will be flown: its area is everything within `CORRIDOR_M` of it.
 import io
 import json
 import re
+import struct
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeAlias
 from xml.etree.ElementTree import Element
@@ -19,12 +19,12 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
+from pyproj import Proj
 
 from sorvolo.capture.small_files import read_small_file, text_of
 from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.arrays import Floats
-from sorvolo.geometry.geodesy import Geodetic, LocalFrame
-from sorvolo.geometry.polygons import convex_hull
+from sorvolo.geometry.polygons import widened_line
 from sorvolo.survey.area import Area
 
 CORRIDOR_M = 30.0
@@ -32,6 +32,12 @@ CORRIDOR_M = 30.0
 taken along the path are kept although GPS is off by some metres."""
 
 _MOST_BYTES = 20_000_000
+_MOST_POLYGONS = 10_000
+# zipfile trusts the offsets in a file: a negative one is a ValueError, one beyond 63 bits an OverflowError
+_BROKEN_ZIP = (
+    zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, ValueError, OverflowError, zlib.error,
+    struct.error,
+)
 _SEPARATOR = re.compile(r"[,;\s]+")
 _LATITUDE_NAMES = ("latitude", "lat", "latitude_deg")
 _LONGITUDE_NAMES = ("longitude", "lon", "lng", "long", "longitude_deg")
@@ -56,6 +62,8 @@ def read_area(path: Path) -> Area:
             polygons = _from_kml(path, text)
         else:
             polygons = _from_text(path, text)
+        if len(polygons) > _MOST_POLYGONS:
+            raise InputError(f"{path}: {len(polygons)} polygons; an area has at most {_MOST_POLYGONS}; join them")
         return Area(tuple(polygons), path.stem)
     except GeometryError as error:
         raise InputError(f"{path}: {error}") from error
@@ -69,8 +77,8 @@ def _kml_in_kmz(path: Path, raw: bytes) -> bytes:
                 raise InputError(f"{path}: the KMZ holds no .kml file")
             with archive.open(names[0]) as file:
                 kml = file.read(_MOST_BYTES + 1)
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
-        raise InputError(f"{path}: broken KMZ: {error}") from error
+    except _BROKEN_ZIP as error:
+        raise InputError(f"{path}: broken KMZ: {error}; export it again") from error
     if len(kml) > _MOST_BYTES:
         raise InputError(f"{path}: its KML is larger than {_MOST_BYTES // 1_000_000} MB")
     return kml
@@ -90,7 +98,7 @@ def _from_geojson(path: Path, text: str) -> list[Rings]:
                 lines.append(_lonlat(path, coordinates))
             elif kind == "MultiLineString":
                 lines += [_lonlat(path, each) for each in coordinates]
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # a whole number of thousands of digits is a plain ValueError
         raise InputError(f"{path}: broken GeoJSON: {error}") from error
     except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: GeoJSON without the expected member: {error}") from error
@@ -120,7 +128,7 @@ def _lonlat(path: Path, positions: Sequence[Any]) -> Floats:
     """Positions with or without a height, longitude first, as (N, 2)."""
     try:
         lonlat = np.array([[float(position[0]), float(position[1])] for position in positions])
-    except (TypeError, ValueError, IndexError) as error:
+    except (TypeError, ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{path}: a position is not a pair of numbers: {error}") from error
     return _checked(path, lonlat.reshape(-1, 2), "GeoJSON and KML put longitude first")
 
@@ -229,16 +237,14 @@ def _area_of_list(path: Path, lonlat: Floats) -> list[Rings]:
 
 
 def _corridor(path: Path, lonlat: Floats) -> list[Rings]:
-    """One polygon a segment: everything within `CORRIDOR_M` of it, its round ends as half 16-gons."""
+    """The polygons of everything within `CORRIDOR_M` of the path."""
     if len(lonlat) < 2:
         raise InputError(f"{path}: a single point; an area needs a path or an outline")
-    angles = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    circle_m = CORRIDOR_M / np.cos(np.pi / 16) * np.column_stack([np.cos(angles), np.sin(angles)])
-    capsules: list[Rings] = []
-    for start, end in pairwise(lonlat):
-        frame = LocalFrame(Geodetic(float(start[1]), float((start[0] + 180) % 360 - 180)))
-        end_m = frame.site_from_wgs84(end[1], end[0], np.zeros(()))[:2]
-        outline_m = convex_hull(np.concatenate([circle_m, circle_m + end_m]))
-        latitude, longitude, _ = frame.wgs84_from_site(outline_m)
-        capsules.append((np.column_stack([longitude, latitude]),))
-    return capsules
+    middle = lonlat[len(lonlat) // 2]
+    # distances from the path's middle are true, so a corridor of 500 km is 0.03 % too narrow at most
+    plane = Proj(proj="aeqd", lon_0=middle[0], lat_0=middle[1], datum="WGS84")
+    path_m = np.column_stack(plane(lonlat[:, 0], lonlat[:, 1]))
+    return [
+        tuple(np.column_stack(plane(ring[:, 0], ring[:, 1], inverse=True)) for ring in rings)
+        for rings in widened_line(path_m, CORRIDOR_M)
+    ]

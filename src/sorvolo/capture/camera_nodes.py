@@ -72,7 +72,7 @@ def _from_json(path: Path, text: str) -> dict[str, Node]:
     nodes: dict[str, Node] = {}
     try:
         _flatten_json(path, json.loads(text), nodes)
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # a whole number of thousands of digits is a plain ValueError
         raise InputError(f"{path}: broken JSON: {error}") from error
     return nodes
 
@@ -88,6 +88,8 @@ def _flatten_json(path: Path, tree: Mapping[str, Any], nodes: dict[str, Node]) -
             nodes.setdefault(_key(name), _array(path, name, value))
         elif isinstance(value, str):
             nodes.setdefault(_key(name), value)
+        elif isinstance(value, bool):
+            nodes.setdefault(_key(name), str(value).lower())
         elif isinstance(value, int | float):
             nodes.setdefault(_key(name), _number(str(value)))
 
@@ -118,16 +120,17 @@ def _matrix(path: Path, name: str, children: Mapping[str, str]) -> Floats:
     numbers = np.array([_number(each) for each in _NUMBER.findall(children["data"])])
     rows = children.get("rows", "1").strip()
     columns = children.get("cols", str(len(numbers))).strip()
-    if not (rows.isdecimal() and columns.isdecimal() and int(rows) * int(columns) == len(numbers)):
-        raise InputError(f"{path}: {name} should hold {rows} x {columns} numbers but has {len(numbers)}")
+    is_shape = all(re.fullmatch(r"[0-9]{1,6}", each) for each in (rows, columns))
+    if not (is_shape and int(rows) * int(columns) == len(numbers)):
+        raise InputError(f"{path}: {name} should hold {rows[:20]} x {columns[:20]} numbers but has {len(numbers)}")
     return numbers.reshape(int(rows), int(columns))
 
 
 def _array(path: Path, name: str, values: list[Any]) -> Floats:
     try:
         return np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: {name} is not a list of numbers") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{path}: {name} is not a list of numbers that a camera can have") from error
 
 
 def _scalar_or_array(text: str) -> Node:

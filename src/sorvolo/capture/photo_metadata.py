@@ -1,9 +1,8 @@
 """What a photo says of itself: size, camera, time, place and attitude from its EXIF and XMP."""
 
 import re
-import struct
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from math import atan2, degrees, hypot, isfinite, nan
@@ -13,22 +12,21 @@ from typing import Any, TypeAlias
 from defusedxml import ElementTree
 from PIL import ExifTags, Image
 
+from sorvolo.capture.decoding import (
+    BROKEN_PICTURE,
+    check_size,
+    dng_size_px,
+    is_dng,
+    open_picture,
+    reason_in_words,
+    reduced_size_px,
+    reduction_of,
+)
 from sorvolo.errors import InputError
 from sorvolo.geometry.pose import gimbal_angles_from_rotation, site_from_body_nadir_rotation
 
-PIXEL_LIMIT = 300_000_000
-"""A larger picture is refused before it is decoded: a few kilobytes can claim gigabytes."""
-
-# Pillow's own guard stands at 89 megapixels and is a global by design; survey cameras make 150.
-Image.MAX_IMAGE_PIXELS = PIXEL_LIMIT
-
-BROKEN_PICTURE = (
-    OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError,
-    ZeroDivisionError, EOFError, RuntimeError, MemoryError, struct.error, Image.DecompressionBombError,
-)
-"""What Pillow raises, by accident or on purpose, on damaged files."""
-
 _Tags: TypeAlias = Mapping[int, Any]
+_XMP_TAG = 700
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 # the EXIF FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
@@ -66,50 +64,97 @@ class PhotoMetadata:
             return self.height_px, self.width_px
         return self.width_px, self.height_px
 
+    @property
+    def reduction(self) -> int:
+        """By which divisor the photo's size is used: 1, but for the largest."""
+        return reduction_of(self.width_px, self.height_px)
+
+    @property
+    def used_size_px(self) -> tuple[int, int]:
+        """Width and height as missions get the photo: as shown, the largest ones reduced."""
+        return reduced_size_px(*self.shown_size_px)
+
 
 def read_photo_metadata(path: Path) -> PhotoMetadata:
-    """Read a JPEG, TIFF or PNG's metadata without decoding its pixels.
+    """Read a picture's metadata without decoding its pixels.
 
-    Raises InputError when the file is no picture at all; damaged EXIF or XMP is named in `unreadable`.
+    Raises InputError when the file is no picture at all, larger than any mission can use, or of a kind whose extra is
+    not installed; damaged EXIF or XMP is named in `unreadable`.
     """
+    header = _dng_header(path) if is_dng(path) else _picture_header(path)
+    check_size(path.name, header.width_px, header.height_px, is_jpeg=header.is_jpeg)
+    unreadable = header.unreadable
+    properties: dict[str, str] = {}
+    if header.xmp:
+        try:
+            properties = _xmp_properties(header.xmp)
+        except (ElementTree.ParseError, ValueError, RecursionError):
+            unreadable = (*unreadable, "XMP")
+    main, detail, gps = header.tags
+    return PhotoMetadata(
+        header.width_px, header.height_px, _orientation(main), _text(main.get(ExifTags.Base.Make)),
+        _text(main.get(ExifTags.Base.Model)), _positive(detail.get(ExifTags.Base.FocalLength)),
+        _positive(detail.get(ExifTags.Base.FocalLengthIn35mmFilm)), _focal_plane_px_per_mm(detail),
+        _whole(detail.get(ExifTags.Base.ExifImageWidth)) or max(header.width_px, header.height_px),
+        _utc_ns(main, detail, gps, properties), _camera_clock_ns(main, detail), _telemetry_columns(gps, properties),
+        unreadable,
+    )
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What stands before a picture's pixels: size, EXIF's main, Exif and GPS directories, the XMP packet."""
+
+    width_px: int
+    height_px: int
+    is_jpeg: bool
+    tags: tuple[_Tags, _Tags, _Tags]
+    xmp: bytes
+    unreadable: tuple[str, ...]
+
+
+def _picture_header(path: Path) -> _Header:
     try:
-        with warnings.catch_warnings(record=True) as caught, Image.open(path) as picture:
+        with warnings.catch_warnings(record=True) as caught, open_picture(path, path.name) as picture:
             warnings.simplefilter("always")
-            (width_px, height_px), mode = picture.size, picture.mode
-            tags, unreadable = _exif_of(picture)
+            (width_px, height_px), mode, kind = picture.size, picture.mode, picture.format
+            tags, unreadable = _exif_of(picture.getexif)
             xmp = picture.info.get("xmp") or picture.info.get("XML:com.adobe.xmp") or b""
     except BROKEN_PICTURE as error:
-        raise InputError(f"{path.name} is not a readable picture ({error}); copy it again") from error
-    if width_px * height_px > PIXEL_LIMIT:
-        raise InputError(
-            f"{path.name} claims {width_px}x{height_px} pixels; "
-            f"at most {PIXEL_LIMIT // 1_000_000} megapixels are read"
-        )
+        raise InputError(f"{path.name} is not a readable picture: {reason_in_words(error)}; copy it again") from error
     if mode == "F":
         raise InputError(f"{path.name} holds floating-point numbers (an elevation map?), not a photo")
     if caught and not unreadable:  # Pillow leaves damaged tags out and warns
         unreadable = ("EXIF",)
-    properties: dict[str, str] = {}
-    if xmp:
-        try:
-            properties = _xmp_properties(xmp if isinstance(xmp, bytes) else str(xmp).encode())
-        except (ElementTree.ParseError, ValueError, RecursionError):
-            unreadable = (*unreadable, "XMP")
-    main, detail, gps = tags
-    return PhotoMetadata(
-        width_px, height_px, _orientation(main), _text(main.get(ExifTags.Base.Make)),
-        _text(main.get(ExifTags.Base.Model)), _positive(detail.get(ExifTags.Base.FocalLength)),
-        _positive(detail.get(ExifTags.Base.FocalLengthIn35mmFilm)), _focal_plane_px_per_mm(detail),
-        _whole(detail.get(ExifTags.Base.ExifImageWidth)), _utc_ns(main, detail, gps, properties),
-        _camera_clock_ns(main, detail), _telemetry_columns(gps, properties), unreadable,
-    )
+    packet = xmp if isinstance(xmp, bytes) else str(xmp).encode()
+    return _Header(width_px, height_px, kind in ("JPEG", "MPO"), tags, packet, unreadable)
 
 
-def _exif_of(picture: Image.Image) -> tuple[tuple[_Tags, _Tags, _Tags], tuple[str, ...]]:
+def _dng_header(path: Path) -> _Header:
+    """A raw picture is a TIFF whose pixels Pillow does not know: its directories are read without them."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path.name} is not a readable picture: {reason_in_words(error)}") from error
+    width_px, height_px = dng_size_px(data, path.name)
+
+    def loaded() -> Image.Exif:
+        exif = Image.Exif()
+        exif.load(data)
+        return exif
+
+    with warnings.catch_warnings(record=True):
+        warnings.simplefilter("always")
+        tags, unreadable = _exif_of(loaded)
+    xmp = tags[0].get(_XMP_TAG, b"")
+    return _Header(width_px, height_px, False, tags, xmp if isinstance(xmp, bytes) else b"", unreadable)
+
+
+def _exif_of(load: Callable[[], Image.Exif]) -> tuple[tuple[_Tags, _Tags, _Tags], tuple[str, ...]]:
     """The main, Exif and GPS directories as plain dicts; what is damaged comes back empty and is named."""
     empty: _Tags = {}
     try:
-        exif = picture.getexif()
+        exif = load()
         main = dict(exif)
     except BROKEN_PICTURE:
         return (empty, empty, empty), ("EXIF",)

@@ -6,30 +6,26 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from statistics import median_low
 
 import cv2
 import numpy as np
-from PIL import Image
 
-from sorvolo.capture.photo_metadata import BROKEN_PICTURE, PhotoMetadata, read_photo_metadata
+from sorvolo.capture.decoding import LARGEST_FRAME_PX, decode_photo
+from sorvolo.capture.photo_metadata import PhotoMetadata, read_photo_metadata
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.telemetry.quality import clean, notice
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry
 
-PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".png"})
-
 _LOOK_AHEAD = 2
 _STEP_NS = 1_000_000  # between photos of the same second
 _UNTIMED_STEP_NS = 1_000_000_000
 _QUARTER_TURN = 6  # EXIF's number for clockwise
 _EDGE_BYTES = 65_536
-_JPEG_START = b"\xff\xd8\xff"
 
 
 @dataclass(frozen=True)
@@ -109,44 +105,22 @@ class PhotoSource:
         if photo.problem:
             return LostFrame(index, photo.path.name, photo.time_ns, photo.problem)
         try:
-            image = decode_photo(photo.path.read_bytes(), photo.path.name)
+            image = decode_photo(photo.path.read_bytes(), photo.path.name, photo.metadata.reduction)
             fitted = _fit(image, photo.metadata.orientation, self.album.width_px, self.album.height_px)
         except (InputError, OSError) as error:
             return LostFrame(index, photo.path.name, photo.time_ns, f"corrupt: {error}")
         return Frame(index, photo.path.name, photo.time_ns, fitted)
 
 
-def decode_photo(data: bytes, name: str) -> ImageRGB:
-    """Pixels of a JPEG, TIFF or PNG as stored (EXIF orientation not applied), 8 bits, RGB.
-
-    Deeper, gray, CMYK and transparent ones are converted. Raises InputError when it is damaged or cut.
-    """
-    # For JPEG OpenCV needs half of Pillow's time and, since version 5, refuses cut files too.
-    if data.startswith(_JPEG_START):
-        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
-        try:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-        except cv2.error:
-            image = None
-        if image is not None:
-            return np.asarray(image, dtype=np.uint8)
-    try:
-        with Image.open(BytesIO(data)) as picture:
-            if picture.mode in ("I", "F", "I;16", "I;16B", "I;16L"):
-                gray = np.clip(np.asarray(picture).astype(np.float64) / 257, 0, 255).astype(np.uint8)
-                return np.repeat(gray[:, :, None], 3, axis=2)
-            return np.array(picture.convert("RGB"))
-    except BROKEN_PICTURE as error:
-        raise InputError(f"{name} is damaged or cut ({error})") from error
-
-
-def read_picture(path: Path) -> ImageRGB:
+def read_picture(path: Path, *, reduces: bool = False) -> ImageRGB:
     """A picture's pixels as its EXIF orientation wants them shown, 8 bits, RGB.
 
-    Raises InputError when it is missing or damaged.
+    `reduces`: the largest JPEGs come at half their size, as a flight's frames do. Raises InputError when the picture is
+    missing, damaged or too large.
     """
-    orientation = read_photo_metadata(path).orientation
-    return np.ascontiguousarray(_turn(decode_photo(path.read_bytes(), path.name), orientation))
+    metadata = read_photo_metadata(path)
+    image = decode_photo(path.read_bytes(), path.name, metadata.reduction if reduces else 1)
+    return np.ascontiguousarray(_turn(image, metadata.orientation))
 
 
 def read_album(paths: Sequence[Path]) -> Album:
@@ -157,8 +131,7 @@ def read_album(paths: Sequence[Path]) -> Album:
     found = [_read(path) for path in sorted(paths, key=lambda path: (_natural(path.stem), path.name))]
     if all(photo.problem for photo in found):
         raise InputError(
-            f"none of the {len(found)} pictures can be read (first: {found[0].problem}); "
-            "copy them again from the camera"
+            f"none of the {len(found)} pictures can be read; the first: {found[0].problem.removeprefix('corrupt: ')}"
         )
     timed, start_origin, time_notices = _put_in_time(found)
     distinct = _mark_duplicates(timed)
@@ -166,7 +139,7 @@ def read_album(paths: Sequence[Path]) -> Album:
     photos = [_check_size(photo, width_px, height_px) for photo in distinct]
     typical = next(
         photo.metadata for photo in photos
-        if not photo.problem and photo.metadata.shown_size_px == (width_px, height_px)
+        if not photo.problem and photo.metadata.used_size_px == (width_px, height_px)
     )
     telemetry, gps_notices = _telemetry_of(photos)
     return Album(
@@ -278,12 +251,12 @@ def _digest_of_ends(path: Path, size: int) -> bytes:
 
 def _usual_size(photos: Sequence[Photo]) -> tuple[int, int]:
     """Width and height that most usable photos have as shown; of equally many the larger."""
-    sizes = Counter(photo.metadata.shown_size_px for photo in photos if not photo.problem)
+    sizes = Counter(photo.metadata.used_size_px for photo in photos if not photo.problem)
     return max(sizes, key=lambda size: (sizes[size], size[0] * size[1], size))
 
 
 def _check_size(photo: Photo, width_px: int, height_px: int) -> Photo:
-    own_px, flight_px = photo.metadata.shown_size_px, (width_px, height_px)
+    own_px, flight_px = photo.metadata.used_size_px, (width_px, height_px)
     if photo.problem or own_px[::-1] == flight_px or is_same_shape(own_px, flight_px):
         return photo
     return replace(photo, problem=other_size(own_px, flight_px))
@@ -332,8 +305,8 @@ def _telemetry_of(photos: Sequence[Photo]) -> tuple[Telemetry, list[Notice]]:
 
 def _picture_notices(photos: Sequence[Photo], width_px: int, height_px: int) -> list[Notice]:
     used = [photo.metadata for photo in photos if not photo.problem]
-    other = [metadata for metadata in used if metadata.shown_size_px != (width_px, height_px)]
-    turned = [metadata for metadata in other if metadata.shown_size_px == (height_px, width_px)]
+    other = [metadata for metadata in used if metadata.used_size_px != (width_px, height_px)]
+    turned = [metadata for metadata in other if metadata.used_size_px == (height_px, width_px)]
     cameras = {(metadata.make, metadata.model) for metadata in used}
     focal_mm = {metadata.focal_length_mm for metadata in used if metadata.focal_length_mm > 0}
     return [
@@ -346,6 +319,8 @@ def _picture_notices(photos: Sequence[Photo], width_px: int, height_px: int) -> 
         *notice("rotated_photo", len(turned), "photos that lay across the others, turned by 90 deg: {}"),
         *notice("resized_photo", len(other) - len(turned),
                 f"photos of another size, resampled to {width_px}x{height_px}: {{}}"),
+        *notice("reduced_photo", sum(metadata.reduction > 1 for metadata in used),
+                f"photos of more than {LARGEST_FRAME_PX // 1_000_000} megapixels, used at half their size: {{}}"),
         *notice("unreadable_metadata", sum(bool(metadata.unreadable) for metadata in used),
                 "photos with damaged EXIF or XMP, which is not used: {}"),
         *notice("mixed_cameras", len(cameras) if len(cameras) > 1 else 0,

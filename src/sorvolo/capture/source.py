@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from sorvolo.capture.calibration import camera_from_option, guess_camera
+from sorvolo.capture.decoding import PHOTO_SUFFIXES
 from sorvolo.capture.live.addresses import (
     ADDRESS_FORMS,
     FollowedPath,
@@ -27,7 +28,7 @@ from sorvolo.capture.live.links import LINK_FORMS, is_link
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream, open_stream
 from sorvolo.capture.photo_metadata import PhotoMetadata
-from sorvolo.capture.photos import PHOTO_SUFFIXES, PhotoSource, read_album
+from sorvolo.capture.photos import PhotoSource, read_album
 from sorvolo.capture.telemetry import find_telemetry_beside, is_telemetry, read_telemetry
 from sorvolo.capture.telemetry.quality import notice
 from sorvolo.capture.video import VIDEO_SUFFIXES, VideoInfo, VideoSource, read_video_info

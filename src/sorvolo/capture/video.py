@@ -10,13 +10,14 @@ import av
 import numpy as np
 
 from sorvolo.capture.containers import ends_early, top_boxes
+from sorvolo.capture.decoding import is_heif
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.telemetry.quality import notice
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Anything, ImageRGB
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
 
-PIXEL_LIMIT = 100_000_000
+PIXEL_LIMIT = 64_000_000
 """A video of larger frames is refused before it is decoded."""
 
 VIDEO_SUFFIXES = frozenset({
@@ -325,6 +326,9 @@ def _check_file(path: Path) -> None:
         raise InputError(f"{path} is not a file; give a video file or a folder of photos")
     if path.stat().st_size == 0:
         raise InputError(f"{path.name} is empty (0 bytes); copy it again from the drone")
+    with path.open("rb") as file:
+        if is_heif(file.read(12)):
+            raise InputError(f"{path.name} is a HEIC picture, not a video; rename it to {path.stem}.heic")
 
 
 def _opened(path: Path) -> av.container.InputContainer:

@@ -1,15 +1,22 @@
-"""Polygons in a plane: area, what lies inside, where an outline crosses itself, and what a band cuts out.
+"""Polygons in a plane, by shapely: area, what lies inside, self-crossing outlines, spans within a band.
 
 A ring is an (N, 2) array of at least three corners without the first one repeated. A polygon is a sequence of
-rings, the outline first, then its holes; inside follows the even-odd rule, so a ring may turn either way.
+rings, the outline first, then its holes; a ring may turn either way.
 """
 
+import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, PointsM
+
+_MOST_HULL_CORNERS = 1000
+_HULL_TOLERANCE = 1e-6  # of the extent, where a hull has more corners than that
+_LOCATION = re.compile(r"\[(\S+) (\S+)\]$")
 
 
 def signed_area(ring: PointsM) -> float:
@@ -26,57 +33,37 @@ def polygon_area(rings: Sequence[PointsM]) -> float:
 def points_inside(rings: Sequence[PointsM], points: PointsM) -> NDArray[np.bool_]:
     """(N,) whether each point, shape (N, 2), lies inside the polygon; NaN points do not."""
     x, y = np.asarray(points, dtype=np.float64).reshape(-1, 2).T
-    inside = np.zeros(len(x), dtype=bool)
-    for ring in rings:
-        for (x0, y0), (x1, y1) in zip(ring, np.roll(ring, -1, axis=0)):
-            if y0 != y1:
-                crosses = (y0 > y) != (y1 > y)
-                inside ^= crosses & (x < x0 + (y - y0) / (y1 - y0) * (x1 - x0))
-    return inside
+    polygon = _polygon(rings)
+    shapely.prepare(polygon)
+    return np.asarray(shapely.contains_xy(polygon, x, y), dtype=np.bool_)
 
 
 def first_crossing(ring: PointsM) -> tuple[int, int] | None:
-    """The first two edges, by the index of their first corners, that meet other than at a shared corner.
+    """Two edges, by the index of their first corners, that meet other than at a corner they share.
 
     None when the ring is simple. Edges that run back over their neighbour count as meeting.
     """
-    start, end = ring, np.roll(ring, -1, axis=0)
-    count = len(ring)
-    tolerance = 1e-12 * float(np.ptp(ring, axis=0).max()) ** 2
-    for i in range(count):
-        others = np.arange(i + 1, count)
-        meets = _segments_meet(start[i], end[i], start[others], end[others], tolerance)
-        neighbours = (others == i + 1) | ((i == 0) & (others == count - 1))
-        meets[neighbours] = [
-            _runs_back(start[i], end[i], start[j], end[j], tolerance) for j in others[neighbours]
-        ]
-        if meets.any():
-            return i, int(others[np.argmax(meets)])
-    return None
+    polygon = _polygon([ring])
+    if shapely.is_valid(polygon):
+        return None
+    place = _LOCATION.search(shapely.is_valid_reason(polygon))
+    edges = shapely.linestrings(np.stack([ring, np.roll(ring, -1, axis=0)], axis=1))
+    point = shapely.Point(float(place[1]), float(place[2])) if place else shapely.Point(*ring[0])
+    distances = shapely.distance(edges, point)
+    # the message prints the place with few digits where its numbers are large
+    meeting = np.flatnonzero(distances <= 1e-9 * float(np.ptp(ring, axis=0).max()))
+    if len(meeting) < 2:
+        meeting = np.sort(np.argsort(distances)[:2])
+    return int(meeting[0]), int(meeting[len(meeting) // 2])
 
 
 def band_spans(rings: Sequence[PointsM], low: float, high: float) -> list[tuple[float, float]]:
-    """The x-extents of the polygon's parts with low <= y <= high, in order of x, touching ones joined.
-
-    The outline of each part is made of pieces of the polygon's edges and of chords along the two band lines;
-    the extents of those pieces together are the extent of the part.
-    """
-    spans: list[tuple[float, float]] = []
-    for ring in rings:
-        for a, b in zip(ring, np.roll(ring, -1, axis=0)):
-            if max(a[1], b[1]) < low or min(a[1], b[1]) > high:
-                continue
-            rise = b[1] - a[1]
-            if rise == 0:
-                ends = np.array([0.0, 1.0])
-            else:
-                ends = np.clip(np.sort((np.array([low, high]) - a[1]) / rise), 0.0, 1.0)
-            x0, x1 = sorted(a[0] + ends * (b[0] - a[0]))
-            spans.append((float(x0), float(x1)))
-    for level in (low, high):
-        crossings = _crossings(rings, level)
-        spans += list(zip(crossings[::2], crossings[1::2]))
-    return join_spans(spans, 0.0)
+    """The x-extents of the polygon's parts with low <= y <= high, in order of x, touching ones joined."""
+    outline = rings[0]
+    left, right = float(outline[:, 0].min()) - 1.0, float(outline[:, 0].max()) + 1.0
+    parts = shapely.get_parts(shapely.clip_by_rect(_polygon(rings), left, low, right, high))
+    bounds = shapely.bounds(parts)
+    return join_spans([(float(x0), float(x1)) for x0, _, x1, _ in bounds if np.isfinite(x0)], 0.0)
 
 
 def join_spans(spans: Sequence[tuple[float, float]], gap: float) -> list[tuple[float, float]]:
@@ -91,28 +78,26 @@ def join_spans(spans: Sequence[tuple[float, float]], gap: float) -> list[tuple[f
 
 
 def convex_hull(points: PointsM) -> PointsM:
-    """(M, 2) corners of the convex hull of points, shape (N, 2), counter-clockwise (Andrew's chain)."""
-    ordered = np.unique(np.asarray(points, dtype=np.float64), axis=0)
-    if len(ordered) < 3:
-        return ordered
-    halves = []
-    for sweep in (ordered, ordered[::-1]):
-        chain: list[Floats] = []
-        for point in sweep:
-            while len(chain) > 1 and _turn(chain[-2], chain[-1], point) <= 0:
-                chain.pop()
-            chain.append(point)
-        halves += chain[:-1]
-    return np.array(halves)
+    """(M, 2) corners of the convex hull of points, shape (N, 2), counter-clockwise; two for points on one line."""
+    hull = shapely.convex_hull(shapely.multipoints(np.asarray(points, dtype=np.float64)))
+    corners = np.asarray(shapely.get_coordinates(hull), dtype=np.float64)
+    if shapely.get_type_id(hull) != shapely.GeometryType.POLYGON:
+        return corners
+    corners = corners[:-1]
+    return corners if signed_area(corners) > 0 else corners[::-1]
 
 
 def narrowest_extent(points: PointsM) -> tuple[float, Floats]:
     """The least width of points, shape (N, 2), in any direction, and the unit vector, (2,), at right angles.
 
     The vector runs along the points' longer way (rotating calipers over the hull). The width of points on one
-    line is zero. Of equally narrow ways, as in a square, the one along the hull's longest edge is taken.
+    line is zero. Of equally narrow ways, as in a square, the one along the hull's longest edge is taken. Hulls of
+    more than a thousand corners are simplified to a millionth of their extent first.
     """
     hull = convex_hull(points)
+    if len(hull) > _MOST_HULL_CORNERS:
+        tolerance = _HULL_TOLERANCE * float(np.ptp(hull, axis=0).max())
+        hull = shapely.get_coordinates(shapely.simplify(_polygon([hull]), tolerance))[:-1]
     edges = np.roll(hull, -1, axis=0) - hull
     lengths = np.linalg.norm(edges, axis=1)
     if lengths.max() == 0:
@@ -123,36 +108,25 @@ def narrowest_extent(points: PointsM) -> tuple[float, Floats]:
     return float(spread[best]), along[best]
 
 
-def _crossings(rings: Sequence[PointsM], level: float) -> list[float]:
-    found: list[float] = []
-    for ring in rings:
-        a, b = ring, np.roll(ring, -1, axis=0)
-        hit = (a[:, 1] > level) != (b[:, 1] > level)
-        a, b = a[hit], b[hit]
-        found += list(a[:, 0] + (level - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0]))
-    return sorted(found)
+def widened_line(line: PointsM, reach: float) -> list[list[PointsM]]:
+    """The polygons of everything within `reach` of a line, shape (N, 2); round ends become half 16-gons.
+
+    The 16-gon holds the circle. Gaps that the line leaves free count only where they are wider than a tenth of
+    `reach` all over: narrower ones are filled.
+    """
+    outer = reach / np.cos(np.pi / 16)
+    widened = shapely.buffer(shapely.linestrings(line), outer, quad_segs=4)
+    polygons = []
+    for polygon in shapely.get_parts(widened):
+        rings = [_open(ring) for ring in shapely.get_rings(polygon)]
+        holes = [ring for ring in rings[1:] if narrowest_extent(ring)[0] > 0.1 * reach]
+        polygons.append([rings[0], *holes])
+    return polygons
 
 
-def _turn(a: Floats, b: Floats, c: Floats) -> Floats:
-    """Twice the signed area of the triangles a, b, c; arrays (..., 2)."""
-    ab, ac = b - a, c - a
-    return ab[..., 0] * ac[..., 1] - ab[..., 1] * ac[..., 0]
+def _polygon(rings: Sequence[PointsM]) -> Any:
+    return shapely.polygons(shapely.linearrings(rings[0]), [shapely.linearrings(ring) for ring in rings[1:]] or None)
 
 
-def _segments_meet(a: Floats, b: Floats, c: Floats, d: Floats, tolerance: float) -> NDArray[np.bool_]:
-    """Whether the segment a-b, (2,) each, meets the segments c-d, (N, 2) each, ends included."""
-    c_side, d_side = _turn(a, b, c), _turn(a, b, d)
-    a_side, b_side = _turn(c, d, a), _turn(c, d, b)
-    straddle = (c_side * d_side <= tolerance**2) & (a_side * b_side <= tolerance**2)
-    boxes = (
-        (np.maximum(c, d) >= np.minimum(a, b) - 1e-12).all(axis=-1)
-        & (np.minimum(c, d) <= np.maximum(a, b) + 1e-12).all(axis=-1)
-    )
-    return straddle & boxes
-
-
-def _runs_back(a: Floats, b: Floats, c: Floats, d: Floats, tolerance: float) -> bool:
-    """Whether two edges that share a corner lie on one line and overlap beyond it."""
-    first, second = b - a, d - c
-    across = first[0] * second[1] - first[1] * second[0]
-    return bool(abs(across) <= tolerance and first @ second < 0)
+def _open(ring: Any) -> PointsM:
+    return np.asarray(shapely.get_coordinates(ring)[:-1], dtype=np.float64)

@@ -8,7 +8,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
-from sorvolo.capture.photos import PHOTO_SUFFIXES, read_picture
+from sorvolo.capture.decoding import PHOTO_SUFFIXES
+from sorvolo.capture.photos import read_picture
 from sorvolo.detection.models import (
     HASH_KEY,
     InstalledModel,

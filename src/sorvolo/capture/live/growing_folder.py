@@ -11,10 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from sorvolo.capture.decoding import PHOTO_SUFFIXES
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.telemetry_log import TelemetryLog
 from sorvolo.capture.photo_metadata import PhotoMetadata, read_photo_metadata
-from sorvolo.capture.photos import PHOTO_SUFFIXES, read_picture
+from sorvolo.capture.photos import read_picture
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.telemetry.quality import notice
 from sorvolo.errors import InputError
@@ -139,7 +140,7 @@ class GrowingFolder:
                 self.start_ns = _time_ns(metadata)
                 self._last_ns = self.start_ns - 1
                 self._note_place(self.start_ns, metadata)
-                self.size_px = metadata.shown_size_px
+                self.size_px = metadata.used_size_px
                 return path, metadata
             self._closing.wait(_POLL_S)
         raise InputError(
@@ -180,7 +181,7 @@ class GrowingFolder:
         if not wanted(index, time_ns):
             return None
         try:
-            image = read_picture(path)
+            image = read_picture(path, reduces=True)
         except (InputError, OSError) as error:
             self._corrupt += 1
             return LostFrame(index, path.name, time_ns, f"corrupt: {error}")

@@ -270,7 +270,7 @@ class LiveStream:
 
     def restarted(self) -> None:
         """See `reader.Hearer`: frames are held anew until their delay is known."""
-        self._deliver_held()
+        self._settle()  # the clock may restart before the first frames' own hold is over
         with self._lock:
             self._clock.restart()
             self._held, self._held_since = [], None

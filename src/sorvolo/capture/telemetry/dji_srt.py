@@ -2,6 +2,7 @@
 
 import re
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,6 +24,9 @@ from sorvolo.survey.flight import Telemetry
 
 SMALLEST_SIGMA_M = 1.5
 """Horizontal sigma of a consumer drone's GPS in hover, which no number of printed decimals improves."""
+
+_MOST_CUES = 1_000_000  # four and a half hours at 60 frames a second
+_LONGEST_CUE = 4000  # characters; drones write up to 600
 
 _CUE = re.compile(r"(\d{1,3}):(\d{2}):(\d{2})[,.](\d{1,3})[ \t]*-->")
 _TELEMETRY = re.compile(
@@ -89,13 +93,11 @@ def read(data: bytes, name: str) -> Telemetry:
     InputError when no cue says where the drone was or how it stood.
     """
     text = text_from_bytes(data)
-    starts = list(_CUE.finditer(text))
-    if not starts:
-        raise InputError(f"{name}: no subtitle times (00:00:01,000 --> 00:00:02,000) in it")
-    ends = [match.start() for match in starts[1:]] + [len(text)]
     counts: Counter[str] = Counter()
     decimals = [0]
-    cues = [_cue(match, text[match.end():end], counts, decimals) for match, end in zip(starts, ends)]
+    cues = [_cue(match, body, counts, decimals) for match, body in _cues_in(text, name)]
+    if not cues:
+        raise InputError(f"{name}: no subtitle times (00:00:01,000 --> 00:00:02,000) in it")
     if not cues[-1].values and any(cue.values for cue in cues):
         counts["truncated"] = 1
         cues.pop()
@@ -133,6 +135,19 @@ def read(data: bytes, name: str) -> Telemetry:
         ],
         position_decimals=max(decimals) or None,
     )
+
+
+def _cues_in(text: str, name: str) -> Iterator[tuple[re.Match[str], str]]:
+    """Each cue's times and the text behind them, as far as any drone's reaches."""
+    before = None
+    for count, match in enumerate(_CUE.finditer(text)):
+        if count >= _MOST_CUES:
+            raise InputError(f"{name}: more than {_MOST_CUES} subtitles; no flight has so many, cut the file")
+        if before is not None:
+            yield before, text[before.end():min(match.start(), before.end() + _LONGEST_CUE)]
+        before = match
+    if before is not None:
+        yield before, text[before.end():before.end() + _LONGEST_CUE]
 
 
 def _cue(match: re.Match[str], body: str, counts: Counter[str], decimals: list[int]) -> _Cue:

@@ -1,0 +1,297 @@
+"""Small files that ask for much memory or time, and files that once ended in a crash: each tried."""
+
+import io
+import json
+import struct
+import threading
+import time
+import tracemalloc
+import zipfile
+import zlib
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from sorvolo.capture import decoding
+from sorvolo.capture.areas import read_area
+from sorvolo.capture.calibration import read_camera
+from sorvolo.capture.decoding import decode_photo
+from sorvolo.capture.live.addresses import live_address
+from sorvolo.capture.live.reader import StreamFacts
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.capture.live.stream import LiveStream
+from sorvolo.capture.photos import read_album, read_picture
+from sorvolo.capture.source import open_sources
+from sorvolo.capture.telemetry import read_telemetry
+from sorvolo.errors import InputError
+
+
+def png_of(width_px: int, height_px: int) -> bytes:
+    """A PNG of one colour: some hundred kilobytes for hundreds of megapixels."""
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    deflate = zlib.compressobj(9)
+    row = bytes(1 + (width_px + 7) // 8)
+    rows = b"".join(deflate.compress(row) for _ in range(height_px)) + deflate.flush()
+    header = struct.pack(">IIBBBBB", width_px, height_px, 1, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def test_a_small_png_of_many_pixels_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
+    bomb = tmp_path / "bomb.png"
+    bomb.write_bytes(png_of(17_000, 17_000))
+    assert bomb.stat().st_size < 1_000_000
+    with pytest.raises(InputError, match=r"17000x17000 pixels; at most 64 megapixels"):
+        read_album([bomb])
+    with pytest.raises(InputError, match="64 megapixels"):
+        decode_photo(bomb.read_bytes(), bomb.name)
+
+
+def test_the_largest_photos_are_decoded_at_half_their_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(decoding, "LARGEST_FRAME_PX", 200_000)
+    small = np.random.default_rng(3).integers(0, 255, (5, 6, 3), dtype=np.uint8)
+    large = cv2.resize(small, (501, 400), interpolation=cv2.INTER_LINEAR)
+    path = tmp_path / "a.jpg"
+    path.write_bytes(cv2.imencode(".jpg", large)[1].tobytes())
+    (source,) = open_sources([path])
+    (frame,) = source.frames(lambda index, time_ns: True)
+    assert frame.image.shape == (200, 251, 3)
+    halved = cv2.resize(large[:, :, ::-1], (251, 200), interpolation=cv2.INTER_AREA)
+    assert np.abs(frame.image.astype(int) - halved).mean() < 3
+    assert (source.camera.camera.width_px, source.camera.camera.height_px) == (251, 200)
+    assert {notice.code for notice in source.notices()} >= {"reduced_photo"}
+    # labels on pictures count the pixels of the file
+    assert read_picture(path).shape == (400, 501, 3)
+
+
+def test_a_subtitle_of_many_megabytes_costs_no_multiple_of_itself(tmp_path: Path) -> None:
+    cue = "1\n00:00:00,000 --> 00:00:01,000\n[latitude: 46.1] [longitude: 11.2] "
+    path = tmp_path / "bomb.srt"
+    path.write_text(cue + "[rel_alt: 1.5] " * 2_000_000)
+    tracemalloc.start()
+    began_s = time.monotonic()
+    telemetry = read_telemetry(path)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(telemetry) == 1 and telemetry["latitude_deg"][0] == 46.1
+    assert peak_bytes < 3 * path.stat().st_size and time.monotonic() - began_s < 10
+
+
+def test_an_area_of_a_hundred_thousand_points_is_read_in_seconds(tmp_path: Path) -> None:
+    angles = np.linspace(0, 2 * np.pi, 100_000, endpoint=False)
+    ring = np.column_stack([12 + 0.01 * np.cos(angles), 45 + 0.007 * np.sin(angles)])
+    path = tmp_path / "circle.geojson"
+    began_s = time.monotonic()
+    path.write_text(json.dumps({"type": "Polygon", "coordinates": [ring.tolist()]}))
+    area = read_area(path)
+    assert area.contains(np.array([[12.0, 45.0], [12.02, 45.0]])).tolist() == [True, False]
+    assert area.area_m2 == pytest.approx(np.pi * 788 * 778, rel=0.01)
+    path.write_text(json.dumps({"type": "LineString", "coordinates": ring.tolist()}))
+    corridor = read_area(path)
+    assert corridor.contains(np.array([[12.0, 45.0], [12.01, 45.0]])).tolist() == [False, True]
+    assert time.monotonic() - began_s < 20
+
+
+def test_an_area_of_too_many_polygons_is_refused(tmp_path: Path) -> None:
+    square = [[12, 45], [12.1, 45], [12.1, 45.1]]
+    path = tmp_path / "many.geojson"
+    path.write_text(json.dumps({"type": "MultiPolygon", "coordinates": [[square]] * 10_001}))
+    with pytest.raises(InputError, match="10001 polygons"):
+        read_area(path)
+
+
+def test_a_kmz_with_a_negative_offset_is_refused(tmp_path: Path) -> None:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("doc.kml", "<kml/>")
+    data = bytearray(buffer.getvalue())
+    directory = data.index(b"PK\x01\x02")
+    end = data.index(b"PK\x05\x06")
+    for offset in (0xFFFF_FFF0, 0x7FFF_FFFF, 1):
+        struct.pack_into("<I", data, directory + 42, offset)
+        path = tmp_path / "a.kmz"
+        path.write_bytes(data)
+        with pytest.raises(InputError, match="broken KMZ"):
+            read_area(path)
+    struct.pack_into("<I", data, end + 16, directory + 100)  # the directory lies before the file
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="broken KMZ"):
+        read_area(path)
+
+
+@pytest.mark.parametrize("digits", [400, 5000])
+@pytest.mark.parametrize("text", [
+    '{{"fx": {0}, "fy": 1000, "cx": 500, "cy": 400, "width": 1000, "height": 800}}',
+    '{{"camera_matrix": [[{0}, 0, 500], [0, 1000, 400], [0, 0, 1]]}}',
+    '{{"camera_matrix": {{"rows": {0}, "cols": 3, "data": [1000, 0, 500, 0, 1000, 400, 0, 0, 1]}}}}',
+])
+def test_a_camera_file_with_a_number_of_hundreds_of_digits_is_refused(tmp_path: Path, text: str, digits: int) -> None:
+    path = tmp_path / "camera.json"
+    path.write_text(text.format("9" * digits))
+    with pytest.raises(InputError):
+        read_camera(path, 1000, 800)
+
+
+def test_a_camera_file_with_a_truth_value_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "camera.json"
+    path.write_text('{"fx": 900, "fy": 900, "cx": 500, "cy": 400, "width": 1000, "height": 800, "fisheye": false}')
+    assert read_camera(path, 1000, 800).camera.fx_px == 900
+    path.write_text(path.read_text().replace("false", "true"))
+    with pytest.raises(InputError, match="fisheye"):
+        read_camera(path, 1000, 800)
+
+
+def test_an_area_with_a_number_of_hundreds_of_digits_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "area.geojson"
+    for digits in (400, 5000):
+        path.write_text('{"type": "Polygon", "coordinates": [[[%s, 45], [12, 45], [12, 46]]]}' % ("9" * digits))
+        with pytest.raises(InputError):
+            read_area(path)
+
+
+def test_a_stream_whose_clock_restarts_at_once_keeps_its_first_frames() -> None:
+    address = live_address("udp://:5999")
+    stream = LiveStream(address, None, LiveSettings(keeps_all=True), threading.Event(), None)  # type: ignore[arg-type]
+    stream.opened(StreamFacts("h264", "mpegts", 25.0, False))
+    stream.restarted()
+    for stamp_ns in (5_000_000_000, 5_040_000_000, 0, 40_000_000, 700_000_000, 800_000_000):
+        decoded = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), "rgb24")
+        decoded.time_base = Fraction(1, 1000)
+        if stamp_ns == 0:
+            stream.restarted()
+        stream.frame(decoded, stamp_ns, stamp_ns / 1e9)
+    assert stream.size_px == (64, 48) and stream.start_ns > 0
+    stream.ended()
+    frames = list(stream.frames(lambda index, time_ns: True))
+    assert [frame.index for frame in frames] == [0, 1, 2, 3, 4, 5]
+    assert all(frame.image.shape == (48, 64, 3) for frame in frames)
+    assert all(a.time_ns < b.time_ns for a, b in pairwise(frames))
+
+
+def heic_of(image: Image.Image) -> bytes:
+    pillow_heif = pytest.importorskip("pillow_heif")
+    buffer = io.BytesIO()
+    exif = Image.Exif()
+    exif[271], exif[272], exif[274] = "Apple", "iPhone", 6
+    pillow_heif.from_pillow(image).save(buffer, quality=95, exif=exif.tobytes())
+    return buffer.getvalue()
+
+
+@pytest.fixture
+def checks() -> Image.Image:
+    blocks = np.random.default_rng(1).integers(0, 255, (15, 20, 3), dtype=np.uint8)
+    return Image.fromarray(np.kron(blocks, np.ones((8, 8, 1), np.uint8)))
+
+
+def test_heic_pictures_are_photos(tmp_path: Path, checks: Image.Image) -> None:
+    path = tmp_path / "a.heic"
+    path.write_bytes(heic_of(checks))
+    (source,) = open_sources([path])
+    assert source.kind == "photos"
+    (frame,) = source.frames(lambda index, time_ns: True)
+    assert frame.image.shape[2] == 3 and {frame.image.shape[0], frame.image.shape[1]} == {120, 160}
+    shown = frame.image if frame.image.shape[0] == 120 else np.rot90(frame.image)
+    flat = np.asarray(checks).astype(int)
+    assert min(np.abs(shown.astype(int) - each).mean() for each in (flat, flat[::-1, ::-1])) < 12
+    path.rename(tmp_path / "a.mp4")
+    with pytest.raises(InputError, match="HEIC picture, not a video"):
+        open_sources([tmp_path / "a.mp4"])
+
+
+def test_heic_without_its_extra_says_what_to_install(
+    tmp_path: Path, checks: Image.Image, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.heic"
+    path.write_bytes(heic_of(checks))
+    monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
+    with pytest.raises(InputError, match=r"pip install 'sorvolo\[heic\]'"):
+        open_sources([path])
+    heic = path.read_bytes()
+    path.write_bytes(heic[:60])
+    with pytest.raises(InputError):
+        open_sources([path])
+
+
+def dng_of(image: np.ndarray) -> bytes:
+    """A DNG of one directory with an uncompressed 16-bit RGGB mosaic of the picture."""
+    height_px, width_px = image.shape[:2]
+    mosaic = np.zeros((height_px, width_px), np.uint16)
+    for (y, x), channel in {(0, 0): 0, (0, 1): 1, (1, 0): 1, (1, 1): 2}.items():
+        mosaic[y::2, x::2] = image[y::2, x::2, channel].astype(np.uint16) * 257
+    identity = b"".join(struct.pack("<ii", value, 1) for value in (1, 0, 0, 0, 1, 0, 0, 0, 1))
+    camera = b"DJI\0"
+    model = b"FC3582\0\0"
+    entries = {
+        254: (4, 1, 0), 256: (4, 1, width_px), 257: (4, 1, height_px), 258: (3, 1, 16), 259: (3, 1, 1),
+        262: (3, 1, 32803), 271: (2, 4, camera), 272: (2, 7, model), 273: (4, 1, None), 277: (3, 1, 1),
+        278: (4, 1, height_px), 279: (4, 1, mosaic.nbytes), 33421: (3, 2, struct.pack("<HH", 2, 2)),
+        33422: (1, 4, bytes([0, 1, 1, 2])), 50706: (1, 4, bytes([1, 4, 0, 0])), 50708: (2, 7, model),
+        50721: (10, 9, identity),
+    }
+    directory_bytes = 2 + 12 * len(entries) + 4
+    extra, at = b"", 8 + directory_bytes
+    rows = b""
+    for tag, (kind, count, value) in sorted(entries.items()):
+        if value is None:
+            value = at + 200
+        if isinstance(value, bytes) and len(value) > 4:
+            field, extra = struct.pack("<I", at + len(extra)), extra + value
+        else:
+            field = value.ljust(4, b"\0") if isinstance(value, bytes) else struct.pack("<I", value)
+        rows += struct.pack("<HHI", tag, kind, count) + field
+    head = b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", len(entries)) + rows + bytes(4)
+    return head + extra.ljust(200, b"\0") + mosaic.tobytes()
+
+
+def test_dng_pictures_are_photos(tmp_path: Path) -> None:
+    pytest.importorskip("rawpy")
+    ramp = np.zeros((120, 160, 3), np.uint8)
+    ramp[:, :80, 0] = ramp[:, 80:, 2] = 200
+    path = tmp_path / "a.dng"
+    path.write_bytes(dng_of(ramp))
+    (source,) = open_sources([path])
+    (frame,) = source.frames(lambda index, time_ns: True)
+    assert frame.image.shape == (120, 160, 3)
+    left, right = frame.image[20:100, 20:60].mean((0, 1)), frame.image[20:100, 100:140].mean((0, 1))
+    assert left[0] > 3 * left[2] and right[2] > 3 * right[0]
+    assert "Mini 3 Pro" in source.camera.origin
+    path.write_bytes(path.read_bytes()[:5000])
+    try:
+        (lost,) = open_sources([path])[0].frames(lambda index, time_ns: True)
+        assert lost.reason.startswith("corrupt")
+    except InputError:
+        pass
+
+
+def test_dng_without_its_extra_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.dng"
+    path.write_bytes(dng_of(np.zeros((64, 64, 3), np.uint8)))
+    monkeypatch.setitem(__import__("sys").modules, "rawpy", None)
+    with pytest.raises(InputError, match=r"pip install 'sorvolo\[raw\]'"):
+        open_sources([path])
+
+
+@pytest.mark.parametrize(("data", "words"), [
+    (b"no picture at all", "no JPEG, TIFF, PNG, HEIC or DNG picture"),
+    (b"", "no JPEG, TIFF, PNG, HEIC or DNG picture"),
+])
+def test_why_a_picture_cannot_be_read_is_plain(tmp_path: Path, data: bytes, words: str) -> None:
+    path = tmp_path / "a.jpg"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=words) as caught:
+        open_sources([path])
+    assert "0x" not in str(caught.value) and "BytesIO" not in str(caught.value)
+
+
+def test_why_a_cut_jpeg_cannot_be_decoded_is_plain(checks: Image.Image) -> None:
+    buffer = io.BytesIO()
+    checks.save(buffer, "JPEG")
+    with pytest.raises(InputError, match=r"the file ends before the picture does\); copy it again"):
+        decode_photo(buffer.getvalue()[:-2000], "a.jpg")
