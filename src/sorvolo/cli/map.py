@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.flight.settings import MapSettings
 
-_COLOURS = {"vision": "green", "gps_only": "yellow", "rejected": "red"}
+_COLOURS = {"vision": "green", "gps-only": "yellow", "rejected": "red"}
 _MOST_REASONS = 6
 
 
