@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import onnx
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Anything, Floats, ImageRGB
@@ -55,14 +55,20 @@ def export_onnx(model: FasterRCNN, info: dict[str, Any], *, regions: int | None 
     if regions is not None and regions < 1:
         raise SettingsError(f"a head looks at one region or more, not {regions}")
     own = _reaching(deepcopy(model).eval().cpu(), regions or model.reach.regions)
-    for weight in own.parameters():
+    full = {"stride": model.stride, "least_score": model.reach.least_score, "regions": own.reach.regions, **info}
+    return onnx_from_module(own, full)
+
+
+def onnx_from_module(model: nn.Module, info: dict[str, Any]) -> bytes:
+    """A module that takes a picture and gives boxes, scores and labels, as the bytes of an ONNX file."""
+    for weight in model.parameters():
         weight.data = weight.data.contiguous()
     picture = torch.randint(0, 255, (1, 3, *_TRACED_PX), dtype=torch.uint8)
     buffer = io.BytesIO()
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            own, (picture,), buffer, dynamo=False,  # type: ignore[arg-type]
+            model, (picture,), buffer, dynamo=False,  # type: ignore[arg-type]
             opset_version=OPSET, input_names=["image"],
             output_names=["boxes", "scores", "labels"],
             dynamic_axes={
@@ -73,12 +79,8 @@ def export_onnx(model: FasterRCNN, info: dict[str, Any], *, regions: int | None 
     graph = onnx.load_model_from_string(buffer.getvalue())
     for output in graph.graph.output:  # rows vary, whatever the traced picture had
         output.type.tensor_type.shape.dim[0].dim_param = "count"
-    full = {
-        "format": 1, "stride": model.stride, "least_score": model.reach.least_score, "regions": own.reach.regions,
-        **info,
-    }
     entry = graph.metadata_props.add()
-    entry.key, entry.value = "sorvolo", json.dumps(full)
+    entry.key, entry.value = "sorvolo", json.dumps({"format": 1, **info})
     onnx.checker.check_model(graph)
     return graph.SerializeToString()
 
