@@ -46,7 +46,8 @@ class NanoDetBackbone(nn.Module):
 
     def forward(self, images: Tensor) -> list[Tensor]:
         """Pictures (N, 3, H, W), sides multiples of 32, to features (N, C, H / stride, W / stride), fine first."""
-        x = functional.leaky_relu(self.stem((images.float() - self.get_buffer("mean")) / self.get_buffer("std")), _SLOPE)
+        scaled = (images.float() - self.get_buffer("mean")) / self.get_buffer("std")
+        x = functional.leaky_relu(self.stem(scaled), _SLOPE)
         x = functional.max_pool2d(x, 3, 2, 1)
         levels = []
         for stage in self.stages:
