@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 
 from provenance import commit, machine, note_scoring
-from sorvolo.change.compared_ground import ComparedGround, compared_ground
+from sorvolo.change.metrics import ComparedGround, compared_ground
 from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.polygons import points_inside
 from sorvolo.missions.compare.flights import compare_flights

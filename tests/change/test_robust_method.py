@@ -12,7 +12,7 @@ from sorvolo.change.pair.flight_tuning import FlightTuning
 from sorvolo.change.pair.region_score import Trees, how_sure
 from sorvolo.change.pair.regions import FEATURES
 from sorvolo.change.pair.residual_alignment import settle
-from sorvolo.change.pair.robust import RobustSettings, compare_robust
+from sorvolo.change.pair.robust import RobustSettings, compare_robust, examine
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.kernels import reference_robust
 
@@ -34,6 +34,20 @@ def test_a_box_that_came_is_found_where_it_is(ground: np.ndarray) -> None:
     assert result.boxes.shape == (1, 4) and np.abs(result.boxes[0] - [200, 150, 44, 28]).max() <= 4
     assert result.scores[0] > 0.8
     assert set(np.unique(result.mask)) == {0, 255}
+
+
+def test_no_result_is_written_over_by_the_next_pair(ground: np.ndarray) -> None:
+    first, second = (camera(ground, 1), camera(with_box(ground), 2)), (camera(with_box(ground), 3), camera(ground, 4))
+    examined, compared = examine(*first, None, RobustSettings()), compare_robust(*first)
+    arrays = [
+        examined.views.before, examined.views.after, examined.views.lit, examined.regions.strength,
+        examined.regions.weak, examined.regions.labels,
+        examined.light.gains, compared.mask, compared.light.gains, compared.light.cells.trust,
+    ]
+    kept = [each.copy() for each in arrays]
+    examine(*second, None, RobustSettings())
+    compare_robust(*second)
+    assert all(np.array_equal(a, b) for a, b in zip(arrays, kept, strict=True))
 
 
 def test_a_box_that_went_is_found_where_it_was(ground: np.ndarray) -> None:

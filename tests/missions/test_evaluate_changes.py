@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sorvolo.change.compared_ground import compared_ground
+from sorvolo.change.metrics import compared_ground
 from sorvolo.cli.evaluate import evaluate_app
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.evaluate.changes import evaluate_changes

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from sorvolo.geometry.arrays import (
     Vector3,
     frozen,
 )
+from sorvolo.geometry.homography import apply_homography
 
 
 class ViewStatus(StrEnum):
@@ -76,6 +78,15 @@ class ComparedView:
             raise GeometryError(f"view {self.name}: image, reference, valid and changed differ in size")
         if len(self.boxes) != len(self.scores):
             raise GeometryError(f"view {self.name}: {len(self.boxes)} boxes but {len(self.scores)} scores")
+
+    @cached_property
+    def m_per_px(self) -> float:
+        """Ground metres of a pixel in the middle of the view's picture."""
+        height, width = self.changed.shape
+        middle = np.array([[width / 2, height / 2], [width / 2 + 1, height / 2], [width / 2, height / 2 + 1]])
+        a, b, c = apply_homography(self.site_from_image, middle)
+        across = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        return float(np.sqrt(abs(across))) or 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.evidence.cells import CellWindow, scale_m_per_px
+from sorvolo.change.evidence.cells import CellWindow
 from sorvolo.change.shape.kinds import kind_of
 from sorvolo.change.shape.outlines import measures, outline_of
 from sorvolo.change.shape.patches import Cut, PatchWindow, cut, moved, patch_of
@@ -73,7 +73,7 @@ class GatheredChange:
         if place_m is not None and len(self._places) < 64:
             self._places.append(place_m)
         if view is not None:
-            self._residual_m_sum += view.residual_px * scale_m_per_px(view) if np.isfinite(view.residual_px) else 0.0
+            self._residual_m_sum += view.residual_px * view.m_per_px if np.isfinite(view.residual_px) else 0.0
 
     def from_camera(self, camera_m: Floats) -> None:
         """The camera's place (3,) in a view that flagged it."""

@@ -130,7 +130,7 @@ def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask) -> LaidVie
     cell is flagged where most of it is changed, and seen where the map and the frame know all of it.
     """
     height, width = view.changed.shape
-    m_per_px = scale_m_per_px(view)
+    m_per_px = view.m_per_px
     shrink = int(np.clip(cell_m / m_per_px, 1, min(height, width)))
     rows, columns = height // shrink, width // shrink
 
@@ -178,15 +178,6 @@ def pieces(cells: Mask, gap: int) -> Iterator[tuple[Mask, tuple[slice, slice]]]:
         x, y, w, h = (int(each) for each in stats[label, :4])
         part = (slice(y, y + h), slice(x, x + w))
         yield labels[part] == label, part
-
-
-def scale_m_per_px(view: ComparedView) -> float:
-    """Ground metres of a pixel in the middle of the view's picture."""
-    height, width = view.changed.shape
-    middle = np.array([[width / 2, height / 2], [width / 2 + 1, height / 2], [width / 2, height / 2 + 1]])
-    a, b, c = apply_homography(view.site_from_image, middle)
-    across = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-    return float(np.sqrt(abs(across))) or 1.0
 
 
 def _window_of(view: ComparedView, cell_m: float) -> CellWindow:

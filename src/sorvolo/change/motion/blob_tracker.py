@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.evidence.cells import scale_m_per_px
 from sorvolo.change.motion.blobs import RIM_PX, Blob, blobs_of
 from sorvolo.change.shape.shadows import shadow_of_arrival
 from sorvolo.errors import SettingsError
@@ -318,7 +317,7 @@ def _follow_over_rim(
     """Mark the boxes that are cut by the view's rim, thus no blobs, and lie where an unsteady thing must be by now."""
     if not tracks:
         return
-    m_per_px = scale_m_per_px(view)
+    m_per_px = view.m_per_px
     image_from_site = np.linalg.inv(view.site_from_image)
     for track in tracks:
         ahead_s = (view.time_ns - track.last.time_ns) * 1e-9

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sorvolo.change.evidence.cells import scale_m_per_px
 from sorvolo.change.shape.shadows import shadow_of_arrival, thing_of
 from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.geometry.homography import apply_homography
@@ -33,7 +32,7 @@ class Blob:
 def blobs_of(view: ComparedView) -> list[Blob]:
     """The blobs that lie whole inside the view; one cut by its rim would seem to move with the camera."""
     height, width = view.changed.shape
-    m_per_px = scale_m_per_px(view)
+    m_per_px = view.m_per_px
     blobs = []
     for index in np.argsort(-view.scores, kind="stable")[:_MOST_BOXES]:
         x, y, w, h = (int(each) for each in view.boxes[index])
@@ -76,7 +75,7 @@ def standing_outline_m(view: ComparedView, blob: Blob) -> PointsM | None:
     )
     if not np.isfinite(all_m).all():
         return None
-    outline_m = _foot_m(thing_m, all_m, view.camera_m, scale_m_per_px(view))
+    outline_m = _foot_m(thing_m, all_m, view.camera_m, view.m_per_px)
     if outline_m is None:
         outline_m = np.asarray(cv2.convexHull(thing_m.astype(np.float32)).reshape(-1, 2), np.float64)
     return outline_m if len(outline_m) >= 3 and abs(signed_area(outline_m)) > 0 else None

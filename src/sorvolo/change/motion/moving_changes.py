@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from sorvolo.change.evidence.cells import scale_m_per_px
 from sorvolo.change.motion.blob_tracker import Track
 from sorvolo.change.motion.blobs import standing_outline_m
 from sorvolo.change.shape.outlines import measures
@@ -66,7 +65,7 @@ class Movers:
 
     def _change(self, view: ComparedView, track: Track, change_id: str) -> Change:
         """A moving thing as this view shows it."""
-        m_per_px = scale_m_per_px(view)
+        m_per_px = view.m_per_px
         outline_m = standing_outline_m(view, track.last.blob)
         if outline_m is None:
             outline_m = _square(track.last.blob.place_m, self._cell_m)

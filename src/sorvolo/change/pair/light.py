@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.change.pair.moved_shadows import STEPS, moved_shades
-from sorvolo.change.shape.medians import middle
 from sorvolo.geometry.arrays import Anything, Floats, Mask
 from sorvolo.kernels import detail_products, relight, slopes
 
@@ -95,7 +94,7 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     exponents = slopes(detail_before, detail_after, NO_SLOPE * len(detail_before)).clip(0.5, 2.0)
     offset = after - exponents.astype(np.float32) * before
     kept = _chosen(offset, sure)
-    offsets = np.array([middle(kept[:, channel]) for channel in range(3)])
+    offsets = np.median(kept, axis=0).astype(np.float64)
     shades = _shades(reference, query, exponents, offsets, known)
     if shades is not None:
         offset -= cv2.resize(shades, size, interpolation=cv2.INTER_AREA)

@@ -30,7 +30,7 @@ Window = tuple[slice, slice]
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Two pictures (h, w, 3) uint8 BGR of half size as regions were found in them, until the thread compares others.
+    """Two pictures (h, w, 3) uint8 BGR of half size as regions were found in them.
 
     `before` is in its own light, `lit` is the same in that of `after`. They were compared where `known` (h, w), None
     everywhere, with `settings`.

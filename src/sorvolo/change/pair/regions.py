@@ -35,7 +35,6 @@ FEATURES = (
 )
 
 _LOG = np.clip(np.rint(np.log2((np.arange(256) + 8) / 8) * 50), 0, 255).astype(np.uint8)
-_SCRATCH = Scratch()
 Image = Anything
 """uint8, (h, w) or (h, w, 3)."""
 
@@ -59,7 +58,7 @@ class RegionSettings:
 class Regions:
     """Regions 1 .. N of `labels` (h, w) uint8: `boxes` (N, 4) int32 x, y, w, h and `features` (N, len(FEATURES)).
 
-    `strength` (h, w) uint8 is how much the pictures differ, until the thread compares others; `weak` (h, w) uint8 is
+    `strength` (h, w) uint8 is how much the pictures differ; `weak` (h, w) uint8 is
     255 wherever they differ at all, `noise` the 95 % quantile of small differences.
     Outside of `known` (h, w), None where everything is, nothing is found. `came` (N,) is positive where the query shows
     a thing on the reference's ground, negative where it is the other way round.
@@ -76,15 +75,20 @@ class Regions:
 
 
 def find_regions(
-    reference: Image, query: Image, known: Mask | None, settings: RegionSettings, rest_px: float, unevenness: float
+    reference: Image, query: Image, known: Mask | None, settings: RegionSettings, rest_px: float, unevenness: float,
+    scratch: Scratch | None = None,
 ) -> Regions:
-    """Regions that differ between two pictures (h, w, 3) uint8 BGR in the same light; none where not `known`."""
+    """Regions that differ between two pictures (h, w, 3) uint8 BGR in the same light; none where not `known`.
+
+    The result's `strength` lies in `scratch`, in memory of its own without it.
+    """
+    scratch = scratch or Scratch()
     size = reference.shape[0], reference.shape[1]
     planes = differences(
-        reference, query, known, settings.reach_px, settings.chroma_weight, _SCRATCH.stack("planes", size, 6)
+        reference, query, known, settings.reach_px, settings.chroma_weight, scratch.stack("planes", size, 6)
     )
     difference, chroma, came, went, light_before, light_after = planes
-    spare, specks, smooth, threshold = _SCRATCH.stack("thresholds", size, 4)
+    spare, specks, smooth, threshold = scratch.stack("thresholds", size, 4)
     # a large thing's inside is no clutter: only what is small among the differences raises the thresholds around it
     window = np.ones((SPECK_PX, SPECK_PX), np.uint8)
     cv2.subtract(difference, cv2.morphologyEx(difference, cv2.MORPH_OPEN, window, dst=spare), dst=specks)
@@ -105,11 +109,11 @@ def find_regions(
     if len(boxes) == 0:
         return Regions(labels, boxes, np.zeros((0, len(FEATURES))), smooth, weak, noise, known, np.zeros(0))
     # a shadow takes from all colours alike: red over blue stays
-    colour = tint(reference, query, _LOG, boxes, RING_PX, _SCRATCH.take("tint", size))
+    colour = tint(reference, query, _LOG, boxes, RING_PX, scratch.take("tint", size))
     channels = [difference, chroma, activity, light_before, light_after, came, went, colour]
     frame = np.array([noise, rest_px, unevenness, np.log1p(len(boxes))])
     green = _green(reference, boxes), _green(query, boxes)
-    features = _measured(labels, boxes, channels, green, frame)
+    features = _measured(labels, boxes, channels, green, frame, scratch)
     # along its outline a thing's values are new, while the ground's are still to be seen near
     balance = rim_balance(labels, boxes, came, went).astype(np.float64)
     return Regions(labels, boxes, features, smooth, weak, noise, known, balance)
@@ -117,10 +121,10 @@ def find_regions(
 
 def _measured(
     labels: NDArray[np.uint8], boxes: NDArray[np.int32], channels: list[Image], green: tuple[Floats, Floats],
-    frame: NDArray[np.float64],
+    frame: NDArray[np.float64], scratch: Scratch,
 ) -> Floats:
-    planes = _SCRATCH.stack("measured", (labels.shape[0], labels.shape[1]), 10)
-    searched = _SCRATCH.take("searched", (labels.shape[0], labels.shape[1]), margin_px=MATCH_REACH_PX)
+    planes = scratch.stack("measured", (labels.shape[0], labels.shape[1]), 10)
+    searched = scratch.take("searched", (labels.shape[0], labels.shape[1]), margin_px=MATCH_REACH_PX)
     part, corner = _looked_at(boxes, labels.shape)
     labels, *channels = (np.ascontiguousarray(each[part]) for each in (labels, *channels))
     difference, chroma, activity, light_before, level, came, went, colour = channels

@@ -13,7 +13,7 @@ from sorvolo.change.pair.region_extent import Piece, Views, grown, without_halos
 from sorvolo.change.pair.region_score import how_sure
 from sorvolo.change.pair.regions import FEATURES, Regions, RegionSettings, find_regions
 from sorvolo.change.pair.residual_alignment import Settling, settle
-from sorvolo.change.pair.scratch import Scratch
+from sorvolo.change.pair.scratch import Scratch, scratch_of_thread
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Anything, Boxes, Floats, ImageGray, Mask
 from sorvolo.kernels import looked_up
@@ -30,8 +30,6 @@ RIM_WIDTH_PX = 5  # a thing's outline runs where half of the difference within t
 SLACK, LEAST_SHARE = 5.0, 0.4  # ... of what it was before the ground's own range was taken off, at least this share
 RIM_PX = 4  # around the unknown, in half size pixels: resampling mixes the unknown into it
 
-
-_SCRATCH = Scratch()
 
 
 @dataclass(frozen=True)
@@ -71,9 +69,10 @@ def compare_robust(
     """
     _check(reference, query, valid)
     settings = settings or RobustSettings()
-    examined = examine(reference, query, valid, settings)
+    scratch = scratch_of_thread()
+    examined = examine(reference, query, valid, settings, scratch)
     scores = how_sure(examined.regions.features, FEATURES)
-    return _result(examined, scores, scores >= settings.least_score, query.shape[1::-1])
+    return _result(examined, scores, scores >= settings.least_score, query.shape[1::-1], scratch)
 
 
 class Examined(NamedTuple):
@@ -87,13 +86,16 @@ class Examined(NamedTuple):
 
 
 def examine(
-    reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask | None, settings: RobustSettings
+    reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask | None, settings: RobustSettings,
+    scratch: Scratch | None = None,
 ) -> Examined:
-    """Look at a pair of pictures as `compare_robust` does."""
+    """Look at a pair of pictures as `compare_robust` does. Pictures and strengths of the result lie in `scratch`, in
+    memory of their own without it."""
+    scratch = scratch or Scratch()
     height, width = query.shape[:2]
     half = width // 2, height // 2
     size = half[::-1]
-    before, after, spare = (_SCRATCH.take(name, size, (3,)) for name in ("before", "after", "spare"))
+    before, after, spare = (scratch.take(name, size, (3,)) for name in ("before", "after", "spare"))
     cv2.resize(reference, half, dst=before, interpolation=cv2.INTER_AREA)
     cv2.resize(query, half, dst=after, interpolation=cv2.INTER_AREA)
     known = _half_known(valid, half)
@@ -101,13 +103,13 @@ def examine(
         cv2.copyTo(after, np.logical_not(known).view(np.uint8), before)
     settling = Settling(np.eye(3), 0.0, 0.0)
     if settings.settles:
-        grays = _SCRATCH.stack("grays", size, 2)
+        grays = scratch.stack("grays", size, 2)
         for image, gray in zip((before, after), grays, strict=True):
             cv2.cvtColor(image, cv2.COLOR_BGR2GRAY, dst=gray)
         settling = settle(grays[0], grays[1], known)
     if settling.moved_px > 0:
         # OpenCV resamples four bands in half the time that three take it
-        four, moved = (_SCRATCH.take(name, size, (4,)) for name in ("four", "moved"))
+        four, moved = (scratch.take(name, size, (4,)) for name in ("four", "moved"))
         cv2.cvtColor(before, cv2.COLOR_BGR2BGRA, dst=four)
         cv2.warpPerspective(
             four, settling.reference_from_query, half, dst=moved, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
@@ -118,7 +120,7 @@ def examine(
     rim = None if known is None else _without_rim(known, RIM_PX + int(np.ceil(settling.moved_px)))
     lit = relit(before, light, spare)
     for_pair = _for_pair(settings.regions, settling)
-    regions = find_regions(lit, after, rim, for_pair, settling.rest_px, light.unevenness)
+    regions = find_regions(lit, after, rim, for_pair, settling.rest_px, light.unevenness, scratch)
     share = 1.0 if rim is None else cv2.countNonZero(rim.view(np.uint8)) / rim.size
     return Examined(regions, light, settling, share, Views(before, after, lit, rim, for_pair))
 
@@ -157,7 +159,9 @@ def _without_rim(known: Mask, rim_px: int) -> Mask:
     return np.asarray(cv2.erode(known.astype(np.uint8), window, borderValue=1) > 0)
 
 
-def _result(examined: Examined, scores: Floats, sure: Mask, size: tuple[int, int]) -> RobustResult:
+def _result(
+    examined: Examined, scores: Floats, sure: Mask, size: tuple[int, int], scratch: Scratch
+) -> RobustResult:
     """The answer at full `size` (w, h): the `sure` (N,) among the regions."""
     regions, light, settling, known, views = examined
     if not sure.any():
@@ -176,13 +180,14 @@ def _result(examined: Examined, scores: Floats, sure: Mask, size: tuple[int, int
     half = regions.labels.shape[::-1]
     boxes_px = np.array([_around(box, pieces.get(each)) for each, box in enumerate(regions.boxes)], np.float64)
     if settling.moved_px < SAME_PLACE_PX or not (sure & went).any():
-        half_mask = _filled(sure, regions, pieces, parts, count)
+        half_mask = _filled(sure, regions, pieces, parts, count, scratch)
     else:  # what disappeared is seen in the reference: it keeps the reference's pixels
-        gone: Anything = _filled(sure & went, regions, pieces, parts, count)
+        gone: Anything = _filled(sure & went, regions, pieces, parts, count, scratch)
         gone = cv2.warpPerspective(gone, settling.reference_from_query, half, flags=cv2.INTER_LINEAR)
         stays = sure & ~went
-        half_mask = _filled(stays, regions, pieces, parts, count) if stays.any() else np.zeros(half[::-1], np.uint8)
-        half_mask = np.asarray(cv2.max(half_mask, gone), np.uint8)
+        half_mask = np.asarray(gone, np.uint8)
+        if stays.any():
+            half_mask = np.asarray(cv2.max(_filled(stays, regions, pieces, parts, count, scratch), gone), np.uint8)
         middle = boxes_px[:, :2] + boxes_px[:, 2:] / 2
         moved = np.column_stack([middle, np.ones(len(middle))]) @ settling.reference_from_query.T
         boxes_px[went, :2] += (moved[:, :2] / moved[:, 2:] - middle)[went]
@@ -228,7 +233,8 @@ def _went(regions: Regions, parts: Anything) -> Mask:
 
 
 def _filled(
-    chosen: Mask, regions: Regions, pieces: Mapping[int, Piece], parts: Anything, count: int
+    chosen: Mask, regions: Regions, pieces: Mapping[int, Piece], parts: Anything, count: int,
+    scratch: Scratch,
 ) -> ImageGray:
     """The things of the `chosen` (N,) regions: their `pieces`, and where there is none the region with what weakly
     differs around its core, less a rim of blur; without gaps.
@@ -238,7 +244,7 @@ def _filled(
     passes 127.
     """
     size = regions.labels.shape[0], regions.labels.shape[1]
-    cores, around, whole = _SCRATCH.stack("filled", size, 3)
+    cores, around, whole = scratch.stack("filled", size, 3)
     alone = np.array([bool(is_chosen) and each not in pieces for each, is_chosen in enumerate(chosen)], bool)
     if alone.any():
         shown = np.zeros(256, np.uint8)

@@ -9,10 +9,11 @@ from sorvolo.geometry.arrays import Anything
 MOST_KEPT_PX = 1 << 20  # of a picture: what is larger is given back
 
 
-class Scratch(threading.local):
-    """Arrays by name, for one size of pictures at a time; each thread has its own.
+class Scratch:
+    """Arrays by name, for one size of pictures at a time. Only `take` and `stack` change it.
 
-    What is in them lasts until the same name is asked for again: nothing that is handed out may live in one.
+    An array lasts until its name is asked for again. So whoever makes a `Scratch` owns what is in it: a result that
+    outlives the comparison must hold arrays of its own, or come from a `Scratch` that nobody uses again.
     """
 
     def __init__(self) -> None:
@@ -39,3 +40,16 @@ class Scratch(threading.local):
         if key not in self._kept:
             self._kept[key] = np.empty(shape, np.uint8)
         return self._kept[key]
+
+
+class _OfThread(threading.local):
+    def __init__(self) -> None:
+        self.scratch = Scratch()
+
+
+_OF_THREAD = _OfThread()
+
+
+def scratch_of_thread() -> Scratch:
+    """The one `Scratch` of this thread, for a function that returns nothing out of it."""
+    return _OF_THREAD.scratch

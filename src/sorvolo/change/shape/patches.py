@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.evidence.cells import scale_m_per_px
 from sorvolo.change.shape.outlines import mask_of
 from sorvolo.geometry.arrays import ImageRGB, ImageRGBA, Matrix3, PointsM
 from sorvolo.survey.findings import ComparedView, Patch
@@ -74,7 +73,7 @@ class Cut:
 
 def cut(view: ComparedView, window: PatchWindow) -> Cut:
     """The view's pictures of both dates, resampled to a window of the ground."""
-    shrink = max(1, int(window.m_per_px / scale_m_per_px(view)))
+    shrink = max(1, int(window.m_per_px / view.m_per_px))
     patch_from_image = np.linalg.inv(window.site_from_patch) @ view.site_from_image
     valid = view.valid.view(np.uint8) * np.uint8(255)
     before, after = view.reference, view.image

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.shape.kinds import kind_of, unlike_ground
-from sorvolo.change.shape.medians import median_ratio
+from sorvolo.change.shape.kinds import kind_of, median_ratio, unlike_ground
 from sorvolo.change.shape.outlines import measures, outline_of
 from sorvolo.geometry.arrays import Anything, ImageRGB, Mask
 from sorvolo.survey.findings import Change, ChangeKind, Patch

@@ -13,7 +13,6 @@ from typing import Any, Self
 import cv2
 import numpy as np
 
-from sorvolo.change.evidence.cells import scale_m_per_px
 from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
 from sorvolo.change.map_update import is_painted, patched
 from sorvolo.change.pair.thesis import thesis_steps
@@ -233,7 +232,7 @@ class CompareRun:
         How coarse they are, the first view says, or the telemetry's heights, whichever says less: either may be wrong.
         """
         settings, map_m_per_px = self._settings, self._archive.site_grid().grid.m_per_px
-        views_m_per_px = float(np.fmin(self._views.m_per_px, scale_m_per_px(first)))
+        views_m_per_px = float(np.fmin(self._views.m_per_px, first.m_per_px))
         return EvidenceMap(
             views_m_per_px if views_m_per_px > _COARSER * map_m_per_px else map_m_per_px,
             EvidenceSettings(k=settings.votes, n=settings.voters), self._setup.source.name,

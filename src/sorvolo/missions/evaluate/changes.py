@@ -9,14 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from sorvolo.change.compared_ground import ComparedGround, compared_ground
 from sorvolo.change.metrics import (
+    ComparedGround,
     Counts,
     EventMatch,
     EventScores,
     EventSettings,
     FoundEvent,
     TrueEvent,
+    compared_ground,
     match_events,
     score_events,
 )
