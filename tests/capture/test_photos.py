@@ -17,11 +17,14 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import GPS, IFD, Base
 from PIL.TiffImagePlugin import IFDRational
 
+from real_data import real_data
 from sorvolo.capture.decoding import decode_photo
 from sorvolo.capture.photo_metadata import read_photo_metadata
 from sorvolo.capture.photos import PhotoSource, read_album
 from sorvolo.capture.source import open_sources
+from sorvolo.capture.sync import tie_clocks, track_from_telemetry
 from sorvolo.errors import InputError
+from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.pose import site_from_body_nadir_rotation, site_from_gimbal_rotation
 from sorvolo.survey.flight import Frame, LostFrame
 
@@ -174,6 +177,121 @@ def test_an_rtk_height_is_ellipsoidal(tmp_path: Path) -> None:
     columns = read_photo_metadata(write_photo(tmp_path / "a.jpg", xmp=xmp)).columns
     assert columns["ellipsoidal_height_m"] == 198.5 and "orthometric_height_m" not in columns
     assert columns["horizontal_sigma_m"] == pytest.approx(0.03) and columns["vertical_sigma_m"] == 0.05
+
+
+XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description rdf:about="" xmlns:{prefix}="{address}">{body}</rdf:Description></rdf:RDF></x:xmpmeta>"""
+
+
+def xmp_of(prefix: str, address: str, values: dict[str, str]) -> str:
+    body = "".join(f"<{prefix}:{name}>{text}</{prefix}:{name}>" for name, text in values.items())
+    return XMP.format(prefix=prefix, address=address, body=body)
+
+
+def test_sensefly_photos_state_three_heights_and_the_bodys_attitude(tmp_path: Path) -> None:
+    xmp = xmp_of("sensefly", "http://ns.sensefly.com/sensefly/1.0/", {
+        "AltitudeAMSL": "313.379", "AltitudeWGS84": "277.870", "Course": "0.0", "GroundSpeed": "6.7",
+        "Heading": "43.89", "Height": "65.5", "PitchAngle": "2.86", "RollAngle": "-3.84",
+        "UTCTime": "2013-06-04T17:50:31",
+    })
+    metadata = read_photo_metadata(write_photo(
+        tmp_path / "a.jpg", (41.0, -83.3, 277.87), local="2013:06:04 13:49:57", xmp=xmp,
+        gps_extra={GPS.GPSTrack: IFDRational(4389, 100)},
+    ))
+    found = metadata.columns
+    assert found["ellipsoidal_height_m"] == 277.87 and found["orthometric_height_m"] == 313.379
+    assert found["height_above_takeoff_m"] == 65.5 and found["speed_m_s"] == 6.7
+    assert [found[f"body_{axis}_deg"] for axis in ("yaw", "pitch", "roll")] == [43.89, 2.86, -3.84]
+    assert "course_deg" not in found and "camera_yaw_deg" not in found
+    assert metadata.utc_ns == 1_370_368_231 * 10**9
+
+
+@pytest.mark.parametrize("form", ["resource", "attributes"])
+def test_skydio_photos_state_the_cameras_attitude_as_a_structure(tmp_path: Path, form: str) -> None:
+    angles = {"Roll": "0.5", "Pitch": "-89.5", "Yaw": "120.25"}
+    structures = ""
+    for name, shift in (("CameraOrientationFLU", 7.0), ("CameraOrientationNED", 0.0), ("VehicleOrientationNED", 3.0)):
+        moved = {axis: str(float(text) + shift) for axis, text in angles.items()}
+        inside = "".join(f"<drone-skydio:{axis}>{text}</drone-skydio:{axis}>" for axis, text in moved.items())
+        attributes = " ".join(f'drone-skydio:{axis}="{text}"' for axis, text in moved.items())
+        structures += (
+            f'<drone-skydio:{name} rdf:parseType="Resource">{inside}</drone-skydio:{name}>' if form == "resource"
+            else f"<drone-skydio:{name} {attributes}/>"
+        )
+    body = "<drone-skydio:AbsoluteAltitude>310.5</drone-skydio:AbsoluteAltitude>" + structures
+    body += "<drone-skydio:RelativeAltitude>42.25</drone-skydio:RelativeAltitude>"
+    xmp = XMP.format(prefix="drone-skydio", address="https://www.skydio.com/drone-skydio/1.0/", body=body)
+    found = read_photo_metadata(write_photo(tmp_path / "a.jpg", (46.5, 11.2, 355.0), xmp=xmp)).columns
+    assert [found[f"camera_{axis}_deg"] for axis in ("yaw", "pitch", "roll")] == [120.25, -89.5, 0.5]
+    assert [found[f"body_{axis}_deg"] for axis in ("yaw", "pitch", "roll")] == [123.25, -86.5, 3.5]
+    assert found["height_above_takeoff_m"] == 42.25 and found["orthometric_height_m"] == 310.5
+
+
+@pytest.mark.parametrize(("flag", "column"), [("50", "ellipsoidal_height_m"), ("16", "orthometric_height_m")])
+def test_autel_photos_by_their_rtk_flag(tmp_path: Path, flag: str, column: str) -> None:
+    xmp = xmp_of("drone", "http://www.example.org/1.0/", {
+        "AbsoluteAltitude": "250.0", "RelativeAltitude": "60.0", "GimbalYawDegree": "10", "GimbalPitchDegree": "-90",
+        "GimbalRollDegree": "0", "FlightYawDegree": "12", "RtkFlag": flag,
+    })
+    found = read_photo_metadata(write_photo(tmp_path / "a.jpg", (46.5, 11.2, 250.0), xmp=xmp)).columns
+    assert found[column] == 250.0 and found["height_above_takeoff_m"] == 60.0
+    assert found["camera_pitch_deg"] == -90 and found["body_yaw_deg"] == 12
+    assert len({"ellipsoidal_height_m", "orthometric_height_m"} & set(found)) == 1
+
+
+def test_parrot_photos_state_angles_and_the_height_above_takeoff(tmp_path: Path) -> None:
+    body = "".join(
+        f"<drone-parrot:{name}>{text}</drone-parrot:{name}>" for name, text in {
+            "CameraYawDegree": "80", "CameraPitchDegree": "-88", "CameraRollDegree": "1", "DroneYawDegree": "81",
+            "DronePitchDegree": "4", "DroneRollDegree": "-2",
+        }.items()
+    ) + ('<Camera:AboveGroundAltitude xmlns:Camera="http://pix4d.com/camera/1.0/">33.5</Camera:AboveGroundAltitude>'
+         '<Camera:VertCS xmlns:Camera="http://pix4d.com/camera/1.0/">ellipsoidal</Camera:VertCS>')
+    xmp = XMP.format(prefix="drone-parrot", address="http://www.parrot.com/drone-parrot/1.0/", body=body)
+    found = read_photo_metadata(write_photo(tmp_path / "a.jpg", (46.5, 11.2, 250.0), xmp=xmp)).columns
+    assert [found[f"camera_{axis}_deg"] for axis in ("yaw", "pitch", "roll")] == [80, -88, 1]
+    assert [found[f"body_{axis}_deg"] for axis in ("yaw", "pitch", "roll")] == [81, 4, -2]
+    assert found["height_above_takeoff_m"] == 33.5 and found["ellipsoidal_height_m"] == 250.0
+
+
+def test_stated_errors_become_the_priors_own(tmp_path: Path) -> None:
+    body = "".join(f"<Camera:{name}>{text}</Camera:{name}>" for name, text in {
+        "Yaw": "30", "Pitch": "1", "Roll": "2", "IMUYawAccuracy": "1.5", "IMUPitchAccuracy": "0.4",
+        "IMURollAccuracy": "0.4", "GPSXYAccuracy": "0.04", "GPSZAccuracy": "0.06",
+    }.items())
+    xmp = XMP.format(prefix="Camera", address="http://pix4d.com/camera/1.0", body=body)
+    write_photo(tmp_path / "a.jpg", xmp=xmp, utc="2021:06:01 10:00:00")
+    source = open_photos(tmp_path / "a.jpg")
+    clock = tie_clocks(
+        source.telemetry, kind="photos", start_ns=source.start_ns, duration_s=0, offset_given=False, strict=False
+    )
+    frame = LocalFrame(Geodetic(46.5, -92.25))
+    prior = track_from_telemetry(source.telemetry, clock, frame)[0].prior(0.0)
+    assert prior.attitude_sigma_deg == pytest.approx([0.4, 0.4, 1.5])
+    assert prior.position_sigma_m == pytest.approx([0.04, 0.04, 0.06])
+
+
+@pytest.mark.parametrize(("tags", "sigma_m"), [
+    ({GPS.GPSDOP: IFDRational(12, 10)}, 1.8), ({GPS.GPSHPositioningError: IFDRational(7, 10)}, 0.7), ({}, None),
+])
+def test_exif_states_the_positions_error(tmp_path: Path, tags: dict[int, object], sigma_m: float | None) -> None:
+    found = read_photo_metadata(write_photo(tmp_path / "a.jpg", gps_extra=tags)).columns
+    assert found.get("horizontal_sigma_m") == (None if sigma_m is None else pytest.approx(sigma_m))
+
+
+def test_a_void_fix_is_no_place(tmp_path: Path) -> None:
+    found = read_photo_metadata(write_photo(tmp_path / "a.jpg", gps_extra={GPS.GPSStatus: "V"})).columns
+    assert "latitude_deg" not in found
+
+
+def test_a_real_fixed_wing_flight_states_heights_and_attitude() -> None:
+    source = open_photos(real_data("flights/fixed_wing"))
+    telemetry = source.telemetry
+    ground_m = telemetry["orthometric_height_m"] - telemetry["height_above_takeoff_m"]
+    assert np.ptp(ground_m) < 0.5 and np.isfinite(telemetry["body_roll_deg"]).all()
+    # the geoid lies 33 to 36 m below the ellipsoid there
+    assert np.median(telemetry["ellipsoidal_height_m"] - telemetry["orthometric_height_m"]) == pytest.approx(-35, abs=2)
+    assert source.start_origin == "UTC in the photos' EXIF"
 
 
 @pytest.mark.parametrize("angles", [(30.0, 5.0, -8.0), (200.0, 0.0, 0.0), (10.0, 60.0, 20.0)])

@@ -5,13 +5,14 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from math import atan2, degrees, hypot, isfinite, nan
+from math import isfinite, nan
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from defusedxml import ElementTree
 from PIL import ExifTags, Image
 
+from sorvolo.capture import photo_xmp
 from sorvolo.capture.decoding import (
     BROKEN_PICTURE,
     check_size,
@@ -22,8 +23,8 @@ from sorvolo.capture.decoding import (
     reduced_size_px,
     reduction_of,
 )
+from sorvolo.capture.telemetry.quality import sigma_from_hdop_m
 from sorvolo.errors import InputError
-from sorvolo.geometry.pose import gimbal_angles_from_rotation, site_from_body_nadir_rotation
 
 _Tags: TypeAlias = Mapping[int, Any]
 _XMP_TAG = 700
@@ -87,7 +88,7 @@ def read_photo_metadata(path: Path) -> PhotoMetadata:
     properties: dict[str, str] = {}
     if header.xmp:
         try:
-            properties = _xmp_properties(header.xmp)
+            properties = photo_xmp.read_properties(header.xmp)
         except (ElementTree.ParseError, ValueError, RecursionError):
             unreadable = (*unreadable, "XMP")
     main, detail, gps = header.tags
@@ -232,7 +233,8 @@ def _camera_clock_ns(main: _Tags, detail: _Tags) -> int:
 
 def _utc_ns(main: _Tags, detail: _Tags, gps: _Tags, properties: Mapping[str, str]) -> int:
     """UTC of the exposure: the drone's stamp, else the GPS receiver's, else a clock with its zone; else 0."""
-    written = properties.get("dji:UTCAtExposure", "").replace("-", ":").replace("T", " ").rstrip("Z")
+    written = properties.get("dji:UTCAtExposure", properties.get("sensefly:UTCTime", ""))
+    written = written.replace("-", ":").replace("T", " ").rstrip("Z")
     if time_ns := _parse_ns(written if "." in written else f"{written}.0", "%Y:%m:%d %H:%M:%S.%f"):
         return time_ns
     day_ns = _parse_ns(_text(gps.get(ExifTags.GPS.GPSDateStamp)).replace("-", ":"), "%Y:%m:%d")
@@ -255,20 +257,29 @@ def _telemetry_columns(gps: _Tags, properties: Mapping[str, str]) -> dict[str, f
     columns = {
         "latitude_deg": _degrees(gps.get(ExifTags.GPS.GPSLatitude), gps.get(ExifTags.GPS.GPSLatitudeRef)),
         "longitude_deg": _degrees(gps.get(ExifTags.GPS.GPSLongitude), gps.get(ExifTags.GPS.GPSLongitudeRef)),
-        "horizontal_sigma_m": _positive(gps.get(ExifTags.GPS.GPSHPositioningError)),
+        "horizontal_sigma_m": _horizontal_sigma_m(gps),
         "course_deg": _number(gps.get(ExifTags.GPS.GPSTrack)),
         "speed_m_s": _number(gps.get(ExifTags.GPS.GPSSpeed))
         * _M_S_PER_SPEED_UNIT.get(_text(gps.get(ExifTags.GPS.GPSSpeedRef)) or "K", nan),
-        **_height_columns(gps, properties),
     }
-    columns |= {name: value for name, value in _xmp_columns(properties).items() if isfinite(value)}
+    altitude_m, is_ellipsoidal = _altitude(gps)
+    columns |= photo_xmp.height_columns(properties, altitude_m, exif_is_ellipsoidal=is_ellipsoidal)
+    columns |= {name: value for name, value in photo_xmp.telemetry_columns(properties).items() if isfinite(value)}
+    if "sensefly:Heading" in properties:
+        columns["course_deg"] = nan  # its GPSTrack repeats the heading, from which wind turns the course
+    if _text(gps.get(ExifTags.GPS.GPSStatus)) == "V":
+        columns["latitude_deg"] = nan
     if not (isfinite(columns["latitude_deg"]) and isfinite(columns["longitude_deg"])):
-        columns["latitude_deg"] = _xmp_number(properties, "dji:GpsLatitude")
-        # DJI's firmware spells it "GpsLongtitude" as often as not
-        columns["longitude_deg"] = _first_number(properties, "dji:GpsLongitude", "dji:GpsLongtitude")
+        columns |= photo_xmp.place_columns(properties)
     if not (abs(columns["latitude_deg"]) <= 90 and abs(columns["longitude_deg"]) <= 180):
         columns["latitude_deg"] = columns["longitude_deg"] = nan
     return {name: value for name, value in columns.items() if isfinite(value)}
+
+
+def _horizontal_sigma_m(gps: _Tags) -> float:
+    """The receiver's own estimate, else one from its dilution of precision."""
+    stated_m = _positive(gps.get(ExifTags.GPS.GPSHPositioningError))
+    return stated_m if isfinite(stated_m) else sigma_from_hdop_m(_positive(gps.get(ExifTags.GPS.GPSDOP)))
 
 
 def _degrees(parts: Any, reference: Any) -> float:
@@ -280,90 +291,16 @@ def _degrees(parts: Any, reference: Any) -> float:
     return -angle_deg if _text(reference).upper() in ("S", "W") else angle_deg
 
 
-def _height_columns(gps: _Tags, properties: Mapping[str, str]) -> dict[str, float]:
-    """EXIF's altitude by its reference: 0 above, 1 below the sea; 2 above, 3 below the ellipsoid (EXIF 3.0).
+def _altitude(gps: _Tags) -> tuple[float, bool]:
+    """EXIF's altitude, and whether its reference is the ellipsoid.
 
-    DJI's RTK drones write ellipsoidal heights there and say so in XMP only.
+    References: 0 above, 1 below the sea; 2 above, 3 below the ellipsoid (EXIF 3.0).
     """
     altitude_m = _number(gps.get(ExifTags.GPS.GPSAltitude))
-    if not isfinite(altitude_m):
-        altitude_m = _xmp_number(properties, "dji:AbsoluteAltitude")
     reference = gps.get(ExifTags.GPS.GPSAltitudeRef, 0)
     if isinstance(reference, (bytes, str)):
         reference = reference[0] if reference else 0
         reference = ord(reference) if isinstance(reference, str) else reference
     code = int(_number(reference)) if isfinite(_number(reference)) else 0
     code = code - ord("0") if code >= ord("0") else code
-    if code in (1, 3):
-        altitude_m = -abs(altitude_m)
-    is_ellipsoidal = code in (2, 3) or properties.get("dji:AltitudeType", "").lower() == "rtkalt"
-    return {"ellipsoidal_height_m" if is_ellipsoidal else "orthometric_height_m": altitude_m}
-
-
-def _xmp_properties(xmp: bytes) -> dict[str, str]:
-    """Every DJI, Parrot and Pix4D ("Camera:") property of an XMP packet, attribute or element, by short name.
-
-    Raises ValueError or ParseError for damaged XML, and for entities, which no camera writes.
-    """
-    properties: dict[str, str] = {}
-    for element in ElementTree.fromstring(xmp.strip(b"\0 \r\n\t")).iter():
-        content = " ".join("".join(element.itertext()).split())
-        for qualified, value in [*element.attrib.items(), (element.tag, content)]:
-            space, _, name = str(qualified).lstrip("{").rpartition("}")
-            for marker, prefix in (("drone-dji", "dji"), ("dji.com", "dji"), ("parrot.com/drone", "parrot"),
-                                   ("pix4d.com/camera", "camera")):
-                if marker in space and value:
-                    properties.setdefault(f"{prefix}:{name}", str(value))
-    return properties
-
-
-def _xmp_columns(properties: Mapping[str, str]) -> dict[str, float]:
-    north_m_s = _xmp_number(properties, "dji:FlightXSpeed")
-    east_m_s = _xmp_number(properties, "dji:FlightYSpeed")
-    columns = {
-        "height_above_takeoff_m": _xmp_number(properties, "dji:RelativeAltitude"),
-        "camera_yaw_deg": _first_number(properties, "dji:GimbalYawDegree", "parrot:CameraYawDegree"),
-        "camera_pitch_deg": _first_number(properties, "dji:GimbalPitchDegree", "parrot:CameraPitchDegree"),
-        "camera_roll_deg": _first_number(properties, "dji:GimbalRollDegree", "parrot:CameraRollDegree"),
-        "body_yaw_deg": _first_number(properties, "dji:FlightYawDegree", "parrot:DroneYawDegree"),
-        "body_pitch_deg": _first_number(properties, "dji:FlightPitchDegree", "parrot:DronePitchDegree"),
-        "body_roll_deg": _first_number(properties, "dji:FlightRollDegree", "parrot:DroneRollDegree"),
-        "speed_m_s": hypot(north_m_s, east_m_s),
-        "course_deg": degrees(atan2(east_m_s, north_m_s)) % 360 if north_m_s or east_m_s else nan,
-        "horizontal_sigma_m": _xmp_number(properties, "camera:GPSXYAccuracy"),
-        "vertical_sigma_m": _xmp_number(properties, "camera:GPSZAccuracy"),
-    }
-    rtk_east_m = _xmp_number(properties, "dji:RtkStdLon")
-    rtk_north_m = _xmp_number(properties, "dji:RtkStdLat")
-    if isfinite(rtk_east_m) and isfinite(rtk_north_m):
-        columns["horizontal_sigma_m"] = hypot(rtk_east_m, rtk_north_m) / 2**0.5
-        columns["vertical_sigma_m"] = _xmp_number(properties, "dji:RtkStdHgt")
-    for name in ("horizontal_sigma_m", "vertical_sigma_m"):
-        columns[name] = columns[name] if columns[name] > 0 else nan
-    if not isfinite(columns["camera_pitch_deg"]):
-        columns |= _pix4d_angles(properties)
-    return columns
-
-
-def _pix4d_angles(properties: Mapping[str, str]) -> dict[str, float]:
-    """senseFly's and Pix4D's Camera:Yaw, Pitch, Roll, which are 0 when looking down, as a gimbal's angles."""
-    yaw_deg, pitch_deg = _xmp_number(properties, "camera:Yaw"), _xmp_number(properties, "camera:Pitch")
-    roll_deg = _xmp_number(properties, "camera:Roll")
-    if not (isfinite(yaw_deg) and isfinite(pitch_deg) and isfinite(roll_deg)):
-        return {}
-    angles = gimbal_angles_from_rotation(site_from_body_nadir_rotation(yaw_deg, pitch_deg, roll_deg))
-    return dict(zip(("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg"), angles))
-
-
-def _first_number(properties: Mapping[str, str], *names: str) -> float:
-    return next((value for name in names if isfinite(value := _xmp_number(properties, name))), nan)
-
-
-def _xmp_number(properties: Mapping[str, str], name: str) -> float:
-    """The number of texts such as "+39.80" or "3980/100"; NaN otherwise."""
-    numerator, slash, denominator = properties.get(name, "").strip().partition("/")
-    number = _number(numerator)
-    if not slash:
-        return number
-    divisor = _number(denominator)
-    return number / divisor if divisor else nan
+    return -abs(altitude_m) if code in (1, 3) else altitude_m, code in (2, 3)

@@ -111,6 +111,7 @@ class Track:
     pitch_deg: Floats
     roll_deg: Floats
     attitude: str  # "gimbal" | "body" | "none"
+    stated_sigma_deg: tuple[float, float]  # of tilt and heading, NaN where the source states none
     interval_s: float
     longest_gap_s: float = field(default=3.0)
 
@@ -180,15 +181,23 @@ class Track:
                 for column in (self.yaw_deg, self.pitch_deg, self.roll_deg)
             )
             if self.attitude == "gimbal":
-                return site_from_gimbal_rotation(yaw, pitch, roll), np.array([2.0, 2.0, 4.0]), "gimbal attitude"
+                return site_from_gimbal_rotation(yaw, pitch, roll), self._sigma_deg(2.0, 4.0), "gimbal attitude"
             words = "body attitude, camera taken as fixed straight down"
-            return site_from_body_nadir_rotation(yaw, pitch, roll), np.array([5.0, 5.0, 8.0]), words
+            return site_from_body_nadir_rotation(yaw, pitch, roll), self._sigma_deg(5.0, 8.0), words
         course_deg = 0.0
         words = "no attitude: camera taken as looking down"
         if np.isfinite(velocity_m_s[:2]).all() and np.hypot(*velocity_m_s[:2]) > 0.5:
             course_deg = float(np.degrees(np.arctan2(velocity_m_s[0], velocity_m_s[1])))
             words += ", image top taken as the course"
         return site_from_gimbal_rotation(course_deg, -90.0, 0.0), np.array([12.0, 12.0, np.inf]), words
+
+    def _sigma_deg(self, usual_tilt: float, usual_heading: float) -> Vector3:
+        """Sigmas about the camera's x, y, z axes: as stated, else what such sources usually reach."""
+        tilt, heading = (
+            max(stated, 0.1) if np.isfinite(stated) else usual
+            for stated, usual in zip(self.stated_sigma_deg, (usual_tilt, usual_heading))
+        )
+        return np.array([tilt, tilt, heading])
 
 
 def track_from_telemetry(
@@ -220,7 +229,7 @@ def track_from_telemetry(
         interval_s = 0.0
     track = Track(
         clock.sample_s, east_north, up_m, sigma, vertical_sigma_m, offset_sigma_m, words, *angles, attitude,
-        interval_s, gap_s,
+        (_median_of(telemetry["tilt_sigma_deg"]), _median_of(telemetry["heading_sigma_deg"])), interval_s, gap_s,
     )
     return track, notices
 
@@ -347,6 +356,11 @@ def _heights(
         return filled - typical + 40.0, f"{words}, ground found from the pictures", sigma_m, np.inf, tuple(notices)
     notices.append(Notice("height_unknown", 1, "telemetry has no height: it is found from the pictures and GPS"))
     return np.full(len(telemetry), 40.0), "none, found from the pictures", np.inf, np.inf, tuple(notices)
+
+
+def _median_of(values: Floats) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
 
 
 def _angles(telemetry: Telemetry) -> tuple[str, tuple[Floats, Floats, Floats]]:

@@ -16,6 +16,7 @@ TELEMETRY_COLUMNS = (
     "horizontal_sigma_m", "vertical_sigma_m",
     "camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg",
     "body_yaw_deg", "body_pitch_deg", "body_roll_deg",
+    "tilt_sigma_deg", "heading_sigma_deg",
     "course_deg", "speed_m_s",
 )
 """Every number a telemetry sample can carry. NaN means that the source does not say.
@@ -23,6 +24,7 @@ TELEMETRY_COLUMNS = (
 The three heights are different things and are never converted silently: above the WGS84 ellipsoid, above mean sea
 level (a geoid), above the take-off point. Camera angles are a gimbal's, against north and the horizon (pitch -90 looks
 straight down); body angles are the aircraft's (yaw clockwise from north, pitch nose up, roll right side down).
+The attitude's sigmas are those that the source states, of the angles that it gives.
 """
 
 

@@ -50,6 +50,8 @@ _LIMITS: Mapping[str, tuple[float, float]] = {
     "body_yaw_deg": (-720, 720),
     "body_pitch_deg": (-360, 360),
     "body_roll_deg": (-360, 360),
+    "tilt_sigma_deg": (0, 180),
+    "heading_sigma_deg": (0, 180),
     "course_deg": (-720, 720),
     "speed_m_s": (0, 1000),
 }
@@ -89,7 +91,7 @@ def clean(
         if position_decimals is not None:
             found += _widen_to_rounding(table, position_decimals)
         found += _blank_jumps(times, table)
-    if not any(np.isfinite(value).any() for key, value in table.items() if not key.endswith("_sigma_m")):
+    if not any(np.isfinite(value).any() for key, value in table.items() if "_sigma_" not in key):
         told = "; ".join(notice.text for notice in found) or "it holds no samples"
         raise InputError(
             f"{name}: no usable {reader} telemetry sample ({told}); "
