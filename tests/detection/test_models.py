@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -17,6 +19,7 @@ from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import Integrity, find_model, installed_models, integrity, models_folder
 from sorvolo.detection.session import read_info
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.missions.fetched_files import WebRedirects
 from sorvolo.missions.model_files import fetch_model
 from sorvolo.survey.objects import CLASSES
 
@@ -48,6 +51,12 @@ class _Shelf(BaseHTTPRequestHandler):
         super().__init__(*arguments)  # type: ignore[arg-type]
 
     def do_GET(self) -> None:
+        if self.path.startswith("/to-"):
+            scheme, _, rest = self.path.removeprefix("/to-").partition("-")
+            self.send_response(302)
+            self.send_header("Location", f"{scheme}://{self.headers['Host']}/{rest}")
+            self.end_headers()
+            return
         path = self.folder / self.path.split("?")[0].lstrip("/").replace("cut-", "")
         if not path.is_file():
             self.send_error(404)
@@ -129,6 +138,27 @@ def test_what_is_not_the_file_never_appears(folder: Path, model: Path, address: 
     with pytest.raises(InputError, match="cannot be run"):
         fetch_model(str(text), _hash(text))
     assert list(folder.iterdir()) == []
+
+
+def test_a_redirect_is_followed_over_the_web_alone(folder: Path, model: Path, address: str) -> None:
+    assert fetch_model(f"{address}/to-http-coast.onnx", _hash(model), name="moved").name == "moved"
+    for scheme in ("ftp", "file"):
+        with pytest.raises(InputError, match=f"cannot be fetched .*edirect.* .?{scheme}"):
+            fetch_model(f"{address}/to-{scheme}-coast.onnx", _hash(model), name="elsewhere")
+    assert not (folder / "elsewhere.onnx").exists()
+
+
+@pytest.mark.parametrize("asked, offered, is_followed", [
+    ("https", "https", True), ("http", "https", True), ("https", "http", False), ("http", "ftp", False),
+])
+def test_a_redirect_never_gives_up_encryption(asked: str, offered: str, is_followed: bool) -> None:
+    request = urllib.request.Request(f"{asked}://example.org/a.onnx")
+    follow = partial(WebRedirects().redirect_request, request, None, 302, "", {}, f"{offered}://example.org/b.onnx")
+    if is_followed:
+        assert follow().full_url == f"{offered}://example.org/b.onnx"
+    else:
+        with pytest.raises(urllib.error.URLError, match="not followed"):
+            follow()
 
 
 def test_a_failed_fetch_leaves_the_old_model(folder: Path, model: Path, address: str, tmp_path: Path) -> None:

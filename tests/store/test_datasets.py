@@ -160,6 +160,15 @@ def test_coco_missing_pictures_are_counted_and_none_left_is_an_error(tmp_path):
         read_dataset(put.put_coco(lonely / "all.json", ["gone.jpg"], []))
 
 
+@pytest.mark.parametrize("name", ["../secret.jpg", "images/../../secret.jpg", "{}/secret.jpg", "C:/secret.jpg"])
+def test_coco_names_that_lead_out_of_the_set_are_refused(tmp_path, name):
+    put.put_picture(tmp_path / "secret.jpg")
+    put.put_picture(tmp_path / "set" / "a.jpg")
+    path = put.put_coco(tmp_path / "set" / "c.json", ["a.jpg", name.format(tmp_path)], [(0, 1, 1, 2, 3, 4, 0)])
+    with pytest.raises(InputError, match=r"leads out of the set; needed are names below"):
+        read_dataset(path)
+
+
 @pytest.mark.parametrize(("share", "how"), [(0.35, "breaks off"), (0.8, "breaks off"), (1.0, "is damaged")])
 def test_coco_that_breaks_off_is_told_with_file_and_place(tmp_path, share, how):
     put.put_picture(tmp_path / "a.jpg")

@@ -4,10 +4,11 @@ import hashlib
 import http.client
 import re
 import urllib.error
+import urllib.parse
 import urllib.request
 from contextlib import closing
 from pathlib import Path
-from typing import IO
+from typing import IO, Any, cast
 
 from sorvolo.errors import InputError
 
@@ -50,5 +51,19 @@ def copy_by_hash(address: str, to: Path, sha256: str, *, offline: str) -> None:
 
 def _opened(address: str) -> IO[bytes]:
     if is_web_address(address):
-        return urllib.request.urlopen(address, timeout=_PATIENCE_S)
+        opener = urllib.request.build_opener(WebRedirects)
+        return cast(IO[bytes], opener.open(address, timeout=_PATIENCE_S))
     return Path(address).expanduser().open("rb")
+
+
+class WebRedirects(urllib.request.HTTPRedirectHandler):
+    """Follows a redirect to the web alone, and from https to https alone."""
+
+    def redirect_request(  # noqa: D102
+        self, req: urllib.request.Request, fp: Any, code: int, msg: str, headers: Any, newurl: str
+    ) -> urllib.request.Request | None:
+        asked = urllib.parse.urlsplit(req.full_url).scheme
+        scheme = urllib.parse.urlsplit(newurl).scheme
+        if scheme not in ("http", "https") or (asked == "https" and scheme != "https"):
+            raise urllib.error.URLError(f"it redirects from {asked} to {scheme}, which is not followed")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)

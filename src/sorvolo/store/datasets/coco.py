@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from math import isfinite
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from sorvolo.errors import InputError
@@ -142,7 +142,7 @@ def _pictures(
     folders = _folders(path)
     by_name: dict[str, list[Path]] | None = None
     for image_id, row in images.items():
-        name = str(row.get("file_name", "")).replace("\\", "/")
+        name = _inside(path, str(row.get("file_name", "")).replace("\\", "/"))
         found = next((folder / name for folder in folders if name and os.path.isfile(folder / name)), None)
         if found is None and name:
             by_name = _by_name(path.parent) if by_name is None else by_name
@@ -157,6 +157,19 @@ def _pictures(
             found, tuple(boxes.get(image_id, ())), (size[0], size[1]) if size and min(size) > 0 else None, group,
             next(iter(_finite([row.get("m_per_px")])), float("nan")),
         )
+
+
+def _inside(path: Path, name: str) -> str:
+    """The picture's name as given; raises InputError where it leads out of the set's folder."""
+    place = Path(os.path.normpath(path.parent / name))
+    folders = [path.parent, *(each for each in _folders(path) if each != path.parent.parent)]
+    is_below = any(place.is_relative_to(os.path.normpath(each)) for each in folders)
+    if name.startswith("/") or PureWindowsPath(name).drive or (".." in name.split("/") and not is_below):
+        raise InputError(
+            f"{path}: its file_name {name!r} leads out of the set; needed are names below the label file's folder or "
+            "in images/ beside it: put the label file beside its pictures and give their names alone"
+        )
+    return name
 
 
 def _folders(path: Path) -> list[Path]:
