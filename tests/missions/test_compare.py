@@ -16,6 +16,7 @@ import pytest
 
 from sorvolo.capture.calibration import camera_from_option, guess_camera
 from sorvolo.capture.source import opened_sources
+from sorvolo.change.pair.thesis_options import thesis_options
 from sorvolo.change.reference import ReferenceMap
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError, StoreError
@@ -324,11 +325,13 @@ def test_a_guessed_camera_is_told_of_one_that_was_given_for_pictures_of_its_size
 
 
 def test_the_thesis_method_compares_too_and_shows_its_steps(flown, site, tmp_path):
+    settings = CompareSettings(model="none", method="thesis", thesis=thesis_options(["T_gray=light", "threads=2"]))
     updates = list(compare_flights(
-        [flown / "flight2"], site, CompareSettings(model="none", method="thesis"), camera=flown / "camera.xml",
-        steps=tmp_path / "steps",
+        [flown / "flight2"], site, settings, camera=flown / "camera.xml", steps=tmp_path / "steps",
     ))
     assert report(site)["comparison"]["method"] == "thesis"
+    assert report(site)["settings"]["thesis"]["threads"] == 2
+    assert report(site)["settings"]["thesis"]["settings"]["gray_threshold"] is None
     pictures = list((tmp_path / "steps").rglob("*.png"))
     assert len(pictures) >= 7 * len(updates)
 

@@ -59,6 +59,13 @@ def compare(
     steps: Annotated[
         Path | None, typer.Option(help="Folder for method thesis's eight pictures a view (its Figure 3.14), 4-8 MB.")
     ] = None,
+    thesis: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A value of Table 4.2 for method thesis, such as T_gray=light, W_a=8x8, eq3.21=printed, threads=4; "
+            "again for each. See docs/thesis.md."
+        ),
+    ] = None,
     update: Annotated[
         bool, typer.Option("--update/--no-update", help="Bring the map up to date where the ground changed or is new.")
     ] = True,
@@ -78,11 +85,12 @@ def compare(
     Example: sorvolo compare photos/ --site field --masks --json
     """
     from sorvolo.capture.live.reconnect import LiveSettings
+    from sorvolo.change.pair.thesis_options import thesis_options
     from sorvolo.missions.flight.settings import CompareSettings
 
     settings = CompareSettings(
         method.value, views_per_second, votes, voters, offset, ground_elevation, updates_map=update, writes_masks=masks,
-        model=model,
+        model=model, thesis=thesis_options(thesis or []),
     )
     results = compare_and_read_results(
         inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area, steps=steps,

@@ -1,6 +1,6 @@
 """The thesis's change detection (section 3.2), step by step, on two aligned pictures."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import cv2
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from sorvolo import kernels
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
+
+_TABLE_LEVEL, _TABLE_SHARE = 40, 0.3  # T_gray and T_H of Table 4.2
 
 Picture = NDArray[np.uint8]
 """(height, width, 3) uint8, blue green red."""
@@ -21,8 +23,8 @@ class ThesisSettings:
 
     averaging_px: tuple[int, int] = (10, 10)  # W_a
     pattern_px: tuple[int, int] = (15, 15)  # W_l
-    gray_threshold: int = 40  # T_gray, called T_diff in section 3.2
-    hamming_share: float = 0.3  # T_H, of the three strings together
+    gray_threshold: int | None = 40  # T_gray, called T_diff in section 3.2; None: from each pair's light
+    hamming_share: float | None = 0.3  # T_H, of the three strings together; None: from each pair's light
     isolation_px: tuple[int, int] = (37, 37)  # W_i
     isolation_share: float = 0.25  # T_iso
     isolation_as_printed: bool = False  # at most T_iso of a window black; else at least T_iso white: see docs/errata.md
@@ -30,21 +32,35 @@ class ThesisSettings:
     least_distance: float = 0.3  # T_B
 
     def __post_init__(self) -> None:
-        most = kernels.LARGEST_WINDOW_PX
         for name in ("averaging_px", "pattern_px", "isolation_px"):
-            window = getattr(self, name)
-            whole = isinstance(window, tuple) and all(isinstance(side, int) for side in window)
-            if not whole or len(window) != 2 or not all(1 <= side <= most for side in window):
-                raise SettingsError(f"{name} is {window}; give width and height as whole numbers from 1 to {most}")
+            _check_window(name, getattr(self, name))
         for name in ("hamming_share", "isolation_share", "area_share", "least_distance"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise SettingsError(f"{name} is {getattr(self, name)}; give a number from 0 to 1")
-        if not isinstance(self.gray_threshold, int) or not 0 <= self.gray_threshold <= 255:
-            raise SettingsError(f"gray_threshold is {self.gray_threshold}; give a whole number from 0 to 255")
+            share = getattr(self, name)
+            if not (share is None and name == "hamming_share") and not 0 <= share <= 1:
+                raise SettingsError(f"{name} is {share}; give a number from 0 to 1")
+        level = self.gray_threshold
+        if level is not None and not (isinstance(level, int) and 0 <= level <= 255):
+            raise SettingsError(f"gray_threshold is {level}; give a whole number from 0 to 255")
+
+    def in_light(self, light_levels: float) -> "ThesisSettings":
+        """With T_diff and T_H as numbers, where they were left to the light.
+
+        Section 3.2: the more the light of T and Q differs, the higher both are; it gives no formula. Here Table 4.2's
+        values hold for like light, T_diff is at least twice the gray levels that light alone leaves between the
+        pre-processed pictures (`light_difference`), and T_H rises with it, to 0.45 at most.
+        """
+        level = min(max(_TABLE_LEVEL, round(2 * light_levels)), 255)
+        share = min(_TABLE_SHARE * level / _TABLE_LEVEL, 0.45)
+        return replace(
+            self,
+            gray_threshold=level if self.gray_threshold is None else self.gray_threshold,
+            hamming_share=share if self.hamming_share is None else self.hamming_share,
+        )
 
     @property
     def most_differing_bits(self) -> int:
         """How many bits of the three binary strings together may differ between pixels that are the same."""
+        assert self.hamming_share is not None  # `in_light` made it a number
         return _whole_share(self.hamming_share, 3 * self.pattern_px[0] * self.pattern_px[1])
 
     @property
@@ -152,6 +168,17 @@ def thesis_steps(
     )
 
 
+def light_difference(before: ThesisReference, after: ThesisReference) -> float:
+    """How far the light of two prepared pictures differs, in gray levels: what pre-processing leaves of it.
+
+    1.48 times the median of their absolute difference, a spread that changes do not raise unless they fill half the
+    picture. 0 where nothing is known.
+    """
+    apart = cv2.absdiff(before.gray, after.gray)
+    known = apart if after.known is None else apart[after.known > 0]
+    return 1.4826 * float(np.median(known)) if known.size else 0.0
+
+
 def bhattacharyya_distances(first: NDArray[np.int64], second: NDArray[np.int64]) -> Floats:
     """Equation 3.22 for pairs of histograms (N, bins): 0 the same, 1 nothing in common; 0 where one is empty.
 
@@ -190,6 +217,7 @@ def _compare(
     if before.known is not None:
         valid = before.known.view(np.bool_) if valid is None else valid & before.known.view(np.bool_)
     after = prepare_reference(query, valid, settings, threads)
+    settings = settings.in_light(light_difference(before, after))
     difference = _differences(before, after, settings, threads)
     kept = kernels.without_isolations(difference, *settings.isolation_px, settings.most_black, threads)
     if after.known is not None:
@@ -201,6 +229,7 @@ def _differences(
     before: ThesisReference, after: ThesisReference, settings: ThesisSettings, threads: int
 ) -> ImageGray:
     """M_diff: equation 3.19, and where its D is 1 the Hamming distance of the strings of equation 3.20."""
+    assert settings.gray_threshold is not None  # `in_light` made it a number
     apart = cv2.absdiff(before.gray, after.gray)
     different = np.asarray(cv2.threshold(apart, settings.gray_threshold - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)
     if after.known is not None:
@@ -242,6 +271,13 @@ def _looked_up(prepared: ThesisReference) -> Picture:
 
 def _interleaved(planes: NDArray[np.uint8]) -> Picture:
     return np.ascontiguousarray(planes.transpose(1, 2, 0))
+
+
+def _check_window(name: str, window: object) -> None:
+    most = kernels.LARGEST_WINDOW_PX
+    whole = isinstance(window, tuple) and len(window) == 2 and all(isinstance(side, int) for side in window)
+    if not whole or not all(1 <= side <= most for side in window):  # type: ignore[attr-defined]
+        raise SettingsError(f"{name} is {window}; give width and height as whole numbers from 1 to {most}")
 
 
 def _whole_share(share: float, count: int) -> int:

@@ -343,7 +343,10 @@ class CompareRun:
             changed, valid = self._views.masks_of_frame(view)
             self._writer.save_masks(view.name, changed, valid, self._views.boxes_of_frame(view))
         if self._steps is not None:
-            steps = thesis_steps(as_bgr(view.reference), as_bgr(view.image), view.valid)
+            thesis = self._settings.thesis
+            steps = thesis_steps(
+                as_bgr(view.reference), as_bgr(view.image), view.valid, thesis.settings, thesis.threads
+            )
             write_pictures(self._steps / view.name, steps.pictures())
 
     def _paint(self, changes: Sequence[Change]) -> None:

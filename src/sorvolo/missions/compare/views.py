@@ -89,6 +89,7 @@ class ViewMaker:
         self._pictures = pictures
         self._aligner = Aligner(reference, site_grid)
         self._tuning = FlightTuning() if settings.method == "robust" else None
+        self._thesis = settings.thesis
         self._frame_maps: tuple[Anything, Anything] | None = None
 
     def look(self, posed: PosedFrame) -> ViewOutcome | OneSided:
@@ -231,7 +232,9 @@ class ViewMaker:
         """What differs from the map; the flight's tuning learns of it."""
         settings = self._settings_now()
         if self._tuning is None or settings is None:
-            thesis = compare_thesis(reference, query, valid)
+            thesis = compare_thesis(
+                reference, query, valid, self._thesis.settings, self._thesis.threads
+            )
             return Difference(thesis.mask, thesis.boxes, np.full(len(thesis.boxes), 0.5))
         found = compare_robust(reference, query, valid, settings)
         self._tuning.observe(found)

@@ -1,8 +1,9 @@
 """What a person may choose for a mission; each value has its unit and a default that suits most flights."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
+from sorvolo.change.pair.thesis_options import ThesisOptions
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import check_map_crs
 
@@ -55,8 +56,11 @@ class CompareSettings:
     updates_map: bool = True  # make a new version of the map where the ground changed or is new
     writes_masks: bool = False
     model: str = "default"  # that looks for objects: an installed one's name, a file, or "none"
+    thesis: ThesisOptions = field(default_factory=ThesisOptions)  # of method thesis: Table 4.2, threads
 
     def __post_init__(self) -> None:
+        if self.method != "thesis" and self.thesis != ThesisOptions():
+            raise SettingsError("Table 4.2 belongs to the thesis's method: give --method thesis as well")
         if self.method not in ("robust", "thesis"):
             raise SettingsError(f"method must be robust or thesis, got {self.method!r}")
         if not 0.05 <= self.views_per_second <= 240:
