@@ -109,6 +109,18 @@ def test_wrong_wishes_are_told_before_anything_is_written(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_placeholder_inside_a_shells_program_is_warned_of(
+    model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = _arguments(_fly(tmp_path / "flight", 3), model, tmp_path / "out")
+    assert cli.main([*arguments, "--alert-command", "sh -c 'echo {crop}'", "--json"]) == 0
+    shown = capsys.readouterr()
+    assert "{crop} stands inside a program for a shell" in " ".join(shown.err.split())
+    assert any("{crop}" in each for each in json.loads(shown.out)["watches"][0]["warnings"])
+    assert cli.main([*arguments, "--alert-command", "sh -c 'echo \"$1\"' alert {crop}"]) == 0
+    assert "warning" not in capsys.readouterr().err
+
+
 @pytest.fixture(scope="module")
 def long_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return _fly(tmp_path_factory.mktemp("long") / "flight", 1500)

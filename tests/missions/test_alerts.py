@@ -1,6 +1,7 @@
 """Alerts: a real script, a real web server, and that slow or dead ones hold nothing up."""
 
 import json
+import socket
 import sys
 import threading
 import time
@@ -12,7 +13,7 @@ from typing import ClassVar
 import pytest
 
 from sorvolo.errors import SettingsError, StoreError
-from sorvolo.missions.watch.alerts import Outbox, Pace, alert_command, alert_url
+from sorvolo.missions.watch.alerts import Outbox, Pace, alert_command, alert_url, interpreted_placeholder
 
 _ALERT = {"id": 3, "class": "small object", "score": 0.9, "latitude": 41.9, "longitude": None, "crop": "/a b/3.jpg"}
 
@@ -21,6 +22,11 @@ class _Receiver(BaseHTTPRequestHandler):
     got: ClassVar[list[dict[str, object]]] = []
 
     def do_POST(self) -> None:
+        if self.path == "/moved":
+            self.send_response(302)
+            self.send_header("Location", "/hook")
+            self.end_headers()
+            return
         body = self.rfile.read(int(self.headers["Content-Length"]))
         self.got.append(json.loads(body))
         self.send_response(500 if self.path == "/broken" else 204)
@@ -99,6 +105,64 @@ def test_an_outbox_goes_on_after_failures(server: str) -> None:
     (told,) = outbox.notices()
     assert (told.code, told.count, outbox.sent, len(_Receiver.got)) == ("alert_url_failed", 2, 0, 2)
     assert "500" in told.text
+
+
+@pytest.fixture
+def rude_server() -> Iterator[tuple[str, list[bytes]]]:
+    """Answers the first request with what is no HTTP, later ones well."""
+    requests: list[bytes] = []
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        def serve() -> None:
+            while True:
+                try:
+                    connection, _ = listening.accept()
+                except OSError:
+                    return
+                with connection:
+                    requests.append(connection.recv(65536))
+                    connection.sendall(b"GARBAGE\r\n\r\n" if len(requests) == 1 else b"HTTP/1.1 204 No Content\r\n\r\n")
+
+        threading.Thread(target=serve, daemon=True).start()
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}", requests
+        listening.shutdown(socket.SHUT_RDWR)
+
+
+def test_alerts_go_on_after_an_answer_that_is_no_http(rude_server: tuple[str, list[bytes]]) -> None:
+    url, requests = rude_server
+    outbox = Outbox(alert_url(url), code="alert_url", what="the alert")
+    for _ in range(3):
+        outbox.put(_ALERT)
+    outbox.close(20)
+    (notice,) = outbox.notices()
+    assert (outbox.sent, notice.count, len(requests)) == (2, 1, 3)
+    assert "does not answer as a web server does: GARBAGE" in notice.text
+
+
+def test_alerts_go_on_after_a_failure_of_any_kind() -> None:
+    def fails_once(number: int) -> None:
+        if number == 0:
+            raise RuntimeError
+
+    outbox = Outbox(fails_once, code="x", what="it")
+    outbox.put(0)
+    outbox.put(1)
+    outbox.close(10)
+    assert outbox.sent == 1 and outbox.notices()[0].text == "it failed 1 times, last: RuntimeError"
+
+
+def test_an_alert_is_not_sent_elsewhere(server: str) -> None:
+    with pytest.raises(StoreError, match=r"redirects alerts to http://127.0.0.1:\d+/hook"):
+        alert_url(f"{server}/moved")(_ALERT)
+    assert not _Receiver.got
+
+
+@pytest.mark.parametrize(("template", "found"), [
+    ("sh -c 'echo {class}'", "class"), ("/bin/bash -ec 'mail {crop}'", "crop"), ("env LANG=C sh -c 'x {id}'", "id"),
+    ("python3 -c 'print(\"{class}\")'", "class"), ("cmd /C 'copy {crop} x'", "crop"),
+    ("sh -c 'echo \"$1\"' alert {class}", ""), ("sh notify.sh {class}", ""), ("notify -c {class}", ""), ("", ""),
+])
+def test_a_placeholder_that_an_interpreter_would_run_is_found(template: str, found: str) -> None:
+    assert interpreted_placeholder(template) == found
 
 
 def test_a_slow_receiver_holds_nothing_up() -> None:

@@ -82,6 +82,7 @@ def watch_command(
     Example: sorvolo watch rtsp://192.168.1.10/live --telemetry udp://:10110 --cot udp://239.2.3.1:6969
     """
     from sorvolo.capture.live.reconnect import LiveSettings
+    from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
     from sorvolo.missions.watch.flights import watch
     from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
     from sorvolo.store.exports.cursor_on_target import COT_TYPES
@@ -93,6 +94,8 @@ def watch_command(
         out, save.value, _names(labels), cot, {**COT_TYPES, **_types(cot_type or [])}, alert_command=alert_command,
         alert_url=alert_url,
     )
+    if name := interpreted_placeholder(alert_command):
+        Console(stderr=True).print(f"[yellow]warning[/yellow]  {escape(interpreted_words(name))}", soft_wrap=True)
     folders: dict[Path, None] = {}
     watching = watch(
         source, settings, outputs, telemetry=telemetry or None, camera=camera or None,

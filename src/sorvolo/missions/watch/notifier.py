@@ -1,0 +1,90 @@
+"""Reports tracks while a watch runs: to a TAK server, a command and a URL, each through an outbox of its own."""
+
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sorvolo.missions.watch.alerts import Outbox, Pace, alert_command, alert_url
+from sorvolo.missions.watch.cot_sender import CotSender, cot_place
+from sorvolo.missions.watch.settings import WatchOutputs
+from sorvolo.store.exports.cursor_on_target import cot_event, cot_removal, cot_type
+from sorvolo.store.exports.detection_files import track_properties
+from sorvolo.survey.flight import Notice, Site
+from sorvolo.survey.objects import Track
+
+
+class Notifier:
+    """Sends alerts of new tracks, and keeps a TAK server's map up to date."""
+
+    def __init__(self, flight: str, fingerprint: str, site: Site, outputs: WatchOutputs, folder: Path) -> None:
+        self._flight, self._uid = flight, f"sorvolo.{flight}.{fingerprint[:8]}"
+        self._site, self._outputs, self._folder = site, outputs, folder
+        self._pace = Pace(outputs.cot_every_s)
+        self._sent_types: dict[int, str] = {}
+        self._cot: Outbox[bytes] | None = None
+        self._sender: CotSender | None = None
+        self._alerts: list[Outbox[Mapping[str, Any]]] = []
+        if outputs.cot and not site.is_local:
+            self._sender = CotSender(cot_place(outputs.cot))
+            self._cot = Outbox(self._sender.send, code="cot", what=f"sending to {outputs.cot}")
+        if outputs.alert_command:
+            run = alert_command(outputs.alert_command)
+            self._alerts.append(Outbox(run, code="alert_command", what="the alert command"))
+        if outputs.alert_url:
+            post = alert_url(outputs.alert_url)
+            self._alerts.append(Outbox(post, code="alert_url", what=f"the alert to {outputs.alert_url}"))
+
+    def report(self, new: Sequence[Track], seen: Sequence[Track], crops: Mapping[int, str], segment: int) -> None:
+        """Send one alert for each new track, and the TAK server all tracks that are seen, each at its pace."""
+        of_segment = {"segment": segment} if self._site.is_local else {}
+        for track in new:
+            crop = crops.get(track.id)
+            alert = {
+                "flight": self._flight, **track_properties(track, self._site), **of_segment,
+                "crop": None if crop is None else str((self._folder / crop).resolve()),
+            }
+            alert["time"] = alert["last_seen"]
+            for outbox in self._alerts:
+                outbox.put(alert)
+        for track in seen:
+            if self._cot is not None and self._pace.allows(track.id):
+                self._sent_types[track.id] = cot_type(track.label, self._outputs.cot_types)
+                self._cot.put(self._event(track))
+
+    def withdraw(self, track_ids: Iterable[int]) -> None:
+        """Tracks that turned out to be others leave the TAK server's map."""
+        for track_id in track_ids:
+            if self._cot is not None and track_id in self._sent_types:
+                uid, kind = f"{self._uid}.{track_id}", self._sent_types.pop(track_id)
+                self._cot.put(cot_removal(uid, type_=kind, now_ns=time.time_ns()))
+
+    def report_final(self, tracks: Sequence[Track]) -> None:
+        """Send the TAK server each track's final place."""
+        if self._cot is not None:
+            for track in tracks:
+                self._cot.put(self._event(track))
+
+    def close(self, alerts_s: float, events_s: float) -> None:
+        """Wait until all is sent, at most so long for the alerts and for the TAK server."""
+        for outbox in self._alerts:
+            outbox.close(alerts_s)
+        if self._cot is not None and self._sender is not None:
+            self._cot.close(events_s)
+            self._sender.close()
+
+    def notices(self) -> tuple[Notice, ...]:
+        """What could not be sent so far, and why."""
+        found: list[Notice] = []
+        if self._outputs.cot and self._cot is None:
+            text = f"nothing was sent to {self._outputs.cot}: this flight has no place on Earth"
+            found.append(Notice("cot_without_place", 1, text))
+        for outbox in self._alerts:
+            found += outbox.notices()
+        return (*found, *(self._cot.notices() if self._cot is not None else ()))
+
+    def _event(self, track: Track) -> bytes:
+        return cot_event(
+            track, self._site, uid=f"{self._uid}.{track.id}", now_ns=time.time_ns(),
+            stale_s=self._outputs.cot_stale_s, types=self._outputs.cot_types,
+        )
