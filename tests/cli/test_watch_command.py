@@ -78,7 +78,7 @@ def test_json_then_words(model: Path, tmp_path: Path, capsys: pytest.CaptureFixt
 
     assert cli.main([*_arguments(video, model, out), "--every", "2"]) == 0
     words = capsys.readouterr().out
-    assert "2 x small object" in words and "15 of 30 frames searched" in words
+    assert "2 small objects" in words and "15 of 30 frames searched" in words
     first = told["tracks"]["features"][0]["properties"]
     assert f"{first['latitude']:.5f}" in words and str(out / "report.html") in words.replace("\n", "")
 

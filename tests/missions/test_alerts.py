@@ -147,7 +147,7 @@ def test_alerts_go_on_after_a_failure_of_any_kind() -> None:
     outbox.put(0)
     outbox.put(1)
     outbox.close(10)
-    assert outbox.sent == 1 and outbox.notices()[0].text == "it failed 1 times, last: RuntimeError"
+    assert outbox.sent == 1 and outbox.notices()[0].text == "it failed 1 time, last: RuntimeError"
 
 
 def test_an_alert_is_not_sent_elsewhere(server: str) -> None:

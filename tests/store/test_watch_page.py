@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from html_checker import checked
 
-from sorvolo.store.pages.watch import count_words, watch_page
+from sorvolo.store.pages.watch import watch_page
 
 _REPORT: dict[str, Any] = {
     "sorvolo": "0.1.0", "flight": "DJI<1>", "georeferenced": True, "first_frame": "2026-05-01T10:00:00Z",
@@ -82,8 +82,3 @@ def test_what_no_clock_dated_is_told_from_the_start() -> None:
     page = watch_page(report, [track], {}, np.zeros((0, 2)))
     assert "1970" not in page
     assert "00:00:00 to 00:00:14" in page and ">00:00:03<" in page and ">00:00:09<" in page
-
-
-def test_counts_in_words() -> None:
-    assert count_words({"person": 3, "car": 0, "boat": 1}) == "3 x person, 1 x boat"
-    assert count_words({}) == "nothing"

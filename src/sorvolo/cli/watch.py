@@ -2,6 +2,7 @@
 
 import json
 import signal
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from enum import StrEnum
@@ -97,13 +98,15 @@ def watch_command(
     if name := interpreted_placeholder(alert_command):
         Console(stderr=True).print(f"[yellow]warning[/yellow]  {escape(interpreted_words(name))}", soft_wrap=True)
     folders: dict[Path, None] = {}
+    stop = _Stop()
     watching = watch(
         source, settings, outputs, telemetry=telemetry or None, camera=camera or None,
-        live=LiveSettings(give_up_s=give_up),
+        live=LiveSettings(give_up_s=give_up), until=stop.until,
     )
     # closed after a stop: then what was found is written
-    with _stopped_by_signals(), closing(watching) as updates, suppress(KeyboardInterrupt):
+    with stop.on_signals(), closing(watching) as updates, suppress(KeyboardInterrupt):
         for folder in _show_progress(updates, Console(stderr=True), is_quiet=as_json):
+            stop.is_running = True
             folders[folder] = None
     results = [_result(folder) for folder in folders]
     if as_json:
@@ -115,22 +118,36 @@ def watch_command(
         Console(stderr=True).print("stopped before the first frame was searched")
 
 
-@contextmanager
-def _stopped_by_signals() -> Iterator[None]:
-    """A service is ended by SIGTERM: then, as with Ctrl-C, what was found is written."""
-    def stop(*_: Any) -> None:
-        raise KeyboardInterrupt
+class _Stop:
+    """Ctrl-C and SIGTERM as an event that the watch looks at after each frame.
 
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    An exception would strike anywhere, also inside a queue's own lock, and the end would wait for it for ever. Before
+    the first frame there is nothing to keep, and after the first signal nothing to wait for: then it is an exception.
+    """
+
+    def __init__(self) -> None:
+        self.until = threading.Event()
+        self.is_running = False
+
+    @contextmanager
+    def on_signals(self) -> Iterator[None]:
+        """Take the signals for the length of a block."""
+        before = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _stop(self, *_: Any) -> None:
+        if self.until.is_set() or not self.is_running:
+            raise KeyboardInterrupt
+        self.until.set()
 
 
 def _show_progress(updates: Iterator["WatchUpdate"], console: Console, *, is_quiet: bool) -> Iterator[Path]:
     """Take all updates, telling each new object; the folder of each."""
-    from sorvolo.store.pages.watch import count_words
+    from sorvolo.survey.wording import counted_list
 
     columns = (
         SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=24),
@@ -144,7 +161,7 @@ def _show_progress(updates: Iterator["WatchUpdate"], console: Console, *, is_qui
             rate = f"{update.frames_detected / update.seconds:.1f} frames/s, " if update.seconds > 0 else ""
             progress.update(
                 task, description="watching",
-                told=f"{rate}{1000 * update.latency_s:.0f} ms behind, {count_words(update.counts)}",
+                told=f"{rate}{1000 * update.latency_s:.0f} ms behind, {counted_list(update.counts)}",
                 total=max(update.frames_expected, update.frames_read) if update.frames_expected else None,
                 completed=update.frames_read,
             )
@@ -170,11 +187,11 @@ def _result(folder: Path) -> dict[str, Any]:
 
 
 def _show_result(result: Mapping[str, Any], console: Console) -> None:
-    from sorvolo.store.pages.watch import count_words
+    from sorvolo.survey.wording import counted_list
 
     tracks = [each["properties"] for each in result["tracks"]["features"]]
     console.print(
-        f"Watch of {escape(result['flight'])}: {escape(count_words(result['objects']['by_class']))}", style="bold"
+        f"Watch of {escape(result['flight'])}: {escape(counted_list(result['objects']['by_class']))}", style="bold"
     )
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     on_ground = result["georeferenced"]

@@ -19,6 +19,7 @@ from urllib.parse import urlsplit
 
 from sorvolo.errors import SettingsError, StoreError
 from sorvolo.survey.flight import Notice
+from sorvolo.survey.wording import counted
 
 PLACEHOLDERS = ("id", "class", "score", "latitude", "longitude", "time", "crop")
 """What an alert command's words may hold in braces."""
@@ -80,10 +81,10 @@ class Outbox(Generic[_Item]):
         """What failed so far."""
         found = []
         if self._failed:
-            text = f"{self._what} failed {self._failed} times, last: {self._last_words}"
+            text = f"{self._what} failed {counted(self._failed, 'time')}, last: {self._last_words}"
             found.append(Notice(f"{self._code}_failed", self._failed, text))
         if self._dropped:
-            text = f"{self._what} was too slow: {self._dropped} were not sent"
+            text = f"{self._what} was too slow: {counted(self._dropped, 'message')} not sent"
             found.append(Notice(f"{self._code}_dropped", self._dropped, text))
         return tuple(found)
 

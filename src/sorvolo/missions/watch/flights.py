@@ -32,7 +32,7 @@ _STOPPED = "stopped on demand"
 def watch(
     source: Path | str, settings: WatchSettings = WatchSettings(), outputs: WatchOutputs = WatchOutputs(), *,  # noqa: B008 (frozen)
     telemetry: Path | str | None = None, camera: Path | str | None = None, detector: Detects | None = None,
-    live: LiveSettings = LiveSettings(),  # noqa: B008 (frozen)
+    live: LiveSettings = LiveSettings(), until: threading.Event | None = None,  # noqa: B008 (frozen)
 ) -> Generator[WatchUpdate]:
     """Search a flight, yielding an update for each frame searched.
 
@@ -42,9 +42,10 @@ def watch(
     bounded, and the others are counted. Objects are placed on the ground where telemetry allows it, else followed in
     the picture.
 
-    Close the generator, or press Ctrl-C, to end early: all that was found until then is written. Raises InputError,
-    SettingsError or StoreError with what to do.
+    Set `until`, close the generator, or press Ctrl-C, to end early: all that was found until then is written. Raises
+    InputError, SettingsError or StoreError with what to do.
     """
+    until = until or threading.Event()
     if outputs.cot:
         check_host(cot_place(outputs.cot))
     finder = Detector.load(settings.model) if detector is None else detector
@@ -52,23 +53,26 @@ def watch(
         raise SettingsError(f"the model knows no {unknown[0]!r}; it knows {', '.join(finder.classes)}")
     if unknown := sorted(set(outputs.cot_types) - {*finder.classes, *COT_TYPES}):
         raise SettingsError(f"--cot-type {unknown[0]}: no such class; the model knows {', '.join(finder.classes)}")
-    sources = open_sources([source], telemetry, camera, live=live)
+    sources = open_sources([source], telemetry, camera, live=live, until=until)
     with ExitStack() as stack:
         for each in sources:
             if isinstance(each, LiveSource):
                 stack.callback(each.close)
         for each in sources:
+            if until.is_set():
+                return
             folder = outputs.folder or Path(f"{each.name}-watch")
             if len(sources) > 1 and outputs.folder is not None:
                 folder = outputs.folder / each.name
             yield from _watch_one(
-                each, finder, settings, replace(outputs, folder=folder), folder, telemetry_named=telemetry is not None
+                each, finder, settings, replace(outputs, folder=folder), folder, until,
+                telemetry_named=telemetry is not None,
             )
 
 
 def _watch_one(
-    source: Source, detector: Detects, settings: WatchSettings, outputs: WatchOutputs, folder: Path, *,
-    telemetry_named: bool,
+    source: Source, detector: Detects, settings: WatchSettings, outputs: WatchOutputs, folder: Path,
+    until: threading.Event, *, telemetry_named: bool,
 ) -> Generator[WatchUpdate]:
     mapping = MapSettings(offset_s=settings.offset_s, ground_elevation_m=settings.ground_elevation_m)
 
@@ -92,8 +96,10 @@ def _watch_one(
                         yield run.add(each, arrived_s)
                     else:
                         run.lose(each)
-            ended = "the source ended"
-            if not isinstance(source, LiveSource):
+                    if until.is_set():
+                        break
+            ended = _STOPPED if until.is_set() else "the source ended"
+            if ended != _STOPPED and not isinstance(source, LiveSource):
                 run.log.read = asked.frames  # also those after the last one that was searched
         except KeyboardInterrupt:
             pass  # the usual way to end a live watch: what was found is written below

@@ -20,9 +20,10 @@ from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.detection_files import write_detections_geojson
 from sorvolo.store.exports.plain import json_bytes
-from sorvolo.store.pages.watch import count_words, watch_page
+from sorvolo.store.pages.watch import watch_page
 from sorvolo.survey.flight import Frame, LostFrame, Site
 from sorvolo.survey.objects import Detections, Sighting, Track
+from sorvolo.survey.wording import counted_list
 
 _LAST_ALERTS_S, _LAST_EVENTS_S = 35.0, 5.0  # how long the end waits for what is still on its way
 
@@ -102,7 +103,7 @@ class WatchRun:
         with log.stage("hand over"):
             self._files.add(SeenFrame(
                 frame, time_ns, found, taken.sightings, taken.track_ids, frozenset(each.id for each in confirmed),
-                f"frame {frame.name}, counted so far: {count_words(counts)}", taken.segment,
+                f"frame {frame.name}, counted so far: {counted_list(counts)}", taken.segment,
             ))
             seen_ids = set(taken.track_ids)
             seen = [track for track in confirmed if track.id in seen_ids]

@@ -26,6 +26,7 @@ from sorvolo.store.pages.words import (
     table_of,
     with_unit,
 )
+from sorvolo.survey.wording import counted_list
 
 _WIDE_PX, _HIGH_PX, _RIM_PX = 940.0, 560.0, 36.0
 _LETTER_PX, _LINE_PX = 7.5, 12.0  # of the map's labels
@@ -64,11 +65,6 @@ def watch_page(
     return page_of(f"{escaped(report.get('flight'))} - watch", STYLE + _WATCH_STYLE, body)
 
 
-def count_words(counts: Mapping[str, int]) -> str:
-    """What was found, in words: "3 x person, 1 x car"; "nothing" for nothing."""
-    return ", ".join(f"{count} x {name}" for name, count in counts.items() if count) or "nothing"
-
-
 def _header(report: Mapping[str, Any], tracks: Sequence[Mapping[str, Any]]) -> str:
     counts = Counter(str(each["class"]) for each in tracks)
     looked_for = ", ".join(at(report, "settings", "classes") or at(report, "model", "classes") or [])
@@ -76,7 +72,7 @@ def _header(report: Mapping[str, Any], tracks: Sequence[Mapping[str, Any]]) -> s
     return (
         f'<header><p class="over">Watch of <b>{escaped(report.get("flight"))}</b>, '
         f'{_when(report.get("first_frame"))} to {_when(report.get("last_frame"))}</p>'
-        f"<h1>Found: {escape(count_words(dict(counts.most_common())))}.</h1>"
+        f"<h1>Found: {escape(counted_list(dict(counts.most_common())))}.</h1>"
         f"<p>{escaped(frames)} frames were searched for {escape(looked_for)}. Each object is counted once, however "
         "many frames and passes saw it. What no frame showed clearly, or nobody flew over, is not here.</p></header>"
     )

@@ -1,0 +1,29 @@
+"""Counts in plain English: "1 person", "4 people, 3 cars"."""
+
+from collections.abc import Mapping
+
+_PLURALS = {"person": "people", "bus": "buses", "is": "are", "was": "were"}
+
+
+def plural(noun: str, count: int) -> str:
+    """The noun, or its last word's plural unless the count is 1."""
+    if count == 1:
+        return noun
+    before, space, last = noun.rpartition(" ")
+    if last in _PLURALS:
+        return f"{before}{space}{_PLURALS[last]}"
+    if last.endswith(("s", "x", "z", "ch", "sh")):
+        return f"{noun}es"
+    if last.endswith("y") and last[-2:-1] not in "aeiou":
+        return f"{noun[:-1]}ies"
+    return f"{noun}s"
+
+
+def counted(count: int, noun: str) -> str:
+    """How many of one thing: "1 car", "1,200 frames", "no changes" for none."""
+    return f"{count:,} {plural(noun, count)}" if count else f"no {plural(noun, 0)}"
+
+
+def counted_list(counts: Mapping[str, int], *, none: str = "nothing") -> str:
+    """How many of each thing, in the mapping's order; `none` where all counts are 0."""
+    return ", ".join(counted(count, name) for name, count in counts.items() if count) or none
