@@ -16,7 +16,7 @@ GPX = (b'<gpx version="1.1"><trk><trkseg><trkpt lat="48.1" lon="11.5">'
        b"<time>2016-05-04T10:00:00Z</time></trkpt>"
        b"</trkseg></trk></gpx>")
 UMCD = b"offsetTime,Longitude,Latitude\n0.0,11.5,48.1\n0.1,11.5,48.1\n"
-SAMPLES = {"nmea": NMEA, "dji_srt": SRT, "gpx": GPX, "umcd": UMCD}
+SAMPLES = {"nmea": NMEA, "dji_srt": SRT, "gpx": GPX, "table": UMCD}
 
 
 def write(path: Path, data: bytes) -> Path:
@@ -44,7 +44,7 @@ def test_every_reader_is_listed_by_its_own_name():
     (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", r"binary file, it starts with b'\\x89PNG"),
     (b"dear diary, today I flew\n", "no known telemetry format"),
     (b"a,b,c\n1,2,3\n", "no known telemetry format"),
-    (b"offsetTime,Longitude,Latitude\n", "no usable umcd"),
+    (b"offsetTime,Longitude,Latitude\n", "no usable table"),
     (b"offsetTime,Longitude,Latitude\n0,0,0\n", "0/0"),
     (NMEA.replace(b"545", b"546"), "bad checksum"),
 ])

@@ -30,6 +30,7 @@ from sorvolo.capture.live.stream import LiveStream, open_stream
 from sorvolo.capture.photo_metadata import PhotoMetadata
 from sorvolo.capture.photos import PhotoSource, read_album
 from sorvolo.capture.telemetry import find_telemetry_beside, is_telemetry, read_telemetry
+from sorvolo.capture.telemetry.gpmf import read_gpmf_file
 from sorvolo.capture.telemetry.quality import notice
 from sorvolo.capture.video import VIDEO_SUFFIXES, VideoInfo, VideoSource, read_video_info
 from sorvolo.errors import InputError
@@ -246,7 +247,7 @@ def _free_name(name: str, fingerprint: str, taken: Mapping[str, str]) -> str:
 
 def _open_video(path: Path, name: str, telemetry: Path | None, camera: Path | str | None) -> VideoSource:
     info = _video_info(path)
-    inside = read_klv_file(path) if info.container == "mpegts" else None
+    inside = _metadata_inside(path, info.container)
     found, notices = _video_telemetry(path, telemetry, inside)
     told = None if inside is None or inside.lens is None else camera_of(inside.lens, info.width_px, info.height_px)
     if camera is None:
@@ -257,6 +258,14 @@ def _open_video(path: Path, name: str, telemetry: Path | None, camera: Path | st
     if inside is not None and found is inside.telemetry:
         source.ground_elevation_m = inside.ground_elevation_m
     return source
+
+
+def _metadata_inside(path: Path, container: str) -> FileMetadata | None:
+    """The telemetry within the video: MISB ST 0601 in MPEG-TS, GoPro's GPMF in MP4; None where there is none."""
+    if container == "mpegts":
+        return read_klv_file(path)
+    telemetry = read_gpmf_file(path) if container == "mov" else None
+    return None if telemetry is None else FileMetadata(telemetry, None, float("nan"))
 
 
 def _video_info(path: Path) -> VideoInfo:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Protocol
 
-from sorvolo.capture.telemetry import dji_srt, gpx, nmea, umcd
+from sorvolo.capture.telemetry import dji_srt, flight_table, gpx, nmea
 from sorvolo.errors import InputError
 from sorvolo.survey.flight import Telemetry
 
@@ -29,7 +29,7 @@ class Reader(Protocol):
 
 
 # Order matters where a file fits two: a table may hold NMEA sentences in one of its columns.
-TELEMETRY_READERS: dict[str, Reader] = {"dji_srt": dji_srt, "gpx": gpx, "umcd": umcd, "nmea": nmea}
+TELEMETRY_READERS: dict[str, Reader] = {"dji_srt": dji_srt, "gpx": gpx, "table": flight_table, "nmea": nmea}
 """Every format that is read, by the name that `Telemetry.format` carries."""
 
 
@@ -46,7 +46,8 @@ def read_telemetry(path: Path) -> Telemetry:
         what = "a binary file" if _is_binary(data[:_HEAD_BYTES]) else "text of no known telemetry format"
         raise InputError(
             f"{path}: {what}, it starts with {head!r}; read are DJI subtitles (.SRT), GPX tracks with times, "
-            "tables with Latitude and Longitude columns (UMCD, .csv), and NMEA 0183 with GGA or RMC sentences"
+            "tables with Latitude and Longitude columns (DatCon, Airdata, DJI logs as .csv), and NMEA 0183 with GGA or "
+            "RMC sentences"
         )
     return TELEMETRY_READERS[reader].read(data, str(path))
 

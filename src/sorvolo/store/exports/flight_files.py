@@ -261,7 +261,7 @@ def _umcd(telemetry: Telemetry) -> str:
         gimbal = [f"{telemetry[f'camera_{axis}_deg'][i]:.4f}" for axis in ("roll", "pitch", "yaw")]
         writer.writerow(
             [
-                round(time_s * 4_500_000),
+                round(time_s * 600),
                 f"{time_s:.3f}",
                 round(time_s * 1000),
                 f"{telemetry['longitude_deg'][i]:.10f}",

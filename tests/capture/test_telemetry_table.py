@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sorvolo.capture.telemetry import umcd
+from real_data import real_data
+from sorvolo.capture.telemetry import flight_table, read_telemetry
 from sorvolo.errors import InputError
 
 # thesis, Table 2.2, columns 1 to 60
@@ -72,7 +73,7 @@ def assert_is_the_flight(telemetry, count: int = 20) -> None:
 
 def test_the_sixty_columns_of_the_thesis():
     assert len(COLUMNS) == 60
-    telemetry = umcd.read(table().encode(), "path1.csv")
+    telemetry = flight_table.read(table().encode(), "path1.csv")
     assert_is_the_flight(telemetry)
     assert codes(telemetry) == {"no_date": 20}
 
@@ -92,19 +93,19 @@ def test_neither_order_nor_dress_of_columns_matters(order, delimiter, newline, b
     if quoted:
         cells = [f'"{cell}"' for cell in cells]
     data = (delimiter.join(cells) + newline + rest).encode("utf-8-sig" if bom else "utf-8")
-    assert umcd.recognises(data)
-    assert_is_the_flight(umcd.read(data, "a.csv"))
+    assert flight_table.recognises(data)
+    assert_is_the_flight(flight_table.read(data, "a.csv"))
 
 
 @pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
 def test_other_encodings(encoding):
     data = table().encode(encoding)
-    assert umcd.recognises(data)
-    assert_is_the_flight(umcd.read(data, "a.csv"))
+    assert flight_table.recognises(data)
+    assert_is_the_flight(flight_table.read(data, "a.csv"))
 
 
 def test_decimal_commas():
-    assert_is_the_flight(umcd.read(table(delimiter=";").replace(".", ",").encode(), "a.csv"))
+    assert_is_the_flight(flight_table.read(table(delimiter=";").replace(".", ",").encode(), "a.csv"))
 
 
 @pytest.mark.parametrize("old, new, factor, column, expected", [
@@ -121,18 +122,18 @@ def test_units_of_the_header_are_converted(old, new, factor, column, expected):
         rows = [{**each, "Yaw": math.radians(30.0)} for each in rows]
     lines = [",".join(names)]
     lines += [",".join(str(each[name] * (factor if name == old else 1)) for name in COLUMNS) for each in rows]
-    telemetry = umcd.read("\n".join(lines).encode(), "a.csv")
+    telemetry = flight_table.read("\n".join(lines).encode(), "a.csv")
     assert telemetry[column] == pytest.approx([expected] * 5)
     assert telemetry.time_ns[1] == pytest.approx(SECOND_NS / 10, abs=1000)
 
 
 def test_an_unknown_unit_is_told_and_not_guessed():
-    telemetry = umcd.read(table().replace("relativeHeight", "relativeHeight(furlongs)").encode(), "a.csv")
+    telemetry = flight_table.read(table().replace("relativeHeight", "relativeHeight(furlongs)").encode(), "a.csv")
     assert "unknown_unit" in codes(telemetry)
     assert "furlongs" in next(notice.text for notice in telemetry.notices if notice.code == "unknown_unit")
     assert not (telemetry["height_above_takeoff_m"] == 10.5).any()
     with pytest.raises(InputError, match="degrees or radians"):
-        umcd.read(table().replace("Latitude", "Latitude(furlongs)").encode(), "a.csv")
+        flight_table.read(table().replace("Latitude", "Latitude(furlongs)").encode(), "a.csv")
 
 
 @settings(max_examples=60, deadline=None)
@@ -146,7 +147,7 @@ def test_the_quaternion_stands_in_for_missing_angles(yaw, pitch, roll):
     }
     columns = tuple(name for name in COLUMNS if name not in ("Roll", "Pitch", "Yaw"))
     changes = [(0, name, value) for name, value in quaternion.items()]
-    telemetry = umcd.read(table(columns, 2, changes=changes).encode(), "a.csv")
+    telemetry = flight_table.read(table(columns, 2, changes=changes).encode(), "a.csv")
     assert (telemetry["body_yaw_deg"][0] - yaw + 180) % 360 - 180 == pytest.approx(0, abs=1e-5)
     assert telemetry["body_pitch_deg"][0] == pytest.approx(pitch, abs=1e-5)
     assert telemetry["body_roll_deg"][0] == pytest.approx(roll, abs=1e-5)
@@ -157,16 +158,110 @@ def test_the_quaternion_stands_in_for_missing_angles(yaw, pitch, roll):
     (("offsetTime", "flightTime(msec)", "Tick#"), True),
 ])
 def test_each_column_of_time_stands_in_for_the_next(missing, rate_is_told):
-    telemetry = umcd.read(table(tuple(name for name in COLUMNS if name not in missing)).encode(), "a.csv")
+    telemetry = flight_table.read(table(tuple(name for name in COLUMNS if name not in missing)).encode(), "a.csv")
     assert_is_the_flight(telemetry)
     assert ("assumed_rate" in codes(telemetry)) is rate_is_told
+
+
+@pytest.mark.parametrize("ticks_hz", [600, 4_500_000])
+def test_ticks_are_the_flight_controllers_clock(ticks_hz):
+    changes = [(index, "Tick#", 7000 + round(0.2 * index * ticks_hz)) for index in range(20)]
+    columns = tuple(name for name in COLUMNS if name not in ("offsetTime", "flightTime(msec)"))
+    telemetry = flight_table.read(table(columns, changes=changes).encode(), "a.csv")
+    assert np.diff(telemetry.time_ns) == pytest.approx([0.2 * SECOND_NS] * 19, abs=1000)
+
+
+def test_datcons_table_with_empty_cells_and_trailing_ones():
+    header = (
+        "Tick#,offsetTime,flightTime(msec),Longitude,Latitude,numSats,gpsHealth,gpsAltitude(meters),baroAlt(meters),"
+        "vpsHeight(M),relativeHeight,accelX(M/S2),velN(M/S),velE(M/S),velD(M/S),velH(M/S),quatW,quatX,quatY,quatZ,Roll,"
+        "Pitch,Yaw,Yaw360,distancHP(M),Gimbal:roll,Gimbal:pitch,Gimbal:yaw,Gimbal:Xroll,MotorSpeed:RFront,Attribute|Value"
+    )
+    lines = [header + ",V2.8.0"]
+    for index in range(100):  # 50 rows a second; the receiver finds its satellites after half a second
+        place = (f"{9.19 + 1e-6 * index:.7f}", f"{45.46 + 2e-6 * index:.7f}") if index >= 25 else ("", "")
+        distance = f"{0.2 * index:.1f}" if index >= 30 else ""
+        lines.append(",".join([
+            str(240_000 + 12 * index), f"{5 + 0.02 * index:.3f}", str(20 * index), *place, "12", "4", "121.5", "119.9",
+            "", f"{30 + 0.01 * index:.2f}", "0.1", "3", "4", "0", "5", "1", "0", "0", "0", "1.5", "-2", "-90", "270",
+            distance, "0.1", "-90", "-91", "7", "", "ACType|P3", "more",
+        ]))
+    data = "\r\n".join(lines).encode()
+    assert flight_table.recognises(data[:4000])
+    telemetry = flight_table.read(data, "FLY123.csv")
+    assert len(telemetry) == 100 and codes(telemetry)["no_fix"] == 25
+    assert np.diff(telemetry.time_ns) == pytest.approx([0.02 * SECOND_NS] * 99, abs=1000)
+    assert telemetry["longitude_deg"][50] == pytest.approx(9.19005) and np.isnan(telemetry["latitude_deg"][24])
+    assert telemetry["orthometric_height_m"][0] == 121.5 and telemetry["height_above_takeoff_m"][99] == 30.99
+    assert telemetry["camera_pitch_deg"][0] == -90 and telemetry["camera_yaw_deg"][0] == -91
+    assert telemetry["body_yaw_deg"][0] == -90 and telemetry["speed_m_s"][0] == 5
+    assert "unreadable_line" not in codes(telemetry)
+
+
+def test_airdatas_table():
+    header = (
+        "time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(feet),altitude_above_seaLevel(feet),"
+        "speed(mph),distance(feet),satellites,isVideo,xSpeed(mph),ySpeed(mph),zSpeed(mph),compass_heading(degrees),"
+        "pitch(degrees),roll(degrees),gimbal_heading(degrees),gimbal_pitch(degrees),gimbal_roll(degrees),message"
+    )
+    rows = [
+        f"{100 * i},2023-05-04 10:00:{i // 10:02d},46.{500000 + i},11.2,{100 + i},{1100 + i},10,1,14,1,6,8,0,"
+        f"45,2.5,-1.5,46,-89.9,0.1,\"Home, sweet home\"" for i in range(40)
+    ]
+    telemetry = flight_table.read("\n".join([header, *rows]).encode(), "airdata.csv")
+    assert len(telemetry) == 40 and abs(int(telemetry.time_ns[0]) - 1_683_194_400 * SECOND_NS) < SECOND_NS
+    assert np.diff(telemetry.time_ns) == pytest.approx([SECOND_NS / 10] * 39, abs=1000)
+    assert telemetry["height_above_takeoff_m"][0] == pytest.approx(30.48)
+    assert telemetry["orthometric_height_m"][0] == pytest.approx(1100 * 0.3048)
+    assert telemetry["speed_m_s"][0] == pytest.approx(4.4704)
+    assert telemetry["course_deg"][0] == pytest.approx(53.13, abs=0.01)
+    assert telemetry["camera_pitch_deg"][0] == -89.9 and telemetry["body_roll_deg"][0] == -1.5
+    assert "time_zone_unknown" not in codes(telemetry)
+
+
+def test_a_dji_log_with_date_and_time_of_columns_of_their_own():
+    header = (
+        "CUSTOM.date [UTC],CUSTOM.updateTime [UTC],OSD.flyTime [s],OSD.latitude,OSD.longitude,OSD.height [ft],"
+        "OSD.altitude [ft],OSD.hSpeed [MPH],OSD.xSpeed [MPH],OSD.ySpeed [MPH],OSD.pitch,OSD.roll,OSD.yaw,GIMBAL.pitch,"
+        "GIMBAL.roll,GIMBAL.yaw,HOME.latitude,HOME.longitude"
+    )
+    rows = [
+        f"7/14/2023,{12 - (i < 10)}:{'59' if i < 10 else '00'}:{(50 + i) % 60:02d}.25 {'AM' if i < 10 else 'PM'},"
+        f"{i}.1,46.{500000 + 10 * i},11.2,100,900,3,3,4,1,2,30,-90,0,31,45,10" for i in range(20)
+    ]
+    telemetry = flight_table.read("\n".join([header, *rows]).encode(), "DJIFlightRecord.csv")
+    noon_ns = int(np.datetime64("2023-07-14T12:00:00", "ns").astype(np.int64))
+    assert list(telemetry.time_ns[[0, 10]] - noon_ns) == [-9_750_000_000, SECOND_NS // 4]
+    assert telemetry["orthometric_height_m"][0] == pytest.approx(900 * 0.3048)
+    assert telemetry["latitude_deg"][0] == 46.5 and telemetry["body_yaw_deg"][0] == 30
+
+
+def test_a_real_phantom_4_log():
+    telemetry = read_telemetry(real_data("telemetry/phantom4_log/log.csv"))
+    assert telemetry.format == "table" and len(telemetry) > 700
+    found = codes(telemetry)
+    assert found["time_zone_unknown"] > 700 and "unreadable_line" not in found
+    assert telemetry["latitude_deg"][0] == pytest.approx(55.507158) and telemetry["longitude_deg"][0] == 10.717078
+    assert np.nanmax(telemetry["height_above_takeoff_m"]) == pytest.approx(64.5, abs=0.3)
+    # its column of altitudes repeats the heights; the ground lies 21 m above the sea
+    assert np.isnan(telemetry["orthometric_height_m"]).all()
+    assert np.nanmedian(telemetry["camera_pitch_deg"]) == pytest.approx(-90, abs=0.2)
+    moving = telemetry["speed_m_s"] > 2
+    # the drone flies the way that its own position moves
+    east = np.gradient(telemetry["longitude_deg"]) * np.cos(np.radians(55.5))
+    north = np.gradient(telemetry["latitude_deg"])
+    way = np.degrees(np.arctan2(east, north))[moving]
+    turn = (way - telemetry["course_deg"][moving] + 180) % 360 - 180
+    assert np.median(np.abs(turn)) < 15
+    steps_s = np.diff(telemetry.time_ns) / SECOND_NS
+    assert np.median(steps_s) == pytest.approx(0.1, abs=0.01)
 
 
 def test_a_gap_shows_in_ticks_too():
     columns = tuple(name for name in COLUMNS if name not in ("offsetTime", "flightTime(msec)"))
     lines = table(columns, 60).splitlines()
     del lines[20:50]
-    telemetry = umcd.read("\n".join(lines).encode(), "a.csv")
+    telemetry = flight_table.read("\n".join(lines).encode(), "a.csv")
     assert codes(telemetry)["gap"] == 1
     assert np.diff(telemetry.time_ns).max() == pytest.approx(3.1 * SECOND_NS)
 
@@ -181,7 +276,7 @@ def test_a_column_of_dates_gives_utc():
     }.items():
         lines = table(count=30).splitlines()
         text = "\n".join([f"{lines[0]},{name}", *(f"{line},{each}" for line, each in zip(lines[1:], texts))])
-        telemetry = umcd.read(text.encode(), "a.csv")
+        telemetry = flight_table.read(text.encode(), "a.csv")
         assert len(telemetry) == 30, name
         assert abs(int(telemetry.time_ns[0]) - start) < SECOND_NS, name
         assert np.diff(telemetry.time_ns) == pytest.approx([SECOND_NS / 10] * 29, abs=1000), name
@@ -193,12 +288,12 @@ def test_a_date_without_its_zone_is_told():
     lines = table(count=3).splitlines()
     rows = [f"{line},2016-05-04 10:00:00.{i}" for i, line in enumerate(lines[1:])]
     text = "\n".join([f"{lines[0]},dateTime", *rows])
-    assert codes(umcd.read(text.encode(), "a.csv"))["time_zone_unknown"] == 3
+    assert codes(flight_table.read(text.encode(), "a.csv"))["time_zone_unknown"] == 3
 
 
 def test_the_barometer_stands_in_for_the_relative_height_and_says_so():
     columns = tuple(name for name in COLUMNS if name != "relativeHeight")
-    telemetry = umcd.read(table(columns, 3).encode(), "a.csv")
+    telemetry = flight_table.read(table(columns, 3).encode(), "a.csv")
     assert list(telemetry["height_above_takeoff_m"]) == [0.0, 1.0, 2.0]
     assert codes(telemetry)["height_from_barometer"] == 3
 
@@ -207,7 +302,7 @@ def test_sentences_in_a_61st_column_do_not_disturb():
     lines = table(count=4).splitlines()
     nmea = "$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47"
     text = "\n".join([lines[0] + ",NMEA GGA/RMC Strings", *(f"{line},{nmea}" for line in lines[1:])])
-    assert_is_the_flight(umcd.read(text.encode(), "a.csv"), 4)
+    assert_is_the_flight(flight_table.read(text.encode(), "a.csv"), 4)
 
 
 def test_broken_rows_are_counted():
@@ -216,7 +311,7 @@ def test_broken_rows_are_counted():
     lines[7] = "1,2"
     lines[9] = '"' + lines[9]  # a stray quote
     lines[12] = ""
-    telemetry = umcd.read(("\n".join(lines) + "\n").encode(), "a.csv")
+    telemetry = flight_table.read(("\n".join(lines) + "\n").encode(), "a.csv")
     said = codes(telemetry)
     assert said["unreadable_line"] == 1
     assert said["short_row"] == 2
@@ -225,15 +320,15 @@ def test_broken_rows_are_counted():
 
 def test_a_half_written_last_row_is_counted():
     text = table(count=5)
-    telemetry = umcd.read(text[:-40].encode(), "a.csv")
+    telemetry = flight_table.read(text[:-40].encode(), "a.csv")
     assert codes(telemetry)["truncated"] == 1
     assert_is_the_flight(telemetry, 4)
-    assert "truncated" not in codes(umcd.read(text.rstrip().encode(), "a.csv"))
+    assert "truncated" not in codes(flight_table.read(text.rstrip().encode(), "a.csv"))
 
 
 def test_a_flight_starts_before_the_clock_does():
     changes = [(0, "offsetTime", -3.0), (1, "offsetTime", -2.9)]
-    telemetry = umcd.read(table(count=2, changes=changes).encode(), "a.csv")
+    telemetry = flight_table.read(table(count=2, changes=changes).encode(), "a.csv")
     assert list(telemetry.video_time_ns) == [0, SECOND_NS // 10]
 
 
@@ -251,7 +346,7 @@ def test_mutated_files_raise_only_input_errors(data):
         if not valid:
             return
     try:
-        telemetry = umcd.read(bytes(valid), "a.csv")
+        telemetry = flight_table.read(bytes(valid), "a.csv")
     except InputError:
         return
     assert (np.diff(telemetry.time_ns) > 0).all()
@@ -266,7 +361,7 @@ def test_mutated_files_raise_only_input_errors(data):
 def test_any_cells_raise_only_input_errors(cells):
     text = "offsetTime,Latitude,Longitude,time\n" + "\n".join(",".join(each) for each in cells)
     try:
-        telemetry = umcd.read(text.encode("utf-8", "surrogatepass"), "a.csv")
+        telemetry = flight_table.read(text.encode("utf-8", "surrogatepass"), "a.csv")
     except InputError:
         return
     latitude = telemetry["latitude_deg"]

@@ -1,9 +1,10 @@
-"""The UMCD dataset's telemetry table (thesis Table 2.2) and other flight logs with named columns."""
+"""Flight tables with named columns: DatCon's, which the UMCD dataset has (thesis Table 2.2), Airdata's, DJI's logs."""
 
 import csv
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -19,74 +20,31 @@ from sorvolo.capture.telemetry.quality import (
     text_from_bytes,
     time_ns_from_text,
 )
+from sorvolo.capture.telemetry.table_columns import COLUMN_NAMES, COUNTERS, plain_name, unit_factor
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, Mask, TimesNs
 from sorvolo.survey.flight import Notice, Telemetry
 
 _HEADER_LINES = 40  # some programs write a preamble before the header
 _DATASET_RATE_HZ = 10.0  # thesis, section 2.2
+# DatCon's Tick# is the flight controller's counter, of later drones or of the Phantom 3. DatCon writes 200 rows a
+# second at most: the step between rows shows which it is, and a smaller one counts rows.
+_TICK_RATES_HZ = ((20_000.0, 4_500_000.0), (3.0, 600.0))
+_SAME_HEIGHT_M = 1.5  # DJI's apps write the height above take-off into the column of altitudes as well
 _LONGEST_HEADER = 20_000
 _LARGEST_S = 1e9  # a counter beyond thirty years is broken
 _EPOCH_S = (3e8, 7e9)  # 1979 to 2191: what a number must be to count as a time since 1970
-_ODD = re.compile(r"[\s_#:.\-]+")
+_LINE = re.compile(r"[^\r\n]+")
+_DAY = re.compile(r"(\d{1,4})[/.-](\d{1,2})[/.-](\d{1,4})")
+_CLOCK = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([.,]\d{1,9})?\s*([AP]M)?", re.IGNORECASE)
 _UNKNOWN_WORDS = {"", "nan", "na", "n/a", "null", "none", "-", "--"}
-
-# what each column may be called: lower case without blanks and punctuation, best first
-_NAMES: Mapping[str, tuple[str, ...]] = {
-    "latitude": ("latitude", "lat", "gpslat", "gpslatitude"),
-    "longitude": ("longitude", "lon", "long", "lng", "gpslon", "gpslong", "gpslongitude"),
-    "altitude": ("gpsaltitude", "altitudeabovesealevel", "altitudemsl", "abvsealevel"),
-    "relative_height": ("relativeheight", "heightabovetakeoff", "relativealtitude", "relalt"),
-    "barometer": ("baroalt",),
-    "camera_yaw": ("gimbalyaw", "gimbalheading"),
-    "camera_pitch": ("gimbalpitch",),
-    "camera_roll": ("gimbalroll",),
-    "body_yaw": ("yaw", "compassheading"),
-    "body_pitch": ("pitch",),
-    "body_roll": ("roll",),
-    "velocity_north": ("veln", "velocitynorth"),
-    "velocity_east": ("vele", "velocityeast"),
-    "speed": ("groundspeed", "speed"),
-    "course": ("course", "directionoftravel"),
-    "quaternion_w": ("quatw",),
-    "quaternion_x": ("quatx",),
-    "quaternion_y": ("quaty",),
-    "quaternion_z": ("quatz",),
-    "offset_time": ("offsettime",),
-    "flight_time": ("flighttime",),
-    "time": ("time", "elapsedtime"),
-    "tick": ("tick", "ticks"),
-    "utc": ("gpsdatetimestamp", "datetimestamp", "datetimeutc", "utcdatetime", "datetime", "utc", "utctime",
-            "gpstime", "timestamp"),
-}
-_COUNTERS = ("offset_time", "flight_time", "time", "tick")
-# factors to deg, m, m/s and s of the units that headers print, lower case
-_DEGREES = {"": 1.0, "degrees": 1.0, "degree": 1.0, "deg": 1.0, "°": 1.0,
-            "radians": 180 / np.pi, "radian": 180 / np.pi, "rad": 180 / np.pi}
-_METRES = {"": 1.0, "m": 1.0, "meters": 1.0, "metres": 1.0, "meter": 1.0, "metre": 1.0,
-           "feet": 0.3048, "foot": 0.3048, "ft": 0.3048, "cm": 0.01, "centimeters": 0.01, "mm": 0.001,
-           "km": 1000.0, "kilometers": 1000.0}
-_METRES_A_SECOND = {"": 1.0, "m/s": 1.0, "mps": 1.0, "meters/s": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6,
-                    "kph": 1 / 3.6, "mph": 0.44704, "knots": 1852 / 3600, "kn": 1852 / 3600,
-                    "kt": 1852 / 3600, "feet/s": 0.3048, "ft/s": 0.3048, "cm/s": 0.01}
-_SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "second": 1.0, "msec": 1e-3, "ms": 1e-3,
-            "millisecond": 1e-3, "milliseconds": 1e-3, "usec": 1e-6, "us": 1e-6,
-            "microseconds": 1e-6, "nsec": 1e-9, "ns": 1e-9, "minutes": 60.0, "min": 60.0}
-_UNITS: Mapping[str, Mapping[str, float]] = {
-    **dict.fromkeys(("altitude", "relative_height", "barometer"), _METRES),
-    **dict.fromkeys(("velocity_north", "velocity_east", "speed"), _METRES_A_SECOND),
-    **{f"quaternion_{axis}": {"": 1.0} for axis in "wxyz"},
-    "tick": {"": 1.0},
-    "offset_time": {"": 1.0, **_SECONDS},
-    "flight_time": {"": 1e-3, **_SECONDS},
-    "time": {"": 1.0, **_SECONDS},
-    "utc": {"": 1.0, "utc": 1.0, "gps": 1.0, **_SECONDS},
-}
-
 
 @dataclass(frozen=True)
 class _Table:
-    """The table as texts: which cell of a row holds each quantity, its factor to our unit, and the rows."""
+    """The table as texts: which cell of a row holds each quantity, its factor to our unit, and the rows.
+
+    Rows hold the wanted columns only: a log has up to 230.
+    """
 
     cells: Mapping[str, int]
     factors: Mapping[str, float]
@@ -95,30 +53,40 @@ class _Table:
     notices: list[Notice]
 
 
+@dataclass(frozen=True)
+class _Header:
+    """The line with the columns' names: where the rows begin, the delimiter, each column's plain name and unit."""
+
+    rows_from: int
+    delimiter: str
+    columns: list[tuple[str, str]]
+
+
 def recognises(head: bytes) -> bool:
     """Whether one of the file's first lines names a latitude and a longitude column."""
-    return _header(_lines(text_from_bytes(head))) is not None
+    return _header(text_from_bytes(head)) is not None
 
 
 def read(data: bytes, name: str) -> Telemetry:
     """The samples of a table with named columns, in any order; unknown columns are ignored.
 
     Units printed in the header are converted; without one they are deg, m, m/s and s (ms for flightTime).
-    gpsAltitude is stored as orthometric, relativeHeight as above take-off. Times: a column of dates where
-    there is one, else offsetTime, flightTime or Tick# from 1970-01-01, the first sample at the video's
-    first frame. `name` is for messages. Raises InputError when there is no such table or no usable row.
+    gpsAltitude is stored as orthometric, relativeHeight as above take-off; a column of altitudes that repeats the
+    height above take-off is left out. Times: a column of dates where there is one, else offsetTime, flightTime or
+    Tick# (600 a second, DatCon's) from 1970-01-01, the first sample at the video's first frame. `name` is for
+    messages. Raises InputError when there is no such table or no usable row.
     """
     table = _table(text_from_bytes(data), name)
-    numbers = {key: _numbers(table, key) for key in table.cells if key not in ("utc", "time")}
+    numbers = {key: _numbers(table, key) for key in table.cells if key not in ("utc", "time", "date")}
     if "time" in table.cells:
         numbers["time"] = _numbers(table, "time", is_text_allowed=True)
     unreadable = np.zeros(len(table.rows), dtype=np.bool_)
     for _, bad in numbers.values():
         unreadable |= bad
     columns, notices = _columns({key: values for key, (values, _) in numbers.items()})
-    times_ns, video_ns, clock = _times(table, {key: numbers[key][0] for key in _COUNTERS if key in numbers})
+    times_ns, video_ns, clock = _times(table, {key: numbers[key][0] for key in COUNTERS if key in numbers})
     return clean(
-        "umcd", name, times_ns, columns, video_ns,
+        "table", name, times_ns, columns, video_ns,
         notices=[
             *table.notices,
             *notice("unreadable_line", int(unreadable.sum()), "{} rows have cells that are no numbers"),
@@ -127,10 +95,6 @@ def read(data: bytes, name: str) -> Telemetry:
         ],
         position_decimals=_position_decimals(table),
     )
-
-
-def _lines(text: str) -> list[str]:
-    return re.split(r"\r\n|\r|\n", text)
 
 
 def _split(line: str, delimiter: str) -> list[str]:
@@ -143,74 +107,78 @@ def _split(line: str, delimiter: str) -> list[str]:
         return line.split(delimiter)
 
 
-def _header(lines: list[str]) -> tuple[int, str, list[tuple[str, str]]] | None:
-    """The header's line number, its delimiter, and each column's plain name and unit; None without one."""
-    for number, line in enumerate(lines[:_HEADER_LINES]):
+def _header(text: str) -> _Header | None:
+    """The header; None without one."""
+    for line in islice(_LINE.finditer(text), _HEADER_LINES):
         for delimiter in (",", ";", "\t"):
-            if delimiter not in line or len(line) > _LONGEST_HEADER:
+            if delimiter not in line[0] or len(line[0]) > _LONGEST_HEADER:
                 continue
-            columns = [_plain(cell) for cell in _split(line, delimiter)]
+            columns = [plain_name(cell) for cell in _split(line[0], delimiter)]
             plain = {column for column, _ in columns}
-            if plain.intersection(_NAMES["latitude"]) and plain.intersection(_NAMES["longitude"]):
-                return number, delimiter, columns
+            if plain.intersection(COLUMN_NAMES["latitude"]) and plain.intersection(COLUMN_NAMES["longitude"]):
+                return _Header(line.end(), delimiter, columns)
     return None
 
 
-def _plain(cell: str) -> tuple[str, str]:
-    """("velN(M/S)") -> ("veln", "m/s")."""
-    label, _, rest = cell.replace("[", "(").replace("]", ")").partition("(")
-    return _ODD.sub("", label).lower(), rest.partition(")")[0].strip().lower()
-
-
 def _table(text: str, name: str) -> _Table:
-    lines = _lines(text)
-    header = _header(lines)
+    header = _header(text)
     if header is None:
         raise InputError(
             f"{name}: no header line with Latitude and Longitude columns; add one, "
             "separated by commas, semicolons or tabs"
         )
-    number, delimiter, columns = header
-    cells: dict[str, int] = {}
+    places: dict[str, int] = {}
     factors: dict[str, float] = {}
     notices: list[Notice] = []
-    labels = [column for column, _ in columns]
-    for key, names in _NAMES.items():
+    labels = [column for column, _ in header.columns]
+    for key, names in COLUMN_NAMES.items():
         label = next((each for each in names if each in labels), None)
         if label is None:
             continue
-        unit = columns[labels.index(label)][1]
-        factor = _UNITS.get(key, _DEGREES).get(unit)
+        unit = header.columns[labels.index(label)][1]
+        factor = unit_factor(key, unit)
         if factor is None:
-            notices += notice("unknown_unit", 1, f"column {label} is ignored: its unit ({unit}) is not known")
+            notices += notice("unknown_unit", 1, f"column {label} is not used: its unit ({unit}) is unknown")
             continue
-        cells[key], factors[key] = labels.index(label), factor
-    if "latitude" not in cells or "longitude" not in cells:
+        places[key], factors[key] = labels.index(label), factor
+    if "latitude" not in places or "longitude" not in places:
         raise InputError(f"{name}: {notices[0].text}; latitude and longitude must be in degrees or radians")
-    is_utc = "utc" in cells and bool(re.search("utc|gps", " ".join(columns[cells["utc"]])))
-    needed = 1 + max(cells["latitude"], cells["longitude"])
-    rows, found = _rows(lines[number + 1:], delimiter, len(columns), needed)
-    return _Table(cells, factors, is_utc, rows, notices + found)
+    is_utc = "utc" in places and bool(re.search("utc|gps", " ".join(header.columns[places["utc"]])))
+    rows, found = _rows(text, header, list(places.values()), 1 + max(places["latitude"], places["longitude"]))
+    return _Table({key: index for index, key in enumerate(places)}, factors, is_utc, rows, notices + found)
 
 
-def _rows(lines: list[str], delimiter: str, width: int, needed: int) -> tuple[list[list[str]], list[Notice]]:
-    """The rows that reach the position's columns, decimal commas made points, and what was dropped."""
-    rows = [(number, _split(line, delimiter)) for number, line in enumerate(lines) if line.strip()]
-    notices: list[Notice] = []
+def _rows(text: str, header: _Header, places: list[int], needed: int) -> tuple[list[list[str]], list[Notice]]:
+    """The cells at `places` of the rows that reach the position's columns, decimal commas made points."""
+    rows: list[list[str]] = []
+    short = 0
+    width = 0
+    for line in _LINE.finditer(text, header.rows_from):
+        if not line[0].strip():
+            continue
+        cells = _split(line[0], header.delimiter)
+        width = len(cells)
+        if width < needed:
+            short += 1
+        else:
+            rows.append([cells[place].strip() if place < width else "" for place in places])
     # a last line without its end that lacks cells was being written when the recording stopped
-    if rows and rows[-1][0] == len(lines) - 1 and len(rows[-1][1]) < width:
+    is_cut = 0 < width < len(header.columns) and text[-1] not in "\r\n"
+    if is_cut and width < needed:
+        short -= 1
+    elif is_cut:
         rows.pop()
-        notices += notice("truncated", 1, "the last row is cut off")
-    whole = [row for _, row in rows if len(row) >= needed]
-    notices += notice("short_row", len(rows) - len(whole), "{} rows dropped: they end before the position")
-    if delimiter != ",":
-        whole = [[cell.replace(",", ".") for cell in row] for row in whole]
-    return whole, notices
+    if header.delimiter != ",":
+        rows = [[cell.replace(",", ".") for cell in row] for row in rows]
+    return rows, [
+        *notice("truncated", int(is_cut), "the last row is cut off"),
+        *notice("short_row", short, "{} rows dropped: they end before the position"),
+    ]
 
 
 def _texts(table: _Table, key: str) -> list[str]:
     place = table.cells[key]
-    return [row[place].strip() if place < len(row) else "" for row in table.rows]
+    return [row[place] for row in table.rows]
 
 
 def _numbers(table: _Table, key: str, is_text_allowed: bool = False) -> tuple[Floats, Mask]:
@@ -232,9 +200,11 @@ def _columns(numbers: Mapping[str, Floats]) -> tuple[dict[str, Floats], list[Not
     direct = {
         "latitude": "latitude_deg", "longitude": "longitude_deg", "altitude": "orthometric_height_m",
         "relative_height": "height_above_takeoff_m", "speed": "speed_m_s", "course": "course_deg",
-        **{key: f"{key}_deg" for key in _NAMES if key.startswith(("camera_", "body_"))},
+        **{key: f"{key}_deg" for key in COLUMN_NAMES if key.startswith(("camera_", "body_"))},
     }
     columns = {direct[key]: values for key, values in numbers.items() if key in direct}
+    if _repeats_height(columns):
+        del columns["orthometric_height_m"]
     if not np.isfinite(columns.get("height_above_takeoff_m", np.nan)).any() and "barometer" in numbers:
         barometer = numbers["barometer"]
         known = np.flatnonzero(np.isfinite(barometer))
@@ -254,6 +224,15 @@ def _columns(numbers: Mapping[str, Floats]) -> tuple[dict[str, Floats], list[Not
             if not np.isfinite(columns.get(key, np.nan)).any():
                 columns[key] = values
     return columns, notices
+
+
+def _repeats_height(columns: Mapping[str, Floats]) -> bool:
+    """Whether the altitudes are the heights above take-off once more."""
+    if "orthometric_height_m" not in columns or "height_above_takeoff_m" not in columns:
+        return False
+    apart_m = np.abs(columns["orthometric_height_m"] - columns["height_above_takeoff_m"])
+    known = np.isfinite(apart_m)
+    return bool(known.any() and (apart_m[known] <= _SAME_HEIGHT_M).all())
 
 
 def _angles(w: Floats, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats, Floats]:
@@ -309,7 +288,10 @@ def _stamps(table: _Table) -> tuple[TimesNs, int]:
     for key in ("utc", "time"):
         if key not in table.cells or (stamps_ns != NO_TIME_NS).any():
             continue
-        for row, text in enumerate(_texts(table, key)):
+        texts = _texts(table, key)
+        if key == "utc" and "date" in table.cells:
+            texts = [_joined(day, clock) for day, clock in zip(_texts(table, "date"), texts)]
+        for row, text in enumerate(texts):
             if stamp := time_ns_from_text(text):
                 stamps_ns[row] = stamp[0]
                 zoned += stamp[1]
@@ -317,6 +299,19 @@ def _stamps(table: _Table) -> tuple[TimesNs, int]:
                 stamps_ns[row] = epoch_ns
                 zoned += 1
     return stamps_ns, zoned
+
+
+def _joined(day: str, clock: str) -> str:
+    """A date and a clock of columns of their own, "7/4/2018" (month first) and "9:19:31.7 PM", as one text."""
+    date, time = _DAY.fullmatch(day), _CLOCK.fullmatch(clock)
+    if date is None or time is None:
+        return clock
+    first, second, third = date.groups()
+    year, month, of_month = (first, second, third) if len(first) == 4 else (third, first, second)
+    hour = int(time[1])
+    if time[5]:
+        hour = hour % 12 + (12 if time[5].upper() == "PM" else 0)
+    return f"{year}-{month}-{of_month} {hour:02d}:{time[2]}:{time[3]}{(time[4] or '').replace(',', '.')}"
 
 
 def _epoch_ns(text: str, factor: float) -> int:
@@ -332,14 +327,10 @@ def _epoch_ns(text: str, factor: float) -> int:
 
 
 def _counter(counters: Mapping[str, Floats], rows: int) -> TimesNs:
-    """The column that tells most rows apart, in ns; ticks have no known rate and get the dataset's."""
+    """The counter with most distinct times in order, in ns."""
     best, most = np.full(rows, NO_TIME_NS), 0
     for key, values in counters.items():
-        seconds = values
-        if key == "tick":
-            steps = np.diff(values[np.isfinite(values)])
-            step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
-            seconds = values / (step * _DATASET_RATE_HZ)
+        seconds = values / _tick_rate_hz(values) if key == "tick" else values
         known = np.isfinite(seconds) & (np.abs(seconds) < _LARGEST_S)
         counter_ns = np.full(rows, NO_TIME_NS)
         counter_ns[known] = np.round(seconds[known] * 1e6).astype(np.int64) * 1000
@@ -347,6 +338,13 @@ def _counter(counters: Mapping[str, Floats], rows: int) -> TimesNs:
         if rising > most:
             best, most = counter_ns, rising
     return best
+
+
+def _tick_rate_hz(ticks: Floats) -> float:
+    """DatCon's rate, or, where ticks count rows, the dataset's."""
+    steps = np.diff(ticks[np.isfinite(ticks)])
+    step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    return next((rate for least, rate in _TICK_RATES_HZ if step >= least), step * _DATASET_RATE_HZ)
 
 
 def _position_decimals(table: _Table) -> int | None:
