@@ -5,6 +5,7 @@ import json
 import sqlite3
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -21,17 +22,35 @@ from sorvolo.survey.mosaic import Status
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    with Archive.open(tmp_path / "site", write=True) as archive:
-        archive.create_site(SITE)
     return tmp_path / "site"
 
 
+def opened(folder: Path) -> Archive:
+    """The site to be written, made where there is none."""
+    archive = Archive.open(folder, write=True)
+    if not archive.has_site:
+        archive.create_site(SITE)
+    return archive
+
+
 def test_a_site_comes_back_as_it_was_and_only_once(folder: Path) -> None:
+    with opened(folder) as archive:
+        map_flight(archive, "a", 20)
     with Archive.open(folder, write=True) as archive:
         assert archive.has_site
         assert archive.site() == SITE
         with pytest.raises(StoreError, match="field"):
             archive.create_site(SITE)
+
+
+def test_a_site_that_no_flight_entered_is_forgotten(folder: Path) -> None:
+    with opened(folder):  # as good as a kill between create_site and begin_flight
+        pass
+    with Archive.open(folder, write=True) as archive:
+        assert not archive.has_site
+        archive.create_site(replace(SITE, m_per_px=0.25))
+        map_flight(archive, "a", 20)
+        assert archive.site().m_per_px == 0.25
 
 
 def test_an_empty_archive_has_no_site(tmp_path: Path) -> None:
@@ -44,7 +63,7 @@ def test_an_empty_archive_has_no_site(tmp_path: Path) -> None:
 
 
 def test_a_flight_comes_back_whole(folder: Path) -> None:
-    with Archive.open(folder, write=True) as archive:
+    with opened(folder) as archive:
         version = map_flight(archive, "morning", 20)
     with Archive.open(folder, write=False) as archive:
         (flight,) = archive.flights()
@@ -79,7 +98,7 @@ def test_a_flight_comes_back_whole(folder: Path) -> None:
 
 def test_a_keyframe_stored_smaller_sees_the_same_ground(folder: Path) -> None:
     full = frame(1)
-    with Archive.open(folder, write=True) as archive, archive.begin_flight("a", "", {}) as writer:
+    with opened(folder) as archive, archive.begin_flight("a", "", {}) as writer:
         path = writer.save_image(1, cv2.resize(image(1), (32, 18), interpolation=cv2.INTER_AREA))
         writer.commit([full], {1: path}, {}, "")
         (keyframe,) = archive.keyframes()
@@ -91,7 +110,7 @@ def test_a_keyframe_stored_smaller_sees_the_same_ground(folder: Path) -> None:
 
 
 def test_images_come_out_of_the_writer_as_out_of_the_archive(folder: Path) -> None:
-    with Archive.open(folder, write=True) as archive:
+    with opened(folder) as archive:
         with archive.begin_flight("a", "", {}, cache_mb=0) as writer:
             paths = {index: writer.save_image(index, image(index)) for index in range(3)}
             seen = [writer.image(index) for index in range(3)]
@@ -107,7 +126,7 @@ def test_images_come_out_of_the_writer_as_out_of_the_archive(folder: Path) -> No
 
 
 def test_leaving_without_commit_changes_nothing(folder: Path) -> None:
-    with Archive.open(folder, write=True) as archive:
+    with opened(folder) as archive:
         map_flight(archive, "a", 20)
         before = (archive.flights(), archive.versions(), sorted(path for path in folder.rglob("*.[pj]*g")))
         with pytest.raises(ZeroDivisionError), archive.begin_flight("b", "", {}) as writer:
@@ -123,7 +142,7 @@ def test_leaving_without_commit_changes_nothing(folder: Path) -> None:
 
 
 def test_mapping_again_keeps_the_rank_and_shows_the_former_run_until_the_commit(folder: Path) -> None:
-    with Archive.open(folder, write=True) as archive:
+    with opened(folder) as archive:
         map_flight(archive, "a", 20)
         map_flight(archive, "b", 40)
         former = archive.keyframes("a")
@@ -142,7 +161,7 @@ def test_mapping_again_keeps_the_rank_and_shows_the_former_run_until_the_commit(
 
 
 def test_a_version_starts_from_the_newest_one_that_another_flight_made(folder: Path) -> None:
-    with Archive.open(folder, write=True) as archive:
+    with opened(folder) as archive:
         first = map_flight(archive, "a", 20, count=2)
         for colour in (40, 60):  # the second time over the version of flight a, not over its own
             with archive.begin_flight("b", "", {}) as writer:
@@ -156,7 +175,7 @@ def test_a_version_starts_from_the_newest_one_that_another_flight_made(folder: P
 
 
 def test_versions_share_the_tiles_in_which_they_agree(folder: Path) -> None:
-    with Archive.open(folder, write=True) as archive:
+    with opened(folder) as archive:
         map_flight(archive, "a", 20)
         blobs = set(folder.glob("tiles/*/*.png"))
         with archive.begin_flight("b", "", {}) as writer:
@@ -178,7 +197,7 @@ def test_versions_share_the_tiles_in_which_they_agree(folder: Path) -> None:
 
 
 def test_repainting_leaves_no_blobs_behind(folder: Path) -> None:
-    with Archive.open(folder, write=True) as archive, archive.begin_flight("a", "", {}, cache_mb=2) as writer:
+    with opened(folder) as archive, archive.begin_flight("a", "", {}, cache_mb=2) as writer:
         for colour in range(20, 30):
             for column in range(4):  # more than fit into memory, so that some are written between flushes
                 writer.tiles[column, 0] = tile(colour, opaque_columns=100 + column)
@@ -188,7 +207,7 @@ def test_repainting_leaves_no_blobs_behind(folder: Path) -> None:
 
 
 def test_a_tile_must_have_the_sites_size_and_comes_out_read_only(folder: Path) -> None:
-    with Archive.open(folder, write=True) as archive, archive.begin_flight("a", "", {}) as writer:
+    with opened(folder) as archive, archive.begin_flight("a", "", {}) as writer:
         with pytest.raises(GeometryError, match="512x512"):
             writer.tiles[0, 0] = np.ones((256, 256, 4), np.uint8)
         painted = tile(5)
@@ -209,7 +228,7 @@ def test_another_process_reads_the_growing_map(folder: Path) -> None:
         "    print(len(live), int(live[0, 0][0, 0, 0]), len(whole), int(whole[0, 0][0, 0, 0]))\n"
         "    print(len(archive.keyframes()))\n"
     )
-    with Archive.open(folder, write=True) as archive:
+    with opened(folder) as archive:
         map_flight(archive, "a", 20)
         with archive.begin_flight("b", "", {}) as writer:
             writer.tiles[0, 0] = tile(111)
@@ -221,7 +240,7 @@ def test_another_process_reads_the_growing_map(folder: Path) -> None:
 
 
 def test_a_reader_follows_a_tile_that_is_replaced_under_it(folder: Path) -> None:
-    with Archive.open(folder, write=True) as archive, archive.begin_flight("a", "", {}) as writer:
+    with opened(folder) as archive, archive.begin_flight("a", "", {}) as writer:
         writer.tiles[0, 0] = tile(1)
         writer.flush()
         with Archive.open(folder, write=False) as reader:
@@ -236,9 +255,9 @@ def test_a_reader_follows_a_tile_that_is_replaced_under_it(folder: Path) -> None
 
 
 def test_only_one_writer_and_one_flight_at_a_time(folder: Path) -> None:
-    with Archive.open(folder, write=True) as archive:
+    with opened(folder) as archive:
         with pytest.raises(StoreError, match="another process"):
-            Archive.open(folder, write=True)
+            opened(folder)
         with archive.begin_flight("a", "", {}), pytest.raises(StoreError, match="already"):
             archive.begin_flight("b", "", {})
     with Archive.open(folder, write=False) as archive, pytest.raises(StoreError, match="write=True"):
@@ -247,7 +266,7 @@ def test_only_one_writer_and_one_flight_at_a_time(folder: Path) -> None:
 
 @pytest.mark.parametrize("flight_id", ["", "../up", ".hidden", "a/b", "a\0b"])
 def test_a_flight_id_cannot_leave_its_folder(folder: Path, flight_id: str) -> None:
-    with Archive.open(folder, write=True) as archive, pytest.raises(SettingsError):
+    with opened(folder) as archive, pytest.raises(SettingsError):
         archive.begin_flight(flight_id, "", {})
 
 
@@ -271,17 +290,19 @@ def test_a_catalogue_that_is_none_is_refused_and_left_alone(tmp_path: Path, cont
 
 
 def test_a_damaged_catalogue_is_refused_and_left_alone(folder: Path) -> None:
-    with Archive.open(folder, write=True) as archive:
+    with opened(folder) as archive:
         map_flight(archive, "a", 20)
     whole = (folder / "site.db").read_bytes()
     cut = whole[: len(whole) // 2]
     (folder / "site.db").write_bytes(cut)
     with pytest.raises(StoreError, match="damaged"):
-        Archive.open(folder, write=True)
+        opened(folder)
     assert (folder / "site.db").read_bytes() == cut
 
 
 def test_another_format_version_is_refused_with_both_versions(folder: Path) -> None:
+    with opened(folder):
+        pass
     with sqlite3.connect(folder / "site.db") as connection:
         connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 6}")
     connection.close()
@@ -291,7 +312,7 @@ def test_another_format_version_is_refused_with_both_versions(folder: Path) -> N
 
 
 def test_a_folder_on_a_read_only_disk_can_be_read_but_not_written(folder: Path, tmp_path: Path) -> None:
-    with Archive.open(folder, write=True) as archive:
+    with opened(folder) as archive:
         map_flight(archive, "a", 20)
     view = tmp_path / "view"
     view.mkdir()
@@ -311,7 +332,7 @@ def test_a_folder_on_a_read_only_disk_can_be_read_but_not_written(folder: Path, 
 
 
 def test_a_damaged_or_missing_tile_is_named(folder: Path) -> None:
-    with Archive.open(folder, write=True) as archive:
+    with opened(folder) as archive:
         map_flight(archive, "a", 20, count=1)
     (blob,) = folder.glob("tiles/*/*.png")
     data = bytearray(blob.read_bytes())
@@ -326,7 +347,7 @@ def test_a_damaged_or_missing_tile_is_named(folder: Path) -> None:
 
 
 def test_files_that_a_commit_still_owed_are_written_by_the_next_opening(folder: Path) -> None:
-    with Archive.open(folder, write=True) as archive:
+    with opened(folder) as archive:
         map_flight(archive, "a", 20, count=1)
         archive.preview_path.unlink()
         (archive.preview_path / "in the way").mkdir(parents=True)  # as good as a kill: the commit stops here
@@ -335,15 +356,15 @@ def test_files_that_a_commit_still_owed_are_written_by_the_next_opening(folder: 
         assert [flight.id for flight in archive.flights()] == ["a", "b"]
     (folder / "preview.png" / "in the way").rmdir()
     (folder / "preview.png").rmdir()
-    with Archive.open(folder, write=True) as archive:
+    with opened(folder) as archive:
         assert cv2.imread(str(archive.preview_path), cv2.IMREAD_UNCHANGED).shape == (512, 3 * 512, 4)
         archive.mosaic_path.unlink()
-    with Archive.open(folder, write=True) as archive:
+    with opened(folder) as archive:
         assert archive.mosaic_path.is_file()
 
 
 def test_a_flight_without_any_tile_leaves_no_map(folder: Path) -> None:
-    with Archive.open(folder, write=True) as archive:
+    with opened(folder) as archive:
         with archive.begin_flight("a", "", {}) as writer:
             writer.commit([frame(0, Status.REJECTED)], {}, {"value": np.nan}, "")
         assert not archive.mosaic_path.exists()
@@ -363,7 +384,7 @@ def test_a_local_site_has_a_map_without_a_place_on_earth(tmp_path: Path) -> None
 
 def test_a_commit_refuses_an_image_that_was_never_saved(folder: Path) -> None:
     with (
-        Archive.open(folder, write=True) as archive,
+        opened(folder) as archive,
         archive.begin_flight("a", "", {}) as writer,
         pytest.raises(StoreError, match="never saved"),
     ):

@@ -233,7 +233,7 @@ def _map_files(site: Path) -> dict[str, Path]:
 def newest_version(site: Path) -> int:
     """The id of the site's newest version; 0 where there is no site yet."""
     from sorvolo.store.site.archive import Archive
-    from sorvolo.store.site.folder import CATALOGUE
+    from sorvolo.store.site.files import CATALOGUE
 
     if not (site / CATALOGUE).is_file():
         return 0

@@ -1,8 +1,8 @@
 """Files that appear whole or not at all: written beside their place, synced, then renamed."""
 
 import errno
-import itertools
 import os
+import secrets
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -15,7 +15,6 @@ TEMPORARY_PREFIX = ".tmp-"
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
-_counter = itertools.count()
 
 
 @contextmanager
@@ -27,7 +26,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
     cut may lose it. Raises StoreError when the disk is full or the folder cannot be written; other errors
     pass through.
     """
-    temporary = _temporary(path)
+    temporary = temporary_beside(path)
     with writing(path):
         try:
             yield temporary
@@ -47,7 +46,10 @@ def atomic_write_bytes(path: Path, data: bytes, *, durable: bool = True) -> None
     Raises StoreError when the disk is full or the folder cannot be written.
     """
     with atomic_path(path, durable=durable) as temporary:
-        temporary.write_bytes(data)
+        # a link with this very name, however unlikely, is not followed
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(data)
 
 
 @contextmanager
@@ -56,7 +58,7 @@ def scratch_folder(parent: Path) -> Iterator[Path]:
 
     Raises StoreError when the disk is full or the folder cannot be written.
     """
-    folder = _temporary(parent / "scratch")
+    folder = temporary_beside(parent / "scratch")
     with writing(folder):
         folder.mkdir()
         try:
@@ -99,7 +101,7 @@ def remove_leftovers(folders: Iterable[Path]) -> int:
     removed = 0
     for folder in folders:
         for leftover in folder.glob(f"{TEMPORARY_PREFIX}*"):
-            if leftover.is_dir():
+            if leftover.is_dir() and not leftover.is_symlink():
                 shutil.rmtree(leftover, ignore_errors=True)
             else:
                 leftover.unlink(missing_ok=True)
@@ -107,5 +109,7 @@ def remove_leftovers(folders: Iterable[Path]) -> int:
     return removed
 
 
-def _temporary(path: Path) -> Path:
-    return path.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{next(_counter)}-{path.name}")
+def temporary_beside(path: Path) -> Path:
+    """A name in the same folder that nothing has; what a killed process leaves there is a leftover."""
+    # nobody can know the name before and put a link there, which other programs' writers would follow
+    return path.with_name(f"{TEMPORARY_PREFIX}{secrets.token_hex(6)}-{path.name}")

@@ -2,13 +2,17 @@
 
 from collections import OrderedDict
 from collections.abc import Callable
-from pathlib import Path
 
 import cv2
 import numpy as np
 
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import Anything, ImageRGB, ImageRGBA, frozen
+
+MOST_KEYFRAME_PX = 160_000_000
+"""Of a stored keyframe: the largest cameras that fly have 150 million pixels."""
+MOST_TILE_PX = 4096 * 4096
+"""Of a tile or a crop."""
 
 # 4:4:4 and 92: features found again on the stored keyframe sit where they sat; 4:2:0 shifts coloured edges.
 _JPEG = [
@@ -29,22 +33,12 @@ def jpeg_from_image(image: ImageRGB) -> bytes:
     return data.tobytes()
 
 
-def image_from_jpeg(data: bytes, name: str) -> ImageRGB:
-    """Decode a JPEG; raises StoreError, naming `name`, when it is damaged."""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+def image_from_jpeg(data: bytes, name: str, most_px: int = MOST_KEYFRAME_PX) -> ImageRGB:
+    """Decode a JPEG; raises StoreError, naming `name`, when it is damaged or has more than `most_px` pixels."""
+    image = _decoded(data, _jpeg_pixels, cv2.IMREAD_COLOR, name, most_px)
     if image is None:
         raise StoreError(f"{name} is damaged: no JPEG in its {len(data)} bytes; map its flight again")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-
-
-def read_keyframe(path: Path) -> ImageRGB:
-    """Read a stored keyframe; raises StoreError when it is gone or damaged."""
-    try:
-        return image_from_jpeg(path.read_bytes(), str(path))
-    except FileNotFoundError as error:
-        raise StoreError(
-            f"the keyframe {path} is gone; if its flight was mapped again meanwhile, list the keyframes anew"
-        ) from error
 
 
 def png_from_rgba(rgba: ImageRGBA) -> bytes:
@@ -53,12 +47,41 @@ def png_from_rgba(rgba: ImageRGBA) -> bytes:
     return data.tobytes()
 
 
-def rgba_from_png(data: bytes, name: str) -> ImageRGBA:
-    """Decode an RGBA PNG; raises StoreError, naming `name`, when it is damaged or has no alpha."""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+def rgba_from_png(data: bytes, name: str, most_px: int = MOST_TILE_PX) -> ImageRGBA:
+    """Decode an RGBA PNG; raises StoreError, naming `name`, when it is damaged, too large, or has no alpha."""
+    image = _decoded(data, _png_pixels, cv2.IMREAD_UNCHANGED, name, most_px)
     if image is None or image.ndim != 3 or image.shape[2] != 4:
         raise StoreError(f"{name} is damaged: no RGBA PNG in its {len(data)} bytes; map its flight again")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA), dtype=np.uint8)
+
+
+def _decoded(data: bytes, size_of: Callable[[bytes], int], flags: int, name: str, most_px: int) -> Anything | None:
+    """The picture as OpenCV gives it; None for bytes of another form. The size in its header is looked at first."""
+    pixels = size_of(data)
+    if pixels > most_px:
+        raise StoreError(f"{name} has {pixels / 1e6:.0f} million pixels, at most {most_px / 1e6:.0f} were expected")
+    return cv2.imdecode(np.frombuffer(data, np.uint8), flags) if pixels else None
+
+
+def _png_pixels(data: bytes) -> int:
+    """How many pixels the header of a PNG announces; 0 for anything else."""
+    if data[:8] != b"\x89PNG\r\n\x1a\n" or data[12:16] != b"IHDR" or len(data) < 24:
+        return 0
+    return int.from_bytes(data[16:20], "big") * int.from_bytes(data[20:24], "big")
+
+
+def _jpeg_pixels(data: bytes) -> int:
+    """How many pixels the frame header of a JPEG announces (ITU T.81, B.2.2); 0 for anything else."""
+    at = 2 if data[:2] == b"\xff\xd8" else len(data)
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD9:  # a filling byte, or a marker without a length
+            at += 1 if marker == 0xFF else 2
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            return int.from_bytes(data[at + 5:at + 7], "big") * int.from_bytes(data[at + 7:at + 9], "big")
+        else:
+            at += 2 + int.from_bytes(data[at + 2:at + 4], "big")
+    return 0
 
 
 def shrink(rgba: ImageRGBA, width: int, height: int) -> ImageRGBA:

@@ -14,7 +14,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, Matrix3
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
-from sorvolo.store.site.folder import CATALOGUE
+from sorvolo.store.site.files import CATALOGUE
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 

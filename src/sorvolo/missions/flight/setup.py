@@ -16,7 +16,7 @@ from sorvolo.geometry.homography import apply_homography
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.mosaic.selection import interval_s
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.folder import CATALOGUE
+from sorvolo.store.site.files import CATALOGUE
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import CameraPrior, Frame, Notice, PosedFrame, Site, Telemetry, no_telemetry
 

@@ -23,6 +23,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes
+from sorvolo.store.rasters.gdal import open_raster
 from sorvolo.survey.flight import Frame, Telemetry
 
 UMCD_COLUMNS = (
@@ -217,7 +218,7 @@ def read_orthophoto(path: Path, m_per_px: float | None = None) -> tuple[ImageRGB
     Raises InputError for a file that is no picture of three 8-bit bands or whose pixel size is not known.
     """
     try:
-        with rasterio.open(path) as source:
+        with open_raster(path, "an orthophoto", ("GTiff", "PNG", "JPEG")) as source:
             if source.count < 3 or source.dtypes[0] != "uint8":
                 raise InputError(
                     f"{path}: {source.count} band(s) of {source.dtypes[0]}; an orthophoto needs red, green"

@@ -16,7 +16,7 @@ import rasterio
 import rasterio.shutil
 from rasterio.crs import CRS
 from rasterio.enums import ColorInterp, Resampling
-from rasterio.errors import CRSError, RasterioError
+from rasterio.errors import RasterioError
 from rasterio.transform import Affine
 from rasterio.warp import calculate_default_transform, reproject
 from rasterio.windows import Window
@@ -26,6 +26,7 @@ from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
 from sorvolo.store.atomic import atomic_path, scratch_folder, writing
 from sorvolo.store.images import shrink
+from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, quiet_gdal
 
 _BLOCK_PX = 512
 _VERIFIED_BLOCKS = 64
@@ -37,8 +38,6 @@ _COG = {
     "overviews": "FORCE_USE_EXISTING", "bigtiff": "IF_SAFER", "num_threads": "ALL_CPUS",
     "sparse_ok": True,
 }
-# a small cache keeps memory flat; no directory listing keeps GDAL from opening neighbours of a user's file
-_ENVIRONMENT = {"GDAL_CACHEMAX": 128, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +66,7 @@ def write_cog(
     with (
         scratch_folder(path.parent) as scratch,
         atomic_path(path) as temporary,
-        rasterio.Env(**_ENVIRONMENT),
+        quiet_gdal(),
         _naming_faults(path),
     ):
         plain = scratch / "plain.tif"
@@ -85,10 +84,7 @@ def parse_crs(crs: str, grid: Grid) -> CRS:
     """The CRS to reproject a map to; raises SettingsError when unknown or when the map is not on Earth."""
     if not grid.crs:
         raise SettingsError(f"this site has no geo-reference, so its map cannot be in {crs}; leave it out")
-    try:
-        return CRS.from_user_input(crs)
-    except CRSError as error:
-        raise SettingsError(f"unknown coordinate reference system {crs!r}; try one as EPSG:32633") from error
+    return crs_of_epsg(crs)
 
 
 def read_raster(path: Path, max_px: int) -> Raster:
@@ -97,10 +93,8 @@ def read_raster(path: Path, max_px: int) -> Raster:
     Only the GTiff driver opens it: a VRT renamed .tif could name any other file. Thinning averages whole
     blocks of pixels, so that the origin and the ground sampling distance stay exact. Raises InputError.
     """
-    if not Path(path).is_file():
-        raise InputError(f"no such file: {path}; a GeoTIFF was needed")
     try:
-        with rasterio.Env(**_ENVIRONMENT), rasterio.open(Path(path), driver="GTiff") as source:
+        with open_raster(path, "a GeoTIFF") as source:
             return _raster(source, path, max_px)
     except RasterioError as error:
         raise InputError(f"{path} is no readable GeoTIFF ({error}); export it as GeoTIFF again") from error
@@ -114,7 +108,7 @@ def _write_plain(tiles: Mapping[TileIndex, ImageRGBA], grid: Grid, path: Path) -
     profile = _SCRATCH | {
         "width": width, "height": height, "count": 4, "dtype": "uint8", "photometric": "RGB", "alpha": "YES",
         "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX, "bigtiff": "IF_SAFER",
-        "crs": grid.crs or None,
+        "crs": crs_of_epsg(grid.crs) if grid.crs else None,
         "transform": Affine(grid.m_per_px, 0, outer_corner_m[0], 0, -grid.m_per_px, outer_corner_m[1]),
     }
     with rasterio.open(path, "w", **profile) as sink:

@@ -17,10 +17,10 @@ from scipy.ndimage import map_coordinates
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
+from sorvolo.store.rasters.gdal import open_raster
 
 _WGS84 = "EPSG:4326"
 _MOST_PX = 4096  # a side that is kept: finer models are averaged
-_ENVIRONMENT = {"GDAL_CACHEMAX": 128, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +53,8 @@ def read_height_model(path: Path, bounds_deg: tuple[float, float, float, float])
     Only the GTiff driver opens it: a VRT renamed .tif could name any other file. Raises InputError for a file that is
     no GeoTIFF with one band and a place on Earth, and for one of other ground.
     """
-    if not path.is_file():
-        raise InputError(f"no such file: {path}; a GeoTIFF of heights was needed")
     try:
-        with rasterio.Env(**_ENVIRONMENT), rasterio.open(path, driver="GTiff") as source:
+        with open_raster(path, "a GeoTIFF of heights") as source:
             if source.crs is None:
                 raise InputError(f"{path} has no coordinate reference system; export it with one")
             if source.count != 1:

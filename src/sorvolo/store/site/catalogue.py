@@ -12,7 +12,7 @@ import numpy as np
 from sqlalchemy import Connection, Row, Table, delete, func, insert, literal, select, update
 from sqlalchemy.exc import DBAPIError
 
-from sorvolo.errors import StoreError
+from sorvolo.errors import GeometryError, StoreError
 from sorvolo.geometry.arrays import Floats, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic
@@ -20,6 +20,7 @@ from sorvolo.geometry.grid import TileIndex
 from sorvolo.geometry.pose import Pose
 from sorvolo.store.atomic import atomic_path
 from sorvolo.store.site import schema
+from sorvolo.store.site.names import checked_crs, checked_image_path
 from sorvolo.store.site.schema import SCHEMA_VERSION
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
@@ -111,8 +112,11 @@ class Catalogue:
     @staticmethod
     def create(path: Path) -> None:
         """Put an empty catalogue at `path`, whole from its first moment."""
-        with atomic_path(path) as temporary:
-            schema.create_tables(temporary)
+        try:
+            with atomic_path(path) as temporary:
+                schema.create_tables(temporary)
+        except (sqlite3.Error, DBAPIError) as error:
+            raise _store_error(path, str(error.orig if isinstance(error, DBAPIError) else error)) from error
 
     def close(self) -> None:
         """Close every connection; the last writer folds the write-ahead log into the file."""
@@ -164,16 +168,18 @@ class Catalogue:
         try:
             yield
         except DBAPIError as error:
-            fault = str(error.orig)
-            if "full" in fault:
-                raise StoreError(
-                    f"disk full: could not write {self._path} ({fault}); free some space and run it again"
-                ) from error
-            if "readonly" in fault or "locked" in fault or "unable to open" in fault or "disk I/O" in fault:
-                raise StoreError(
-                    f"cannot use {self._path}: {fault}; check the disk and its permissions"
-                ) from error
-            raise StoreError(_damaged(self._path, fault)) from error
+            raise _store_error(self._path, str(error.orig)) from error
+
+
+@contextmanager
+def reading_rows(what: str) -> Iterator[None]:
+    """Turn values in a row that no Sorvolo wrote into a StoreError."""
+    try:
+        yield
+    except (TypeError, ValueError, KeyError, AttributeError, OverflowError, GeometryError) as error:
+        raise StoreError(
+            f"the site's catalogue holds a {what} that cannot be ({error}); restore the site from a copy, or map again"
+        ) from error
 
 
 def utc_now() -> str:
@@ -186,8 +192,11 @@ def load_site(connection: Connection) -> Site | None:
     row = connection.execute(select(schema.site)).one_or_none()
     if row is None:
         return None
-    origin = Geodetic(row.latitude_deg, row.longitude_deg, row.height_m)
-    return Site(row.name, origin, row.crs, row.m_per_px, row.is_local, row.height_reference)
+    with reading_rows("site"):
+        origin = Geodetic(row.latitude_deg, row.longitude_deg, row.height_m)
+        if not 0 < row.m_per_px < np.inf:
+            raise ValueError(f"{row.m_per_px} metres a pixel")
+        return Site(row.name, origin, checked_crs(row.crs), row.m_per_px, row.is_local, row.height_reference)
 
 
 def add_site(connection: Connection, site: Site) -> None:
@@ -227,7 +236,8 @@ def list_versions(connection: Connection) -> list[VersionEntry]:
     )
     return [
         VersionEntry(
-            row.id, row.parent_id, row.flight_id, row.created_utc, row.tiles, row.complete, row.export_crs, row.run_id
+            row.id, row.parent_id, row.flight_id, row.created_utc, row.tiles, row.complete,
+            checked_crs(row.export_crs), row.run_id,
         )
         for row in rows
     ]
@@ -243,6 +253,12 @@ def tile_hashes(connection: Connection, version_id: int) -> dict[TileIndex, str]
     """SHA-256 of every tile of a version; empty for a version that does not exist."""
     rows = connection.execute(select(schema.version_tiles).where(schema.version_tiles.c.version_id == version_id))
     return {(row.tile_column, row.tile_row): row.sha256 for row in rows}
+
+
+def tiles_alike(connection: Connection, version_id: int, other_id: int) -> set[TileIndex]:
+    """The places at which two versions have the same tile."""
+    one, two = tile_hashes(connection, version_id), tile_hashes(connection, other_id)
+    return {index for index, sha256 in one.items() if two.get(index) == sha256}
 
 
 def tile_changes(connection: Connection, version: VersionEntry) -> tuple[list[str], int]:
@@ -347,12 +363,12 @@ def complete_run(
 def drop_unfinished(connection: Connection) -> None:
     """Forget every run that was not committed, with its version, and flights that have no other.
 
-    A site that such a run made is forgotten as well when nothing was ever committed: its place, its ground sampling
-    distance and its height are that run's, and need not suit the next one.
+    A site is forgotten as well when no flight was ever committed to it: its place, its ground sampling distance and
+    its height are those of a run that was stopped, perhaps before it began, and need not suit the next one.
     """
     connection.execute(delete(schema.versions).where(schema.versions.c.complete.is_(False)))
-    dropped = connection.execute(delete(schema.runs).where(schema.runs.c.status == "mapping")).rowcount
-    if dropped and newest_version(connection) == 0:
+    connection.execute(delete(schema.runs).where(schema.runs.c.status == "mapping"))
+    if newest_version(connection) == 0:
         connection.execute(delete(schema.site))
     connection.execute(delete(schema.flights).where(
         schema.flights.c.id.not_in(select(schema.runs.c.flight_id)),
@@ -438,6 +454,15 @@ def _inserted(connection: Connection, table: Table, values: Mapping[str, Any]) -
     return int(key[0])
 
 
+def _store_error(path: Path, fault: str) -> StoreError:
+    """What to do about a fault of SQLite's."""
+    if "full" in fault:
+        return StoreError(f"disk full: could not write {path} ({fault}); free some space and run it again")
+    if any(words in fault for words in ("readonly", "locked", "unable to open", "disk I/O")):
+        return StoreError(f"cannot use {path}: {fault}; check the disk and its permissions")
+    return StoreError(_damaged(path, fault))
+
+
 def _damaged(path: Path, fault: object) -> str:
     return (
         f"{path} is damaged or not a Sorvolo catalogue ({fault}); nothing was changed: "
@@ -465,13 +490,15 @@ def _row_of(keyframe: StoredKeyframe, run_id: int) -> dict[str, Any]:
 
 
 def _keyframe_of(row: Row[Any]) -> StoredKeyframe:
-    return StoredKeyframe(
-        row.flight_id, row.frame_index, row.name, row.time_ns, Status(row.status), row.image_path,
-        Camera(**row.camera),
-        np.array(row.site_from_image),
-        Pose(row.rotation, row.translation_m) if row.rotation else None,
-        np.array(row.gains),
-        np.nan if row.sigma_m is None else row.sigma_m,
-        np.nan if row.residual_px is None else row.residual_px,
-        np.array(row.vignette),
-    )
+    with reading_rows("keyframe"):
+        return StoredKeyframe(
+            row.flight_id, row.frame_index, row.name, row.time_ns, Status(row.status),
+            checked_image_path(row.image_path, row.flight_id),
+            Camera(**row.camera),
+            np.array(row.site_from_image, np.float64).reshape(3, 3),
+            Pose(row.rotation, row.translation_m) if row.rotation else None,
+            np.array(row.gains, np.float64),
+            np.nan if row.sigma_m is None else row.sigma_m,
+            np.nan if row.residual_px is None else row.residual_px,
+            np.array(row.vignette, np.float64),
+        )

@@ -11,10 +11,9 @@ from sqlalchemy import Connection, Row, delete, func, insert, select
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import Floats, PointsM, frozen
 from sorvolo.store.site import schema
-from sorvolo.store.site.catalogue import utc_now
+from sorvolo.store.site.catalogue import reading_rows, utc_now
+from sorvolo.store.site.names import checked_name, is_plain_name
 from sorvolo.survey.findings import Change, ChangeKind, Verdict
-
-_FORBIDDEN = set('/\\:*?"<>|\0\n\r\t')
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ def stored_changes(flight_id: str, changes: Sequence[Change]) -> list[StoredChan
     for change_id in ids:
         if ids.count(change_id) > 1:
             raise StoreError(f"two changes have the id {change_id!r}; each needs its own")
-        if not change_id or change_id.startswith(".") or not set(change_id).isdisjoint(_FORBIDDEN):
+        if not is_plain_name(change_id):
             raise StoreError(f"{change_id!r} cannot name a change's pictures; choose letters, digits and dashes")
     endings = [re.search(r"[0-9]{1,9}$", change_id) for change_id in ids]
     numbers = [int(ending.group()) for ending in endings if ending is not None]
@@ -153,13 +152,14 @@ def load_reviews(connection: Connection) -> list[StoredReview]:
     if _is_older(connection):
         return []
     rows = connection.execute(select(schema.reviews).order_by(schema.reviews.c.at_utc, schema.reviews.c.change_id))
-    return [
-        StoredReview(
-            row.change_id, row.flight_id, Verdict(row.verdict), row.at_utc, row.note, ChangeKind(row.kind),
-            frozen(row.outline_m),
-        )
-        for row in rows
-    ]
+    with reading_rows("review"):
+        return [
+            StoredReview(
+                row.change_id, row.flight_id, Verdict(row.verdict), row.at_utc, row.note, ChangeKind(row.kind),
+                frozen(np.reshape(np.asarray(row.outline_m, np.float64), (-1, 2))),
+            )
+            for row in rows
+        ]
 
 
 def put_reviews(connection: Connection, changes: Sequence[StoredChange], verdict: Verdict, note: str) -> None:
@@ -229,18 +229,22 @@ def _row_of(change: StoredChange, run_id: int) -> dict[str, Any]:
 
 
 def _change_of(row: Row[Any], review: StoredReview | None) -> StoredChange:
-    values = row.properties
-    outline_m = frozen(values["outline_m"])
-    is_reviewed = review is not None and outlines_meet(outline_m, review.outline_m)
-    return StoredChange(
-        row.id, row.flight_id, row.number, ChangeKind(row.kind), values["score"], outline_m,
-        values["first_seen_ns"], values["last_seen_ns"], values["views"],
-        _number(values["area_m2"]), _number(values["length_m"]), _number(values["sigma_m"]),
-        frozen(values["velocity_m_s"]), values["class_before"], values["class_after"],
-        values["announced_ns"], CropPlace(*values["crop"]),
-        review.verdict if review is not None and is_reviewed else None,
-        review.note if review is not None and is_reviewed else "",
-    )
+    with reading_rows("change"):
+        values = row.properties
+        outline_m = frozen(np.reshape(np.asarray(values["outline_m"], np.float64), (-1, 2)))
+        west_m, north_m, m_per_px, width_px, height_px = values["crop"]
+        if not len(outline_m) or not m_per_px > 0:
+            raise ValueError("no outline, or a picture without a scale")
+        is_reviewed = review is not None and outlines_meet(outline_m, review.outline_m)
+        return StoredChange(
+            checked_name(row.id, "change"), row.flight_id, row.number, ChangeKind(row.kind), values["score"], outline_m,
+            values["first_seen_ns"], values["last_seen_ns"], values["views"],
+            _number(values["area_m2"]), _number(values["length_m"]), _number(values["sigma_m"]),
+            frozen(values["velocity_m_s"]), values["class_before"], values["class_after"],
+            values["announced_ns"], CropPlace(west_m, north_m, m_per_px, width_px, height_px),
+            review.verdict if review is not None and is_reviewed else None,
+            review.note if review is not None and is_reviewed else "",
+        )
 
 
 def _number(stored: float | None) -> float:

@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Mapping, MutableMapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -16,19 +16,18 @@ from sorvolo.store.exports.change_files import BOXES_FILE, boxes_json, crop_file
 from sorvolo.store.exports.frame_files import frames_geojson
 from sorvolo.store.exports.object_files import CROPS, object_crops
 from sorvolo.store.exports.plain import geojson_bytes, json_bytes
-from sorvolo.store.images import ImageCache, jpeg_from_image, read_keyframe
+from sorvolo.store.images import ImageCache, jpeg_from_image
 from sorvolo.store.rasters.geotiff import parse_crs
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
 from sorvolo.store.site.catalogue import StoredKeyframe
-from sorvolo.store.site.derived import STAGED, STAGED_FOLDERS
+from sorvolo.store.site.derived import STAGED_FOLDERS
+from sorvolo.store.site.files import SiteFiles
 from sorvolo.store.site.tiles import GrowingTiles
+from sorvolo.store.site.upkeep import forget_unfinished, remove_unused, repair
 from sorvolo.survey.findings import Change
 from sorvolo.survey.map_objects import ObjectSearch
 from sorvolo.survey.mosaic import PlacedFrame, Status
-
-if TYPE_CHECKING:
-    from sorvolo.store.site.archive import Archive
 
 
 class FlightWriter:
@@ -41,7 +40,7 @@ class FlightWriter:
 
     def __init__(
         self,
-        archive: "Archive",
+        files: SiteFiles,
         flight_id: str,
         run_id: int,
         version_id: int,
@@ -49,11 +48,11 @@ class FlightWriter:
         cache_bytes: int,
     ) -> None:
         self.tiles: MutableMapping[TileIndex, ImageRGBA] = tiles
-        self._archive, self._growing = archive, tiles
+        self._files, self._growing = files, tiles
         self._flight_id, self._run_id, self._version_id = flight_id, run_id, version_id
         self._sizes: dict[str, tuple[int, int]] = {}  # path of each saved image: width, height
         self._cache = ImageCache(
-            lambda index: read_keyframe(archive.folder / self._image_path(index)), cache_bytes
+            lambda index: files.image(flight_id, self._image_path(index)), cache_bytes
         )
         self._boxes: dict[str, list[list[int]]] = {}  # of each mask saved
         self._is_open = True
@@ -67,18 +66,22 @@ class FlightWriter:
         if not self._is_open:
             return
         self._is_open = False
-        self._archive._writer = None
         try:
             # files that no reader can see go first: on a full disk, forgetting the run needs their space
-            shutil.rmtree((self._archive.folder / self._image_path(0)).parent, ignore_errors=True)
+            shutil.rmtree((self._files.folder / self._image_path(0)).parent, ignore_errors=True)
             shutil.rmtree(self._staged, ignore_errors=True)
-            self._archive._remove_unused()
-            self._archive._catalogue.fold_log()
-            self._archive._forget_unfinished()
+            remove_unused(self._files)
+            self._files.catalogue.fold_log()
+            forget_unfinished(self._files)
         except StoreError:
             # if the disk is still full, the next opening does it, and the first error is the one to tell
             if error is None:
                 raise
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the flight is still on its way: neither committed nor left."""
+        return self._is_open
 
     def save_image(self, index: int, image: ImageRGB) -> str:
         """Store an undistorted keyframe, (H, W, 3), as JPEG and return its path relative to the site folder.
@@ -86,7 +89,7 @@ class FlightWriter:
         Raises StoreError on a full disk.
         """
         relative = self._image_path(index)
-        path = self._archive.folder / relative
+        path = self._files.folder / relative
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
         atomic_write_bytes(path, jpeg_from_image(image), durable=False)
@@ -115,12 +118,11 @@ class FlightWriter:
     def flush(self) -> None:
         """Let readers see the map as it is now."""
         changed = self._growing.save()
-        catalogue = self._archive._catalogue
-        with catalogue.changing() as connection:
+        with self._files.catalogue.changing() as connection:
             records.change_tiles(connection, self._version_id, changed)
             dropped = self._growing.take_superseded()
             dropped -= records.used_hashes(connection, dropped)
-        self._archive._blobs.remove(dropped)
+        self._files.blobs.remove(dropped)
 
     def commit(
         self,
@@ -148,9 +150,8 @@ class FlightWriter:
         name, not empty. Raises SettingsError for a bad `crs`, StoreError on a full disk, an unknown image path, or an
         id that two changes have.
         """
-        archive = self._archive
         if crs is not None:
-            parse_crs(crs, archive.site_grid().grid)
+            parse_crs(crs, self._files.site_grid().grid)
         keyframes = [
             self._keyframe(frame, image_paths[frame.index])
             for frame in placed
@@ -159,7 +160,7 @@ class FlightWriter:
         found = change_records.stored_changes(self._flight_id, changes or ())
         texts = {
             **(documents or {}),
-            "frames.geojson": geojson_bytes(frames_geojson(placed, archive.site())),
+            "frames.geojson": geojson_bytes(frames_geojson(placed, self._files.site())),
             "report.json": json_bytes(report),
             "report.html": report_html.encode(),
         }
@@ -167,7 +168,7 @@ class FlightWriter:
         self.flush()
         self._stage(changes or (), search)
         self._sync()
-        with archive._catalogue.changing() as connection:
+        with self._files.catalogue.changing() as connection:
             records.complete_run(
                 connection, self._run_id, self._version_id, keyframes, texts, frames, notes, crs or ""
             )
@@ -176,14 +177,13 @@ class FlightWriter:
             if search is not None:
                 object_records.add_search(connection, self._run_id, search)
         self._is_open = False
-        archive._writer = None
-        archive.repair()
-        archive._remove_unused()
+        repair(self._files)
+        remove_unused(self._files)
         return self._version_id
 
     @property
     def _staged(self) -> Path:
-        return self._archive.flight_folder(self._flight_id) / STAGED / str(self._run_id)
+        return self._files.staged_folder(self._flight_id, self._run_id)
 
     def _make_staged(self, name: str) -> Path:
         folder = self._staged / name
@@ -193,7 +193,7 @@ class FlightWriter:
 
     def _stage(self, changes: Sequence[Change], search: ObjectSearch | None) -> None:
         """Put the pictures where a repair finds them; an empty folder takes away what a former run left."""
-        flight_folder = self._archive.flight_folder(self._flight_id)
+        flight_folder = self._files.flight_folder(self._flight_id)
         for name in STAGED_FOLDERS:
             if (flight_folder / name).is_dir():
                 self._make_staged(name)
@@ -206,20 +206,20 @@ class FlightWriter:
 
     def _sync(self) -> None:
         """What the transaction names must reach the disk before it does."""
-        self._archive._blobs.sync()
+        self._files.blobs.sync()
         for relative in self._sizes:
-            sync_file(self._archive.folder / relative)
+            sync_file(self._files.folder / relative)
         if self._sizes:
-            images = (self._archive.folder / next(iter(self._sizes))).parent
+            images = (self._files.folder / next(iter(self._sizes))).parent
             for folder in (images, images.parent, images.parent.parent, images.parent.parent.parent):
                 sync_file(folder)
         if self._staged.is_dir():
             for path in (*self._staged.rglob("*"), self._staged, *list(self._staged.parents)[:3]):
                 sync_file(path)
-        sync_file(self._archive.folder)
+        sync_file(self._files.folder)
 
     def _image_path(self, index: int) -> str:
-        return f"flights/{self._flight_id}/keyframes/{self._run_id}/{index:06d}.jpg"
+        return self._files.image_name(self._flight_id, self._run_id, index)
 
     def _keyframe(self, frame: PlacedFrame, image_path: str) -> StoredKeyframe:
         if image_path not in self._sizes:

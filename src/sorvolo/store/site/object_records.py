@@ -10,6 +10,8 @@ from sqlalchemy import Connection, insert, select
 
 from sorvolo.geometry.arrays import Floats, PointsM, frozen
 from sorvolo.store.site import schema
+from sorvolo.store.site.catalogue import reading_rows
+from sorvolo.store.site.names import checked_name
 from sorvolo.survey.map_objects import MapObject, ObjectSearch
 
 _SAME_PLACE_M = 0.5  # beside what both places may err: a car parked again, a person who stood up
@@ -56,10 +58,11 @@ def load_searches(connection: Connection) -> list[StoredSearch]:
     if _is_older(connection):
         return []
     rows = connection.execute(_of_complete_runs(schema.searches).order_by(schema.flights.c.rank))
-    return [
-        StoredSearch(row.flight_id, row.rank, row.model, frozen(np.reshape(row.outlines_m, (-1, 4, 2))))
-        for row in rows
-    ]
+    with reading_rows("search"):
+        return [
+            StoredSearch(row.flight_id, row.rank, row.model, frozen(np.reshape(row.outlines_m, (-1, 4, 2))))
+            for row in rows
+        ]
 
 
 def load_objects(connection: Connection, flight_id: str | None = None) -> list[StoredObject]:
@@ -145,8 +148,11 @@ def _properties(each: MapObject) -> dict[str, Any]:
 
 
 def _object_of(object_id: str, values: dict[str, Any]) -> MapObject:
-    numbers = {name: np.nan if values[name] is None else values[name] for name in ("sigma_m", "length_m", "width_m")}
-    return MapObject(object_id, **{**values, **numbers})
+    with reading_rows("object"):
+        lengths = {
+            name: np.nan if values[name] is None else values[name] for name in ("sigma_m", "length_m", "width_m")
+        }
+        return MapObject(checked_name(object_id, "object"), **{**values, **lengths})
 
 
 def _finite(number: float) -> float | None:

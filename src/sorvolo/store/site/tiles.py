@@ -13,6 +13,8 @@ from sorvolo.geometry.arrays import ImageRGBA, frozen
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, sync_file
 from sorvolo.store.images import png_from_rgba, rgba_from_png
+from sorvolo.store.nofollow import read_below
+from sorvolo.store.site.names import checked_sha256, is_sha256
 
 _CACHE_BYTES = 96 << 20  # the tiles of a map of some hectares, which half a dozen exports read one after the other
 
@@ -53,7 +55,7 @@ class TileBlobs:
                 self._read.move_to_end(sha256)
                 return self._read[sha256]
         path = self._path(sha256)
-        data = path.read_bytes()
+        data = read_below(self._folder.parent, f"{self._folder.name}/{sha256[:2]}/{sha256}.png")
         if hashlib.sha256(data).hexdigest() != sha256:
             raise StoreError(f"the tile {path} is damaged; restore it from a copy of the site, or map again")
         tile = rgba_from_png(data, str(path))
@@ -87,7 +89,7 @@ class TileBlobs:
 
     def stored(self) -> set[str]:
         """The SHA-256 of every blob in the folder."""
-        return {path.stem for path in self._folder.glob("??/*.png") if not path.name.startswith(".")}
+        return {path.stem for path in self._folder.glob("??/*.png") if is_sha256(path.stem)}
 
     def size_bytes(self, hashes: Iterable[str]) -> int:
         """How much room blobs take, each counted once."""
@@ -103,7 +105,7 @@ class TileBlobs:
         self._read_bytes -= 0 if tile is None else tile.nbytes
 
     def _path(self, sha256: str) -> Path:
-        return self._folder / sha256[:2] / f"{sha256}.png"
+        return self._folder / checked_sha256(sha256)[:2] / f"{sha256}.png"
 
 
 class TileView(Mapping[TileIndex, ImageRGBA]):

@@ -1,0 +1,68 @@
+"""GDAL behind a locked door: one driver, plain local files, no network, no neighbours of a file."""
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import rasterio
+from rasterio.crs import CRS
+from rasterio.errors import CRSError, RasterioIOError
+
+from sorvolo.errors import InputError, SettingsError
+
+# a small cache keeps memory flat; no directory listing keeps GDAL from opening neighbours of a user's file; a curl name
+# that nothing has keeps /vsicurl/ and its kin from fetching anything
+_ENVIRONMENT = {
+    "GDAL_CACHEMAX": 128, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO",
+    "CPL_VSIL_CURL_ALLOWED_FILENAME": "/none", "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": ".none",
+    "GDAL_HTTP_MAX_RETRY": 0, "GDAL_HTTP_CONNECTTIMEOUT": 1,
+}
+
+
+def quiet_gdal() -> rasterio.Env:
+    """The settings under which every file is opened."""
+    return rasterio.Env(**_ENVIRONMENT)
+
+
+@contextmanager
+def open_raster(
+    path: Path, what: str, drivers: Sequence[str] = ("GTiff",)
+) -> Iterator[rasterio.DatasetReader]:
+    """Open a user's GeoTIFF, with these drivers alone: a VRT renamed .tif could name any file or address.
+
+    Raises InputError, saying that `what` was needed, for anything but a file on the disk, so that none of GDAL's
+    virtual paths (/vsicurl/, /vsizip/) and none of rasterio's (https:, zip:) is followed.
+    """
+    try:
+        whole = Path(path).resolve()
+        is_file = whole.is_file()
+    except (OSError, ValueError, RuntimeError):
+        is_file = False
+    if not is_file:
+        raise InputError(f"no such file: {path}; {what} was needed")
+    if str(whole).startswith("/vsi"):
+        raise InputError(f"{path}: GDAL would take this for one of its virtual files; move it to another folder")
+    with quiet_gdal(), _opened(whole, drivers) as source:
+        yield source
+
+
+def _opened(path: Path, drivers: Sequence[str]) -> rasterio.DatasetReader:
+    """The file, by the first of the drivers that can read it."""
+    for driver in drivers[:-1]:
+        try:
+            return rasterio.open(path, driver=driver, sharing=False)
+        except RasterioIOError:
+            continue
+    return rasterio.open(path, driver=drivers[-1], sharing=False)
+
+
+def crs_of_epsg(code: str) -> CRS:
+    """The CRS of a code such as EPSG:32633. Raises SettingsError for all else: GDAL would fetch an address."""
+    match = re.fullmatch(r"(?:EPSG|epsg):([1-9][0-9]{0,8})", code)
+    if match is None:
+        raise SettingsError(f"{code!r} is no EPSG code; give one such as EPSG:32633")
+    try:
+        return CRS.from_epsg(int(match[1]))
+    except CRSError as error:
+        raise SettingsError(f"unknown coordinate reference system {code!r}; try one as EPSG:32633") from error

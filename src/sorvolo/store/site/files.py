@@ -1,0 +1,205 @@
+"""SiteFiles: what a site consists of - its folder, its catalogue, its tiles; the only path layout (docs/formats.md)."""
+
+import fcntl
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+from sorvolo.errors import StoreError
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.grid import SiteGrid
+from sorvolo.store.atomic import TEMPORARY_PREFIX, writing
+from sorvolo.store.images import image_from_jpeg
+from sorvolo.store.nofollow import read_below, refuse_links
+from sorvolo.store.site import catalogue as records
+from sorvolo.store.site.catalogue import Catalogue, VersionEntry
+from sorvolo.store.site.names import checked_document, checked_image_path, checked_name
+from sorvolo.store.site.tiles import TileBlobs, TileView
+from sorvolo.survey.flight import Site
+
+CATALOGUE = "site.db"
+STAGED = "staged"
+"""The folder of a flight in which its next run collects pictures until it is committed."""
+
+_LOCK = "site.lock"
+_MOST_REPORT_BYTES = 256_000_000  # of a report.json: an hour's track takes a hundredth
+
+
+class SiteFiles:
+    """One open site: its catalogue and its tile blobs, and the path of everything that lies in its folder.
+
+    Every name that comes out of the catalogue is checked before it becomes a path. Made by `open`.
+    """
+
+    def __init__(self, folder: Path, catalogue: Catalogue, lock: int | None) -> None:
+        self.folder, self.catalogue = folder, catalogue
+        self.blobs = TileBlobs(folder / "tiles")
+        self._lock = lock
+
+    @classmethod
+    def open(cls, folder: Path, *, write: bool) -> Self:
+        """Open a site folder. Raises StoreError as `Archive.open` does; to write, the folder is made and locked."""
+        path = folder / CATALOGUE
+        if not write:
+            if not path.is_file():
+                raise StoreError(f"no site at {folder}; make one with: sorvolo map INPUT --site {folder}")
+            _refuse_traps(folder, skipped=frozenset({"tiles", "keyframes"}))  # those are read link by link
+            return cls(folder, Catalogue(path, write=False), None)
+        _make_folder(folder)
+        lock = _lock_folder(folder)
+        try:
+            _refuse_traps(folder)
+            if not path.exists():
+                Catalogue.create(path)
+            return cls(folder, Catalogue(path, write=True), lock)
+        except BaseException:
+            os.close(lock)
+            raise
+
+    def close(self) -> None:
+        """Let go of the catalogue and of the right to write."""
+        self.catalogue.close()
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    @property
+    def is_writable(self) -> bool:
+        """Whether this process has the right to write."""
+        return self._lock is not None
+
+    @property
+    def mosaic_path(self) -> Path:
+        """The map as a Cloud Optimized GeoTIFF."""
+        return self.folder / "mosaic.tif"
+
+    @property
+    def preview_path(self) -> Path:
+        """The map as a small PNG."""
+        return self.folder / "preview.png"
+
+    @property
+    def kmz_path(self) -> Path:
+        """The map for Google Earth."""
+        return self.folder / "mosaic.kmz"
+
+    @property
+    def live_preview_path(self) -> Path:
+        """A small PNG of the growing map."""
+        return self.folder / "live.png"
+
+    def flight_folder(self, flight_id: str) -> Path:
+        """Where a flight's files lie; raises StoreError for an id that is no plain name."""
+        return self.folder / "flights" / checked_name(flight_id, "flight")
+
+    def flight_folders(self) -> list[Path]:
+        """The folders of all flights that have one, whether the catalogue knows them or not."""
+        return [path for path in (self.folder / "flights").glob("*") if path.is_dir() and not path.is_symlink()]
+
+    def document_path(self, flight_id: str, name: str) -> Path:
+        """A text file of a flight; raises StoreError for a name that could lie elsewhere."""
+        return self.flight_folder(flight_id) / checked_document(name)
+
+    def staged_folder(self, flight_id: str, run_id: int) -> Path:
+        """Where a run collects pictures until it is committed."""
+        return self.flight_folder(flight_id) / STAGED / str(int(run_id))
+
+    def image_name(self, flight_id: str, run_id: int, index: int) -> str:
+        """The path of a keyframe's image in the site folder, as the catalogue holds it."""
+        return f"flights/{checked_name(flight_id, 'flight')}/keyframes/{int(run_id)}/{index:06d}.jpg"
+
+    def image(self, flight_id: str, image_path: str) -> ImageRGB:
+        """A stored keyframe; raises StoreError when it is gone, damaged, or no keyframe of this flight."""
+        name = checked_image_path(image_path, flight_id)
+        try:
+            return image_from_jpeg(read_below(self.folder, name), str(self.folder / name))
+        except FileNotFoundError as error:
+            raise StoreError(
+                f"the keyframe {self.folder / name} is gone; if its flight was mapped again meanwhile, list the "
+                "keyframes anew"
+            ) from error
+
+    def report(self, flight_id: str) -> Mapping[str, Any]:
+        """A flight's report.json; empty when somebody took it away or broke it."""
+        try:
+            name = f"flights/{checked_name(flight_id, 'flight')}/report.json"
+            report = json.loads(read_below(self.folder, name, _MOST_REPORT_BYTES))
+        except (OSError, ValueError, RecursionError):
+            return {}
+        return report if isinstance(report, dict) else {}
+
+    def find_site(self) -> Site | None:
+        """The site; None while there is none."""
+        with self.catalogue.reading() as connection:
+            return records.load_site(connection)
+
+    def site(self) -> Site:
+        """The site; raises StoreError while there is none."""
+        site = self.find_site()
+        if site is None:
+            raise StoreError(f"{self.folder} has no site yet; map a flight into it first")
+        return site
+
+    def site_grid(self) -> SiteGrid:
+        """The pixel grid of the site's tiles; raises StoreError while there is no site."""
+        site = self.site()
+        return SiteGrid.at(site.origin, site.m_per_px, site.crs)
+
+    def versions(self) -> list[VersionEntry]:
+        """Every state of the map, oldest first."""
+        with self.catalogue.reading() as connection:
+            return records.list_versions(connection)
+
+    def tiles(self, version_id: int) -> TileView:
+        """The tiles of a version, read when asked for; none for a version that does not exist."""
+
+        def hashes() -> Mapping[Any, str]:
+            with self.catalogue.reading() as connection:
+                return records.tile_hashes(connection, version_id)
+
+        return TileView(self.blobs, hashes(), hashes)
+
+
+def _make_folder(folder: Path) -> None:
+    """Create the folder; refuse one that holds anything but a site (or what a killed creation left)."""
+    try:
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise StoreError(f"{folder} is a file, a folder was needed; choose another name") from error
+    if (folder / CATALOGUE).exists():
+        return
+    names = (path.name for path in folder.iterdir())
+    foreign = sorted(name for name in names if name != _LOCK and not name.startswith(TEMPORARY_PREFIX))
+    if foreign:
+        raise StoreError(
+            f"{folder} is no site: it holds {foreign[0]!r} and no {CATALOGUE}; choose a new or empty folder"
+        )
+
+
+def _lock_folder(folder: Path) -> int:
+    """The right to write, as a file descriptor to close; raises StoreError when another process has it."""
+    path = folder / _LOCK
+    if path.is_symlink():
+        refuse_links(folder)
+    with writing(path):
+        lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(lock)
+        raise StoreError(f"another process is mapping into {folder}; wait until it has finished") from error
+    return lock
+
+
+def _refuse_traps(folder: Path, *, skipped: frozenset[str] = frozenset()) -> None:
+    """Raise StoreError for links, and for a rollback journal: SQLite would follow and delete the files it names.
+
+    Sorvolo's catalogue is in write-ahead mode and never has one.
+    """
+    refuse_links(folder, skipped=skipped)
+    journal = folder / f"{CATALOGUE}-journal"
+    if journal.exists():
+        raise StoreError(f"{journal} is no file of Sorvolo's; remove it, or do not use this site")

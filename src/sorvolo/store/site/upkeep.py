@@ -1,0 +1,98 @@
+"""A site kept whole: derived files that are owed are written, what nothing refers to any more is removed."""
+
+import shutil
+from pathlib import Path
+
+from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
+from sorvolo.store.site import catalogue as records
+from sorvolo.store.site import change_records, object_records
+from sorvolo.store.site.catalogue import OwedFiles, VersionEntry
+from sorvolo.store.site.derived import (
+    map_is_there,
+    site_objects_are_there,
+    take_staged,
+    write_change_files,
+    write_map_files,
+    write_object_files,
+    write_site_objects,
+)
+from sorvolo.store.site.files import STAGED, SiteFiles
+
+
+def repair(files: SiteFiles) -> None:
+    """Write the derived files that a killed process still owed, and those of the map that were deleted.
+
+    Raises StoreError on a full disk; what the catalogue says stays true.
+    """
+    with files.catalogue.reading() as connection:
+        owed = records.owed_files(connection)
+        shown = records.derived_version(connection)
+    newest = next((each for each in reversed(files.versions()) if each.complete), None)
+    for each in owed:
+        _write_flight_files(files, each)
+    if owed or not site_objects_are_there(files):
+        write_site_objects(files)
+    if newest is None:
+        return
+    if not _looks_like(files, newest, shown) or (newest.tiles and not map_is_there(files)):
+        write_map_files(files, newest)
+    with files.catalogue.changing() as connection:
+        records.mark_written(connection, [each.run_id for each in owed], newest.id)
+
+
+def forget_unfinished(files: SiteFiles) -> None:
+    """Drop runs that never committed, then every file that nothing refers to any more."""
+    with files.catalogue.changing() as connection:
+        records.drop_unfinished(connection)
+    remove_unused(files)
+
+
+def remove_unused(files: SiteFiles) -> None:
+    """Delete tiles and pictures that nothing in the catalogue refers to, and what killed processes left."""
+    with files.catalogue.reading() as connection:
+        runs, used = records.run_ids(connection), records.used_hashes(connection)
+    flights = files.flight_folders()
+    remove_leftovers([files.folder, *flights, *(images for each in flights for images in each.glob("keyframes/*"))])
+    files.blobs.remove_leftovers()
+    files.blobs.remove(files.blobs.stored() - used)
+    files.live_preview_path.unlink(missing_ok=True)
+    for flight in flights:
+        _remove_unused_pictures(flight, {str(run_id) for run_id in runs.get(flight.name, set())})
+
+
+def _remove_unused_pictures(flight: Path, known_runs: set[str]) -> None:
+    """Delete the pictures of runs that are not known, then folders of the flight that this emptied."""
+    for images in (*(flight / "keyframes").glob("*"), *(flight / STAGED).glob("*")):
+        if images.name.isdigit() and images.name not in known_runs:
+            shutil.rmtree(images, ignore_errors=True)
+    for emptied in (flight / STAGED, *(() if known_runs else (flight / "keyframes", flight))):
+        if emptied.is_dir() and not any(emptied.iterdir()):
+            emptied.rmdir()
+
+
+def _looks_like(files: SiteFiles, version: VersionEntry, shown: int) -> bool:
+    """Whether the map's files, which show another version, would be the same for this one."""
+    if version.id == shown:
+        return True
+    crs = {each.id: each.export_crs for each in files.versions()}.get(shown)
+    with files.catalogue.reading() as connection:
+        same = records.tile_hashes(connection, version.id) == records.tile_hashes(connection, shown)
+    return same and crs == version.export_crs
+
+
+def _write_flight_files(files: SiteFiles, owed: OwedFiles) -> None:
+    folder = files.flight_folder(owed.flight_id)
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    for name, content in owed.documents.items():
+        if content:
+            atomic_write_bytes(files.document_path(owed.flight_id, name), content)
+    for name in owed.leftovers:
+        files.document_path(owed.flight_id, name).unlink(missing_ok=True)
+    take_staged(folder, owed.run_id)
+    with files.catalogue.reading() as connection:
+        is_compared = change_records.is_compared(connection, owed.run_id)
+        is_searched = object_records.is_searched(connection, owed.run_id)
+    version = next((each for each in files.versions() if each.run_id == owed.run_id and is_compared), None)
+    write_change_files(files, owed.flight_id, version)
+    write_object_files(files, owed.flight_id, is_searched=is_searched)
