@@ -2,6 +2,7 @@
 
 import json
 import math
+import zipfile
 from xml.etree import ElementTree
 
 import numpy as np
@@ -10,6 +11,8 @@ import typer
 from typer.testing import CliRunner
 
 from sorvolo.cli.plan import plan as plan_command
+from sorvolo.detection.models import find_model
+from sorvolo.detection.session import read_info
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.planning import BOTTOM_CRITICAL_M, FRONT_CRITICAL_M, Task
 from sorvolo.missions.plan_flight import (
@@ -18,6 +21,7 @@ from sorvolo.missions.plan_flight import (
     camera_to_plan_with,
     critical_dimension_m,
     plan_over,
+    seen_person_m,
     write_plan,
 )
 from sorvolo.survey.area import Area
@@ -41,7 +45,8 @@ def run(*arguments):
 
 
 def test_the_thesiss_heights_come_out_of_the_command():
-    result = run("--focal-mm", 1.7, "--pixel-um", 6.97, "--task", "detection", "--facing", "front", "--json")
+    thesis = ("--focal-mm", 1.7, "--pixel-um", 6.97, "--task", "detection", "--facing", "front", "--json")
+    result = run(*thesis, "--model", "none", "--max-height", 150)
     assert result.exit_code == 0, result.output
     answers = json.loads(result.output)
     heights_m = answers["maximum_heights_m"]
@@ -49,7 +54,38 @@ def test_the_thesiss_heights_come_out_of_the_command():
     assert math.floor(heights_m["recognition"] * 100) == 3048
     assert math.floor(heights_m["identification"] * 100) == 1524
     assert answers["height_m"] == heights_m["detection"]
-    assert answers["fulfilled_tasks"] == ["detection"]
+    assert answers["fulfilled_tasks"] == ["detection"] and answers["bounded_by"] == "task"
+
+
+def test_no_flight_is_planned_above_the_laws_limit():
+    answers = json.loads(run("--camera", "Mavic 2 Pro", "--task", "detection", "--json").output)
+    assert answers["maximum_heights_m"]["detection"] == pytest.approx(1715.65, abs=0.01)
+    assert (answers["height_m"], answers["bounded_by"]) == (120.0, "ceiling")
+    table = " ".join(run("--camera", "Mavic 2 Pro", "--task", "detection").output.split())
+    assert "120.00 m above ground" in table and "highest flight allowed" not in table.split("flight height")[0]
+    higher = json.loads(run("--camera", "Mavic 2 Pro", "--max-height", 200, "--json").output)
+    assert higher["height_m"] == 200.0
+    assert "get a permit" in " ".join(run("--camera", "Mavic 2 Pro", "--max-height", 200).output.split())
+    refused = run("--camera", "Mavic 2 Pro", "--height", 150)
+    assert isinstance(refused.exception, SettingsError) and "--max-height" in str(refused.exception)
+
+
+def test_the_packaged_detector_bounds_the_height_by_its_own_word():
+    least_px = read_info(find_model("default")).best_px["person"][0]
+    answers = json.loads(run("--camera", "aov=70", "--size", "1920x1080", "--task", "detection", "--json").output)
+    assert answers["bounded_by"] == "detector"
+    # a person from above is 0.6 m long, and that many pixels at this height
+    assert 0.6 / answers["ground_sampling_m"] == pytest.approx(least_px)
+    alone = json.loads(run("--camera", "aov=70", "--task", "detection", "--model", "none", "--json").output)
+    assert alone["bounded_by"] == "ceiling" and "detector" not in alone["height_bounds_m"]
+    too_high = run("--camera", "aov=70", "--height", 100)
+    assert "the detector will miss people" in " ".join(too_high.output.split())
+
+
+def test_another_object_is_not_bounded_by_how_people_are_found():
+    answers = answer_questions(THESIS_LENS, PlanSettings(critical_m=4.0, person_m=seen_person_m("bottom", 4.0)))
+    assert set(answers.height_bounds_m) == {"task", "ceiling"}
+    assert seen_person_m("front", math.nan) == 1.7
 
 
 def test_answers_fit_together():
@@ -119,6 +155,94 @@ def test_qgroundcontrol_plan(tmp_path, flight):
     triggers = [item["params"][0] for item in items if item["command"] == 206]
     assert triggers[::2] == pytest.approx([flight.photo_spacing_m] * len(flight.passes_m), abs=0.006)
     assert set(triggers[1::2]) == {0}
+    # MAV_CMD_DO_MOUNT_CONTROL, straight down, before the first pass
+    (gimbal,) = (item for item in items if item["command"] == 205)
+    assert gimbal["params"][0] == -90 and gimbal["params"][6] == 2
+    assert commands.index(205) < commands.index(16)
+
+
+_NUMBER = (int, float)
+_PLAN_KEYS = {  # what QGroundControl's loader asks for (its "Plan File Format", and MissionItem's own check)
+    "": {"fileType": str, "version": int, "groundStation": str, "mission": dict, "geoFence": dict, "rallyPoints": dict},
+    "mission": {
+        "version": int, "items": list, "plannedHomePosition": list, "firmwareType": int, "vehicleType": int,
+        "cruiseSpeed": _NUMBER, "hoverSpeed": _NUMBER, "globalPlanAltitudeMode": int,
+    },
+    "geoFence": {"circles": list, "polygons": list, "version": int}, "rallyPoints": {"points": list, "version": int},
+}
+_ITEM_KEYS = {"type": str, "frame": int, "command": int, "params": list, "autoContinue": bool, "doJumpId": int}
+_PLACE_KEYS = {"Altitude": _NUMBER, "AltitudeMode": int, "AMSLAltAboveTerrain": (type(None), *_NUMBER)}
+
+
+def test_qgroundcontrols_loader_finds_all_it_asks_for(tmp_path, flight):
+    path = tmp_path / "field.plan"
+    write_plan(path, flight, AREA)
+    plan = json.loads(path.read_text())
+    for part, keys in _PLAN_KEYS.items():
+        found = plan[part] if part else plan
+        for key, kind in keys.items():
+            assert isinstance(found[key], kind), (part, key)
+    assert len(plan["mission"]["plannedHomePosition"]) == 3
+    for item in plan["mission"]["items"]:
+        keys = _ITEM_KEYS | (_PLACE_KEYS if item["frame"] == 3 else {})
+        assert all(isinstance(item[key], kind) for key, kind in keys.items()), item
+        assert len(item["params"]) == 7
+        assert all(each is None or isinstance(each, _NUMBER) for each in item["params"][:4])
+        assert all(isinstance(each, _NUMBER) for each in item["params"][4:])
+
+
+_WPML = "{http://www.dji.com/wpmz/1.0.2}"
+_KML = "{http://www.opengis.net/kml/2.2}"
+_MISSION_KEYS = {
+    "flyToWaylineMode", "finishAction", "exitOnRCLost", "executeRCLostAction", "takeOffSecurityHeight",
+    "globalTransitionalSpeed", "globalRTHHeight", "droneInfo",
+}
+_TEMPLATE_KEYS = {
+    "templateType", "templateId", "autoFlightSpeed", "waylineCoordinateSysParam", "globalWaypointTurnMode",
+    "gimbalPitchMode", "globalHeight", "globalWaypointHeadingParam", "payloadParam",
+}
+_WAYLINES_KEYS = {"templateId", "waylineId", "autoFlightSpeed", "executeHeightMode"}
+_WAYPOINT_KEYS = {"index", "executeHeight", "waypointSpeed", "waypointHeadingParam", "waypointTurnParam"}
+_GROUP_KEYS = {
+    "actionGroupId", "actionGroupStartIndex", "actionGroupEndIndex", "actionGroupMode", "actionTrigger", "action",
+}
+
+
+def _names(element):
+    return {each.tag.removeprefix(_WPML) for each in element if each.tag.startswith(_WPML)}
+
+
+@pytest.mark.parametrize("drone", ["fly", "m3e", "m30t"])
+def test_djis_kmz_holds_what_its_documentation_requires(tmp_path, flight, drone):
+    path = tmp_path / "field.kmz"
+    write_plan(path, flight, AREA, dji_drone=drone)
+    with zipfile.ZipFile(path) as archive:
+        assert archive.namelist() == ["wpmz/template.kml", "wpmz/waylines.wpml"]
+        template, waylines = (ElementTree.fromstring(archive.read(name)) for name in archive.namelist())
+    for root, keys in ((template, _TEMPLATE_KEYS), (waylines, _WAYLINES_KEYS)):
+        mission = root.find(f"{_KML}Document/{_WPML}missionConfig")
+        assert _names(mission) >= _MISSION_KEYS | (set() if drone == "fly" else {"payloadInfo"})
+        folder = root.find(f"{_KML}Document/{_KML}Folder")
+        assert _names(folder) >= keys
+        for group in folder.iter(f"{_WPML}actionGroup"):
+            assert _names(group) == _GROUP_KEYS
+    placemarks = waylines.findall(f".//{_KML}Placemark")
+    assert len(placemarks) == len(flight.waypoints_m) == len(template.findall(f".//{_KML}Placemark"))
+    assert all(_names(each) >= _WAYPOINT_KEYS for each in placemarks)
+    assert [each.find(f"{_WPML}index").text for each in placemarks] == [str(each) for each in range(len(placemarks))]
+    assert {each.find(f"{_WPML}executeHeight").text for each in placemarks} == {"30"}
+    places = np.array([each.find(f"{_KML}Point/{_KML}coordinates").text.split(",") for each in placemarks], float)
+    latitude_deg, longitude_deg, _ = AREA.frame.wgs84_from_site(flight.waypoints_m)
+    np.testing.assert_allclose(places, np.column_stack([longitude_deg, latitude_deg]), atol=1e-8)
+    pitches = [each.text for each in waylines.iter(f"{_WPML}gimbalPitchRotateAngle")]
+    assert pitches == ["-90"] and {each.text for each in template.iter(f"{_WPML}gimbalPitchAngle")} == {"-90"}
+    spacings = [float(each.text) for each in waylines.iter(f"{_WPML}actionTriggerParam")]
+    assert spacings == pytest.approx([flight.photo_spacing_m] * len(flight.passes_m), abs=0.006)
+
+
+def test_a_drone_without_djis_number_is_refused(tmp_path, flight):
+    with pytest.raises(SettingsError, match="m3e"):
+        write_plan(tmp_path / "field.kmz", flight, AREA, dji_drone="anafi")
 
 
 def test_geojson_and_kml_hold_the_same_path(tmp_path, flight):
@@ -136,7 +260,7 @@ def test_geojson_and_kml_hold_the_same_path(tmp_path, flight):
 
 
 def test_another_ending_is_refused_and_nothing_is_left(tmp_path, flight):
-    with pytest.raises(SettingsError, match=r"\.plan, \.geojson"):
+    with pytest.raises(SettingsError, match=r"\.plan, \.kmz"):
         write_plan(tmp_path / "field.shp", flight, AREA)
     assert list(tmp_path.iterdir()) == []
 
@@ -152,7 +276,8 @@ def test_the_command_covers_an_area(tmp_path, field_file):
 
 
 def test_the_table_tells_when_the_height_is_too_great(field_file):
-    result = run("--camera", "FC300S", "--task", "identification", "--height", 200, "--area", field_file)
+    wanted = ("--task", "identification", "--height", 200, "--max-height", 200)
+    result = run("--camera", "FC300S", *wanted, "--area", field_file)
     assert result.exit_code == 0, result.output
     plain = " ".join(result.output.split())
     assert "too high for identification" in plain

@@ -11,13 +11,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from sorvolo.cli.options import AsJson, Camera, size_px
 from sorvolo.errors import SettingsError
 
 if TYPE_CHECKING:
     from sorvolo.geometry.planning import FlightPlan
     from sorvolo.missions.plan_flight import FlightAnswers, PlanSettings
-
-_LEGAL_CEILING_M = 120.0
 
 
 class Purpose(StrEnum):
@@ -36,98 +35,127 @@ class Facing(StrEnum):
 
 
 def plan(
-    camera: Annotated[str, typer.Option(help="Calibration file, preset name or EXIF code, or aov=DEG.")] = "",
+    camera: Camera = "",
     focal_mm: Annotated[float, typer.Option(help="Focal length, mm.", show_default="of --camera")] = math.nan,
     pixel_um: Annotated[float, typer.Option(help="Sensor pixel, um.", show_default="of --camera")] = math.nan,
-    size: Annotated[str, typer.Option(help="Frame size, such as 1920x1080.")] = "",
-    task: Annotated[Purpose, typer.Option(help="What must be made out of an object.")] = Purpose.RECOGNITION,
-    facing: Annotated[Facing, typer.Option(help="Side of a person that is seen.")] = Facing.BOTTOM,
-    critical_m: Annotated[float, typer.Option(help="Critical size, m.", show_default="person")] = math.nan,
-    height: Annotated[float, typer.Option(help="Height above ground, m.", show_default="task")] = math.nan,
+    size: Annotated[str, typer.Option(help="Picture size, such as 1920x1080.")] = "",
+    task: Annotated[
+        Purpose, typer.Option(help="detection: something is there. recognition: it is a person. identification: who.")
+    ] = Purpose.RECOGNITION,
+    facing: Annotated[
+        Facing, typer.Option(help="Side of a person that the camera sees: bottom is from straight above.")
+    ] = Facing.BOTTOM,
+    critical_m: Annotated[
+        float, typer.Option(help="Smallest side of another object to be made out, m.", show_default="a person's")
+    ] = math.nan,
+    height: Annotated[
+        float, typer.Option(help="Flight height above ground, m.", show_default="as high as allowed")
+    ] = math.nan,
+    max_height: Annotated[float, typer.Option(help="Highest flight allowed, m: the law's in most countries.")] = 120.0,
+    model: Annotated[str, typer.Option(help="Detector that must find people: a name, a file, or none.")] = "default",
     speed: Annotated[float, typer.Option(help="Ground speed, m/s.")] = 5.0,
-    overlap: Annotated[float, typer.Option(help="Overlap of consecutive frames, 0 to 0.95.")] = 0.75,
+    overlap: Annotated[float, typer.Option(help="Overlap of consecutive pictures, 0 to 0.95.")] = 0.75,
     side_overlap: Annotated[float, typer.Option(help="Overlap of neighbouring strips, 0 to 0.95.")] = 0.65,
-    bearing: Annotated[float, typer.Option(help="Strip direction, deg.", show_default="longest")] = math.nan,
-    area: Annotated[Path | None, typer.Option(help="Outline to cover: GeoJSON, KML, KMZ or a list.")] = None,
-    out: Annotated[list[Path] | None, typer.Option(help="Write .plan, .geojson or .kml; may repeat.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    bearing: Annotated[
+        float, typer.Option(help="Direction of the strips, deg from north.", show_default="along the area")
+    ] = math.nan,
+    area: Annotated[Path | None, typer.Option(help="Area to cover: GeoJSON, KML, KMZ, or a list of corners.")] = None,
+    out: Annotated[
+        list[Path] | None,
+        typer.Option(help="File to write: .plan (QGroundControl), .kmz (DJI), .geojson or .kml. Can be repeated."),
+    ] = None,
+    dji_drone: Annotated[
+        str, typer.Option(help="For a .kmz: fly (DJI Fly), m300, m350, m30, m30t, m3e, m3t, m3m, m3d, m3td.")
+    ] = "fly",
+    as_json: AsJson = False,
 ) -> None:
-    """Flight height, overlap and frame rate for a task, and waypoints over an area.
+    """Find the flight height, speed and overlap for a task, and write waypoints over an area.
 
-    Example: sorvolo plan --camera "Mavic 2 Pro" --task recognition --area field.geojson --out field.plan
+    The height is the lowest of three: what the task needs, what the detector needs, and what the law allows.
 
-    Example without area: sorvolo plan --focal-mm 1.7 --pixel-um 6.97 --task detection --facing front
+    Example: sorvolo plan --camera "Mavic 2 Pro" --area field.geojson --out field.plan --out field.kmz
+
+    Example without an area: sorvolo plan --focal-mm 1.7 --pixel-um 6.97 --task detection --facing front
     """
     from sorvolo.capture.areas import read_area
     from sorvolo.geometry.planning import Task
-    from sorvolo.missions.plan_flight import (
-        PlanSettings,
-        answer_questions,
-        camera_to_plan_with,
-        critical_dimension_m,
-        plan_over,
-        write_plan,
-    )
+    from sorvolo.missions import plan_flight as planning
 
-    settings = PlanSettings(
-        Task(task.value), critical_dimension_m(facing.value, critical_m), height, speed, overlap, side_overlap, bearing
+    settings = planning.PlanSettings(
+        Task(task.value), planning.critical_dimension_m(facing.value, critical_m), height, max_height, model,
+        planning.seen_person_m(facing.value, critical_m), speed, overlap, side_overlap, bearing,
     )
     if out and area is None:
-        raise SettingsError("--out writes waypoints over an area: give --area FILE too")
-    answers = answer_questions(camera_to_plan_with(camera, focal_mm, pixel_um, _size(size)), settings)
-    flight = None
+        raise SettingsError("--out writes waypoints over an area: give --area FILE as well")
+    chosen = planning.camera_to_plan_with(camera, focal_mm, pixel_um, size_px(size))
+    answers, flight = planning.answer_questions(chosen, settings), None
     if area is not None:
         outline = read_area(area)
-        flight = plan_over(outline, answers, settings)
+        flight = planning.plan_over(outline, answers, settings)
         for path in out or []:
-            write_plan(path, flight, outline)
+            planning.write_plan(path, flight, outline, dji_drone=dji_drone)
     if as_json:
         typer.echo(json.dumps(_as_json(answers, flight, out or []), indent=1))
     else:
         _show(answers, flight, out or [], settings)
 
 
-def _size(text: str) -> tuple[int, int] | None:
-    if not text:
-        return None
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
-        raise SettingsError(f"--size {text!r}: a frame size looks like 1920x1080")
-    return int(width), int(height)
-
-
 def _show(
     answers: "FlightAnswers", flight: "FlightPlan | None", out: list[Path], settings: "PlanSettings"
 ) -> None:
     console = Console()
-    camera = answers.camera.camera
     table = Table("", "", title="Flight plan", show_header=False, title_justify="left")
-    table.add_row("camera", f"{answers.camera.origin}")
-    table.add_row("frame", f"{camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.0f} px")
-    table.add_row("angle of view", "{:.1f} x {:.1f} deg".format(*answers.angle_of_view_deg))
-    for name, highest_m in answers.maximum_heights_m.items():
-        needed = answers.required_px_per_m[name]
-        table.add_row(f"height for {name}", f"at most {highest_m:.2f} m ({needed:.2f} px/m)")
-    chosen = f"the most for {settings.task.value}" if math.isnan(settings.height_m) else "as asked"
-    table.add_row("flight height", f"{answers.height_m:.2f} m ({chosen})")
-    table.add_row("ground sampling", f"{100 * answers.ground_sampling_m:.2f} cm/px")
-    table.add_row("footprint", "{:.1f} x {:.1f} m".format(*answers.footprint_m))
-    table.add_row(
-        "frame rate",
-        f"at least {answers.minimum_frame_rate_hz:.3g} per s for {settings.forward_overlap:.0%} overlap at "
-        f"{settings.speed_m_s:g} m/s: a frame every {answers.photo_spacing_m:.1f} m",
-    )
-    table.add_row("strips", f"{answers.strip_spacing_m:.1f} m apart for {settings.side_overlap:.0%} overlap")
+    for row in (*_camera_rows(answers), *_height_rows(answers, settings), *_rate_rows(answers, settings)):
+        table.add_row(*row)
     if flight is not None:
         table.add_row("passes", f"{len(flight.passes_m)}, at {flight.strip_bearing_deg:.0f} deg and back")
-        table.add_row("photos", str(flight.photo_count))
+        table.add_row("photos", f"{flight.photo_count:,}")
         minutes = flight.duration_s / 60
-        table.add_row("path", f"{flight.distance_m:.0f} m, {minutes:.1f} min without take-off and return")
+        table.add_row("path", f"{flight.distance_m:,.0f} m, {minutes:.1f} min without take-off and return")
     for path in out:
         table.add_row("written", str(path))
     console.print(table)
     for warning in _warnings(answers, settings):
-        console.print(f"Note: {warning}")
+        console.print(f"[yellow]warning[/yellow]  {warning}", highlight=False)
+
+
+def _camera_rows(answers: "FlightAnswers") -> list[tuple[str, str]]:
+    camera = answers.camera.camera
+    return [
+        ("camera", answers.camera.origin),
+        ("pictures", f"{camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.0f} px"),
+        ("angle of view", "{:.1f} x {:.1f} deg".format(*answers.angle_of_view_deg)),
+    ]
+
+
+def _height_rows(answers: "FlightAnswers", settings: "PlanSettings") -> list[tuple[str, str]]:
+    rows = []
+    for name, highest_m in answers.maximum_heights_m.items():
+        by_resolution = f"{highest_m:,.2f} m by resolution alone, {answers.required_px_per_m[name]:.2f} px/m"
+        bounded_m = min(highest_m, settings.max_height_m)
+        rows.append((f"height for {name}", f"at most {bounded_m:.2f} m ({by_resolution})"))
+    detector_m = answers.height_bounds_m.get("detector")
+    if detector_m is not None:
+        rows.append(("height for the detector", f"at most {detector_m:.2f} m (model {settings.model}, for people)"))
+    reasons = {
+        "asked": "as asked", "task": f"the most for {settings.task.value}", "detector": "the most for the detector",
+        "ceiling": "the highest flight allowed",
+    }
+    rows.append(("flight height", f"{answers.height_m:.2f} m above ground ({reasons[answers.bounded_by]})"))
+    return rows
+
+
+def _rate_rows(answers: "FlightAnswers", settings: "PlanSettings") -> list[tuple[str, str]]:
+    rate = (
+        f"at least {answers.minimum_frame_rate_hz:.3g} a second for {settings.forward_overlap:.0%} overlap at "
+        f"{settings.speed_m_s:g} m/s: one every {answers.photo_spacing_m:.1f} m"
+    )
+    return [
+        ("ground resolution", f"{100 * answers.ground_sampling_m:.2f} cm a pixel"),
+        ("a picture covers", "{:.1f} x {:.1f} m".format(*answers.footprint_m)),
+        ("pictures", rate),
+        ("strips", f"{answers.strip_spacing_m:.1f} m apart for {settings.side_overlap:.0%} overlap"),
+    ]
 
 
 def _warnings(answers: "FlightAnswers", settings: "PlanSettings") -> list[str]:
@@ -137,11 +165,14 @@ def _warnings(answers: "FlightAnswers", settings: "PlanSettings") -> list[str]:
             f"{answers.height_m:.1f} m is too high for {settings.task.value}; fly at most "
             f"{answers.maximum_heights_m[settings.task]:.1f} m"
         )
-    if answers.height_m > _LEGAL_CEILING_M:
-        warnings.append(f"many countries allow small drones no more than {_LEGAL_CEILING_M:g} m above ground")
+    detector_m = answers.height_bounds_m.get("detector", math.inf)
+    if answers.height_m > detector_m:
+        warnings.append(f"from {answers.height_m:.1f} m the detector will miss people; fly at most {detector_m:.1f} m")
+    if settings.max_height_m > 120:
+        warnings.append("the law of most countries allows small drones 120 m above ground: to fly higher, get a permit")
     if answers.camera.focal_sigma > 0.1:
         sigma = answers.camera.focal_sigma
-        warnings.append(f"the focal length is a guess, good to {sigma:.0%}, and so are the heights")
+        warnings.append(f"the focal length is a guess, uncertain by {sigma:.0%}, so are the heights; calibrate once")
     return warnings
 
 

@@ -55,14 +55,19 @@ def scale_for(info: ModelInfo, m_per_px: float, wanted: Sequence[str], thermal: 
     name = "person" if "person" in known else min(known, key=lambda each: TYPICAL_SIZE_M[each][0])
     length_m, width_m, height_m = TYPICAL_SIZE_M[name]
     critical_m = BOTTOM_CRITICAL_M if name == "person" else width_m
-    least_px, most_px = info.best_px[name]
-    least = m_per_px * max(required_px_per_m(TASK, critical_m), least_px / length_m)
+    most_px = info.best_px[name][1]
+    least = m_per_px * max(required_px_per_m(TASK, critical_m), needed_px_per_m(info, name, length_m))
     if thermal and name == "person":
         least *= _THERMAL_PX
     most = m_per_px * most_px / max(length_m, height_m)
     if least > 1:
         return min(least, _MOST_LARGER)
     return min(1.0, max(least, most))
+
+
+def needed_px_per_m(info: ModelInfo, name: str, length_m: float) -> float:
+    """The ground resolution from which on the model finds objects of a class well that show a side of `length_m`."""
+    return info.best_px[name][0] / length_m
 
 
 def plan_tiles(

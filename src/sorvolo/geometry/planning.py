@@ -22,6 +22,9 @@ FRONT_CRITICAL_M = 0.75
 BOTTOM_CRITICAL_M = float(np.hypot(0.25, 0.551))
 """Critical dimension of a person seen from above: the diagonal of bust depth and forearm-forearm breadth."""
 
+LEGAL_CEILING_M = 120.0
+"""Above ground, without a permit: the EU's open category (2019/947); the USA's Part 107 allows 400 ft (122 m)."""
+
 TURN_S = 4.0
 """Time a multicopter loses by braking, turning and speeding up again at one waypoint."""
 

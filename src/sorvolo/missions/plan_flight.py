@@ -3,15 +3,20 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 
 from sorvolo.capture.calibration import camera_from_option
 from sorvolo.capture.camera_presets import find_preset
-from sorvolo.errors import SettingsError
+from sorvolo.detection.models import find_model
+from sorvolo.detection.session import read_info
+from sorvolo.detection.tiling import needed_px_per_m
+from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.planning import (
     BOTTOM_CRITICAL_M,
     FRONT_CRITICAL_M,
+    LEGAL_CEILING_M,
     FlightPlan,
     StripSettings,
     Task,
@@ -27,6 +32,7 @@ from sorvolo.geometry.planning import (
 from sorvolo.store.exports.waypoints import write_waypoints
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import CameraModel
+from sorvolo.survey.objects import TYPICAL_SIZE_M
 
 DEFAULT_SIZE_PX = (1920, 1080)
 """Frame size where neither the user nor a preset names one."""
@@ -34,29 +40,58 @@ DEFAULT_SIZE_PX = (1920, 1080)
 
 @dataclass(frozen=True)
 class PlanSettings:
-    """What the flight is for. A NaN `height_m` means: as high as the task allows.
+    """What the flight is for. A NaN `height_m` means: as high as task, detector and `max_height_m` allow.
 
     `critical_m` is the object's smallest decisive dimension as the camera sees it; for people Table 3.1 takes
     `FRONT_CRITICAL_M` for a camera that faces them (or people lying) and `BOTTOM_CRITICAL_M` from above.
+    `person_m` is the longest side of a person that the camera sees, which the detector `model` must make out; NaN, or
+    the model "none", where no detector has to. Raises SettingsError for a height above `max_height_m`.
     """
 
     task: Task = Task.RECOGNITION
     critical_m: float = BOTTOM_CRITICAL_M
     height_m: float = math.nan
+    max_height_m: float = LEGAL_CEILING_M
+    model: str = "default"
+    person_m: float = TYPICAL_SIZE_M["person"][0]
     speed_m_s: float = 5.0
     forward_overlap: float = 0.75
     side_overlap: float = 0.65
     strip_bearing_deg: float = math.nan
 
+    def __post_init__(self) -> None:
+        if not self.max_height_m > 0:
+            raise SettingsError(f"--max-height must be positive, got {self.max_height_m} m")
+        if self.height_m > self.max_height_m:
+            raise SettingsError(
+                f"--height {self.height_m:g} is above {self.max_height_m:g} m, the law's limit for small drones in "
+                "most countries; with a permit, give --max-height as well"
+            )
+
+
+class Bound(StrEnum):
+    """What keeps the flight from going higher."""
+
+    ASKED = "asked"
+    TASK = "task"
+    DETECTOR = "detector"
+    CEILING = "ceiling"
+
 
 @dataclass(frozen=True)
 class FlightAnswers:
-    """The plan's numbers. `maximum_heights_m` and `required_px_per_m` are by task name."""
+    """The plan's numbers. `maximum_heights_m` and `required_px_per_m` are by task name, by resolution alone.
+
+    `height_bounds_m` are the heights that task, detector (if one must see) and ceiling allow, by `Bound`; `bounded_by`
+    says which of them `height_m` is.
+    """
 
     camera: CameraModel
     angle_of_view_deg: tuple[float, float]
     required_px_per_m: Mapping[str, float]
     maximum_heights_m: Mapping[str, float]
+    height_bounds_m: Mapping[str, float]
+    bounded_by: Bound
     height_m: float
     ground_sampling_m: float
     footprint_m: tuple[float, float]
@@ -96,7 +131,10 @@ def answer_questions(model: CameraModel, settings: PlanSettings) -> FlightAnswer
     required = {task.value: required_px_per_m(task, settings.critical_m) for task in Task}
     focal_px = min(camera.fx_px, camera.fy_px)
     heights_m = {task: maximum_height_m(focal_px, each) for task, each in required.items()}
-    height_m = heights_m[settings.task] if math.isnan(settings.height_m) else settings.height_m
+    bounds_m: dict[str, float] = {Bound.TASK: heights_m[settings.task], **_detector_bound(focal_px, settings)}
+    bounds_m[Bound.CEILING] = settings.max_height_m
+    bound = Bound(min(bounds_m, key=lambda each: bounds_m[each])) if math.isnan(settings.height_m) else Bound.ASKED
+    height_m = settings.height_m if bound is Bound.ASKED else bounds_m[bound]
     strips = _strips(settings, height_m)
     width_m, _ = footprint_size_m(camera, height_m)
     length_m = scene_length_m(height_m, camera.angle_of_view_deg[1])
@@ -105,6 +143,8 @@ def answer_questions(model: CameraModel, settings: PlanSettings) -> FlightAnswer
         angle_of_view_deg=camera.angle_of_view_deg,
         required_px_per_m=required,
         maximum_heights_m=heights_m,
+        height_bounds_m=bounds_m,
+        bounded_by=bound,
         height_m=height_m,
         ground_sampling_m=1 / px_per_m(height_m, focal_px),
         footprint_m=(width_m, length_m),
@@ -121,9 +161,9 @@ def plan_over(area: Area, answers: FlightAnswers, settings: PlanSettings) -> Fli
     return plan_strips(area.polygons_m(area.frame), answers.camera.camera, strips)
 
 
-def write_plan(path: Path, plan: FlightPlan, area: Area) -> None:
-    """Write a plan made by `plan_over` as .plan, .geojson or .kml."""
-    write_waypoints(path, plan, area.frame, area.name)
+def write_plan(path: Path, plan: FlightPlan, area: Area, *, dji_drone: str = "fly") -> None:
+    """Write a plan made by `plan_over` as .plan, .kmz (for a DJI drone), .geojson or .kml."""
+    write_waypoints(path, plan, area.frame, area.name, dji_drone=dji_drone)
 
 
 def critical_dimension_m(facing: str, critical_m: float) -> float:
@@ -131,6 +171,24 @@ def critical_dimension_m(facing: str, critical_m: float) -> float:
     if not math.isnan(critical_m):
         return critical_m
     return {"front": FRONT_CRITICAL_M, "bottom": BOTTOM_CRITICAL_M}[facing]
+
+
+def seen_person_m(facing: str, critical_m: float) -> float:
+    """The longest side of a person that a camera `facing` front or bottom sees; NaN where `critical_m` is another
+    object's."""
+    length_m, _, standing_m = TYPICAL_SIZE_M["person"]
+    return {"front": standing_m, "bottom": length_m}[facing] if math.isnan(critical_m) else math.nan
+
+
+def _detector_bound(focal_px: float, settings: PlanSettings) -> dict[Bound, float]:
+    """The height up to which the detector finds people well; nothing where no detector has to."""
+    if settings.model == "none" or math.isnan(settings.person_m):
+        return {}
+    info = read_info(find_model(settings.model))
+    if "person" not in info.best_px:
+        raise InputError(f"the model {settings.model} does not look for people; give another --model, or none")
+    needed = needed_px_per_m(info, "person", settings.person_m)
+    return {Bound.DETECTOR: maximum_height_m(focal_px, needed)}
 
 
 def _strips(settings: PlanSettings, height_m: float) -> StripSettings:

@@ -1,7 +1,7 @@
-"""Flight plans for other programs: GeoJSON, KML and QGroundControl's .plan.
+"""Flight plans for other programs: GeoJSON, KML, QGroundControl's .plan, and DJI's .kmz.
 
-Heights are above the take-off point in all three. The .plan works for PX4 and ArduPilot multicopters:
-take-off, speed, every pass with the camera triggered by distance flown, return to launch.
+Heights are above the take-off point in all of them. The .plan works for PX4 and ArduPilot multicopters: take-off,
+speed, the gimbal straight down, every pass with the camera triggered by distance flown, return to launch.
 """
 
 import json
@@ -15,8 +15,10 @@ from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.planning import FlightPlan
 from sorvolo.store.atomic import atomic_write_bytes
+from sorvolo.store.exports.wpml import wpml_kmz
 
-_TAKEOFF, _WAYPOINT, _RETURN, _CHANGE_SPEED, _TRIGGER_DISTANCE = 22, 16, 20, 178, 206  # MAV_CMD
+_TAKEOFF, _WAYPOINT, _RETURN, _CHANGE_SPEED, _MOUNT_CONTROL, _TRIGGER_DISTANCE = 22, 16, 20, 178, 205, 206  # MAV_CMD
+_MOUNT_BY_MAVLINK = 2  # MAV_MOUNT_MODE: to the angles given
 _FRAME_RELATIVE_HEIGHT, _FRAME_MISSION = 3, 2  # MAV_FRAME
 _HEIGHT_RELATIVE = 1  # QGroundControl's AltitudeMode
 _AUTOPILOT_PX4, _VEHICLE_QUADROTOR = 12, 2  # MAV_AUTOPILOT, MAV_TYPE
@@ -25,21 +27,25 @@ _Item: TypeAlias = dict[str, Any]
 _LonLat: TypeAlias = list[list[float]]
 
 
-def write_waypoints(path: Path, plan: FlightPlan, frame: LocalFrame, name: str = "survey") -> None:
+def write_waypoints(
+    path: Path, plan: FlightPlan, frame: LocalFrame, name: str = "survey", *, dji_drone: str = "fly"
+) -> None:
     """Write the plan, whose metres are those of `frame`, in the format that the path's ending names.
 
-    Raises SettingsError for an ending other than .plan, .geojson, .json or .kml, StoreError when it cannot be
-    written.
+    `dji_drone`, one of `DJI_DRONES`, is what a .kmz is for. Raises SettingsError for an ending other than .plan, .kmz,
+    .geojson, .json or .kml and for an unknown drone, StoreError when the file cannot be written.
     """
-    writers: Mapping[str, Callable[[FlightPlan, _LonLat, str], str]] = {
-        ".plan": _qgroundcontrol, ".geojson": _geojson, ".json": _geojson, ".kml": _kml,
+    writers: Mapping[str, Callable[[FlightPlan, _LonLat, str], str | bytes]] = {
+        ".plan": _qgroundcontrol, ".kmz": lambda plan, lonlat, _: wpml_kmz(plan, lonlat, dji_drone),
+        ".geojson": _geojson, ".json": _geojson, ".kml": _kml,
     }
     writer = writers.get(path.suffix.lower())
     if writer is None:
-        raise SettingsError(f"{path}: a flight plan ends in {', '.join(writers)}, not in {path.suffix!r}")
+        raise SettingsError(f"{path}: flight plans are written as {', '.join(writers)}, not as {path.suffix!r}")
     latitude_deg, longitude_deg, _ = frame.wgs84_from_site(plan.waypoints_m)
     lonlat = [[round(float(lon), 9), round(float(lat), 9)] for lon, lat in zip(longitude_deg, latitude_deg)]
-    atomic_write_bytes(path, writer(plan, lonlat, name).encode())
+    content = writer(plan, lonlat, name)
+    atomic_write_bytes(path, content.encode() if isinstance(content, str) else content)
 
 
 def _geojson(plan: FlightPlan, lonlat: _LonLat, name: str) -> str:
@@ -87,6 +93,7 @@ def _qgroundcontrol(plan: FlightPlan, lonlat: _LonLat, _name: str) -> str:
     commands: list[tuple[int, int, list[float | None]]] = [
         (_TAKEOFF, _FRAME_RELATIVE_HEIGHT, [0, 0, 0, None, *_place(plan, lonlat[0])]),
         (_CHANGE_SPEED, _FRAME_MISSION, [1, plan.speed_m_s, -1, 0, 0, 0, 0]),
+        (_MOUNT_CONTROL, _FRAME_MISSION, [-90, 0, 0, 0, 0, 0, _MOUNT_BY_MAVLINK]),  # pitch, roll, yaw
     ]
     for index, place in enumerate(lonlat):
         starts_pass = index % 2 == 0

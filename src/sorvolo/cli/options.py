@@ -1,0 +1,42 @@
+"""Options that several commands share, each worded once."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sorvolo.errors import SettingsError
+
+Camera = Annotated[
+    str, typer.Option(help="Camera: a calibration file, a drone's name such as 'Mavic 2 Pro', or aov=DEGREES.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
+Area = Annotated[
+    Path | None, typer.Option(help="Outline of the area: GeoJSON, KML, KMZ. Frames outside it are not used.")
+]
+LiveTelemetry = Annotated[
+    str | None,
+    typer.Option(help="The flight's log if it is not beside the video; for a live source, the receiver's address."),
+]
+Offset = Annotated[
+    float | None, typer.Option(help="Telemetry time minus video time, s. Without it: estimated from the motion.")
+]
+GroundElevation = Annotated[
+    float | None, typer.Option(help="Elevation of the ground, m, in the telemetry's own height reference.")
+]
+GiveUp = Annotated[float, typer.Option(help="End a live source after so many seconds without a picture.")]
+
+
+def size_px(text: str) -> tuple[int, int] | None:
+    """Width and height of "1920x1080"; None for no text. Raises SettingsError for anything else."""
+    if not text:
+        return None
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
+        raise SettingsError(f"--size {text!r}: give width x height in pixels, such as 1920x1080")
+    return int(width), int(height)
+
+
+def names(text: str) -> tuple[str, ...]:
+    """The names in a list with commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
