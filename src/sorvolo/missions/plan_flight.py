@@ -180,7 +180,7 @@ def seen_person_m(facing: str, critical_m: float) -> float:
     return {"front": standing_m, "bottom": length_m}[facing] if math.isnan(critical_m) else math.nan
 
 
-def _detector_bound(focal_px: float, settings: PlanSettings) -> dict[Bound, float]:
+def _detector_bound(focal_px: float, settings: PlanSettings) -> dict[str, float]:
     """The height up to which the detector finds people well; nothing where no detector has to."""
     if settings.model == "none" or math.isnan(settings.person_m):
         return {}
