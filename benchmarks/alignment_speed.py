@@ -26,8 +26,8 @@ from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import prepare
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.mosaic.lens import Undistorter
 from sorvolo.mosaic.selection import every
+from sorvolo.registration.lens import Undistorter
 from sorvolo.simulation.presets import preset
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Frame

@@ -12,7 +12,7 @@ import numpy as np
 
 from change_suites import Pair
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
-from sorvolo.mosaic.lens import Undistorter
+from sorvolo.registration.lens import Undistorter
 from sorvolo.simulation.flight import SimulatedFlight, simulate_flights
 from sorvolo.simulation.presets import preset
 from sorvolo.simulation.truth import change_mask

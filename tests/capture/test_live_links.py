@@ -179,15 +179,16 @@ def test_a_receiver_beside_a_stream_tells_where_each_frame_was_taken(has_metadat
         )
         assert isinstance(source, LiveStream)
         setup = prepare(source, MapSettings(), None, telemetry_named=True)
-        first_samples = setup.telemetry_version
-        assert setup.track is not None and first_samples >= 2
+        assert setup.telemetry is not None
+        first_samples = setup.telemetry.version
+        assert first_samples >= 2
         priors = []
         for frame in source.frames(lambda index, _: index % 5 == 0):
             priors.append(setup.prior(frame, first=False))  # type: ignore[arg-type]
             if len(priors) == 12:
                 break
         source.close()
-    assert source.telemetry.format == "nmea" and setup.telemetry_version > first_samples
+    assert source.telemetry.format == "nmea" and setup.telemetry.version > first_samples
     assert all(prior.knows_place for prior in priors)
     north_m = [prior.position_m[1] for prior in priors]
     steps_m = [b - a for a, b in pairwise(north_m)]

@@ -18,11 +18,11 @@ from sorvolo.capture.calibration import camera_from_option, guess_camera
 from sorvolo.capture.source import opened_sources
 from sorvolo.change.pair.thesis_options import thesis_options
 from sorvolo.change.reference import ReferenceMap
+from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.geodesy import Geodetic
-from sorvolo.missions.compare.flights import _looked_at, compare_flights
-from sorvolo.missions.compare.views import ViewMaker, ViewOutcome
+from sorvolo.missions.compare.flights import _begun, compare_flights
 from sorvolo.missions.evaluate.changes import evaluate_changes
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
@@ -203,16 +203,16 @@ def test_stopping_half_way_leaves_the_site_as_it_was(flown, site):
     assert not (site / "flights" / "flight2").exists()
 
 
-def test_a_view_that_fails_beside_the_rest_is_told_and_leaves_the_site_as_it_was(flown, site, monkeypatch):
-    looked, look = [], ViewMaker.look
+def test_a_view_that_fails_beside_the_rest_is_reported_and_leaves_the_site_as_it_was(flown, site, monkeypatch):
+    begun, compare_with_map = [], ViewMaker.compare_with_map
 
     def fails(self, posed):
-        looked.append(posed.frame.index)
-        if len(looked) == 6:
+        begun.append(posed.frame.index)
+        if len(begun) == 6:
             raise StoreError("a tile is damaged")
-        return look(self, posed)
+        return compare_with_map(self, posed)
 
-    monkeypatch.setattr(ViewMaker, "look", fails)
+    monkeypatch.setattr(ViewMaker, "compare_with_map", fails)
     before, told = files(site), []
     with pytest.raises(StoreError, match="a tile is damaged"):
         for each in compare_flights([flown / "flight2"], site, _COMPARE, camera=flown / "camera.xml"):
@@ -255,9 +255,9 @@ def test_a_live_view_is_told_at_once_unless_the_next_one_waits_already(waiting, 
         asked.append(5)
 
     setup = SimpleNamespace(prior=lambda frame, first: None)
-    run = SimpleNamespace(look=lambda posed: posed.frame.index, lose=None)
-    looked_at = _looked_at(frames(), setup, lambda posed: True, run, lambda: 2 * waiting[asked[-1]])
-    found = [(each, asked[-1]) for each in looked_at]
+    run = SimpleNamespace(begin=lambda posed: posed.frame.index, lose=None)
+    begun = _begun(frames(), setup, lambda posed: True, run, lambda: 2 * waiting[asked[-1]])
+    found = [(each, asked[-1]) for each in begun]
     assert [each for each, _ in found] == [0, 1, 2, 3, 4]
     assert [last for _, last in found] == told_at
 
@@ -421,7 +421,8 @@ def test_a_frame_that_does_not_fit_is_recorded_with_its_residual(flown, site):
     ):
         setup = prepare(sources[0], _MAP, archive.site(), telemetry_named=False, finds_itself=True)
         grid = archive.site_grid()
-        views = ViewMaker(setup, ReferenceMap(archive.tiles(), grid.grid), grid, _COMPARE, None)
+        flight = FlightCamera(sources[0].camera.camera, setup.usual_height_m, 1280, setup.utc_ns)
+        views = ViewMaker(flight, ReferenceMap(archive.tiles(), grid.grid), grid, None, None)
         frame = next(iter(sources[0].frames(every(1.0))))
         outcome = ViewOutcome(ViewStatus.NOT_ALIGNED, "its points fit the map badly", 3.5, 0.0)
         placed = views.placed(PosedFrame(frame, setup.prior(frame, first=True)), outcome, 0.3)

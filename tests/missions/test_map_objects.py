@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from truth_detector import TruthDetector
 
+from sorvolo.change.classes import object_at, seen_at
 from sorvolo.errors import InputError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.missions.compare.change_classes import ChangeClasses, object_at, seen_at
+from sorvolo.missions.compare.change_classes import ChangeClasses
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.evaluate.changes import evaluate_changes
 from sorvolo.missions.evaluate.objects import evaluate_objects
@@ -225,12 +226,12 @@ def test_what_left_or_came_where_another_thing_stands_was_replaced(simulated: Pa
     person = standing("person", 10.0, 20.0, 0.8)
     left, came = change_at(ChangeKind.DISAPPEARED), change_at(ChangeKind.APPEARED)
     classes = ChangeClasses(Sees(simulated, 0.1), [person])
-    named = classes.finally_named(left, [here], [])
+    named = classes.final(left, [here], [])
     assert (named.kind, named.class_before, named.class_after) == (ChangeKind.REPLACED, "person", "car")
-    assert classes.at_once(came).kind == ChangeKind.REPLACED
+    assert classes.preliminary(came).kind == ChangeKind.REPLACED
     for other in (beside, small, walks):
-        assert classes.finally_named(left, [other], []).kind == ChangeKind.DISAPPEARED
-    assert ChangeClasses(Sees(simulated, 0.1), []).at_once(came).kind == ChangeKind.APPEARED
+        assert classes.final(left, [other], []).kind == ChangeKind.DISAPPEARED
+    assert ChangeClasses(Sees(simulated, 0.1), []).preliminary(came).kind == ChangeKind.APPEARED
 
 
 def test_a_changes_own_pictures_are_the_last_word(simulated: Path) -> None:
@@ -240,7 +241,7 @@ def test_a_changes_own_pictures_are_the_last_word(simulated: Path) -> None:
         (ChangeKind.APPEARED, "", "car"), (ChangeKind.DISAPPEARED, "person", ""),
         (ChangeKind.REPLACED, "person", "car"), (ChangeKind.MOVING, "", "car"),
     ):
-        named = classes.at_once(change_at(kind))
+        named = classes.preliminary(change_at(kind))
         assert (named.class_before, named.class_after) == (before, after)
-    unsure = ChangeClasses(Sees(simulated, 0.1), []).at_once(change_at(ChangeKind.REPLACED))
+    unsure = ChangeClasses(Sees(simulated, 0.1), []).preliminary(change_at(ChangeKind.REPLACED))
     assert (unsure.class_before, unsure.class_after) == ("", "")

@@ -8,8 +8,8 @@ from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
-from sorvolo.mosaic.placing import canvas_frame, rejected
-from sorvolo.survey.mosaic import Status
+from sorvolo.mosaic.placing import canvas_frame
+from sorvolo.survey.mosaic import PlacedFrame, Status
 
 CAMERA = Camera.from_angle_of_view(320, 240, 60)
 SITE_GRID = SiteGrid.at(Geodetic(41.89, 12.6), 0.05, "EPSG:32633")
@@ -34,7 +34,7 @@ def test_a_picture_that_sees_the_horizon_is_not_laid():
 
 
 def test_the_record_of_a_rejected_frame_says_why_and_has_no_place():
-    record = rejected(3, "IMG_3.jpg", 17, "blurred", CAMERA)
+    record = PlacedFrame.rejected(3, "IMG_3.jpg", 17, "blurred", CAMERA)
     assert (record.status, record.reason, record.name, record.time_ns) == (Status.REJECTED, "blurred", "IMG_3.jpg", 17)
     assert record.site_from_camera is None
     assert np.isnan(record.outline_m).all() and np.isnan(record.site_from_image).all()

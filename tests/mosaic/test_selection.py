@@ -6,7 +6,15 @@ import pytest
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.camera import Camera
-from sorvolo.mosaic.selection import Selected, SelectionSettings, every, interval_s, select_keyframes, small_gray
+from sorvolo.mosaic.selection import (
+    Selected,
+    SelectionSettings,
+    StretchSelection,
+    every,
+    interval_s,
+    select_keyframes,
+    small_gray,
+)
 from sorvolo.survey.flight import CameraPrior, Frame, LostFrame, PosedFrame
 
 WIDTH, HEIGHT = 384, 256
@@ -124,3 +132,12 @@ def test_every_keeps_its_rate_over_uneven_frames():
 def test_impossible_overlaps_are_refused(overlap):
     with pytest.raises(SettingsError, match="overlap"):
         SelectionSettings(overlap=overlap)
+
+
+def test_of_frames_over_known_ground_those_that_show_enough_new_ground_are_taken():
+    outline_m = np.array([[0.0, 10.0], [20.0, 10.0], [20.0, 0.0], [0.0, 0.0]])
+    selection = StretchSelection(0.7, keep_all=False)
+    assert [selection.take(outline_m + [east_m, 0.0]) for east_m in (0, 5, 7, 9, 14)] == [True, False, True, False, True]
+    assert selection.take(None) and selection.take(outline_m), "where the last one's place is not known, the next counts"
+    photos = StretchSelection(0.7, keep_all=True)
+    assert [photos.take(outline_m) for _ in range(3)] == [True] * 3

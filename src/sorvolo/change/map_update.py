@@ -1,9 +1,13 @@
-"""The map brought up to date: a change's later picture painted into a tile."""
+"""The map brought up to date: changes' later pictures painted into its tiles; by how much it grew."""
+
+from collections.abc import Iterable, Mapping, MutableMapping
 
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import ImageRGBA, Matrix3
+from sorvolo.geometry.arrays import ImageRGBA, Matrix3, PointsM
+from sorvolo.geometry.grid import SiteGrid, TileIndex
+from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 
 _GROWN_PX = 6  # of the tile, beyond the outline: covers the thing's blurred rim
@@ -15,6 +19,36 @@ _LEAST_RING_PX = 50
 def is_painted(change: Change) -> bool:
     """Whether a change belongs into the map: what moves does not."""
     return change.kind != ChangeKind.MOVING
+
+
+def paint_changes(
+    changes: Iterable[Change], tiles: MutableMapping[TileIndex, ImageRGBA], site_grid: SiteGrid
+) -> None:
+    """Paint what changed into the map: only the tiles that it touches become new."""
+    for change in changes:
+        if not is_painted(change):
+            continue
+        grid_from_site = site_grid.grid_from_site_affine(change.outline_m.mean(axis=0), 50.0)
+        height, width = change.patch.changed.shape
+        corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]]) - 0.5
+        outline = apply_homography(grid_from_site @ change.patch.site_from_patch, corners)
+        for index in sorted(site_grid.grid.tiles_touched(outline)):
+            if index in tiles:
+                old = tiles[index]
+                new = patched(old, site_grid.grid.tile_window(index), grid_from_site, change.patch)
+                if new is not old:
+                    tiles[index] = new
+
+
+def grown_m2(
+    outlines_m: Iterable[PointsM], before: Mapping[TileIndex, ImageRGBA], after: Mapping[TileIndex, ImageRGBA],
+    site_grid: SiteGrid,
+) -> float:
+    """Ground in the tiles under these outlines that the map shows `after` and did not show `before`."""
+    outlines = [site_grid.grid_from_site(each) for each in outlines_m]
+    touched = frozenset[TileIndex]().union(*(site_grid.grid.tiles_touched(outline) for outline in outlines))
+    grown = sum(_seen_px(after, each) - _seen_px(before, each) for each in touched)
+    return grown * site_grid.grid.m_per_px**2
 
 
 def patched(
@@ -50,6 +84,10 @@ def patched(
     result[touched, :3] = np.clip(np.rint(mixed[touched]), 0, 255).astype(np.uint8)
     result[touched, 3] = 255
     return result
+
+
+def _seen_px(tiles: Mapping[TileIndex, ImageRGBA], index: TileIndex) -> int:
+    return int(np.count_nonzero(tiles[index][..., 3])) if index in tiles else 0
 
 
 def _weight(patch: Patch, grow: int, feather: int) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:

@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Mapping
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from sorvolo.survey.mosaic import Features
 
 _BLOCK_PX = 512  # features are found in blocks of this side
 _APRON_PX = 40  # what contrast and descriptors look at beyond a block
+_LEVEL_TILES, _LEVEL_STEP_PX = 20, 16  # by which the map's middle grey is known
 _MOST_PX = 48_000_000  # of the map in one view: more is a view towards the horizon
 _FEATURES = FeatureSettings(detection_side_px=_BLOCK_PX + 2 * _APRON_PX, orb_count=1100)
 _NOTHING = Features("orb", np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
@@ -92,7 +94,20 @@ class ReferenceMap:
             return _NOTHING
         return _joined([self._block(level, each) for each in sorted(blocks)])
 
+    def brightness_of(self, image: ImageRGB) -> float:
+        """How many times as bright as the map a picture is, by the middle grey of either."""
+        return float(np.median(image[::_LEVEL_STEP_PX, ::_LEVEL_STEP_PX])) / max(self._middle_grey, 1.0)
+
     # ---- inside -----------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _middle_grey(self) -> float:
+        """By a few of the map's tiles."""
+        step = _LEVEL_STEP_PX
+        every = -(-len(self._tiles) // _LEVEL_TILES)
+        some = [self._tiles[index][::step, ::step] for index in sorted(self._tiles)[::every]]
+        levels = np.concatenate([tile[tile[..., 3] > 0][:, :3].ravel() for tile in some])
+        return float(np.median(levels)) if len(levels) else 0.0
 
     def _window_around(self, level: int, box: tuple[int, int, int, int]) -> tuple[int, int, ImageRGBA]:
         if level in self._windows:

@@ -1,5 +1,6 @@
 """The endless pixel grid that is laid on a site, cut into square tiles."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -8,6 +9,7 @@ import numpy as np
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Matrix3, PointsM, PointsPx
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame, Projection
+from sorvolo.geometry.homography import apply_homography
 
 TileIndex: TypeAlias = tuple[int, int]
 """(column, row) of a tile; both may be negative."""
@@ -99,6 +101,11 @@ class SiteGrid:
             return points
         latitude_deg, longitude_deg, _ = self.frame.wgs84_from_site(points)
         return Projection(self.grid.crs).projected_from_wgs84(latitude_deg, longitude_deg)
+
+    def tile_centres_m(self, tiles: Iterable[TileIndex]) -> PointsM:
+        """(N, 2) the middles of tiles on the ground, site metres, by the affine map around the site's origin."""
+        site_from_grid = np.linalg.inv(self.grid_from_site_affine(np.zeros(2), 50.0))
+        return apply_homography(site_from_grid, (np.array(sorted(tiles)) + 0.5) * self.grid.tile_px)
 
     def grid_from_site_affine(self, centre_m: PointsM, reach_m: float) -> Matrix3:
         """(3, 3) affine map from site metres to grid pixels, right around `centre_m`, shape (2,).

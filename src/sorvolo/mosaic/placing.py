@@ -7,7 +7,6 @@ from sorvolo.geometry.arrays import Floats, Mask, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.mosaic.canvas_frame import CanvasFrame
-from sorvolo.survey.mosaic import PlacedFrame, Status
 
 
 def canvas_frame(
@@ -26,12 +25,3 @@ def canvas_frame(
         )
     except GeometryError:
         return None
-
-
-def rejected(index: int, name: str, time_ns: int, reason: str, camera: Camera) -> PlacedFrame:
-    """The record of a frame that has no place."""
-    nowhere = np.full((3, 3), np.nan)
-    return PlacedFrame(
-        name, index, time_ns, Status.REJECTED, reason, camera, None, nowhere, np.full((4, 2), np.nan), float("nan"),
-        float("nan"),
-    )

@@ -7,12 +7,14 @@ import cv2
 import numpy as np
 
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import ImageGray, ImageRGB
+from sorvolo.geometry.arrays import ImageGray, ImageRGB, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.registration.features import gray_from_rgb, normalise_contrast, sharpness
 from sorvolo.survey.flight import LostFrame, PosedFrame
 
 _SMALL_PX = 256
+_UNTIMED_STEP_S = 0.2  # candidates of a video without telemetry, or live: five a second, the pictures decide
+_LIVE_SPEED_M_S = 5.0  # at least: a flight that has just begun does not show yet how fast it will be
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,18 @@ class SelectionSettings:
             raise SettingsError(f"overlap must lie between {self.least_overlap} and 1, got {self.overlap}")
 
 
+@dataclass(frozen=True)
+class FramePlan:
+    """How often a flight's frames are asked for, and how many keyframes to expect.
+
+    `step_s` is between candidates (0: every frame); fixes within `smooth_s` to both sides of a frame are averaged.
+    """
+
+    step_s: float
+    smooth_s: float
+    expected: int
+
+
 @dataclass(frozen=True, eq=False)
 class Selected:
     """A selected frame; `reason` is empty, or says why it cannot be used after all."""
@@ -41,6 +55,31 @@ def interval_s(camera: Camera, height_m: float, speed_m_s: float, overlap: float
     """Longest time between frames that keeps `overlap` along the shorter side: 1 / fr_min of eq. 3.17."""
     length_m = height_m * min(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px)
     return float(np.clip(length_m * (1 - overlap) / max(speed_m_s, 0.1), 0.02, 10.0))
+
+
+def untimed_plan(*, is_video: bool, expected: int) -> FramePlan:
+    """The plan of a flight of unknown speed: a video's pictures are asked five times a second, photos are all taken."""
+    step_s = _UNTIMED_STEP_S if is_video else 0.0
+    return FramePlan(step_s, 0.0, expected)
+
+
+def live_plan(camera: Camera, height_m: float, speed_m_s: float, overlap: float, *, by_pictures: bool) -> FramePlan:
+    """The plan of a video that has just begun and does not show yet how fast it will be."""
+    keyframe_s = interval_s(camera, height_m, max(speed_m_s, _LIVE_SPEED_M_S), overlap)
+    step_s = _UNTIMED_STEP_S if by_pictures else min(keyframe_s, 2.0)
+    return FramePlan(step_s, 0.5 * keyframe_s if by_pictures else 0.0, 2)
+
+
+def video_plan(
+    camera: Camera, height_m: float, speed_m_s: float, overlap: float, duration_s: float, frame_rate_hz: float, *,
+    by_pictures: bool,
+) -> FramePlan:
+    """The plan of a recorded video. `by_pictures`: three times as many frames are asked as eq. 3.17 needs, and the
+    pictures decide; else (the thesis) it alone does."""
+    keyframe_s = interval_s(camera, height_m, speed_m_s, overlap)
+    share = 3 if by_pictures else 1
+    step_s = float(np.clip(keyframe_s / share, 1 / max(frame_rate_hz, 1.0), 2.0 / share))
+    return FramePlan(step_s, 0.5 * keyframe_s if by_pictures else 0.0, max(2, round(duration_s / keyframe_s)))
 
 
 def every(step_s: float) -> Callable[[int, int], bool]:
@@ -91,6 +130,26 @@ def select_keyframes(
         yield Selected(each, "")
 
 
+class StretchSelection:
+    """Of frames whose places are known, those that show enough ground that the last one taken did not.
+
+    `overlap` is the share of a frame that the last one taken may show as well; of photos each was meant, and all are
+    taken. Only `take` changes it.
+    """
+
+    def __init__(self, overlap: float, *, keep_all: bool) -> None:
+        self._overlap, self._keep_all = overlap, keep_all
+        self._last_m: PointsM | None = None
+
+    def take(self, outline_m: PointsM | None) -> bool:
+        """Whether to take the frame of this outline, (4, 2) site metres; None where its place is not known."""
+        last_m = None if self._keep_all else self._last_m
+        if outline_m is not None and last_m is not None and _covered(last_m, outline_m) > self._overlap:
+            return False
+        self._last_m = outline_m
+        return True
+
+
 def small_gray(image: ImageRGB) -> ImageGray:
     """A gray copy whose longer side has 256 px."""
     scale = _SMALL_PX / max(image.shape[:2])
@@ -108,3 +167,11 @@ def _overlap(last: ImageGray, new: ImageGray) -> float:
     if response < 0.04:
         return 0.0
     return max(0.0, 1 - abs(dx) / width) * max(0.0, 1 - abs(dy) / height)
+
+
+def _covered(a_m: PointsM, b_m: PointsM) -> float:
+    """The share of outline b, convex, that outline a covers."""
+    centre = b_m.mean(axis=0)
+    a, b = (a_m - centre).astype(np.float32), (b_m - centre).astype(np.float32)
+    area, _ = cv2.intersectConvexConvex(a, b)
+    return float(area / max(cv2.contourArea(b), 1e-6))

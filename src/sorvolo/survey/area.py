@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Floats, PointsM, frozen
+from sorvolo.geometry.arrays import Floats, PointsM, Vector3, frozen
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame, ecef_from_wgs84, wgs84_from_ecef
 from sorvolo.geometry.polygons import first_crossing, narrowest_extent, points_inside, polygon_area
 
@@ -72,6 +72,11 @@ class Area:
         # the far side of the Earth has the same east and north
         near = points_m[:, 2] > -3e6
         return near & inside_any(self.polygons_m(self.frame), points_m[:, :2])
+
+    def holds(self, frame: LocalFrame, position_m: Vector3) -> bool:
+        """Whether a place, (3,) metres of `frame`, lies inside."""
+        latitude, longitude, _ = frame.wgs84_from_site(position_m[None])
+        return bool(self.contains(np.column_stack([longitude, latitude]))[0])
 
 
 def inside_any(polygons: Sequence[Sequence[PointsM]], points: PointsM) -> NDArray[np.bool_]:

@@ -116,6 +116,17 @@ class PlacedFrame:
     gps_residual_m: Floats = field(default_factory=lambda: np.full(3, np.nan))
     vignette: Floats = field(default_factory=lambda: np.zeros(2))
 
+    @classmethod
+    def rejected(
+        cls, index: int, name: str, time_ns: int, reason: str, camera: Camera, residual_px: float = float("nan")
+    ) -> "PlacedFrame":
+        """The record of a frame that has no place."""
+        nowhere = np.full((3, 3), np.nan)
+        return cls(
+            name, index, time_ns, Status.REJECTED, reason, camera, None, nowhere, np.full((4, 2), np.nan), residual_px,
+            float("nan"),
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Tile:

@@ -1,25 +1,14 @@
 """What a change is, before and after: people, cars and small objects that the flights saw there."""
 
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 
-import cv2
-import numpy as np
-
-from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, ImageRGBA, PointsM
+from sorvolo.change.classes import LENIENT, can_show, class_of_change, enlarged, object_at, seen_at, stands_in
+from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.missions.flight.detects import Detects
 from sorvolo.survey.findings import Change, ChangeKind
 from sorvolo.survey.map_objects import MapObject
 from sorvolo.survey.objects import Sighting
-
-_BESIDE_M = 0.4  # by which an object's place may lie outside of the change's outline, beside a part of its own length
-_LONGEST_S = 5.0  # before or after the time at which a moving change was where its outline is
-_TURN = 0.4  # of the way it goes meanwhile: people turn
-_LEAST_SIDE_PX = 160  # of a picture that a detector is shown
-_LEAST_SHARE = 0.5  # of the box or of the change, whichever is smaller, that both have in common
-_LIKE_LENGTHS = 1.6  # times the other's, at most
-_LENIENT = 0.6  # times each class's score: that something is there is known already
 
 _HAS_BEFORE = (ChangeKind.DISAPPEARED, ChangeKind.REPLACED)
 _HAS_AFTER = (ChangeKind.APPEARED, ChangeKind.REPLACED, ChangeKind.MOVING)
@@ -31,19 +20,19 @@ class ChangeClasses:
     def __init__(self, detector: Detects, known: Sequence[MapObject]) -> None:
         self._detector, self._known = detector, known
 
-    def at_once(self, change: Change) -> Change:
-        """The change with its classes as far as its own pictures and the known objects tell them: while it flies."""
-        return self.finally_named(change, (), ())
+    def preliminary(self, change: Change) -> Change:
+        """The change with its classes by its own pictures and the known objects alone: while the flight goes on."""
+        return self.final(change, (), ())
 
-    def finally_named(self, change: Change, found: Sequence[MapObject], sightings: Sequence[Sighting]) -> Change:
+    def final(self, change: Change, found: Sequence[MapObject], sightings: Sequence[Sighting]) -> Change:
         """The change with its classes, "" where nothing is recognised: of the objects that were there before or after;
-        else of the flight's sightings there; else of what the detector sees in the change's own pictures.
+        else of the flight's sightings there; else of what the detector finds in the change's own pictures.
 
         `found` and `sightings` are those of the flight, by its frames' final places. Where something left and a found
         object of about its size stands in its outline, or something came where a known one stood, it was replaced.
         """
         others = {ChangeKind.DISAPPEARED: found, ChangeKind.APPEARED: self._known}.get(change.kind, ())
-        if any(_stands_in(change, each) for each in others):
+        if any(stands_in(change, each) for each in others):
             change = replace(change, kind=ChangeKind.REPLACED)
         before = after = ""
         if change.kind in _HAS_BEFORE:
@@ -54,101 +43,13 @@ class ChangeClasses:
         return replace(change, class_before=before, class_after=after)
 
     def _in_picture(self, change: Change, rgba: ImageRGBA) -> str:
-        """The class that the detector sees where a picture of the change shows it; "" where it sees none."""
-        rows, columns = np.nonzero(change.patch.changed)
-        if not len(rows) or not (rgba[..., 3] > 0).any():
+        """The class that the detector finds where a picture of the change shows it; "" where it finds none."""
+        if not can_show(change.patch, rgba):
             return ""
-        picture, (left_px, top_px) = _enlarged(rgba)
+        picture, offset_px = enlarged(rgba)
         thresholds = self._detector.thresholds_for(picture)
         seen = self._detector.detect(
             picture, tiles="auto", m_per_px=change.patch.m_per_px,
-            least_score=_LENIENT * min(thresholds.values(), default=0.5),
+            least_score=LENIENT * min(thresholds.values(), default=0.5),
         )
-        changed_px = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float)
-        changed_px += [left_px, top_px, left_px, top_px]
-        best, best_score = "", 0.0
-        for box_px, name, score in zip(seen.boxes_px, seen.names, seen.scores):
-            share = _common_share(np.asarray(box_px, np.float64), changed_px)
-            if score >= _LENIENT * thresholds[name] and share >= _LEAST_SHARE and share * score > best_score:
-                best, best_score = name, share * float(score)
-        return best
-
-
-def _stands_in(change: Change, thing: MapObject) -> bool:
-    """Whether an object that does not move stands in a change's outline and is about as long."""
-    if thing.moving or _outside_m(change.outline_m, thing.position_m) > 0:
-        return False
-    return change.length_m / _LIKE_LENGTHS <= thing.length_m <= change.length_m * _LIKE_LENGTHS
-
-
-def object_at(change: Change, objects: Sequence[MapObject]) -> str:
-    """The class of the object that stands in a change's outline, or nearly, and is nearest to it in place and size.
-
-    "" where there is none; what moves is left out.
-    """
-    best, best_cost = "", np.inf
-    centre_m = _middle(change.outline_m)
-    for each in objects:
-        if each.moving:
-            continue
-        length_m = each.length_m if np.isfinite(each.length_m) else change.length_m
-        reach_m = _BESIDE_M + length_m / 4
-        outside_m = _outside_m(change.outline_m, each.position_m)
-        if outside_m > reach_m:
-            continue
-        ratio = float(np.log(max(length_m, 0.1) / max(change.length_m, 0.1)))
-        cost = float(np.hypot(*(each.position_m - centre_m))) / max(change.length_m, 0.5) + abs(ratio)
-        if cost < best_cost:
-            best, best_cost = each.label, cost
-    return best
-
-
-def seen_at(change: Change, sightings: Sequence[Sighting]) -> str:
-    """The class of a flight's sightings in a change's outline, by their summed scores; "" where there is none.
-
-    What moves is looked for where it was at each sighting's time.
-    """
-    sums: dict[str, float] = defaultdict(float)
-    speed_m_s = float(np.hypot(*change.velocity_m_s))
-    for each in sightings:
-        after_s = (each.time_ns - change.last_seen_ns) / 1e9
-        if change.kind is ChangeKind.MOVING and abs(after_s) > _LONGEST_S:
-            continue
-        meanwhile_m: Floats = change.velocity_m_s * after_s if speed_m_s else np.zeros(2)
-        reach_m = _BESIDE_M + each.size_m[0] / 4 + _TURN * float(np.hypot(*meanwhile_m))
-        outside_m = _outside_m(change.outline_m, each.position_m - meanwhile_m)
-        if outside_m <= reach_m:
-            sums[each.label] += each.score / (1.0 + max(outside_m, 0.0))
-    return max(sums, key=sums.__getitem__, default="")
-
-
-def _outside_m(outline_m: PointsM, place_m: Floats) -> float:
-    """How far a place (2,) lies outside of an outline, negative inside."""
-    ring = np.ascontiguousarray(outline_m - outline_m[0], np.float32)
-    east, north = place_m - outline_m[0]
-    return -float(cv2.pointPolygonTest(ring, (float(east), float(north)), True))
-
-
-def _middle(outline_m: PointsM) -> Floats:
-    return np.asarray((outline_m.min(axis=0) + outline_m.max(axis=0)) / 2, np.float64)
-
-
-def _enlarged(rgba: ImageRGBA) -> tuple[ImageRGB, tuple[int, int]]:
-    """The picture without alpha, wide enough for a detector; how far it begins to the right of and below its corner.
-
-    What is unknown gets the mean colour of what is known, what lies around is mirrored.
-    """
-    known = rgba[..., 3] > 0
-    rgb = rgba[..., :3].copy()
-    rgb[~known] = rgb[known].mean(axis=0).astype(np.uint8)
-    height, width = known.shape
-    top, left = (max(0, _LEAST_SIDE_PX - side + 1) // 2 for side in (height, width))
-    padded = cv2.copyMakeBorder(rgb, top, top, left, left, cv2.BORDER_REFLECT)
-    return np.asarray(padded, np.uint8), (left, top)
-
-
-def _common_share(one: Anything, other: Anything) -> float:
-    """What two boxes have in common, as a share of the smaller one."""
-    low, high = np.maximum(one[:2], other[:2]), np.minimum(one[2:], other[2:])
-    areas = np.prod(one[2:] - one[:2]), np.prod(other[2:] - other[:2])
-    return float(np.prod(np.clip(high - low, 0, None)) / max(min(areas), 1e-9))
+        return class_of_change(change.patch, seen, thresholds, offset_px)

@@ -11,19 +11,20 @@ from sorvolo.capture.areas import read_area
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.errors import InputError, SettingsError, StoreError
-from sorvolo.missions.compare.run import CompareRun, Looking
+from sorvolo.missions.compare.run import CompareRun, Pending
 from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.map_objects import open_detector
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup, known_flights, known_ground_m, prepare
 from sorvolo.mosaic.selection import every
+from sorvolo.registration.opencv_threads import single_threaded_opencv
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.area import Area
 from sorvolo.survey.findings import CompareUpdate, ViewStatus
 from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
 
-_AHEAD = 2  # frames that are looked at while the evidence of one is gathered: a thread for each
+_AHEAD = 2  # frames that are compared while the evidence of one is gathered: a thread for each
 
 
 def compare_flights(
@@ -35,7 +36,7 @@ def compare_flights(
     """Compare one or more later flights with the map in the site folder, yielding an update for each frame compared.
 
     `inputs`, `telemetry`, `camera`, `area`, `detector`, `live` and `until` are those of `map_flights`. An update
-    carries the changes that its frame made sure of. `steps` is a folder for the intermediate pictures of method thesis
+    carries the changes that its frame announced. `steps` is a folder for the intermediate pictures of method thesis
     (its Figure 3.14). The flights' findings and the new version of the map are part of the site when a flight's last
     update was yielded.
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
@@ -54,7 +55,7 @@ def compare_flights(
         inputs, telemetry, camera, known_flights(site), live=live, until=until,
         better_camera=lambda guess: known_camera(guess, archive),
     )
-    with Archive.open(site, write=True) as archive, opened as sources:
+    with Archive.open(site, write=True) as archive, opened as sources, single_threaded_opencv():
         for source in sources:
             yield from _compare_one(
                 source, archive, settings, wanted, steps, looks, telemetry_named=telemetry is not None
@@ -77,11 +78,11 @@ def _compare_one(
         settings = replace(settings, updates_map=False)  # what later flights painted stays
     with CompareRun(setup, archive, settings, base, steps, detector) as run:
 
-        def ahead() -> int:  # a live view's changes are told at once, unless the next view waits already
+        def ahead() -> int:  # a live view's changes are announced at once, unless the next view waits already
             return 0 if isinstance(source, LiveSource) and not source.is_behind else _AHEAD
 
-        for each in _looked_at(source.frames(every(step_s)), setup, inside, run, ahead):
-            if isinstance(each, Looking):
+        for each in _begun(source.frames(every(step_s)), setup, inside, run, ahead):
+            if isinstance(each, Pending):
                 outcome, announced = run.add(each)
                 frame: Frame | LostFrame = each.posed.frame
                 status, reason, residual_px = outcome.status, outcome.reason, outcome.residual_px
@@ -95,17 +96,17 @@ def _compare_one(
         run.finish(source.notices(), started_s)
 
 
-def _looked_at(
+def _begun(
     frames: Iterable[Frame | LostFrame], setup: FlightSetup, inside: Callable[[PosedFrame], bool], run: CompareRun,
     ahead: Callable[[], int],
-) -> Iterator[Looking | LostFrame]:
-    """The frames inside of the area, in order, while the run looks at them and up to `ahead()` of those after."""
-    waiting: deque[Looking | LostFrame] = deque()
+) -> Iterator[Pending | LostFrame]:
+    """The frames inside of the area in order, each with its comparison begun, and that of up to `ahead()` after it."""
+    waiting: deque[Pending | LostFrame] = deque()
     for each in frames:
         if isinstance(each, LostFrame):
             waiting.append(each)
         elif inside(posed := PosedFrame(each, setup.prior(each, first=False))):
-            waiting.append(run.look(posed))
+            waiting.append(run.begin(posed))
         while len(waiting) > ahead():
             yield waiting.popleft()
     yield from waiting

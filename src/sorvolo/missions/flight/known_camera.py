@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from sorvolo.mosaic.lens import refined_camera
+from sorvolo.registration.lens import refined_camera
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import CameraModel
 

@@ -63,7 +63,7 @@ def _map_one(
 
         def posed() -> Iterator[PosedFrame | LostFrame]:
             nonlocal read
-            for each in source.frames(every(setup.step_s)):
+            for each in source.frames(every(setup.plan.step_s)):
                 read = each.index + 1
                 yield PosedFrame(each, setup.prior(each, first=read == 1)) if isinstance(each, Frame) else each
 
@@ -78,7 +78,7 @@ def _map_one(
             name = each.posed.frame.name if isinstance(each, Selected) else each.name
             yield MosaicUpdate(
                 name, status, reason, read, source.frame_count, run.selected,
-                max(setup.expected_keyframes, run.selected), run.by_vision, tiles, time.monotonic() - started_s,
+                max(setup.plan.expected, run.selected), run.by_vision, tiles, time.monotonic() - started_s,
             )
         run.finish(source.notices(), started_s)
 

@@ -21,10 +21,10 @@ from sorvolo.missions.map.run import FlightRun
 from sorvolo.mosaic.canvas import Canvas
 from sorvolo.mosaic.canvas_frame import CanvasFrame
 from sorvolo.mosaic.exposure import Exposure
-from sorvolo.mosaic.lens import Undistorter, refined_camera
-from sorvolo.mosaic.placing import canvas_frame, rejected
+from sorvolo.mosaic.placing import canvas_frame
 from sorvolo.mosaic.planar import KnownKeyframe, PlanarMapper
 from sorvolo.mosaic.pose_graph import PoseGraphSettings
+from sorvolo.registration.lens import Undistorter, refined_camera
 from sorvolo.store.exports.map_pictures import picture, write_live_preview
 from sorvolo.store.images import ImageCache
 from sorvolo.store.pages.flight import report_page
@@ -308,7 +308,7 @@ class PlanarRun(FlightRun):
             applied_s += found.offset_s
             moved_track = shifted(track, applied_s)
             self._mapper.retime({
-                each: moved_track.prior(seconds, smooth_s=setup.smooth_s)
+                each: moved_track.prior(seconds, smooth_s=setup.plan.smooth_s)
                 for each, seconds in zip(ids, times, strict=True)
             })
         self._log.offset_applied_s = applied_s
@@ -327,7 +327,7 @@ class PlanarRun(FlightRun):
             keyframe_id = self._first_id + ending.index
             time_ns = self._setup.utc_ns(ending.time_ns)
             if keyframe_id not in self._frames:
-                result.append(rejected(ending.index, ending.name, time_ns, ending.reason, camera))
+                result.append(PlacedFrame.rejected(ending.index, ending.name, time_ns, ending.reason, camera))
                 continue
             status, reason = self._mapper.ending(keyframe_id)
             pose = self._mapper.pose(keyframe_id)
@@ -335,7 +335,7 @@ class PlanarRun(FlightRun):
             if not np.isfinite(outline_m).all():
                 reason = "the camera looks at the horizon"
                 self._log.end(ending.index, ending.name, ending.time_ns, Status.REJECTED, reason)
-                result.append(rejected(ending.index, ending.name, time_ns, reason, camera))
+                result.append(PlacedFrame.rejected(ending.index, ending.name, time_ns, reason, camera))
                 continue
             self._log.end(ending.index, ending.name, ending.time_ns, status, reason)
             result.append(PlacedFrame(

@@ -16,9 +16,8 @@ from sorvolo.missions.flight.report import Stage, build_report, nothing_placed
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.map.run import FlightRun
-from sorvolo.mosaic.lens import Undistorter
-from sorvolo.mosaic.placing import rejected
 from sorvolo.mosaic.roi_stitching import RoiStitcher, RoiStitchingSettings, Stitched, georeference
+from sorvolo.registration.lens import Undistorter
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
@@ -145,7 +144,7 @@ class ThesisRun(FlightRun):
         for ending in self._log.endings.values():
             time_ns = self._setup.utc_ns(ending.time_ns)
             if ending.index not in self._frames:
-                result.append(rejected(ending.index, ending.name, time_ns, ending.reason, camera))
+                result.append(PlacedFrame.rejected(ending.index, ending.name, time_ns, ending.reason, camera))
                 continue
             posed, stitched = self._frames[ending.index], self._stitched.get(ending.index)
             if stitched is not None:

@@ -1,55 +1,56 @@
-"""The pictures that the map was made of, as witnesses: taken from near the same place, they lean the same way."""
+"""Earlier pictures of the ground under a frame: taken from near the same place, they lean the same way."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, ImageRGBA, Mask, Matrix3, PointsM, Vector3
+from sorvolo.geometry.arrays import Anything, ImageRGB, ImageRGBA, Mask, Matrix3, PointsM, Vector3
+from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, pose_from_homography
-from sorvolo.store.images import ImageCache
-from sorvolo.store.site.archive import Archive
-from sorvolo.survey.mosaic import Status
+from sorvolo.geometry.pose import Pose
 
-_CACHE_BYTES = 128 * 2**20
 _EDGE = 0.01  # of a stored picture: the lens's correction repeats pixels there
 
 
+class EarlierPicture(NamedTuple):
+    """Where a picture of an earlier flight lies; `site_from_camera` is None where its method has no pose."""
+
+    camera: Camera
+    site_from_image: Matrix3
+    site_from_camera: Pose | None
+
+
 class EarlierPictures:
-    """The keyframes of earlier flights, seen from where a later frame was taken.
+    """The pictures of earlier flights, seen from where a later frame was taken.
 
     The map shows each piece of ground as one of them saw it, often from quite another side: a tree or a wall then leans
-    another way, and looks changed. `superseded` are flights whose keyframes the map does not show any more.
+    another way, and looks changed. `load` gives a picture by its place in `pictures`, (h, w, 4), with its alpha as
+    `with_known_pixels` sets it.
     """
 
-    def __init__(self, archive: Archive, superseded: Sequence[str] = ()) -> None:
-        self._keyframes = [
-            each for each in archive.keyframes()
-            if each.flight_id not in superseded and each.status is Status.VISION
-        ]
+    def __init__(self, pictures: Sequence[EarlierPicture], load: Callable[[int], ImageRGBA]) -> None:
+        self._pictures, self._load = pictures, load
         places = []
-        for each in self._keyframes:
+        for each in pictures:
             pose = each.site_from_camera or pose_from_homography(each.site_from_image, each.camera)
             places.append(np.full(3, np.inf) if pose is None else pose.translation_m)
         self._cameras_m = np.array(places).reshape(-1, 3)
-        self._images = ImageCache(
-            lambda index: _where_it_sees(cv2.cvtColor(archive.image(self._keyframes[index]), cv2.COLOR_RGB2RGBA)),
-            _CACHE_BYTES,
-        )
 
     def seen_from(
         self, site_from_image: Matrix3, camera_m: Vector3, width_px: int, height_px: int, most: int
     ) -> Iterator[tuple[Anything, Mask]]:
-        """The `most` keyframes taken nearest to `camera_m`, one from each side along the way, in an image's pixels:
+        """The `most` pictures taken nearest to `camera_m`, one from each side along the way, in an image's pixels:
         BGR (`height_px`, `width_px`, 3), and where they see."""
         for index in self._nearest(camera_m, most):
-            keyframe = self._keyframes[index]
-            picture = self._images.get(index)
+            keyframe = self._pictures[index]
+            picture = self._load(index)
             image_from_picture = np.linalg.inv(site_from_image) @ keyframe.site_from_image
             centre = image_from_picture @ np.array([keyframe.camera.cx_px, keyframe.camera.cy_px, 1.0])
             scale = _scale(image_from_picture, (keyframe.camera.cx_px, keyframe.camera.cy_px))
             while scale < 0.6:  # a mere interpolation would skip pixels
-                picture = _where_it_sees(cv2.pyrDown(picture))
+                picture = _known_inside(cv2.pyrDown(picture))
                 image_from_picture = image_from_picture @ np.array([[2.0, 0, 0.0], [0, 2.0, 0.0], [0, 0, 1.0]])
                 scale *= 2
             if centre[2] == 0:
@@ -59,7 +60,7 @@ class EarlierPictures:
             yield cv2.cvtColor(seen, cv2.COLOR_RGBA2BGR), np.asarray(cv2.extractChannel(seen, 3) == 255)
 
     def _nearest(self, camera_m: Vector3, most: int) -> list[int]:
-        """The nearest keyframe and then the nearest ones that lie on the other sides of the camera."""
+        """The nearest picture and then the nearest ones that lie on the other sides of the camera."""
         if not len(self._cameras_m):
             return []
         apart_m = self._cameras_m[:, :2] - camera_m[:2]
@@ -76,11 +77,16 @@ class EarlierPictures:
         return chosen
 
 
-def _where_it_sees(rgba: Anything) -> ImageRGBA:
-    """The picture (h, w, 4) with alpha 0 at its edge and 255 elsewhere; it is written over.
+def with_known_pixels(rgb: ImageRGB) -> ImageRGBA:
+    """The picture, (h, w, 3), with alpha 0 at its edge and 255 elsewhere.
 
-    In four bands OpenCV resamples it, and where it sees, in less time than in three and one.
+    In four bands OpenCV resamples it, and where it is known, in less time than in three and one.
     """
+    return _known_inside(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA))
+
+
+def _known_inside(rgba: Anything) -> ImageRGBA:
+    """The picture (h, w, 4) with alpha 0 at its edge and 255 elsewhere; it is written over."""
     edge = max(2, round(_EDGE * rgba.shape[1]))
     rgba[..., 3] = 0
     rgba[edge:-edge, edge:-edge, 3] = 255

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sorvolo.geometry.camera import Camera
-from sorvolo.mosaic.lens import Undistorter, refined_camera
+from sorvolo.registration.lens import Undistorter, refined_camera
 
 PERFECT = Camera(480, 320, 400.0, 402.0, 243.0, 155.0)
 BARREL = Camera(480, 320, 400.0, 402.0, 243.0, 155.0, np.array([-0.12, 0.03, 0.001, -0.0008, 0.0]))

@@ -1,0 +1,147 @@
+"""One flight's telemetry in the site frame, as it is known by now, and what it foretells of the flight."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sorvolo.capture.source import LiveSource, Source
+from sorvolo.capture.sync import Clock, Track, shifted, tie_clocks, track_from_telemetry
+from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.geodesy import LocalFrame
+from sorvolo.survey.flight import CameraPrior, Notice, Telemetry
+
+_SLOWEST_M_S = 0.3
+_LOWEST_M = 2.0
+_PLACES_ASKED = 200  # of a flight
+_LARGELY = 0.5  # share of samples that have a height: then it is the one that the flight counts in
+
+
+@dataclass(frozen=True)
+class TelemetryWishes:
+    """What a person says of a flight's telemetry: seconds to add to the video's time (None: not said), the ground's
+    height in telemetry's own reference (None: not said), whether the file was named by hand."""
+
+    offset_s: float | None = None
+    ground_elevation_m: float | None = None
+    is_named: bool = False
+
+
+class FlightTelemetry:
+    """A flight's telemetry tied to its frames and laid into the site frame. Only `renew` changes it: a live flight's
+    goes on."""
+
+    def __init__(self, source: Source, samples: Telemetry, frame: LocalFrame, wishes: TelemetryWishes) -> None:
+        self._source, self._frame = source, frame
+        self.samples, self.offset_s = samples, wishes.offset_s or 0.0
+        self.version = source.telemetry_version if isinstance(source, LiveSource) else 0
+        self._ground_m = wishes.ground_elevation_m
+        if self._ground_m is None and np.isfinite(source.ground_elevation_m):
+            self._ground_m = source.ground_elevation_m
+        self.clock = _live_clock(source, samples) if isinstance(source, LiveSource) else tie_clocks(
+            samples, kind=source.kind, start_ns=source.start_ns, duration_s=duration_s(source),
+            offset_given=wishes.offset_s is not None, strict=wishes.is_named,
+        )
+        self.track, notices = track_from_telemetry(samples, self.clock, frame, ground_elevation_m=self._ground_m)
+        if wishes.offset_s is not None:
+            self.track = shifted(self.track, wishes.offset_s)
+        self.notices: tuple[Notice, ...] = (*self.clock.notices, *notices)
+
+    def renew(self, time_ns: int) -> None:
+        """Take in what a live flight's telemetry has by now, once the fix after `time_ns` came or is late.
+
+        The zero of heights stays where it was, so that all frames are counted from the same.
+        """
+        source = self._source
+        if not isinstance(source, LiveSource):
+            return
+        source.wait_for_telemetry(time_ns)
+        if source.telemetry_version == self.version:
+            return
+        self.version, self.samples = source.telemetry_version, source.telemetry
+        self.clock = _live_clock(source, self.samples)
+        found, _ = track_from_telemetry(self.samples, self.clock, self._frame, ground_elevation_m=self._ground_m)
+        self.track = _continued(self.track, shifted(found, self.offset_s))
+
+    def covers(self, seconds: float) -> bool:
+        """Whether any fix lies within a video of so many seconds, or nearly."""
+        track, known = self.track, self._known
+        margin_s = 1.5 * track.interval_s + 0.5
+        return bool(((track.sample_s[known] >= -margin_s) & (track.sample_s[known] <= seconds + margin_s)).any())
+
+    @property
+    def height_m(self) -> float:
+        """The flight's usual height above the ground."""
+        return max(float(np.median(self.track.up_m[self._known])), _LOWEST_M)
+
+    @property
+    def median_height_m(self) -> float:
+        """The median of the heights above the ground at all samples, with or without a fix."""
+        return float(np.nanmedian(self.track.up_m))
+
+    @property
+    def speed_m_s(self) -> float:
+        """The speed that three quarters of the flight stay below, over steps of a second or more."""
+        return _speed_m_s(self.track.sample_s[self._known], self.track.east_north_m[self._known])
+
+    def ground_height(self, ground_up_m: float) -> tuple[float, str]:
+        """The height of ground that lies at `ground_up_m` by the track's heights, in telemetry's reference; which that
+        is. 0 "above ground" where telemetry has heights above take-off alone."""
+        for column, stated in (("ellipsoidal_height_m", "ellipsoidal"), ("orthometric_height_m", "orthometric")):
+            heights = self.samples[column]
+            if np.isfinite(heights).mean() > _LARGELY:
+                return float(np.nanmedian(heights - self.track.up_m)) + ground_up_m, stated
+        return 0.0, "above ground"
+
+    @property
+    def _known(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        return np.asarray(np.isfinite(self.track.east_north_m[:, 0]))
+
+
+def duration_s(source: Source) -> float:
+    """How long a video lasts, s; 0 for photos."""
+    return source.frame_count / source.frame_rate_hz if source.frame_rate_hz > 0 else 0.0
+
+
+def distance_m(track: Track, ground_m: PointsM | None) -> float:
+    """How near the flight comes to any of these places, (N, 2) site metres; None: to the site's origin."""
+    ground_m = np.zeros((1, 2)) if ground_m is None else ground_m
+    known = track.east_north_m[np.isfinite(track.east_north_m[:, 0])]
+    some = known[:: -(-len(known) // _PLACES_ASKED)]
+    return min(float(np.hypot(*(ground_m - place).T).min()) for place in some)
+
+
+def local_prior(camera: Camera, *, first: bool) -> CameraPrior:
+    """Without telemetry the first frame defines the frame: one unit is one of its pixels, its top is "north"."""
+    rotation = np.diag([1.0, -1.0, -1.0])
+    position_m = np.array([0.0, 0.0, camera.fx_px])
+    sigma = np.full(3, 1e-3 * camera.fx_px) if first else np.full(3, np.inf)
+    attitude = np.array([4.0, 4.0, 0.1]) if first else np.array([12.0, 12.0, np.inf])
+    return CameraPrior(position_m, sigma, rotation, attitude, source="no telemetry")
+
+
+def _speed_m_s(path_s: Floats, path_m: PointsM) -> float:
+    if len(path_s) < 2:
+        return 1.0
+    times = np.arange(path_s[0], path_s[-1], max(1.0, float(np.median(np.diff(path_s)))))
+    if len(times) < 2:
+        return 1.0
+    steps = np.column_stack([np.interp(times, path_s, path_m[:, k]) for k in range(2)])
+    speeds = np.linalg.norm(np.diff(steps, axis=0), axis=1) / np.diff(times)
+    return max(_SLOWEST_M_S, float(np.percentile(speeds, 75)))
+
+
+def _live_clock(source: LiveSource, telemetry: Telemetry) -> Clock:
+    """A live source ties its telemetry to its frames itself."""
+    return Clock(
+        (telemetry.time_ns - source.start_ns) / 1e9, source.telemetry_tie, source.telemetry_sigma_s, source.start_ns
+    )
+
+
+def _continued(before: Track, now: Track) -> Track:
+    """The track as it is known now, its heights counted from the same zero as before."""
+    same_m = np.interp(before.sample_s, now.sample_s, now.up_m)
+    return replace(
+        now, up_m=now.up_m + np.median(before.up_m - same_m), height_words=before.height_words,
+        vertical_sigma_m=before.vertical_sigma_m, altitude_offset_sigma_m=before.altitude_offset_sigma_m,
+    )

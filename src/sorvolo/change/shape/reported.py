@@ -1,0 +1,22 @@
+"""Changes as they are reported: around the things alone, as uncertain as the map, without what a person rejected."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sorvolo.change.shape.outlines import KnownPlace, is_known
+from sorvolo.change.shape.shadows import without_shadow
+from sorvolo.survey.findings import Change
+
+
+def reported(changes: Iterable[Change], map_sigma_m: float, rejected: Sequence[KnownPlace]) -> list[Change]:
+    """The changes without their shadows, their sigmas joined with the map's own, m per axis.
+
+    Those at places in `rejected` are left out: a person rejected them on an earlier flight.
+    """
+    finished = [without_shadow(each) for each in changes]
+    return [
+        replace(each, sigma_m=float(np.hypot(each.sigma_m, map_sigma_m))) for each in finished
+        if not is_known(each.outline_m, each.kind, rejected)
+    ]

@@ -1,0 +1,219 @@
+"""Frames of a later flight to views compared with the map: aligned, resampled, searched for differences."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sorvolo.change.alignment import Aligned, Aligner
+from sorvolo.change.earlier_pictures import EarlierPictures
+from sorvolo.change.frame_pixels import FramePixels, comparison_camera
+from sorvolo.change.pair.corroboration import LEAST_SURENESS, Difference, believed
+from sorvolo.change.pair.flight_tuning import FlightTuning
+from sorvolo.change.pair.robust import RobustSettings, compare_robust
+from sorvolo.change.pair.thesis import compare_thesis
+from sorvolo.change.pair.thesis_options import ThesisOptions
+from sorvolo.change.reference import ReferenceMap
+from sorvolo.geometry.arrays import Anything, ImageRGB, Mask, Matrix3
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.grid import SiteGrid
+from sorvolo.registration.lens import Undistorter
+from sorvolo.survey.findings import ComparedView, ViewStatus
+from sorvolo.survey.flight import PosedFrame
+from sorvolo.survey.mosaic import PlacedFrame
+
+_KNOWN_ENOUGH = 0.1  # share of a frame on known ground: with less there is nothing to compare
+_WITNESSES = 2  # earlier pictures asked about a difference: one from each side
+_COARSER = 1.25  # times the map's pixels: views less coarse than that have its pixels
+_ALL_CHANGED = 0.5  # share of a view: more is snow, a flood or another place, not a list of changes
+
+
+@dataclass(frozen=True, eq=False)
+class ViewOutcome:
+    """How one frame's comparison ended. `view` exists when it was compared, `site_from_image` (of the full undistorted
+    frame) when it was aligned. `known` is the share of the frame that lies on known ground, `brightness` how many times
+    as bright as the map the flight is so far, NaN where that is not known."""
+
+    status: ViewStatus
+    reason: str
+    residual_px: float  # in pixels of the full frame
+    known: float
+    site_from_image: Matrix3 | None = None
+    view: ComparedView | None = None
+    brightness: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class OneSided:
+    """A frame compared with the map, before earlier pictures corroborate it; `image` is RGB, `query` the same as BGR.
+
+    `settings` are those by which earlier pictures are to be compared, `outcome` is what is known of its ending.
+    """
+
+    posed: PosedFrame
+    aligned: Aligned
+    image: ImageRGB
+    reference: ImageRGB
+    query: Anything
+    valid: Mask
+    found: Difference
+    settings: RobustSettings | None
+    outcome: ViewOutcome
+
+
+@dataclass(frozen=True, eq=False)
+class FlightCamera:
+    """The camera of a flight to be compared, its usual height above ground (m, NaN: unknown), the longest side of a
+    compared picture, and how a frame's time becomes UTC."""
+
+    full: Camera
+    height_m: float
+    side_px: int
+    utc_ns: Callable[[int], int]
+
+
+class ViewMaker:
+    """Compares the frames of one flight with one version of the map, in order of time.
+
+    `compare_with_map` finds what differs from the map, `corroborate` keeps what earlier pictures confirm. Either is
+    called for the frames in their order; one may run while the other does, in another thread. With `thesis`, its
+    method compares, which asks no earlier pictures; else the robust one.
+    """
+
+    def __init__(
+        self, flight: FlightCamera, reference: ReferenceMap, site_grid: SiteGrid, thesis: ThesisOptions | None,
+        pictures: EarlierPictures | None,
+    ) -> None:
+        self._flight, self._reference, self._site_grid = flight, reference, site_grid
+        small = comparison_camera(flight.full, flight.height_m, site_grid.grid.m_per_px, flight.side_px)
+        self.pixels = FramePixels(flight.full, small)
+        self._lens = Undistorter(small, flight.full)
+        size = small.width_px, small.height_px
+        seen = self._lens.valid(*size)
+        self._lens_sees: Mask = np.ones(size[::-1], bool) if seen is None else seen
+        self._pictures = pictures
+        self._aligner = Aligner(reference, site_grid)
+        self._thesis = thesis or ThesisOptions()
+        self._tuning = FlightTuning() if thesis is None else None
+
+    def compare_with_map(self, posed: PosedFrame) -> ViewOutcome | OneSided:
+        """Align one frame and compare it with the map; a `ViewOutcome` if that ended it."""
+        frame, small = posed.frame, self.pixels.small
+        image = self._lens.undistort(frame.image)
+        aligned = self._aligner.align(image, self._lens.camera, posed.prior, frame.time_ns)
+        to_full = self._flight.full.width_px / small.width_px
+        if not isinstance(aligned, Aligned):
+            status = ViewStatus.OUTSIDE if aligned.is_outside else ViewStatus.NOT_ALIGNED
+            return ViewOutcome(status, aligned.reason, aligned.residual_px * to_full, 0.0, brightness=self.brightness)
+        residual_px = aligned.residual_px * to_full
+        site_from_full = aligned.site_from_image @ self.pixels.small_from_full
+        reference, known = self._reference.seen_from(
+            self._grid_from_image(aligned.site_from_image), small.width_px, small.height_px
+        )
+        valid = known & self._lens_sees
+        share = np.count_nonzero(valid) / np.count_nonzero(self._lens_sees)
+        if share < _KNOWN_ENOUGH:
+            reason = f"less than {_KNOWN_ENOUGH:.0%} of it lies on the map"
+            return ViewOutcome(
+                ViewStatus.OUTSIDE, reason, residual_px, share, site_from_full, brightness=self.brightness
+            )
+        query = as_bgr(image)
+        found = self._difference(as_bgr(reference), query, valid)
+        outcome = ViewOutcome(
+            ViewStatus.COMPARED, "", residual_px, share, site_from_full, brightness=self.brightness
+        )
+        return OneSided(posed, aligned, image, reference, query, valid, found, self._settings_now(), outcome)
+
+    def corroborate(self, compared: ViewOutcome | OneSided) -> ViewOutcome:
+        """Keep the differences that earlier pictures of the ground confirm: how the frame's comparison ended."""
+        if isinstance(compared, ViewOutcome):
+            return compared
+        frame, aligned, valid, outcome = compared.posed.frame, compared.aligned, compared.valid, compared.outcome
+        found = self._corroborated(compared)
+        changed = np.count_nonzero(found.mask) / max(1, int(np.count_nonzero(valid)))
+        if changed > _ALL_CHANGED:
+            reason = f"{changed:.0%} of it looks changed: snow, a flood, night or another place?"
+            return replace(outcome, status=ViewStatus.ALL_CHANGED, reason=reason)
+        return replace(outcome, view=ComparedView(
+            frame.index, frame.name, self._flight.utc_ns(frame.time_ns), aligned.site_from_image, aligned.camera_m,
+            compared.image, compared.reference, valid, found.mask, found.boxes, found.scores, aligned.residual_px,
+        ))
+
+    def placed(self, posed: PosedFrame, outcome: ViewOutcome, map_sigma_m: float) -> PlacedFrame:
+        """The frame's record: placed by the map it fits, or rejected with the reason."""
+        return self.pixels.placed(
+            posed, self._flight.utc_ns(posed.frame.time_ns), outcome.site_from_image, outcome.reason,
+            outcome.residual_px, map_sigma_m,
+        )
+
+    def chosen(self) -> dict[str, Any]:
+        """What the robust method's parameters set themselves to on this flight; nothing for method thesis."""
+        return {} if self._tuning is None else self._tuning.chosen()
+
+    def change_m_per_px(self, first: ComparedView) -> float:
+        """Of the pictures of changes: the map's pixels, or the views' where these are coarser.
+
+        How coarse they are, the first view gives, or the flight's height, whichever is finer: either may be wrong.
+        """
+        map_m_per_px = self._site_grid.grid.m_per_px
+        views_m_per_px = float(np.fmin(self._m_per_px, first.m_per_px))
+        return views_m_per_px if views_m_per_px > _COARSER * map_m_per_px else map_m_per_px
+
+    def brightness_beside_map(self, posed: PosedFrame, outcome: ViewOutcome) -> float:
+        """How many times as bright as the map a frame is. Where no ground was compared in its light yet (and method
+        thesis never does), its middle grey gives it."""
+        if np.isnan(outcome.brightness):
+            return self._reference.brightness_of(posed.frame.image)
+        return outcome.brightness
+
+    @property
+    def brightness(self) -> float:
+        """How many times as bright as the map the flight is; NaN where that is not known."""
+        return float("nan") if self._tuning is None else self._tuning.brightness
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    @property
+    def _m_per_px(self) -> float:
+        """Ground metres of a compared picture's pixel, at the flight's usual height; NaN where that is not known."""
+        return self._flight.height_m / self.pixels.small.fx_px
+
+    def _grid_from_image(self, site_from_image: Matrix3) -> Matrix3:
+        camera = self.pixels.small
+        centre = site_from_image @ np.array([camera.cx_px, camera.cy_px, 1.0])
+        return self._site_grid.grid_from_site_affine(centre[:2] / centre[2], 50.0) @ site_from_image
+
+    def _corroborated(self, compared: OneSided) -> Difference:
+        """What differs from the map or from one of the nearest earlier pictures, as far as they confirm it."""
+        if self._pictures is None or compared.settings is None:
+            return compared.found
+        height, width = compared.valid.shape
+        earlier = []
+        for picture, sees in self._pictures.seen_from(
+            compared.aligned.site_from_image, compared.aligned.camera_m, width, height, _WITNESSES
+        ):
+            sees &= self._lens_sees
+            found = compare_robust(picture, compared.query, sees, compared.settings)
+            earlier.append((Difference(found.mask, found.boxes, found.scores), sees))
+        return believed((compared.found, compared.valid), earlier)
+
+    def _difference(self, reference: Anything, query: Anything, valid: Mask) -> Difference:
+        """What differs from the map; the flight's tuning learns of it."""
+        settings = self._settings_now()
+        if self._tuning is None or settings is None:
+            thesis = compare_thesis(reference, query, valid, self._thesis.settings, self._thesis.threads)
+            return Difference(thesis.mask, thesis.boxes, np.full(len(thesis.boxes), 0.5))
+        found = compare_robust(reference, query, valid, settings)
+        self._tuning.observe(found)
+        return Difference(found.mask, found.boxes, found.scores)
+
+    def _settings_now(self) -> RobustSettings | None:
+        """Those of the robust method as the flight has set them so far; None for method thesis."""
+        return None if self._tuning is None else replace(self._tuning.settings(), least_score=LEAST_SURENESS)
+
+
+def as_bgr(image: ImageRGB) -> Anything:
+    """The picture with its channels in OpenCV's order."""
+    return cv2.cvtColor(image, cv2.COLOR_RGB2BGR)

@@ -1,0 +1,75 @@
+"""Objects beside a comparison: frames that fit the map are searched for them, and they name what changes are."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from sorvolo.change.views import ViewMaker, ViewOutcome
+from sorvolo.missions.compare.change_classes import ChangeClasses
+from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.map_objects import ObjectFinder, search_summary, why_not_searched
+from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.mosaic.selection import StretchSelection
+from sorvolo.store.site.archive import Archive
+from sorvolo.survey.findings import Change
+from sorvolo.survey.flight import Notice, PosedFrame
+from sorvolo.survey.map_objects import ObjectSearch
+from sorvolo.survey.mosaic import PlacedFrame
+
+_OVERLAP = 0.75  # of frames that are searched
+
+
+class ComparisonObjects:
+    """A detector's part in one comparison; without a detector nothing is searched and no change has a class."""
+
+    def __init__(
+        self, detector: Detects | None, setup: FlightSetup, archive: Archive, base_version: int, model: str
+    ) -> None:
+        self._name, self._model = setup.source.name, model
+        self._selection = StretchSelection(_OVERLAP, keep_all=setup.source.kind != "video")
+        self._finder: ObjectFinder | None = None
+        self._classes: ChangeClasses | None = None
+        if detector is not None:
+            before = {each.flight_id for each in archive.versions() if each.complete and each.id <= base_version}
+            known = archive.newest_objects(before - {self._name})
+            self._classes = ChangeClasses(detector, [each.thing for each in known])
+            self._finder = ObjectFinder(detector, setup.source.camera.camera)
+
+    def close(self) -> None:
+        """End the detector's thread."""
+        if self._finder is not None:
+            self._finder.close()
+
+    @property
+    def notices(self) -> tuple[Notice, ...]:
+        """What the detector would have a user know of the frames."""
+        return () if self._finder is None else self._finder.notices
+
+    def search(self, posed: PosedFrame, outcome: ViewOutcome, views: ViewMaker) -> None:
+        """Have a frame that fits the map searched, each stretch of ground in a few of them."""
+        if self._finder is None or outcome.site_from_image is None:
+            return
+        outline_m = views.pixels.ground_m(posed, outcome.site_from_image)
+        if outline_m is not None and self._selection.take(outline_m):
+            self._finder.look(posed)
+
+    def named(self, announced: Sequence[Change]) -> tuple[Change, ...]:
+        """The changes with their classes so far."""
+        if self._classes is None:
+            return tuple(announced)
+        return tuple(self._classes.preliminary(each) for each in announced)
+
+    def conclude(
+        self, placed: Sequence[PlacedFrame], changes: Sequence[Change]
+    ) -> tuple[ObjectSearch | None, list[Change]]:
+        """The flight's objects by its frames' final places (None: nobody searched), and the changes with their
+        classes."""
+        if self._finder is None or self._classes is None:
+            return None, list(changes)
+        search = self._finder.conclude(placed, self._name, has_metres=True)
+        sightings = self._finder.sightings
+        return search, [self._classes.final(each, search.objects, sightings) for each in changes]
+
+    def summary(self, search: ObjectSearch | None) -> dict[str, Any]:
+        """The report's part on objects."""
+        seconds = 0.0 if self._finder is None else self._finder.seconds
+        return search_summary(search, seconds, why_not_searched(self._model))

@@ -1,0 +1,112 @@
+"""What a comparison adds to a flight's report: views counted, changes counted, warnings."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+from sorvolo.change.compared_cells import ComparedCells
+from sorvolo.change.views import ViewMaker, ViewOutcome
+from sorvolo.geometry.summary import median_of_known, percentile_of_known
+from sorvolo.missions.compare.extension import NIGHT
+from sorvolo.missions.flight.settings import CompareSettings
+from sorvolo.survey.findings import Change, ChangeKind, ViewStatus
+
+_DARK = 0.4  # times the map's brightness: less hides things
+
+
+class ViewCounts:
+    """How a flight's frames ended and what ground they compared, as they come. Only `end` and `take` change it."""
+
+    def __init__(self) -> None:
+        self.ground = ComparedCells()
+        self._statuses: Counter[ViewStatus] = Counter()
+        self._reasons: Counter[str] = Counter()
+        self._residuals_px: list[float] = []
+
+    def end(self, status: ViewStatus, reason: str) -> None:
+        """Count a frame that ended so."""
+        self._statuses[status] += 1
+        if reason:
+            self._reasons[reason] += 1
+
+    def take(self, outcome: ViewOutcome) -> None:
+        """Count a frame's comparison."""
+        self.end(outcome.status, outcome.reason)
+        if outcome.site_from_image is not None:
+            self._residuals_px.append(outcome.residual_px)
+
+    def __getitem__(self, status: ViewStatus) -> int:
+        return self._statuses[status]
+
+    @property
+    def total(self) -> int:
+        """Frames that ended so far, lost ones included."""
+        return self._statuses.total()
+
+    @property
+    def commonest_reason(self) -> str:
+        """Why most frames could not be compared, in words."""
+        return self._reasons.most_common(1)[0][0] if self._reasons else "there is none"
+
+    def summary(self) -> dict[str, Any]:
+        """The counts as the report has them."""
+        return {
+            "views": {status.value: self._statuses[status] for status in ViewStatus},
+            "reasons": dict(self._reasons.most_common()),
+            "residual_px": {
+                "median": median_of_known(self._residuals_px), "p95": percentile_of_known(self._residuals_px, 95),
+            },
+        }
+
+
+def comparison_summary(
+    changes: Sequence[Change], suppressed: int, counts: ViewCounts, views: ViewMaker, settings: CompareSettings,
+    base_version: int,
+) -> dict[str, Any]:
+    """The report's part on the comparison; specified in docs/formats.md. `suppressed` changes were not reported: a
+    person rejected them on an earlier flight."""
+    kinds = Counter(each.kind for each in changes)
+    return {
+        "against_version": base_version,
+        "method": settings.method,
+        **counts.summary(),
+        "changes": {kind.value: kinds[kind] for kind in ChangeKind},
+        "suppressed": suppressed,
+        "compared_area_m2": counts.ground.area_m2,
+        "unknown_share": counts.ground.unknown_share,
+        "votes": settings.votes, "voters": settings.voters,
+        "chosen": views.chosen(),
+        "map_updated": settings.updates_map,
+        "most_missed": views.brightness < NIGHT,
+    }
+
+
+def comparison_warnings(counts: ViewCounts, brightness: float) -> list[str]:
+    """What makes this comparison show less than a user would expect of it; `brightness` is in times the map's."""
+    warnings = []
+    views = max(1, counts.total)
+    if brightness < NIGHT:
+        warnings.append(
+            f"the flight is {brightness:.2f} times as bright as the map: most changes are missed, so that finding "
+            "none means little, and new ground is not added to the map; compare flights by daylight"
+        )
+    elif brightness < _DARK or brightness > 1 / _DARK:
+        warnings.append(
+            f"the flight is {brightness:.2f} times as bright as the map: changes that are small, dark or of the "
+            "ground's colour are missed; compare flights by daylight"
+        )
+    if counts[ViewStatus.OUTSIDE] == counts.total - counts[ViewStatus.LOST]:
+        warnings.append(
+            f"none of {counts.total} views lies on the map, which grew beside what it showed: if the flight was over "
+            "the same ground, its telemetry is metres off; `sorvolo history` has the map from before"
+        )
+    unmatched = counts[ViewStatus.NOT_ALIGNED] + counts[ViewStatus.LOST]
+    if unmatched > 0.3 * views:
+        warnings.append(f"{unmatched} of {views} views could not be matched with the map; `reasons` lists why")
+    all_changed = counts[ViewStatus.ALL_CHANGED]
+    if all_changed > 0.1 * views:
+        warnings.append(
+            f"{all_changed} of {views} views look changed all over (snow, a flood?) and were left out: "
+            "map the site anew"
+        )
+    return warnings
