@@ -137,7 +137,8 @@ def test_impossible_overlaps_are_refused(overlap):
 def test_of_frames_over_known_ground_those_that_show_enough_new_ground_are_taken():
     outline_m = np.array([[0.0, 10.0], [20.0, 10.0], [20.0, 0.0], [0.0, 0.0]])
     selection = StretchSelection(0.7, keep_all=False)
-    assert [selection.take(outline_m + [east_m, 0.0]) for east_m in (0, 5, 7, 9, 14)] == [True, False, True, False, True]
-    assert selection.take(None) and selection.take(outline_m), "where the last one's place is not known, the next counts"
+    taken = [selection.take(outline_m + np.array([east_m, 0.0])) for east_m in (0, 5, 7, 9, 14)]
+    assert taken == [True, False, True, False, True]
+    assert selection.take(None) and selection.take(outline_m), "after one of unknown place the next is taken"
     photos = StretchSelection(0.7, keep_all=True)
     assert [photos.take(outline_m) for _ in range(3)] == [True] * 3

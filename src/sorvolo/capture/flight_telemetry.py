@@ -1,11 +1,20 @@
 """One flight's telemetry in the site frame, as it is known by now, and what it foretells of the flight."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sorvolo.capture.source import LiveSource, Source
-from sorvolo.capture.sync import Clock, Track, shifted, tie_clocks, track_from_telemetry
+from sorvolo.capture.sync import (
+    Clock,
+    OffsetEstimate,
+    Track,
+    estimate_offset,
+    shifted,
+    tie_clocks,
+    track_from_telemetry,
+)
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import LocalFrame
@@ -14,6 +23,7 @@ from sorvolo.survey.flight import CameraPrior, Notice, Telemetry
 _SLOWEST_M_S = 0.3
 _LOWEST_M = 2.0
 _PLACES_ASKED = 200  # of a flight
+_SEARCHED_SIGMAS, _SEARCHED_AGAIN_S = 4, 1.0  # how far a clock offset is searched, first and after one was found
 _LARGELY = 0.5  # share of samples that have a height: then it is the one that the flight counts in
 
 
@@ -84,6 +94,20 @@ class FlightTelemetry:
         """The speed that three quarters of the flight stay below, over steps of a second or more."""
         return _speed_m_s(self.track.sample_s[self._known], self.track.east_north_m[self._known])
 
+    def offset_seen(self, seconds: Sequence[float], seen_m: PointsM, applied_s: float) -> OffsetEstimate:
+        """The clock offset, beyond `applied_s`, that makes the fixes fit the path seen in the pictures: places (N, 2+)
+        at N seconds of the video, NaN where a picture has none. See `estimate_offset`."""
+        tied = np.isfinite(seen_m[:, 0])
+        reach_s = _SEARCHED_AGAIN_S if applied_s else _SEARCHED_SIGMAS * self.clock.sigma_s
+        return estimate_offset(
+            shifted(self.track, applied_s), np.array(seconds)[tied], seen_m[tied, :2], reach_s=reach_s
+        )
+
+    def priors(self, seconds: Sequence[float], offset_s: float, smooth_s: float) -> list[CameraPrior]:
+        """What telemetry gives of the camera at these seconds of the video, under another clock offset."""
+        moved = shifted(self.track, offset_s)
+        return [moved.prior(each, smooth_s=smooth_s) for each in seconds]
+
     def ground_height(self, ground_up_m: float) -> tuple[float, str]:
         """The height of ground that lies at `ground_up_m` by the track's heights, in telemetry's reference; which that
         is. 0 "above ground" where telemetry has heights above take-off alone."""
@@ -92,6 +116,11 @@ class FlightTelemetry:
             if np.isfinite(heights).mean() > _LARGELY:
                 return float(np.nanmedian(heights - self.track.up_m)) + ground_up_m, stated
         return 0.0, "above ground"
+
+    @property
+    def knows_ground(self) -> bool:
+        """Whether the zero of heights is known to be the ground, however well."""
+        return bool(np.isfinite(self.track.altitude_offset_sigma_m))
 
     @property
     def _known(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

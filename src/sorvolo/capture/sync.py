@@ -55,6 +55,10 @@ class OffsetEstimate:
             and self.rms_m < 0.97 * self.rms_at_zero_m
         )
 
+    def refined(self, found: "OffsetEstimate", applied_s: float) -> "OffsetEstimate":
+        """This estimate after another search, which began at `applied_s` and found so much more."""
+        return OffsetEstimate(applied_s + found.offset_s, found.sigma_s, self.rms_at_zero_m, found.rms_m)
+
 
 def tie_clocks(
     telemetry: Telemetry, *, kind: str, start_ns: int, duration_s: float, offset_given: bool, strict: bool

@@ -25,6 +25,11 @@ def footprint(camera: Camera, site_from_camera: Pose, ground_height_m: float = 0
     return ground_from_pixels(camera, site_from_camera, camera.corners_px, ground_height_m)
 
 
+def is_on_ground(outline_m: PointsM) -> bool:
+    """Whether all points of an outline, (N, 2), lie on the ground: none is at or above the horizon."""
+    return bool(np.isfinite(outline_m).all())
+
+
 def ground_from_pixels(
     camera: Camera, site_from_camera: Pose, points_px: PointsPx, ground_height_m: float = 0.0
 ) -> PointsM:

@@ -70,6 +70,14 @@ class Exposure:
     vignettes: Mapping[int, Floats]
     spread: float
 
+    def gains_of(self, frame_id: int) -> Floats:
+        """(3,) the frame's gains; ones where nothing is known of it."""
+        return self.gains.get(frame_id, np.ones(3))
+
+    def vignette_of(self, camera_id: int) -> Floats:
+        """(2,) the camera's vignette; none where nothing is known of it."""
+        return self.vignettes.get(camera_id, np.zeros(2))
+
 
 def tie_colours(
     image_a: ImageRGB, points_a_px: PointsPx, image_b: ImageRGB, points_b_px: PointsPx

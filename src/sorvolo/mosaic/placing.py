@@ -1,5 +1,7 @@
 """Placed frames as the canvas and the records need them, whichever method placed them."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sorvolo.errors import GeometryError
@@ -7,6 +9,10 @@ from sorvolo.geometry.arrays import Floats, Mask, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.mosaic.canvas_frame import CanvasFrame
+from sorvolo.survey.flight import CameraPrior
+
+_HORIZON_MARGIN_DEG = 5.0
+_KNOWN_ATTITUDE_DEG = 4.0  # one sigma of a gimbal's tilt
 
 
 def canvas_frame(
@@ -25,3 +31,17 @@ def canvas_frame(
         )
     except GeometryError:
         return None
+
+
+def sees_horizon(camera: Camera, prior: CameraPrior) -> bool:
+    """Whether a picture's corners look to the horizon or nearly, by telemetry that knows where the camera looks."""
+    if prior.attitude_sigma_deg[:2].max() > _KNOWN_ATTITUDE_DEG:
+        return False
+    rays = camera.rays_from_pixels(camera.corners_px) @ prior.rotation.T
+    down = -rays[:, 2] / np.linalg.norm(rays, axis=1)
+    return bool(np.degrees(np.arcsin(down.min())) < _HORIZON_MARGIN_DEG)
+
+
+def map_m_per_px(heights_m: Sequence[float], focal_px: float) -> float:
+    """The ground sampling distance of pictures taken from these heights, to three digits: a new map's."""
+    return float(f"{np.median(heights_m) / focal_px:.3g}")

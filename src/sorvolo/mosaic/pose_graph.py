@@ -20,6 +20,12 @@ _ENOUGH = 8  # frames from which telemetry's own errors are learnt
 _OFFSET_GROUPS = ((2,), (5, 6), (7,))  # of SHARED: altitude's zero, tilt, heading; judged together
 _OFFSETS = tuple(k for group in _OFFSET_GROUPS for k in group)
 _AT_WORD = np.array([np.inf, np.inf, 0.1, np.inf, np.inf, 0.002, 0.002, 0.003])  # sigma of an offset not believed in
+_CALIBRATED = 0.005  # relative: a focal length known so well is held
+_RADIAL_SIGMA = 0.03  # of a lens that nobody calibrated
+_FREE_M = 1e4  # a zero of heights that nothing is known of
+_GPS_OFFSET_M = 5.0  # of a receiver, the same all flight
+_TILT_OFFSET_DEG = 2.0  # a gimbal's zero, or a camera's mount
+_HEADING_OFFSET_DEG = 5.0  # a drone's compass beside its motors
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,27 @@ class PoseGraphSettings:
     gps_offset_sigma_m: float = 0.0  # > 0 when a known map fixes the datum instead of this flight's GPS
     tilt_offset_sigma_deg: float = 0.0  # of gimbal or mount against the vertical, the same all flight
     heading_offset_sigma_deg: float = 0.0  # of the compass, the same all flight
+
+    @classmethod
+    def of_flight(
+        cls, focal_sigma: float, altitude_offset_sigma_m: float | None, *, joins_map: bool
+    ) -> "PoseGraphSettings":
+        """What is free on a flight whose focal length is known to `focal_sigma` (relative) and the zero of whose
+        heights to `altitude_offset_sigma_m` (infinite: not at all; None: a flight without telemetry). `joins_map`: a
+        known map fixes where it lies.
+        """
+        calibrated = focal_sigma <= _CALIBRATED
+        has_telemetry = altitude_offset_sigma_m is not None
+        height_known = altitude_offset_sigma_m is not None and bool(np.isfinite(altitude_offset_sigma_m))
+        offset_sigma_m = altitude_offset_sigma_m if altitude_offset_sigma_m is not None and height_known else _FREE_M
+        return cls(
+            focal_sigma=0.0 if calibrated or not height_known else focal_sigma,
+            radial_sigma=0.0 if calibrated else _RADIAL_SIGMA,
+            altitude_offset_sigma_m=offset_sigma_m if has_telemetry else 0.0,
+            gps_offset_sigma_m=_GPS_OFFSET_M if joins_map else 0.0,
+            tilt_offset_sigma_deg=_TILT_OFFSET_DEG if has_telemetry else 0.0,
+            heading_offset_sigma_deg=_HEADING_OFFSET_DEG if has_telemetry else 0.0,
+        )
 
 
 @dataclass(frozen=True, eq=False)

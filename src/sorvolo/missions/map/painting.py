@@ -1,0 +1,152 @@
+"""A flight's keyframes painted into the site's map while they still move, and once more when they stand."""
+
+import time
+from collections.abc import Collection
+
+from sorvolo.geometry.arrays import ImageRGB, Mask, Matrix3
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.grid import SiteGrid
+from sorvolo.geometry.homography import site_from_image_homography
+from sorvolo.missions.flight.report import FlightLog, Stage
+from sorvolo.missions.map.known_keyframes import KnownKeyframes
+from sorvolo.mosaic.canvas import Canvas
+from sorvolo.mosaic.canvas_frame import CanvasFrame
+from sorvolo.mosaic.exposure import Exposure
+from sorvolo.mosaic.placing import canvas_frame
+from sorvolo.mosaic.planar import PlanarMapper
+from sorvolo.registration.lens import Undistorter
+from sorvolo.registration.sizes import at_size
+from sorvolo.store.exports.map_pictures import write_live_preview
+from sorvolo.store.images import ImageCache
+from sorvolo.store.site.archive import Archive, FlightWriter
+
+_PAINT_EVERY = 8  # keyframes painted together: tiles that several touch are rendered once
+_PAINT_REST = 4  # times as long as a painting took: showing a map that still moves must not hold up the flight
+_COARSE_MAP = 0.77  # times the pictures' own pixels: a coarser map does not need every pixel of them
+_CACHE_BYTES = 128 * 1024 * 1024  # of earlier flights' pictures
+
+
+class FlightPainter:
+    """Stores a flight's pictures and paints them into its site; ground that the map shows already stays as it is.
+
+    `native_m_per_px` is the ground sampling distance of the flight's own pictures. Keyframes have ids from
+    `known.count` on, earlier flights' those before.
+    """
+
+    def __init__(
+        self, writer: FlightWriter, archive: Archive, mapper: PlanarMapper, lens: Undistorter, known: KnownKeyframes,
+        native_m_per_px: float, log: FlightLog, live_s: float,
+    ) -> None:
+        self._writer, self._archive, self._mapper, self._known, self._log = writer, archive, mapper, known, log
+        self._live_s = live_s
+        self.images: dict[int, str] = {}
+        """Where each frame's picture is stored, by frame index: what `FlightWriter.commit` wants."""
+        self.exposure = Exposure({}, {}, 0.0)
+        self._known_images = ImageCache(lambda each: archive.image(known[each].stored), _CACHE_BYTES)
+        self._stored: Camera = lens.camera
+        shrink = native_m_per_px / archive.site_grid().grid.m_per_px
+        if shrink < _COARSE_MAP:
+            full = lens.camera
+            self._stored = full.resized(max(16, round(full.width_px * shrink)), max(16, round(full.height_px * shrink)))
+        self._valid: Mask | None = lens.valid(self._stored.width_px, self._stored.height_px)
+        self._canvas = self._new_canvas()
+        self._frames: set[int] = set()
+        self._dirty: set[int] = set()
+        self._painted_at = 0
+        self._paint_again_s = 0.0
+        self._shown_s = time.monotonic()
+
+    def save(self, keyframe_id: int, image: ImageRGB) -> None:
+        """Store a keyframe's picture, no larger than the map needs it."""
+        index = keyframe_id - self._known.count
+        small = at_size(image, self._stored.width_px, self._stored.height_px)
+        self.images[index] = self._writer.save_image(index, small)
+
+    def mark(self, moved: Collection[int]) -> None:
+        """These keyframes are new or moved: they are to be painted."""
+        self._frames |= set(moved)
+        self._dirty |= set(moved)
+
+    def show(self) -> int:
+        """Paint what moved and let readers see it, now and then; how many tiles were painted."""
+        started_s = time.monotonic()
+        if len(self._frames) - self._painted_at < _PAINT_EVERY or started_s < self._paint_again_s:
+            return 0
+        with self._log.stage(Stage.PAINT):
+            self.exposure = self._mapper.exposure()
+        painted = self._paint()
+        self._paint_again_s = time.monotonic() + _PAINT_REST * (time.monotonic() - started_s)
+        if time.monotonic() - self._shown_s > self._live_s:
+            with self._log.stage(Stage.STORE):
+                self._writer.flush()
+                write_live_preview(self._writer.tiles, self._archive.live_preview_path)
+            self._shown_s = time.monotonic()
+        return painted
+
+    def finish(self) -> None:
+        """Paint all keyframes where they stand in the end.
+
+        What was shown while they still moved is taken out first: when that was painted, which a clock decides, and how
+        little a frame had to move to be left as it was, must not be seen in the map.
+        """
+        self.exposure = self._mapper.exposure()
+        self._straighten()
+        if self._painted_at:
+            self._writer.take_back_tiles()
+            self._canvas = self._new_canvas()
+        self._dirty = set(self._frames)
+        self._paint()
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _new_canvas(self) -> Canvas:
+        site_grid = self._archive.site_grid()
+        canvas = Canvas(
+            site_grid.grid, self._writer.tiles, self._image, painted=self._known.canvas_frames(site_grid),
+            keeps_known_ground=True,
+        )
+        if self._known.count:
+            canvas.paint([], forget=self._known.superseded)
+        return canvas
+
+    def _image(self, keyframe_id: int) -> ImageRGB:
+        if keyframe_id < self._known.count:
+            return self._known_images.get(keyframe_id)
+        return self._writer.image(keyframe_id - self._known.count)
+
+    def _straighten(self) -> None:
+        """Where the flight showed a distortion that the calibration left over, take it out of the kept pictures."""
+        lens = Undistorter.left_over(self._stored, self._mapper.radial)
+        if lens is None:
+            return
+        for keyframe_id in sorted(self._frames):
+            index = keyframe_id - self._known.count
+            self.images[index] = self._writer.save_image(index, lens.undistort(self._writer.image(index)))
+        self._valid = lens.valid(self._stored.width_px, self._stored.height_px)
+
+    def _paint(self) -> int:
+        """Paint what moved; how many tiles were painted."""
+        self._painted_at = len(self._frames)
+        site_grid = self._archive.site_grid()
+        with self._log.stage(Stage.PAINT):
+            painted = {each: self._canvas_frame(each, site_grid) for each in sorted(self._dirty)}
+            tiles = self._canvas.paint(
+                [frame for frame in painted.values() if frame is not None],
+                forget=[each for each, frame in painted.items() if frame is None],
+            )
+            self._dirty.clear()
+        return len(tiles)
+
+    def _canvas_frame(self, keyframe_id: int, site_grid: SiteGrid) -> CanvasFrame | None:
+        return canvas_frame(
+            keyframe_id, self._known.next_rank, self._stored,
+            site_from_image(self._mapper, keyframe_id, self._stored), site_grid, self.exposure.gains_of(keyframe_id),
+            self.exposure.vignette_of(0), self._valid,
+        )
+
+
+def site_from_image(mapper: PlanarMapper, keyframe_id: int, camera: Camera) -> Matrix3:
+    """(3, 3) of an undistorted image of the size that `camera` has: the stored one's or the frame's own."""
+    refined = camera.with_focal_px(camera.fx_px * mapper.focal_scale)
+    return site_from_image_homography(refined, mapper.pose(keyframe_id))
+
