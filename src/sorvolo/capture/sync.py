@@ -47,6 +47,11 @@ class OffsetEstimate:
     rms_m: float
 
     @property
+    def is_known(self) -> bool:
+        """Whether the motion shows an offset at all, however badly."""
+        return bool(np.isfinite(self.sigma_s))
+
+    @property
     def is_significant(self) -> bool:
         """Whether the offset is well seen and worth applying."""
         return (

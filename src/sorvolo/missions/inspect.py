@@ -18,7 +18,8 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.planning import footprint_size_m, minimum_frame_rate, px_per_m
 from sorvolo.geometry.track import find_strips, length_m, speeds_m_s
-from sorvolo.missions.flight.glimpses import glimpses_of, sharpness_and_texture
+from sorvolo.missions.flight.glimpses import glimpses_of
+from sorvolo.registration.features import sharpness_and_texture
 from sorvolo.survey.flight import CameraModel, Notice, Telemetry
 
 _WANTED_OVERLAP = 0.7
@@ -189,7 +190,7 @@ def _inspect(source: Source) -> Inspection:
 def _frame_facts(source: Source) -> FrameFacts:
     camera = source.camera.camera
     glimpses = glimpses_of(source)
-    seen = [sharpness_and_texture(frame) for frame in glimpses]
+    seen = [sharpness_and_texture(frame.image) for frame in glimpses]
     sharp, texture = np.median(seen, axis=0).tolist() if seen else (math.nan, math.nan)
     if isinstance(source, VideoSource):
         info = source.info

@@ -95,6 +95,11 @@ def every(step_s: float) -> Callable[[int, int], bool]:
     return wanted
 
 
+def evenly(count: int, most: int) -> list[int]:
+    """At most so many of the numbers from 0 to `count` - 1, evenly chosen, first and last among them."""
+    return [int(each) for each in np.unique(np.rint(np.linspace(0, count - 1, min(most, count))))]
+
+
 def select_keyframes(
     frames: Iterable[PosedFrame | LostFrame], settings: SelectionSettings, *, keep_all: bool,
     inside: Callable[[PosedFrame], bool],

@@ -10,6 +10,8 @@ import numpy as np
 from sorvolo.geometry.arrays import Anything, ImageGray, ImageRGB, PointsPx
 from sorvolo.survey.mosaic import Features
 
+_TEXTURE_SIDE_PX = 960
+
 
 @dataclass(frozen=True)
 class FeatureSettings:
@@ -93,6 +95,16 @@ def corners(gray: ImageGray, settings: FeatureSettings) -> PointsPx:
             best = best[cell[best] > 0]
             found.append(np.column_stack([best % max(1, x1 - x0) + x0, best // max(1, x1 - x0) + y0]))
     return (np.concatenate(found) + 0.5) / scale - 0.5
+
+
+def sharpness_and_texture(image: ImageRGB) -> tuple[float, float]:
+    """`sharpness` at 960 px, and the spread of gray about its surroundings, in levels."""
+    gray = gray_from_rgb(image)
+    scale = min(1.0, _TEXTURE_SIDE_PX / max(gray.shape))
+    small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    smooth = cv2.GaussianBlur(small, (0, 0), 1.0).astype(np.float64)  # without the sensor's noise
+    detail = smooth - cv2.boxFilter(small, cv2.CV_64F, (31, 31))
+    return sharpness(np.asarray(small, np.uint8)), float(detail.std())
 
 
 def sharpness(gray: ImageGray) -> float:

@@ -1,11 +1,13 @@
 """What stands on a map: each object once, however many frames of a flight saw it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Floats, frozen
+from sorvolo.survey.mosaic import PlacedFrame
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,3 +69,12 @@ class ObjectSearch:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "outlines_m", frozen(np.reshape(self.outlines_m, (-1, 4, 2))))
+
+    @classmethod
+    def over(
+        cls, frames: Sequence[PlacedFrame], model: str, classes: tuple[str, ...], objects: tuple[MapObject, ...],
+        looked: int, sightings: int, dropped: int,
+    ) -> "ObjectSearch":
+        """The search of these placed frames."""
+        outlines_m = np.array([each.outline_m for each in frames])
+        return cls(model, classes, objects, outlines_m, looked, sightings, dropped)

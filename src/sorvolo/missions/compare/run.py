@@ -22,8 +22,9 @@ from sorvolo.missions.compare.extension import MapExtension
 from sorvolo.missions.compare.objects import ComparisonObjects
 from sorvolo.missions.compare.report import ViewCounts, comparison_summary, comparison_warnings
 from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.map_objects import crops_of
-from sorvolo.missions.flight.report import FlightLog, Stage, build_report
+from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.store.exports.change_files import write_pictures
@@ -200,10 +201,9 @@ class CompareRun:
         notices: Sequence[Notice], started_s: float,
     ) -> dict[str, Any]:
         report = build_report(
-            self._setup, self._settings.mapping, self._log, placed, self._archive.site(), None, None,
-            self._setup.source.camera.camera, self._writer.tiles,
-            [*self._setup.notices, *notices, *self._objects.notices],
-            time.monotonic() - started_s, spread=float("nan"),
+            self._setup, self._settings.mapping, self._log, FlightResult(placed, self._setup.source.camera.camera),
+            self._archive.site(), self._writer.tiles, [*notices, *self._objects.notices],
+            time.monotonic() - started_s,
         )
         warnings = comparison_warnings(self._counts, self._views.brightness)
         comparison = comparison_summary(

@@ -1,4 +1,4 @@
-"""What stands on the map: a detector looks at the frames beside the mapping; in the end each object is told once."""
+"""Objects on the map: a detector searches the frames beside the mapping; in the end each object is reported once."""
 
 import math
 import time
@@ -8,14 +8,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
-import numpy as np
-
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import installed_models
-from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.missions.flight.detects import Detects
+from sorvolo.registration.sizes import at_most
 from sorvolo.store.exports.detection_files import crop_around
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.images import jpeg_from_image
@@ -24,7 +22,7 @@ from sorvolo.survey.map_objects import MapObject, ObjectSearch
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.objects import Detections, Sighting
 from sorvolo.tracking.laying import LaidSighting, lay_on_ground
-from sorvolo.tracking.standing import Standing, fuse
+from sorvolo.tracking.map_objects import objects_on_map
 
 NO_MODEL, DEFAULT_MODEL = "none", "default"
 """The model that looks for nothing, and the one that comes with the package."""
@@ -48,7 +46,7 @@ def open_detector(model: str) -> Detects | None:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What the detector said of one frame, the crops (JPEG) around the surest, and how long it took."""
+    """What the detector found in one frame, the crops (JPEG) around the surest, and how long it took."""
 
     index: int
     found: Detections
@@ -57,7 +55,7 @@ class _Seen:
 
 
 class ObjectFinder:
-    """Looks for objects in the frames of one flight, one frame after another, in a thread beside the mapping.
+    """Searches the frames of one flight for objects, one frame after another, in a thread beside the mapping.
 
     A context manager: leaving it ends the thread.
     """
@@ -70,7 +68,7 @@ class ObjectFinder:
         self._sightings: tuple[Sighting, ...] = ()
 
     def close(self) -> None:
-        """End the thread; frames that still wait are not looked at."""
+        """End the thread; frames that still wait are not searched."""
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     @property
@@ -80,7 +78,7 @@ class ObjectFinder:
 
     @property
     def sightings(self) -> tuple[Sighting, ...]:
-        """All that was seen, by the frames' final places, once that is concluded."""
+        """All detections, by the frames' final places, once that is concluded."""
         return self._sightings
 
     @property
@@ -89,7 +87,7 @@ class ObjectFinder:
         return sum(each.seconds for each in self._seen.values())
 
     def look(self, posed: PosedFrame) -> None:
-        """Have a frame looked at; waits when the detector is some frames behind."""
+        """Have a frame searched; waits when the detector is some frames behind."""
         height_m, sigma_m = posed.prior.position_m[2], posed.prior.position_sigma_m[2]
         knows_height = math.isfinite(sigma_m) and height_m > 1.0
         m_per_px = float(height_m) / self._camera.fx_px if knows_height else None
@@ -97,7 +95,7 @@ class ObjectFinder:
         self._take(_AHEAD)
 
     def conclude(self, placed: Sequence[PlacedFrame], flight_id: str, *, has_metres: bool) -> ObjectSearch:
-        """Lay all that was seen on the ground by the frames' final places, and tell each object once."""
+        """Lay all detections on the ground by the frames' final places, and report each object once."""
         self._take(0)
         frames = [each for each in placed if each.index in self._seen and each.status is not Status.REJECTED]
         laid: list[LaidSighting] = []
@@ -109,16 +107,10 @@ class ObjectFinder:
                     laid.append(each)
                     crops.append(crop)
         self._sightings = tuple(each.sighting for each in laid)
-        fused = fuse(laid, frames)
-        flight_sigma_m = _gps_sigma_m(frames)
-        sigmas_m = {each.index: each.sigma_m if math.isfinite(each.sigma_m) else flight_sigma_m for each in frames}
-        objects = [
-            _told(each, f"{flight_id}-o{number}", laid, crops, sigmas_m, has_metres=has_metres)
-            for number, each in enumerate(fused.objects, start=1)
-        ]
-        return ObjectSearch(
-            self._detector.info.name, self._detector.classes, tuple(objects),
-            np.array([each.outline_m for each in frames]), len(self._seen), len(laid), fused.dropped,
+        found = objects_on_map(laid, crops, frames, flight_id, has_metres=has_metres)
+        return ObjectSearch.over(
+            frames, self._detector.info.name, self._detector.classes, found.objects, len(self._seen), len(laid),
+            found.dropped,
         )
 
     def _take(self, left: int) -> None:
@@ -130,13 +122,13 @@ class ObjectFinder:
     def _look(self, frame: Frame, m_per_px: float | None) -> _Seen:
         started_s = time.monotonic()
         found = self._detector.detect(frame.image, tiles="auto", m_per_px=m_per_px)
-        surest = found.only(np.argsort(-found.scores, kind="stable")[:_MOST_CROPS])
+        surest = found.surest(_MOST_CROPS)
         crops = tuple(_crop(frame.image, box) for box in surest.boxes_px)
         return _Seen(frame.index, surest, crops, time.monotonic() - started_s)
 
 
 def search_summary(search: ObjectSearch | None, seconds: float, why_not: str = "") -> dict[str, Any]:
-    """The report's part on objects; specified in docs/formats.md. `why_not` says why nothing was looked for."""
+    """The report's part on objects; specified in docs/formats.md. `why_not`: why nothing was searched."""
     if search is None:
         return {"model": None, "why_not": why_not, "count": 0, "classes": {}, "list": []}
     counts = Counter(each.label for each in search.objects)
@@ -150,10 +142,10 @@ def search_summary(search: ObjectSearch | None, seconds: float, why_not: str = "
 
 
 def why_not_searched(model: str) -> str:
-    """Why nothing was looked for, in words."""
+    """Why nothing was searched for objects, in words."""
     if model == NO_MODEL:
         return "no model was wanted"
-    return "no default model is installed; `sorvolo models` tells how to get one"
+    return "no default model is installed; `sorvolo models` shows how to get one"
 
 
 def crops_of(search: ObjectSearch | None) -> dict[str, bytes]:
@@ -169,34 +161,5 @@ def _row(each: MapObject) -> dict[str, Any]:
     }
 
 
-def _told(
-    each: Standing, object_id: str, laid: Sequence[LaidSighting], crops: Sequence[bytes], sigmas_m: dict[int, float], *,
-    has_metres: bool,
-) -> MapObject:
-    sightings = [laid[k].sighting for k in each.members]
-    frames = {sighting.frame_index for sighting in sightings}
-    shared_m = float(np.median([sigmas_m[index] for index in frames]))
-    length_m, width_m = each.size_m if has_metres else (math.nan, math.nan)
-    sigma_m = math.hypot(shared_m, each.sigma_m) if has_metres else math.nan
-    return MapObject(
-        object_id, each.label, each.score, each.position_m, sigma_m, float(length_m), float(width_m), len(frames),
-        each.possible_views,
-        min(sighting.time_ns for sighting in sightings), max(sighting.time_ns for sighting in sightings),
-        each.moves, each.velocity_m_s, each.class_scores, laid[each.best].sighting.frame_name, crops[each.best],
-    )
-
-
-def _gps_sigma_m(frames: Sequence[PlacedFrame]) -> float:
-    """How far the frames lie from their fixes, per axis: what is known of a place where the method tells none."""
-    apart_m: Floats = np.array([each.gps_residual_m[:2] for each in frames]).reshape(-1, 2)
-    apart_m = apart_m[np.isfinite(apart_m).all(axis=1)]
-    return float(np.sqrt((apart_m**2).sum(axis=1).mean() / 2)) if len(apart_m) else math.nan
-
-
 def _crop(image: ImageRGB, box_px: Any) -> bytes:
-    crop = crop_around(image, box_px)
-    longest = max(crop.shape[:2])
-    if longest > _CROP_PX:
-        size = tuple(max(1, round(side * _CROP_PX / longest)) for side in crop.shape[1::-1])
-        crop = np.asarray(cv2.resize(crop, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return jpeg_from_image(np.ascontiguousarray(crop))
+    return jpeg_from_image(at_most(crop_around(image, box_px), _CROP_PX))

@@ -7,7 +7,7 @@ from sorvolo.geometry.arrays import ImageRGB, Mask, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import site_from_image_homography
-from sorvolo.missions.flight.report import FlightLog, Stage
+from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.map.known_keyframes import KnownKeyframes
 from sorvolo.mosaic.canvas import Canvas
 from sorvolo.mosaic.canvas_frame import CanvasFrame

@@ -8,8 +8,9 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.ground import footprint, is_on_ground
+from sorvolo.missions.flight.log import Ending, Stage, nothing_placed
 from sorvolo.missions.flight.map_objects import ObjectFinder, crops_of
-from sorvolo.missions.flight.report import Ending, Stage, build_report, nothing_placed
+from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.map.known_keyframes import KnownKeyframes
@@ -111,11 +112,13 @@ class PlanarRun(FlightRun):
         search = self._search(placed)
         with self._log.stage(Stage.REPORT):
             shown = picture(writer.tiles, 1600).rgba
+        result = FlightResult(
+            placed, self._refined(self._setup.source.camera.camera), self._offset, self._mapper.report(),
+            self._exposure.spread,
+        )
         report = build_report(
-            self._setup, self._settings, self._log, placed, self._archive.site(), self._offset, self._mapper.report(),
-            self._refined(self._setup.source.camera.camera), writer.tiles,
-            [*self._setup.notices, *notices, *self._detector_notices],
-            time.monotonic() - started_s, spread=self._exposure.spread,
+            self._setup, self._settings, self._log, result, self._archive.site(), writer.tiles,
+            [*notices, *self._detector_notices], time.monotonic() - started_s,
         )
         report["objects"] = self._search_summary(search)
         page = report_page(report, shown, crops_of(search))

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Self
 
+from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.map_objects import ObjectFinder, search_summary, why_not_searched
-from sorvolo.missions.flight.report import FlightLog, Stage
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, new_site
 from sorvolo.store.site.archive import Archive, FlightWriter

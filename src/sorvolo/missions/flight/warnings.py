@@ -1,0 +1,71 @@
+"""What a user of a flight's map should know first."""
+
+from collections.abc import Sequence
+
+from sorvolo.missions.flight.log import FlightLog
+from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.mosaic.flight_figures import FlightFigures
+from sorvolo.survey.mosaic import PlacedFrame, Status
+
+_OBLIQUE_DEG = 35.0  # pictures that look to opposite sides share too little to be linked
+_MANY = 0.1  # share of the frames
+_BAD_FIT_PX = 3.0
+_OFF_M, _OFF_SHARE = 8.0, 0.25  # by which telemetry may disagree: metres, and a share of how far the flight reaches
+_GUESSED = 0.1  # relative: a focal length that is hardly known
+
+
+def flight_warnings(
+    placed: Sequence[PlacedFrame], figures: FlightFigures, setup: FlightSetup, log: FlightLog
+) -> list[str]:
+    """The warnings of a flight's report."""
+    return [
+        *_frame_warnings(placed), *_fit_warnings(placed, figures), *_camera_warnings(figures, setup),
+        *_clock_warnings(setup, log),
+    ]
+
+
+def _frame_warnings(placed: Sequence[PlacedFrame]) -> list[str]:
+    warnings = []
+    lost = sum(each.status is Status.REJECTED for each in placed)
+    if lost > _MANY * len(placed):
+        warnings.append(f"{lost} of {len(placed)} frames have no place in the map; `reasons` lists why")
+    by_gps = sum(each.status is Status.GPS_ONLY for each in placed)
+    if by_gps > _MANY * len(placed):
+        warnings.append(f"{by_gps} frames are placed by GPS alone: expect steps of some metres at their edges")
+    return warnings
+
+
+def _fit_warnings(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
+    warnings = []
+    seen = sum(each.status is not Status.REJECTED for each in placed)
+    off_m = figures.gps_median_m
+    if off_m is not None and seen > 3 and off_m > max(_OFF_SHARE * figures.reach_m, _OFF_M):
+        warnings.append(
+            f"the pictures' own path and the telemetry disagree by {off_m:.0f} m (median): is this the telemetry "
+            "of this flight, and is the clock offset right?"
+        )
+    if figures.residual_median_px is not None and figures.residual_median_px > _BAD_FIT_PX:
+        warnings.append("pictures fit each other badly: high trees or houses, a wrong camera, or a rolling shutter")
+    return warnings
+
+
+def _camera_warnings(figures: FlightFigures, setup: FlightSetup) -> list[str]:
+    warnings = []
+    if setup.track is not None and setup.track.attitude == "none" and figures.tilt_deg > _OBLIQUE_DEG:
+        warnings.append(
+            f"the camera looks {figures.tilt_deg:.0f} deg away from straight down and telemetry has no camera angles: "
+            "strips flown in opposite directions may not fit each other; give telemetry with the camera's angles"
+        )
+    if setup.source.camera.focal_sigma > _GUESSED:
+        warnings.append(f"camera: {setup.source.camera.origin}; until then the scale is not sure")
+    return warnings
+
+
+def _clock_warnings(setup: FlightSetup, log: FlightLog) -> list[str]:
+    clock, applied_s = setup.clock, log.offset_applied_s
+    if clock is None or abs(applied_s) <= 2 * clock.sigma_s:
+        return []
+    return [
+        f"the pictures fit this telemetry best {applied_s:+.1f} s from where its clock puts them, more than clocks "
+        f"tied like these differ ({clock.tie}): is it the telemetry of this flight? --offset 0 keeps to its clock"
+    ]

@@ -1,0 +1,60 @@
+"""From a flight's sightings, laid on the ground by its frames' final places, to the objects on its map."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sorvolo.geometry.arrays import Floats
+from sorvolo.survey.map_objects import MapObject
+from sorvolo.survey.mosaic import PlacedFrame
+from sorvolo.tracking.laying import LaidSighting
+from sorvolo.tracking.standing import Standing, fuse
+
+
+@dataclass(frozen=True)
+class ObjectsOnMap:
+    """The objects, and how many sightings belong to none of them."""
+
+    objects: tuple[MapObject, ...]
+    dropped: int
+
+
+def objects_on_map(
+    laid: Sequence[LaidSighting], crops: Sequence[bytes], frames: Sequence[PlacedFrame], flight_id: str, *,
+    has_metres: bool,
+) -> ObjectsOnMap:
+    """Each object once. `crops` are the pictures, JPEG, around each sighting; sizes are left out without metres."""
+    fused = fuse(laid, frames)
+    flight_sigma_m = _gps_sigma_m(frames)
+    sigmas_m = {each.index: each.sigma_m if math.isfinite(each.sigma_m) else flight_sigma_m for each in frames}
+    objects = (
+        _map_object(each, f"{flight_id}-o{number}", laid, crops, sigmas_m, has_metres=has_metres)
+        for number, each in enumerate(fused.objects, start=1)
+    )
+    return ObjectsOnMap(tuple(objects), fused.dropped)
+
+
+def _map_object(
+    each: Standing, object_id: str, laid: Sequence[LaidSighting], crops: Sequence[bytes],
+    sigmas_m: Mapping[int, float], *, has_metres: bool,
+) -> MapObject:
+    sightings = [laid[k].sighting for k in each.members]
+    frames = {sighting.frame_index for sighting in sightings}
+    shared_m = float(np.median([sigmas_m[index] for index in frames]))
+    length_m, width_m = each.size_m if has_metres else (math.nan, math.nan)
+    sigma_m = math.hypot(shared_m, each.sigma_m) if has_metres else math.nan
+    return MapObject(
+        object_id, each.label, each.score, each.position_m, sigma_m, float(length_m), float(width_m), len(frames),
+        each.possible_views,
+        min(sighting.time_ns for sighting in sightings), max(sighting.time_ns for sighting in sightings),
+        each.moves, each.velocity_m_s, each.class_scores, laid[each.best].sighting.frame_name, crops[each.best],
+    )
+
+
+def _gps_sigma_m(frames: Sequence[PlacedFrame]) -> float:
+    """How far the frames lie from their fixes, per axis: what is known of a place where the method gives none."""
+    apart_m: Floats = np.array([each.gps_residual_m[:2] for each in frames]).reshape(-1, 2)
+    apart_m = apart_m[np.isfinite(apart_m).all(axis=1)]
+    return float(np.sqrt((apart_m**2).sum(axis=1).mean() / 2)) if len(apart_m) else math.nan
