@@ -15,7 +15,7 @@ orthophotos differ locally. A view is right when it is placed and its corners li
 where they are, what the map of the earlier date is off by as a whole taken out.
 
 **Changes** (2024-02-24/2024-03-01): polygons in pixels of the earlier orthophoto, drawn by hand with the later one laid
-over the earlier beside it, 1.5 times as large. A thing is found when an event overlaps it by at least a quarter of the
+over the earlier beside it, 1.6 times as large, before anything was scored. A thing is found when an event overlaps it by at least a quarter of the
 smaller of the two areas and is at most ten times as large. An area (over 100 m2) is found when one event covers at
 least 40 % of it; the share that all events together cover is given as well. An event is false when at least half of it
 lies on ground drawn as unchanged. Events that touch neither are counted as elsewhere: not all that changed is drawn.
