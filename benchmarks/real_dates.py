@@ -15,10 +15,11 @@ orthophotos differ locally. A view is right when it is placed and its corners li
 where they are, what the map of the earlier date is off by as a whole taken out.
 
 **Changes** (2024-02-24/2024-03-01): polygons in pixels of the earlier orthophoto, drawn by hand with the later one laid
-over the earlier beside it, 1.6 times as large, before anything was scored. A thing is found when an event overlaps it by at least a quarter of the
-smaller of the two areas and is at most ten times as large. An area (over 100 m2) is found when one event covers at
-least 40 % of it; the share that all events together cover is given as well. An event is false when at least half of it
-lies on ground drawn as unchanged. Events that touch neither are counted as elsewhere: not all that changed is drawn.
+over the earlier beside it, 1.6 times as large, before anything was scored. A thing is found when an event overlaps it
+by at least a quarter of the smaller of the two areas and is at most ten times as large. An area (over 100 m2) is found
+when one event covers at least 40 % of it; the share that all events together cover is given as well. An event is false
+when at least half of it lies on ground drawn as unchanged. Events that touch neither are counted as elsewhere: not all
+that changed is drawn.
 
 Each run is appended to results/real_dates.json: how often a pair was scored is how often it stands there.
 """
@@ -35,6 +36,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from sorvolo.store.flight_files import write_camera, write_photo
 
 from mosaic_methods import commit, machine
 from sorvolo.geometry.geodesy import LocalFrame
@@ -42,8 +44,8 @@ from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.evaluate.frame_rows import FrameRow, map_frames, site_points
-from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+from sorvolo.missions.map.flights import map_flights
 from sorvolo.simulation.flight import SimulatedFlight, simulate_flight
 from sorvolo.simulation.ground import orthophoto_ground
 from sorvolo.simulation.settings import (
@@ -56,7 +58,6 @@ from sorvolo.simulation.settings import (
     SimulationSettings,
 )
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.flight_files import write_camera, write_photo
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "real_dates.json"
@@ -95,7 +96,8 @@ def main() -> None:
     parser.add_argument("--attitude", nargs="+", choices=("none", "known", "wrong"), default=("none", "known"),
                         help="of the later flight; wrong: the compass is 90 degrees off")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--keep", type=Path, required=True, help="folder for photos and maps, used again when run again")
+    parser.add_argument("--keep", type=Path, required=True,
+                        help="folder for photos and maps, used again when run again")
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     truth = json.loads((HERE / "real_dates.json").read_text())
