@@ -8,14 +8,16 @@ from blob_world import CAMERA_HEIGHT_M, M_PER_PX, START_NS, Thing, flight, view_
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sorvolo.change.evidence.candidate import GatheredChange, joined
+from sorvolo.change.evidence.announcing import AnnounceSettings, Reason
+from sorvolo.change.evidence.candidate import Candidate, KeptView
+from sorvolo.change.evidence.cells import CellWindow, LaidView
 from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
 from sorvolo.errors import SettingsError
 from sorvolo.survey.findings import Change, ChangeKind
 
 
-def collect(views, **how) -> tuple[EvidenceMap, list[tuple[int, Change]]]:
-    evidence = EvidenceMap(M_PER_PX, EvidenceSettings(**how), "f")
+def collect(views, rules: AnnounceSettings | None = None, **how) -> tuple[EvidenceMap, list[tuple[int, Change]]]:
+    evidence = EvidenceMap(M_PER_PX, EvidenceSettings(announcing=rules or AnnounceSettings(), **how), "f")
     return evidence, [(view.index, change) for view in views for change in evidence.add(view)]
 
 
@@ -50,28 +52,27 @@ def test_it_is_told_within_a_second_of_being_in_view_whatever_the_frame_rate():
         assert change.announced_ns == START_NS + round(index / fps * 1e9)
 
 
-def gathered(number: int, shown: int, missed: int) -> GatheredChange:
-    change = GatheredChange(number, START_NS)
-    for each in range(shown):
-        change.see(START_NS + each, 0.9, None, None, 1.0)
-        change.from_camera(np.array([each, 0, CAMERA_HEIGHT_M]))
-    change.whole = shown
-    for _ in range(missed):
-        change.miss(1.0)
-    return change
+def candidate(number: int, shown: int, missed: int) -> Candidate:
+    """One cell that some views show and others do not."""
+    cell = CellWindow(0, 0, 1, 1)
+    result = Candidate(number, cell, START_NS)
+    one, no = np.ones((1, 1), bool), np.zeros((1, 1), bool)
+    for each in range(shown + missed):
+        flagged = one if each < shown else no
+        laid = LaidView(cell.grown(2), np.pad(flagged, 2), np.ones((5, 5), bool), np.full((5, 5), 230, np.uint8),
+                        np.zeros((5, 5), bool))
+        view = KeptView(START_NS + each, laid, np.array([each, 0.0, CAMERA_HEIGHT_M]), np.eye(3),
+                        np.zeros((4, 4), np.uint8), np.ones((4, 4), bool), 0.1, True)
+        assert result.see(view, one, 0.1) == flagged.any()
+    return result
 
 
-@pytest.mark.parametrize("older_is_surer", [True, False])
-def test_of_two_changes_that_join_the_surer_ones_record_counts(older_is_surer):
-    flickers, stands = gathered(1, 3, 12), gathered(2, 12, 0)
-    stands.is_told, stands.announced_ns = True, 7
-    if older_is_surer:
-        flickers.number, stands.number = 2, 1
-    older, younger = sorted([flickers, stands], key=lambda each: each.number)
-    score = stands.score
-    change = joined(older, younger)
-    assert (change.number, change.views, change.asked, change.score) == (1, 12, 12, score)
-    assert change.is_told and change.announced_ns == 7
+def test_of_two_candidates_that_join_one_record_and_both_times_count():
+    flickers, stands = candidate(1, 3, 12), candidate(2, 12, 0)
+    before = stands.tally
+    joined = stands.joined(flickers, 1)
+    assert joined.number == 1 and (joined.tally.views, joined.tally.asked) == (12, 12)
+    assert joined.tally.score_sum == before.score_sum and joined.tally.last_seen_ns == before.last_seen_ns
 
 
 def test_the_patch_shows_both_dates_north_up():
@@ -144,8 +145,12 @@ def test_the_moving_ghost_of_something_tall_is_no_event():
     # stands on both dates: the map shows it from one side, each view from another; only its foot stays in place
     pole = Thing(0, 0, (0.3, 0.3), height_m=5, on_map=True)
     evidence, told = collect(flight([pole], map_eye_m=(0.5, 0.3, CAMERA_HEIGHT_M)))
-    assert all(np.abs(centre(each) - [0, 0]).max() < 1.2 for _, each in told)  # its leans stay in place
-    assert not any(each.kind == ChangeKind.MOVING for each in evidence.conclude())
+    # near its foot both its ends are seen: the map's and the flight's
+    assert [each.kind for _, each in told] == [ChangeKind.APPEARED, ChangeKind.DISAPPEARED]
+    assert all(np.abs(centre(each)).max() < 1.1 for _, each in told)
+    final = evidence.conclude()
+    assert [each.kind for each in final] == [ChangeKind.APPEARED, ChangeKind.DISAPPEARED]
+    assert all(np.abs(centre(each)).max() < 0.5 for each in final)
 
 
 def test_a_drone_that_hovers_tells_a_ghost_only_with_half_the_score_and_takes_it_back_when_it_flies_on():
@@ -250,11 +255,11 @@ def test_a_single_view_is_believed_only_if_very_sure_and_at_half_the_score():
     thing = Thing(0, 0)
     sure = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [thing], score=0.95)
     unsure = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [thing], score=0.7)
-    evidence, told = collect([sure], single_view_score=0.9, least_score=0.24)
+    evidence, told = collect([sure], AnnounceSettings(least_score=0.24), single_view_score=0.9)
     assert told == []
     (change,) = evidence.conclude()
     assert change.views == 1 and change.score < 0.4
-    assert collect([unsure], single_view_score=0.9, least_score=0.24)[0].conclude() == ()
+    assert collect([unsure], AnnounceSettings(least_score=0.24), single_view_score=0.9)[0].conclude() == ()
     assert collect([sure])[0].conclude() == ()  # unless asked for, a single view is not believed at all
 
 
@@ -276,7 +281,7 @@ def test_what_less_than_half_of_the_views_show_passed_by(shown, of, is_told):
     views = [
         view_of(i, i / 5, (-6 + 0.2 * i, 0, CAMERA_HEIGHT_M), [thing] if i < shown else []) for i in range(of)
     ]
-    evidence, _ = collect(views, least_share=0.0, least_score=0.1)
+    evidence, _ = collect(views, AnnounceSettings(least_share=0.0, least_score=0.1))
     assert len(evidence.conclude()) == is_told
 
 
@@ -293,6 +298,18 @@ def test_a_thing_seen_shortly_and_in_other_pieces_each_time_is_told_if_its_groun
     evidence, _ = collect(views)
     final = evidence.conclude()
     assert [each.kind for each in final] == [ChangeKind.APPEARED] * stays
+
+
+def test_what_became_of_the_candidates_is_counted():
+    stays, goes = Thing(-3, 1), Thing(-4, -1)
+    views = [
+        view_of(i, i / 5, (-6 + 0.2 * i, 0, CAMERA_HEIGHT_M), [stays, goes] if i < 6 else [stays]) for i in range(30)
+    ]
+    evidence, announced = collect(views)
+    assert len(announced) == 2 and len(evidence.conclude()) == 1
+    assert evidence.outcomes() == {
+        "announced": {"still": 1, "moving": 0}, "withdrawn": {Reason.UNSURE.value: 1}, "never_announced": {},
+    }
 
 
 def test_something_seen_for_a_while_only_is_taken_back():
@@ -324,11 +341,17 @@ def test_every_well_seen_thing_is_found_once_and_nothing_else(seed):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"k": 6}, {"k": 0}, {"n": 9}, {"least_views": 4}, {"least_share": 2.0}, {"join_m": -1}]
+    "wrong", [{"k": 6}, {"k": 0}, {"n": 9}, {"least_views": 4}, {"join_m": -1}]
 )
 def test_settings_that_contradict_themselves_are_refused(wrong):
     with pytest.raises(SettingsError):
         EvidenceSettings(**wrong)
+
+
+def test_a_share_or_score_beyond_one_is_refused():
+    for wrong in ({"least_share": 2.0}, {"least_score": -0.1}):
+        with pytest.raises(SettingsError):
+            AnnounceSettings(**wrong)
 
 
 def test_a_view_without_any_known_ground_is_harmless():

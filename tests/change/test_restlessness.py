@@ -1,11 +1,13 @@
 """Ground on which differences come and go makes what is found in it less sure; calm ground does not."""
 
+from dataclasses import replace
+
 import numpy as np
 from blob_world import CAMERA_HEIGHT_M, M_PER_PX, Thing, view_of
 
+from sorvolo.change.evidence.announcing import AnnounceSettings, Tally, sureness
 from sorvolo.change.evidence.cells import CellGrid, CellWindow, LaidView
-from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
-from sorvolo.change.evidence.restlessness import calmness, restlessness
+from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings, restlessness
 
 CELL_M = 0.1
 GROUND = CellWindow(-100, -100, 100, 100)
@@ -56,9 +58,12 @@ def test_where_nothing_else_was_seen_twice_nothing_is_known():
 
 
 def test_calm_ground_leaves_a_score_as_it_is_and_restless_ground_hardly_anything():
-    assert calmness(0.0) == 1.0
-    assert calmness(0.01) > 0.9
-    assert calmness(0.15) < 0.2
+    def score(restless: float) -> float:
+        tally = Tally(0, 0, 4, 8, 1, 2, 2.8, whole=4, camera_low_m=(0, 0, 10), camera_high_m=(20, 0, 10))
+        return sureness(replace(tally, restless=restless), AnnounceSettings())
+
+    assert score(0.01) > 0.9 * score(0.0)
+    assert score(0.15) < 0.2 * score(0.0)
 
 
 def photos_among(ghosts: int, photos: int = 3, **how: object) -> EvidenceMap:

@@ -4,6 +4,7 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -77,9 +78,18 @@ def window_around(points_m: PointsM, cell_m: float) -> CellWindow:
     )
 
 
+class CellReport(NamedTuple):
+    """What one view reports of some cells."""
+
+    seen: float  # share of them
+    flagged: float  # share of them
+    score: float  # 0 to 1, the highest of the flagged ones
+    place_m: Floats  # (2,) the middle of the flagged ones
+
+
 @dataclass(frozen=True, eq=False)
 class LaidView:
-    """One view as cells of a window: `flagged` where it shows a change, `seen` where it can tell at all.
+    """One view as cells of a window: `flagged` where it shows a change, `seen` where it knows the ground.
 
     `score` is 255 times the sureness of the change there; `held` marks cells under things that seem to move.
     """
@@ -99,24 +109,23 @@ class LaidView:
         cut = np.unique(labels[beside & self.flagged])
         return np.isin(labels, cut) if len(cut) else np.zeros_like(self.flagged)
 
-    def answer(self, window: CellWindow, cells: Mask, cell_m: float) -> tuple[float, float, float, Floats]:
-        """What the view says of some `cells` of a window: the shares of them it saw and flagged, how sure it is, and
-        where (2,) the flagged ones lie."""
+    def report(self, window: CellWindow, cells: Mask, cell_m: float) -> "CellReport":
+        """What the view reports of some `cells` of a window."""
         inner = CellWindow(
             max(window.x0, self.window.x0), max(window.y0, self.window.y0),
             min(window.x1, self.window.x1), min(window.y1, self.window.y1),
         )
         if 0 in inner.shape:
-            return 0.0, 0.0, 0.0, np.zeros(2)
+            return CellReport(0.0, 0.0, 0.0, np.zeros(2))
         here, there = inner.within(window), inner.within(self.window)
         mine, total = cells[here], max(int(np.count_nonzero(cells)), 1)
         flagged = mine & self.flagged[there]
         seen = np.count_nonzero(mine & self.seen[there]) / total
         if not flagged.any():
-            return seen, 0.0, 0.0, np.zeros(2)
+            return CellReport(seen, 0.0, 0.0, np.zeros(2))
         rows, columns = np.nonzero(flagged)
         middle = np.array([columns.mean() + inner.x0 + 0.5, -(rows.mean() + inner.y0 + 0.5)]) * cell_m
-        return seen, len(rows) / total, float(self.score[there][flagged].max()) / 255, middle
+        return CellReport(seen, len(rows) / total, float(self.score[there][flagged].max()) / 255, middle)
 
     def part_of(self, marked: Mask, window: CellWindow, cells: Mask) -> Mask:
         """Which of some `cells` of a window the view has `marked`, as far as it reaches."""
@@ -124,7 +133,7 @@ class LaidView:
 
 
 def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask) -> LaidView:
-    """The view's answer for every cell of ground that it shows.
+    """The view as cells of the ground.
 
     `ignored` and `held`, (number of boxes,), choose boxes: what lies in ignored ones is taken for unknown ground. A
     cell is flagged where most of it is changed, and seen where the map and the frame know all of it.
@@ -228,7 +237,7 @@ class _Chunk:
 class CellGrid:
     """Histories of the cells, kept only where something changed. `record` and `own` change it.
 
-    At most `most_chunks` pieces of 64 x 64 cells are kept; the one not looked at for the longest time goes first.
+    At most `most_chunks` pieces of 64 x 64 cells are kept; the one not used for the longest time goes first.
     """
 
     def __init__(self, n: int, most_chunks: int = 4096) -> None:
@@ -238,7 +247,7 @@ class CellGrid:
         self._quiet: dict[tuple[int, int], int] = {}  # views of chunks in which nothing ever changed
 
     def record(self, laid: LaidView, counts: bool) -> CellEvidence:
-        """Shift one view into the cells' histories; `counts` says whether the lifelong counts take it, too."""
+        """Shift one view into the cells' histories; the counts over all views take it in if it `counts`."""
         found = _no_evidence(laid.window)
         for key, inside, part in _pieces(laid.window):
             flagged, seen = laid.flagged[part], laid.seen[part]

@@ -209,6 +209,7 @@ class CompareRun:
         comparison = comparison_summary(
             changes, suppressed, self._counts, self._views, self._settings, self._base_version
         )
+        comparison["candidates"] = None if self._evidence is None else self._evidence.outcomes()
         comparison["extension"] = {
             "frames": len(self._extension.frames), "shown_as_well": shown_as_well,
             "area_m2": self._extension.grown_m2(self._base_version),

@@ -314,8 +314,20 @@ def _not_compared(report: Mapping[str, Any]) -> str:
     )
     return (
         f"<section><h2>What was compared, and what could not be</h2>{table_of(rows, ('view', 'number', 'meaning'))}"
-        f"{why}{share}</section>"
+        f"{why}{share}{_not_reported(report)}</section>"
     )
+
+
+def _not_reported(report: Mapping[str, Any]) -> str:
+    """Candidates for changes that the views did not confirm, by reason."""
+    rows = [
+        (escaped(count), words, escaped(reason))
+        for name, words in (("withdrawn", "withdrawn after being announced"), ("never_announced", "never announced"))
+        for reason, count in (at(report, "comparison", "candidates", name) or {}).items()
+    ]
+    if not rows:
+        return ""
+    return f"<h3>Candidates that are not in the list</h3>{table_of(rows, ('number', 'what became of them', 'reason'))}"
 
 
 def _how(report: Mapping[str, Any]) -> str:
