@@ -205,3 +205,13 @@ def test_a_real_video() -> None:
     (source,) = open_sources([real_data("flights/pond_video")])
     counted = sum(1 for _ in source.frames(lambda index, time_ns: index % 100 == 0))
     assert source.frame_count == 558 and counted == 6 and source.notices() == ()
+
+
+def test_an_empty_telemetry_file_beside_the_video_is_named(tmp_path: Path) -> None:
+    write_video(tmp_path / "DJI_0001.mp4")
+    (tmp_path / "DJI_0001.SRT").touch()
+    (tmp_path / "other.srt").touch()
+    (source,) = open_sources([tmp_path / "DJI_0001.mp4"])
+    found = {notice.code: notice.text for notice in source.notices()}
+    assert "DJI_0001.SRT" in found["empty_telemetry"] and "0 bytes" in found["empty_telemetry"]
+    assert not source.telemetry.has_fixes

@@ -308,6 +308,24 @@ def test_photos_that_all_say_0_0_are_mapped_without_a_place(photos: Path, tmp_pa
     assert "12 positions are 0/0" in " ".join(each["text"] for each in report["notices"])
 
 
+@pytest.mark.parametrize("noise_levels", [0.0, 3.0])
+def test_a_gray_video_is_refused_as_without_texture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], noise_levels: float
+) -> None:
+    rng = np.random.default_rng(0)
+    with av.open(str(tmp_path / "gray.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=5)
+        stream.width, stream.height, stream.pix_fmt = 640, 480, "yuv420p"
+        for _ in range(15):
+            gray = np.clip(128 + rng.normal(0, noise_levels, (480, 640, 1)), 0, 255).astype(np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.repeat(gray, 3, axis=2), "rgb24")))
+        container.mux(stream.encode(None))
+    site = tmp_path / "site"
+    assert "no texture" in refused(capsys, tmp_path / "gray.mp4", "--site", site)
+    with Archive.open(site, write=False) as archive:
+        assert not archive.has_site  # nothing is begun that another flight would have to fit
+
+
 def test_water_is_placed_by_gps_alone(photos: Path, photographed: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     files = sorted(photos.iterdir())

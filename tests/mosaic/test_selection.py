@@ -11,6 +11,7 @@ from sorvolo.mosaic.selection import (
     SelectionSettings,
     StretchSelection,
     every,
+    has_texture,
     interval_s,
     select_keyframes,
     small_gray,
@@ -142,3 +143,14 @@ def test_of_frames_over_known_ground_those_that_show_enough_new_ground_are_taken
     assert selection.take(None) and selection.take(outline_m), "after one of unknown place the next is taken"
     photos = StretchSelection(0.7, keep_all=True)
     assert [photos.take(outline_m) for _ in range(3)] == [True] * 3
+
+
+@pytest.mark.parametrize("noise_levels", [0.0, 1.0, 3.0])
+def test_one_gray_and_noise_alone_are_no_texture(noise_levels):
+    noise = np.random.default_rng(0).normal(0, noise_levels, (480, 640, 1))
+    bare = np.repeat(np.clip(128 + noise, 0, 255).astype(np.uint8), 3, axis=2)
+    assert not has_texture(bare, SelectionSettings())
+    seen = posed(0, 0).frame.image
+    assert has_texture(seen, SelectionSettings())
+    # a field in fog: a twentieth of its contrast
+    assert has_texture(np.clip(128 + (seen.astype(float) - 128) / 20, 0, 255).astype(np.uint8), SelectionSettings())

@@ -29,7 +29,7 @@ from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream, open_stream
 from sorvolo.capture.photo_metadata import PhotoMetadata
 from sorvolo.capture.photos import PhotoSource, read_album
-from sorvolo.capture.telemetry import find_telemetry_beside, is_telemetry, read_telemetry
+from sorvolo.capture.telemetry import empty_files_beside, find_telemetry_beside, is_telemetry, read_telemetry
 from sorvolo.capture.telemetry.gpmf import read_gpmf_file
 from sorvolo.capture.telemetry.quality import notice
 from sorvolo.capture.video import VIDEO_SUFFIXES, VideoInfo, VideoSource, read_video_info
@@ -331,19 +331,26 @@ def _open_photos(
 def _video_telemetry(
     video: Path, telemetry: Path | None, inside: FileMetadata | None
 ) -> tuple[Telemetry, list[Notice]]:
-    """The telemetry and what to tell; only a file that was asked for must be readable."""
+    """The telemetry, and notices of files that cannot be used; only a file that was asked for must be readable."""
     if telemetry is not None:
         return read_telemetry(telemetry), []
     if inside is not None and inside.telemetry.has_fixes:
         return inside.telemetry, []
+    notices = [
+        Notice(
+            "empty_telemetry", 1,
+            f"{each.name} beside the video is empty (0 bytes) and not used; copy it from the drone again",
+        )
+        for each in empty_files_beside(video)
+    ]
     beside = find_telemetry_beside(video)
     if beside is None:
-        return no_telemetry(), []
+        return no_telemetry(), notices
     try:
-        return read_telemetry(beside), []
+        return read_telemetry(beside), notices
     except InputError as error:
         text = f"the telemetry file beside the video cannot be used: {error}"
-        return no_telemetry(), [Notice("unusable_telemetry", 1, text)]
+        return no_telemetry(), [*notices, Notice("unusable_telemetry", 1, text)]
 
 
 def _video_camera(info: VideoInfo) -> CameraModel:

@@ -15,6 +15,7 @@ from sorvolo.survey.flight import LostFrame, PosedFrame
 _SMALL_PX = 256
 _UNTIMED_STEP_S = 0.2  # candidates of a video without telemetry, or live: five a second, the pictures decide
 _LIVE_SPEED_M_S = 5.0  # at least: a flight that has just begun does not show yet how fast it will be
+_COARSE_PX = 64  # at which a sensor's noise averages out and ground still shows itself
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class SelectionSettings:
     least_overlap: float = 0.5  # a blurred frame is skipped only while its successors still overlap this much
     blurred: float = 0.6  # of the usual sharpness: wait for a better one
     useless: float = 0.35  # of the usual sharpness: reject
+    bare_levels: float = 0.6  # of gray, spread at 64 px: one gray 0, with noise 0.5, the barest real field 2.2
 
     def __post_init__(self) -> None:
         if not 0 < self.least_overlap <= self.overlap < 1:
@@ -160,6 +162,15 @@ def small_gray(image: ImageRGB) -> ImageGray:
     scale = _SMALL_PX / max(image.shape[:2])
     size = (max(16, round(image.shape[1] * scale)), max(16, round(image.shape[0] * scale)))
     return gray_from_rgb(cv2.resize(image, size, interpolation=cv2.INTER_AREA))  # type: ignore[arg-type]
+
+
+def has_texture(image: ImageRGB, settings: SelectionSettings) -> bool:
+    """Whether a picture shows anything but one gray, or noise alone, as a covered lens gives."""
+    gray = small_gray(image)
+    scale = _COARSE_PX / max(gray.shape)
+    size = (max(4, round(gray.shape[1] * scale)), max(4, round(gray.shape[0] * scale)))
+    coarse = cv2.resize(gray.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return float((coarse - cv2.boxFilter(coarse, -1, (9, 9))).std()) >= settings.bare_levels
 
 
 def _overlap(last: ImageGray, new: ImageGray) -> float:

@@ -92,6 +92,19 @@ def find_telemetry_beside(video: Path) -> Path | None:
     return None
 
 
+def empty_files_beside(video: Path) -> list[Path]:
+    """Files named as the video's telemetry would be that hold nothing at all: cards that fail leave such ones."""
+    if not video.parent.is_dir():
+        return []
+    stem = video.stem.lower()
+    names = {stem, video.name.lower(), *(pattern.format(stem) for pattern in _BESIDE)}
+    return sorted(
+        each for each in video.parent.iterdir()
+        if each.suffix.lower() in _SUFFIXES and each.stem.lower() in names and each.is_file()
+        and each.stat().st_size == 0
+    )
+
+
 def _bytes_of(path: Path) -> bytes:
     try:
         if path.is_dir():

@@ -1,10 +1,12 @@
 """A few pictures of a flight, spread over it."""
 
+from collections.abc import Iterator
 from itertools import islice
 
 from sorvolo.capture.source import LiveSource, Source
 from sorvolo.capture.video import VideoSource
-from sorvolo.mosaic.selection import evenly, every
+from sorvolo.errors import InputError
+from sorvolo.mosaic.selection import SelectionSettings, evenly, every, has_texture
 from sorvolo.survey.flight import Frame
 
 _GLIMPSES = 5
@@ -18,5 +20,36 @@ def glimpses_of(source: Source) -> list[Frame]:
     if isinstance(source, LiveSource):
         coming = islice(source.frames(every(_LIVE_STEP_S if source.kind == "video" else 0.0)), _GLIMPSES)
         return [frame for frame in coming if isinstance(frame, Frame)]
+    return list(_spread_photos(source))
+
+
+def _spread_photos(source: Source) -> Iterator[Frame]:
     chosen = set(evenly(source.frame_count, _GLIMPSES))
-    return [frame for frame in source.frames(lambda index, _: index in chosen) if isinstance(frame, Frame)]
+    return (frame for frame in source.frames(lambda index, _: index in chosen) if isinstance(frame, Frame))
+
+
+def _spread_frames(source: Source) -> Iterator[Frame]:
+    """Frames of a recorded flight, one at first: that is nearly always enough."""
+    if isinstance(source, VideoSource):
+        yield from source.glimpses(1)
+        yield from source.glimpses(_GLIMPSES)
+    else:
+        yield from _spread_photos(source)
+
+
+def refuse_without_texture(source: Source) -> None:
+    """Raise InputError for a recorded flight none of whose glimpses shows anything but one gray, or noise alone."""
+    if isinstance(source, LiveSource):
+        return
+    settings = SelectionSettings()
+    seen = 0
+    for frame in _spread_frames(source):
+        if has_texture(frame.image, settings):
+            return
+        seen += 1
+    if not seen:
+        return  # nothing can be read there: its frames will say so
+    raise InputError(
+        f"{source.name}: its pictures show no texture ({seen} all over the flight are of one gray, or noise "
+        "alone); is the lens covered? `sorvolo inspect` shows what the flight holds"
+    )

@@ -9,6 +9,7 @@ from sorvolo.capture.areas import read_area
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import Source, opened_sources
 from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.glimpses import refuse_without_texture
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import known_flights, known_ground_m, prepare
@@ -56,6 +57,7 @@ def _map_one(
         source, settings, archive.site() if archive.has_site else None, telemetry_named=telemetry_named,
         ground_m=known_ground_m(archive),
     )
+    refuse_without_texture(source)
     make = ThesisRun if settings.method == "thesis" else PlanarRun
     finder = None if detector is None else ObjectFinder(detector, source.camera.camera)
     with make(setup, archive, settings, finder=finder) as run:
