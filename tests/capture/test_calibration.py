@@ -11,7 +11,7 @@ from PIL import Image
 
 from real_data import real_data
 from sorvolo.capture.calibration import camera_from_option, camera_xml, guess_camera, read_camera
-from sorvolo.capture.camera_presets import CAMERA_PRESETS, find_preset
+from sorvolo.capture.camera_presets import CAMERA_PRESETS, find_presets
 from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera
 
@@ -278,9 +278,10 @@ def test_every_preset_is_a_camera_near_its_makers_angle_of_view():
         aspect = preset.sensor_width_mm / preset.sensor_height_mm
         assert aspect == pytest.approx(preset.width_px / preset.height_px, abs=0.03)
         camera = camera_from_option(preset.name, preset.width_px, preset.height_px).camera
-        assert 40 < camera.angle_of_view_deg[0] < 100
+        is_narrow = preset.name.endswith((" tele", " thermal"))
+        assert (25 if is_narrow else 40) < camera.angle_of_view_deg[0] < (60 if is_narrow else 100)
         for code in preset.codes:
-            assert find_preset(code) is preset
+            assert preset in find_presets(code)
 
 
 def test_a_second_camera_under_the_same_name_is_not_taken_for_the_preset():
@@ -357,3 +358,26 @@ def test_a_real_phantom_3_photo_is_recognised():
     found = guess_camera(4000, 2250, make=exif[271], model=exif[272], focal_length_mm=3.61)
     assert "Phantom 3" in found.origin
     assert found.camera.fx_px == pytest.approx(2329, abs=1)
+
+
+@pytest.mark.parametrize(("model", "width_px", "height_px", "focal_mm", "name"), [
+    ("M3T", 4000, 3000, 4.4, "Mavic 3T"), ("M3T", 640, 512, 9.1, "Mavic 3T thermal"),
+    ("M3T", 640, 512, math.nan, "Mavic 3T thermal"), ("M3T", 1920, 1080, math.nan, "Mavic 3T"),
+    ("M3M", 5280, 3956, 12.29, "Mavic 3E"), ("M3M", 2592, 1944, 4.34, "Mavic 3M multispectral"),
+    ("ZH20T", 640, 512, 13.5, "Zenmuse H20T thermal"), ("M4T", 8064, 6048, 6.72, "Matrice 4T"),
+])
+def test_a_drones_cameras_are_told_apart(model, width_px, height_px, focal_mm, name):
+    found = guess_camera(width_px, height_px, make="DJI", model=model, focal_length_mm=focal_mm)
+    assert found.origin.startswith(f"preset {name}:")
+
+
+@pytest.mark.parametrize(("name", "fov_deg"), [
+    # the fields of view across the diagonal that DJI's pages state; lenses that bend differ by some degrees
+    ("Mavic 3T", 84), ("Mavic 3T thermal", 61), ("Matrice 30", 84), ("Zenmuse H30", 82.1), ("Air 3", 82),
+    ("Air 3 tele", 35), ("Zenmuse H20T thermal", 40.6), ("Zenmuse H30T thermal", 45.2), ("Matrice 4E", 84),
+    ("Matrice 4T", 82), ("Matrice 4T thermal", 45), ("Mavic 3M multispectral", 73.9),
+])
+def test_presets_see_as_much_as_their_makers_state(name, fov_deg):
+    (preset,) = find_presets(name)
+    across_mm = math.hypot(preset.sensor_width_mm, preset.sensor_height_mm)
+    assert math.degrees(2 * math.atan(0.5 * across_mm / preset.focal_mm)) == pytest.approx(fov_deg, abs=4.5)

@@ -254,6 +254,47 @@ def test_parrot_photos_state_angles_and_the_height_above_takeoff(tmp_path: Path)
     assert found["height_above_takeoff_m"] == 33.5 and found["ellipsoidal_height_m"] == 250.0
 
 
+def test_djis_calibration_in_xmp_becomes_the_camera(tmp_path: Path) -> None:
+    data = "2021-01-01;3713.29,3712.5,5.84,-16.9,-0.1123,0.0149,-0.0002,0.0001,-0.0272"
+    xmp = DJI.format(elements="", attributes=f'drone-dji:DewarpFlag="0" drone-dji:DewarpData="{data}"')
+    photo = write_photo(tmp_path / "a.jpg", xmp=xmp, image=picture(548, 364), extra={Base.ExifImageWidth: 5480})
+    found = open_photos(photo).camera
+    assert found.focal_sigma == 0.005 and "XMP: calibrated" in found.origin
+    assert found.camera.fx_px == pytest.approx(371.329) and found.camera.cx_px == pytest.approx(273.5 + 0.584)
+    assert found.camera.distortion.tolist() == [-0.1123, 0.0149, -0.0002, 0.0001, -0.0272]
+    taken_out = xmp.replace('DewarpFlag="0"', 'DewarpFlag="1"')
+    assert not open_photos(write_photo(tmp_path / "b.jpg", xmp=taken_out, image=picture(548, 364))).camera \
+        .camera.distortion.any()
+
+
+@pytest.mark.parametrize("maker", ["dji", "skydio"])
+def test_the_lenss_design_in_xmp_becomes_the_camera(tmp_path: Path, maker: str) -> None:
+    if maker == "dji":
+        xmp = DJI.format(elements="", attributes=(
+            'drone-dji:CalibratedFocalLength="366.67" drone-dji:CalibratedOpticalCenterX="276.0" '
+            'drone-dji:CalibratedOpticalCenterY="182.0"'
+        ))
+    else:
+        body = "".join(
+            f'<drone-skydio:{name} rdf:parseType="Resource"><drone-skydio:X>{x}</drone-skydio:X>'
+            f"<drone-skydio:Y>{y}</drone-skydio:Y></drone-skydio:{name}>"
+            for name, x, y in (("CalibratedFocalLength", 366.67, 366.67), ("CalibratedOpticalCenter", 276, 182))
+        )
+        xmp = XMP.format(prefix="drone-skydio", address="https://www.skydio.com/drone-skydio/1.0/", body=body)
+    found = open_photos(write_photo(tmp_path / "a.jpg", xmp=xmp, image=picture(548, 364))).camera
+    assert found.focal_sigma == 0.01 and found.camera.fx_px == pytest.approx(366.67)
+    assert found.camera.cx_px == pytest.approx(275.5) and found.camera.cy_px == pytest.approx(181.5)
+
+
+@pytest.mark.parametrize("attributes", [
+    'drone-dji:CalibratedFocalLength="0"', 'drone-dji:CalibratedFocalLength="nan"', 'drone-dji:DewarpData="1,2"',
+    'drone-dji:DewarpData="x;1,1,0,0,0,0,0,0,0"', 'drone-dji:DewarpData="x;300,300,0,0,-9,0,0,0,0"',
+])
+def test_a_lens_in_xmp_that_cannot_be_is_passed_over(tmp_path: Path, attributes: str) -> None:
+    xmp = DJI.format(elements="", attributes=attributes)
+    assert "preset Phantom 3" in open_photos(write_photo(tmp_path / "a.jpg", xmp=xmp)).camera.origin
+
+
 def test_stated_errors_become_the_priors_own(tmp_path: Path) -> None:
     body = "".join(f"<Camera:{name}>{text}</Camera:{name}>" for name, text in {
         "Yaw": "30", "Pitch": "1", "Roll": "2", "IMUYawAccuracy": "1.5", "IMUPitchAccuracy": "0.4",

@@ -4,12 +4,16 @@ A guess is never hidden: `CameraModel.origin` tells in words where the numbers c
 """
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from sorvolo.capture.camera_nodes import read_nodes
-from sorvolo.capture.camera_presets import CameraPreset, find_preset, preset_names
-from sorvolo.capture.intrinsics import OPENCV_ORDER, camera_from_nodes
-from sorvolo.errors import InputError
+from sorvolo.capture.camera_presets import CameraPreset, find_presets, preset_names
+from sorvolo.capture.intrinsics import OPENCV_ORDER, camera_from_nodes, check_lens
+from sorvolo.capture.photo_xmp import StatedLens
+from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.camera import Camera
 from sorvolo.survey.flight import CameraModel
@@ -68,27 +72,46 @@ def guess_camera(
     """
     make, model = _clean(make), _clean(model)
     label = (model if model.startswith(make) else f"{make} {model}").strip() or "camera"
-    preset = find_preset(model) or find_preset(label)
-    if preset and _fits(preset, focal_length_mm):
-        return _camera_of_preset(preset, width_px, height_px, focal_length_mm)
-    full_width_px = full_width_px or width_px
-    if _known(focal_length_mm) and _known(focal_plane_px_per_mm):
-        focal_px = focal_length_mm * focal_plane_px_per_mm * width_px / full_width_px
-        if _is_lens(focal_px, width_px):
-            words = f"EXIF of the {label}: {focal_length_mm:g} mm at {focal_plane_px_per_mm:.1f} px/mm"
-            return _plain_camera(width_px, height_px, focal_px, words, 0.05)
-    if _known(focal_length_35mm):
-        # The equivalent compares diagonals of whole photos. A 16:9 picture is nearly always cut from a 4:3
-        # sensor.
-        is_wide = width_px / height_px > 1.6
-        diagonal_px = width_px * 1.25 if is_wide else math.hypot(width_px, height_px)
-        focal_px = focal_length_35mm / _FULL_FRAME_DIAGONAL_MM * diagonal_px
-        if _is_lens(focal_px, width_px):
-            words = f"EXIF of the {label}: equivalent to {focal_length_35mm:g} mm on 35 mm film"
-            return _plain_camera(width_px, height_px, focal_px, words, 0.05)
+    presets = [
+        each for each in find_presets(model) or find_presets(label) if _fits(each, width_px, focal_length_mm)
+    ]
+    if presets:
+        return _camera_of_preset(presets[0], width_px, height_px, focal_length_mm)
+    focal_px = focal_length_mm * focal_plane_px_per_mm * width_px / (full_width_px or width_px)
+    if _known(focal_length_mm) and _known(focal_plane_px_per_mm) and _is_lens(focal_px, width_px):
+        words = f"EXIF of the {label}: {focal_length_mm:g} mm at {focal_plane_px_per_mm:.1f} px/mm"
+        return _plain_camera(width_px, height_px, focal_px, words, 0.05)
+    # The equivalent compares diagonals of whole photos. A 16:9 picture is nearly always cut from a 4:3 sensor.
+    diagonal_px = width_px * 1.25 if width_px / height_px > 1.6 else math.hypot(width_px, height_px)
+    focal_px = focal_length_35mm / _FULL_FRAME_DIAGONAL_MM * diagonal_px
+    if _known(focal_length_35mm) and _is_lens(focal_px, width_px):
+        words = f"EXIF of the {label}: equivalent to {focal_length_35mm:g} mm on 35 mm film"
+        return _plain_camera(width_px, height_px, focal_px, words, 0.05)
     camera = Camera.from_angle_of_view(width_px, height_px, GUESSED_AOV_DEG)
     origin = f"a GUESS, {GUESSED_AOV_DEG:g} deg across, the lens of this {label} being unknown; {_BETTER}"
     return CameraModel(camera, origin, 0.2)
+
+
+def stated_camera(lens: StatedLens, width_px: int, height_px: int) -> CameraModel | None:
+    """The camera that a photo's own XMP states, for frames of this size; None where it states none that can be.
+
+    A calibration of this very camera (DJI's DewarpData) is good to 0.5 %, the lens's design to 1 %.
+    """
+    scale = width_px / lens.width_px if lens.width_px else math.nan
+    focal_px = lens.fx_px * scale
+    if not (_known(focal_px) and _is_lens(focal_px, width_px)):
+        return None
+    cx_px, cy_px = (width_px - 1) / 2 + lens.cx_px * scale, (height_px - 1) / 2 + lens.cy_px * scale
+    words = "the photo's own XMP: " + ("calibrated" if lens.is_calibrated else "as the lens was designed")
+    try:
+        camera = Camera(
+            width_px, height_px, focal_px, lens.fy_px * scale, cx_px, cy_px, np.array(lens.distortion)
+        )
+        check_lens("XMP", camera)
+    except (GeometryError, InputError):
+        return None
+    return CameraModel(camera, f"{words} ({camera.angle_of_view_deg[0]:.1f} deg across)",
+                       0.005 if lens.is_calibrated else 0.01)
 
 
 def camera_from_option(option: str, width_px: int, height_px: int) -> CameraModel:
@@ -101,8 +124,8 @@ def camera_from_option(option: str, width_px: int, height_px: int) -> CameraMode
     path = Path(option)
     if path.is_file():
         return read_camera(path, width_px, height_px)
-    if preset := find_preset(option):
-        return _camera_of_preset(preset, width_px, height_px, math.nan)
+    if presets := find_presets(option):
+        return _camera_of_preset(_nearest_in_size(presets, width_px), width_px, height_px, math.nan)
     key, equals, text = option.partition("=")
     if equals:
         return _camera_of_number(key.strip().lower(), text, width_px, height_px)
@@ -156,11 +179,19 @@ def _plain_camera(width_px: int, height_px: int, focal_px: float, words: str, si
     return CameraModel(camera, f"{words} ({aov_deg:.1f} deg across, lens distortion unknown)", sigma)
 
 
-def _fits(preset: CameraPreset, focal_length_mm: float) -> bool:
-    """Whether EXIF's focal length is the preset's; a second camera may carry the same model name."""
-    if preset.changes_lens or not _known(focal_length_mm):
-        return True
-    return abs(focal_length_mm / preset.focal_mm - 1) < 0.1
+def _fits(preset: CameraPreset, width_px: int, focal_length_mm: float) -> bool:
+    """Whether EXIF's focal length is the preset's, or, without one, the pictures are of its size.
+
+    A second camera may carry the same model name. Videos and resized photos of colour cameras have other sizes.
+    """
+    if _known(focal_length_mm):
+        return preset.changes_lens or abs(focal_length_mm / preset.focal_mm - 1) < 0.1
+    return preset == _nearest_in_size(find_presets(preset.codes[0] if preset.codes else preset.name), width_px)
+
+
+def _nearest_in_size(presets: Sequence[CameraPreset], width_px: int) -> CameraPreset:
+    """Of several cameras with one name that whose pictures are this wide, else the first."""
+    return next((each for each in presets if each.width_px == width_px), presets[0])
 
 
 def _known(number: float) -> bool:

@@ -1,4 +1,9 @@
-"""Cameras by model name: sensor, focal length and image size of common drones, as their makers state them."""
+"""Cameras by model name: sensor, focal length and image size of common drones, as their makers state them.
+
+Source of those sold since 2022: DJI's pages "Specs" (Mavic 3 Enterprise and Multispectral, Matrice 30, Matrice 4,
+Zenmuse H20, H30, L1 and L2, Air 3), which state the focal length or its 35 mm equivalent, the field of view and, of
+thermal cameras, the pixel's pitch of 12 um. Where a sensor's size is not stated it follows from those.
+"""
 
 import re
 from dataclasses import dataclass
@@ -39,12 +44,18 @@ CAMERA_PRESETS = (
     CameraPreset("Phantom 4 Pro", ("FC6310", "FC6310S"), 13.2, 8.8, 8.8, 5472, 3648),
     CameraPreset("Phantom 4 RTK", ("FC6310R",), 13.2, 8.8, 8.8, 5472, 3648),
     CameraPreset("Zenmuse X4S", ("FC6510",), 13.2, 8.8, 8.8, 5472, 3648),
+    CameraPreset("Zenmuse L1", (), 13.2, 8.8, 8.8, 5472, 3648),
     CameraPreset("Mavic 2 Pro", ("L1D-20c",), 13.2, 8.8, 10.26, 5472, 3648),
     CameraPreset("Air 2S", ("FC3411",), 13.2, 8.8, 8.38, 5472, 3648, 0.03),
     CameraPreset("senseFly S.O.D.A.", ("S.O.D.A.", "SODA"), 12.75, 8.5, 10.6, 5472, 3648),
     # 1/2 and 1/1.3 inch
     CameraPreset("Mavic Air 2", ("FC3170",), 6.4, 4.8, 4.5, 4000, 3000, 0.03),
     CameraPreset("Mavic 3T", ("M3T", "M3TD"), 6.4, 4.8, 4.4, 4000, 3000, 0.03),
+    CameraPreset("Matrice 30", ("M30", "M30T"), 6.49, 4.87, 4.5, 4000, 3000, 0.03),
+    CameraPreset("Matrice 4T", ("M4T", "M4TD"), 9.7, 7.3, 6.72, 8064, 6048, 0.04),
+    CameraPreset("Zenmuse H30", ("H30", "H30T"), 9.7, 7.3, 6.72, 8064, 6048, 0.04),
+    CameraPreset("Air 3", (), 9.7, 7.3, 6.72, 8064, 6048, 0.04),
+    CameraPreset("Air 3 tele", (), 9.7, 7.3, 19.6, 8064, 6048, 0.05),
     CameraPreset("Zenmuse H20", ("ZH20", "ZH20T", "ZH20N"), 6.17, 4.63, 4.5, 4056, 3040, 0.03),
     CameraPreset("Mini 3", ("FC3682",), 9.7, 7.3, 6.72, 4000, 3000, 0.04),
     CameraPreset("Mini 3 Pro", ("FC3582",), 9.7, 7.3, 6.72, 4032, 3024, 0.04),
@@ -52,6 +63,8 @@ CAMERA_PRESETS = (
     # 4/3 inch and larger
     CameraPreset("Mavic 3", ("L2D-20c",), 17.3, 13.0, 12.29, 5280, 3956, 0.03),
     CameraPreset("Mavic 3E", ("M3E", "M3M"), 17.3, 13.0, 12.29, 5280, 3956, 0.03),
+    CameraPreset("Matrice 4E", ("M4E", "M4D"), 17.3, 13.0, 12.29, 5280, 3956, 0.03),
+    CameraPreset("Zenmuse L2", (), 17.3, 13.0, 12.29, 5280, 3956, 0.03),
     CameraPreset("Zenmuse X5", ("FC550", "FC550RAW"), 17.3, 13.0, 15.0, 4608, 3456, changes_lens=True),
     CameraPreset("Zenmuse X5S", ("FC6520",), 17.3, 13.0, 15.0, 5280, 3956, changes_lens=True),
     CameraPreset("Zenmuse X7", ("FC6540",), 23.5, 15.7, 24.0, 6016, 4008, changes_lens=True),
@@ -61,22 +74,35 @@ CAMERA_PRESETS = (
     CameraPreset("Parrot ANAFI", ("Anafi", "AnafiUSA", "AnafiThermal"), 5.985, 4.498, 4.0, 5344, 4016, 0.05),
     CameraPreset("GoPro HERO4", ("HERO4 Black", "HERO4 Silver"), 6.17, 4.63, 2.92, 4000, 3000, 0.1),
     CameraPreset("GoPro HERO5", ("HERO5 Black", "HERO6 Black"), 6.17, 4.63, 2.92, 4000, 3000, 0.1),
+    # multispectral and thermal, beside the colour camera of the same name: the focal length in EXIF tells them apart
+    CameraPreset("Mavic 3M multispectral", ("M3M",), 5.133, 3.874, 4.34, 2592, 1944, 0.03),
+    CameraPreset("Mavic 3T thermal", ("M3T", "M3TD"), 7.68, 6.144, 9.1, 640, 512, 0.04),
+    CameraPreset("Matrice 30T thermal", ("M30T",), 7.68, 6.144, 9.1, 640, 512, 0.04),
+    CameraPreset("Matrice 4T thermal", ("M4T", "M4TD"), 7.68, 6.144, 12.05, 640, 512, 0.05),
+    CameraPreset("Zenmuse H20T thermal", ("ZH20T",), 7.68, 6.144, 13.5, 640, 512, 0.04),
+    CameraPreset("Zenmuse H30T thermal", ("H30T",), 15.36, 12.288, 24.0, 1280, 1024, 0.04),
 )
 
 
-def find_preset(name: str) -> CameraPreset | None:
-    """The preset with this name or EXIF code; case, blanks, hyphens and "DJI" before it do not matter."""
+def find_presets(name: str) -> list[CameraPreset]:
+    """The presets with this name or EXIF code, several where a drone has several cameras.
+
+    Case, blanks, hyphens and "DJI" before it do not matter.
+    """
     wanted = _plain(name)
+    found = []
     for preset in CAMERA_PRESETS:
         known = {_plain(preset.name), *(_plain(code) for code in preset.codes)}
         if wanted in known or (wanted.startswith("dji") and wanted[3:] in known):
-            return preset
-    return None
+            found.append(preset)
+    return found
 
 
 def preset_names() -> str:
     """Every preset with its EXIF codes, for a message."""
-    return ", ".join(f"{preset.name} ({', '.join(preset.codes)})" for preset in CAMERA_PRESETS)
+    return ", ".join(
+        f"{preset.name} ({', '.join(preset.codes)})" if preset.codes else preset.name for preset in CAMERA_PRESETS
+    )
 
 
 def _plain(name: str) -> str:

@@ -57,6 +57,7 @@ class PhotoMetadata:
     local_ns: int = 0
     columns: Mapping[str, float] = field(default_factory=dict)
     unreadable: tuple[str, ...] = ()
+    lens: photo_xmp.StatedLens = field(default_factory=photo_xmp.StatedLens)
 
     @property
     def shown_size_px(self) -> tuple[int, int]:
@@ -92,13 +93,15 @@ def read_photo_metadata(path: Path) -> PhotoMetadata:
         except (ElementTree.ParseError, ValueError, RecursionError):
             unreadable = (*unreadable, "XMP")
     main, detail, gps = header.tags
+    full_width_px = _whole(detail.get(ExifTags.Base.ExifImageWidth)) or max(header.width_px, header.height_px)
+    full_height_px = round(full_width_px * header.height_px / header.width_px)
     return PhotoMetadata(
         header.width_px, header.height_px, _orientation(main), _text(main.get(ExifTags.Base.Make)),
         _text(main.get(ExifTags.Base.Model)), _positive(detail.get(ExifTags.Base.FocalLength)),
         _positive(detail.get(ExifTags.Base.FocalLengthIn35mmFilm)), _focal_plane_px_per_mm(detail),
-        _whole(detail.get(ExifTags.Base.ExifImageWidth)) or max(header.width_px, header.height_px),
-        _utc_ns(main, detail, gps, properties), _camera_clock_ns(main, detail), _telemetry_columns(gps, properties),
-        unreadable,
+        full_width_px, _utc_ns(main, detail, gps, properties), _camera_clock_ns(main, detail),
+        _telemetry_columns(gps, properties),
+        unreadable, photo_xmp.stated_lens(properties, full_width_px, full_height_px),
     )
 
 

@@ -7,6 +7,7 @@ EXIF and XMP tags", and real files of senseFly's (docs/formats-in.md).
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from math import atan2, degrees, hypot, isfinite, nan
 from xml.etree.ElementTree import Element
 
@@ -40,6 +41,46 @@ _ABOVE_TAKEOFF = (
     "camera:AboveGroundAltitude",
 )
 _ABOVE_SEA = ("sensefly:AltitudeAMSL", "skydio:AbsoluteAltitude")
+
+
+@dataclass(frozen=True)
+class StatedLens:
+    """The lens that a photo's XMP states, in pixels of a photo `width_px` wide; NaN where it states none.
+
+    `cx_px` and `cy_px` count from the photo's centre; `distortion` is k1 k2 p1 p2 k3, zeros where the maker has taken
+    it out or does not state it. `is_calibrated`: measured on this very camera, not the design.
+    """
+
+    width_px: int = 0
+    fx_px: float = nan
+    fy_px: float = nan
+    cx_px: float = 0.0
+    cy_px: float = 0.0
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    is_calibrated: bool = False
+
+
+def stated_lens(properties: Mapping[str, str], width_px: int, height_px: int) -> StatedLens:
+    """DJI's DewarpData ("date;fx,fy,cx,cy,k1,k2,p1,p2,k3"), else a calibrated focal length, DJI's or Skydio's.
+
+    The size is that of the photo as the camera wrote it, whose pixels the numbers count.
+    """
+    numbers = [_finite(text) for text in properties.get("dji:DewarpData", "").rpartition(";")[2].split(",")]
+    if len(numbers) == 9 and all(map(isfinite, numbers)):
+        fx_px, fy_px, cx_px, cy_px, k1, k2, p1, p2, k3 = numbers
+        is_undistorted = number(properties, "dji:DewarpFlag") == 1
+        distortion = (0.0, 0.0, 0.0, 0.0, 0.0) if is_undistorted else (k1, k2, p1, p2, k3)
+        return StatedLens(width_px, fx_px, fy_px, cx_px, cy_px, distortion, True)
+    fx_px = _first(properties, "dji:CalibratedFocalLength", "skydio:CalibratedFocalLength.X")
+    fy_px = _first(properties, "skydio:CalibratedFocalLength.Y")
+    centre_px = [
+        _first(properties, f"dji:CalibratedOpticalCenter{axis}", f"skydio:CalibratedOpticalCenter.{axis}") - 0.5 * size
+        for axis, size in (("X", width_px), ("Y", height_px))
+    ]
+    is_near = all(isfinite(each) and abs(each) < 0.1 * width_px for each in centre_px)
+    return StatedLens(
+        width_px, fx_px, fy_px if isfinite(fy_px) else fx_px, *(centre_px if is_near else (0.0, 0.0)),
+    )
 
 
 def read_properties(packet: bytes) -> dict[str, str]:

@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from sorvolo.capture.calibration import camera_from_option, guess_camera
+from sorvolo.capture.calibration import camera_from_option, guess_camera, stated_camera
 from sorvolo.capture.decoding import PHOTO_SUFFIXES
 from sorvolo.capture.live.addresses import (
     ADDRESS_FORMS,
@@ -362,7 +362,9 @@ def _video_camera(info: VideoInfo) -> CameraModel:
 
 
 def _guess(width_px: int, height_px: int, words: PhotoMetadata) -> CameraModel:
-    """The guess for pictures that may stand on their side: sensors lie, so it is made for the longer side."""
+    """The lens that a photo states, else the guess; sensors lie, so for pictures that stand it is made lying."""
+    if width_px >= height_px and (stated := stated_camera(words.lens, width_px, height_px)) is not None:
+        return stated
     model = guess_camera(
         max(width_px, height_px), min(width_px, height_px), make=words.make, model=words.model,
         focal_length_mm=words.focal_length_mm, focal_length_35mm=words.focal_length_35mm,

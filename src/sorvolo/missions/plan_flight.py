@@ -7,7 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from sorvolo.capture.calibration import camera_from_option
-from sorvolo.capture.camera_presets import find_preset
+from sorvolo.capture.camera_presets import find_presets
 from sorvolo.detection.models import find_model
 from sorvolo.detection.session import read_info
 from sorvolo.detection.tiling import needed_px_per_m
@@ -108,7 +108,7 @@ def camera_to_plan_with(
 
     Without `size_px` a preset plans with its full photo, anything else with `DEFAULT_SIZE_PX`.
     """
-    preset = find_preset(option) if option else None
+    preset = next(iter(find_presets(option)), None) if option else None
     width_px, height_px = size_px or ((preset.width_px, preset.height_px) if preset else DEFAULT_SIZE_PX)
     if option and not (math.isnan(focal_mm) and math.isnan(pixel_um)):
         raise SettingsError("--camera and --focal-mm/--pixel-um both describe the camera; give one of them")
