@@ -161,16 +161,10 @@ class Track:
         if not len(good):
             return unknown, unknown, unknown
         times = self.sample_s[good]
-        after = int(np.searchsorted(times, time_s))
-        before = after - 1
-        reach_s = max(1.5 * self.interval_s, 0.3)
-        if before < 0 or after >= len(good):
-            edge = max(0, min(len(good) - 1, before if after >= len(good) else after))
-            if abs(times[edge] - time_s) > reach_s:
-                return unknown, unknown, unknown
-            before, after = (edge - 1, edge) if edge > 0 else (0, min(1, len(good) - 1))
-        elif times[after] - times[before] > self.longest_gap_s and times[after] != time_s:
+        around = self._fixes_around(times, time_s)
+        if around is None:
             return unknown, unknown, unknown
+        before, after = around
         chosen = np.arange(before, after + 1)
         if smooth_s > 0:
             near = np.flatnonzero(np.abs(times - time_s) <= smooth_s)
@@ -185,6 +179,17 @@ class Track:
         # neighbouring fixes err alike, so averaging many never helps by more than a factor of two
         shrink = max(gain, 0.5)
         return place, np.array([sigma_h, sigma_h, self.vertical_sigma_m]) * shrink, velocity
+
+    def _fixes_around(self, times: Floats, time_s: float) -> tuple[int, int] | None:
+        """The fixes before and after a moment, at the ends the last two; None in a gap and too far beyond the ends."""
+        after = int(np.searchsorted(times, time_s))
+        if 0 < after < len(times):
+            is_gap = times[after] - times[after - 1] > self.longest_gap_s and times[after] != time_s
+            return None if is_gap else (after - 1, after)
+        edge = min(after, len(times) - 1)
+        if abs(times[edge] - time_s) > max(1.5 * self.interval_s, 0.3):
+            return None
+        return (edge - 1, edge) if edge > 0 else (0, min(1, len(times) - 1))
 
     def _nearest(self, time_s: float) -> Vector3:
         """The fix nearest in time: where to begin the search for a frame of unknown place."""

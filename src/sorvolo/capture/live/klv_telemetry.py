@@ -15,7 +15,7 @@ from sorvolo.capture.telemetry.quality import clean, notice
 from sorvolo.geometry.arrays import Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import gimbal_angles_from_rotation, site_from_gimbal_rotation
-from sorvolo.survey.flight import CameraModel, Notice, Telemetry
+from sorvolo.survey.flight import TELEMETRY_COLUMNS, CameraModel, Notice, Telemetry
 
 FORMAT = "klv"
 """The name that `Telemetry.format` carries."""
@@ -131,20 +131,19 @@ def metadata_of(sets: Sequence[tuple[int, LocalSet]], counts: Counter[str], name
 
     `counts` are what `klv.local_sets` counted. Raises InputError, which calls the file `name`, without a usable sample.
     """
-    timed = [(video_ns, each) for video_ns, each in sets if each.time_ns]
+    video_ns = [stamp_ns for stamp_ns, each in sets if each.time_ns]
+    timed = [each for _, each in sets if each.time_ns]
     counts["no_time"] += len(sets) - len(timed)
-    rows = [columns_of(each) for _, each in timed]
-    names = sorted({column for row in rows for column in row})
-    video_ns = [stamp_ns for stamp_ns, _ in timed]
+    rows = [columns_of(each) for each in timed]
     telemetry = clean(
-        FORMAT, name, [each.time_ns for _, each in timed],
-        {column: [row.get(column, nan) for row in rows] for column in names},
+        FORMAT, name, [each.time_ns for each in timed],
+        {column: [row.get(column, nan) for row in rows] for column in TELEMETRY_COLUMNS},
         # a tie to the video holds for all samples or for none
         video_ns if min(video_ns, default=-1) >= 0 else None,
         notices=klv_notices(counts),
     )
-    lens = next((each for _, each in timed if isfinite(each["sensor_horizontal_fov_deg"])), None)
-    grounds_m = [ground_m for _, each in timed if isfinite(ground_m := ground_elevation_m(each))]
+    lens = next((each for each in timed if isfinite(each["sensor_horizontal_fov_deg"])), None)
+    grounds_m = list(filter(isfinite, map(ground_elevation_m, timed)))
     return FileMetadata(telemetry, lens, median(grounds_m) if grounds_m else nan)
 
 

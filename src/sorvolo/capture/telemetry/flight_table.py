@@ -220,12 +220,16 @@ def _columns(numbers: Mapping[str, Floats]) -> tuple[dict[str, Floats], list[Not
         north, east = numbers["velocity_north"], numbers["velocity_east"]
         columns["speed_m_s"] = np.hypot(north, east)
         columns["course_deg"] = np.degrees(np.arctan2(east, north)) % 360
-    if all(f"quaternion_{axis}" in numbers for axis in "wxyz"):
-        angles = _angles(*(numbers[f"quaternion_{axis}"] for axis in "wxyz"))
-        for key, values in zip(("body_yaw_deg", "body_pitch_deg", "body_roll_deg"), angles):
-            if not _has_numbers(columns, key):
-                columns[key] = values
-    return columns, notices
+    stated = {key: values for key, values in columns.items() if _has_numbers(columns, key)}
+    return _attitude_of(numbers) | stated, notices
+
+
+def _attitude_of(numbers: Mapping[str, Floats]) -> dict[str, Floats]:
+    """The body's angles from its quaternion, where there is a whole one."""
+    parts = [numbers[f"quaternion_{axis}"] for axis in "wxyz" if f"quaternion_{axis}" in numbers]
+    if len(parts) < 4:
+        return {}
+    return dict(zip(("body_yaw_deg", "body_pitch_deg", "body_roll_deg"), _angles(*parts)))
 
 
 def _has_numbers(columns: Mapping[str, Floats], key: str) -> bool:

@@ -134,11 +134,16 @@ def _payloads_in(container: Any) -> Iterator[Payload]:
     video = container.streams.video[0]
     first_ns = round((video.start_time or 0) * (video.time_base or 0) * SECOND_NS)
     for packet in container.demux(streams):
-        data = bytes(packet) if packet.size else b""
-        if is_gpmf(data) and packet.pts is not None and packet.time_base:
-            base_ns = packet.time_base * SECOND_NS
-            when_ns = max(0, round(packet.pts * base_ns) - first_ns)
-            yield Payload(when_ns, round((packet.duration or 0) * base_ns), data)
+        if payload := _payload_of(packet, first_ns):
+            yield payload
+
+
+def _payload_of(packet: Any, first_ns: int) -> Payload | None:
+    data = bytes(packet) if packet.size else b""
+    if not is_gpmf(data) or packet.pts is None or not packet.time_base:
+        return None
+    base_ns = packet.time_base * SECOND_NS
+    return Payload(max(0, round(packet.pts * base_ns) - first_ns), round((packet.duration or 0) * base_ns), data)
 
 
 def _samples_of(payload: Payload, streams: Sequence[_Stream]) -> list[_Sample]:

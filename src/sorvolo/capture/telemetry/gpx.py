@@ -58,17 +58,20 @@ def read(data: bytes, name: str) -> Telemetry:
             f"{name}: none of its {len(points)} GPX points has a <time>; export the track with its times, "
             "without them no picture can be given a place"
         )
-    columns = {column: [_number(each, tag) for each in texts] for column, tag in _TAG_OF_COLUMN.items()}
-    columns["horizontal_sigma_m"] = [sigma_from_hdop_m(_number(each, "hdop")) for each in texts]
     decimals = max(decimals_of(each.get(axis, "")) for each in timed for axis in ("lat", "lon"))
     return clean(
-        "gpx", name, stamps_ns, columns,
+        "gpx", name, stamps_ns, _columns_of(texts),
         notices=[
             *notice("truncated", counts["truncated"], "the file is cut off; read up to its last whole point"),
             *notice("unreadable_line", len(points) - len(timed), "{} points dropped: no readable <time>"),
         ],
         position_decimals=decimals or None,
     )
+
+
+def _columns_of(points: list[dict[str, str]]) -> dict[str, list[float]]:
+    columns = {column: [_number(each, tag) for each in points] for column, tag in _TAG_OF_COLUMN.items()}
+    return columns | {"horizontal_sigma_m": [sigma_from_hdop_m(_number(each, "hdop")) for each in points]}
 
 
 def _time_ns(texts: dict[str, str]) -> int:
