@@ -117,6 +117,7 @@ def test_the_headline_counts_and_does_not_count_what_moves() -> None:
     ({"suppressed": 3}, "3 changes left out"),
     ({"map_updated": False}, "not updated"),
     ({"reasons": {"too few points fit": 9}}, "too few points fit"),
+    ({"candidates": {"withdrawn": {"a passing shadow": 2}}}, "a passing shadow"),
 ])
 def test_what_was_not_compared_is_said(changed: dict[str, Any], words: str) -> None:
     report = fake_report(5) | {"warnings": [], "comparison": fake_comparison(**changed)}

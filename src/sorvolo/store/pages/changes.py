@@ -80,7 +80,7 @@ def changes_page(
         changes=listed, is_reviewed=is_reviewed, has_metres=not site.is_local,
         systems=() if site.is_local else tuple(SYSTEMS.items()),
         columns=_columns(listed, is_reviewed), files=_files(site),
-        view_rows=_view_rows(report),
+        view_rows=_view_rows(report), not_announced=_not_announced(report),
         reasons=[(count, why) for why, count in (at(report, "comparison", "reasons") or {}).items()],
         unknown_share=None if unknown is None else f"{unknown:.1%}", how=_how(report),
     )
@@ -260,48 +260,21 @@ def _crop(rgba: ImageRGBA | None, change: StoredChange, when: str, most_bytes: i
 
 def _view_rows(report: Mapping[str, Any]) -> list[tuple[str, int, str]]:
     views = at(report, "comparison", "views") or {}
-<<<<<<< HEAD
-    reasons = at(report, "comparison", "reasons") or {}
-    unknown = number_at(report, "comparison", "unknown_share")
-    if not views and not reasons:
-        return ""
-    rows = [(status.value, escaped(views[status.value]), words) for status, words in _VIEW_WORDS.items()
-            if views.get(status.value)]
-    why = ""
-    if reasons:
-        listed = table_of([(escaped(count), escaped(reason)) for reason, count in reasons.items()], ("views", "why"))
-        why = f"<h3>Reasons</h3>{listed}"
-    share = "" if unknown is None else (
-        f'<p class="note">On average {unknown:.1%} of a compared view was unknown: a hole in the map, its rim or the '
-        "view's. Nothing is said of it, neither that it changed nor that it did not.</p>"
-    )
-    return (
-        f"<section><h2>What was compared, and what could not be</h2>{table_of(rows, ('view', 'number', 'meaning'))}"
-        f"{why}{share}{_not_reported(report)}</section>"
-    )
-
-
-def _not_reported(report: Mapping[str, Any]) -> str:
-    """Candidates for changes that the views did not confirm, by reason."""
-    rows = [
-        (escaped(count), words, escaped(reason))
-        for name, words in (("withdrawn", "withdrawn after being announced"), ("never_announced", "never announced"))
-        for reason, count in (at(report, "comparison", "candidates", name) or {}).items()
-    ]
-    if not rows:
-        return ""
-    return f"<h3>Candidates that are not in the list</h3>{table_of(rows, ('number', 'what became of them', 'reason'))}"
-
-
-def _how(report: Mapping[str, Any]) -> str:
-=======
     return [
         (status.value, views[status.value], _VIEW_WORDS[status]) for status in ViewStatus if views.get(status.value)
     ]
 
 
+def _not_announced(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Candidates for changes that the views did not confirm, by reason: number, what became of them, reason."""
+    return [
+        (known(count), words, str(reason))
+        for name, words in (("withdrawn", "withdrawn after being announced"), ("never_announced", "never announced"))
+        for reason, count in (at(report, "comparison", "candidates", name) or {}).items()
+    ]
+
+
 def _how(report: Mapping[str, Any]) -> list[tuple[str, str]]:
->>>>>>> 2842a65 (Pages are made from templates with one style sheet: plain English, coordinates by choice, cards on a phone, light and dark)
     residual_px = number_at(report, "comparison", "residual_px", "median")
     rows = [
         ("method", at(report, "comparison", "method")),

@@ -165,7 +165,7 @@ def _metric_figures(report: Mapping[str, Any]) -> list[tuple[str, str | None, st
         ("ground resolution", length_words(number_at(report, "ground_sampling_distance_m")),
          f"per pixel of the map; of the frames {native}"),
         ("position accuracy", length_words(number_at(report, "sigma_m")),
-         "1 sigma: two of three such maps lie closer to their true position. Includes the error shared by all GPS fixes"),
+         "1 sigma: two of three such maps lie closer to their true position; includes the error shared by all fixes"),
         ("distance to GPS", length_words(number_at(report, "gps_residual_m", "median")),
          f"median, horizontal, of cameras and their fixes; root mean square {rms}"),
         ("flight height", with_unit("{:.1f} m", number_at(report, "height_above_ground_m")),
