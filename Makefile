@@ -60,6 +60,7 @@ $(READY): requirements.lock pyproject.toml setup.py $(wildcard src/sorvolo/kerne
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -e .
 	touch $@
 
-$(TRAINS): $(READY) requirements-training.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock -r requirements-training.lock
+$(TRAINS): $(READY) requirements-training.lock requirements-notebooks.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock -r requirements-training.lock \
+	  -r requirements-notebooks.lock
 	touch $@

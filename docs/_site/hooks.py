@@ -1,7 +1,7 @@
 """What MkDocs does beside docs/: the README is the front page, links to other files of the repository are checked.
 
-Pages that lie beside docs/ (README, ARCHITECTURE, CONTRIBUTING, CHANGELOG) become pages of the site. Any other link out of
-docs/ must lead to something in the repository, else it is a broken link; on the site its text stays, as the file is no page.
+Pages that lie beside docs/ (README, ARCHITECTURE, CONTRIBUTING, CHANGELOG) become pages of the site. Any other link out
+of docs/ must lead to something in the repository, else it is a broken link; on the site its text stays.
 """
 
 import logging
@@ -63,6 +63,5 @@ def _relinked(markdown: str, folder: str, page: str) -> str:
             _log.warning("%s links to %s, which is not in the repository", page, target)
         return text
 
-    return "".join(
-        part if number % 2 else _LINK.sub(relink, part) for number, part in enumerate(re.split(r"(```.*?```)", markdown, flags=re.S))
-    )
+    parts = re.split(r"(```.*?```)", markdown, flags=re.S)  # every other one is code
+    return "".join(part if number % 2 else _LINK.sub(relink, part) for number, part in enumerate(parts))

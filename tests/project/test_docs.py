@@ -1,4 +1,4 @@
-"""The pages keep to the program: links lead somewhere, commands and options exist. `make docs` checks the site itself."""
+"""The pages keep to the program: links lead somewhere, commands and options exist; `make docs` checks the site."""
 
 import posixpath
 import re
@@ -53,7 +53,7 @@ def test_commands_and_options_of_a_page_exist(page: Path) -> None:
             command = next((each for each in (" ".join(words[1:3]), " ".join(words[1:2])) if each in commands), None)
             if command is None and len(words) > 1 and words[1].isidentifier():
                 wrong.append(line)
-            allowed = commands[command] | known_of_groups(command) if command else known
+            allowed = commands[command] if command else known
             wrong += [f"{line}: {each}" for each in _OPTION.findall(line.partition("|")[0]) if each not in allowed]
         else:
             wrong += [f"{line}: {each}" for each in _OPTION.findall(line) if each not in known]
@@ -64,10 +64,6 @@ def code_of(page: Path) -> Iterator[str]:
     for fenced, span, indented in _CODE.findall(page.read_text(encoding="utf-8")):
         for line in (fenced or span or indented).splitlines():
             yield re.split(r"\s#\s|\s{3,}", line.strip())[0]
-
-
-def known_of_groups(command: str) -> set[str]:
-    return {"--help"}
 
 
 def options_by_command() -> dict[str, set[str]]:
