@@ -22,7 +22,7 @@ FLIGHT = "demo-site/simulation/flight{0}/flight{0}.mp4"
 CAMERA = ["--camera", "demo-site/simulation/camera.xml"]
 COMMANDS = {
     "inspect": ["inspect", FLIGHT.format(1), *CAMERA],
-    "plan": ["plan", "--camera", "Mavic 2 Pro", "--task", "recognition", "--area", "area.geojson", "--out", "field.plan"],
+    "plan": ["plan", "--camera", "Mavic 2 Pro", "--area", "area.geojson", "--out", "field.plan", "--out", "field.kmz"],
     "map": ["map", FLIGHT.format(1), *CAMERA, "--site", "field"],
     "compare": ["compare", FLIGHT.format(2), *CAMERA, "--site", "field"],
     "watch": ["watch", FLIGHT.format(2), *CAMERA, "--out", "search"],
@@ -81,11 +81,9 @@ def pictured(name: str, page: Path, width: int, height: int) -> None:
     """The top of a page as a browser shows it."""
     with tempfile.TemporaryDirectory() as scratch:
         shot = Path(scratch) / "page.png"
-        subprocess.run(
-            ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--force-device-scale-factor=1",
-             f"--window-size={width},{height}", f"--screenshot={shot}", page.resolve().as_uri()],
-            check=True, capture_output=True, timeout=120,
-        )
+        command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+        command += [f"--window-size={width},{height}", f"--screenshot={shot}", page.resolve().as_uri()]
+        subprocess.run(command, check=True, capture_output=True, timeout=120)
         Image.open(shot).convert("RGB").save(IMAGES / f"{name}.jpg", quality=72, optimize=True, progressive=True)
 
 
