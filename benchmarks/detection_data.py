@@ -88,6 +88,15 @@ def sdd(data: Path) -> dict[str, LabelledSet]:
     return {"test": in_order(whole)}
 
 
+def semantic_drone(data: Path) -> dict[str, LabelledSet]:
+    """Straight down from 5 to 30 m, of which nothing was learnt or tuned (non-commercial): only to measure."""
+    whole = read_dataset(
+        data / "semantic_drone", classes={"person": "person", "car": "car"}, ignore=("bicycle", "dog"),
+        unlabelled=(SMALL,),
+    )
+    return {"test": in_order(whole)}
+
+
 def mannequin(data: Path) -> dict[str, LabelledSet]:
     """A dummy that floats on a pond, one video: only to train."""
     return {"train": in_order(read_dataset(data / "mannequin", classes={"person": "person", "mannequin": "person"}))}

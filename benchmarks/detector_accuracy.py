@@ -33,7 +33,7 @@ from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
 
 RESULTS = Path(__file__).parent / "results" / "detector_accuracy.json"
-REAL = ("hituav", "tinyperson", "aerial_cars", "cats", "sdd")
+REAL = ("hituav", "tinyperson", "aerial_cars", "cats", "sdd", "semantic_drone")
 FIRST_SEED = 301
 FLIGHTS, FRAMES_OF_ONE, PICTURES = ("compare", "compare-urban", "compare-dirt", "survey", "survey-urban"), 8, 120
 TARGETS = {"people": 16, "cars": 8, "small_objects": 16}

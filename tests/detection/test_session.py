@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnxruntime
 import pytest
 from toy_models import METADATA, draw, onnx, rectangle_model, write_model
 
-from sorvolo.detection import session as sessions
 from sorvolo.detection.session import Session, read_info, usable_cores
 from sorvolo.errors import InputError, SettingsError
 
@@ -101,6 +101,8 @@ def test_missing_outputs_and_answers_that_break_the_contract(tmp_path: Path) -> 
         ({"thresholds": {"person": 0.5}}, "says nothing of 'car'"),
         ({"best_px": {"person": [9, 3], "car": [1, 2], "small object": [1, 2]}}, "best_px"),
         ({"stride": 0}, "stride"),
+        ({"on_request": ["dog"]}, "on_request must be some of its classes"),
+        ({"on_request": ["person", "car", "small object"]}, "on_request must be some"),
         ({"thresholds": None}, "cannot be used"),
     ],
 )
@@ -125,7 +127,7 @@ def test_providers_and_threads(tmp_path: Path) -> None:
         Session(path, "tpu")  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match="thread"):
         Session(path, "cpu", 0)
-    if "CUDAExecutionProvider" not in sessions.onnxruntime.get_available_providers():
+    if "CUDAExecutionProvider" not in onnxruntime.get_available_providers():
         with pytest.raises(SettingsError, match="onnxruntime-gpu"):
             Session(path, "cuda")
     assert 1 <= usable_cores() <= 4096

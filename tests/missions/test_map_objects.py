@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -245,3 +246,14 @@ def test_a_changes_own_pictures_are_the_last_word(simulated: Path) -> None:
         assert (named.class_before, named.class_after) == (before, after)
     unsure = ChangeClasses(Sees(simulated, 0.1), []).preliminary(change_at(ChangeKind.REPLACED))
     assert (unsure.class_before, unsure.class_after) == ("", "")
+
+
+def test_a_class_that_is_reported_on_request_alone_is_not_looked_for(simulated: Path, tmp_path: Path) -> None:
+    """The map's objects are people and cars where the model is too unsure of small objects."""
+    knowing = Knowing(simulated)
+    knowing.info = replace(knowing.info, on_request=("small object",))
+    for _ in map_flights([simulated / "flight1/flight1.mp4"], tmp_path / "site", detector=knowing):
+        pass
+    told = report_of(tmp_path / "site", "flight1")["objects"]
+    assert told["looked_for"] == ["person", "car"]
+    assert set(told["classes"]) == {"person", "car"} and told["count"] > 0

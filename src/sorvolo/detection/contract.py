@@ -25,7 +25,8 @@ class ModelInfo:
     `thresholds` says from which score on each class is reported; `best_px` from which to which longer side, in
     pixels, the model finds a class well. `stride`: the sides of its input are multiples of it. `thermal`: it was
     trained on thermal frames; `daylight`: on daylight. `thermal_by`: the installed model that looks at thermal frames
-    in its place, "" for none. `precision` is float32 or int8.
+    in its place, "" for none. `precision` is float32 or int8. `on_request`: classes too unsure to be reported unless a
+    person asks for them.
     """
 
     name: str
@@ -42,6 +43,12 @@ class ModelInfo:
     licence: str = ""
     trained_on: str = ""
     created: str = ""
+    on_request: tuple[str, ...] = ()
+
+    @property
+    def usual_classes(self) -> tuple[str, ...]:
+        """What is reported where nobody asks for certain classes."""
+        return tuple(name for name in self.classes if name not in self.on_request)
 
 
 def info_from_metadata(metadata: Mapping[str, str], where: str) -> ModelInfo:
@@ -85,13 +92,16 @@ def _info(told: dict[str, Any]) -> ModelInfo:
     stride = int(told.get("stride", _FALLBACK_STRIDE))
     if not 1 <= stride <= 256:
         raise ValueError(f"its stride must lie in 1 to 256, not {stride}")
+    on_request = tuple(str(each) for each in told.get("on_request", ()))
+    if not set(on_request) < set(classes):
+        raise ValueError(f"its on_request must be some of its classes, not {list(on_request)}")
     texts = {
         each: _words(told[each])
         for each in ("thermal_by", "preset", "version", "precision", "licence", "trained_on", "created") if each in told
     }
     return ModelInfo(
         str(told["name"]), classes, MappingProxyType(thresholds), MappingProxyType(best_px), stride,
-        bool(told.get("thermal", False)), bool(told.get("daylight", True)), **texts,
+        bool(told.get("thermal", False)), bool(told.get("daylight", True)), on_request=on_request, **texts,
     )
 
 

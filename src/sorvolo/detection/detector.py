@@ -9,9 +9,10 @@ from typing import overload
 import numpy as np
 
 from sorvolo.detection.contract import ModelInfo
+from sorvolo.detection.engine import Provider
 from sorvolo.detection.light import is_thermal, rgb_from_picture
 from sorvolo.detection.models import find_model, thermal_model
-from sorvolo.detection.session import Provider, Seen, Session
+from sorvolo.detection.session import Seen, Session
 from sorvolo.detection.suppression import SeenTile, merge_tiles
 from sorvolo.detection.tiling import Tiles, plan_tiles
 from sorvolo.errors import SettingsError

@@ -1,28 +1,26 @@
-"""One model file, opened where it runs fastest: a picture in, boxes out; the only place that knows ONNX Runtime."""
+"""One model file, opened where it runs fastest: a picture in, boxes out."""
 
 import math
 import os
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import get_args
 
 import cv2
 import numpy as np
-import onnxruntime
 
-from sorvolo.detection.contract import ModelInfo, info_from_metadata
+from sorvolo.detection.confined import confined_engine, described_confined
+from sorvolo.detection.contract import ModelInfo
+from sorvolo.detection.engine import Engine, Provider, describe, open_engine
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, ImageRGB, TimesNs
 
-Provider = Literal["auto", "cpu", "cuda", "openvino"]
-"""Where a model runs; "auto" takes CUDA where there is one, else OpenVINO where it is installed, else the CPU."""
+PACKAGED = Path(__file__).parent / "data"
+"""The folder of the models that come with the package; all others run in a process of their own."""
 
-_INPUT, _OUTPUTS = "image", ("boxes", "scores", "labels")
 _FILLING = 114
 _RUN_CODE = frozenset({".pt", ".pth", ".pkl", ".pickle", ".ckpt", ".bin", ".joblib"})
-_OPENVINO_PRECISION = "f32"
-_CUDA = "CUDAExecutionProvider"
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +51,8 @@ class Session:
             raise SettingsError(f"a model needs at least one thread, not {threads}")
         model = read_model(path)
         self._threads = threads or usable_cores()
-        self._run, self.provider, self.info, self.fixed_px = _opened(model, str(path), provider, self._threads)
+        engine = _engine(model, path, provider, self._threads)
+        self._run, self.provider, self.info, self.fixed_px = engine.run, engine.provider, engine.info, engine.fixed_px
         self._path = path
         self._buffer: Anything = np.zeros((1, 3, 0, 0), np.uint8)
         self._lock = threading.Lock()
@@ -118,7 +117,8 @@ class Session:
 
 def read_info(path: Path) -> ModelInfo:
     """What a model file says of itself, without making it ready to run. Raises InputError as Session does."""
-    return _contract(_described(read_model(path), str(path)), str(path))[0]
+    model = read_model(path)
+    return (describe if _is_packaged(path) else described_confined)(model, str(path)).info
 
 
 def read_model(path: Path) -> bytes:
@@ -140,6 +140,15 @@ def read_model(path: Path) -> bytes:
         raise InputError(f"the model file {path} cannot be read ({error.strerror}); check its permissions") from error
 
 
+def _engine(model: bytes, path: Path, provider: Provider, threads: int) -> Engine:
+    """A packaged model runs in this process, any other beside it, where it cannot take all memory."""
+    return (open_engine if _is_packaged(path) else confined_engine)(model, str(path), provider, threads)
+
+
+def _is_packaged(path: Path) -> bool:
+    return path.resolve().parent == PACKAGED.resolve()
+
+
 def usable_cores() -> int:
     """How many cores this process may use: its affinity, and its container's quota where one is set."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -158,130 +167,3 @@ def _resized(picture: ImageRGB, scale: float) -> ImageRGB:
         return picture
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(np.ascontiguousarray(picture), size[::-1], interpolation=way), np.uint8)
-
-
-def _opened(
-    model: bytes, where: str, provider: Provider, threads: int
-) -> tuple[Any, str, ModelInfo, tuple[int, int] | None]:
-    """What runs the model, where in words, what it says of itself, and its input's (height, width) if that is fixed."""
-    if provider in ("auto", "cuda") and _CUDA in onnxruntime.get_available_providers():
-        session = _onnx_session(model, where, threads, [_CUDA, "CPUExecutionProvider"])
-        if session.get_providers()[0] == _CUDA:
-            return _runner(session), "ONNX Runtime on the GPU (CUDA)", *_contract(session, where)
-    if provider == "cuda":
-        raise SettingsError(
-            "CUDA is not to be had here: install onnxruntime-gpu in place of onnxruntime, with a driver and CUDA of "
-            "its version, or choose the provider cpu"
-        )
-    refused = ""
-    if provider in ("auto", "openvino"):
-        described = _described(model, where)
-        # before OpenVINO sees it: that crashes on some models that break the contract
-        contract = _contract(described, where)
-        try:
-            run = _openvino_runner(model, threads)
-        except ImportError as error:
-            if provider == "openvino":
-                raise SettingsError(
-                    "OpenVINO is not installed: pip install 'sorvolo[openvino]', or choose the provider cpu"
-                ) from error
-        except RuntimeError as error:
-            if provider == "openvino":
-                told = " ".join(str(error).split())[:200]
-                raise InputError(f"{where}: OpenVINO refuses it ({told}); choose the provider cpu") from error
-            refused = ", since OpenVINO refuses the model"
-        else:
-            return run, f"OpenVINO on the CPU, {_count(threads)}", *contract
-    session = _onnx_session(model, where, threads, ["CPUExecutionProvider"])
-    return _runner(session), f"ONNX Runtime on the CPU, {_count(threads)}{refused}", *_contract(session, where)
-
-
-def _contract(session: Any, where: str) -> tuple[ModelInfo, tuple[int, int] | None]:
-    """What the model says of itself, and its input's (height, width) if that is fixed; InputError if it breaks it."""
-    info = info_from_metadata(session.get_modelmeta().custom_metadata_map, where)
-    return info, _input_size(session, where, info.stride)
-
-
-def _count(threads: int) -> str:
-    return "1 thread" if threads == 1 else f"{threads} threads"
-
-
-def _described(model: bytes, where: str) -> Any:
-    """A session that is only asked what the model is like: quick, since nothing is optimised."""
-    return _onnx_session(model, where, 1, ["CPUExecutionProvider"], optimise=False)
-
-
-def _onnx_session(
-    model: bytes, where: str, threads: int, providers: list[str], *, optimise: bool = True
-) -> Any:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.log_severity_level = 4
-    level = onnxruntime.GraphOptimizationLevel
-    options.graph_optimization_level = level.ORT_ENABLE_ALL if optimise else level.ORT_DISABLE_ALL
-    if _CUDA in providers:
-        onnxruntime.preload_dlls()
-    try:
-        return onnxruntime.InferenceSession(model, options, providers=providers)
-    except Exception as error:  # the runtime's own classes share no base but this
-        raise InputError(f"{where} cannot be run: {_refusal(str(error))}") from error
-
-
-def _refusal(told: str) -> str:
-    """Why the runtime refuses a model, and what to do."""
-    runtime = f"ONNX Runtime {onnxruntime.__version__}"
-    first = " ".join(told.split())[:200]
-    if "IR version" in told or "opset" in told.lower():
-        return f"it is of a newer ONNX than {runtime} reads ({first}); update onnxruntime, or export with opset 17"
-    if "Protobuf" in told or "protobuf" in told:
-        return f"it is damaged or no ONNX file ({first}); copy or fetch it again"
-    return f"{runtime} refuses it ({first}); export it again with opset 17"
-
-
-def _runner(session: Any) -> Any:
-    def run(batch: Anything) -> tuple[Anything, ...]:
-        return tuple(session.run(list(_OUTPUTS), {_INPUT: batch}))
-
-    return run
-
-
-def _openvino_runner(model: bytes, threads: int) -> Any:
-    import openvino
-
-    core = openvino.Core()
-    wishes = {
-        "PERFORMANCE_HINT": "LATENCY", "INFERENCE_NUM_THREADS": threads,
-        "INFERENCE_PRECISION_HINT": _OPENVINO_PRECISION,
-    }
-    compiled = core.compile_model(core.read_model(model=model), "CPU", wishes)
-    request = compiled.create_infer_request()
-
-    def run(batch: Anything) -> tuple[Anything, ...]:
-        request.infer({_INPUT: batch}, share_inputs=True)
-        return tuple(request.get_tensor(name).data.copy() for name in _OUTPUTS)
-
-    return run
-
-
-def _input_size(session: Any, where: str, stride: int) -> tuple[int, int] | None:
-    """The (height, width) that the model is fixed to, or None; raises InputError where it breaks the contract."""
-    inputs = session.get_inputs()
-    outputs = {each.name for each in session.get_outputs()}
-    found = ", ".join(f"{each.name} {each.type} {each.shape}" for each in inputs)
-    needed = f"one input '{_INPUT}', uint8 (1, 3, H, W), and outputs {', '.join(_OUTPUTS)}; export the model again"
-    if len(inputs) != 1 or inputs[0].name != _INPUT or inputs[0].type != "tensor(uint8)":
-        raise InputError(f"{where} takes {found}; needed is {needed}")
-    if missing := set(_OUTPUTS) - outputs:
-        lacking, given = ", ".join(sorted(missing)), ", ".join(sorted(outputs))
-        raise InputError(f"{where} gives no {lacking}, but {given}; needed is {needed}")
-    shape = inputs[0].shape
-    if len(shape) != 4 or (isinstance(shape[0], int) and shape[0] != 1) or shape[1] != 3:
-        raise InputError(f"{where} takes {found}; needed is {needed}")
-    fixed = [isinstance(each, int) for each in shape[2:]]
-    if not any(fixed):
-        return None
-    if not all(fixed):
-        raise InputError(f"{where} takes {found}: height and width must be both free or both fixed; export it again")
-    if shape[2] % stride or shape[3] % stride:
-        raise InputError(f"{where} takes {found}, but its stride is {stride}; export it again")
-    return int(shape[2]), int(shape[3])

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-_PLURALS = {"person": "people", "bus": "buses", "is": "are", "was": "were", "shows": "show"}
+_PLURALS = {"person": "people", "bus": "buses", "is": "are", "was": "were"}
 
 
 def plural(noun: str, count: int) -> str:

@@ -16,6 +16,7 @@ from sorvolo.errors import InputError
 from sorvolo.training.faster_rcnn import FasterRCNN
 
 _WEIGHTED = ("Conv", "Gemm")
+_AERIAL = "/aerial/"  # of a model of two networks, such as the packaged one, the part that can be learnt on from
 _OF_CLASSES = "head.scores"  # the one layer with a row for each class; the background's comes last
 
 
@@ -40,6 +41,7 @@ def load_exported(
     variances are those that `pictures` (N, 3, H, W), RGB 0 to 255, give them, so that they fit the pictures which are
     to be learnt from; what the model sees in a picture stays the same. `classes` are the model's: those that the file
     names too keep what it knows of them, the others start as `model` has them; None: the same ones in the same order.
+    Of a file that holds two networks (`training.daylight`) it is the aerial one.
     Raises InputError where the file's layers are not the model's, as those of a model in eight bits are not, and for a
     model with batch norms that do not learn (ResNet-50's of the presets `accurate` and `thesis`).
     """
@@ -52,10 +54,12 @@ def load_exported(
     layers = {name: each for name, each in model.named_modules() if isinstance(each, nn.Conv2d | nn.Linear)}
     norms = _norms_after(model)
     loaded: dict[str, list[Tensor]] = {}
+    is_part = any(node.name.startswith(_AERIAL) for node in graph.node)
     for node in graph.node:
         own = [values[name] for name in node.input[1:] if name in values]
-        if node.op_type in _WEIGHTED and own:
-            name = _module_of(node.name, list(layers)) or node.name
+        if node.op_type in _WEIGHTED and own and (not is_part or node.name.startswith(_AERIAL)):
+            inner = node.name.removeprefix(_AERIAL.rstrip("/")) if is_part else node.name
+            name = _module_of(inner, list(layers)) or node.name
             loaded[name] = [torch.from_numpy(numpy_helper.to_array(each).copy()) for each in own]
     if foreign := [name for name in loaded if name not in layers]:
         raise _unfitting(f"the network has no layer {foreign[0]}, as the file has")

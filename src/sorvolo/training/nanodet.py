@@ -116,9 +116,13 @@ class CocoDetector(nn.Module):
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """One picture (1, 3, H, W), RGB 0 to 255: boxes (K, 4) px, scores (K,), labels (K,), best first."""
-        scores, bins, places = cells(self.head(self.backbone(images)), self.head.strides, self.head.classes)
+        return self.found(self.head(self.backbone(images)), (images.shape[2], images.shape[3]))
+
+    def found(self, outputs: Sequence[Tensor], size_px: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+        """What `forward` gives, from what the head says of a picture of this (height, width)."""
+        scores, bins, places = cells(outputs, self.head.strides, self.head.classes)
         own = torch.stack([scores[0][:, rows].amax(1) for rows in self.coco_of_class]).sigmoid()
-        boxes = clipped(boxes_from_bins(bins[0], places), images.shape[2], images.shape[3])
+        boxes = clipped(boxes_from_bins(bins[0], places), *size_px)
         best, cell = torch.topk(own.amax(0), at_most(self.settings.before, own[0]))
         reach = self.settings
         kept = suppress(boxes[cell], own[:, cell].contiguous(), reach.most, reach.suppress_iou, reach.least_score)

@@ -61,7 +61,7 @@ class ObjectFinder:
     """
 
     def __init__(self, detector: Detects, camera: Camera) -> None:
-        self._detector, self._camera = detector, camera
+        self._detector, self._camera, self._classes = detector, camera, detector.info.usual_classes
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="detector")
         self._waiting: deque[Future[_Seen]] = deque()
         self._seen: dict[int, _Seen] = {}
@@ -109,7 +109,7 @@ class ObjectFinder:
         self._sightings = tuple(each.sighting for each in laid)
         found = objects_on_map(laid, crops, frames, flight_id, has_metres=has_metres)
         return ObjectSearch.over(
-            frames, self._detector.info.name, self._detector.classes, found.objects, len(self._seen), len(laid),
+            frames, self._detector.info.name, self._classes, found.objects, len(self._seen), len(laid),
             found.dropped,
         )
 
@@ -121,7 +121,7 @@ class ObjectFinder:
 
     def _look(self, frame: Frame, m_per_px: float | None) -> _Seen:
         started_s = time.monotonic()
-        found = self._detector.detect(frame.image, tiles="auto", m_per_px=m_per_px)
+        found = self._detector.detect(frame.image, tiles="auto", m_per_px=m_per_px, classes=self._classes)
         surest = found.surest(_MOST_CROPS)
         crops = tuple(_crop(frame.image, box) for box in surest.boxes_px)
         return _Seen(frame.index, surest, crops, time.monotonic() - started_s)

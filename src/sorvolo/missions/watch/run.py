@@ -92,7 +92,7 @@ class WatchRun:
         with log.stage("detect"):
             found = self._detector.detect(
                 frame.image, tiles=settings.tiles, m_per_px=self._places.m_per_px(frame),
-                least_score=settings.least_score, classes=settings.classes or None,
+                least_score=settings.least_score, classes=settings.classes or self._detector.info.usual_classes,
             )
         with log.stage("track"):
             taken = self._places.take(frame, time_ns, found)

@@ -1,0 +1,101 @@
+"""What models report of real flights that hardly show anyone: python benchmarks/false_alarms.py FLIGHTS MODEL ...
+
+FLIGHTS is the folder with `brighton_beach` (18 photos, no part of it was learnt as bare ground, cars are parked there)
+and `caliterra` (from its 47th photo on; the ground up to there taught the judge what is no car, so that its figures are
+too good; one white car and some machines). Photos are shown at half size, as they would be at half the resolution, and
+counted at each model's own thresholds, without any check of sizes on the ground. With --out FOLDER, each report's crop
+is drawn there; how many of them are right was counted by eye, and is given with --right MODEL:FLIGHT:CLASS=COUNT.
+
+Writes results/false_alarms.json: reports a photo, and false ones where --right is given.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mosaic_methods import commit, machine
+from sorvolo.detection.detector import Detector
+
+RESULTS = Path(__file__).parent / "results" / "false_alarms.json"
+FIRST = {"brighton_beach": "", "caliterra": "IMG_9400.jpg"}
+SHOWN = ("person", "car")
+SCALE, CROP_PX, IN_A_ROW = 0.5, 120, 10
+
+
+def main() -> None:
+    """Look, count, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("flights", type=Path)
+    parser.add_argument("models", nargs="+")
+    parser.add_argument("--right", nargs="*", default=[])
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    wishes = parser.parse_args()
+    right = {key: int(count) for key, count in (each.split("=") for each in wishes.right)}
+    found = {}
+    for model in wishes.models:
+        detector = Detector.load(model, provider="cpu", threads=1)
+        name = Path(model).stem
+        found[name] = {flight: looked(detector, wishes.flights / flight, wishes.out) for flight in FIRST}
+        for flight, rows in found[name].items():
+            for label in SHOWN:
+                if (count := right.get(f"{name}:{flight}:{label}")) is not None:
+                    rows[label]["right_by_eye"] = count
+                    rows[label]["false_a_photo"] = round((rows[label]["reports"] - count) / rows["photos"], 3)
+        print(name, json.dumps(found[name]), flush=True)
+    document = {
+        "benchmark": "false_alarms", "machine": machine(), "commit": commit(), "scale": SCALE,
+        "date": time.strftime("%Y-%m-%d"), "models": found,
+    }
+    wishes.results.write_text(json.dumps(document, indent=1) + "\n")
+
+
+def looked(detector: Detector, folder: Path, out: Path | None) -> dict:
+    """Reports of each class over a flight's photos."""
+    paths = [each for each in sorted(folder.iterdir()) if each.suffix.lower() == ".jpg"]
+    paths = [each for each in paths if each.name >= FIRST[folder.name]]
+    scores: dict[str, list[float]] = {label: [] for label in SHOWN}
+    crops: dict[str, list[np.ndarray]] = {label: [] for label in SHOWN}
+    for path in paths:
+        whole = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
+        shown = cv2.resize(whole, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_AREA)
+        seen = detector.detect(np.ascontiguousarray(shown[..., ::-1]), tiles="auto", classes=SHOWN)
+        for box, score, label in zip(seen.boxes_px, seen.scores, seen.names):
+            scores[label].append(float(score))
+            crops[label].append(crop(shown, box, f"{score:.2f} {path.stem[-4:]}"))
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        for label, each in crops.items():
+            if each:
+                cv2.imwrite(str(out / f"{detector.info.name}-{folder.name}-{label}.png"), sheet(each))
+    return {"photos": len(paths)} | {
+        label: {
+            "threshold": detector.info.thresholds[label], "reports": len(each),
+            "a_photo": round(len(each) / len(paths), 3), "highest": round(max(each, default=0.0), 3),
+        }
+        for label, each in scores.items()
+    }
+
+
+def crop(picture: np.ndarray, box: np.ndarray, text: str) -> np.ndarray:
+    """A report with its surroundings."""
+    reach = max(20, int(max(box[2:] - box[:2])))
+    x, y = (int(each) for each in (box[:2] + box[2:]) / 2)
+    wide = cv2.copyMakeBorder(picture, reach, reach, reach, reach, cv2.BORDER_CONSTANT)
+    cut = cv2.resize(wide[y : y + 2 * reach, x : x + 2 * reach], (CROP_PX, CROP_PX))
+    return cv2.putText(cut, text, (2, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 255, 255), 1)
+
+
+def sheet(crops: list[np.ndarray]) -> np.ndarray:
+    """All of them, ten in a row."""
+    empty = np.zeros_like(crops[0])
+    crops = crops + [empty] * (-len(crops) % IN_A_ROW)
+    return np.vstack([np.hstack(crops[row : row + IN_A_ROW]) for row in range(0, len(crops), IN_A_ROW)])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,217 @@
+"""A model of unknown origin in a process of its own, with a limit on its memory: a kilobyte can ask for gigabytes.
+
+Between the two processes go lengths, JSON and the bytes of arrays, nothing that could be run.
+"""
+
+import json
+import os
+import struct
+import subprocess
+import sys
+import weakref
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from sorvolo.detection.contract import METADATA_KEY, info_from_metadata
+from sorvolo.detection.engine import CUDA, OUTPUTS, Engine, Provider, describe, open_engine
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import Anything
+
+MOST_BYTES = 6 << 30
+"""Of memory that such a process may map on Linux: twice what the package's own models take for the largest tile."""
+
+_PER_THREAD_BYTES = 160 << 20  # that a thread maps and hardly uses: its stack and its share of the heap
+_MOST_MESSAGE_BYTES = 1 << 28
+_MOST_ROWS = 100_000
+_TYPES = {"boxes": np.float32, "scores": np.float32, "labels": np.int64}
+_ERRORS = {"InputError": InputError, "SettingsError": SettingsError}
+
+
+@dataclass(frozen=True)
+class _Wish:
+    """What the process is to do: describe the model, or run it."""
+
+    where: str
+    provider: Provider
+    threads: int
+    describes: bool
+    most_bytes: int
+
+
+def confined_engine(
+    model: bytes, where: str, provider: Provider, threads: int, most_bytes: int = MOST_BYTES
+) -> Engine:
+    """As `engine.open_engine`, in another process of at most `most_bytes`.
+
+    Raises what that raises, and InputError where the model asks for more memory or its process ends.
+    """
+    return _Process(model, _Wish(where, provider, threads, False, most_bytes)).engine()
+
+
+def described_confined(model: bytes, where: str, most_bytes: int = MOST_BYTES) -> Engine:
+    """As `engine.describe`, in another process, which has ended when this returns: the engine cannot run."""
+    process = _Process(model, _Wish(where, "cpu", 1, True, most_bytes))
+    try:
+        return process.engine()
+    finally:
+        process.end()
+
+
+class _Process:
+    """The other process, as seen from here. It ends with this object."""
+
+    def __init__(self, model: bytes, wish: _Wish) -> None:
+        self._wish = wish
+        package = str(Path(__file__).parents[2])
+        paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
+        self._child = subprocess.Popen(
+            [sys.executable, "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        )
+        self.end = weakref.finalize(self, _end, self._child)
+        self._send(wish.__dict__, model)
+
+    def engine(self) -> Engine:
+        """What runs the model there."""
+        about, _ = self._receive()
+        info = info_from_metadata({METADATA_KEY: str(about["metadata"])}, self._wish.where)
+        fixed = about["fixed_px"]
+        return Engine(
+            self._run, str(about["provider"]), str(about["metadata"]), info,
+            None if fixed is None else (int(fixed[0]), int(fixed[1])),
+        )
+
+    def _run(self, batch: Anything) -> tuple[Anything, ...]:
+        self._send({"shape": list(batch.shape)}, np.ascontiguousarray(batch, np.uint8).tobytes())
+        head, data = self._receive()
+        try:
+            return _arrays(head, data)
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{self._wish.where} answers with no boxes, scores and labels ({error})") from error
+
+    def _send(self, head: dict[str, Any], data: bytes) -> None:
+        assert self._child.stdin is not None
+        try:
+            _write(self._child.stdin, head, data)
+        except (BrokenPipeError, OSError) as error:
+            raise self._ended() from error
+
+    def _receive(self) -> tuple[dict[str, Any], bytes]:
+        assert self._child.stdout is not None
+        try:
+            head, data = _read(self._child.stdout)
+        except EOFError as error:
+            raise self._ended() from error
+        if (kind := head.get("error")) is not None:
+            raise _ERRORS.get(kind, InputError)(str(head["text"]))
+        return head, data
+
+    def _ended(self) -> InputError:
+        self.end()
+        return InputError(
+            f"{self._wish.where}: the process that ran this model ended; it asks for more than "
+            f"{self._wish.most_bytes / (1 << 30):.0f} GB of memory or is damaged. Show it smaller tiles, or get another"
+        )
+
+
+def _end(child: "subprocess.Popen[bytes]") -> None:
+    child.kill()
+    for stream in (child.stdin, child.stdout):
+        if stream is not None:
+            try:
+                stream.close()
+            except OSError:
+                pass  # what was still to be written goes nowhere
+    child.wait()
+
+
+def _arrays(head: dict[str, Any], data: bytes) -> tuple[Anything, ...]:
+    """Boxes, scores and labels from their shapes and bytes. Raises ValueError where they do not fit."""
+    out, start = [], 0
+    for name in OUTPUTS:
+        shape = [int(each) for each in head["shapes"][name]]
+        if len(shape) > 2 or min(shape, default=0) < 0 or max(shape, default=0) > _MOST_ROWS:
+            raise ValueError(f"{name} of shape {shape}")
+        kind = np.dtype(_TYPES[name])
+        count = int(np.prod(shape, dtype=np.int64))
+        out.append(np.frombuffer(data, kind, count, start).reshape(shape))
+        start += count * kind.itemsize
+    return tuple(out)
+
+
+def _write(stream: IO[bytes], head: dict[str, Any], data: bytes) -> None:
+    text = json.dumps(head).encode()
+    stream.write(struct.pack("<II", len(text), len(data)) + text)
+    stream.write(data)
+    stream.flush()
+
+
+def _read(stream: IO[bytes]) -> tuple[dict[str, Any], bytes]:
+    """Head and data of one message. Raises EOFError where the other side has ended or sends what is no message."""
+    lengths = stream.read(8)
+    if len(lengths) < 8:
+        raise EOFError
+    text_bytes, data_bytes = struct.unpack("<II", lengths)
+    if max(text_bytes, data_bytes) > max(_MOST_MESSAGE_BYTES, MOST_BYTES >> 2):
+        raise EOFError
+    text, data = stream.read(text_bytes), stream.read(data_bytes)
+    if len(text) < text_bytes or len(data) < data_bytes:
+        raise EOFError
+    try:
+        head = json.loads(text)
+    except ValueError as error:
+        raise EOFError from error
+    return (head, data) if isinstance(head, dict) else ({}, data)
+
+
+def serve(source: IO[bytes], sink: IO[bytes]) -> None:
+    """The other process: open the model that comes first, then answer pictures until there are no more."""
+    head, model = _read(source)
+    wish = _Wish(**head)
+    try:
+        _limit(wish)
+        engine = (
+            describe(model, wish.where) if wish.describes
+            else open_engine(model, wish.where, wish.provider, wish.threads)
+        )
+        _write(sink, {"provider": engine.provider, "metadata": engine.metadata, "fixed_px": engine.fixed_px}, b"")
+        while not wish.describes:
+            head, data = _read(source)
+            found = engine.run(np.frombuffer(data, np.uint8).reshape(head["shape"]))
+            arrays = [np.ascontiguousarray(each, _TYPES[name]) for name, each in zip(OUTPUTS, found)]
+            shapes = {name: list(each.shape) for name, each in zip(OUTPUTS, arrays)}
+            _write(sink, {"shapes": shapes}, b"".join(each.tobytes() for each in arrays))
+    except (InputError, SettingsError) as error:
+        _write(sink, {"error": type(error).__name__, "text": str(error)}, b"")
+    except EOFError:
+        return  # nobody asks any more
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200]
+        text = (
+            f"{wish.where}: the model cannot be run ({reason or type(error).__name__}); it may ask for more than "
+            f"{wish.most_bytes / (1 << 30):.0f} GB of memory: show it smaller tiles, or get another"
+        )
+        _write(sink, {"error": "InputError", "text": text}, b"")
+
+
+def _limit(wish: _Wish) -> None:
+    """Bound the memory that this process may map. Not where a GPU is used: its driver maps far more than it takes."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    import onnxruntime
+
+    if wish.provider in ("auto", "cuda") and CUDA in onnxruntime.get_available_providers():
+        return
+    most = wish.most_bytes + wish.threads * _PER_THREAD_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+
+if __name__ == "__main__":
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what libraries print is no answer
+    serve(sys.stdin.buffer, answers)

@@ -1,0 +1,161 @@
+"""An ONNX model made ready to run, here and now, by ONNX Runtime or OpenVINO; the only place that knows them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import onnxruntime
+
+from sorvolo.detection.contract import METADATA_KEY, ModelInfo, info_from_metadata
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import Anything
+
+Provider = Literal["auto", "cpu", "cuda", "openvino"]
+"""Where a model runs; "auto" takes CUDA where there is one, else OpenVINO where it is installed, else the CPU."""
+
+Run = Callable[[Anything], tuple[Anything, ...]]
+"""A picture (1, 3, H, W) uint8 to boxes, scores and labels."""
+
+INPUT, OUTPUTS = "image", ("boxes", "scores", "labels")
+CUDA = "CUDAExecutionProvider"
+_OPENVINO_PRECISION = "f32"
+
+
+@dataclass(frozen=True)
+class Engine:
+    """A model that runs: `provider` in words, its `metadata` as it stands in the file, and what that means.
+
+    `fixed_px` is the (height, width) of its input where the model takes only one size, else None.
+    """
+
+    run: Run
+    provider: str
+    metadata: str
+    info: ModelInfo
+    fixed_px: tuple[int, int] | None
+
+
+def open_engine(model: bytes, where: str, provider: Provider, threads: int) -> Engine:
+    """The model `where` made ready. Raises InputError where it is damaged or none of ours, SettingsError for a
+    provider that is not installed."""
+    if provider in ("auto", "cuda") and CUDA in onnxruntime.get_available_providers():
+        session = _onnx_session(model, where, threads, [CUDA, "CPUExecutionProvider"])
+        if session.get_providers()[0] == CUDA:
+            return _engine(_runner(session), "ONNX Runtime on the GPU (CUDA)", session, where)
+    if provider == "cuda":
+        raise SettingsError(
+            "CUDA is not to be had here: install onnxruntime-gpu in place of onnxruntime, with a driver and CUDA of "
+            "its version, or choose the provider cpu"
+        )
+    refused = ""
+    if provider in ("auto", "openvino"):
+        # before OpenVINO sees it: that crashes on some models that break the contract
+        described = describe(model, where)
+        try:
+            run = _openvino_runner(model, threads)
+        except ImportError as error:
+            if provider == "openvino":
+                raise SettingsError(
+                    "OpenVINO is not installed: pip install 'sorvolo[openvino]', or choose the provider cpu"
+                ) from error
+        except RuntimeError as error:
+            if provider == "openvino":
+                reason = " ".join(str(error).split())[:200]
+                raise InputError(f"{where}: OpenVINO refuses it ({reason}); choose the provider cpu") from error
+            refused = ", since OpenVINO refuses the model"
+        else:
+            return replace(described, run=run, provider=f"OpenVINO on the CPU, {_count(threads)}")
+    session = _onnx_session(model, where, threads, ["CPUExecutionProvider"])
+    return _engine(_runner(session), f"ONNX Runtime on the CPU, {_count(threads)}{refused}", session, where)
+
+
+def describe(model: bytes, where: str) -> Engine:
+    """The model opened only to be asked what it is like: quick, since nothing is optimised."""
+    session = _onnx_session(model, where, 1, ["CPUExecutionProvider"], optimise=False)
+    return _engine(_runner(session), "nowhere yet", session, where)
+
+
+def _engine(run: Run, provider: str, session: Any, where: str) -> Engine:
+    metadata = session.get_modelmeta().custom_metadata_map
+    info = info_from_metadata(metadata, where)
+    return Engine(run, provider, metadata[METADATA_KEY], info, _input_size(session, where, info.stride))
+
+
+def _count(threads: int) -> str:
+    return "1 thread" if threads == 1 else f"{threads} threads"
+
+
+def _onnx_session(
+    model: bytes, where: str, threads: int, providers: list[str], *, optimise: bool = True
+) -> Any:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.log_severity_level = 4
+    level = onnxruntime.GraphOptimizationLevel
+    options.graph_optimization_level = level.ORT_ENABLE_ALL if optimise else level.ORT_DISABLE_ALL
+    if CUDA in providers:
+        onnxruntime.preload_dlls()
+    try:
+        return onnxruntime.InferenceSession(model, options, providers=providers)
+    except Exception as error:  # the runtime's own classes share no base but this
+        raise InputError(f"{where} cannot be run: {_refusal(str(error))}") from error
+
+
+def _refusal(told: str) -> str:
+    """Why the runtime refuses a model, and what to do."""
+    runtime = f"ONNX Runtime {onnxruntime.__version__}"
+    first = " ".join(told.split())[:200]
+    if "IR version" in told or "opset" in told.lower():
+        return f"it is of a newer ONNX than {runtime} reads ({first}); update onnxruntime, or export with opset 17"
+    if "Protobuf" in told or "protobuf" in told:
+        return f"it is damaged or no ONNX file ({first}); copy or fetch it again"
+    return f"{runtime} refuses it ({first}); export it again with opset 17"
+
+
+def _runner(session: Any) -> Run:
+    def run(batch: Anything) -> tuple[Anything, ...]:
+        return tuple(session.run(list(OUTPUTS), {INPUT: batch}))
+
+    return run
+
+
+def _openvino_runner(model: bytes, threads: int) -> Run:
+    import openvino
+
+    core = openvino.Core()
+    wishes = {
+        "PERFORMANCE_HINT": "LATENCY", "INFERENCE_NUM_THREADS": threads,
+        "INFERENCE_PRECISION_HINT": _OPENVINO_PRECISION,
+    }
+    compiled = core.compile_model(core.read_model(model=model), "CPU", wishes)
+    request = compiled.create_infer_request()
+
+    def run(batch: Anything) -> tuple[Anything, ...]:
+        request.infer({INPUT: batch}, share_inputs=True)
+        return tuple(request.get_tensor(name).data.copy() for name in OUTPUTS)
+
+    return run
+
+
+def _input_size(session: Any, where: str, stride: int) -> tuple[int, int] | None:
+    """The (height, width) that the model is fixed to, or None; raises InputError where it breaks the contract."""
+    inputs = session.get_inputs()
+    outputs = {each.name for each in session.get_outputs()}
+    found = ", ".join(f"{each.name} {each.type} {each.shape}" for each in inputs)
+    needed = f"one input '{INPUT}', uint8 (1, 3, H, W), and outputs {', '.join(OUTPUTS)}; export the model again"
+    if len(inputs) != 1 or inputs[0].name != INPUT or inputs[0].type != "tensor(uint8)":
+        raise InputError(f"{where} takes {found}; needed is {needed}")
+    if missing := set(OUTPUTS) - outputs:
+        lacking, given = ", ".join(sorted(missing)), ", ".join(sorted(outputs))
+        raise InputError(f"{where} gives no {lacking}, but {given}; needed is {needed}")
+    shape = inputs[0].shape
+    if len(shape) != 4 or (isinstance(shape[0], int) and shape[0] != 1) or shape[1] != 3:
+        raise InputError(f"{where} takes {found}; needed is {needed}")
+    fixed = [isinstance(each, int) for each in shape[2:]]
+    if not any(fixed):
+        return None
+    if not all(fixed):
+        raise InputError(f"{where} takes {found}: height and width must be both free or both fixed; export it again")
+    if shape[2] % stride or shape[3] % stride:
+        raise InputError(f"{where} takes {found}, but its stride is {stride}; export it again")
+    return int(shape[2]), int(shape[3])

@@ -1,0 +1,147 @@
+"""The daylight model: people as NanoDet learnt them on COCO, and aerial candidates scored again by its features."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from sorvolo.training.boxes import at_most, suppress
+from sorvolo.training.faster_rcnn import FasterRCNN
+from sorvolo.training.heads import roi_means
+from sorvolo.training.nanodet import CocoDetector, NanoDetBackbone
+
+_SUPPORT_CELLS = 3  # a side, over a candidate's box
+
+
+@dataclass(frozen=True)
+class JudgeSettings:
+    """Which features of a candidate the judge reads: levels of NanoDet's backbone, around how much of the box."""
+
+    levels: tuple[int, ...] = (1, 2)  # strides 8 and 16
+    grown: tuple[float, ...] = (1.3, 2.0)  # the box and its surroundings, in sides of the box
+    cells: tuple[int, ...] = (4, 3)  # pooled to so many cells a side
+    width: int = 48
+
+
+class Judge(nn.Module):
+    """Scores a candidate again: from NanoDet's features in and around its box, its size, and the score that it had."""
+
+    def __init__(self, classes: int, settings: JudgeSettings = JudgeSettings()) -> None:
+        super().__init__()
+        self.settings, self.classes = settings, classes
+        channels = [NanoDetBackbone.channels[level] for level in settings.levels]
+        inputs = sum(each * cells**2 for each, cells in zip(channels, settings.cells))
+        self.look = nn.Linear(inputs, settings.width)
+        self.decide = nn.Sequential(nn.Linear(settings.width + classes + 1, 32), nn.ReLU(), nn.Linear(32, classes))
+
+    def pooled(self, levels: Sequence[Tensor], boxes: Tensor) -> Tensor:
+        """(R, inputs) one picture's features in and around boxes (R, 4) px."""
+        middle, half = (boxes[:, :2] + boxes[:, 2:]) / 2, (boxes[:, 2:] - boxes[:, :2]) / 2
+        parts = []
+        for level, grown, cells in zip(self.settings.levels, self.settings.grown, self.settings.cells):
+            around = torch.cat([middle - grown * half, middle + grown * half], 1)
+            parts.append(roi_means(levels[level], around, NanoDetBackbone.strides[level], cells).flatten(1))
+        return torch.cat(parts, 1)
+
+    def forward(self, pooled: Tensor, boxes: Tensor, scores: Tensor, labels: Tensor) -> Tensor:
+        """(R, classes) before the sigmoid; the candidates came with `scores` (R,) for the classes `labels` (R,)."""
+        known = odds_from_scores(scores).clamp(-6, 6)[:, None] * one_hot(labels, self.classes)
+        size = torch.log((boxes[:, 2:] - boxes[:, :2]).amax(1, keepdim=True).clamp(min=1.0) / 32)
+        answer: Tensor = self.decide(torch.cat([torch.relu(self.look(pooled)), known, size], 1))
+        return answer
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How an opinion in logits becomes a score: the sigmoid of `slope` times it, `support` times NanoDet's, `shift`."""
+
+    slope: float = 1.0
+    shift: float = 0.0
+    support: float = 0.0
+
+
+@dataclass(frozen=True)
+class DaylightSettings:
+    """The class that NanoDet finds too, and what is reported in the end."""
+
+    person: int = 0
+    most: int = 300
+    suppress_iou: float = 0.5
+    least_score: float = 0.02
+
+
+class Daylight(nn.Module):
+    """Two networks in one graph: NanoDet finds people, Faster R-CNN all classes, and NanoDet has a say in its scores.
+
+    A candidate of the aerial network for a person is supported by NanoDet's own score for people there; one of a
+    judged class is scored again by the judge, and the mean of both opinions counts.
+    """
+
+    stride = 32
+
+    def __init__(
+        self, aerial: FasterRCNN, coco: CocoDetector, judge: Judge, judged: Mapping[int, Calibration],
+        person: Calibration, aerial_person: Calibration = Calibration(),
+        settings: DaylightSettings = DaylightSettings(),
+    ) -> None:
+        """`coco` finds people alone. `judged`: classes whose aerial candidates the judge scores again."""
+        super().__init__()
+        self.aerial, self.coco, self.judge, self.settings = aerial, coco, judge, settings
+        self.judged, self.person, self.aerial_person = dict(judged), person, aerial_person
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """One picture (1, 3, H, W), RGB 0 to 255: boxes (K, 4) px, scores (K,), labels (K,), best first."""
+        levels = self.coco.backbone(images)
+        outputs = self.coco.head(levels)
+        people, people_scores, _ = self.coco.found(outputs, (images.shape[2], images.shape[3]))
+        people_scores = _calibrated(odds_from_scores(people_scores), self.person)
+        boxes, scores, labels = self.aerial(images)
+        scores = self._scored(levels, outputs, boxes, scores, labels)
+        boxes, scores = torch.cat([people, boxes]), torch.cat([people_scores, scores])
+        labels = torch.cat([torch.full_like(people_scores, self.settings.person).to(labels.dtype), labels])
+        by_class = (scores[:, None] * one_hot(labels, self.judge.classes)).T
+        reach = self.settings
+        kept = suppress(boxes, by_class.contiguous(), reach.most, reach.suppress_iou, reach.least_score)
+        rows = kept[:, 1]
+        best, order = torch.topk(scores[rows], at_most(reach.most, scores[rows]))
+        return boxes[rows][order], best, kept[:, 0][order]
+
+    def _scored(
+        self, levels: Sequence[Tensor], outputs: Sequence[Tensor], boxes: Tensor, scores: Tensor, labels: Tensor
+    ) -> Tensor:
+        """(R,) the aerial candidates' scores, those of people and of judged classes with NanoDet's say."""
+        own = odds_from_scores(scores)
+        answers = self.judge(self.judge.pooled(levels, boxes), boxes, scores, labels)
+        said = support(outputs, self.coco.head.strides, boxes, self.coco.coco_of_class[0][0])
+        person = _calibrated(own, self.aerial_person, said)
+        out = torch.where(labels == self.settings.person, person, scores)
+        for label, calibration in self.judged.items():
+            out = torch.where(labels == label, _calibrated((own + answers[:, label]) / 2, calibration), out)
+        return out
+
+
+def support(outputs: Sequence[Tensor], strides: Sequence[int], boxes: Tensor, row: int) -> Tensor:
+    """(R,) NanoDet's highest score for the COCO class `row` in each box (R, 4) px, before the sigmoid."""
+    best = [
+        roi_means(output[:, row : row + 1], boxes, stride, _SUPPORT_CELLS).flatten(1).amax(1)
+        for output, stride in zip(outputs, strides)
+    ]
+    return torch.stack(best).amax(0)
+
+
+def _calibrated(opinion: Tensor, how: Calibration, said: Tensor | None = None) -> Tensor:
+    logits = how.slope * opinion + how.shift
+    return torch.sigmoid(logits if said is None else logits + how.support * said)
+
+
+def odds_from_scores(scores: Tensor) -> Tensor:
+    """The logarithm of the odds of scores 0 to 1, within -9 and 9."""
+    inside = scores.clamp(1e-4, 1 - 1e-4)
+    return torch.log(inside / (1 - inside))
+
+
+def one_hot(labels: Tensor, classes: int) -> Tensor:
+    """(N, classes) float: one at each row's label."""
+    numbers = torch.tensor(list(range(classes)), device=labels.device)
+    return (labels[:, None] == numbers).to(torch.float32)
