@@ -117,7 +117,7 @@ def test_the_datasets_order_when_the_file_names_it(read):
     order = "<distortion_order>k1 k2 k3 p1 p2</distortion_order>"
     model = read(xml(distortion="-0.2 0.1 -0.03 0.001 -0.002", extra=order))
     assert_same(model.camera, CAMERA)
-    assert "the file says so" in model.origin
+    assert "as the file states" in model.origin
 
 
 def test_the_datasets_order_is_seen_from_the_numbers(read):
@@ -148,7 +148,7 @@ def test_more_coefficients_are_fine_if_they_are_zero(read):
     assert_same(read(xml(distortion="-0.2 0.1 0.001 -0.002 -0.03 0 0 0")).camera, CAMERA)
 
 
-def test_another_size_of_the_same_shape_is_resized_and_told(read):
+def test_another_size_of_the_same_shape_is_resized_and_named(read):
     model = read(xml(), 1280, 720)
     assert_same(model.camera, CAMERA.resized(1280, 720))
     assert "resized from 1920x1080" in model.origin

@@ -147,7 +147,7 @@ def test_subtitles_count_from_the_first_frame():
 
 
 @pytest.mark.parametrize("hours", [1, 2, -9, 14])
-def test_clocks_some_hours_apart_are_tied_by_their_starts_and_told(hours):
+def test_clocks_some_hours_apart_are_tied_by_their_starts_and_reported(hours):
     clock = tied(straight(ONE_HZ), START_NS + hours * 3600 * 10**9)
     assert clock.sample_s[0] == 0.0
     assert [each.code for each in clock.notices] == ["clocks_apart"]

@@ -127,7 +127,7 @@ def test_units_of_the_header_are_converted(old, new, factor, column, expected):
     assert telemetry.time_ns[1] == pytest.approx(SECOND_NS / 10, abs=1000)
 
 
-def test_an_unknown_unit_is_told_and_not_guessed():
+def test_an_unknown_unit_is_reported_and_not_guessed():
     telemetry = flight_table.read(table().replace("relativeHeight", "relativeHeight(furlongs)").encode(), "a.csv")
     assert "unknown_unit" in codes(telemetry)
     assert "furlongs" in next(notice.text for notice in telemetry.notices if notice.code == "unknown_unit")
@@ -153,14 +153,14 @@ def test_the_quaternion_stands_in_for_missing_angles(yaw, pitch, roll):
     assert telemetry["body_roll_deg"][0] == pytest.approx(roll, abs=1e-5)
 
 
-@pytest.mark.parametrize("missing, rate_is_told", [
+@pytest.mark.parametrize("missing, rate_is_reported", [
     ((), False), (("offsetTime",), False), (("offsetTime", "flightTime(msec)"), False),
     (("offsetTime", "flightTime(msec)", "Tick#"), True),
 ])
-def test_each_column_of_time_stands_in_for_the_next(missing, rate_is_told):
+def test_each_column_of_time_stands_in_for_the_next(missing, rate_is_reported):
     telemetry = flight_table.read(table(tuple(name for name in COLUMNS if name not in missing)).encode(), "a.csv")
     assert_is_the_flight(telemetry)
-    assert ("assumed_rate" in codes(telemetry)) is rate_is_told
+    assert ("assumed_rate" in codes(telemetry)) is rate_is_reported
 
 
 @pytest.mark.parametrize("ticks_hz", [600, 4_500_000])
@@ -284,7 +284,7 @@ def test_a_column_of_dates_gives_utc():
         assert "no_date" not in codes(telemetry) and "time_zone_unknown" not in codes(telemetry), name
 
 
-def test_a_date_without_its_zone_is_told():
+def test_a_date_without_its_zone_is_reported():
     lines = table(count=3).splitlines()
     rows = [f"{line},2016-05-04 10:00:00.{i}" for i, line in enumerate(lines[1:])]
     text = "\n".join([f"{lines[0]},dateTime", *rows])

@@ -46,7 +46,7 @@ Rings: TypeAlias = tuple[Floats, ...]
 
 
 def read_area(path: Path) -> Area:
-    """The area of interest in a file, told apart by its content.
+    """The area of interest in a file, recognised by its content.
 
     Raises InputError for a file that is missing, empty, of another kind, without polygon or path, or whose
     coordinates are off the Earth, cross themselves or are not WGS84 longitude and latitude.
@@ -134,7 +134,7 @@ def _lonlat(path: Path, positions: Sequence[Any]) -> Floats:
 
 
 def _checked(path: Path, lonlat: Floats, order: str) -> Floats:
-    """The points if they lie on the Earth; else an InputError that says what may be the matter."""
+    """The points if they lie on the Earth; else an InputError with the likely cause."""
     bad = ~(np.isfinite(lonlat).all(axis=1) & (np.abs(lonlat[:, 0]) <= 360) & (np.abs(lonlat[:, 1]) <= 90))
     if not bad.any():
         return lonlat
@@ -188,8 +188,8 @@ def _polygons_or_corridors(path: Path, polygons: list[Rings], lines: list[Floats
 def _from_text(path: Path, text: str) -> list[Rings]:
     """Lists of "latitude, longitude" lines, the thesis's order; a blank line starts another area.
 
-    What follows a # is a comment. A first line with names (lat, latitude, lon, longitude ...) says which
-    columns count.
+    What follows a # is a comment. A first line with names (lat, latitude, lon, longitude ...) names the
+    columns.
     """
     lines = [line.split("#")[0].strip() for line in text.splitlines()]
     columns = (0, 1)

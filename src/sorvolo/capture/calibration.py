@@ -1,6 +1,6 @@
-"""Which camera took the pictures: calibration files, presets, EXIF, or a guess that says so.
+"""Which camera took the pictures: calibration files, presets, EXIF, or a guess, named as one.
 
-A guess is never hidden: `CameraModel.origin` tells in words where the numbers come from and how to do better.
+A guess is never hidden: `CameraModel.origin` states where the numbers come from and how to do better.
 """
 
 import math
@@ -30,7 +30,7 @@ def read_camera(path: Path, width_px: int, height_px: int) -> CameraModel:
 
     Reads OpenCV's XML, YAML and JSON (the UMCD dataset's too), ROS camera_info YAML, and plain JSON with
     the fields of `Camera`. The order of five bare distortion coefficients differs: OpenCV writes k1 k2 p1
-    p2 k3, the dataset k1 k2 k3 p1 p2 (thesis section 2.3); `origin` says which was read and why. Raises
+    p2 k3, the dataset k1 k2 k3 p1 p2 (thesis section 2.3); `origin` states which was read and why. Raises
     InputError for a file that cannot be read, a broken matrix, a lens model with more coefficients, or
     another image shape.
     """

@@ -26,7 +26,7 @@ _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?\.?(?:inf|
 
 
 def read_nodes(path: Path) -> Mapping[str, Node]:
-    """The nodes of a camera file, told apart by its first character.
+    """The nodes of a camera file, recognised by its first character.
 
     Raises InputError for a file that is missing, empty, far too large, or no XML, YAML or JSON.
     """

@@ -74,7 +74,7 @@ CAMERA_PRESETS = (
     CameraPreset("Parrot ANAFI", ("Anafi", "AnafiUSA", "AnafiThermal"), 5.985, 4.498, 4.0, 5344, 4016, 0.05),
     CameraPreset("GoPro HERO4", ("HERO4 Black", "HERO4 Silver"), 6.17, 4.63, 2.92, 4000, 3000, 0.1),
     CameraPreset("GoPro HERO5", ("HERO5 Black", "HERO6 Black"), 6.17, 4.63, 2.92, 4000, 3000, 0.1),
-    # multispectral and thermal, beside the colour camera of the same name: the focal length in EXIF tells them apart
+    # multispectral and thermal, beside the colour camera of the same name: the focal length in EXIF distinguishes them
     CameraPreset("Mavic 3M multispectral", ("M3M",), 5.133, 3.874, 4.34, 2592, 1944, 0.03),
     CameraPreset("Mavic 3T thermal", ("M3T", "M3TD"), 7.68, 6.144, 9.1, 640, 512, 0.04),
     CameraPreset("Matrice 30T thermal", ("M30T",), 7.68, 6.144, 9.1, 640, 512, 0.04),

@@ -22,7 +22,7 @@ _SEARCH_PX = 1600
 """Longer side of the picture in which the board is searched; its corners are then refined at full size."""
 
 _SAME_VIEW = 0.03
-"""Views whose corners differ less, in parts of the picture's diagonal, tell the same."""
+"""Views whose corners differ less, in parts of the picture's diagonal, add nothing."""
 
 _ADVICE = (
     "take 15-30 sharp pictures with the board near and far, in every part of the picture, and tilted "
@@ -119,7 +119,7 @@ def select_views(views: Sequence[BoardView], width_px: int, height_px: int) -> l
 
 
 def calibrate(views: Sequence[BoardView], board: Board, width_px: int, height_px: int) -> Calibration:
-    """The camera that explains the views, or an InputError that says what is missing.
+    """The camera that explains the views, or an InputError that names what is missing.
 
     Refused are fewer than 8 views that differ, boards that leave most of the picture empty, boards without a
     variety of tilts (the focal length is then not determined), and a fit that is bad or uncertain.

@@ -1,4 +1,4 @@
-"""The outer structure of video files: what tells a cut file from a whole one."""
+"""The outer structure of video files: how a cut file is recognised."""
 
 from pathlib import Path
 from typing import BinaryIO
@@ -47,7 +47,7 @@ def top_boxes(path: Path) -> dict[str, int]:
 
 
 def _matroska_end(path: Path) -> int:
-    """Where the first Matroska segment says it ends, bytes; 0 if it does not say."""
+    """Where the first Matroska segment ends by its own header, bytes; 0 if unknown."""
     with path.open("rb") as file:
         for _ in range(2):  # the EBML header, then the segment
             identity = file.read(4)

@@ -29,8 +29,8 @@ _LARGELY = 0.5  # share of samples that have a height: then it is the one that t
 
 @dataclass(frozen=True)
 class TelemetryWishes:
-    """What a person says of a flight's telemetry: seconds to add to the video's time (None: not said), the ground's
-    height in telemetry's own reference (None: not said), whether the file was named by hand."""
+    """The user's options for a flight's telemetry: seconds to add to the video's time (None: not given), the ground's
+    height in telemetry's own reference (None: not given), whether the file was named by hand."""
 
     offset_s: float | None = None
     ground_elevation_m: float | None = None

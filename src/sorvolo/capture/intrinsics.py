@@ -34,7 +34,7 @@ _LARGEST_TANGENTIAL = 0.02
 
 _CALIBRATED_SIGMA = 0.003
 _RESIZED_SIGMA = 0.01
-"""A video mode may use a part of the sensor of the same shape, which no file tells."""
+"""A video mode may use a part of the sensor of the same shape, which no file states."""
 
 
 def camera_from_nodes(
@@ -42,7 +42,7 @@ def camera_from_nodes(
 ) -> CameraModel:
     """The camera for frames of this size. Raises InputError, naming the file, for what describes none.
 
-    A calibration of another size serves when the shape is the same; `origin` says so.
+    A calibration of another size serves when the shape is the same; `origin` states it.
     """
     _refuse_other_lens_models(file_name, nodes)
     matrix = _matrix(file_name, nodes)
@@ -143,7 +143,7 @@ def _order(file_name: str, nodes: Mapping[str, Node], numbers: Floats) -> tuple[
             raise InputError(
                 f"{file_name}: distortion_order {stated!r} does not name its {len(numbers)} coefficients"
             )
-        return order, "the file says so"
+        return order, "as the file states"
     if len(numbers) == 4:
         return OPENCV_ORDER[:4], "OpenCV's order"
     third, _, fifth = np.abs(numbers[2:])

@@ -1,4 +1,4 @@
-"""What a photo says of itself: size, camera, time, place and attitude from its EXIF and XMP."""
+"""A photo's metadata: size, camera, time, place and attitude from its EXIF and XMP."""
 
 import re
 import warnings
@@ -36,7 +36,7 @@ _M_S_PER_SPEED_UNIT = {"K": 1 / 3.6, "M": 0.44704, "N": 1852 / 3600}
 
 @dataclass(frozen=True)
 class PhotoMetadata:
-    """One photo's own words. Numbers are NaN, texts empty and times 0 where it says nothing.
+    """One photo's metadata. Numbers are NaN, texts empty and times 0 where it states none.
 
     `width_px` and `height_px` are as stored, before EXIF `orientation` (1-8) is applied. `utc_ns` is known to
     be UTC; `local_ns` is the camera's clock, read as though it showed UTC. `full_width_px` is

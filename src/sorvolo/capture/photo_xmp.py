@@ -179,7 +179,7 @@ def _qualified(tag: object, makers: Mapping[str, str]) -> tuple[str, str]:
 
 
 def _states_ellipsoid(properties: Mapping[str, str]) -> bool:
-    """Whether XMP says that EXIF's altitude is counted from the ellipsoid."""
+    """Whether XMP states that EXIF's altitude is counted from the ellipsoid."""
     if "ellips" in properties.get("camera:VertCS", "").lower():
         return True
     if properties.get("dji:AltitudeType", "").lower() == "rtkalt":

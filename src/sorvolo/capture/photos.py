@@ -30,7 +30,7 @@ _EDGE_BYTES = 65_536
 
 @dataclass(frozen=True)
 class Photo:
-    """One photo in its flight's order. `problem` says why it cannot be used, if known without decoding."""
+    """One photo in its flight's order. `problem` is why it cannot be used, if known without decoding."""
 
     path: Path
     time_ns: int
@@ -165,7 +165,7 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
 
 
 def _put_in_time(photos: Sequence[Photo]) -> tuple[list[Photo], str, list[Notice]]:
-    """Sort photos, given by name, by strictly increasing times; and say where the times come from."""
+    """Sort photos, given by name, by strictly increasing times; and name where the times come from."""
     times_ns, origin, notices = _best_times(photos)
     known = [time_ns for time_ns in times_ns if time_ns]
     if known:

@@ -23,7 +23,7 @@ def read_small_file(path: Path, kind: str, most_bytes: int) -> bytes:
 def text_of(path: Path, raw: bytes, kind: str, needed: str) -> str:
     """Their UTF-8 text without blanks around it.
 
-    Raises InputError for bytes that are no text, and for none at all, saying what is `needed`.
+    Raises InputError for bytes that are no text, and for none at all, naming what is `needed`.
     """
     try:
         text = raw.decode("utf-8-sig").strip()

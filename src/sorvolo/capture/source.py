@@ -81,7 +81,7 @@ class Source(Protocol):
 
     @property
     def start_ns(self) -> int:
-        """UTC of the first frame as the input says; 0 if unknown."""
+        """UTC of the first frame as the input states it; 0 if unknown."""
 
     @property
     def start_origin(self) -> str:
@@ -106,12 +106,12 @@ def open_sources(
     """Each video, each folder of photos, all photos given one by one together, and each live source, as a flight.
 
     Live sources are addresses (rtsp://, rtmp://, udp://, tcp:// ...), `webcam:0`, and `follow:PATH` for a video or a
-    folder of photos that is being written; they are read from now on, as `live` says, until they end or `until` is
-    set. `telemetry` belongs to the only flight; without it, a video's is looked for inside and beside it, and photos'
-    is in them; beside a live source it is a link to a receiver (serial:, tcp://, udp://, follow:LOG). `camera` is a
-    calibration file or what else `--camera` takes (capture.calibration). `known` are the site's flights, name to
-    fingerprint: another flight of the same name (cards are numbered anew) gets a name of its own. `better_camera` gives
-    the camera to use instead of the one that the input or `camera` tells.
+    folder of photos that is being written; they are read from now on, with the settings `live`, until they end or
+    `until` is set. `telemetry` belongs to the only flight. Without it, a video's is looked for inside and beside it;
+    photos' is in them; beside a live source it is a link to a receiver (serial:, tcp://, udp://, follow:LOG). `camera`
+    is a calibration file or what else `--camera` takes (capture.calibration). `known` are the site's flights, name to
+    fingerprint: another flight of the same name (cards are numbered anew) gets a name of its own. `better_camera`
+    gives the camera to use instead of the one of the input or of `camera`.
     Raises InputError for what cannot be read, naming the file and what to do.
     """
     if not inputs:
@@ -249,9 +249,9 @@ def _open_video(path: Path, name: str, telemetry: Path | None, camera: Path | st
     info = _video_info(path)
     inside = _metadata_inside(path, info.container)
     found, notices = _video_telemetry(path, telemetry, inside)
-    told = None if inside is None or inside.lens is None else camera_of(inside.lens, info.width_px, info.height_px)
+    stated = None if inside is None or inside.lens is None else camera_of(inside.lens, info.width_px, info.height_px)
     if camera is None:
-        model = told or _video_camera(info)
+        model = stated or _video_camera(info)
     else:
         model = camera_from_option(str(camera), info.width_px, info.height_px)
     source = VideoSource(name, _fingerprint(path), info, model, found, notices)

@@ -1,4 +1,4 @@
-"""Frames and telemetry on one clock: how they are tied, what telemetry says at a frame, which offset motion shows."""
+"""Frames and telemetry on one clock: the tie, telemetry at a frame's time, the offset that motion shows."""
 
 from dataclasses import dataclass, field, replace
 
@@ -73,7 +73,7 @@ def tie_clocks(
     Photos carry UTC themselves. A video's subtitles count from its first frame. Else UTC decides when the video
     knows its own start and it lies in the telemetry, and the first sample is tied to the first frame when not.
     `strict`: telemetry that the user named; raises InputError when it is plainly of another flight (more than a
-    day apart) and no `--offset` says otherwise.
+    day apart) and no `--offset` is given.
     """
     utc_s = (telemetry.time_ns - telemetry.time_ns[:1]) / 1e9
     first_ns = int(telemetry.time_ns[0])
@@ -97,7 +97,7 @@ def tie_clocks(
             )
         words = f"the video's clock and the telemetry's are {apart_s / 3600:.1f} h apart: their starts were tied"
         return Clock(utc_s, "first sample tied to first frame", 3.0, first_ns, (Notice("clocks_apart", 1, words),))
-    # a log without a date is stamped from 1970: then the video's own start tells when it was
+    # a log without a date is stamped from 1970: then the video's own start dates it
     return Clock(utc_s, "first sample tied to first frame", 3.0, start_ns if first_ns < DATED_NS else first_ns)
 
 
@@ -130,7 +130,9 @@ class Track:
         return self.height_words.startswith("above take-off")
 
     def prior(self, time_s: float, *, smooth_s: float = 0.0) -> CameraPrior:
-        """What telemetry says at `time_s` on the frames' clock (eq. 3.18: linear between fixes).
+        """The camera's position and attitude from telemetry at `time_s` on the frames' clock.
+
+        Between fixes it is linear (eq. 3.18).
 
         `smooth_s`: fixes within this time to both sides are averaged by a straight line, which uses every one of a
         fast receiver's fixes. Beyond a gap or the ends by more than the receiver's interval, nothing is known.

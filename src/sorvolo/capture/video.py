@@ -14,7 +14,7 @@ from sorvolo.capture.decoding import is_heif
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.telemetry.quality import notice
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Anything, ImageRGB
+from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
 
 PIXEL_LIMIT = 64_000_000
@@ -24,7 +24,7 @@ VIDEO_SUFFIXES = frozenset({
     ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg", ".avi", ".wmv", ".flv",
     ".3gp", ".h264", ".264", ".h265", ".265", ".hevc", ".lrv", ".insv", ".ogv",
 })
-"""How videos are told from other files in a folder; a file given by name may have any name."""
+"""How videos in a folder are recognised; a file given by name may have any name."""
 
 _SECOND_NS = 1_000_000_000
 _FALLBACK_RATE_HZ = 25.0
@@ -35,11 +35,11 @@ _DEMUX_RETRIES = 20
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What a video's header and first frame say. Sizes are those of the frames as delivered, upright.
+    """A video's properties by its header and first frame. Sizes are those of the frames as delivered, upright.
 
     `turn` is (transpose, flip left-right, flip up-down), applied in that order to decoded frames;
     `pixel_aspect` the width of a pixel over its height, as delivered; `frame_count` and `duration_s` are
-    estimates, 0 where nothing is known; `is_cut` tells that the file ends before its own header says.
+    estimates, 0 where nothing is known; `is_cut`: the file ends before its header's own length.
     """
 
     path: Path
@@ -93,7 +93,7 @@ class VideoSource:
         last_ns = 0
         for index, decoded in enumerate(_decoded_frames(self.info.path, damage)):
             last_ns = clock.time_ns(decoded)
-            self._found = self._told(self.info.is_cut, damage, sizes, clock)
+            self._found = self._damage_notices(self.info.is_cut, damage, sizes, clock)
             time_ns = self.start_ns + last_ns
             if not wanted(index, time_ns):
                 continue
@@ -112,9 +112,9 @@ class VideoSource:
             yield Frame(index, str(index), time_ns, image)
         missing_s = self.info.duration_s - last_ns / _SECOND_NS
         is_cut = self.info.is_cut or missing_s > max(1.0, 0.05 * self.info.duration_s)
-        self._found = self._told(is_cut, damage, sizes, clock)
+        self._found = self._damage_notices(is_cut, damage, sizes, clock)
 
-    def _told(self, is_cut: bool, damage: "_Damage", sizes: "_Sizes", clock: "_Clock") -> tuple[Notice, ...]:
+    def _damage_notices(self, is_cut: bool, damage: "_Damage", sizes: "_Sizes", clock: "_Clock") -> tuple[Notice, ...]:
         cut = _cut_notice(is_cut or damage.stopped)
         return (*cut, *damage.notices(), *sizes.notices(), *clock.notices())
 
@@ -123,7 +123,9 @@ class VideoSource:
         width_px, height_px = self.info.width_px, self.info.height_px
         if self.info.turn[0]:
             width_px, height_px = height_px, width_px
-        return upright(decoded.to_ndarray(format="rgb24", width=width_px, height=height_px), self.info.turn)
+        return upright(
+            np.asarray(decoded.to_ndarray(format="rgb24", width=width_px, height=height_px), np.uint8), self.info.turn
+        )
 
     def glimpses(self, count: int) -> list[Frame]:
         """A few frames spread over the video, found by seeking: quick, but their times are rough."""
@@ -142,7 +144,7 @@ class VideoSource:
                         continue
                     image = self._image(decoded)
                 except (av.FFmpegError, StopIteration, ValueError, OverflowError, MemoryError):
-                    continue  # a glimpse at a damaged place tells nothing; `frames` counts the damage
+                    continue  # a glimpse at a damaged place is of no use; `frames` counts the damage
                 time_s = max(0.0, decoded.time - first_s) if decoded.time is not None else 0.0
                 index = round(time_s * self.info.frame_rate_hz)
                 found.append(Frame(index, str(index), self.start_ns + round(time_s * _SECOND_NS), image))
@@ -191,8 +193,8 @@ def read_video_info(path: Path) -> VideoInfo:
     )
 
 
-def upright(image: Anything, turn: tuple[bool, bool, bool]) -> ImageRGB:
-    """The picture, (height, width, channels), transposed and flipped as `VideoInfo.turn` says."""
+def upright(image: ImageRGB, turn: tuple[bool, bool, bool]) -> ImageRGB:
+    """The picture, (height, width, channels), transposed and flipped by `VideoInfo.turn`."""
     transpose, left_right, up_down = turn
     if transpose:
         image = image.transpose(1, 0, 2)
@@ -362,7 +364,7 @@ def _video_stream(container: av.container.InputContainer, path: Path) -> av.Vide
     if not streams:
         kinds = ", ".join(sorted({stream.type for stream in container.streams})) or "nothing"
         raise InputError(f"{path.name} has no video in it, only {kinds}; give the drone's video file")
-    # PyAV's type does not say that an unknown codec leaves no context
+    # PyAV's type does not state that an unknown codec leaves no context
     if cast(object, streams[0].codec_context) is None:
         raise InputError(f"{path.name}: the video's codec is unknown to FFmpeg, or its header is damaged")
     return streams[0]
@@ -391,7 +393,7 @@ def _start_of(metadata: dict[str, str]) -> tuple[int, str]:
             since = zoned - datetime(1970, 1, 1, tzinfo=UTC)
             origin = f"{key} in the video (some cameras write local time there)"
             return since // timedelta(microseconds=1) * 1000, origin
-    return 0, "unknown: the video does not say when it was recorded"
+    return 0, "unknown: the video does not state when it was recorded"
 
 
 def _first_of(metadata: dict[str, str], *keys: str) -> str:
@@ -399,4 +401,4 @@ def _first_of(metadata: dict[str, str], *keys: str) -> str:
 
 
 def _cut_notice(is_cut: bool) -> list[Notice]:
-    return notice("truncated", int(is_cut), "the video is cut: it ends before its own header says")
+    return notice("truncated", int(is_cut), "the video is cut: it is shorter than its header states")

@@ -14,7 +14,7 @@ from sorvolo.detection.confined import confined_engine, described_confined
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.engine import Engine, Provider, describe, open_engine
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, ImageRGB, TimesNs
+from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, ImageRGB, Labels
 
 PACKAGED = Path(__file__).parent / "data"
 """The folder of the models that come with the package; all others run in a process of their own."""
@@ -29,7 +29,7 @@ class Seen:
 
     boxes_px: BoxesPx
     scores: Floats
-    labels: TimesNs
+    labels: Labels
 
 
 class Session:

@@ -1,4 +1,4 @@
-"""The array aliases: what shape, order and unit an array has when its annotation says so."""
+"""The array aliases: what shape, order and unit an annotated array has."""
 
 from typing import Any, TypeAlias
 
@@ -12,7 +12,7 @@ PointsPx: TypeAlias = NDArray[np.float64]
 """(N, 2) image or grid points, x right then y down, px; (0, 0) is the centre of the top-left pixel."""
 
 PointsM: TypeAlias = NDArray[np.float64]
-"""(N, 2) or (N, 3) metric points: east, north(, up) in the site frame unless the name says otherwise."""
+"""(N, 2) or (N, 3) metric points: east, north(, up) in the site frame unless the name states another."""
 
 Matrix3: TypeAlias = NDArray[np.float64]
 """(3, 3) matrix."""
@@ -41,6 +41,18 @@ picture is (0, 0, width, height). An edge minus one half is an image point (Poin
 
 TimesNs: TypeAlias = NDArray[np.int64]
 """(N,) UTC time in nanoseconds since 1970-01-01."""
+
+Numbers: TypeAlias = NDArray[np.float32] | NDArray[np.float64] | NDArray[np.integer[Any]]
+"""An array of any real numbers; the docstring gives its shape."""
+
+Rows: TypeAlias = NDArray[np.integer[Any]]
+"""(N,) indices of rows."""
+
+Descriptors: TypeAlias = NDArray[np.uint8] | NDArray[np.float32]
+"""(N, B) features: B bytes each (ORB, A-KAZE), or B float32 (SIFT, learned ones)."""
+
+Labels: TypeAlias = NDArray[np.integer[Any]]
+"""(N,) or (height, width) class or region numbers."""
 
 Anything: TypeAlias = NDArray[Any]
 """An array of any type."""

@@ -1,7 +1,7 @@
 """How high, how fast and along which strips to fly: Johnson's criteria, overlap, the lawnmower over an area.
 
 Everything is computed from the focal length in pixels, f / k in the thesis's letters: eqs 3.7-3.9 hold the
-sensor's size and its pixel's only in that ratio. `docs/errata.md` says where the thesis's numbers differ.
+sensor's size and its pixel's only in that ratio. `docs/errata.md` lists where the thesis's numbers differ.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What a track over ground tells of its flight: the speed, the length and the parallel strips."""
+"""A flight's measures from its track over ground: the speed, the length and the parallel strips."""
 
 from dataclasses import dataclass
 from itertools import groupby

@@ -102,7 +102,7 @@ def _open_ring(ring: Floats) -> Floats:
         worst = lonlat[np.argmax(np.abs(lonlat[:, column])), column] if len(lonlat) else 0.0
         if abs(worst) > limit_deg:
             raise GeometryError(f"{name} {worst} lies outside [-{limit_deg}, {limit_deg}] deg")
-    # repeated corners say nothing and would look like edges without a direction
+    # repeated corners add nothing and would look like edges without a direction
     distinct = lonlat[(lonlat != np.roll(lonlat, 1, axis=0)).any(axis=1)]
     if len(distinct) < 3:
         raise GeometryError(f"a ring needs at least 3 different points, got {len(distinct)}")

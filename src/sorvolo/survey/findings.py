@@ -42,7 +42,7 @@ class ChangeKind(StrEnum):
 
 
 class Verdict(StrEnum):
-    """What a person said of a change."""
+    """A person's verdict on a change."""
 
     CONFIRMED = "confirmed"
     REJECTED = "rejected"
@@ -140,7 +140,7 @@ class Change:
     velocity_m_s: Floats = field(default_factory=lambda: np.zeros(2))
     class_before: str = ""
     class_after: str = ""
-    announced_ns: int = -1  # when it was told; -1: only after the last frame
+    announced_ns: int = -1  # when it was announced; -1: only after the last frame
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "outline_m", frozen(self.outline_m))

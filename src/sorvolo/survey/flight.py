@@ -1,4 +1,4 @@
-"""What a flight brings home: telemetry, frames, and what telemetry says of each frame's camera."""
+"""A flight's data: telemetry, frames, and each frame's camera as telemetry has it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ TELEMETRY_COLUMNS = (
     "tilt_sigma_deg", "heading_sigma_deg",
     "course_deg", "speed_m_s",
 )
-"""Every number a telemetry sample can carry. NaN means that the source does not say.
+"""Every number a telemetry sample can carry. NaN means that the source does not state it.
 
 The three heights are different things and are never converted silently: above the WGS84 ellipsoid, above mean sea
 level (a geoid), above the take-off point. Camera angles are a gimbal's, against north and the horizon (pitch -90 looks
@@ -39,7 +39,7 @@ class Notice:
 
 @dataclass(frozen=True, eq=False)
 class Telemetry:
-    """Samples of one flight in order of time, as columns of equal length; NaN where the source says nothing.
+    """Samples of one flight in order of time, as columns of equal length; NaN where the source states nothing.
 
     `time_ns` is UTC and strictly increasing. `video_time_ns`, where the source is tied to a video (subtitles), is
     the sample's time since the video's first frame; -1 where unknown. `format` is the reader's name.
@@ -122,11 +122,11 @@ class LostFrame:
 
 @dataclass(frozen=True, eq=False)
 class CameraPrior:
-    """What telemetry says of one frame's camera, in the site frame; what it does not say has an infinite sigma.
+    """One frame's camera by telemetry, in the site frame; what telemetry does not state has an infinite sigma.
 
     `position_m` (east, north, up above the site's ground plane); `rotation` is site_from_camera;
     `attitude_sigma_deg` is about the camera's own x, y (tilt) and z (heading) axes.
-    `velocity_m_s` is the aircraft's over ground, zero where unknown; `source` says in words what was used.
+    `velocity_m_s` is the aircraft's over ground, zero where unknown; `source` names what was used.
     """
 
     position_m: Vector3
@@ -150,7 +150,7 @@ class CameraPrior:
 
 @dataclass(frozen=True, eq=False)
 class PosedFrame:
-    """A frame with what telemetry says of its camera."""
+    """A frame with its camera by telemetry."""
 
     frame: Frame
     prior: CameraPrior
@@ -162,7 +162,7 @@ class Site:
 
     The site's up = 0 is its ground; `origin.height_m` is the ellipsoidal height of that ground where it is known,
     else 0 (`docs/frames.md`). `is_local` marks a site without geo-reference, in a frame without metres.
-    `height_reference` says what `origin.height_m` is counted from: "ellipsoidal", "orthometric" (mean sea level),
+    `height_reference` names what `origin.height_m` is counted from: "ellipsoidal", "orthometric" (mean sea level),
     "above take-off" or "above ground".
     """
 

@@ -1,4 +1,4 @@
-"""Labelled pictures: what people, or a simulation, say is in them; training and evaluation read these."""
+"""Labelled pictures: their objects as people, or a simulation, mark them; training and evaluation read these."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

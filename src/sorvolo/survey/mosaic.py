@@ -7,7 +7,7 @@ import numpy as np
 
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import (
-    Anything,
+    Descriptors,
     Floats,
     ImageGray,
     ImageRGBA,
@@ -28,7 +28,7 @@ class Features:
 
     kind: str
     points_px: PointsPx
-    descriptors: Anything
+    descriptors: Descriptors
 
     def __post_init__(self) -> None:
         if len(self.points_px) != len(self.descriptors):

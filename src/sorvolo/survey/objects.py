@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, TimesNs, frozen
+from sorvolo.geometry.arrays import BoxesPx, Floats, Labels, Mask, Rows, TimesNs, frozen
 
 CLASSES = ("person", "car", "small object")
-"""What Sorvolo's own models tell apart, in the order of their labels; other models bring their own names."""
+"""The classes of Sorvolo's own models, in the order of their labels; other models bring their own names."""
 
 TYPICAL_SIZE_M = {"person": (0.6, 0.5, 1.7), "car": (4.4, 1.8, 1.5), "small object": (0.6, 0.45, 0.35)}
 """Length, width and height of a class's usual member; how high the middle of a box lies above the ground."""
@@ -24,7 +24,7 @@ class Detections:
 
     boxes_px: BoxesPx
     scores: Floats
-    labels: TimesNs
+    labels: Labels
     classes: tuple[str, ...]
 
     def __post_init__(self) -> None:
@@ -46,7 +46,7 @@ class Detections:
         """Each row's class by name."""
         return [self.classes[label] for label in self.labels]
 
-    def only(self, keep: Anything | Sequence[int]) -> "Detections":
+    def only(self, keep: Mask | Rows | Sequence[int]) -> "Detections":
         """The rows that a mask or indices keep."""
         index = np.asarray(keep)
         return Detections(self.boxes_px[index], self.scores[index], self.labels[index], self.classes)

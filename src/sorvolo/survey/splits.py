@@ -1,4 +1,4 @@
-"""Labelled pictures divided into parts that share no video, so that a score on one part says what others will get."""
+"""Labelled pictures divided into parts that share no video, so that a score on one part holds for new videos."""
 
 import re
 from collections import Counter
@@ -30,7 +30,7 @@ def split_by_group(labelled: LabelledSet, shares: Mapping[str, float], seed: int
     if len(sizes) < len(shares):
         raise InputError(
             f"{labelled.name}: {len(sizes)} videos cannot make {len(shares)} parts that share none; take fewer parts, "
-            "say how videos are told apart, or split by blocks of consecutive frames"
+            "name how videos are distinguished, or split by blocks of consecutive frames"
         )
     part_of = _assigned(sizes, shares, seed)
     return {
@@ -45,7 +45,7 @@ def split_by_blocks(
 
     Frame numbers are the last ones in the pictures' names. Where all of a set differ they are one sequence, else each
     group is one. Where two parts meet, pictures whose numbers are within `gap` of the other part's are near-duplicates:
-    the part with the larger share drops them and says how many. Raises SettingsError for impossible shares, InputError
+    the part with the larger share drops them and counts them. Raises SettingsError for impossible shares, InputError
     when names have no number or there are fewer blocks than parts.
     """
     _demand_shares(shares)
@@ -89,7 +89,7 @@ def shared_groups(first: LabelledSet, second: LabelledSet) -> tuple[Notice, ...]
 
 
 def frame_number(path: str) -> int | None:
-    """The last number in a picture's file name, by which neighbours in time are told; None without one."""
+    """The last number in a picture's file name, by which neighbours in time are known; None without one."""
     numbers = re.findall(r"\d+", stem_of(path))
     return int(numbers[-1]) if numbers else None
 
@@ -142,7 +142,7 @@ def _places(labelled: LabelledSet) -> list[tuple[str, int]]:
     for each in labelled.pictures:
         number = frame_number(each.path)
         if number is None:
-            raise InputError(f"{each.path}: no number in its name, so nothing says which pictures are its neighbours")
+            raise InputError(f"{each.path}: no number in its name, so its neighbours in time are unknown")
         numbers.append(number)
     is_one_sequence = len(set(numbers)) == len(numbers)
     groups = ["" if is_one_sequence else each.group for each in labelled.pictures]

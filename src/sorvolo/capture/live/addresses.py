@@ -1,4 +1,4 @@
-"""What a user writes for a live source, and how FFmpeg is told to open it."""
+"""What a user writes for a live source, and FFmpeg's options to open it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ ADDRESS_FORMS = "rtsp://HOST/live, rtmp://HOST/live, udp://:PORT, tcp://:PORT, h
 """What a live source looks like, for messages."""
 
 _WAITING = frozenset({"udp", "rtp"})  # a sender may begin at any time; nothing has to be dialled
-# without a host: the usual port, and how FFmpeg is told to be the server that a drone pushes its video to
+# without a host: the usual port, and FFmpeg's options to be the server that a drone pushes its video to
 _LISTENING: Mapping[str, tuple[int, Mapping[str, str]]] = {
     "rtmp": (1935, {"listen": "1"}), "tcp": (0, {"listen": "1"}),
     "rtsp": (554, {"rtsp_flags": "listen", "listen_timeout": "3"}),

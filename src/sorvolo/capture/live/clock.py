@@ -12,7 +12,7 @@ _STATED_KEPT = 9
 
 
 class Tie(IntEnum):
-    """What says when a frame was taken, the better the higher."""
+    """The source of a frame's time, the better the higher."""
 
     ARRIVAL = 0
     SENDER_REPORT = 1
@@ -55,7 +55,7 @@ class StreamClock:
             self._arrivals.popleft()
 
     def stated(self, tie: Tie, stamp_ns: int, utc_ns: int) -> None:
-        """The stream says that this time stamp is this UTC."""
+        """The stream states this UTC for this time stamp."""
         self._stated.setdefault(tie, deque(maxlen=_STATED_KEPT)).append(utc_ns - stamp_ns)
 
     def settle(self) -> Tie:

@@ -63,7 +63,7 @@ class GrowingFolder:
 
     @property
     def telemetry(self) -> Telemetry:
-        """What the photos so far say of where they were taken."""
+        """The positions of the photos so far."""
         return self._log.telemetry()
 
     @property

@@ -96,8 +96,8 @@ def local_sets(data: bytes, counts: Counter[str]) -> Iterator[LocalSet]:
 def encode(time_ns: int, values: Mapping[str, float], version: int = 19) -> bytes:
     """The local set that states these numbers, by `Item.name`; the inverse of `local_sets` within half a step.
 
-    A value that is not finite is written as "error" where its tag can say so, else left out. Raises InputError for an
-    unknown name or a value outside its tag's range.
+    A value that is not finite is written as "error" where its tag has a code for it, else left out. Raises InputError
+    for an unknown name or a value outside its tag's range.
     """
     numbers = {item.name: tag for tag, item in ITEMS.items()}
     if unknown := sorted(set(values) - set(numbers)):
@@ -215,7 +215,7 @@ def _ber_length(data: bytes, at: int) -> tuple[int, int]:
 
 
 def _ber_oid(data: bytes, at: int) -> tuple[int, int]:
-    """A tag in BER-OID: seven bits a byte, the highest bit saying that another follows."""
+    """A tag in BER-OID: seven bits a byte, the highest bit set where another follows."""
     tag = 0
     for place in range(at, min(at + _LONGEST_KEY_BYTES, len(data))):
         tag = tag << 7 | data[place] & 0x7F

@@ -1,4 +1,4 @@
-"""What MISB ST 0601 says in Sorvolo's words: telemetry columns, the camera's angles, the ground's height, the lens."""
+"""MISB ST 0601 as Sorvolo's records: telemetry columns, the camera's angles, the ground's height, the lens."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -24,24 +24,24 @@ _FOV_SIGMA = 0.03  # of a focal length from the field of view: operators round i
 _LEVEL_FROM_CAMERA = site_from_gimbal_rotation(0.0, 0.0, 0.0)
 
 
-def columns_of(told: LocalSet) -> dict[str, float]:
+def columns_of(stated: LocalSet) -> dict[str, float]:
     """A local set's numbers as telemetry columns (survey.flight.TELEMETRY_COLUMNS); only those that it states.
 
     Tag 15 is above mean sea level (orthometric), tags 75 and 104 above the ellipsoid. The camera's angles come from
     the platform's (5, 6 or 90, 7 or 91) and the sensor's relative to it (18-20); without tag 18 or 19 the aircraft's
-    alone are given. A relative roll that is not said is taken as 0.
+    alone are given. A relative roll that is not stated is taken as 0.
     """
-    full_m = told["sensor_ellipsoid_height_extended_m"]
+    full_m = stated["sensor_ellipsoid_height_extended_m"]
     columns = {
-        "latitude_deg": told["sensor_latitude_deg"], "longitude_deg": told["sensor_longitude_deg"],
-        "orthometric_height_m": told["sensor_true_altitude_m"],
-        "ellipsoidal_height_m": full_m if isfinite(full_m) else told["sensor_ellipsoid_height_m"],
+        "latitude_deg": stated["sensor_latitude_deg"], "longitude_deg": stated["sensor_longitude_deg"],
+        "orthometric_height_m": stated["sensor_true_altitude_m"],
+        "ellipsoidal_height_m": full_m if isfinite(full_m) else stated["sensor_ellipsoid_height_m"],
     }
-    heading, pitch, roll = told["platform_heading_deg"], _pitch_of(told), _roll_of(told)
+    heading, pitch, roll = stated["platform_heading_deg"], _pitch_of(stated), _roll_of(stated)
     columns |= {"body_yaw_deg": heading, "body_pitch_deg": pitch, "body_roll_deg": roll}
-    relative = told["sensor_relative_azimuth_deg"], told["sensor_relative_elevation_deg"]
+    relative = stated["sensor_relative_azimuth_deg"], stated["sensor_relative_elevation_deg"]
     if all(map(isfinite, (heading, pitch, roll, *relative))):
-        own_roll = told["sensor_relative_roll_deg"]
+        own_roll = stated["sensor_relative_roll_deg"]
         rotation = site_from_sensor_rotation(
             (heading, pitch, roll), (*relative, own_roll if isfinite(own_roll) else 0.0)
         )
@@ -61,22 +61,22 @@ def site_from_sensor_rotation(
     return site_from_gimbal_rotation(*platform_deg) @ _LEVEL_FROM_CAMERA.T @ site_from_gimbal_rotation(*relative_deg)
 
 
-def ground_elevation_m(told: LocalSet) -> float:
+def ground_elevation_m(stated: LocalSet) -> float:
     """The ground's height at the frame's centre in the reference of the sensor's own height; NaN where unknown.
 
     Tag 25 (mean sea level) belongs to tag 15, tag 78 (ellipsoid) to tags 75 and 104.
     """
-    if isfinite(told["sensor_true_altitude_m"]):
-        return told["frame_center_elevation_m"]
-    return told["frame_center_ellipsoid_height_m"]
+    if isfinite(stated["sensor_true_altitude_m"]):
+        return stated["frame_center_elevation_m"]
+    return stated["frame_center_ellipsoid_height_m"]
 
 
-def camera_of(told: LocalSet, width_px: int, height_px: int) -> CameraModel | None:
+def camera_of(stated: LocalSet, width_px: int, height_px: int) -> CameraModel | None:
     """The camera by its field of view (tags 16 and 17), for frames of this size; None where it is not stated.
 
     A vertical angle that does not fit square pixels within 10 % is of another cut of the sensor and not used.
     """
-    across_deg, down_deg = told["sensor_horizontal_fov_deg"], told["sensor_vertical_fov_deg"]
+    across_deg, down_deg = stated["sensor_horizontal_fov_deg"], stated["sensor_vertical_fov_deg"]
     if not 1 < across_deg < 150:
         return None
     camera = Camera.from_angle_of_view(width_px, height_px, across_deg)
@@ -98,14 +98,14 @@ def klv_notices(counts: Mapping[str, int]) -> list[Notice]:
 
 
 def klv_streams(container: Any) -> list[Any]:
-    """The KLV streams of a PyAV container; private data that does not say what it is counts as well."""
+    """The KLV streams of a PyAV container; private data of unknown kind counts as well."""
     data = (stream for stream in container.streams if stream.type == "data")
     return [stream for stream in data if _name(stream) in ("klv", "bin_data", "")]
 
 
 @dataclass(frozen=True, eq=False)
 class FileMetadata:
-    """What the metadata inside a video file says; `lens` is a local set with the field of view, if any has it.
+    """The metadata inside a video file; `lens` is a local set with the field of view, if any has it.
 
     `ground_elevation_m` is the median, in the reference of the sensor's own height; NaN where unknown.
     """
@@ -165,12 +165,12 @@ def _name(stream: Any) -> str:
     return str(getattr(stream, "name", "") or "")
 
 
-def _pitch_of(told: LocalSet) -> float:
-    return _first_known(told["platform_pitch_full_deg"], told["platform_pitch_deg"])
+def _pitch_of(stated: LocalSet) -> float:
+    return _first_known(stated["platform_pitch_full_deg"], stated["platform_pitch_deg"])
 
 
-def _roll_of(told: LocalSet) -> float:
-    return _first_known(told["platform_roll_full_deg"], told["platform_roll_deg"])
+def _roll_of(stated: LocalSet) -> float:
+    return _first_known(stated["platform_roll_full_deg"], stated["platform_roll_deg"])
 
 
 def _first_known(*values: float) -> float:

@@ -40,7 +40,7 @@ class NmeaLink:
     """A receiver's sentences, read in a thread of their own and given on moment by moment.
 
     `heard(arrived_utc_ns, epoch)` is called in that thread; the epoch's time is UTC, its day the one nearest to this
-    computer's clock. A link that is silent for `silent_s` is said to be, and one that breaks is opened anew.
+    computer's clock. A link that is silent for `silent_s` is reported, and one that breaks is opened anew.
     """
 
     def __init__(self, address: str, settings: LiveSettings, heard: Callable[[int, Epoch], None]) -> None:
@@ -113,7 +113,7 @@ class SentenceBuffer:
     def take(self, data: bytes, utc_ns: int) -> list[Epoch]:
         """The moments that are complete: a later sentence has another time, or nothing came (`data` is empty).
 
-        `utc_ns` is about now: sentences tell the time of day, and a receiver without a fix invents its date.
+        `utc_ns` is about now: sentences state the time of day, and a receiver without a fix invents its date.
         """
         whole, newline, self._rest = (self._rest + data).rpartition(b"\n")
         if len(self._rest) > _LONGEST_LINE:  # no receiver's: a wrong baud rate

@@ -29,11 +29,11 @@ _REFUSED = (
 _WALLCLOCK_BYTES = 8  # that a producer reference time begins with, us since 1970
 
 
-class Hearer(Protocol):
-    """Who gets what a stream says; called in the reader's thread."""
+class StreamListener(Protocol):
+    """Receives a stream's frames and metadata; called in the reader's thread."""
 
     def opened(self, facts: "StreamFacts") -> None:
-        """A connection stands; what it says of itself."""
+        """A connection stands; its properties."""
 
     def frame(self, decoded: av.VideoFrame, stamp_ns: int, arrived_s: float) -> None:
         """A decoded frame with its time stamp on the stream's own clock."""
@@ -44,16 +44,16 @@ class Hearer(Protocol):
     def ended(self) -> None:
         """Nothing more comes."""
 
-    def told(self, told: LocalSet, stamp_ns: int) -> None:
+    def metadata(self, stated: LocalSet, stamp_ns: int) -> None:
         """A metadata packet with its time stamp on the stream's own clock."""
 
     def reported(self, stamp_ns: int, utc_ns: int) -> None:
-        """The sender says which UTC a time stamp is."""
+        """The sender states the UTC of a time stamp."""
 
 
 @dataclass(frozen=True)
 class StreamFacts:
-    """What a stream's header says."""
+    """The properties in a stream's header."""
 
     codec: str
     container: str
@@ -65,16 +65,16 @@ class StreamReader:
     """Reads one stream, in a thread of its own, until it has ended for good or `stop` is set.
 
     A connection that gives no packet for `silent_s` is closed and opened anew, with growing pauses where it has to be
-    dialled. The stream has ended when nothing came for `give_up_s`. `refused` then says why, where the other side
+    dialled. The stream has ended when nothing came for `give_up_s`. `refused` is then the reason, where the other side
     will not have us (a wrong name or password) and trying again is no use. `file` opens what is read instead of the
     address: a file that grows.
     """
 
     def __init__(
-        self, address: StreamAddress, hearer: Hearer, settings: LiveSettings, stop: threading.Event,
+        self, address: StreamAddress, listener: StreamListener, settings: LiveSettings, stop: threading.Event,
         file: Callable[[Outages], Any] | None = None,
     ) -> None:
-        self._address, self._hearer, self._settings = address, hearer, settings
+        self._address, self._listener, self._settings = address, listener, settings
         self._stop, self._file = stop, file
         self.outages = Outages(address.shown)
         self.refused = ""
@@ -125,7 +125,7 @@ class StreamReader:
                 if not self._address.waits and not self._stop.is_set() and self._left_s() > 0:
                     self._stop.wait(backoff.next_s())
         finally:
-            self._hearer.ended()
+            self._listener.ended()
             self.is_over.set()
 
     def _left_s(self) -> float:
@@ -140,8 +140,8 @@ class StreamReader:
             with ExitStack() as stack:
                 container = self._opened(stack)
                 video, metadata = _streams_of(container)
-                self._hearer.opened(_facts_of(container, video, metadata))
-                self._hearer.restarted()
+                self._listener.opened(_facts_of(container, video, metadata))
+                self._listener.restarted()
                 self._stamp_ns = -1
                 self._step_ns = round(_SECOND_NS / float(video.average_rate or video.guessed_rate or 25))
                 # frames in threads would hold several back; a stripe each does not
@@ -193,8 +193,8 @@ class StreamReader:
         """Give on what is in a packet; whether a frame was."""
         if packet.stream.type == "data":
             stamp_ns = _stamp_of(packet, packet.time_base)
-            for told in local_sets(bytes(packet), self._counts):
-                self._hearer.told(told, self._stamp_ns if stamp_ns is None else stamp_ns)
+            for stated in local_sets(bytes(packet), self._counts):
+                self._listener.metadata(stated, self._stamp_ns if stamp_ns is None else stamp_ns)
             return False
         self._note_sender_report(packet)
         self._counts["packet"] += packet.is_corrupt
@@ -208,7 +208,7 @@ class StreamReader:
             if frame.width * frame.height <= PIXEL_LIMIT:
                 self._counts["frame"] += frame.is_corrupt
                 self._has_spoken = came = True
-                self._hearer.frame(frame, self._next_stamp_ns(frame), time.monotonic())
+                self._listener.frame(frame, self._next_stamp_ns(frame), time.monotonic())
         return came
 
     def _next_stamp_ns(self, frame: av.VideoFrame) -> int:
@@ -217,7 +217,7 @@ class StreamReader:
             self._counts["missing"] += 1
             stamp_ns = self._stamp_ns + self._step_ns
         elif self._stamp_ns >= 0 and not 0 < stamp_ns - self._stamp_ns < _STAMP_JUMP_NS:
-            self._hearer.restarted()  # the sender began anew, or set its clock
+            self._listener.restarted()  # the sender began anew, or set its clock
         self._stamp_ns = stamp_ns
         return stamp_ns
 
@@ -228,7 +228,7 @@ class StreamReader:
         stamp_ns = _stamp_of(packet, packet.time_base)
         microseconds = int.from_bytes(bytes(packet.get_sidedata("prft"))[:_WALLCLOCK_BYTES], "little", signed=True)
         if stamp_ns is not None and microseconds > 0:
-            self._hearer.reported(stamp_ns, microseconds * 1000)
+            self._listener.reported(stamp_ns, microseconds * 1000)
 
 
 def _streams_of(container: Any) -> tuple[Any, list[Any]]:

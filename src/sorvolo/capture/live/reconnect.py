@@ -18,7 +18,7 @@ class LiveSettings:
     """How a live source is read."""
 
     keeps_all: bool = False  # every wanted frame waits for its turn (mapping); else the newest wins (watching)
-    silent_s: float = 3.0  # without a packet: the source is taken as silent, said so, and opened anew
+    silent_s: float = 3.0  # without a packet: the source counts as silent, which is reported, and is opened anew
     first_s: float = 20.0  # to wait for the first frame before giving up
     give_up_s: float = 30.0  # a source that was silent for so long has ended
     fix_wait_s: float = 1.0  # a frame waits so long for the fix that follows it, if every frame is kept
@@ -41,7 +41,7 @@ class Outages:
         self._lock = threading.Lock()
 
     def lost(self, since_s: float, reason: str) -> None:
-        """Nothing came since that moment (monotonic clock); said once for each outage, to the log."""
+        """Nothing came since that moment (monotonic clock); logged once for each outage."""
         with self._lock:
             if self._since_s is not None:
                 return

@@ -33,8 +33,8 @@ from sorvolo.errors import InputError
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
 
 _HOLD_S = 0.5  # the first frames of a connection come in a burst: only then is their delay known
-_HOLD_FOR_METADATA_S = 2.0  # where the stream has some, it says when and through which lens frames were taken
-_FIRST_FIXES = 2  # that tell where a flight begins, and how fast
+_HOLD_FOR_METADATA_S = 2.0  # where the stream has some, it states the frames' time and lens
+_FIRST_FIXES = 2  # enough for where a flight begins, and how fast
 _FIRST_FIXES_S = 10.0
 _CLOCKS_AGREE_NS = 5_000_000_000
 _DELAYS_KEPT = 60
@@ -52,7 +52,7 @@ class _Held:
 
 
 class LiveStream:
-    """A flight that is going on; fulfils `capture.source.Source`, and what it says grows while it is read.
+    """A flight that is going on; fulfils `capture.source.Source`, and its telemetry grows while it is read.
 
     A thread reads and decodes from the moment it is opened; what comes before `frames` is asked for waits where all
     frames are kept, and is passed over where the newest wins (a growing file waits itself). Close it, or exhaust or
@@ -78,7 +78,7 @@ class LiveStream:
         self._facts: StreamFacts | None = None
         self._lock = threading.RLock()
         self._held: list[_Held] | None = []
-        self._held_told: list[tuple[int, LocalSet]] = []
+        self._held_metadata: list[tuple[int, LocalSet]] = []
         self._held_since: tuple[float, int] | None = None  # the monotonic clock's and the stream's
         self._held_fixes: list[tuple[int, Epoch]] = []
         self._clocks_agree = False
@@ -110,13 +110,13 @@ class LiveStream:
 
     @property
     def facts(self) -> StreamFacts:
-        """What the stream's header says."""
+        """The properties in the stream's header."""
         assert self._facts is not None  # known before the first frame
         return self._facts
 
     @property
     def frame_rate_hz(self) -> float:
-        """Frames a second, as the stream says."""
+        """Frames a second, as the stream states."""
         return self.facts.rate_hz
 
     @property
@@ -127,8 +127,8 @@ class LiveStream:
     @property
     def telemetry(self) -> Telemetry:
         """What is known so far, its times on the frames' clock."""
-        told = self._link.notices() if self._link else klv_notices(self._reader.metadata_counts)
-        return self._log.telemetry(told)
+        found = self._link.notices() if self._link else klv_notices(self._reader.metadata_counts)
+        return self._log.telemetry(found)
 
     @property
     def telemetry_version(self) -> int:
@@ -169,7 +169,7 @@ class LiveStream:
         return self._queue.skipped
 
     def wait_for_first_fixes(self) -> None:
-        """Wait until telemetry says where the flight begins; not where none is to be expected, nor for ever."""
+        """Wait for telemetry's first positions; not where none is to be expected, nor for ever."""
         if (self._link or self.facts.has_metadata) and not self._is_file:
             end_s = time.monotonic() + _FIRST_FIXES_S
             while not self._is_ended and time.monotonic() < end_s:
@@ -262,42 +262,42 @@ class LiveStream:
     def _is_ended(self) -> bool:
         return self._until.is_set() or self._closing.is_set()
 
-    # ---- what the reader says, in its thread ------------------------------------------------------------------
+    # ---- called by the reader, in its thread ------------------------------------------------------------------
 
     def opened(self, facts: StreamFacts) -> None:
-        """See `reader.Hearer`."""
+        """See `reader.StreamListener`."""
         self._facts = facts
 
     def restarted(self) -> None:
-        """See `reader.Hearer`: frames are held anew until their delay is known."""
+        """See `reader.StreamListener`: frames are held anew until their delay is known."""
         self._settle()  # the clock may restart before the first frames' own hold is over
         with self._lock:
             self._clock.restart()
             self._held, self._held_since = [], None
 
     def reported(self, stamp_ns: int, utc_ns: int) -> None:
-        """See `reader.Hearer`."""
+        """See `reader.StreamListener`."""
         if utc_ns > DATED_NS:
             self._clock.stated(Tie.SENDER_REPORT, stamp_ns, utc_ns)
 
-    def told(self, told: LocalSet, stamp_ns: int) -> None:
-        """See `reader.Hearer`."""
-        if told.time_ns:
-            self._clock.stated(Tie.METADATA, stamp_ns, told.time_ns)
-        across_deg = told["sensor_horizontal_fov_deg"]
+    def metadata(self, stated: LocalSet, stamp_ns: int) -> None:
+        """See `reader.StreamListener`."""
+        if stated.time_ns:
+            self._clock.stated(Tie.METADATA, stamp_ns, stated.time_ns)
+        across_deg = stated["sensor_horizontal_fov_deg"]
         if isfinite(across_deg):
-            self._lens = self._lens or told
+            self._lens = self._lens or stated
             self._zooms += abs(across_deg / self._lens["sensor_horizontal_fov_deg"] - 1) > _ZOOMED
         with self._lock:
-            if isfinite(ground_m := ground_elevation_m(told)):
+            if isfinite(ground_m := ground_elevation_m(stated)):
                 self._grounds_m.append(ground_m)
             if self._held is not None:
-                self._held_told.append((stamp_ns, told))
+                self._held_metadata.append((stamp_ns, stated))
             else:
-                self._log_told(stamp_ns, told)
+                self._log_metadata(stamp_ns, stated)
 
     def frame(self, decoded: av.VideoFrame, stamp_ns: int, arrived_s: float) -> None:
-        """See `reader.Hearer`."""
+        """See `reader.StreamListener`."""
         if not self._is_file or self._held_since is None:  # a file is read faster than it was written
             self._clock.arrived(stamp_ns, time.time_ns())
         held = _Held(decoded, stamp_ns, arrived_s)
@@ -313,18 +313,18 @@ class LiveStream:
     def _has_held_enough(self, newest: _Held) -> bool:
         assert self._held is not None and self._held_since is not None
         since_s, since_ns = self._held_since
-        told = sum(bool(each.time_ns) for _, each in self._held_told)
+        stated = sum(bool(each.time_ns) for _, each in self._held_metadata)
         if self._is_file:  # its frames come at once: what counts is how much of the flight was read
-            passed_s, usual_s, is_told = (newest.stamp_ns - since_ns) / 1e9, 0.0, told >= _FIRST_FIXES
+            passed_s, usual_s, is_stated = (newest.stamp_ns - since_ns) / 1e9, 0.0, stated >= _FIRST_FIXES
         else:
-            passed_s, usual_s, is_told = newest.arrived_s - since_s, _HOLD_S, told > 0
+            passed_s, usual_s, is_stated = newest.arrived_s - since_s, _HOLD_S, stated > 0
         held_bytes = len(self._held) * newest.decoded.width * newest.decoded.height * 3 // 2
         if held_bytes > self._settings.most_bytes // 2:
             return True
-        return passed_s >= (_HOLD_FOR_METADATA_S if self.facts.has_metadata and not is_told else usual_s)
+        return passed_s >= (_HOLD_FOR_METADATA_S if self.facts.has_metadata and not is_stated else usual_s)
 
     def _settle(self) -> None:
-        """The frames held so far tell how the stream's clock is tied; from here on they are given on as they come."""
+        """The frames held so far decide how the stream's clock is tied; from here on they are given on as they come."""
         with self._lock:
             if not self._held:
                 return
@@ -343,9 +343,9 @@ class LiveStream:
             held, self._held = self._held or [], None
             if not held:
                 return
-            told, self._held_told = self._held_told, []
-            for stamp_ns, each in told:
-                self._log_told(stamp_ns, each)
+            stated, self._held_metadata = self._held_metadata, []
+            for stamp_ns, each in stated:
+                self._log_metadata(stamp_ns, each)
             fixes, self._held_fixes = self._held_fixes, []
             for arrived_ns, epoch in fixes:
                 self._log_fix(arrived_ns, epoch)
@@ -366,17 +366,17 @@ class LiveStream:
                 self._queue.put(Arrived(index, time_ns, held.arrived_s, held.decoded))
 
     def ended(self) -> None:
-        """See `reader.Hearer`."""
+        """See `reader.StreamListener`."""
         self._settle()
         self._queue.end()
 
     # ---- telemetry on the frames' clock -----------------------------------------------------------------------
 
-    def _log_told(self, stamp_ns: int, told: LocalSet) -> None:
+    def _log_metadata(self, stamp_ns: int, stated: LocalSet) -> None:
         if self._link is not None:
             return
-        states_time = self._clock.tie is Tie.METADATA and told.time_ns
-        self._log.add(told.time_ns if states_time else self._clock.utc_ns(stamp_ns), columns_of(told))
+        states_time = self._clock.tie is Tie.METADATA and stated.time_ns
+        self._log.add(stated.time_ns if states_time else self._clock.utc_ns(stamp_ns), columns_of(stated))
 
     def _fix(self, arrived_ns: int, epoch: Epoch) -> None:
         """A receiver's moment, in the link's thread."""
@@ -387,7 +387,7 @@ class LiveStream:
                 self._log_fix(arrived_ns, epoch)
 
     def _log_fix(self, arrived_ns: int, epoch: Epoch) -> None:
-        """Sentences tell UTC; where the frames do not know theirs as well, both are tied by when they came."""
+        """Sentences state UTC; where the frames do not know theirs as well, both are tied by when they came."""
         self._delays_ns.append(arrived_ns - epoch.time_ns)
         least_ns = min(self._delays_ns)
         ahead_ns = self._clock.host_from_tie_ns()
@@ -427,8 +427,8 @@ def open_stream(
     stream = LiveStream(address, link, settings, until, path)
     stream.begin()
     try:
-        told = camera_of(stream.lens, *stream.size_px) if stream.lens is not None else None
-        stream.camera = camera(*stream.size_px) or told or guess(*stream.size_px)
+        own = camera_of(stream.lens, *stream.size_px) if stream.lens is not None else None
+        stream.camera = camera(*stream.size_px) or own or guess(*stream.size_px)
     except BaseException:
         stream.close()
         raise

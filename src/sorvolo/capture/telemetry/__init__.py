@@ -1,4 +1,4 @@
-"""Telemetry files: which reader a file needs is told by its content, and where a video's telemetry lies."""
+"""Telemetry files: the content decides which reader a file needs, and where a video's telemetry lies."""
 
 from pathlib import Path
 from typing import Protocol

@@ -72,7 +72,7 @@ class _Place(NamedTuple):
 
 @dataclass
 class _Cue:
-    """One subtitle: when it shows, when it says it was taken, and its numbers."""
+    """One subtitle: when it shows, when it was taken, and its numbers."""
 
     video_time_ns: int
     stamp_ns: int
@@ -90,7 +90,7 @@ def read(data: bytes, name: str) -> Telemetry:
 
     rel_alt, BAROMETER, Hb and H are heights above take-off; abs_alt and altitude, which DJI calls absolute,
     are stored as orthometric. Dates name no time zone and are taken as UTC. `name` is for messages. Raises
-    InputError when no cue says where the drone was or how it stood.
+    InputError when no cue states a position or an attitude.
     """
     text = text_from_bytes(data)
     counts: Counter[str] = Counter()
@@ -193,7 +193,7 @@ def _values_in_words(body: str) -> dict[str, float]:
 
 
 def _place(group: str) -> _Place | None:
-    """The place in GPS(...); None where it says N/A.
+    """The place in GPS(...); None where it is N/A.
 
     Letters decide the order, then a value beyond 90, which is a longitude. Else the third value does: a whole
     number is the count of satellites, in files that put longitude first; a height ("0.0M", the Matrice 300)

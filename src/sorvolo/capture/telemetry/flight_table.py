@@ -247,7 +247,7 @@ def _angles(w: Floats, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats,
 
 
 def _times(table: _Table, counters: Mapping[str, Floats]) -> tuple[TimesNs, TimesNs | None, list[Notice]]:
-    """Each row's time, its time in the video where the table is tied to one, and what there is to say."""
+    """Each row's time, its time in the video where the table is tied to one, and the notices."""
     rows = len(table.rows)
     stamps_ns, zoned = _stamps(table)
     counter_ns = _counter(counters, rows)
@@ -315,7 +315,7 @@ def _joined(day: str, clock: str) -> str:
 
 
 def _epoch_ns(text: str, factor: float) -> int:
-    """Nanoseconds of a number since 1970, in the header's unit or the one its size tells; 0 if it is none."""
+    """Nanoseconds of a number since 1970, in the header's unit or the one that fits its size; 0 if it is none."""
     try:
         seconds = float(text) * factor
     except ValueError:

@@ -109,8 +109,8 @@ def read_payloads(payloads: Sequence[Payload], name: str) -> Telemetry:
     """The telemetry of a video's payloads; `video_time_ns` counts as the payloads' does.
 
     A Karma's fused position goes before the camera's GPS. Samples are spread evenly over their payload, as GoPro asks.
-    Heights: GPS5 and GPS9 are above the ellipsoid unless the stream says MSLV; the Karma's are above the sea and above
-    take-off. `name` is for messages. Raises InputError when no sample is usable.
+    Heights: GPS5 and GPS9 are above the ellipsoid unless the stream states MSLV; the Karma's are above the sea and
+    above take-off. `name` is for messages. Raises InputError when no sample is usable.
     """
     counts: Counter[str] = Counter()
     samples: list[_Sample] = []

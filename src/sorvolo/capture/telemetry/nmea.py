@@ -31,7 +31,7 @@ _LONGEST_TAIL = 200  # a sentence has at most 82 characters
 
 @dataclass
 class Epoch:
-    """What the sentences of one moment say, as telemetry columns; no `values` where there was no fix."""
+    """One moment's sentences as telemetry columns; no `values` where there was no fix."""
 
     time_ns: int
     values: dict[str, float] = field(default_factory=dict)
@@ -74,7 +74,7 @@ def read(data: bytes, name: str) -> Telemetry:
             *notice("no_time", counts["no_time"], "{} sentences dropped: no readable time"),
             *notice(
                 "no_date", 0 if dated else len(epochs),
-                "no sentence tells the date: the video dates the {} samples, else they count from 1970-01-01",
+                "no sentence states the date: the video dates the {} samples, else they count from 1970-01-01",
             ),
         ],
         position_decimals=_position_decimals(messages),
@@ -82,7 +82,7 @@ def read(data: bytes, name: str) -> Telemetry:
 
 
 def messages_in(data: bytes, counts: Counter[str]) -> list[Any]:
-    """The intact GGA and RMC sentences in the bytes that tell a time; what is wrong with others is counted."""
+    """The intact GGA and RMC sentences in the bytes that state a time; what is wrong with others is counted."""
     messages = []
     tail = data[data.rfind(b"$"):]
     is_cut = tail.startswith(b"$") and len(tail) < _LONGEST_TAIL and not _FINISHED.search(tail)

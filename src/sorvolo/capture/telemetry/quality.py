@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Anything, Floats, Mask, TimesNs
+from sorvolo.geometry.arrays import Floats, Mask, Rows, TimesNs
 from sorvolo.survey.flight import Notice, Telemetry
 
 SECOND_NS = 1_000_000_000
@@ -66,14 +66,14 @@ def clean(
     notices: Sequence[Notice] = (),
     position_decimals: int | None = None,
 ) -> Telemetry:
-    """The samples of one file as Telemetry, with what is wrong in them taken out, counted and told.
+    """The samples of one file as Telemetry, with what is wrong in them removed, counted and reported.
 
     `reader` is the format's name, `name` the file's (for messages). `time_ns` (N,) may hold NO_TIME_NS. The
     steps: values outside any believable range, 0/0 fixes and half positions become NaN; samples whose clock
     runs backward or stands still are dropped; fixes that imply more than FASTEST_M_S become NaN; gaps are
     counted. `notices` are the reader's own and come first. `position_decimals`, the decimals of a degree
     that the file prints, keeps `horizontal_sigma_m` at least as large as their rounding. Raises InputError
-    when no sample says anything.
+    when no sample has any value.
     """
     found = list(notices)
     times = np.asarray(time_ns, dtype=np.int64)
@@ -92,9 +92,9 @@ def clean(
             found += _widen_to_rounding(table, position_decimals)
         found += _blank_jumps(times, table)
     if not any(np.isfinite(value).any() for key, value in table.items() if "_sigma_" not in key):
-        told = "; ".join(notice.text for notice in found) or "it holds no samples"
+        found_text = "; ".join(notice.text for notice in found) or "it holds no samples"
         raise InputError(
-            f"{name}: no usable {reader} telemetry sample ({told}); "
+            f"{name}: no usable {reader} telemetry sample ({found_text}); "
             "give another file with --telemetry, or map without telemetry"
         )
     found += _gaps(times, table.get("latitude_deg"))
@@ -287,7 +287,7 @@ def _blank_jumps(times: TimesNs, table: dict[str, Floats]) -> list[Notice]:
         f"{{}} samples repeat the position before; distinct fixes: {len(starts)}",
     )
 
-    def fits(old: Anything, new: Anything) -> Anything:
+    def fits(old: Rows, new: Rows) -> Mask:
         turn = (lon[starts[new]] - lon[starts[old]] + 180) % 360 - 180
         scale = np.cos(np.radians((lat[starts[new]] + lat[starts[old]]) / 2))
         distance_m = np.hypot(lat[starts[new]] - lat[starts[old]], turn * scale) * _M_PER_DEG
