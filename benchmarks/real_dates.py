@@ -40,8 +40,8 @@ from sorvolo.store.flight_files import write_camera, write_photo
 
 from mosaic_methods import commit, machine
 from sorvolo.geometry.geodesy import LocalFrame
-from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.geometry.level_ground import footprint
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.evaluate.frame_rows import FrameRow, map_frames, site_points
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings

@@ -22,7 +22,7 @@ from scipy.optimize import minimize
 
 from detection_data import SMALL, aerial_cars, mannequin, tinyperson
 from sorvolo.detection.models import find_model
-from sorvolo.geometry.boxes import cover_matrix, iou_matrix
+from sorvolo.geometry.box_overlap import cover_matrix, iou_matrix
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
 from sorvolo.training.daylight import Calibration, Daylight, Judge, one_hot, support

@@ -5,7 +5,7 @@ import pytest
 
 from sorvolo.detection.session import Seen
 from sorvolo.detection.suppression import SeenTile, merge_tiles
-from sorvolo.geometry.boxes import cover_matrix, iou_matrix
+from sorvolo.geometry.box_overlap import cover_matrix, iou_matrix
 
 _SIZE = (100, 180)
 _LEFT, _RIGHT = (0, 0, 100, 100), (80, 0, 180, 100)

@@ -18,7 +18,7 @@ from PIL import Image
 from sorvolo.capture.telemetry import read_telemetry
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import Projection
-from sorvolo.geometry.ground import ground_from_pixels
+from sorvolo.geometry.level_ground import ground_from_pixels
 from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.flight import simulate_flight, simulate_flights
 from sorvolo.simulation.presets import preset, preset_names

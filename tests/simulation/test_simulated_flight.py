@@ -10,7 +10,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.ground import footprint
+from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import site_from_gimbal_rotation
 from sorvolo.simulation.canvas import Area
 from sorvolo.simulation.flight import simulate_flight, simulate_flights

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.geometry.ground import footprint, ground_from_pixels
+from sorvolo.geometry.level_ground import footprint, ground_from_pixels
 from sorvolo.simulation.bodies import build_body
 from sorvolo.simulation.canvas import GroundRaster
 from sorvolo.simulation.flight import SimulatedFlight, simulate_flight

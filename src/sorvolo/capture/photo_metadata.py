@@ -23,7 +23,7 @@ from sorvolo.capture.decoding import (
     reduced_size_px,
     reduction_of,
 )
-from sorvolo.capture.telemetry.quality import sigma_from_hdop_m
+from sorvolo.capture.telemetry.cleaning import sigma_from_hdop_m
 from sorvolo.errors import InputError
 
 _Tags: TypeAlias = Mapping[int, Any]

@@ -16,7 +16,7 @@ import numpy as np
 from sorvolo.capture.decoding import LARGEST_FRAME_PX, decode_photo
 from sorvolo.capture.photo_metadata import PhotoMetadata, read_photo_metadata
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
-from sorvolo.capture.telemetry.quality import clean, notice
+from sorvolo.capture.telemetry.cleaning import clean, notice
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry

@@ -30,8 +30,8 @@ from sorvolo.capture.live.stream import LiveStream, open_stream
 from sorvolo.capture.photo_metadata import PhotoMetadata
 from sorvolo.capture.photos import PhotoSource, read_album
 from sorvolo.capture.telemetry import empty_files_beside, find_telemetry_beside, is_telemetry, read_telemetry
+from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.capture.telemetry.gpmf import read_gpmf_file
-from sorvolo.capture.telemetry.quality import notice
 from sorvolo.capture.video import VIDEO_SUFFIXES, VideoInfo, VideoSource, read_video_info
 from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera

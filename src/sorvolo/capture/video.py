@@ -12,7 +12,7 @@ import numpy as np
 from sorvolo.capture.containers import ends_early, top_boxes
 from sorvolo.capture.decoding import is_heif
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
-from sorvolo.capture.telemetry.quality import notice
+from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry

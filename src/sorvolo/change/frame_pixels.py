@@ -5,8 +5,8 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Anything, Boxes, ImageGray, Mask, Matrix3, PointsM, Vector3
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import apply_homography, pose_from_homography
+from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose
 from sorvolo.survey.findings import ComparedView
 from sorvolo.survey.flight import PosedFrame

@@ -19,7 +19,7 @@ from pycocotools.cocoeval import COCOeval
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, TimesNs
-from sorvolo.geometry.boxes import iou_matrix
+from sorvolo.geometry.box_overlap import iou_matrix
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections
 

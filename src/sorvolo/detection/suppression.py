@@ -7,7 +7,7 @@ import numpy as np
 
 from sorvolo.detection.session import Seen
 from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, Mask
-from sorvolo.geometry.boxes import areas, cover_matrix, iou_matrix
+from sorvolo.geometry.box_overlap import areas, cover_matrix, iou_matrix
 
 SAME_IOU = 0.4
 """Two tiles' boxes of a class are one object if they overlap this much in what both tiles show."""

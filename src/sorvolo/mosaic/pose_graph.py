@@ -8,8 +8,8 @@ from scipy.sparse.linalg import splu
 
 from sorvolo.geometry.arrays import Anything, Floats, PointsM
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import fit_similarity, pose_from_homography, site_from_image_homography
+from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose
 from sorvolo.mosaic.bundle import SHARED, Nodes, Solution, linearise, rotation_vector, solve
 from sorvolo.mosaic.graph_rows import LinkRows, NodeRows

@@ -11,7 +11,7 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGBA, PointsM
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.grid import SiteGrid, TileIndex
-from sorvolo.geometry.ground import footprint
+from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import gimbal_angles_from_rotation
 from sorvolo.simulation.canvas import GroundRaster
 from sorvolo.simulation.flight import SimulatedFlight, has_changed

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from sorvolo.geometry.arrays import BoxesPx, Floats, PointsM
-from sorvolo.geometry.boxes import iou_matrix, nesting_matrix
+from sorvolo.geometry.box_overlap import iou_matrix, nesting_matrix
 from sorvolo.tracking.followed import Followed
 from sorvolo.tracking.motion import MOVES, log_density, predicted
 

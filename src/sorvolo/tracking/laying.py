@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, Mask, PointsM, PointsPx
-from sorvolo.geometry.ground import ground_from_pixels
 from sorvolo.geometry.homography import pose_from_homography
+from sorvolo.geometry.level_ground import ground_from_pixels
 from sorvolo.geometry.pose import Pose
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.objects import TYPICAL_SIZE_M, Detections, Sighting

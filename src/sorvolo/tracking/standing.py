@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from sorvolo.geometry.arrays import Floats
-from sorvolo.geometry.boxes import iou_matrix, nesting_matrix
+from sorvolo.geometry.box_overlap import iou_matrix, nesting_matrix
 from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.survey.objects import TYPICAL_SIZE_M
 from sorvolo.tracking.joining import WITHIN

@@ -17,7 +17,7 @@ from sorvolo.capture.live.telemetry_log import TelemetryLog
 from sorvolo.capture.photo_metadata import PhotoMetadata, read_photo_metadata
 from sorvolo.capture.photos import read_picture
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
-from sorvolo.capture.telemetry.quality import notice
+from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.errors import InputError
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
 

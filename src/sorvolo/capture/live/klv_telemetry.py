@@ -11,7 +11,7 @@ from typing import Any
 import av
 
 from sorvolo.capture.live.klv import LocalSet, local_sets
-from sorvolo.capture.telemetry.quality import clean, notice
+from sorvolo.capture.telemetry.cleaning import clean, notice
 from sorvolo.geometry.arrays import Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import gimbal_angles_from_rotation, site_from_gimbal_rotation

@@ -12,8 +12,8 @@ from typing import Any, Protocol
 from urllib.parse import parse_qsl, urlsplit
 
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
+from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.capture.telemetry.nmea import Epoch, epochs_of, messages_in, nearest_ns
-from sorvolo.capture.telemetry.quality import notice
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.survey.flight import Notice
 

@@ -6,7 +6,7 @@ import threading
 import time
 from dataclasses import dataclass
 
-from sorvolo.capture.telemetry.quality import notice
+from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.errors import SettingsError
 from sorvolo.survey.flight import Notice
 

@@ -27,8 +27,8 @@ from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.telemetry_log import TelemetryLog
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.sync import DATED_NS
+from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.capture.telemetry.nmea import Epoch
-from sorvolo.capture.telemetry.quality import notice
 from sorvolo.errors import InputError
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sorvolo.capture.telemetry.quality import clean, notice
+from sorvolo.capture.telemetry.cleaning import clean, notice
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.survey.flight import TELEMETRY_COLUMNS, Notice, Telemetry, no_telemetry

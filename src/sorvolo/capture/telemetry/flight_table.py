@@ -8,7 +8,7 @@ from itertools import islice
 
 import numpy as np
 
-from sorvolo.capture.telemetry.quality import (
+from sorvolo.capture.telemetry.cleaning import (
     NO_TIME_NS,
     SECOND_NS,
     clean,

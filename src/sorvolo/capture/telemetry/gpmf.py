@@ -17,7 +17,7 @@ import av
 import numpy as np
 from av.stream import Discard
 
-from sorvolo.capture.telemetry.quality import (
+from sorvolo.capture.telemetry.cleaning import (
     NO_TIME_NS,
     SECOND_NS,
     SMALLEST_HDOP_SIGMA_M,

@@ -9,7 +9,7 @@ from xml.etree.ElementTree import ParseError
 from defusedxml.common import DefusedXmlException
 from defusedxml.ElementTree import fromstring
 
-from sorvolo.capture.telemetry.quality import (
+from sorvolo.capture.telemetry.cleaning import (
     NO_TIME_NS,
     clean,
     decimals_of,

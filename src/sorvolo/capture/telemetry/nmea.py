@@ -11,7 +11,7 @@ from typing import Any
 from pynmeagps import VALNONE, NMEAReader
 from pynmeagps.exceptions import NMEAMessageError, NMEAParseError, NMEATypeError
 
-from sorvolo.capture.telemetry.quality import (
+from sorvolo.capture.telemetry.cleaning import (
     DAY_NS,
     SECOND_NS,
     clean,

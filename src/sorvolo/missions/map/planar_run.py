@@ -7,7 +7,7 @@ from sorvolo.capture.sync import OffsetEstimate
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.ground import footprint, is_on_ground
+from sorvolo.geometry.level_ground import footprint, is_on_ground
 from sorvolo.missions.flight.log import Ending, Stage, nothing_placed
 from sorvolo.missions.flight.map_objects import ObjectFinder, crops_of
 from sorvolo.missions.flight.report import FlightResult, build_report

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats
-from sorvolo.geometry.ground import footprint
+from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, rotation_from_vector, site_from_gimbal_rotation
 from sorvolo.missions.flight.setup import FlightSetup, new_site
 from sorvolo.survey.flight import CameraPrior, Frame, Notice, Site

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sorvolo.capture.telemetry.quality import (
+from sorvolo.capture.telemetry.cleaning import (
     NO_TIME_NS,
     clean,
     fill_stamps,
