@@ -33,7 +33,7 @@ wheel: requirements-build.lock
 # build/site/: this documentation as web pages; a broken link ends it with an error.
 WRITING := build/docs-env
 docs: $(WRITING)/.ready
-	$(WRITING)/bin/python -m mkdocs build --quiet --strict --site-dir build/site
+	NO_MKDOCS_2_WARNING=1 $(WRITING)/bin/python -m mkdocs build --strict --site-dir build/site
 
 # New models in the packaged ones' place: make model DATA=FOLDER LITE0=WEIGHTS, the labelled sets and EfficientNet-Lite0's
 # weights; or trained on from the one that is there: make model DATA=FOLDER START=default. `thermal` begins with the new
@@ -60,6 +60,7 @@ $(READY): requirements.lock pyproject.toml setup.py $(wildcard src/sorvolo/kerne
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -e .
 	touch $@
 
-$(TRAINS): $(READY) requirements-training.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock -r requirements-training.lock
+$(TRAINS): $(READY) requirements-training.lock requirements-notebooks.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock -r requirements-training.lock \
+	  -r requirements-notebooks.lock
 	touch $@

@@ -28,7 +28,7 @@ from sorvolo.change.metrics import ComparedGround, compared_ground
 from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.polygons import points_inside
 from sorvolo.missions.compare.flights import compare_flights
-from sorvolo.missions.evaluate.frame_rows import map_frames, site_points
+from sorvolo.missions.evaluate.frame_rows import map_frames
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.store.site.archive import Archive
@@ -163,7 +163,7 @@ def measured(name: str, method: str, photos: Path, site: Path, pictures: Path | 
     events = []
     for feature in json.loads((site / "flights" / flight / "changes.geojson").read_text())["features"]:
         said = feature["properties"]
-        ring = site_points(described.frame, np.array(feature["geometry"]["coordinates"][0][:-1])[:, :2])
+        ring = described.frame.ground_from_lonlat(feature["geometry"]["coordinates"][0][:-1])
         in_crown = bool(within(crowns, ring.mean(axis=0)[None])[0])
         keys = ("id", "kind", "score", "views", "area_m2", "length_m", "sigma_m")
         events.append({**{key: said[key] for key in keys}, "in_crown": in_crown})
@@ -183,7 +183,7 @@ def crowns_m(name: str, frame) -> list[np.ndarray]:
     outlines = []
     for ring in rings:
         latitude, longitude = Projection(crs).wgs84_from_projected(np.array(ring, float) + np.array([east, north]))
-        outlines.append(site_points(frame, np.column_stack([longitude, latitude])))
+        outlines.append(frame.ground_from_lonlat(np.column_stack([longitude, latitude])))
     return outlines
 
 

@@ -2,27 +2,33 @@
 
 import io
 import json
+import re
 import struct
 import threading
 import time
 import tracemalloc
 import zipfile
 import zlib
+from collections import Counter
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
+from xml.sax.saxutils import escape
 
 import av
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from PIL import Image
 
 from sorvolo.capture import decoding
 from sorvolo.capture.areas import read_area
 from sorvolo.capture.calibration import read_camera
 from sorvolo.capture.decoding import decode_photo
-from sorvolo.capture.live.addresses import live_address
+from sorvolo.capture.live.addresses import is_live_address, live_address
+from sorvolo.capture.live.links import SentenceBuffer
 from sorvolo.capture.live.reader import StreamFacts
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream
@@ -295,3 +301,113 @@ def test_why_a_cut_jpeg_cannot_be_decoded_is_plain(checks: Image.Image) -> None:
     checks.save(buffer, "JPEG")
     with pytest.raises(InputError, match=r"the file ends before the picture does\); copy it again"):
         decode_photo(buffer.getvalue()[:-2000], "a.jpg")
+
+
+def mutated(data: st.DataObject, valid: bytes, most: int = 12) -> bytes:
+    """The bytes with some changed, cut out or doubled."""
+    changed = bytearray(valid)
+    for _ in range(data.draw(st.integers(1, most))):
+        if not changed:
+            break
+        place = data.draw(st.integers(0, len(changed) - 1))
+        action = data.draw(st.integers(0, 2))
+        if action == 0:
+            changed[place] = data.draw(st.integers(0, 255))
+        elif action == 1:
+            del changed[place:place + data.draw(st.integers(1, 40))]
+        else:
+            changed[place:place] = changed[place:place + data.draw(st.integers(1, 40))]
+    return bytes(changed)
+
+
+KML = (
+    "<kml><Document><Polygon><outerBoundaryIs><LinearRing><coordinates>12,45,0 12.01,45,0 12.01,45.01,0</coordinates>"
+    "</LinearRing></outerBoundaryIs></Polygon></Document></kml>"
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_any_kmz_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    buffer = io.BytesIO()
+    method = data.draw(st.sampled_from([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED]))
+    with zipfile.ZipFile(buffer, "w", method) as archive:
+        archive.writestr("doc.kml", KML)
+    path = tmp_path_factory.getbasetemp() / "any.kmz"
+    path.write_bytes(mutated(data, buffer.getvalue()))
+    try:
+        assert read_area(path).area_m2 > 0
+    except InputError:
+        pass
+
+
+XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" drone-dji:RelativeAltitude="+39.8"
+ drone-dji:DewarpData="2021;3713.29,3713.29,5.8,-16.9,-0.11,0.01,0,0,-0.02" drone-dji:RtkStdLon="0.01"
+ xmlns:Camera="http://pix4d.com/camera/1.0/"><Camera:Yaw>3980/100</Camera:Yaw><Camera:Pitch>1</Camera:Pitch>
+<Camera:Roll>2</Camera:Roll><s:CameraOrientationNED xmlns:s="https://www.skydio.com/drone-skydio/1.0/" s:Yaw="1"
+ s:Pitch="-90"/></rdf:Description></rdf:RDF></x:xmpmeta>"""
+NUMBERS = st.one_of(
+    st.floats().map(str), st.integers().map(str), st.text(max_size=8),
+    st.sampled_from(["1e999", "-0", "1/0", "9" * 400]),
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.data())
+def test_any_xmp_is_read_or_named_as_damaged(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    text = XMP
+    for _ in range(data.draw(st.integers(0, 6))):
+        number = escape(data.draw(NUMBERS), {'"': "&quot;"})
+        found = data.draw(st.sampled_from(re.findall(r"[-+]?[0-9]+[0-9./]*", XMP)))
+        text = text.replace(found, number, 1)
+    packet = text.encode("utf-8", "replace")
+    packet = mutated(data, packet, 4) if data.draw(st.booleans()) else packet
+    path = tmp_path_factory.getbasetemp() / "any_xmp.jpg"
+    Image.new("RGB", (64, 48), (90, 120, 60)).save(path, xmp=packet)
+    (source,) = open_sources([path])
+    assert source.camera.camera.width_px == 64
+    for column in source.telemetry.columns.values():
+        assert not np.isinf(column).any()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_any_heic_and_dng_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    pytest.importorskip("rawpy")
+    kind = data.draw(st.sampled_from([".heic", ".dng"]))
+    picture = np.kron(np.arange(48, dtype=np.uint8).reshape(6, 8), np.ones((8, 8), np.uint8))
+    colours = np.repeat(picture[:, :, None], 3, axis=2)
+    valid = heic_of(Image.fromarray(colours)) if kind == ".heic" else dng_of(colours)
+    path = tmp_path_factory.getbasetemp() / f"any{kind}"
+    path.write_bytes(mutated(data, valid))
+    try:
+        (source,) = open_sources([path])
+    except InputError:
+        return
+    assert len(list(source.frames(lambda index, time_ns: True))) == 1
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.binary(max_size=80), max_size=8), st.integers(0, 2**62))
+def test_any_bytes_from_a_receiver_are_counted(parts: list[bytes], now_ns: int) -> None:
+    good = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
+    buffer = SentenceBuffer(Counter())
+    for part in [*parts, good, b"", *parts]:
+        for epoch in buffer.take(part, now_ns):
+            assert all(isinstance(value, float) for value in epoch.values.values())
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.one_of(
+    st.text(max_size=40),
+    st.tuples(st.sampled_from(["rtsp", "udp", "tcp", "rtmp", "http", "webcam", "follow"]), st.text(max_size=30)).map(
+        lambda parts: "://".join(parts)
+    ),
+))
+def test_any_address_is_understood_or_refused(text: str) -> None:
+    if is_live_address(text):
+        try:
+            live_address(text)
+        except InputError:
+            pass

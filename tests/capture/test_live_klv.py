@@ -13,6 +13,7 @@ from sorvolo.capture.live.klv_telemetry import (
     camera_of,
     columns_of,
     ground_elevation_m,
+    metadata_of,
     site_from_sensor_rotation,
 )
 from sorvolo.errors import InputError
@@ -106,6 +107,33 @@ def test_no_bytes_make_it_fail(before: bytes, after: bytes, place: int, value: i
     for data in (before + UNIVERSAL_KEY + after, before + bytes(damaged) + after):
         for found in local_sets(data, Counter()):
             columns_of(found)
+
+
+_TAGS = st.one_of(st.sampled_from(sorted(ITEMS)), st.integers(0, 200))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.lists(st.tuples(_TAGS, st.binary(max_size=12)), max_size=12), min_size=1, max_size=4),
+       st.lists(st.integers(-1, 10**11), min_size=4, max_size=4))
+def test_any_items_with_a_right_checksum_are_read_or_refused(
+    sets: list[list[tuple[int, bytes]]], stamps_ns: list[int]
+) -> None:
+    data = b"".join(
+        packet(*((tag, value.hex()) for tag, value in items if tag not in (1, 2)), (2, f"{_TIME_NS // 1000 + n:016x}"))
+        for n, items in enumerate(sets)
+    )
+    counts: Counter[str] = Counter()
+    found = list(local_sets(data, counts))
+    assert len(found) + counts["bad_checksum"] + counts["damaged"] >= len(sets)
+    for each in found:
+        camera_of(each, 1280, 720)
+        columns = columns_of(each)
+        assert all(np.isfinite(list(columns.values())))
+    try:
+        metadata = metadata_of(list(zip(stamps_ns, found)), counts, "a.ts")
+    except InputError:
+        return
+    assert (np.diff(metadata.telemetry.time_ns) > 0).all()
 
 
 def test_values_out_of_range_cannot_be_written() -> None:

@@ -108,12 +108,27 @@ def test_a_sample_without_a_fix_is_no_fix():
 
 def test_photos_carry_their_own_fixes():
     times_s = np.array([0.0, 4.0, 60.0, 300.0])
-    track, _ = track_of(straight(times_s), sigma_s=0.0)
+    clock = tie_clocks(
+        straight(times_s), kind="photos", start_ns=START_NS, duration_s=300, offset_given=False, strict=True
+    )
+    assert clock.is_per_photo
+    track, _ = track_from_telemetry(straight(times_s), clock, FRAME)
     for time_s in times_s:
         assert np.allclose(track.prior(time_s).position_m[:2], [4 * time_s, time_s], atol=1e-3)
-    assert tie_clocks(
-        straight(times_s), kind="photos", start_ns=START_NS, duration_s=300, offset_given=False, strict=True
-    ).sigma_s == 0
+
+
+def test_a_lag_moves_a_photos_fix_along_its_velocity_and_doubts_it_in_a_turn():
+    times_s = np.arange(0, 50, 10.0)
+    turning = straight(times_s)
+    clock = tie_clocks(turning, kind="photos", start_ns=START_NS, duration_s=40, offset_given=False, strict=True)
+    track, _ = track_from_telemetry(turning, clock, FRAME)
+    east_m = track.east_north_m.copy()
+    east_m[3:, 0] = east_m[2, 0]  # 4 m/s east until the third photo, none after it
+    moved = shifted(replace(track, east_north_m=east_m), 0.5)
+    assert np.allclose((moved.east_north_m - east_m)[:, 0], [2, 2, 1, 0, 0], atol=1e-3)
+    assert np.allclose((moved.east_north_m - east_m)[:, 1], 0.5, atol=1e-3)
+    assert np.allclose(moved.horizontal_sigma_m[[0, 1, 3, 4]], track.horizontal_sigma_m[0])
+    assert moved.horizontal_sigma_m[2] == pytest.approx(np.hypot(track.horizontal_sigma_m[0], 1.0), abs=1e-3)
 
 
 def test_a_slow_fix_repeated_at_frame_rate_is_a_slow_fix():

@@ -1,4 +1,4 @@
-"""What `sorvolo compare` says in the end."""
+"""What `sorvolo compare` prints in the end."""
 
 from io import StringIO
 from pathlib import Path
@@ -7,25 +7,26 @@ import pytest
 from rich.console import Console
 
 from sorvolo.cli.compare import show_results
+from sorvolo.cli.options import PlaceFormat
 
 
-def test_what_was_told_live_and_did_not_last_is_named(tmp_path: Path) -> None:
+def test_withdrawn_changes_are_named(tmp_path: Path) -> None:
     result = {
         "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [],
         "changes": {"features": []},
         "comparison": {"views": {"compared": 7}, "compared_area_m2": 100.0, "reasons": {}},
-        "taken_back": ["b-4", "b-7"],
+        "withdrawn": ["b-4", "b-7"],
     }
     console = Console(record=True, width=120, file=StringIO())
     show_results([result], tmp_path, console)
-    assert "taken back" in (text := console.export_text()) and "b-4, b-7" in text
-    show_results([result | {"taken_back": []}], tmp_path, console)
-    assert "taken back" not in console.export_text()
+    assert "withdrawn (not confirmed by the whole flight): b-4, b-7" in console.export_text()
+    show_results([result | {"withdrawn": []}], tmp_path, console)
+    assert "withdrawn (" not in console.export_text()
 
 
-def test_notices_and_the_report_are_told_as_by_map(tmp_path: Path) -> None:
+def test_notices_and_the_report_are_shown_as_by_map(tmp_path: Path) -> None:
     result = {
-        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "changes": {"features": []}, "taken_back": [],
+        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "changes": {"features": []}, "withdrawn": [],
         "comparison": {"views": {"compared": 7}, "compared_area_m2": 100.0, "reasons": {}},
         "notices": [{"code": "no_date", "count": 1, "text": "the table has no date"}], "warnings": ["look here"],
     }
@@ -36,26 +37,26 @@ def test_notices_and_the_report_are_told_as_by_map(tmp_path: Path) -> None:
     assert f"report  {tmp_path / 'flights' / 'b' / 'report.html'}" in text
 
 
-def test_how_much_the_map_grew_is_told(tmp_path: Path) -> None:
+def test_how_much_the_map_grew_is_shown(tmp_path: Path) -> None:
     comparison = {"views": {"compared": 7, "outside": 5}, "compared_area_m2": 100.0, "reasons": {}}
     result = {
         "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [],
         "changes": {"features": []},
-        "comparison": comparison | {"extension": {"frames": 3, "shown_as_well": 2, "area_m2": 350.4}}, "taken_back": [],
+        "comparison": comparison | {"extension": {"frames": 3, "shown_as_well": 2, "area_m2": 350.4}}, "withdrawn": [],
     }
     console = Console(record=True, width=120, file=StringIO())
     show_results([result], tmp_path, console)
-    assert "the map grew by 350 m2: 3 frames extended it; 2 more show the same ground" in console.export_text()
+    assert "the map grew by 350 m2 from 3 frames; 2 more frames show the same ground" in console.export_text()
 
 
 @pytest.mark.parametrize(("georeference", "shown", "not_shown"), [
-    ({}, ["long m", "latitude, longitude", "204.250000, 289.500000", "100 m2"], ["units"]),
-    ({"crs": None}, ["long units", "north, east", "204.2, 289.5", "100 square units"], ["latitude", " m2"]),
+    ({}, ["1 change found", "length m", "latitude, longitude", "41.250000, 12.500000", "100 m2"], ["units"]),
+    ({"crs": None}, ["length units", "east, north", "12.5, 41.2", "100 square units"], ["latitude", " m2"]),
 ])
-def test_a_map_without_metres_is_not_told_in_metres(
+def test_a_map_without_metres_is_not_shown_in_metres(
     tmp_path: Path, georeference: dict, shown: list[str], not_shown: list[str]
 ) -> None:
-    ring = [[289.0, 204.0], [290.0, 204.0], [290.0, 204.5], [289.0, 204.5], [289.0, 204.0]]
+    ring = [[12.0, 41.0], [13.0, 41.0], [13.0, 41.5], [12.0, 41.5], [12.0, 41.0]]
     change = {
         "geometry": {"coordinates": [ring]},
         "properties": {
@@ -64,7 +65,7 @@ def test_a_map_without_metres_is_not_told_in_metres(
         },
     }
     result = {
-        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [], "taken_back": [],
+        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [], "withdrawn": [],
         "changes": {"features": [change]} | georeference,
         "comparison": {"views": {"compared": 7}, "compared_area_m2": 100.0, "reasons": {}},
     }
@@ -73,3 +74,20 @@ def test_a_map_without_metres_is_not_told_in_metres(
     text = console.export_text()
     assert all(words in text for words in shown)
     assert not any(words in text for words in not_shown)
+
+
+@pytest.mark.parametrize(("form", "place"), [("utm", "33T 29053"), ("mgrs", "33T TF 90533 69524")])
+def test_places_are_written_as_asked_for(tmp_path: Path, form: str, place: str) -> None:
+    ring = [[12.4, 41.2], [12.6, 41.2], [12.6, 41.3], [12.4, 41.3], [12.4, 41.2]]
+    change = {"geometry": {"coordinates": [ring]}, "properties": {
+        "id": "b-1", "kind": "appeared", "length_m": 1.0, "sigma_m": 2.0, "views": 9, "score": 0.7,
+        "class_before": None, "class_after": "car",
+    }}
+    result = {
+        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [], "withdrawn": [],
+        "changes": {"features": [change]},
+        "comparison": {"views": {"compared": 7}, "compared_area_m2": 100.0, "reasons": {}},
+    }
+    console = Console(record=True, width=120, file=StringIO())
+    show_results([result], tmp_path, console, PlaceFormat(form))
+    assert place in console.export_text()

@@ -202,7 +202,7 @@ class TestFailures:
 
     def test_stopped(self, capsys: pytest.CaptureFixture[str]) -> None:
         code, told = self._told(KeyboardInterrupt(), capsys)
-        assert code == 130 and told == "stopped; what was not finished is left out, what was before is as it was\n"
+        assert code == 130 and told == "stopped; unfinished work was discarded, everything before it is unchanged\n"
 
 
 def test_import_is_quick_and_lazy() -> None:

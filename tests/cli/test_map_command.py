@@ -75,7 +75,7 @@ def test_a_stop_leaves_the_site_as_it_was(simulated: Path, tmp_path: Path) -> No
         out, err = running.communicate(timeout=60)
     assert running.returncode == 130, err
     assert out == ""
-    assert err.splitlines()[-1] == "stopped; what was not finished is left out, what was before is as it was"
+    assert err.splitlines()[-1] == "stopped; unfinished work was discarded, everything before it is unchanged"
     with Archive.open(site, write=False) as archive:
         assert not [flight for flight in archive.flights() if flight.status == "complete"]
 
@@ -99,5 +99,5 @@ def test_demo_leaves_other_peoples_files(tmp_path: Path, capsys: pytest.CaptureF
 
 def test_bar_words() -> None:
     update = MosaicUpdate("7", Status.VISION, "", 40, 100, 8, 20, 7, 3, 4.0)
-    assert words_of(update) == "10.0 frames/s, 7 of 8 placed by vision"
-    assert words_of(replace(update, seconds=0.0)) == "7 of 8 placed by vision"
+    assert words_of(update) == "10.0 frames/s, 7 of 8 frames matched"
+    assert words_of(replace(update, seconds=0.0)) == "7 of 8 frames matched"

@@ -117,7 +117,7 @@ def test_band_spans_hold_exactly_the_x_of_points_in_the_band(corners, low, width
     if not is_simple(corners):
         return
     ring = np.array(corners, dtype=float)
-    spans = band_spans([ring], low, low + width)
+    (spans,) = band_spans([ring], [(low, low + width)])
     x, y = np.meshgrid(np.linspace(-9.5, 9.5, 96), np.linspace(low, low + width, 24))
     points = np.column_stack([x.ravel(), y.ravel()])
     seen = np.unique(points[points_inside([ring], points), 0])
@@ -136,8 +136,14 @@ def test_band_spans_hold_exactly_the_x_of_points_in_the_band(corners, low, width
 
 
 def test_a_hole_splits_a_narrow_band_only():
-    assert band_spans([SQUARE, HOLE], 1.8, 2.2) == [(0.0, 1.0), (3.0, 4.0)]
-    assert band_spans([SQUARE, HOLE], 0.5, 2.2) == [(0.0, 4.0)]
+    split, whole = band_spans([SQUARE, HOLE], [(1.8, 2.2), (0.5, 2.2)])
+    assert split == [(0.0, 1.0), (3.0, 4.0)] and whole == [(0.0, 4.0)]
+
+
+def test_an_outline_that_crosses_itself_has_the_spans_of_its_parts():
+    bow_tie = SQUARE[[0, 2, 1, 3]]  # two triangles that meet in the middle
+    low, middle = band_spans([bow_tie], [(0.0, 0.5), (1.5, 2.5)])
+    assert low == [(0.0, 0.5), (3.5, 4.0)] and middle == [(0.0, 4.0)]
 
 
 def test_spans_join_over_small_gaps():

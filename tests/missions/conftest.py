@@ -43,6 +43,16 @@ def photographed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def lagging(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same photos, each with the fix of 0.4 s before: 2 m behind."""
+    folder = tmp_path_factory.mktemp("flights") / "lagging"
+    sensor = replace(_SMALL.sensor, clock_offset_s=0.4)
+    for _ in simulate_site(folder, replace(_SMALL, sensor=sensor, output=OutputSettings(photos=True))):
+        pass
+    return folder
+
+
+@pytest.fixture(scope="session")
 def oblique(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same video by a camera that looks 45 degrees down, with telemetry in every format."""
     folder = tmp_path_factory.mktemp("flights") / "oblique"

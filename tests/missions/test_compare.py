@@ -474,7 +474,7 @@ def test_the_command_tells_the_changes_as_json(flown, site, capsys):
     told = json.loads(capsys.readouterr().out)["flights"][0]
     assert told["flight"] == "flight2"
     assert len(told["changes"]["features"]) == sum(told["comparison"]["changes"].values()) > 0
-    assert not set(told["taken_back"]) & {each["properties"]["id"] for each in told["changes"]["features"]}
+    assert not set(told["withdrawn"]) & {each["properties"]["id"] for each in told["changes"]["features"]}
 
 
 def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(compared, flown, site):

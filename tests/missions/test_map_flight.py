@@ -128,6 +128,13 @@ def test_a_clock_offset_is_found_from_motion_or_taken_as_given(filmed: Path, tmp
         assert corner_errors_m(tmp_path / site, "flight1", filmed / "truth")[0] < 0.5
 
 
+def test_photos_whose_fixes_lag_are_put_where_their_motion_shows(lagging: Path, tmp_path: Path) -> None:
+    run_map(tmp_path / "site", lagging / "flight1" / "photos", "--camera", lagging / "camera.xml")
+    offset = report_of(tmp_path / "site", "photos")["time_offset"]
+    assert offset["origin"] == "estimated" and offset["applied_s"] == pytest.approx(0.4, abs=0.1)
+    assert corner_errors_m(tmp_path / "site", "photos", lagging / "truth")[0] < 0.3  # the lag alone is 2 m
+
+
 def test_a_video_without_telemetry_is_mapped_in_a_frame_of_its_own(filmed: Path, tmp_path: Path) -> None:
     alone = tmp_path / "alone"
     alone.mkdir()

@@ -9,6 +9,7 @@ from fake_flights import LOCAL_SITE, SITE, frame, map_flight
 
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, StoreError
+from sorvolo.geometry.coordinates import Coordinates, place_text
 from sorvolo.missions.site.review import list_changes, review_changes
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Verdict
@@ -75,7 +76,25 @@ def test_sizes_are_listed_in_the_units_of_the_map(
         with archive.begin_flight("b", "", {}) as writer:
             writer.commit([frame(0)], {}, {}, "<html></html>", changes=[fake_change(1)])
     assert main(["review", str(tmp_path / "site")]) == 0
-    assert f" size {unit} " in capsys.readouterr().out
+    assert f" length {unit} " in capsys.readouterr().out
+
+
+def test_a_changes_place_is_listed_as_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with Archive.open(tmp_path / "site", write=True) as archive:
+        archive.create_site(SITE)
+        map_flight(archive, "a", 20, count=1)
+        with archive.begin_flight("b", "", {}) as writer:
+            writer.commit([frame(0)], {}, {}, "<html></html>", changes=[fake_change(1)])
+    assert main(["review", str(tmp_path / "site"), "--json"]) == 0
+    (change,) = json.loads(capsys.readouterr().out)["changes"]
+    for form in Coordinates:
+        place = place_text(change["latitude"], change["longitude"], form)
+        assert main(["review", str(tmp_path / "site"), "--coordinates", form.value]) == 0
+        shown = capsys.readouterr().out
+        assert place in shown and form.heading.split(",")[0] in shown
+        assert main(["history", str(tmp_path / "site"), "--coordinates", form.value]) == 0
+        origin = SITE.origin
+        assert place_text(origin.latitude_deg, origin.longitude_deg, form) in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_folder_that_is_no_site_is_not_made_one(tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ def test_changes_come_back_as_they_were_found(folder: Path) -> None:
     written = cv2.imread(str(folder / "flights/b/changes/b-1-before.png"), cv2.IMREAD_UNCHANGED)
     assert np.array_equal(cv2.cvtColor(written, cv2.COLOR_BGRA2RGBA), made[1].patch.before)
     page = (folder / "flights/b/changes.html").read_text()
-    assert "2 changes" not in page and "1 change " in page and "1 moving thing" in page
+    assert "2 changes" not in page and "1 change " in page and "1 moving object" in page
     assert "version 1: flight a" in page and "version 2: flight b" in page
 
 

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from importlib.resources import files
 from typing import Any
 
 import cv2
@@ -17,11 +18,11 @@ from hypothesis import strategies as st
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.store.exports.map_pictures import Picture
 from sorvolo.store.pages.changes import changes_page
-from sorvolo.store.pages.changes_style import SCRIPT
 from sorvolo.store.site.change_records import StoredChange, stored_changes
 from sorvolo.survey.findings import Change, ChangeKind, Verdict
 
 KINDS = list(ChangeKind)
+SCRIPT = (files("sorvolo.store.pages") / "templates" / "swipe.js").read_text().strip()
 
 
 def page_of(changes: list[Change], report: dict[str, Any] | None = None, **changed: Any) -> str:
@@ -104,7 +105,7 @@ def test_the_headline_counts_and_does_not_count_what_moves() -> None:
     changes = [fake_change(1), fake_change(2, kind=ChangeKind.MOVING, velocity_m_s=(-1.0, 0.0))]
     page = page_of(changes)
     text = " ".join("".join(checked(page).text).split())
-    assert "1 change on 3 412 m²" in text and ": 1 appeared; 1 moving thing besides." in text
+    assert "1 change on 3 412 m²" in text and ": 1 appeared; also 1 moving object." in text
     assert "1.0 m/s to the west" in text
     assert "180 of 197 views were compared" in text and "3.1% of the ground" in text
 
@@ -113,9 +114,10 @@ def test_the_headline_counts_and_does_not_count_what_moves() -> None:
     ({"views": {"compared": 0, "not-aligned": 40}}, "No view could be compared"),
     ({"views": {"compared": 10, "not-aligned": 40}}, "40 of 50 views: not-aligned"),
     ({"unknown_share": 0.42}, "42% of the ground under the views was unknown"),
-    ({"suppressed": 3}, "3 changes were left out"),
-    ({"map_updated": False}, "not brought up to date"),
+    ({"suppressed": 3}, "3 changes left out"),
+    ({"map_updated": False}, "not updated"),
     ({"reasons": {"too few points fit": 9}}, "too few points fit"),
+    ({"candidates": {"withdrawn": {"a passing shadow": 2}}}, "a passing shadow"),
 ])
 def test_what_was_not_compared_is_said(changed: dict[str, Any], words: str) -> None:
     report = fake_report(5) | {"warnings": [], "comparison": fake_comparison(**changed)}
@@ -124,7 +126,7 @@ def test_what_was_not_compared_is_said(changed: dict[str, Any], words: str) -> N
 
 def test_nothing_to_look_at_first_when_all_is_well() -> None:
     report = fake_report(5) | {"warnings": [], "comparison": fake_comparison()}
-    assert "Look at this first" not in page_of([fake_change(1)], report)
+    assert "Read this first" not in page_of([fake_change(1)], report)
 
 
 def test_verdicts_are_shown_and_rejected_ones_can_be_hidden() -> None:
@@ -132,7 +134,7 @@ def test_verdicts_are_shown_and_rejected_ones_can_be_hidden() -> None:
     stored = stored_changes("b", changes)
     stored[1] = replace(stored[1], verdict=Verdict.REJECTED, note="a shadow")
     page = page_of_stored(stored, changes)
-    assert 'id="show-rejected"' in page and "a shadow" in page and "1 rejected by a person" in page
+    assert 'id="show-rejected"' in page and "a shadow" in page and "Reviewed by a person: 1 rejected." in page
     assert page.count("is-rejected") > page_of(changes).count("is-rejected")
 
 
@@ -144,7 +146,7 @@ def test_times_without_a_date_are_times_into_the_flight() -> None:
 def test_pictures_that_are_gone_are_said_to_be() -> None:
     changes = [fake_change(1)]
     page = changes_page({}, stored_changes("b", changes), None, None, LOCAL_SITE, {})
-    assert page.count("the picture is gone") == 2
+    assert page.count("the picture is missing") == 2
     assert "class=\"swipe" not in page
     checked(page)
 

@@ -32,9 +32,10 @@ def test_page_needs_nothing_else() -> None:
 
 def test_a_later_flight_fits_the_map_and_made_none() -> None:
     words = _words(report_page(fake_report() | {"comparison": {"against_version": 1}}, fake_picture()))
-    assert re.search(r"\d+ of 60 views fit the map", words) and "changes.html" in words and "frame to the map" in words
+    assert re.search(r"\d+ of 60 frames matched the map", words) and "changes.html" in words
+    assert "a frame and the map" in words
     alone = _words(report_page(fake_report(), fake_picture()))
-    assert "make a map" in alone and "changes.html" not in alone and "to its neighbours" in alone
+    assert ": a map of" in alone and "changes.html" not in alone and "and its neighbours" in alone
 
 
 def test_picture_is_the_map_on_grey() -> None:
@@ -66,7 +67,7 @@ def test_everything_from_outside_is_escaped() -> None:
     page = report_page(report, fake_picture(60, 40))
     checker = checked(page)
     assert "script" not in checker.names and checker.names.count("img") == 1
-    assert "<script" not in page and "alert(&quot;1&quot;)" in page
+    assert "<script" not in page and "alert(&#34;1&#34;)" in page
 
 
 def _with_every_text(value: Any, text: str) -> Any:
@@ -121,9 +122,9 @@ def test_fix_lies_at_camera_less_residual() -> None:
 
 
 @pytest.mark.parametrize(("counts", "words"), [
-    ((60, 0, 0), "All 60 selected frames fit together"),
-    ((55, 3, 2), "58 of 60 selected frames make a map of 3\u202f412 m\u00b2 at 3 cm a pixel: 55 by what they "
-                 "show, 3 by GPS alone; 2 could not be placed."),
+    ((60, 0, 0), "60 of 60 frames matched: a map of 3\u202f412 m\u00b2"),
+    ((55, 3, 2), "55 of 60 frames matched, 3 placed by GPS only, 2 not placed: a map of 3\u202f412 m\u00b2 at a "
+                 "ground resolution of 3 cm per pixel."),
     ((0, 0, 60), "there is no map"),
 ])
 def test_headline_is_honest(counts: tuple[int, int, int], words: str) -> None:
@@ -136,9 +137,11 @@ def test_headline_is_honest(counts: tuple[int, int, int], words: str) -> None:
 
 def test_local_map_promises_no_metres() -> None:
     page = report_page(fake_report(georeferenced=False), fake_picture(60, 40))
-    headline = _words(page).split("What became")[0]
+    headline = _words(page).split("Frames")[0]
     assert "without metres and without north" in headline
     assert " m\u00b2" not in headline and "cm" not in headline and 'class="scale"' not in page
+    words = _words(page)
+    assert "units" not in words and "GPS fix" not in words and "position accuracy" not in words.lower()
 
 
 def test_scale_bar_is_as_long_as_it_says() -> None:
@@ -154,7 +157,7 @@ def test_unknown_numbers_are_said_or_left_out() -> None:
     report = _without_numbers(plain_json(fake_report()))
     words = _words(report_page(report, fake_picture(60, 40)))
     assert "None" not in words and "nan" not in words.lower().split()
-    assert "Look at this first" in words
+    assert "Read this first" in words
 
 
 def _without_numbers(value: Any) -> Any:

@@ -36,12 +36,12 @@ def test_a_page_says_what_where_and_how_sure() -> None:
     way_m = np.column_stack([np.linspace(0, 50, 9), np.zeros(9)])
     page = checked(watch_page(_REPORT, tracks, {1: b"\xff\xd8picture"}, way_m))
     text = " ".join(page.text)
-    assert "Found: 1 x person, 1 x car." in text and "person, car" in text
-    assert "41.900000, 12.600000" in text and "1.2 m" in text and "5.0 m/s" in text and "5 in 2" in text
+    assert "Objects found: 1 person, 1 car." in text and "person, car" in text
+    assert "41.900000, 12.600000" in text and "1.2 m" in text and "5.0 m/s" in text and "passes" in text
     assert "a <notice>" in text and "a <warning>" in text and "DJI<1>" in text and "Apache-2.0 & others" in text
     assert page.names.count("img") == 1 and page.names.count("circle") == 4 and "polyline" in page.names
     assert all(address.startswith(("data:", "#")) for address in page.addresses)
-    assert "1 more have no picture here" in text and "40, of which 1 without a place on the ground" in text
+    assert "1 more without a picture here" in text and "40, of which 1 without a place on the ground" in text
 
 
 def test_neighbours_on_the_map_have_names_that_can_be_read() -> None:
@@ -62,7 +62,7 @@ def test_a_day_is_said_once_in_a_row() -> None:
 
 def test_nothing_found_and_nothing_known_is_a_page_too() -> None:
     text = " ".join(checked(watch_page({"flight": "x"}, [], {}, np.zeros((0, 2)))).text)
-    assert "Found: nothing." in text
+    assert "Objects found: nothing." in text
     only_way = checked(watch_page(_REPORT, [], {}, np.array([[0.0, 0.0], [40.0, 10.0]])))
     assert "polyline" in only_way.names and "circle" not in only_way.names
 
@@ -72,7 +72,7 @@ def test_a_flight_that_nothing_places_is_drawn_in_pixels() -> None:
     track = {key: value for key, value in _track(1).items() if key not in ("latitude", "longitude")}
     page = checked(watch_page(local, [track | {"x_px": 100.0, "y_px": 50.0}], {}, np.zeros((0, 2))))
     text = " ".join(page.text)
-    assert "100, 50 px" in text and "nothing placed this flight" in text
+    assert "100, 50 px" in text and "nothing places this flight" in text
     assert "40, of which none with a place on the ground" in text
 
 

@@ -78,13 +78,13 @@ def guess_camera(
     if presets:
         return _camera_of_preset(presets[0], width_px, height_px, focal_length_mm)
     focal_px = focal_length_mm * focal_plane_px_per_mm * width_px / (full_width_px or width_px)
-    if _known(focal_length_mm) and _known(focal_plane_px_per_mm) and _is_lens(focal_px, width_px):
+    if _is_lens(focal_px, width_px):  # not where one is unknown: NaN or 0
         words = f"EXIF of the {label}: {focal_length_mm:g} mm at {focal_plane_px_per_mm:.1f} px/mm"
         return _plain_camera(width_px, height_px, focal_px, words, 0.05)
     # The equivalent compares diagonals of whole photos. A 16:9 picture is nearly always cut from a 4:3 sensor.
     diagonal_px = width_px * 1.25 if width_px / height_px > 1.6 else math.hypot(width_px, height_px)
     focal_px = focal_length_35mm / _FULL_FRAME_DIAGONAL_MM * diagonal_px
-    if _known(focal_length_35mm) and _is_lens(focal_px, width_px):
+    if _is_lens(focal_px, width_px):
         words = f"EXIF of the {label}: equivalent to {focal_length_35mm:g} mm on 35 mm film"
         return _plain_camera(width_px, height_px, focal_px, words, 0.05)
     camera = Camera.from_angle_of_view(width_px, height_px, GUESSED_AOV_DEG)

@@ -238,44 +238,60 @@ def _utc_ns(main: _Tags, detail: _Tags, gps: _Tags, properties: Mapping[str, str
     """UTC of the exposure: the drone's stamp, else the GPS receiver's, else a clock with its zone; else 0."""
     written = properties.get("dji:UTCAtExposure", properties.get("sensefly:UTCTime", ""))
     written = written.replace("-", ":").replace("T", " ").rstrip("Z")
-    if time_ns := _parse_ns(written if "." in written else f"{written}.0", "%Y:%m:%d %H:%M:%S.%f"):
-        return time_ns
+    stamp_ns = _parse_ns(written if "." in written else f"{written}.0", "%Y:%m:%d %H:%M:%S.%f")
+    return stamp_ns or _receiver_utc_ns(gps) or _zoned_clock_ns(main, detail)
+
+
+def _receiver_utc_ns(gps: _Tags) -> int:
     day_ns = _parse_ns(_text(gps.get(ExifTags.GPS.GPSDateStamp)).replace("-", ":"), "%Y:%m:%d")
     clock = gps.get(ExifTags.GPS.GPSTimeStamp)
-    if day_ns and isinstance(clock, (tuple, list)) and len(clock) == 3:
-        hours, minutes, seconds = (_number(part) for part in clock)
-        since_midnight_s = hours * 3600 + minutes * 60 + seconds
-        if 0 <= since_midnight_s <= 86_401:
-            return day_ns + round(since_midnight_s * 1000) * 1_000_000
+    if not day_ns or not isinstance(clock, (tuple, list)) or len(clock) != 3:
+        return 0
+    hours, minutes, seconds = (_number(part) for part in clock)
+    since_midnight_s = hours * 3600 + minutes * 60 + seconds
+    return day_ns + round(since_midnight_s * 1000) * 1_000_000 if 0 <= since_midnight_s <= 86_401 else 0
+
+
+def _zoned_clock_ns(main: _Tags, detail: _Tags) -> int:
     offset = _text(detail.get(ExifTags.Base.OffsetTimeOriginal) or detail.get(ExifTags.Base.OffsetTime))
-    zone = re.fullmatch(r"([+-])(\d\d):?(\d\d)", offset)
+    zone = re.fullmatch(r"([+-])(\d\d):?(\d\d)", offset.replace("Z", "+00:00"))
     clock_ns = _camera_clock_ns(main, detail)
-    if clock_ns and (zone or offset == "Z"):
-        minutes_east = (int(zone[2]) * 60 + int(zone[3])) * (-1 if zone[1] == "-" else 1) if zone else 0
-        return clock_ns - minutes_east * 60 * 1_000_000_000
-    return 0
+    if not clock_ns or zone is None:
+        return 0
+    minutes_east = (int(zone[2]) * 60 + int(zone[3])) * (-1 if zone[1] == "-" else 1)
+    return clock_ns - minutes_east * 60 * 1_000_000_000
 
 
 def _telemetry_columns(gps: _Tags, properties: Mapping[str, str]) -> dict[str, float]:
+    altitude_m, is_ellipsoidal = _altitude(gps)
     columns = {
-        "latitude_deg": _degrees(gps.get(ExifTags.GPS.GPSLatitude), gps.get(ExifTags.GPS.GPSLatitudeRef)),
-        "longitude_deg": _degrees(gps.get(ExifTags.GPS.GPSLongitude), gps.get(ExifTags.GPS.GPSLongitudeRef)),
         "horizontal_sigma_m": _horizontal_sigma_m(gps),
         "course_deg": _number(gps.get(ExifTags.GPS.GPSTrack)),
         "speed_m_s": _number(gps.get(ExifTags.GPS.GPSSpeed))
         * _M_S_PER_SPEED_UNIT.get(_text(gps.get(ExifTags.GPS.GPSSpeedRef)) or "K", nan),
+        **photo_xmp.height_columns(properties, altitude_m, exif_is_ellipsoidal=is_ellipsoidal),
     }
-    altitude_m, is_ellipsoidal = _altitude(gps)
-    columns |= photo_xmp.height_columns(properties, altitude_m, exif_is_ellipsoidal=is_ellipsoidal)
-    columns |= {name: value for name, value in photo_xmp.telemetry_columns(properties).items() if isfinite(value)}
+    columns |= _finite(photo_xmp.telemetry_columns(properties))
     if "sensefly:Heading" in properties:
         columns["course_deg"] = nan  # its GPSTrack repeats the heading, from which wind turns the course
+    place = _finite(_exif_place(gps))
+    place = place if len(place) == 2 else _finite(photo_xmp.place_columns(properties))
+    if abs(place.get("latitude_deg", nan)) <= 90 and abs(place.get("longitude_deg", nan)) <= 180:
+        columns |= place
+    return _finite(columns)
+
+
+def _exif_place(gps: _Tags) -> dict[str, float]:
+    """Latitude and longitude, none for a fix that the receiver calls void."""
     if _text(gps.get(ExifTags.GPS.GPSStatus)) == "V":
-        columns["latitude_deg"] = nan
-    if not (isfinite(columns["latitude_deg"]) and isfinite(columns["longitude_deg"])):
-        columns |= photo_xmp.place_columns(properties)
-    if not (abs(columns["latitude_deg"]) <= 90 and abs(columns["longitude_deg"]) <= 180):
-        columns["latitude_deg"] = columns["longitude_deg"] = nan
+        return {}
+    return {
+        "latitude_deg": _degrees(gps.get(ExifTags.GPS.GPSLatitude), gps.get(ExifTags.GPS.GPSLatitudeRef)),
+        "longitude_deg": _degrees(gps.get(ExifTags.GPS.GPSLongitude), gps.get(ExifTags.GPS.GPSLongitudeRef)),
+    }
+
+
+def _finite(columns: Mapping[str, float]) -> dict[str, float]:
     return {name: value for name, value in columns.items() if isfinite(value)}
 
 

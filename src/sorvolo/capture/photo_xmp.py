@@ -162,13 +162,12 @@ def _collect(element: Element, owner: str, makers: Mapping[str, str], properties
     content = " ".join("".join(element.itertext()).split())
     if maker and content:
         properties.setdefault(f"{maker}:{owner}{name}", content)
-    inside = f"{name}." if maker and len(element) else owner
-    if maker and not len(element) and any(_qualified(key, makers)[0] for key in element.attrib):
-        inside = f"{name}."
-    for key, value in element.attrib.items():
-        maker_of_key, key_name = _qualified(key, makers)
-        if maker_of_key and value:
-            properties.setdefault(f"{maker_of_key}:{inside}{key_name}", str(value))
+    parts = [(*_qualified(key, makers), str(value)) for key, value in element.attrib.items()]
+    is_structure = maker and (len(element) or any(part_maker for part_maker, _, _ in parts))
+    inside = f"{name}." if is_structure else owner
+    for part_maker, part, value in parts:
+        if part_maker and value:
+            properties.setdefault(f"{part_maker}:{inside}{part}", value)
     for child in element:
         _collect(child, inside, makers, properties)
 

@@ -19,13 +19,14 @@ from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.telemetry.cleaning import clean, notice
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry
+from sorvolo.survey.flight import TELEMETRY_COLUMNS, CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry
 
 _LOOK_AHEAD = 2
 _STEP_NS = 1_000_000  # between photos of the same second
 _UNTIMED_STEP_NS = 1_000_000_000
 _QUARTER_TURN = 6  # EXIF's number for clockwise
 _EDGE_BYTES = 65_536
+_EXIF_UTC = "UTC in the photos' EXIF"
 
 
 @dataclass(frozen=True)
@@ -184,32 +185,18 @@ def _put_in_time(photos: Sequence[Photo]) -> tuple[list[Photo], str, list[Notice
 
 
 def _best_times(photos: Sequence[Photo]) -> tuple[list[int], str, list[Notice]]:
-    """Each photo's UTC, 0 where unknown.
-
-    EXIF's GPS time is that of the receiver's fix: where it stands still from photo to photo and the camera's
-    clock does not, the clock is used, set by the median of its difference to the GPS.
-    """
+    """Each photo's UTC, 0 where unknown; where the times come from; and notices."""
     utc_ns = [photo.metadata.utc_ns for photo in photos]
     local_ns = [photo.metadata.local_ns for photo in photos]
     untimed = notice(
-        "photo_without_time", sum(1 for utc, local in zip(utc_ns, local_ns) if not (utc or local)),
+        "photo_without_time", sum(not (utc or local) for utc, local in zip(utc_ns, local_ns)),
         "photos without a time, placed by their names: {}",
     )
-    offsets_ns = [utc - local for utc, local in zip(utc_ns, local_ns) if utc and local]
-    if offsets_ns:
-        offset_ns = median_low(offsets_ns)
-        stands_still = any(
-            utc == next_utc != 0 and 0 != local != next_local != 0
-            for (utc, local), (next_utc, next_local) in pairwise(zip(utc_ns, local_ns))
-        )
-        times_ns = [
-            local + offset_ns if local and (stands_still or not utc) else utc
-            for utc, local in zip(utc_ns, local_ns)
-        ]
-        clock = "the camera's clock, set by the photos' GPS time"
-        return times_ns, clock if stands_still else "UTC in the photos' EXIF", untimed
+    if any(utc and local for utc, local in zip(utc_ns, local_ns)):
+        times_ns, origin = _times_of_two_clocks(utc_ns, local_ns)
+        return times_ns, origin, untimed
     if any(utc_ns):
-        return utc_ns, "UTC in the photos' EXIF", untimed
+        return utc_ns, _EXIF_UTC, untimed
     if any(local_ns):
         origin = "EXIF time of the camera's clock, its time zone unknown and taken as UTC"
         zone = notice(
@@ -218,6 +205,22 @@ def _best_times(photos: Sequence[Photo]) -> tuple[list[int], str, list[Notice]]:
         )
         return local_ns, origin, [*zone, *untimed]
     return utc_ns, "unknown: no photo has a time; they are taken to be one second apart, by name", untimed
+
+
+def _times_of_two_clocks(utc_ns: list[int], local_ns: list[int]) -> tuple[list[int], str]:
+    """UTC of photos that mostly carry it and the camera's own clock as well.
+
+    EXIF's GPS time is that of the receiver's fix: where it stands still from photo to photo and the camera's
+    clock does not, the clock is used, set by the median of its difference to the GPS.
+    """
+    both = list(zip(utc_ns, local_ns))
+    offset_ns = median_low([utc - local for utc, local in both if utc and local])
+    stands_still = any(
+        utc == next_utc != 0 and 0 != local != next_local != 0
+        for (utc, local), (next_utc, next_local) in pairwise(both)
+    )
+    times_ns = [local + offset_ns if local and (stands_still or not utc) else utc for utc, local in both]
+    return times_ns, "the camera's clock, set by the photos' GPS time" if stands_still else _EXIF_UTC
 
 
 def _mark_duplicates(photos: Sequence[Photo]) -> list[Photo]:
@@ -286,18 +289,17 @@ def _turn(image: ImageRGB, orientation: int) -> ImageRGB:
 
 
 def _telemetry_of(photos: Sequence[Photo]) -> tuple[Telemetry, list[Notice]]:
-    """One sample a photo that says where it is or how it looked, and is no duplicate, at exactly the photo's time."""
-    readable = [
-        photo for photo in photos if photo.metadata.width_px and not photo.problem.startswith("duplicate")
-    ]
-    placed = [photo for photo in readable if "latitude_deg" in photo.metadata.columns]
-    missing = notice("photo_without_gps", len(readable) - len(placed), "photos without a GPS position: {}")
+    """One sample a photo that states its place or attitude, and is no duplicate, at exactly the photo's time."""
+    readable = [photo for photo in photos if photo.metadata.width_px and not _is_duplicate(photo)]
+    placed = sum("latitude_deg" in photo.metadata.columns for photo in readable)
+    missing = notice("photo_without_gps", len(readable) - placed, "photos without a GPS position: {}")
     if not placed:
         return no_telemetry(), missing
-    telling = [photo for photo in readable if photo.metadata.columns]
-    names = {name for photo in telling for name in photo.metadata.columns}
-    columns = {name: [photo.metadata.columns.get(name, np.nan) for photo in telling] for name in names}
-    cleaned = clean("exif", telling[0].path.parent.name, [photo.time_ns for photo in telling], columns)
+    sampled = [photo for photo in readable if photo.metadata.columns]
+    columns = {
+        name: [photo.metadata.columns.get(name, np.nan) for photo in sampled] for name in TELEMETRY_COLUMNS
+    }
+    cleaned = clean("exif", sampled[0].path.parent.name, [photo.time_ns for photo in sampled], columns)
     if not cleaned.has_fixes:
         return no_telemetry(), [*missing, *cleaned.notices]
     return replace(cleaned, notices=(*missing, *cleaned.notices)), []
@@ -305,26 +307,44 @@ def _telemetry_of(photos: Sequence[Photo]) -> tuple[Telemetry, list[Notice]]:
 
 def _picture_notices(photos: Sequence[Photo], width_px: int, height_px: int) -> list[Notice]:
     used = [photo.metadata for photo in photos if not photo.problem]
-    other = [metadata for metadata in used if metadata.used_size_px != (width_px, height_px)]
-    turned = [metadata for metadata in other if metadata.used_size_px == (height_px, width_px)]
-    cameras = {(metadata.make, metadata.model) for metadata in used}
-    focal_mm = {metadata.focal_length_mm for metadata in used if metadata.focal_length_mm > 0}
     return [
-        *notice("duplicate_photo", sum(photo.problem.startswith("duplicate") for photo in photos),
+        *notice("duplicate_photo", sum(map(_is_duplicate, photos)),
                 "photos that are exact copies of others, not used twice: {}"),
         *notice("unreadable_photo", sum(not photo.metadata.width_px for photo in photos),
                 "files named like pictures that cannot be read: {}"),
-        *notice("other_size", sum(photo.problem.startswith("size") for photo in photos),
-                f"photos of another shape than the flight's {width_px}x{height_px}, not used: {{}}"),
-        *notice("rotated_photo", len(turned), "photos that lay across the others, turned by 90 deg: {}"),
-        *notice("resized_photo", len(other) - len(turned),
-                f"photos of another size, resampled to {width_px}x{height_px}: {{}}"),
-        *notice("reduced_photo", sum(metadata.reduction > 1 for metadata in used),
-                f"photos of more than {LARGEST_FRAME_PX // 1_000_000} megapixels, used at half their size: {{}}"),
+        *_size_notices(photos, used, (width_px, height_px)),
         *notice("unreadable_metadata", sum(bool(metadata.unreadable) for metadata in used),
                 "photos with damaged EXIF or XMP, which is not used: {}"),
+        *_camera_notices(used),
+    ]
+
+
+def _size_notices(
+    photos: Sequence[Photo], used: Sequence[PhotoMetadata], size_px: tuple[int, int]
+) -> list[Notice]:
+    other = [metadata.used_size_px for metadata in used if metadata.used_size_px != size_px]
+    turned = other.count(size_px[::-1])
+    shown = f"{size_px[0]}x{size_px[1]}"
+    return [
+        *notice("other_size", sum(photo.problem.startswith("size") for photo in photos),
+                f"photos of another shape than the flight's {shown}, not used: {{}}"),
+        *notice("rotated_photo", turned, "photos that lay across the others, turned by 90 deg: {}"),
+        *notice("resized_photo", len(other) - turned, f"photos of another size, resampled to {shown}: {{}}"),
+        *notice("reduced_photo", sum(metadata.reduction > 1 for metadata in used),
+                f"photos of more than {LARGEST_FRAME_PX // 1_000_000} megapixels, used at half their size: {{}}"),
+    ]
+
+
+def _camera_notices(used: Sequence[PhotoMetadata]) -> list[Notice]:
+    cameras = {(metadata.make, metadata.model) for metadata in used}
+    focal_mm = {metadata.focal_length_mm for metadata in used if metadata.focal_length_mm > 0}
+    return [
         *notice("mixed_cameras", len(cameras) if len(cameras) > 1 else 0,
                 "different cameras, mapped as if they were one: {}"),
         *notice("zoom", len(focal_mm) if len(focal_mm) > 1 else 0,
                 "different focal lengths, mapped as if they were one: {}"),
     ]
+
+
+def _is_duplicate(photo: Photo) -> bool:
+    return photo.problem.startswith("duplicate")

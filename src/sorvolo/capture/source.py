@@ -117,12 +117,7 @@ def open_sources(
     if not inputs:
         raise InputError("no input; give a video file, a folder of photos, photos, or a live stream's address")
     addresses = [live_address(text) for text in map(str, inputs) if is_live_address(text)]
-    recorded = [str(each) for each in inputs if not is_live_address(str(each))]
-    for text in recorded:
-        if not Path(text).exists():
-            raise InputError(_nothing_at(text))
-    paths = [Path(text) for text in recorded]
-    videos, albums = _sort_inputs(paths)
+    videos, albums = _sort_inputs(_recorded(inputs))
     names = _distinct_names([*(path.resolve() for path in videos), *(album.place for album in albums)])
     if telemetry is not None and len(names) + len(addresses) > 1:
         raise InputError(
@@ -131,20 +126,23 @@ def open_sources(
         )
     log = _telemetry_file(telemetry, is_live=bool(addresses))
     sources: list[VideoSource | PhotoSource | LiveSource] = [
-        _open_video(path, name, log, camera) for path, name in zip(videos, names)
+        *(_open_video(path, name, log, camera) for path, name in zip(videos, names)),
+        *(_open_photos(album, name, log, camera) for album, name in zip(albums, names[len(videos):])),
+        *(_open_live(address, telemetry, camera, live, until or threading.Event()) for address in addresses),
     ]
-    sources += [
-        _open_photos(album, name, log, camera) for album, name in zip(albums, names[len(videos):])
-    ]
-    for address in addresses:
-        sources.append(_open_live(address, telemetry, camera, live, until or threading.Event()))
-    taken = dict(known)
-    for each in sources:
-        each.name = _free_name(safe_name(each.name), each.fingerprint, taken)
-        taken[each.name] = each.fingerprint
-        if better_camera is not None:
+    _give_names(sources, known)
+    if better_camera is not None:
+        for each in sources:
             each.camera = better_camera(each.camera)
     return list(sources)
+
+
+def _recorded(inputs: Sequence[Path | str]) -> list[Path]:
+    """The inputs that are files or folders; raises InputError for one that is not there."""
+    recorded = [str(each) for each in inputs if not is_live_address(str(each))]
+    if missing := next((text for text in recorded if not Path(text).exists()), ""):
+        raise InputError(_nothing_at(missing))
+    return [Path(text) for text in recorded]
 
 
 @contextmanager
@@ -183,27 +181,31 @@ def _sort_inputs(inputs: Sequence[Path]) -> tuple[list[Path], list[_AlbumInput]]
     albums: list[_AlbumInput] = []
     single: list[Path] = []
     for path in dict.fromkeys(inputs):
-        if not path.is_dir():
-            (single if path.suffix.lower() in PHOTO_SUFFIXES else videos).append(path)
-            continue
-        if (path / _SITE_MARK).is_file():
-            raise InputError(
-                f"{path}: a site folder (it has {_SITE_MARK}), no flight; give the flight's video or photos (map and "
-                "compare take the site as --site)"
-            )
-        inside = [each for each in sorted(path.iterdir()) if each.is_file() and each.name[0] != "."]
-        photos = [each for each in inside if each.suffix.lower() in PHOTO_SUFFIXES]
-        films = [each for each in inside if each.suffix.lower() in VIDEO_SUFFIXES]
-        if photos:
-            albums.append(_AlbumInput(path.resolve(), photos, len(inside) - len(photos)))
-        elif films:
+        if path.is_dir():
+            films, album = _inside(path)
             videos += films
+            albums += album
         else:
-            raise InputError(_nothing_in(path, len(inside)))
+            (single if path.suffix.lower() in PHOTO_SUFFIXES else videos).append(path)
     if single:
         place = single[0].resolve() if len(single) == 1 else single[0].resolve().parent
         albums.append(_AlbumInput(place, single))
     return videos, albums
+
+
+def _inside(folder: Path) -> tuple[list[Path], list[_AlbumInput]]:
+    """A folder's photos as one album, or, where it has none, its videos."""
+    if (folder / _SITE_MARK).is_file():
+        raise InputError(
+            f"{folder}: a site folder (it has {_SITE_MARK}), no flight; give the flight's video or photos (map and "
+            "compare take the site as --site)"
+        )
+    files = [each for each in sorted(folder.iterdir()) if each.is_file() and each.name[0] != "."]
+    if photos := [each for each in files if each.suffix.lower() in PHOTO_SUFFIXES]:
+        return [], [_AlbumInput(folder.resolve(), photos, len(files) - len(photos))]
+    if films := [each for each in files if each.suffix.lower() in VIDEO_SUFFIXES]:
+        return films, []
+    raise InputError(_nothing_in(folder, len(files)))
 
 
 def _nothing_at(text: str) -> str:
@@ -237,6 +239,14 @@ def _distinct_names(places: Sequence[Path]) -> list[str]:
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(f"two flights would be named {twice[0]}; rename one, or map them one by one")
     return names
+
+
+def _give_names(sources: Sequence["VideoSource | PhotoSource | LiveSource"], known: Mapping[str, str]) -> None:
+    """Names that are safe as folders and no other flight has, by their fingerprints."""
+    taken = dict(known)
+    for each in sources:
+        each.name = _free_name(safe_name(each.name), each.fingerprint, taken)
+        taken[each.name] = each.fingerprint
 
 
 def _free_name(name: str, fingerprint: str, taken: Mapping[str, str]) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.geometry.arrays import Floats, Mask, PointsM, TimesNs
+from sorvolo.geometry.arrays import Floats, Mask, PointsM, TimesNs, frozen
 from sorvolo.geometry.polygons import points_inside, signed_area
 from sorvolo.survey.findings import ChangeKind
 
@@ -112,9 +112,20 @@ class TrueEvent:
     kind: ChangeKind
     outline_m: PointsM
     length_m: float
-    clear_ns: TimesNs
+    clear_ns: TimesNs | Sequence[int]
     path_m: PointsM = field(default_factory=lambda: np.zeros((0, 2)))
     must_find: bool = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "clear_ns", frozen(self.clear_ns, np.int64))
+        object.__setattr__(self, "path_m", frozen(self.path_m).reshape(-1, 2))
+
+    def is_shown(self, ground: "ComparedGround", views: int, moving_views: int) -> bool:
+        """Whether compared ground shows it well enough to have to be found: all of its outline in so many clear views,
+        or, if it moves, so many of the places of its path."""
+        if self.kind is ChangeKind.MOVING:
+            return int(np.count_nonzero(ground.holds(self.path_m))) >= moving_views
+        return len(self.clear_ns) >= views and bool(ground.holds(self.outline_m).all())
 
 
 @dataclass(frozen=True)

@@ -8,18 +8,21 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from sorvolo.cli.options import AsJson
+from sorvolo.survey.wording import counted
+
 if TYPE_CHECKING:
     from sorvolo.capture.checkerboard import Calibration
 
 
 def calibrate(
-    inputs: Annotated[list[Path], typer.Argument(help="Photos, a folder of them, or a video of the board.")],
-    board: Annotated[str, typer.Option(help="Inner corners, such as 9x6 for a board of 10 x 7 squares.")],
+    inputs: Annotated[list[Path], typer.Argument(help="Photos of the board, a folder of photos, or a video.")],
+    board: Annotated[str, typer.Option(help="Inner corners of the board, such as 9x6 for 10 x 7 squares.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Camera file to write.")] = Path("camera.xml"),
     square: Annotated[float, typer.Option(help="Side of a square, mm.")] = 25.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Make a camera file from pictures of a checkerboard, in the mode (size, zoom) that will fly.
+    """Make a camera file from pictures of a checkerboard, taken with the size and zoom that will fly.
 
     Example: sorvolo calibrate board_video.mp4 --board 9x6 -o camera.xml
     """
@@ -28,12 +31,12 @@ def calibrate(
 
     chessboard = parse_board(board, square)
     looked = []
-    with Console(stderr=True).status("looking for the board") as status:
+    with Console(stderr=True).status("searching for the board") as status:
         for each in find_views(inputs, chessboard):
             looked.append(each)
             found = sum(isinstance(view.view, BoardView) for view in looked)
-            status.update(f"board found in {found} of {len(looked)} pictures")
-        status.update("solving for the camera")
+            status.update(f"board found in {found} of {counted(len(looked), 'picture')}")
+        status.update("computing the camera")
         result = calibrate_camera(looked, chessboard)
     write_calibration(out, result)
     if as_json:
@@ -47,17 +50,17 @@ def _show(result: "Calibration", out: Path) -> None:
     for name, error_px in result.view_errors_px.items():
         table.add_row(name, f"{error_px:.3f}")
     for name in result.dropped:
-        table.add_row(name, "left out: does not fit the others")
+        table.add_row(name, "left out: contradicts the others")
     console = Console()
     console.print(table)
     k1, k2, p1, p2, k3 = camera.distortion
     console.print(
         f"{out}: {camera.width_px}x{camera.height_px}, focal length {camera.fx_px:.1f} x "
         f"{camera.fy_px:.1f} px "
-        f"(good to {result.focal_sigma:.2%}), centre {camera.cx_px:.1f}, {camera.cy_px:.1f}\n"
+        f"(1 sigma {result.focal_sigma:.2%}), centre {camera.cx_px:.1f}, {camera.cy_px:.1f}\n"
         f"k1 {k1:.5f}  k2 {k2:.5f}  p1 {p1:.5f}  p2 {p2:.5f}  k3 {k3:.5f}\n"
-        f"{result.reprojection_error_px:.3f} px rms over {len(result.view_errors_px)} views, tilts up to "
-        f"{result.tilt_spread_deg:.0f} deg apart, {result.coverage:.0%} of the picture covered"
+        f"reprojection error {result.reprojection_error_px:.3f} px rms over {len(result.view_errors_px)} views; tilts "
+        f"differ by up to {result.tilt_spread_deg:.0f} deg; {result.coverage:.0%} of the picture covered"
     )
 
 

@@ -1,7 +1,7 @@
-"""`sorvolo compare`: a later flight against the map, its changes told as they are found."""
+"""`sorvolo compare`: a later flight against the map; each change is printed as it is announced."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from enum import StrEnum
 from pathlib import Path
@@ -11,11 +11,24 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from sorvolo.cli.map import ended_by_signal, newest_version, read_json, tell_notices_and_warnings, tell_path
-from sorvolo.cli.progress import bars
+from sorvolo.cli.map import ended_by_signal
+from sorvolo.cli.options import (
+    Area,
+    AsJson,
+    Camera,
+    GiveUp,
+    GroundElevation,
+    LiveTelemetry,
+    Offset,
+    PlaceFormat,
+    PlaceFormatOption,
+)
+from sorvolo.cli.places import place_heading, place_words
+from sorvolo.cli.progress import ProgressReport, rate_words
+from sorvolo.cli.shown import newest_version, read_json, show_notices_and_warnings, show_path, site_of, unit_of
+from sorvolo.survey.wording import counted, plural
 
 if TYPE_CHECKING:
     from sorvolo.capture.live.reconnect import LiveSettings
@@ -23,7 +36,7 @@ if TYPE_CHECKING:
     from sorvolo.survey.findings import Change, CompareUpdate
 
 _COLOURS = {"appeared": "green", "disappeared": "red", "replaced": "yellow", "moving": "cyan"}
-_MOST_ROWS = 40
+_MOST_ROWS, _MOST_REASONS = 40, 6
 
 
 class ChangeMethod(StrEnum):
@@ -38,47 +51,44 @@ def compare(
         list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources of a later flight.")
     ],
     site: Annotated[Path, typer.Option(help="Folder of the map that an earlier flight made.")],
-    telemetry: Annotated[
-        str | None, typer.Option(help="The flight's log, if not beside the video; of a live one, the receiver's link.")
-    ] = None,
-    camera: Annotated[str, typer.Option(help="Calibration file, preset name or EXIF code, or aov=DEG.")] = "",
-    area: Annotated[
-        Path | None, typer.Option(help="Outline outside of which frames are not used: GeoJSON, KML, KMZ.")
-    ] = None,
-    method: Annotated[ChangeMethod, typer.Option(help="robust: ours. thesis: the baseline.")] = ChangeMethod.ROBUST,
+    telemetry: LiveTelemetry = None,
+    camera: Camera = "",
+    area: Area = None,
+    method: Annotated[
+        ChangeMethod, typer.Option(help="robust: copes with light, shadows and wind. thesis: the baseline.")
+    ] = ChangeMethod.ROBUST,
     views_per_second: Annotated[
-        float, typer.Option(help="Frames compared a second of a video; the others show the same again.")
+        float, typer.Option(help="Frames of a video compared per second of flight.")
     ] = 5.0,
-    votes: Annotated[int, typer.Option(help="Views that must show a change ...")] = 3,
-    voters: Annotated[int, typer.Option(help="... among the last so many that saw the ground.")] = 5,
-    offset: Annotated[float | None, typer.Option(help="Telemetry time minus video time, s.")] = None,
-    ground_elevation: Annotated[
-        float | None, typer.Option(help="Of the ground, m, in telemetry's own height reference.")
-    ] = None,
-    masks: Annotated[bool, typer.Option("--masks", help="Write each frame's change mask and boxes, too.")] = False,
+    votes: Annotated[int, typer.Option(help="Announce a change that so many views show ...")] = 3,
+    voters: Annotated[int, typer.Option(help="... of the last so many views of that ground.")] = 5,
+    offset: Offset = None,
+    ground_elevation: GroundElevation = None,
+    masks: Annotated[bool, typer.Option("--masks", help="Also write each frame's change mask and boxes.")] = False,
     steps: Annotated[
-        Path | None, typer.Option(help="Folder for method thesis's eight pictures a view (its Figure 3.14), 4-8 MB.")
+        Path | None, typer.Option(help="Folder for pictures of method thesis's eight steps (4-8 MB a view).")
     ] = None,
     thesis: Annotated[
         list[str] | None,
         typer.Option(
-            help="A value of Table 4.2 for method thesis, such as T_gray=light, W_a=8x8, eq3.21=printed, threads=4; "
-            "again for each. See docs/thesis.md."
+            help="A value of Table 4.2 for method thesis, such as T_gray=light, W_a=8x8, eq3.21=printed or threads=4. "
+            "Can be repeated. See docs/thesis.md."
         ),
     ] = None,
     update: Annotated[
-        bool, typer.Option("--update/--no-update", help="Bring the map up to date where the ground changed or is new.")
+        bool, typer.Option("--update/--no-update", help="Update the map where the ground changed or is new.")
     ] = True,
     model: Annotated[
-        str, typer.Option(help="Tells what changed, before and after: a model's name, a file, or none.")
+        str, typer.Option(help="Detector that names what changed: a model's name, a file, or none.")
     ] = "default",
-    give_up: Annotated[float, typer.Option(help="A live source silent for so long has ended, s.")] = 30.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    give_up: GiveUp = 30.0,
+    coordinates: PlaceFormatOption = PlaceFormat.LATLON,
+    as_json: AsJson = False,
 ) -> None:
-    """Find what appeared, disappeared or moves since the map in the site folder was made, and update the map.
+    """Find what appeared, disappeared, was replaced or moves since the map was made, and update the map.
 
-    Live sources are those of `sorvolo map`. Ctrl-C ends a live flight, and what it showed is kept; a second Ctrl-C
-    leaves it out.
+    Live sources are those of `sorvolo map`. Ctrl-C ends a live flight and keeps its changes; a second Ctrl-C discards
+    them.
 
     Example: sorvolo compare DJI_0057.MP4 --site field
 
@@ -94,20 +104,20 @@ def compare(
     )
     results = compare_and_read_results(
         inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area, steps=steps,
-        live=LiveSettings(keeps_all=True, give_up_s=give_up),
+        live=LiveSettings(keeps_all=True, give_up_s=give_up), form=coordinates,
     )
     if as_json:
         typer.echo(json.dumps({"site": str(site), "flights": results}, indent=1))
     else:
-        show_results(results, site, Console())
+        show_results(results, site, Console(), coordinates)
 
 
 def compare_and_read_results(
     inputs: Sequence[Path | str], site: Path, settings: "CompareSettings", *, telemetry: Path | str | None = None,
     camera: str | None = None, area: Path | None = None, steps: Path | None = None,
-    live: "LiveSettings | None" = None,
+    live: "LiveSettings | None" = None, form: PlaceFormat = PlaceFormat.LATLON,
 ) -> list[dict[str, Any]]:
-    """Compare with a bar and each change as it is announced on stderr; report and changes of each flight, in order."""
+    """Compare with progress and announcements on stderr; report and changes of each flight, in order."""
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.compare.flights import compare_flights
     from sorvolo.store.site.archive import Archive
@@ -120,131 +130,137 @@ def compare_and_read_results(
         )
         # closed even when the bar is stopped: then the site is as it was
         with closing(comparing) as updates:
-            told_ids = _show_progress(updates, site, Console(stderr=True))
+            announced = _show_progress(updates, site, Console(stderr=True), form)
     with Archive.open(site, write=False) as archive:
         compared = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
-        return [_result(archive.flight_folder(flight_id), told_ids) for flight_id in compared]
+        return [_result(archive.flight_folder(flight_id), announced) for flight_id in compared]
 
 
-def show_results(results: Sequence[Mapping[str, Any]], site: Path, console: Console) -> None:
-    """Tell what changed, what could not be compared, and where the files are."""
+def show_results(
+    results: Sequence[Mapping[str, Any]], site: Path, console: Console, form: PlaceFormat = PlaceFormat.LATLON
+) -> None:
+    """Print what changed, what could not be compared, and where the files are."""
     for result in results:
-        _show_result(result, console)
+        _show_result(result, console, form)
         folder = site / "flights" / result["flight"]
-        tell_path("page", folder / "changes.html", console)
-        tell_path("GeoJSON", folder / "changes.geojson", console)
-        tell_path("report", folder / "report.html", console)
-    tell_path("map", site / "preview.png", console)
+        show_path("page", folder / "changes.html", console)
+        show_path("GeoJSON", folder / "changes.geojson", console)
+        show_path("report", folder / "report.html", console)
+    show_path("map", site / "preview.png", console)
 
 
-def _show_progress(updates: Any, site: Path, console: Console) -> list[str]:
-    """Take all updates, telling each change as it is announced; the ids of these."""
-    columns = (
-        SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=30),
-        TextColumn("{task.fields[told]}"), TimeRemainingColumn(),
-    )
-    told_ids: list[str] = []
-    unit = ""
-    with bars(*columns, console=console) as progress:
-        task = progress.add_task("opening", total=None, told="")
-        update: CompareUpdate
+def _show_progress(
+    updates: "Iterable[CompareUpdate]", folder: Path, console: Console, form: PlaceFormat
+) -> list[str]:
+    """Take all updates, printing each change as it is announced; the ids of these."""
+    announced: list[str] = []
+    words = None
+    with ProgressReport(console) as progress:
+        progress.show("opening")
         for update in updates:
             for change in update.announced:
-                told_ids.append(change.id)
-                unit = unit or unit_of(site)
-                console.print(_words_of(change, unit), highlight=False)
-            rate = f"{update.frames_read / update.seconds:.1f} frames/s, " if update.seconds > 0 else ""
-            progress.update(
-                task, description="comparing",
-                told=f"{rate}{update.compared} of {update.views} compared, {len(told_ids)} changes",
-                total=max(update.frames_expected, update.frames_read), completed=update.frames_read,
+                announced.append(change.id)
+                words = words or _announcement(folder, form)
+                console.print(words(change), highlight=False)
+            compared = f"{update.compared:,} of {counted(update.views, 'view')} compared"
+            progress.show(
+                "comparing, frame", update.frames_read, max(update.frames_expected, update.frames_read),
+                f"{rate_words(update.frames_read, update.seconds)}{compared}, {counted(len(announced), 'change')}",
             )
-    return told_ids
+    return announced
 
 
-def unit_of(site: Path) -> str:
-    """Metres, or the units of a map that has none."""
-    from sorvolo.store.site.archive import Archive
+def _announcement(folder: Path, form: PlaceFormat) -> "Callable[[Change], str]":
+    """What is printed of a change when it is announced."""
+    site = site_of(folder)
+    unit, place = unit_of(site), place_words(site, form)
 
-    with Archive.open(site, write=False) as archive:
-        return "units" if archive.site().is_local else "m"
+    def words(change: "Change") -> str:
+        colour = _COLOURS[change.kind]
+        what = _class_words(change.class_before, change.class_after)
+        return (
+            f"[{colour}]{change.kind.value:>11}[/{colour}]  {escape(change.id)}: {what + ', ' if what else ''}"
+            f"{change.length_m:.1f} {unit} long, at {place(change.outline_m.mean(axis=0))} "
+            f"(accuracy {change.sigma_m:.2f} {unit})"
+        )
 
-
-def _words_of(change: "Change", unit: str) -> str:
-    colour = _COLOURS[change.kind]
-    centre_m = change.outline_m.mean(axis=0)
-    named = " to ".join(escape(name) for name in (change.class_before, change.class_after) if name)
-    what = f"{named}, " if named else ""
-    return (
-        f"[{colour}]{change.kind.value:>11}[/{colour}]  {escape(change.id)}: {what}{change.length_m:.1f} {unit} long, "
-        f"{centre_m[0]:+.1f} {unit} east {centre_m[1]:+.1f} {unit} north of the site's origin, "
-        f"within {change.sigma_m:.2f} {unit}"
-    )
+    return words
 
 
-def _result(folder: Path, told_ids: Sequence[str]) -> dict[str, Any]:
-    """What a flight's files say, and which changes were told while it lasted and are not among them in the end."""
+def _class_words(before: str | None, after: str | None) -> str:
+    """What stood there and stands there: "car", "car to person"."""
+    return " to ".join(escape(name) for name in (before, after) if name)
+
+
+def _result(folder: Path, announced: Sequence[str]) -> dict[str, Any]:
+    """What a flight's files say, and which changes were announced on the way and withdrawn in the end."""
     report = read_json(folder / "report.json")
     changes = read_json(folder / "changes.geojson")
     kept = {feature["properties"]["id"] for feature in changes["features"]}
-    taken_back = [each for each in told_ids if each.rpartition("-")[0] == report["flight"] and each not in kept]
+    withdrawn = [each for each in announced if each.rpartition("-")[0] == report["flight"] and each not in kept]
     return {
         "flight": report["flight"], "method": report["method"], "comparison": report["comparison"],
         "frames": report["frames"], "seconds": report["seconds"]["total"], "peak_memory_mb": report["peak_memory_mb"],
         "warnings": report["warnings"], "notices": report["notices"], "changes": changes,
-        "taken_back": taken_back,
+        "withdrawn": withdrawn,
     }
 
 
-def _show_result(result: Mapping[str, Any], console: Console) -> None:
-    comparison = result["comparison"]
-    dark = ", and most would be missed: it was too dark" if comparison.get("most_missed") else ""
+def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat) -> None:
+    comparison, features = result["comparison"], result["changes"]["features"]
+    dark = " (it was too dark: most changes would be missed)" if comparison.get("most_missed") else ""
     console.print(
-        f"Flight {escape(result['flight'])}: {len(result['changes']['features'])} changes{dark}", style="bold"
+        f"Flight {escape(result['flight'])}: {counted(len(features), 'change')} found{dark}", style="bold",
+        highlight=False,
     )
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     is_local = result["changes"].get("crs", "WGS84") is None  # no place on Earth, no metres
-    unit, place, digits = ("units", "north, east", 1) if is_local else ("m", "latitude, longitude", 6)
-    for name in ("id", "kind", f"long {unit}", place, f"within {unit}", "views", "score"):
-        table.add_column(name, no_wrap=True)
-    for feature in result["changes"]["features"][:_MOST_ROWS]:
-        each = feature["properties"]
-        longitude, latitude = _middle(feature["geometry"]["coordinates"][0])
-        table.add_row(
-            escape(each["id"]), _kind_words(each), f"{each['length_m']:.2f}",
-            f"{latitude:.{digits}f}, {longitude:.{digits}f}", f"{each['sigma_m']:.2f}", str(each["views"]),
-            f"{each['score']:.2f}",
-        )
-    if table.row_count:
-        console.print(table)
-    if len(result["changes"]["features"]) > _MOST_ROWS:
-        console.print(f"and {len(result['changes']['features']) - _MOST_ROWS} more in changes.geojson")
+    if features:
+        _show_changes(features, console, form, is_local=is_local)
     views = comparison["views"]
+    area = f"{comparison['compared_area_m2']:,.0f} {'square units' if is_local else 'm2'}"
     console.print(
-        f"{views['compared']} of {sum(views.values())} views compared over {comparison['compared_area_m2']:.0f} "
-        f"{'square units' if is_local else 'm2'}, "
-        f"in {result['seconds']:.1f} s, {result['peak_memory_mb']:.0f} MB at most"
+        f"{views['compared']:,} of {counted(sum(views.values()), 'view')} compared, {area}, "
+        f"in {result['seconds']:.1f} s; memory at most {result['peak_memory_mb']:,.0f} MB", highlight=False,
     )
     extension = comparison.get("extension") or {}
     if extension.get("frames"):
-        as_well = f"; {extension['shown_as_well']} more show the same ground" if extension["shown_as_well"] else ""
+        more = extension["shown_as_well"]
         console.print(
-            f"the map grew by {extension['area_m2']:.0f} m2: {extension['frames']} frames extended it{as_well}"
+            f"the map grew by {extension['area_m2']:,.0f} m2 from {counted(extension['frames'], 'frame')}"
+            + (f"; {counted(more, 'more frame')} {plural('shows', more)} the same ground" if more else ""),
+            highlight=False,
         )
-    if result["taken_back"]:
+    if result["withdrawn"]:
         console.print(
-            f"taken back, since what the whole flight showed does not bear them out: {', '.join(result['taken_back'])}",
+            f"withdrawn (not confirmed by the whole flight): {', '.join(result['withdrawn'])}",
             highlight=False, markup=False,
         )
-    for reason, count in list(comparison["reasons"].items())[:6]:
-        console.print(f"  {count} x {escape(reason)}", highlight=False)
-    tell_notices_and_warnings(result, console)
+    for reason, count in list(comparison["reasons"].items())[:_MOST_REASONS]:
+        console.print(f"  {counted(count, 'view')}: {escape(reason)}", highlight=False)
+    show_notices_and_warnings(result, console)
 
 
-def _kind_words(properties: Mapping[str, Any]) -> str:
-    """The kind of change, and below it what it was and is: side by side they do not fit a terminal of 80 columns."""
-    named = " to ".join(escape(name) for name in (properties["class_before"], properties["class_after"]) if name)
-    return f"{properties['kind']}\n{named}" if named else str(properties["kind"])
+def _show_changes(features: Sequence[Any], console: Console, form: PlaceFormat, *, is_local: bool) -> None:
+    from sorvolo.geometry.coordinates import Coordinates, place_text
+
+    unit = "units" if is_local else "m"
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    place_name = place_heading(is_local, form)
+    for name in ("id", "kind", f"length {unit}", place_name, f"accuracy {unit}", "views", "score"):
+        table.add_column(name, no_wrap=name in ("id", place_name), overflow="fold")
+    for feature in features[:_MOST_ROWS]:
+        each = feature["properties"]
+        x, y = _middle(feature["geometry"]["coordinates"][0])
+        what = _class_words(each["class_before"], each["class_after"])
+        table.add_row(
+            escape(each["id"]), f"{each['kind']}\n{what}" if what else str(each["kind"]), f"{each['length_m']:.2f}",
+            f"{x:.1f}, {y:.1f}" if is_local else place_text(y, x, Coordinates(form.value)),
+            f"{each['sigma_m']:.2f}", str(each["views"]), f"{each['score']:.2f}",
+        )
+    console.print(table)
+    if len(features) > _MOST_ROWS:
+        console.print(f"and {len(features) - _MOST_ROWS:,} more in changes.geojson")
+    console.print("accuracy: 1 sigma; views: how many show it; score: 0 to 1, how sure", style="dim", highlight=False)
 
 
 def _middle(ring: Sequence[Sequence[float]]) -> tuple[float, float]:

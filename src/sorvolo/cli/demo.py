@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from sorvolo import __version__
 from sorvolo.cli.compare import compare_and_read_results, show_results
 from sorvolo.cli.map import map_and_read_reports, show_reports
-from sorvolo.cli.progress import bars
+from sorvolo.cli.progress import ProgressReport
+from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
     from sorvolo.simulation.settings import SimulationSettings
@@ -24,10 +24,10 @@ _LATER_FLIGHT = Path("flight2") / "flight2.mp4"
 
 def demo(
     folder: Annotated[
-        Path, typer.Argument(help="Folder to make; the demo's own files in it are replaced.")
+        Path, typer.Argument(help="Folder to make; an earlier demo in it is replaced.")
     ] = _DEFAULT_FOLDER,
 ) -> None:
-    """Simulate two flights over a field, map the first, compare the second, and measure both against the truth.
+    """Try everything: simulate two flights, map the first, compare the second, and check both against the truth.
 
     Example: sorvolo demo
     """
@@ -40,7 +40,7 @@ def demo(
     console = Console()
     settings = preset("demo")
     if _is_simulated(simulation, settings):
-        console.print(f"flights of an earlier run: {simulation}", soft_wrap=True, highlight=False)
+        console.print(f"using the flights of an earlier demo: {simulation}", soft_wrap=True, highlight=False)
     else:
         console.print(f"simulating two flights: {simulation}", soft_wrap=True, highlight=False)
         _simulate(simulation, settings)
@@ -51,12 +51,11 @@ def demo(
     show_reports(reports, site, console)
     for truth in evaluate_mosaic(site, truth=simulation).truth[:1]:
         corners = truth.corners
-        if not corners.absolute.count:  # without frames by vision there is nothing to say
+        if not corners.absolute.count:  # no frame was matched
             continue
         console.print(
-            f"Against the truth, the corners of the frames lie {corners.absolute.rms_m:.2f} m off (rms), "
-            f"where GPS noise alone costs {corners.floor.rms_m:.2f} m; within the map, which GPS moves as a "
-            f"whole, they are {corners.shape.rms_m:.3f} m off."
+            f"Checked against the truth: the frames lie {corners.absolute.rms_m:.2f} m off (rms). GPS noise alone "
+            f"would cost {corners.floor.rms_m:.2f} m; relative to each other they lie {corners.shape.rms_m:.3f} m off."
         )
     later, camera = simulation / _LATER_FLIGHT, simulation / "camera.xml"
     console.print("comparing the second flight with the map")
@@ -66,10 +65,10 @@ def demo(
         if measured.events is not None:
             events = measured.events
             console.print(
-                f"Against the truth, {events.found} of {events.must_find} changes that had to be found were found; "
-                f"{events.false} false ones were told."
+                f"Checked against the truth: {events.found} of {events.must_find} changes found, "
+                f"{counted(events.false, 'false change')} reported."
             )
-    console.print("Next, judge the changes, or map a flight of your own:")
+    console.print("Next, review the changes, or map a flight of your own:")
     for command in (
         f"sorvolo review {site}",
         f"sorvolo history {site}",
@@ -81,16 +80,11 @@ def demo(
 def _simulate(folder: Path, settings: "SimulationSettings") -> None:
     from sorvolo.missions.simulate.site import simulate_site
 
-    columns = (
-        SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=30), TimeRemainingColumn()
-    )
-    with bars(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task("the site", total=None)
+    with ProgressReport(Console(stderr=True)) as progress:
+        progress.show("simulating the site")
         for step in simulate_site(folder, settings):
             if step.stage == "frames":
-                progress.update(
-                    task, description=step.flight, completed=step.frames_done, total=step.frames_total
-                )
+                progress.show(f"simulating {step.flight}, frame", step.frames_done, step.frames_total)
 
 
 def _is_simulated(folder: Path, settings: "SimulationSettings") -> bool:

@@ -10,13 +10,14 @@ from rich.console import Console
 from rich.table import Table
 
 from sorvolo.cli.evaluate_detector import detector
+from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
     from sorvolo.change.metrics import EventScores
     from sorvolo.missions.evaluate.changes import FlightChanges
     from sorvolo.missions.evaluate.mosaic import MosaicEvaluation
-    from sorvolo.missions.evaluate.objects import FlightObjects
     from sorvolo.mosaic.quality import Spread
+    from sorvolo.tracking.metrics import FlightObjects
 
 evaluate_app = typer.Typer(no_args_is_help=True)
 evaluate_app.command()(detector)
@@ -29,15 +30,15 @@ def evaluate() -> None:
 
 @evaluate_app.command()
 def mosaic(
-    site: Annotated[Path, typer.Argument(help="The site folder that `sorvolo map` made.")],
+    site: Annotated[Path, typer.Argument(help="Folder of the map that `sorvolo map` made.")],
     truth: Annotated[Path | None, typer.Option(help="Folder that `sorvolo simulate` made.")] = None,
-    reference: Annotated[Path | None, typer.Option(help="GeoTIFF of the same ground.")] = None,
+    reference: Annotated[Path | None, typer.Option(help="A reference map: a GeoTIFF of the same ground.")] = None,
     positions: Annotated[
-        Path | None, typer.Option(help="CSV of camera places: frame,longitude_deg,latitude_deg[,height_m].")
+        Path | None, typer.Option(help="CSV of camera positions: frame,longitude_deg,latitude_deg[,height_m].")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Accuracy of a map, and how much it deviates from its own frames.
+    """Measure the accuracy of a map, and how much it deviates from its own frames.
 
     Example: sorvolo evaluate mosaic demo-map --truth demo-site
 
@@ -55,15 +56,15 @@ def mosaic(
 
 @evaluate_app.command()
 def changes(
-    found: Annotated[Path, typer.Argument(help="The site folder of `sorvolo compare`, or a folder of masks.")],
+    found: Annotated[Path, typer.Argument(help="Folder of a map that was compared, or a folder of masks.")],
     truth: Annotated[Path, typer.Option(help="Folder that `sorvolo simulate` made, or a folder of masks.")],
-    flight: Annotated[str | None, typer.Option(help="One of the site's compared flights; else all.")] = None,
+    flight: Annotated[str | None, typer.Option(help="Only this compared flight.")] = None,
     least_px: Annotated[
-        int, typer.Option(help="So many changed pixels make a frame positive; the thesis counts any.")
+        int, typer.Option(help="Changed pixels that make a frame positive; 1 as in the thesis.")
     ] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
 ) -> None:
-    """Changes against the truth: by pixel and frame as in the thesis's Tables 4.3 to 4.5, and by event.
+    """Measure changes against the truth: by pixel and frame (the thesis's Tables 4.3 to 4.5), and by event.
 
     Example: sorvolo evaluate changes field-map --truth simulated-field
 
@@ -83,12 +84,12 @@ def changes(
 
 @evaluate_app.command()
 def objects(
-    site: Annotated[Path, typer.Argument(help="The site folder of `sorvolo map` or `sorvolo compare`.")],
+    site: Annotated[Path, typer.Argument(help="Folder of the map.")],
     truth: Annotated[Path, typer.Option(help="Folder that `sorvolo simulate` made.")],
-    flight: Annotated[str | None, typer.Option(help="One of the site's flights; else all.")] = None,
+    flight: Annotated[str | None, typer.Option(help="Only this flight.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
 ) -> None:
-    """What stands on the map against the truth: found, missed, false, counted once, how well placed.
+    """Measure the objects on the map against the truth: found, missed, false, counted once, how well placed.
 
     Example: sorvolo evaluate objects field-map --truth simulated-field
     """
@@ -112,15 +113,15 @@ def _show_objects(console: Console, measured: "FlightObjects") -> None:
             table.add_row(name, *map(str, numbers))
     console.print(table)
     console.print(
-        f"{measured.flight}: {measured.count_error:+.1%} counted too many; {measured.moving} of the found ones move, "
-        f"of {measured.moving_right} it is told rightly whether they do"
+        f"{measured.flight}: count error {measured.count_error:+.1%}; {measured.moving} of the objects found move; "
+        f"moving or standing is right for {measured.moving_right}", highlight=False,
     )
     if math.isfinite(measured.rms_m):
         console.print(
-            f"{measured.flight}: places off by {measured.rms_m:.2f} m rms, {measured.p95_m:.2f} m at 95 %, "
+            f"{measured.flight}: position error {measured.rms_m:.2f} m rms, {measured.p95_m:.2f} m at 95 %, "
             f"{measured.own_rms_m:.2f} m rms without the map's own shift of {measured.map_shift_m:.2f} m; "
-            f"{_share(measured.within_two_sigma)} within twice the stated sigma, median "
-            f"{measured.sigma_median_m:.2f} m; lengths off by {measured.length_error_m:.2f} m median"
+            f"{_share(measured.within_two_sigma)} within twice the reported accuracy (1 sigma, median "
+            f"{measured.sigma_median_m:.2f} m); length error {measured.length_error_m:.2f} m median", highlight=False,
         )
     for each in measured.missed:
         console.print(f"{measured.flight}: missed {each}", highlight=False)
@@ -138,16 +139,17 @@ def show_changes(console: Console, measured: "FlightChanges") -> None:
             table.add_row("F1" if name == "f1" else name, *(_share(getattr(each, name), 2) for each in both))
         console.print(table)
         console.print(
-            f"{measured.flight}: {masks.compared} masks compared; {masks.only_found} found ones have no truth, "
-            f"{masks.only_true} true ones no mask; a frame counts from {masks.least_px} changed pixel(s) on"
+            f"{measured.flight}: {counted(masks.compared, 'mask')} compared; without truth: {masks.only_found}; true "
+            f"masks without a found one: {masks.only_true}; a frame is positive from "
+            f"{counted(masks.least_px, 'changed pixel')} on", highlight=False,
         )
     if measured.events is not None:
         _show_events(console, measured.flight, measured.events, measured.map_shift_m)
     if measured.classes is not None:
         classes = measured.classes
         console.print(
-            f"{measured.flight}: of events found under the right kind, what it was or is is told rightly of "
-            f"{classes.right}, wrongly of {classes.wrong}, not at all of {classes.unnamed}"
+            f"{measured.flight}: class before and after, of the events of the right kind: {classes.right} right, "
+            f"{classes.wrong} wrong, {classes.unnamed} without a class", highlight=False,
         )
     for remark in measured.remarks:
         console.print(f"{measured.flight}: {remark}")
@@ -165,15 +167,16 @@ def _show_events(console: Console, flight: str, scores: "EventScores", map_shift
     )))
     console.print(table)
     console.print(
-        f"{flight}: found {_share(scores.found_share)}, {scores.false_per_hectare:.2f} false per hectare of "
-        f"{scores.compared_m2:.0f} m2 compared, {scores.twice} reported twice; {scores.late} of {scores.judged_late} "
-        "late"
+        f"{flight}: found {_share(scores.found_share)}; {scores.false_per_hectare:.2f} false per hectare "
+        f"({scores.compared_m2:,.0f} m2 compared); {scores.twice} reported twice; {scores.late} of "
+        f"{scores.judged_late} late", highlight=False,
     )
     if math.isfinite(scores.error_median_m):
         shift = f" (the map's own shift of {map_shift_m:.2f} m taken out)" if math.isfinite(map_shift_m) else ""
         console.print(
-            f"{flight}: places off by {scores.error_median_m:.2f} m median, {scores.error_p95_m:.2f} m at 95 %{shift}; "
-            f"{_share(scores.within_two_sigma)} within twice the stated sigma, median {scores.sigma_median_m:.2f} m"
+            f"{flight}: position error {scores.error_median_m:.2f} m median, {scores.error_p95_m:.2f} m at "
+            f"95 %{shift}; {_share(scores.within_two_sigma)} within twice the reported accuracy (1 sigma, median "
+            f"{scores.sigma_median_m:.2f} m)", highlight=False,
         )
 
 
@@ -183,7 +186,7 @@ def _share(value: float, decimals: int = 1) -> str:
 
 def _show(measured: "MosaicEvaluation") -> None:
     console = Console()
-    frames = Table("flight", "selected", "by vision", "by GPS alone", "rejected", "unknown to the truth")
+    frames = Table("flight", "selected", "matched", "by GPS alone", "left out", "without truth")
     for each in measured.flights:
         frames.add_row(each.flight, *map(str, (
             each.selected, each.vision, each.gps_only, each.rejected, each.unmatched
@@ -194,7 +197,7 @@ def _show(measured: "MosaicEvaluation") -> None:
         for name, spread in (
             ("corners", truth.corners.absolute),
             ("corners, shape only", truth.corners.shape),
-            ("floor: what GPS noise alone costs", truth.corners.floor),
+            ("floor: error from GPS noise alone", truth.corners.floor),
             ("corners placed by GPS alone", truth.gps_only),
             ("cameras, horizontal", truth.cameras),
         ):
@@ -206,12 +209,12 @@ def _show(measured: "MosaicEvaluation") -> None:
         console.print(errors)
     for truth in measured.truth:
         if math.isfinite(truth.corners.over_floor):
-            console.print(f"{truth.flight}: absolute error over its floor {truth.corners.over_floor:.2f}")
+            console.print(f"{truth.flight}: absolute error is {truth.corners.over_floor:.2f} times its floor")
     deviation = measured.deviation
     if deviation.frames:
         console.print(
-            f"deviation from {deviation.frames} of its own frames (thesis 4.1.1): {deviation.mean:.1%} on "
-            f"average, {deviation.median:.1%} median, {deviation.worst:.1%} worst"
+            f"deviation from {counted(deviation.frames, 'frame')} of its (thesis 4.1.1): mean {deviation.mean:.1%}, "
+            f"median {deviation.median:.1%}, worst {deviation.worst:.1%}"
         )
     if measured.reference is not None:
         match = measured.reference

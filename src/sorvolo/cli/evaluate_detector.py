@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from sorvolo import __version__
-from sorvolo.cli.progress import bars
+from sorvolo.cli.options import names
+from sorvolo.cli.progress import ProgressReport
 from sorvolo.errors import SettingsError
 
 if TYPE_CHECKING:
@@ -22,36 +22,36 @@ if TYPE_CHECKING:
 
 def detector(
     model: Annotated[
-        str, typer.Argument(help="A model's name or file, or detections.json; several seeds with commas between.")
+        str, typer.Argument(help="A model's name or file, or detections.json; several seeds separated by commas.")
     ],
     data: Annotated[list[Path], typer.Argument(help="Labelled pictures: folders or label files.")],
     compare: Annotated[
-        list[str] | None, typer.Option(help="Another model, beside the first on the same pictures; may be repeated.")
+        list[str] | None, typer.Option(help="Another model to compare on the same pictures. Can be repeated.")
     ] = None,
     form: Annotated[
-        str | None, typer.Option(help="The labels' form (coco, yolo, voc ...); else told from them.")
+        str | None, typer.Option(help="Label format: coco, yolo, voc ...", show_default="recognised")
     ] = None,
     classes: Annotated[
-        str, typer.Option(help="The set's names as ours, such as 'Pedestrian=person,Van=car'.")
+        str, typer.Option(help="Class names of the set as ours, such as 'Pedestrian=person,Van=car'.")
     ] = "",
-    ignore: Annotated[str, typer.Option(help="Names whose boxes are regions to ignore.")] = "",
+    ignore: Annotated[str, typer.Option(help="Class names whose boxes are ignored.")] = "",
     unlabelled: Annotated[str, typer.Option(help="Our classes that may be there without a label.")] = "",
     group_pattern: Annotated[
-        str | None, typer.Option(help="Regular expression whose one group is the video within a picture's path.")
+        str | None, typer.Option(help="Regular expression; its group is the video's name in a picture's path.")
     ] = None,
-    videos: Annotated[str, typer.Option(help="Regular expression: only pictures of videos that it fits.")] = "",
+    videos: Annotated[str, typer.Option(help="Regular expression: use only pictures of matching videos.")] = "",
     held_out: Annotated[
-        float, typer.Option(help="Only the share that `sorvolo train --val` of the same share and seed holds out.")
+        float, typer.Option(help="Use only the share that `sorvolo train --val SHARE` with the same seed holds out.")
     ] = 0.0,
     tiles: Annotated[
-        str, typer.Option(help="none, auto (by the ground's sampling distance), or pixels a side.")
+        str, typer.Option(help="Cut pictures into tiles: none, auto (by ground resolution), or pixels a side.")
     ] = "none",
     out: Annotated[Path | None, typer.Option(help="Folder for detector.html, detector.json, detections.json.")] = None,
-    draws: Annotated[int, typer.Option(min=20, help="Of the bootstrap behind the intervals.")] = 1000,
-    seed: Annotated[int, typer.Option(help="Of the bootstrap, and of what is held out.")] = 1,
+    draws: Annotated[int, typer.Option(min=20, help="Bootstrap draws for the confidence intervals.")] = 1000,
+    seed: Annotated[int, typer.Option(help="Random seed of the bootstrap and of what is held out.")] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print detector.json.")] = False,
 ) -> None:
-    """Detectors on labelled pictures: COCO's AP, the thesis's mAP, recall by size, confusions, worst mistakes.
+    """Measure detectors on labelled pictures: COCO AP, the thesis's mAP, recall by size, confusions, worst errors.
 
     Example: sorvolo evaluate detector default labelled --out measured
 
@@ -71,18 +71,16 @@ def detector(
     from sorvolo.store.exports.plain import plain_json
 
     settings = EvaluationSettings(_tiles(tiles), draws, seed)
-    arms = [_names(each) for each in (model, *(compare or ()))]
+    arms = [list(names(each)) for each in (model, *(compare or ()))]
     labelled = read_sets(
-        data, form=form, classes=_pairs(classes) or None, ignore=_names(ignore), unlabelled=_names(unlabelled),
+        data, form=form, classes=_pairs(classes) or None, ignore=names(ignore), unlabelled=names(unlabelled),
         group_pattern=group_pattern, videos=videos, held_out=held_out, seed=seed, known=known_classes(arms),
     )
-    with bars(*Progress.get_default_columns(), console=Console(stderr=True)) as progress:
-        bar = progress.add_task("looking", total=None)
+    with ProgressReport(Console(stderr=True)) as progress:
         measured = evaluate_detector(
             arms, labelled, settings,
-            lambda step: progress.update(
-                bar, description=f"{step.model}: {step.set_name}", completed=step.pictures_done,
-                total=step.pictures_total,
+            lambda step: progress.show(
+                f"{step.model} on {step.set_name}, picture", step.pictures_done, step.pictures_total
             ),
         )
     notices = (*(note.text for each in labelled for note in each.notices), *measured.notices)
@@ -107,12 +105,8 @@ def detector(
         console.print(f"the whole report: {out / PAGE}")
 
 
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",") if name.strip()]
-
-
 def _pairs(text: str) -> dict[str, str]:
-    pairs = [name.partition("=") for name in _names(text)]
+    pairs = [name.partition("=") for name in names(text)]
     if any(not (theirs.strip() and ours.strip()) for theirs, _, ours in pairs):
         raise SettingsError(f"--classes {text!r}: pairs look like Pedestrian=person,Van=car")
     return {theirs.strip(): ours.strip() for theirs, _, ours in pairs}
@@ -145,7 +139,10 @@ def _show(console: Console, scores: "SetScores") -> None:
     )
     console.print(table)
     if scores.groups > 1:
-        console.print(f"{scores.pictures} pictures of {scores.groups} videos or flights; intervals of 95 % over these")
+        console.print(
+            f"{scores.pictures:,} pictures of {scores.groups} videos or flights; 95 % intervals over these",
+            highlight=False,
+        )
     for remark in scores.remarks:
         console.print(f"{scores.name}: {remark}")
 

@@ -11,6 +11,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sorvolo.cli.options import AsJson, PlaceFormat, PlaceFormatOption
+from sorvolo.cli.shown import site_of
 from sorvolo.errors import SettingsError
 
 if TYPE_CHECKING:
@@ -18,12 +20,13 @@ if TYPE_CHECKING:
 
 
 def history(
-    site: Annotated[Path, typer.Argument(help="The site folder.")],
+    site: Annotated[Path, typer.Argument(help="Folder of the map.")],
     at: Annotated[
-        str | None, typer.Option(help="Version number, or date or time (UTC): the newest version complete by its end.")
+        str | None, typer.Option(help="Version number, or a date or time (UTC): the newest version by then.")
     ] = None,
     export: Annotated[Path | None, typer.Option(help="Write the map as it was: FILE.tif, .png or .kmz.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    coordinates: PlaceFormatOption = PlaceFormat.LATLON,
+    as_json: AsJson = False,
 ) -> None:
     """List the versions of a map, or write the map as it was at one of them.
 
@@ -35,13 +38,14 @@ def history(
     from sorvolo.store.exports.plain import plain_json
 
     if at is not None and export is None:
-        raise SettingsError("--at says which map to write; give --export FILE.tif, FILE.png or FILE.kmz as well")
+        raise SettingsError("--at chooses the map to write: give --export FILE.tif, FILE.png or FILE.kmz as well")
     entries = site_history(site)
     if export is None:
         if as_json:
             typer.echo(json.dumps({"site": str(site), "versions": plain_json(entries)}, indent=1))
         else:
             _show(entries, Console())
+            _show_place(site, coordinates, Console())
         return
     version = export_version(site, at, export)
     if as_json:
@@ -53,7 +57,7 @@ def history(
 
 def _show(entries: Sequence["HistoryEntry"], console: Console) -> None:
     if not entries:
-        console.print("no map yet")
+        console.print("no map yet: sorvolo map makes one")
         return
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for name in ("no", "complete (UTC)", "flight", "by", "tiles", "MB", "changes", "reviewed"):
@@ -64,11 +68,21 @@ def _show(entries: Sequence["HistoryEntry"], console: Console) -> None:
         reviewed = ", ".join(
             f"{count} {word}" for word, count in (("confirmed", each.confirmed), ("rejected", each.rejected)) if count
         )
-        again = " (again since)" if each.is_replaced else ""
+        again = " (repeated later)" if each.is_replaced else ""
         table.add_row(
             str(each.version), each.date_utc[:16].replace("T", " "), escape(each.flight) + again, each.kind,
             f"{each.tiles_changed}/{each.tiles}{removed}", f"{each.bytes_changed / 1e6:.1f}",
             changes or ("none" if each.kind == "compare" else ""), reviewed,
         )
     console.print(table)
-    console.print("tiles: new of all", style="dim")
+    console.print("tiles: new or changed, of all; MB: written for this version", style="dim", highlight=False)
+
+
+def _show_place(folder: Path, form: PlaceFormat, console: Console) -> None:
+    """Where on the Earth the map is, if anywhere."""
+    from sorvolo.geometry.coordinates import Coordinates, place_text
+
+    site = site_of(folder)
+    if not site.is_local:
+        written = place_text(site.origin.latitude_deg, site.origin.longitude_deg, Coordinates(form.value))
+        console.print(f"the map's origin lies at {written}", highlight=False)

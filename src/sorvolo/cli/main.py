@@ -50,33 +50,33 @@ app.add_typer(models_app, name="models")
 
 @dataclass
 class _Wishes:
-    """What the options before the command ask for, and what a command wants to be said when it was stopped."""
+    """What the options before the command ask for, and the last line of a command that was stopped."""
 
     debug: bool
-    stop_words: str = "stopped; what was not finished is left out, what was before is as it was"
+    stop_words: str = "stopped; unfinished work was discarded, everything before it is unchanged"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command. The exit code: 0 well, 1 an error that was told, 2 wrong usage, 130 stopped."""
+    """Run one command. The exit code: 0 success, 1 an error (one line on stderr), 2 wrong usage, 130 stopped."""
     wishes = _Wishes(debug=os.environ.get("SORVOLO_DEBUG", "") not in ("", "0"))
     try:
-        with _no_stop_is_lost():
+        with _interrupts_repeated():
             app(args=None if arguments is None else list(arguments), prog_name="sorvolo", obj=wishes)
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else _FAILED
         if code == _STOPPED:
-            _tell(wishes.stop_words)
+            _print_line(wishes.stop_words)
         return code
     except Exception as error:
         if wishes.debug:
             traceback.print_exc()
-        _tell(f"error: {_words_of(error)}")
+        _print_line(f"error: {_words_of(error)}")
         return _FAILED
     return 0
 
 
 @contextmanager
-def _no_stop_is_lost() -> Iterator[None]:
+def _interrupts_repeated() -> Iterator[None]:
     """A Ctrl-C that strikes where Python can raise nothing, as in the clean-up of a library's object, strikes again."""
     before = sys.unraisablehook
 
@@ -115,19 +115,19 @@ def options(
         typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop."),
     ] = False,
     debug: Annotated[
-        bool, typer.Option("--debug", help="Show where in the program an error arose.")
+        bool, typer.Option("--debug", help="Show where in the program an error occurred.")
     ] = False,
 ) -> None:
-    """Geo-referenced maps from small drones, with an honest report.
+    """Maps from small drones: geo-referenced, compared with earlier flights, searched for people and cars.
 
-    Start with `sorvolo demo`, or with `sorvolo inspect` on a video or a folder of photos.
+    New here? Run `sorvolo demo`. With a flight of your own: `sorvolo inspect`, then `map`, `compare` or `watch`.
     """
     if debug:
         context.obj.debug = True
 
 
 def _words_of(error: Exception) -> str:
-    """One line that says what happened and what to do."""
+    """What happened and what to do, in one line."""
     if isinstance(error, SorvoloError):
         return str(error)
     if isinstance(error, OSError) and error.errno in _FULL:
@@ -140,9 +140,9 @@ def _words_of(error: Exception) -> str:
         return "out of memory; close other programs, or make a coarser map with --gsd"
     return (
         f"this is a bug in sorvolo {__version__}: {type(error).__name__}: {error}. Please report it with the "
-        "command and what it prints after `sorvolo --debug ...` (CONTRIBUTING.md says how)"
+        "command and what `sorvolo --debug ...` prints (see CONTRIBUTING.md)"
     )
 
 
-def _tell(text: str) -> None:
+def _print_line(text: str) -> None:
     typer.echo(" ".join(text.split()), err=True)

@@ -1,4 +1,4 @@
-"""`sorvolo map`: flights into a site folder, and in the end what became of them."""
+"""`sorvolo map`: flights into a site folder, and a summary of each."""
 
 import json
 import signal
@@ -14,14 +14,15 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sorvolo.cli.options import Area, AsJson, Camera, GiveUp, GroundElevation, LiveTelemetry, Offset
 from sorvolo.cli.progress import show_progress
-from sorvolo.errors import StoreError
+from sorvolo.cli.shown import newest_version, read_json, show_notices_and_warnings, show_path
+from sorvolo.survey.wording import counted, counted_list
 
 if TYPE_CHECKING:
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.flight.settings import MapSettings
 
-_COLOURS = {"vision": "green", "gps-only": "yellow", "rejected": "red"}
 _MOST_REASONS = 6
 
 
@@ -41,39 +42,33 @@ class Transform(StrEnum):
 
 def map_command(
     inputs: Annotated[list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources.")],
-    site: Annotated[Path, typer.Option(help="Folder of the map; one that exists is extended.")],
-    telemetry: Annotated[
-        str | None, typer.Option(help="The flight's log, if not beside the video; of a live one, the receiver's link.")
-    ] = None,
-    camera: Annotated[str, typer.Option(help="Calibration file, preset name or EXIF code, or aov=DEG.")] = "",
-    area: Annotated[
-        Path | None, typer.Option(help="Outline outside of which frames are not used: GeoJSON, KML, KMZ.")
-    ] = None,
+    site: Annotated[Path, typer.Option(help="Folder of the map; an existing map is extended.")],
+    telemetry: LiveTelemetry = None,
+    camera: Camera = "",
+    area: Area = None,
     method: Annotated[
-        Method, typer.Option(help="planar: ours. thesis: the baseline, frame against map.")
+        Method, typer.Option(help="planar: all frames fitted together. thesis: the baseline, frame by frame.")
     ] = Method.PLANAR,
     gsd: Annotated[
-        float | None, typer.Option(help="Metres a pixel of a new map; else the frames' own.")
+        float | None, typer.Option(help="Ground resolution of a new map, m a pixel. Without it: the frames' own.")
     ] = None,
-    overlap: Annotated[float, typer.Option(help="Overlap of the frames selected, 0 to 1.")] = 0.7,
-    offset: Annotated[
-        float | None, typer.Option(help="Telemetry time minus video time, s; else found from motion.")
-    ] = None,
-    ground_elevation: Annotated[
-        float | None, typer.Option(help="Of the ground, m, in telemetry's own height reference.")
-    ] = None,
-    crs: Annotated[str, typer.Option(help="CRS of mosaic.tif, such as EPSG:25832; else the UTM zone.")] = "",
-    transform: Annotated[Transform, typer.Option(help="Of method thesis.")] = Transform.SIMILARITY,
+    overlap: Annotated[float, typer.Option(help="Overlap of the selected frames, 0 to 1.")] = 0.7,
+    offset: Offset = None,
+    ground_elevation: GroundElevation = None,
+    crs: Annotated[
+        str, typer.Option(help="Coordinate system of mosaic.tif, such as EPSG:25832. Without it: the UTM zone.")
+    ] = "",
+    transform: Annotated[Transform, typer.Option(help="What --method thesis fits.")] = Transform.SIMILARITY,
     model: Annotated[
-        str, typer.Option(help="Looks for people, cars, objects: a model's name, a file, or none.")
+        str, typer.Option(help="Detector for people, cars and small objects: a model's name, a file, or none.")
     ] = "default",
-    give_up: Annotated[float, typer.Option(help="A live source silent for so long has ended, s.")] = 30.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    give_up: GiveUp = 30.0,
+    as_json: AsJson = False,
 ) -> None:
     """Make a geo-referenced map of one or more flights, or extend the map in the site folder.
 
-    Live sources are addresses (rtsp://, rtmp://, udp://, tcp://), webcam:0, and follow:PATH for a video or a folder of
-    photos that is being written. Ctrl-C ends a live flight, and its map is finished; a second Ctrl-C leaves it out.
+    A live source is an address (rtsp://, rtmp://, udp://, tcp://), webcam:0, or follow:PATH for a video or a folder of
+    photos that is still being written. Ctrl-C ends a live flight and finishes its map; a second Ctrl-C discards it.
 
     Example: sorvolo map DJI_0042.MP4 --site field
 
@@ -104,7 +99,7 @@ def map_and_read_reports(
     camera: str | None = None, area: Path | None = None,
     live: "LiveSettings | None" = None,
 ) -> list[dict[str, Any]]:
-    """Map with a bar on stderr; the reports of the flights that were mapped, in order."""
+    """Map with progress on stderr; the reports of the mapped flights, in order."""
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.map.flights import map_flights
     from sorvolo.store.site.archive import Archive
@@ -151,59 +146,72 @@ def ended_by_signal(inputs: Sequence[Path | str]) -> Iterator[threading.Event]:
 
 
 def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Console) -> None:
-    """Tell what became of the flights, what to look at first, and where the files are."""
+    """Print what became of the flights, what to look at first, and where the files are."""
     for report in reports:
         _show_report(report, console)
     for name, path in _map_files(site).items():
-        tell_path(name, path, console)
+        show_path(name, path, console)
     for report in reports:
-        tell_path("report", site / "flights" / report["flight"] / "report.html", console)
+        show_path("report", site / "flights" / report["flight"] / "report.html", console)
 
 
 def _show_report(report: Mapping[str, Any], console: Console) -> None:
-    frames = report["frames"]
     table = Table(title=f"Flight {escape(report['flight'])}", show_header=False, title_justify="left")
-    table.add_row("frames", f"{frames['selected']} selected of {frames['total']}")
-    for status, colour in _COLOURS.items():
-        if frames[status]:
-            table.add_row(f"[{colour}]{status}[/{colour}]", str(frames[status]))
-    for reason, count in list(frames["reasons"].items())[:_MOST_REASONS]:
-        table.add_row("", escape(f"{count} x {reason}"))
-    unit = "m" if report["georeferenced"] else "units"
-    for name, text in (
-        ("residual", _with_unit("{:.2f} px median", report["residual_px"]["median"])),
-        ("off GPS", _with_unit("{:.2f} " + unit + " median", report["gps_residual_m"]["median"])),
-        ("place good to", _with_unit(
-            "{:.2f} " + unit + ", one sigma, what all fixes err in common included", report["sigma_m"]
-        )),
-        ("map", _size(report)),
-        ("objects", _objects(report.get("objects") or {})),
-        ("clock offset", _clock_offset(report["time_offset"])),
-        ("took", f"{report['seconds']['total']:.1f} s, {report['peak_memory_mb']:.0f} MB at most"),
-    ):
+    for name, text in (*_frame_rows(report["frames"]), *_quality_rows(report)):
         if text:
             table.add_row(name, text)
     console.print(table)
-    tell_notices_and_warnings(report, console)
+    show_notices_and_warnings(report, console)
+
+
+def _frame_rows(frames: Mapping[str, Any]) -> list[tuple[str, str]]:
+    rows = [
+        ("frames", f"{frames['selected']:,} selected of {frames['total']:,}"),
+        ("[green]matched[/green]", f"{frames['vision']:,} of {counted(frames['selected'], 'frame')}"),
+        ("[yellow]by GPS alone[/yellow]", counted(frames["gps-only"], "frame") if frames["gps-only"] else ""),
+        ("[red]left out[/red]", counted(frames["rejected"], "frame") if frames["rejected"] else ""),
+    ]
+    reasons = list(frames["reasons"].items())[:_MOST_REASONS]
+    return rows + [("", escape(f"{counted(count, 'frame')}: {reason}")) for reason, count in reasons]
+
+
+def _quality_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """How well frames fit each other and, where the map has metres, the Earth."""
+    residual_px = report["residual_px"]["median"]
+    rows = [("match error", _with_unit("{:.2f} px (median distance of matched points)", residual_px))]
+    if report["georeferenced"]:
+        rows += [
+            ("distance to GPS", _with_unit("{:.2f} m (median)", report["gps_residual_m"]["median"])),
+            ("position accuracy", _with_unit(
+                "{:.2f} m (1 sigma, including the error shared by all GPS fixes)", report["sigma_m"]
+            )),
+        ]
+    return [
+        *rows,
+        ("map", _size(report)),
+        ("objects found", _objects(report.get("objects") or {})),
+        ("clock offset", _clock_offset(report["time_offset"])),
+        ("took", f"{report['seconds']['total']:.1f} s, memory at most {report['peak_memory_mb']:,.0f} MB"),
+    ]
 
 
 def _size(report: Mapping[str, Any]) -> str:
     if not report["georeferenced"]:
-        return "in a frame of its own, without metres and north"
-    return f"{report['area_m2']:.0f} m2 at {100 * report['ground_sampling_distance_m']:.2f} cm a pixel"
+        return "without scale, north and place on Earth: there was no usable GPS"
+    resolution_cm = 100 * report["ground_sampling_distance_m"]
+    return f"{report['area_m2']:,.0f} m2, ground resolution {resolution_cm:.2f} cm a pixel"
 
 
-def _objects(told: Mapping[str, Any]) -> str:
-    if told.get("model") is None:
-        return f"not looked for: {told['why_not']}" if told.get("why_not") else ""
-    counts = [f"{count} {escape(name)}" for name, count in told["classes"].items() if count]
-    return (", ".join(counts) or "none found") + f", by the model {escape(told['model'])}"
+def _objects(found: Mapping[str, Any]) -> str:
+    if found.get("model") is None:
+        return f"not searched: {escape(str(found['why_not']))}" if found.get("why_not") else ""
+    return escape(f"{counted_list(found['classes'], none='none')} (model {found['model']})")
 
 
 def _clock_offset(offset: Mapping[str, Any]) -> str:
-    parts = [] if offset["origin"] == "none" else [f"{offset['applied_s']:+.2f} s, {offset['origin']}"]
+    parts = [] if offset["origin"] == "none" else [f"{offset['applied_s']:+.2f} s ({offset['origin']})"]
     if offset["estimate_s"] is not None:
-        parts.append(f"motion shows {offset['estimate_s']:+.2f} s within {offset['sigma_s']:.2f} s")
+        parts.append(f"estimated from the motion: {offset['estimate_s']:+.2f} s (1 sigma {offset['sigma_s']:.2f} s)")
     return "; ".join(parts)
 
 
@@ -211,39 +219,6 @@ def _with_unit(pattern: str, number: float | None) -> str:
     return "" if number is None else pattern.format(number)
 
 
-def tell_notices_and_warnings(report: Mapping[str, Any], console: Console) -> None:
-    """Print what was found and survived, and what to look at first."""
-    for notice in report["notices"]:
-        console.print(f"[blue]note[/blue]     {escape(notice['text'])}")
-    for warning in report["warnings"]:
-        console.print(f"[yellow]warning[/yellow]  {escape(warning)}")
-
-
-def tell_path(name: str, path: Path, console: Console) -> None:
-    """Print where a file is."""
-    # in one piece, however long: people copy it
-    console.print(f"{name:>8}  {escape(str(path))}", soft_wrap=True, highlight=False)
-
-
 def _map_files(site: Path) -> dict[str, Path]:
     named = {"picture": "preview.png", "GeoTIFF": "mosaic.tif", "KMZ": "mosaic.kmz", "objects": "objects.geojson"}
     return {name: site / file for name, file in named.items() if (site / file).is_file()}
-
-
-def newest_version(site: Path) -> int:
-    """The id of the site's newest version; 0 where there is no site yet."""
-    from sorvolo.store.site.archive import Archive
-    from sorvolo.store.site.files import CATALOGUE
-
-    if not (site / CATALOGUE).is_file():
-        return 0
-    with Archive.open(site, write=False) as archive:
-        return max((each.id for each in archive.versions() if each.complete), default=0)
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A document of a flight; raises StoreError when it cannot be read."""
-    try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError) as error:
-        raise StoreError(f"{path} cannot be read ({error}); map the flight again") from error

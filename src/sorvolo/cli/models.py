@@ -25,16 +25,16 @@ _MEASURED = "measured"
 
 @models_app.callback()
 def models() -> None:
-    """The detection models that are installed: list, show, fetch by hash, verify, make smaller."""
+    """Manage detection models: list, show, fetch by hash, verify, quantise."""
 
 
 @models_app.command("list")
 def list_models(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
 ) -> None:
-    """List the models that `--model NAME` can name: the packaged ones and your own.
+    """List the models that --model accepts: the packaged ones and your own.
 
-    Your own lie in $SORVOLO_MODELS, else in sorvolo/models of your data folder.
+    Your own models lie in $SORVOLO_MODELS, or in sorvolo/models of your data folder.
 
     Example: sorvolo models list
     """
@@ -62,11 +62,11 @@ def list_models(
         if "error" in row:  # below the table: no column is wide enough to say why
             typer.echo(f"{row['name']} cannot be used: {row['error']}")
     if not rows:
-        typer.echo(f"no models are installed; your own belong in {models_folder()}")
-    _tell_hidden()
+        typer.echo(f"no models are installed; put your own into {models_folder()}")
+    _show_hidden()
 
 
-def _tell_hidden() -> None:
+def _show_hidden() -> None:
     from sorvolo.detection.models import hidden_models
 
     for each in hidden_models():
@@ -78,7 +78,7 @@ def show(
     model: Annotated[str, typer.Argument(help="A model's name, or a .onnx file.")] = "default",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """What a model is: its classes, from which score and at which sizes it finds them, licence, card.
+    """Show a model: its classes, score thresholds and object sizes, licence, card.
 
     Example: sorvolo models show default
     """
@@ -87,22 +87,22 @@ def show(
 
     path = find_model(model)
     info, card = read_info(path), read_card(InstalledModel(path.stem, path, False))
-    told = _told(info) | {"path": str(path), "sha256": file_sha256(path), "card": card}
+    facts = _facts(info) | {"path": str(path), "sha256": file_sha256(path), "card": card}
     if as_json:
-        typer.echo(json.dumps(told, indent=1))
+        typer.echo(json.dumps(facts, indent=1))
         return
     table = Table(title=escape(info.name), show_header=False, title_justify="left")
     table.add_column()
     table.add_column(overflow="fold")
     for name in ("preset", "version", "precision", "licence", "trained_on", "created", "path", "sha256"):
-        table.add_row(name.replace("_", " "), escape(str(told[name])))
-    table.add_row("light", _light(told))
+        table.add_row(name.replace("_", " "), escape(str(facts[name])))
+    table.add_row("light", _light(facts))
     for each in info.classes:
         least_px, most_px = info.best_px[each]
-        words = f"told from score {info.thresholds[each]:.2f}; found well from {least_px:g} to {most_px:g} px"
+        words = f"reported from score {info.thresholds[each]:.2f} on; found well from {least_px:g} to {most_px:g} px"
         table.add_row(escape(each), words)
     for key, value in card.items():
-        if key not in told and key != _MEASURED:
+        if key not in facts and key != _MEASURED:
             table.add_row(escape(key.replace("_", " ")), escape(_in_words(value)))
     console = Console()
     console.print(table)
@@ -113,12 +113,12 @@ def show(
 @models_app.command()
 def fetch(
     source: Annotated[str, typer.Argument(help="Web address or file of a model, or its name in $SORVOLO_MODELS_URL.")],
-    sha256: Annotated[str, typer.Option(help="The file's SHA-256, as whoever gives it says.")],
-    name: Annotated[str, typer.Option(help="Its name among the installed ones.", show_default="the file's")] = "",
+    sha256: Annotated[str, typer.Option(help="SHA-256 of the file, from whoever provides it.")],
+    name: Annotated[str, typer.Option(help="Name to install it under.", show_default="the file's name")] = "",
 ) -> None:
-    """Install a model if its hash is right; otherwise nothing changes.
+    """Install a model if its hash matches; otherwise nothing changes.
 
-    Without a network, bring the file on a disk and give its path.
+    Without a network, give the path of a file.
 
     Example: sorvolo models fetch https://example.org/coast.onnx --sha256 9f86d081884c7d65...
 
@@ -132,10 +132,10 @@ def fetch(
 
 @models_app.command()
 def verify(
-    model: Annotated[str, typer.Argument(help="A model's name, or a .onnx file; none: all.")] = "",
-    sha256: Annotated[str, typer.Option(help="What its SHA-256 must be.", show_default="its card's")] = "",
+    model: Annotated[str, typer.Argument(help="A model's name, or a .onnx file.", show_default="all installed")] = "",
+    sha256: Annotated[str, typer.Option(help="Expected SHA-256.", show_default="the recorded one")] = "",
 ) -> None:
-    """Check that models are whole, unchanged and can be run; exit code 1 where one is not.
+    """Check that models are complete, unchanged and can run. The exit code is 1 if one fails.
 
     Example: sorvolo models verify
 
@@ -150,7 +150,7 @@ def verify(
     else:
         chosen = installed_models()
     if sha256 and not model:
-        raise typer.BadParameter("say which model has this hash", param_hint="--sha256")
+        raise typer.BadParameter("name the model that has this hash", param_hint="--sha256")
     wanted = parse_sha256(sha256) if sha256 else ""
     bad = 0
     for each in chosen:
@@ -160,7 +160,7 @@ def verify(
     if not chosen:
         typer.echo("no models are installed")
     if not model:
-        _tell_hidden()
+        _show_hidden()
     if bad:
         raise typer.Exit(1)
 
@@ -168,9 +168,9 @@ def verify(
 @models_app.command()
 def quantise(
     model: Annotated[str, typer.Argument(help="A model's name, or a .onnx file.")],
-    pictures: Annotated[Path, typer.Option(help="Folder of pictures such as it will see, all lights and grounds.")],
+    pictures: Annotated[Path, typer.Option(help="Folder of pictures like those it will see, in all kinds of light.")],
     out: Annotated[Path, typer.Option(help="The .onnx file to write.")],
-    most: Annotated[int, typer.Option(min=8, help="Use at most so many of the pictures.")] = 64,
+    most: Annotated[int, typer.Option(min=8, help="Use at most this many pictures.")] = 64,
     float_parts: Annotated[
         list[str] | None,
         typer.Option(
@@ -178,12 +178,12 @@ def quantise(
         ),
     ] = None,
     weight_bits: Annotated[
-        int, typer.Option(min=7, max=8, help="7 is safe from overflow on CPUs without VNNI, and rounds a little more.")
+        int, typer.Option(min=7, max=8, help="7 cannot overflow on CPUs without VNNI, and rounds a little more.")
     ] = 8,
 ) -> None:
-    """Make a model that is smaller and quicker, in whole numbers of eight bits. Measure both before you trust it.
+    """Make a smaller and faster model with 8-bit integers. Measure both before you trust it.
 
-    Needs the package onnx, which comes with the extra `training`.
+    Needs the package onnx, which the extra `training` installs.
 
     Example: sorvolo models quantise mine.onnx --pictures flights/ --out mine-int8.onnx
     """
@@ -196,7 +196,7 @@ def quantise(
     )
     typer.echo(
         f"{out}: {made.convolutions} of {made.of} convolutions in eight bits, {len(made.model) / 1e6:.1f} MB; "
-        "compare it with `sorvolo evaluate detector`"
+        "compare both with `sorvolo evaluate detector`"
     )
 
 
@@ -226,7 +226,7 @@ def _measured(sets: Any) -> Table | None:
 
 
 def _interval(told: Any) -> str:
-    """ "62.2 (42.3-77.3)" of a share with its interval, "-" where it is not said."""
+    """ "62.2 (42.3-77.3)" of a share with its interval, "-" where it is not known."""
     numbers = [told.get(key) for key in ("value", "low", "high")] if isinstance(told, Mapping) else [told]
     known = [f"{100 * each:.1f}" for each in numbers if isinstance(each, int | float)]
     return f"{known[0]} ({known[1]}-{known[2]})" if len(known) == 3 else known[0] if known else "-"
@@ -237,12 +237,12 @@ def _row(model: "InstalledModel") -> dict[str, Any]:
 
     row: dict[str, Any] = {"name": model.name, "path": str(model.path), "is_packaged": model.is_packaged}
     try:
-        return row | _told(read_info(model.path)) | {"name": model.name, "bytes": model.path.stat().st_size}
+        return row | _facts(read_info(model.path)) | {"name": model.name, "bytes": model.path.stat().st_size}
     except InputError as error:
         return row | {"error": str(error)}
 
 
-def _told(info: "ModelInfo") -> dict[str, Any]:
+def _facts(info: "ModelInfo") -> dict[str, Any]:
     return {key: dict(value) if isinstance(value, Mapping) else value for key, value in vars(info).items()}
 
 
@@ -266,11 +266,11 @@ def _verdict(model: "InstalledModel", sha256: str) -> tuple[str, bool]:
         else:
             state = integrity(model)
         if state is Integrity.CHANGED:
-            said = "the given" if sha256 else "the recorded"
-            return f"CHANGED: its SHA-256 is not {said} one; do not use it, fetch it again", True
+            expected = "the given" if sha256 else "the recorded"
+            return f"CHANGED: its SHA-256 is not {expected} one; do not use it, fetch it again", True
         read_info(model.path)
     except InputError as error:
         return f"BAD: {error}", True
     if state is Integrity.NOT_RECORDED:
-        return f"can be run, but no hash is recorded; it is {file_sha256(model.path)}", False
+        return f"can run, but no hash is recorded; it is {file_sha256(model.path)}", False
     return "good", False

@@ -1,5 +1,6 @@
 """Options that several commands share, each worded once."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -25,6 +26,19 @@ GroundElevation = Annotated[
     float | None, typer.Option(help="Elevation of the ground, m, in the telemetry's own height reference.")
 ]
 GiveUp = Annotated[float, typer.Option(help="End a live source after so many seconds without a picture.")]
+
+
+class PlaceFormat(StrEnum):
+    """How places are written: the names of `geometry.coordinates.Coordinates`."""
+
+    LATLON = "latlon"
+    UTM = "utm"
+    MGRS = "mgrs"
+
+
+PlaceFormatOption = Annotated[
+    PlaceFormat, typer.Option("--coordinates", help="How places are written: latlon, utm or mgrs.")
+]
 
 
 def size_px(text: str) -> tuple[int, int] | None:

@@ -1,49 +1,88 @@
-"""Bars on a terminal while something runs, and what they say of a mapping."""
+"""How far a command is: a bar on a terminal, a line every ten seconds elsewhere, as in a log file."""
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+import time
+from collections.abc import Callable, Iterable
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+
+from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
     from sorvolo.survey.mosaic import MosaicUpdate
 
+_LINE_EVERY_S = 10.0
 
-def bars(*columns: ProgressColumn, console: Console, stay: bool = False) -> Progress:
-    """Bars that are gone at the end unless they `stay`; nothing where no terminal shows them.
 
-    rich itself ends bars that nobody sees with an empty line, which would stand before an error's.
+class ProgressReport:
+    """What runs, how much of it is done, and how it goes. A context manager.
+
+    On a terminal it is a bar that is gone at the end unless it `stays`. Elsewhere it is a line at most every ten
+    seconds, and none for what ends sooner. `clock` gives seconds that only go forward.
     """
-    return Progress(*columns, console=console, transient=not stay, disable=not console.is_interactive)
+
+    def __init__(
+        self, console: Console, *, stays: bool = False, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.console, self._clock = console, clock
+        self._is_live = console.is_interactive
+        self._last_s = clock()
+        self._task = ""
+        self._bar = Progress(
+            SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=30),
+            TextColumn("{task.fields[words]}"), TimeRemainingColumn(), console=console, transient=not stays,
+            disable=not self._is_live,  # rich itself ends bars that nobody sees with an empty line
+        )
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def show(self, task: str, done: int = 0, total: int | None = None, words: str = "") -> None:
+        """`done` of `total` of a task (None: nobody knows of how many), and more in `words`; a new task, a new bar."""
+        if self._is_live:
+            if task != self._task:
+                for earlier in self._bar.task_ids:
+                    self._bar.update(earlier, visible=False)
+                self._bar.add_task(task, words="")
+            # a total of None would stop the bar from ever filling; rich pulses until there is one
+            self._bar.update(self._bar.task_ids[-1], completed=done, total=total, words=words)
+        elif self._clock() - self._last_s >= _LINE_EVERY_S:
+            self._last_s = self._clock()
+            so_far = f" {done:,} of {total:,}" if total else f" {done:,}" if done else ""
+            self.console.print(f"{task}{so_far}{', ' + words if words else ''}", highlight=False, markup=False)
+        self._task = task
 
 
 def show_progress(updates: Iterable["MosaicUpdate"], console: Console) -> int:
-    """Take all updates, drawing a bar for each flight; return how many there were.
-
-    The bar tells frames a second, frames placed by vision of those selected, and the time left.
-    """
-    columns = (
-        SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=30),
-        TextColumn("{task.fields[told]}"), TimeRemainingColumn(),
-    )
-    count, before = 0, None
-    with bars(*columns, console=console) as progress:
-        task = progress.add_task("opening", total=None, told="")
+    """Take all updates of a mapping, showing each flight's progress; return how many there were."""
+    count, flight, before = 0, 1, None
+    with ProgressReport(console) as progress:
+        progress.show("opening")
         for update in updates:
             count += 1
             if before is not None and update.keyframes <= before.keyframes:
-                progress.update(task, description="mapped", completed=before.frames_expected)
-                task = progress.add_task("mapping", total=None, told="")
+                flight += 1
             before = update
-            progress.update(
-                task, description="mapping", told=words_of(update),
-                total=max(update.frames_expected, update.frames_read), completed=update.frames_read,
-            )
+            task = "mapping, frame" if flight == 1 else f"mapping flight {flight}, frame"
+            expected = max(update.frames_expected, update.frames_read)
+            progress.show(task, update.frames_read, expected, words_of(update))
     return count
 
 
 def words_of(update: "MosaicUpdate") -> str:
-    """What the bar says of an update."""
-    rate = f"{update.frames_read / update.seconds:.1f} frames/s, " if update.seconds > 0 else ""
-    return f"{rate}{update.by_vision} of {update.keyframes} placed by vision"
+    """How a mapping goes: "10.0 frames/s, 7 of 8 frames matched"."""
+    matched = f"{update.by_vision:,} of {counted(update.keyframes, 'frame')} matched"
+    return rate_words(update.frames_read, update.seconds) + matched
+
+
+def rate_words(frames: int, seconds: float) -> str:
+    """ "10.0 frames/s, " where some time has passed."""
+    return f"{frames / seconds:.1f} frames/s, " if seconds > 0 else ""

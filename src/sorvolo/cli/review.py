@@ -1,4 +1,4 @@
-"""`sorvolo review`: the changes that flights found, and what a person says of them."""
+"""`sorvolo review`: the changes that flights found, and a person's verdicts on them."""
 
 import json
 from collections.abc import Sequence
@@ -11,27 +11,33 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.compare import unit_of
+from sorvolo.cli.options import AsJson, PlaceFormat, PlaceFormatOption
+from sorvolo.cli.places import place_heading, place_words
+from sorvolo.cli.shown import site_of, unit_of
 from sorvolo.errors import SettingsError
+from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
     from sorvolo.store.site.change_records import StoredChange
+    from sorvolo.survey.flight import Site
 
 _COLOURS = {"confirmed": "green", "rejected": "red"}
 
 
 def review(
-    site: Annotated[Path, typer.Argument(help="The site folder.")],
+    site: Annotated[Path, typer.Argument(help="Folder of the map.")],
     ids: Annotated[
-        list[str] | None, typer.Argument(help="Changes: ids, or numbers with --flight; none: list them.")
+        list[str] | None,
+        typer.Argument(help="Changes to judge: their ids, or numbers with --flight.", show_default="list all changes"),
     ] = None,
-    confirm: Annotated[bool, typer.Option("--confirm", help="They are real.")] = False,
+    confirm: Annotated[bool, typer.Option("--confirm", help="These changes are real.")] = False,
     reject: Annotated[
-        bool, typer.Option("--reject", help="They are not; they do not come back in later flights.")
+        bool, typer.Option("--reject", help="These are no changes; later flights will not report them again.")
     ] = False,
-    note: Annotated[str, typer.Option(help="Why, in words.")] = "",
-    flight: Annotated[str | None, typer.Option(help="Of this flight only.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    note: Annotated[str, typer.Option(help="Why, in your own words.")] = "",
+    flight: Annotated[str | None, typer.Option(help="Only changes of this flight.")] = None,
+    coordinates: PlaceFormatOption = PlaceFormat.LATLON,
+    as_json: AsJson = False,
 ) -> None:
     """List the changes that flights found, or confirm or reject some.
 
@@ -45,47 +51,54 @@ def review(
     if confirm and reject:
         raise SettingsError("--confirm and --reject contradict each other; give one of them")
     if ids and not (confirm or reject):
-        raise SettingsError("what is to be said of them? give --confirm or --reject")
+        raise SettingsError("changes were named, but no verdict: give --confirm or --reject")
     if not ids and (confirm or reject or note):
-        raise SettingsError("of which changes? give the ids that `sorvolo review SITE` lists")
+        raise SettingsError("which changes? give the ids that `sorvolo review SITE` lists")
     if ids:
         verdict = Verdict.CONFIRMED if confirm else Verdict.REJECTED
         changes = review_changes(site, ids, verdict, note, flight=flight)
     else:
         changes = list_changes(site, flight)
+    place_of = site_of(site)
     if as_json:
-        typer.echo(json.dumps({"site": str(site), "changes": [_plain(each) for each in changes]}, indent=1))
+        rows = [_plain(each, place_of) for each in changes]
+        typer.echo(json.dumps({"site": str(site), "changes": rows}, indent=1))
     else:
-        _show(changes, unit_of(site), Console())
+        _show(changes, place_of, coordinates, Console())
 
 
-def _show(changes: Sequence["StoredChange"], unit: str, console: Console) -> None:
+def _show(changes: Sequence["StoredChange"], site: "Site", form: PlaceFormat, console: Console) -> None:
     from sorvolo.store.exports.plain import time_words
 
     if not changes:
-        console.print("no changes were found, or no flight was compared yet")
+        console.print("no changes: none were found, or no flight was compared yet (sorvolo compare)")
         return
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in ("id", "kind", "score", f"size {unit}", "views", "first seen (UTC)", "verdict"):
-        table.add_column(name, no_wrap=name != "verdict", overflow="fold")
+    table, place = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0)), place_words(site, form)
+    place_name = place_heading(site.is_local, form)
+    for name in ("id", "kind", place_name, f"length {unit_of(site)}", "score", "first seen (UTC)", "verdict"):
+        table.add_column(name, no_wrap=name in ("id", place_name), overflow="fold")
     for each in changes:
         verdict = ""
         if each.verdict is not None:
             colour = _COLOURS[each.verdict]
             verdict = f"[{colour}]{each.verdict.value}[/{colour}]" + (f": {escape(each.note)}" if each.note else "")
         table.add_row(
-            escape(each.id), each.kind.value, f"{each.score:.2f}", f"{each.length_m:.2f}", str(each.views),
+            escape(each.id), each.kind.value, place(each.centre_m), f"{each.length_m:.2f}", f"{each.score:.2f}",
             time_words(each.first_seen_ns), verdict,
         )
     console.print(table)
+    judged = sum(each.verdict is not None for each in changes)
+    console.print(f"{counted(len(changes), 'change')}, {judged} reviewed; score: 0 to 1, how sure", style="dim")
 
 
-def _plain(change: "StoredChange") -> dict[str, Any]:
+def _plain(change: "StoredChange", site: "Site") -> dict[str, Any]:
     from sorvolo.store.exports.plain import utc_text
 
+    latitude, longitude, _ = site.frame.wgs84_from_site(change.centre_m[None])
+    on_earth = {} if site.is_local else {"latitude": float(latitude[0]), "longitude": float(longitude[0])}
     return {
         "id": change.id, "flight": change.flight_id, "number": change.number, "kind": change.kind.value,
         "score": change.score, "first_seen": utc_text(change.first_seen_ns), "last_seen": utc_text(change.last_seen_ns),
-        "views": change.views, "east_m": float(change.centre_m[0]), "north_m": float(change.centre_m[1]),
+        "views": change.views, "east_m": float(change.centre_m[0]), "north_m": float(change.centre_m[1]), **on_earth,
         "review": None if change.verdict is None else change.verdict.value, "note": change.note,
     }

@@ -1,4 +1,4 @@
-"""`sorvolo simulate`: make flights over a synthetic site whose truth is known."""
+"""`sorvolo simulate`: flights over a synthetic site whose truth is known."""
 
 import json
 from collections.abc import Iterator
@@ -8,66 +8,57 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
-from sorvolo.cli.progress import bars
+from sorvolo.cli.options import size_px
+from sorvolo.cli.progress import ProgressReport
 from sorvolo.errors import SettingsError
+from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
     from sorvolo.missions.simulate.site import SimulationProgress
     from sorvolo.simulation.pictures import PictureSettings
     from sorvolo.simulation.settings import SimulationSettings
 
-_COLUMNS = (
-    TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
-)
-
 
 def simulate(
-    folder: Annotated[Path, typer.Argument(help="Folder to make; an earlier simulation there is replaced.")],
+    folder: Annotated[Path, typer.Argument(help="Folder to make; an earlier simulation in it is replaced.")],
     preset_name: Annotated[
-        str, typer.Option("--preset", help="What to simulate; --list-presets names all.")
+        str, typer.Option("--preset", help="What to simulate; --list-presets lists them.")
     ] = "demo",
-    seed: Annotated[int | None, typer.Option(help="Everything random follows from this number.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Random seed; the same seed gives the same flights.")] = None,
     ground: Annotated[
-        str, typer.Option(help="dirt, countryside, urban, sand, or an orthophoto's file.")
+        str, typer.Option(help="Ground: dirt, countryside, urban, sand, or an orthophoto's file.")
     ] = "",
     ground_gsd: Annotated[
-        float | None, typer.Option(help="Metres per pixel of an orthophoto without a CRS.")
+        float | None, typer.Option(help="Ground resolution of an orthophoto without a CRS, m a pixel.")
     ] = None,
-    flights: Annotated[int | None, typer.Option(help="Number of flights; later ones find changes.")] = None,
-    gps_noise: Annotated[float | None, typer.Option(help="White noise of each fix and axis, m rms.")] = None,
-    gps_rate: Annotated[float | None, typer.Option(help="Fixes a second; else the format's own.")] = None,
+    flights: Annotated[int | None, typer.Option(help="Number of flights; between them things change.")] = None,
+    gps_noise: Annotated[float | None, typer.Option(help="GPS noise of each fix and axis, m rms.")] = None,
+    gps_rate: Annotated[float | None, typer.Option(help="GPS fixes a second.", show_default="the format's own")] = None,
     clock_offset: Annotated[
-        float | None, typer.Option(help="Telemetry's clock minus the video's, s.")
+        float | None, typer.Option(help="Telemetry clock minus video clock, s.")
     ] = None,
-    telemetry: Annotated[str, typer.Option(help="csv, srt, nmea, gpx, all or none.")] = "",
-    faults: Annotated[int, typer.Option(help="So many gaps, jumps, 0/0 fixes and bad checksums each.")] = 0,
-    height: Annotated[float | None, typer.Option(help="Height above the ground, m.")] = None,
+    telemetry: Annotated[str, typer.Option(help="Telemetry format: csv, srt, nmea, gpx, all or none.")] = "",
+    faults: Annotated[int, typer.Option(help="Number of gaps, jumps, 0/0 fixes and bad checksums each.")] = 0,
+    height: Annotated[float | None, typer.Option(help="Flight height above ground, m.")] = None,
     speed: Annotated[float | None, typer.Option(help="Ground speed, m/s.")] = None,
     length: Annotated[float | None, typer.Option(help="Length of a strip, m.")] = None,
     strips: Annotated[int | None, typer.Option(help="Number of strips.")] = None,
-    tilt: Annotated[float | None, typer.Option(help="Roll and pitch, deg rms.")] = None,
-    fps: Annotated[float | None, typer.Option(help="Frames a second of the video.")] = None,
+    tilt: Annotated[float | None, typer.Option(help="Roll and pitch of the drone, deg rms.")] = None,
+    fps: Annotated[float | None, typer.Option(help="Video frames a second.")] = None,
     size: Annotated[str, typer.Option(help="Picture size, such as 1280x720.")] = "",
     photos: Annotated[
         bool, typer.Option("--photos", help="Write geo-tagged JPEG photos instead of a video.")
     ] = False,
     pictures: Annotated[
         int | None,
-        typer.Option(help="Instead of flights: so many single pictures, each of a site of its own, with COCO boxes."),
+        typer.Option(help="Make this many single labelled pictures (COCO) of different sites instead of flights."),
     ] = None,
-    thermal: Annotated[float, typer.Option(help="With --pictures: the share of thermal pictures, 0 to 1.")] = 0.0,
-    list_presets: Annotated[bool, typer.Option("--list-presets", help="Name the presets and stop.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object a step.")] = False,
+    thermal: Annotated[float, typer.Option(help="With --pictures: share of thermal pictures, 0 to 1.")] = 0.0,
+    list_presets: Annotated[bool, typer.Option("--list-presets", help="List the presets and stop.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per step.")] = False,
 ) -> None:
-    """Simulated flights with video or photos, telemetry, and the truth of every frame and object.
+    """Simulate flights: video or photos, telemetry, and the truth about every frame and object.
 
     Example: sorvolo simulate demo-site --preset demo
 
@@ -87,7 +78,7 @@ def simulate(
     if ground_file is not None and not ground_file.exists():
         raise SettingsError(f"--ground {ground}: no such file, and none of {', '.join(GroundKind)}")
     if pictures is None and thermal:
-        raise SettingsError("--thermal is a share of single pictures: give their number with --pictures as well")
+        raise SettingsError("--thermal is for single pictures: give their number with --pictures as well")
     if pictures is not None:
         of_flights = {
             "--preset": preset_name != "demo", "--flights": flights, "--gps-noise": gps_noise, "--gps-rate": gps_rate,
@@ -96,7 +87,7 @@ def simulate(
         }
         given = [name for name, value in of_flights.items() if value is not None and value is not False and value != ""]
         if given:
-            raise SettingsError(f"--pictures makes single pictures, no flights: leave out {', '.join(given)}")
+            raise SettingsError(f"--pictures makes single pictures, not flights: leave out {', '.join(given)}")
         wanted = PictureSettings(
             pictures, 1 if seed is None else seed, ground if ground_file is None else "orthophoto", thermal
         )
@@ -136,15 +127,15 @@ def _picture_folder(
     from sorvolo.missions.simulate.pictures import simulate_pictures
 
     last = None
-    console = Console(stderr=as_json)
-    with bars(*_COLUMNS, console=console, stay=True) as progress:
-        bar = progress.add_task("pictures", total=settings.pictures)
+    console = Console()
+    with ProgressReport(Console(stderr=True), stays=True) as progress:
         for last in simulate_pictures(folder, settings, ground_file, ground_gsd):
-            progress.update(bar, completed=last.pictures_done)
+            progress.show("simulating pictures", last.pictures_done, settings.pictures)
     if last is not None and as_json:
         typer.echo(json.dumps(asdict(last)))
     elif last is not None:
-        console.print(f"{last.pictures_done} pictures with {last.boxes} boxes in {last.seconds:.0f} s: {folder}")
+        pictures, boxes = counted(last.pictures_done, "picture"), counted(last.boxes, "box")
+        console.print(f"{pictures} with {boxes} in {last.seconds:.0f} s: {folder}", highlight=False, soft_wrap=True)
 
 
 def _with_options(
@@ -158,24 +149,18 @@ def _with_options(
 
 
 def _size(text: str) -> dict[str, object]:
-    if not text:
-        return {}
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal()):
-        raise SettingsError(f"--size {text!r}: a picture size looks like 1280x720")
-    return {"width_px": int(width), "height_px": int(height)}
+    size = size_px(text)
+    return {} if size is None else {"width_px": size[0], "height_px": size[1]}
 
 
 def _show(steps: Iterator["SimulationProgress"], folder: Path) -> None:
-    console = Console()
-    last = None
-    with bars(*_COLUMNS, console=console, stay=True) as progress:
-        tasks: dict[str, int] = {}
+    console, last = Console(), None
+    with ProgressReport(Console(stderr=True), stays=True) as progress:
         for last in steps:
             if last.stage == "frames":
-                if last.flight not in tasks:
-                    tasks[last.flight] = int(progress.add_task(last.flight, total=last.frames_total))
-                progress.update(progress.task_ids[tasks[last.flight]], completed=last.frames_done)
+                progress.show(f"simulating {last.flight}, frame", last.frames_done, last.frames_total)
     if last is not None:
-        console.print(f"{last.frames_done} frames in {last.seconds:.0f} s: {folder}")
-        console.print(f"the truth is in {folder / 'truth'}; the camera in {folder / 'camera.xml'}")
+        made = counted(last.frames_done, "frame")
+        console.print(f"{made} in {last.seconds:.0f} s: {folder}", highlight=False, soft_wrap=True)
+        truth, camera = folder / "truth", folder / "camera.xml"
+        console.print(f"the truth is in {truth}; the camera is in {camera}", highlight=False, soft_wrap=True)

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from sorvolo.cli.progress import ProgressReport
 from sorvolo.errors import SettingsError
 
 if TYPE_CHECKING:  # torch is an extra, and slow to import: only this command needs it
@@ -51,44 +51,46 @@ def train(
     preset: Annotated[
         Preset, typer.Option(help="fast: laptops. accurate: GPUs. thesis: ResNet-50 with the nine modules.")
     ] = Preset.FAST,
-    rpn: Annotated[Rpn | None, typer.Option(help="Else extended for thesis, extended-residual.")] = None,
+    rpn: Annotated[
+        Rpn | None, typer.Option(help="Proposal network.", show_default="extended-residual; thesis: extended")
+    ] = None,
     schedule: Annotated[
-        Schedule, typer.Option(help="joint: all at once. four-steps: the thesis's.")
+        Schedule, typer.Option(help="joint: everything at once. four-steps: as the thesis does.")
     ] = Schedule.JOINT,
     val: Annotated[
-        str, typer.Option(help="A labelled set, or the share of the pictures held out, by video.")
+        str, typer.Option(help="A labelled set to check on, or the share of videos to hold out.")
     ] = "0.15",
     weights: Annotated[
-        str, typer.Option(help="ImageNet's (auto, or a file), none, or a model to tune: its name or .onnx file."),
+        str, typer.Option(help="Start from ImageNet (auto, or a file), nothing (none), or a model: name or .onnx."),
     ] = "auto",
-    steps: Annotated[int, typer.Option(help="Batches to learn from.")] = 8000,
-    batch: Annotated[int, typer.Option(help="Samples a step.")] = 4,
+    steps: Annotated[int, typer.Option(help="Number of batches.")] = 8000,
+    batch: Annotated[int, typer.Option(help="Samples per batch.")] = 4,
     side: Annotated[int, typer.Option(help="Side of the samples cut from the pictures, px.")] = 416,
-    seed: Annotated[int, typer.Option(help="Everything random follows from this number.")] = 1,
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 1,
     synthetic: Annotated[float, typer.Option(help="Share of simulated samples, 0 to 1.")] = 0.0,
     patience: Annotated[
-        int, typer.Option(help="Checks without a better AP50 before it stops; 0: never. A run has 20.")
+        int, typer.Option(help="Stop after so many of the 20 checks without a better AP50; 0: never.")
     ] = 8,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
-    form: Annotated[str | None, typer.Option(help="The labels' form, if it is not told from the files.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --out.")] = False,
+    form: Annotated[str | None, typer.Option(help="Label format.", show_default="recognised")] = None,
     classes: Annotated[
-        str, typer.Option(help="Which names of the labels stand for which class: Pedestrian=person,Van=car.")
+        str, typer.Option(help="Class names of the labels as ours: Pedestrian=person,Van=car.")
     ] = "",
-    ignore: Annotated[str, typer.Option(help="Names whose boxes teach nothing: Bicycle,DontCare.")] = "",
+    ignore: Annotated[str, typer.Option(help="Class names whose boxes are ignored: Bicycle,DontCare.")] = "",
     unlabelled: Annotated[
         str, typer.Option(help="Classes that may be in the pictures without a label: person.")
     ] = "",
     group_pattern: Annotated[
-        str | None, typer.Option(help="Regular expression; its one group is the video's name in a picture's path.")
+        str | None, typer.Option(help="Regular expression; its group is the video's name in a picture's path.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object a step.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per step.")] = False,
 ) -> None:
-    """A detector from labelled pictures (COCO, YOLO, VOC, VisDrone, Okutama-Action, UMCD).
+    """Train a detector on labelled pictures (COCO, YOLO, VOC, VisDrone, Okutama-Action, UMCD).
 
     Example: sorvolo train my-labels --out my-model
 
-    Example, the packaged model tuned to one's own pictures: sorvolo train my-labels --out tuned --weights default
+    Example, the packaged model tuned to your own pictures: sorvolo train my-labels --out tuned --weights default
 
     Example: sorvolo train a b --preset accurate --val c --synthetic 0.2 --device cuda
 
@@ -106,49 +108,46 @@ def train(
         from sorvolo.missions.train.sets import DataOptions
     except ModuleNotFoundError as error:
         raise SettingsError(
-            f"training needs packages that are not here ({error.name}); install them: pip install 'sorvolo[training]'"
+            f"training needs packages that are not installed ({error.name}): pip install 'sorvolo[training]'"
         ) from error
     options = DataOptions(val, form, _mapping(classes), _names(ignore), _names(unlabelled), group_pattern)
     updates = train_detector(data or [], out, settings, options, device=device, resume=resume)
-    with _stopped_between_steps() as wish:
+    with _stopped_between_steps() as stop:
         if as_json:
             for update in updates:
                 typer.echo(json.dumps(plain_json(asdict(update))))
-                if wish.is_there:
+                if stop.is_there:
                     break
         else:
-            _show(updates, wish)
-        if wish.is_there:
+            _show(updates, stop)
+        if stop.is_there:
             cast(Generator[Any], updates).close()  # leaves a checkpoint, once it has learnt at all
             if (out / CHECKPOINT).is_file():
-                context.obj.stop_words = f"stopped; the same command with --resume goes on where {out} is now"
+                context.obj.stop_words = f"stopped; the same command with --resume continues the run in {out}"
             raise KeyboardInterrupt
     if not as_json:
-        typer.echo(f"{out / 'training.html'} tells how it went; sorvolo evaluate detector measures the model on more")
+        typer.echo(f"report: {out / 'training.html'}; sorvolo evaluate detector measures the model on other pictures")
 
 
-def _show(updates: "Iterator[TrainingUpdate]", wish: "_Wish") -> None:
-    """A line that lives, and one that stays for each check."""
+def _show(updates: "Iterator[TrainingUpdate]", stop: "_StopRequest") -> None:
+    """Progress, and a line that stays for each check and notice."""
     console = Console()
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=20), MofNCompleteColumn(),
-               TextColumn("{task.fields[told]}"))
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("opening", total=None, told="")
+    with ProgressReport(console, stays=True) as progress:
         for update in updates:
             for notice in update.notices:
-                progress.console.print(f"note: {escape(notice)}")
-            progress.update(
-                task, description=escape(update.words), total=update.steps, completed=update.step,
-                told=_losses(update) if update.losses is not None else "",
+                console.print(f"[blue]note[/blue]     {escape(notice)}", highlight=False)
+            progress.show(
+                f"{update.words}, step" if update.step else update.words, update.step, update.steps,
+                _losses(update) if update.losses is not None else "",
             )
             if update.check is not None:
                 each = ", ".join(f"{escape(name)} {_number(ap50)}" for name, ap50 in update.check.classes.items())
-                at = "step" if update.losses is not None else "the model as written, of step"
-                progress.console.print(
+                at = "step" if update.losses is not None else "the model as written, from step"
+                console.print(
                     f"{at} {update.check.step}: AP50 {_number(update.check.ap50)} ({each}), "
-                    f"AP {_number(update.check.ap)}"
+                    f"AP {_number(update.check.ap)}", highlight=False,
                 )
-            if wish.is_there:
+            if stop.is_there:
                 return
 
 
@@ -169,7 +168,7 @@ def _number(value: float) -> str:
     return f"{value:.3f}" if math.isfinite(value) else "-"
 
 
-class _Wish:
+class _StopRequest:
     """Whether somebody asked to stop."""
 
     def __init__(self) -> None:
@@ -177,23 +176,23 @@ class _Wish:
 
 
 @contextmanager
-def _stopped_between_steps() -> Iterator[_Wish]:
+def _stopped_between_steps() -> Iterator[_StopRequest]:
     """The first Ctrl-C waits for the step to end, so that a checkpoint can be left; the second does not."""
-    wish = _Wish()
+    stop = _StopRequest()
     before = signal.getsignal(signal.SIGINT)
 
     def on_interrupt(_signal: int, _frame: Any) -> None:
-        wish.is_there = True
-        typer.echo("stopping after this step; Ctrl-C again stops at once", err=True)
+        stop.is_there = True
+        typer.echo("stopping after this step; press Ctrl-C again to stop at once", err=True)
         signal.signal(signal.SIGINT, before)
 
     try:
         signal.signal(signal.SIGINT, on_interrupt)
     except ValueError:  # not in the main thread: there is no Ctrl-C to wait for
-        yield wish
+        yield stop
         return
     try:
-        yield wish
+        yield stop
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -206,5 +205,5 @@ def _mapping(text: str) -> dict[str, str] | None:
     """ "Van=car,person" as {"Van": "car", "person": "person"}; None of nothing."""
     pairs = [each.partition("=") for each in _names(text)]
     if not all(name.strip() and (target.strip() or not equals) for name, equals, target in pairs):
-        raise SettingsError(f"--classes takes names as THEIRS=OURS, separated by commas; got {text!r}")
+        raise SettingsError(f"--classes {text!r}: give names as THEIRS=OURS, separated by commas")
     return {name.strip(): target.strip() or name.strip() for name, _, target in pairs} or None

@@ -1,9 +1,9 @@
-"""`sorvolo watch`: objects told as they are found, and in the end how many of what, where, and how sure."""
+"""`sorvolo watch`: each object printed when it is found; in the end how many of what, where, and how sure."""
 
 import json
 import signal
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from enum import StrEnum
 from pathlib import Path
@@ -13,12 +13,14 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from sorvolo.cli.map import read_json, tell_path
-from sorvolo.cli.progress import bars
+from sorvolo.cli.options import AsJson, Camera, GiveUp, GroundElevation, PlaceFormat, PlaceFormatOption, names
+from sorvolo.cli.places import place_heading, place_words
+from sorvolo.cli.progress import ProgressReport, rate_words
+from sorvolo.cli.shown import read_json, show_notices_and_warnings, show_path
 from sorvolo.errors import SettingsError
+from sorvolo.survey.wording import counted, counted_list
 
 if TYPE_CHECKING:
     from sorvolo.missions.watch.run import WatchUpdate
@@ -26,10 +28,11 @@ if TYPE_CHECKING:
     from sorvolo.survey.objects import Track
 
 _MOST_ROWS = 40
+_COLUMNS_EXPLAINED = "score: 0 to 1, how sure; accuracy: 1 sigma; views: frames that show it"
 
 
 class Save(StrEnum):
-    """What is kept of the frames, with what was found drawn in."""
+    """How frames are kept, with the objects drawn in."""
 
     NONE = "none"
     VIDEO = "video"
@@ -39,44 +42,53 @@ class Save(StrEnum):
 def watch_command(
     source: Annotated[str, typer.Argument(help="A video, a folder of photos, or a live stream's address.")],
     telemetry: Annotated[
-        str, typer.Option(help="The flight's log, if not beside the video; of a live source, a receiver's address.")
+        str, typer.Option(help="The flight's log if not beside the video; for a live source, a receiver's address.")
     ] = "",
-    camera: Annotated[str, typer.Option(help="Calibration file, preset name or EXIF code, or aov=DEG.")] = "",
-    model: Annotated[str, typer.Option(help="An installed model's name (sorvolo models), or a file.")] = "default",
-    classes: Annotated[str, typer.Option(help="What to look for, such as person,car; else all it knows.")] = "",
-    out: Annotated[Path | None, typer.Option(help="Folder for what is found; else SOURCE-watch.")] = None,
-    save: Annotated[Save, typer.Option(help="Keep frames with what was found drawn in.")] = Save.NONE,
-    labels: Annotated[str, typer.Option(help="Write labels to correct and train with: coco,yolo.")] = "",
-    cot: Annotated[str, typer.Option(help="Tell a TAK server or team: udp://host:port, tcp://host:port.")] = "",
+    camera: Camera = "",
+    model: Annotated[str, typer.Option(help="Detector: a model's name (sorvolo models list), or a file.")] = "default",
+    classes: Annotated[
+        str, typer.Option(help="Classes to search for, such as person,car.", show_default="all that the model knows")
+    ] = "",
+    out: Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="SOURCE-watch")] = None,
+    save: Annotated[Save, typer.Option(help="Keep the frames with the objects drawn in.")] = Save.NONE,
+    labels: Annotated[str, typer.Option(help="Write labels to correct and train with: coco, yolo or coco,yolo.")] = "",
+    cot: Annotated[
+        str, typer.Option(help="Send objects to a TAK server or team: udp://host:port or tcp://host:port.")
+    ] = "",
     cot_type: Annotated[
-        list[str] | None, typer.Option(help="Cursor on Target's type of a class, such as person=a-f-G.")
+        list[str] | None, typer.Option(help="Cursor on Target type of a class, such as person=a-f-G. Can be repeated.")
     ] = None,
     alert_command: Annotated[
-        str, typer.Option(help="Run for each new object; {id} {class} {score} {latitude} {longitude} {time} {crop}.")
+        str,
+        typer.Option(help="Program to run for each object; {id} {class} {score} {latitude} {longitude} {time} {crop}."),
     ] = "",
-    alert_url: Annotated[str, typer.Option(help="Post each new object there as JSON.")] = "",
+    alert_url: Annotated[str, typer.Option(help="Post each new object to this web address as JSON.")] = "",
     every: Annotated[int | None, typer.Option(help="Search every N-th frame only.")] = None,
     fps: Annotated[
-        float | None, typer.Option(help="Frames searched a second of flight; else 10, live as many as it can.")
+        float | None,
+        typer.Option(help="Frames searched per second of flight.", show_default="10; live: as many as possible"),
     ] = None,
     tiles: Annotated[
-        str, typer.Option(help="Cut large pictures: auto by the ground's size in pixels, px a side, or none.")
+        str, typer.Option(help="Cut large pictures into tiles: auto (by ground resolution), pixels a side, or none.")
     ] = "auto",
-    least_score: Annotated[float | None, typer.Option(help="0 to 1; else each class's own.")] = None,
-    offset: Annotated[float | None, typer.Option(help="Telemetry time minus video time, s.")] = None,
-    ground_elevation: Annotated[
-        float | None, typer.Option(help="Of the ground, m, in telemetry's own height reference.")
+    least_score: Annotated[
+        float | None, typer.Option(help="Lowest score to report, 0 to 1.", show_default="each class's own")
     ] = None,
+    offset: Annotated[
+        float | None, typer.Option(help="Telemetry time minus video time, s.", show_default="as their clocks say")
+    ] = None,
+    ground_elevation: GroundElevation = None,
     height_model: Annotated[
-        str, typer.Option(help="GeoTIFF of the ground's heights, m, in the same reference; else it is level.")
+        str, typer.Option(help="GeoTIFF of ground heights in the telemetry's reference.", show_default="level ground")
     ] = "",
-    give_up: Annotated[float, typer.Option(help="A live source silent for so long has ended, s.")] = 30.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object at the end.")] = False,
+    give_up: GiveUp = 30.0,
+    coordinates: PlaceFormatOption = PlaceFormat.LATLON,
+    as_json: AsJson = False,
 ) -> None:
-    """Find people, cars and small objects in a flight, live or recorded, and say where on the ground they are.
+    """Find people, cars and small objects in a flight, live or recorded, and where on the ground they are.
 
-    Ends with the source or with Ctrl-C; either way, all that was found is written, and the exit code is 0 whether or
-    not anything was. Lines of detections.jsonl come as they are made.
+    Ends with the source or with Ctrl-C. Either way all results are written, and the exit code is 0, whether anything
+    was found or not. detections.jsonl grows while the watch runs.
 
     Example: sorvolo watch DJI_0042.MP4 --classes person
 
@@ -89,10 +101,10 @@ def watch_command(
     from sorvolo.store.exports.cursor_on_target import COT_TYPES
 
     settings = WatchSettings(
-        model, _names(classes), least_score, _tiles(tiles), every, fps, offset, ground_elevation, height_model
+        model, names(classes), least_score, _tiles(tiles), every, fps, offset, ground_elevation, height_model
     )
     outputs = WatchOutputs(
-        out, save.value, _names(labels), cot, {**COT_TYPES, **_types(cot_type or [])}, alert_command=alert_command,
+        out, save.value, names(labels), cot, {**COT_TYPES, **_types(cot_type or [])}, alert_command=alert_command,
         alert_url=alert_url,
     )
     if name := interpreted_placeholder(alert_command):
@@ -105,7 +117,7 @@ def watch_command(
     )
     # closed after a stop: then what was found is written
     with stop.on_signals(), closing(watching) as updates, suppress(KeyboardInterrupt):
-        for folder in _show_progress(updates, Console(stderr=True), is_quiet=as_json):
+        for folder in _show_progress(updates, Console(stderr=True), coordinates, is_quiet=as_json):
             stop.is_running = True
             folders[folder] = None
     results = [_result(folder) for folder in folders]
@@ -113,7 +125,7 @@ def watch_command(
         typer.echo(json.dumps({"watches": results}, indent=1))
     else:
         for result in results:
-            _show_result(result, Console())
+            _show_result(result, Console(), coordinates)
     if not results:
         Console(stderr=True).print("stopped before the first frame was searched")
 
@@ -145,40 +157,30 @@ class _Stop:
         self.until.set()
 
 
-def _show_progress(updates: Iterator["WatchUpdate"], console: Console, *, is_quiet: bool) -> Iterator[Path]:
-    """Take all updates, telling each new object; the folder of each."""
-    from sorvolo.survey.wording import counted_list
-
-    columns = (
-        SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=24),
-        TextColumn("{task.fields[told]}"), TimeRemainingColumn(),
-    )
-    with bars(*columns, console=console) as progress:
-        task = progress.add_task("opening", total=None, told="")
+def _show_progress(
+    updates: "Iterator[WatchUpdate]", console: Console, form: PlaceFormat, *, is_quiet: bool
+) -> Iterator[Path]:
+    """Take all updates, printing each new object; the folder of each."""
+    with ProgressReport(console) as progress:
+        progress.show("opening")
         for update in updates:
             for track in update.new if not is_quiet else ():
-                console.print(_words_of(track, update.site), highlight=False)
-            rate = f"{update.frames_detected / update.seconds:.1f} frames/s, " if update.seconds > 0 else ""
-            progress.update(
-                task, description="watching",
-                told=f"{rate}{1000 * update.latency_s:.0f} ms behind, {counted_list(update.counts)}",
-                total=max(update.frames_expected, update.frames_read) if update.frames_expected else None,
-                completed=update.frames_read,
+                console.print(_words_of(track, update.site, form), highlight=False)
+            delay = f"{1000 * update.latency_s:.0f} ms delay"
+            progress.show(
+                "watching, frame", update.frames_read,
+                max(update.frames_expected, update.frames_read) if update.frames_expected else None,
+                f"{rate_words(update.frames_detected, update.seconds)}{delay}, {counted_list(update.counts)}",
             )
             yield update.folder
 
 
-def _words_of(track: "Track", site: "Site") -> str:
-    from sorvolo.store.exports.places import longitude_latitude
-
+def _words_of(track: "Track", site: "Site", form: PlaceFormat) -> str:
     name = f"[bold]{escape(track.label)} {track.id}[/bold]"
+    seen = f"score {track.score:.2f}, {counted(track.views, 'view')}"
     if site.is_local:
-        return f"{name}  score {track.score:.2f}, {track.views} views"
-    longitude, latitude = longitude_latitude(track.position_m[None], site)
-    return (
-        f"{name}  at {latitude[0]:.6f}, {longitude[0]:.6f} within {track.sigma_m:.1f} m, score {track.score:.2f}, "
-        f"{track.views} views"
-    )
+        return f"{name}  {seen}"
+    return f"{name}  at {place_words(site, form)(track.position_m)} (accuracy {track.sigma_m:.1f} m), {seen}"
 
 
 def _result(folder: Path) -> dict[str, Any]:
@@ -186,52 +188,52 @@ def _result(folder: Path) -> dict[str, Any]:
     return {"folder": str(folder), **read_json(folder / "report.json"), "tracks": tracks}
 
 
-def _show_result(result: Mapping[str, Any], console: Console) -> None:
-    from sorvolo.survey.wording import counted_list
-
+def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat) -> None:
     tracks = [each["properties"] for each in result["tracks"]["features"]]
     console.print(
-        f"Watch of {escape(result['flight'])}: {escape(counted_list(result['objects']['by_class']))}", style="bold"
+        f"Watch of {escape(result['flight'])}: {escape(counted_list(result['objects']['by_class']))} found",
+        style="bold", highlight=False,
     )
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    on_ground = result["georeferenced"]
-    has_cuts = len({each.get("segment") for each in tracks}) > 1
-    unit = "m" if on_ground else "px"
-    place_name = "latitude, longitude" if on_ground else "segment: x, y px" if has_cuts else "x, y px"
-    for name in ("id", "class", "score", place_name, f"within {unit}", "views", "moves"):
-        table.add_column(name, no_wrap=True)
-    for each in tracks[:_MOST_ROWS]:
-        place = (
-            f"{each['latitude']:.6f}, {each['longitude']:.6f}" if on_ground
-            else f"{each['segment']}: {each['x_px']:.0f}, {each['y_px']:.0f}" if has_cuts
-            else f"{each['x_px']:.0f}, {each['y_px']:.0f}"
-        )
-        table.add_row(
-            str(each["id"]), escape(each["class"]), f"{each['score']:.2f}", place, f"{each['sigma_m']:.1f}",
-            str(each["views"]), "yes" if each["moving"] else "",
-        )
-    if table.row_count:
-        console.print(table)
-    if len(tracks) > _MOST_ROWS:
-        console.print(f"and {len(tracks) - _MOST_ROWS} more in tracks.geojson")
+    if tracks:
+        _show_tracks(tracks, console, form, on_ground=result["georeferenced"])
     frames, latency = result["frames"], result["latency_s"]
-    rate = result["frames_per_second"] or 0.0
+    skipped = f", {frames['skipped']:,} skipped to keep up with the source" if frames["skipped"] else ""
     console.print(
-        f"{frames['detected']} of {frames['read']} frames searched at {rate:.1f} frames/s, "
-        f"{frames['skipped']} skipped to keep up; {1000 * (latency['median'] or 0):.0f} ms from frame to result "
-        f"(at most {1000 * (latency['max'] or 0):.0f})", highlight=False,
+        f"{frames['detected']:,} of {counted(frames['read'], 'frame')} searched at "
+        f"{result['frames_per_second'] or 0.0:.1f} frames/s{skipped}; delay {1000 * (latency['median'] or 0):.0f} ms "
+        f"(median), {1000 * (latency['max'] or 0):.0f} ms at most", highlight=False,
     )
-    for notice in result["notices"]:
-        console.print(f"[blue]note[/blue]     {escape(notice['text'])}")
-    for warning in result["warnings"]:
-        console.print(f"[yellow]warning[/yellow]  {escape(warning)}")
+    show_notices_and_warnings(result, console)
     folder = Path(result["folder"])
-    tell_path("report", folder / "report.html", console)
-    tell_path("GeoJSON", folder / "tracks.geojson", console)
+    show_path("report", folder / "report.html", console)
+    show_path("GeoJSON", folder / "tracks.geojson", console)
 
 
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())
+def _show_tracks(tracks: Sequence[Any], console: Console, form: PlaceFormat, *, on_ground: bool) -> None:
+    has_cuts = len({each.get("segment") for each in tracks}) > 1
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    in_picture = "segment: x, y px" if has_cuts else "x, y px"
+    place_name = place_heading(False, form) if on_ground else in_picture
+    for name in ("id", "class", "score", place_name, f"accuracy {'m' if on_ground else 'px'}", "views", "moves"):
+        table.add_column(name, no_wrap=name in ("id", place_name), overflow="fold")
+    for each in tracks[:_MOST_ROWS]:
+        table.add_row(
+            str(each["id"]), escape(each["class"]), f"{each['score']:.2f}", _place(each, form, on_ground, has_cuts),
+            f"{each['sigma_m']:.1f}", str(each["views"]), "yes" if each["moving"] else "",
+        )
+    console.print(table)
+    if len(tracks) > _MOST_ROWS:
+        console.print(f"and {len(tracks) - _MOST_ROWS:,} more in tracks.geojson")
+    console.print(_COLUMNS_EXPLAINED, style="dim", highlight=False)
+
+
+def _place(each: Mapping[str, Any], form: PlaceFormat, on_ground: bool, has_cuts: bool) -> str:
+    from sorvolo.geometry.coordinates import Coordinates, place_text
+
+    if on_ground:
+        return place_text(each["latitude"], each["longitude"], Coordinates(form.value))
+    segment = f"{each['segment']}: " if has_cuts else ""
+    return f"{segment}{each['x_px']:.0f}, {each['y_px']:.0f}"
 
 
 def _tiles(text: str) -> Any:

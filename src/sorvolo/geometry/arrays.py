@@ -58,6 +58,11 @@ Anything: TypeAlias = NDArray[Any]
 """An array of any type."""
 
 
+def floats(values: Any) -> Floats:
+    """Numbers from a file's lists as an array; raises ValueError or TypeError for what are none."""
+    return np.asarray(values, np.float64)
+
+
 def frozen(array: Any, dtype: Any = np.float64) -> Any:
     """Copy `array` as a read-only array of `dtype`, for a record's field."""
     copy = np.array(array, dtype=dtype)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 from pyproj import CRS, Transformer
@@ -80,6 +81,15 @@ class LocalFrame:
         """(N, 3) east, north, up metres of WGS84 places given as (N,) arrays; works across the antimeridian."""
         ecef = ecef_from_wgs84(np.asarray(latitude_deg), np.asarray(longitude_deg), np.asarray(height_m))
         return (ecef - self._origin_ecef_m) @ self._site_from_ecef.T
+
+    def ground_from_lonlat(self, lonlat_deg: Any) -> PointsM:
+        """(N, 2) east, north of places on the site's ground: longitudes and latitudes, (N, 2) or more columns, as an
+        array or as the lists of a GeoJSON file. Raises ValueError or TypeError for what are no numbers."""
+        lonlat = np.asarray(lonlat_deg, dtype=np.float64)
+        if lonlat.ndim != 2 or lonlat.shape[1] < 2:
+            raise ValueError(f"places are (N, 2) longitudes and latitudes, got {lonlat.shape}")
+        height_m = np.full(len(lonlat), self.origin.height_m)
+        return self.site_from_wgs84(lonlat[:, 1], lonlat[:, 0], height_m)[:, :2]
 
     def wgs84_from_site(self, points_m: PointsM) -> tuple[Floats, Floats, Floats]:
         """Latitude, longitude (deg) and ellipsoidal height (m), each (N,), of site points, shape (N, 3) or (N, 2).

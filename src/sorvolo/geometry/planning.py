@@ -198,19 +198,26 @@ def plan_strips(
     turned = [[ring @ strip_from_site.T for ring in rings] for rings in polygons_m]
     across = outlines_m @ strip_from_site[1]
     levels = _strip_levels(float(across.min()), float(across.max()), width_m, spacing_m)
+    reaches_m = np.full((len(levels), 2), 0.5 * spacing_m)
+    reaches_m[0, 0] = reaches_m[-1, 1] = 0.5 * width_m
+    bands = list(zip((levels - reaches_m[:, 0]).tolist(), (levels + reaches_m[:, 1]).tolist()))
+    spans = zip(*(band_spans(rings, bands) for rings in turned))
     passes: list[Floats] = []
-    for index, level in enumerate(levels):
-        low = level - (0.5 * width_m if index == 0 else 0.5 * spacing_m)
-        high = level + (0.5 * width_m if index == len(levels) - 1 else 0.5 * spacing_m)
-        spans = [span for rings in turned for span in band_spans(rings, low, high)]
-        spans = join_spans(spans, 2 * length_m)
-        ends = [_whole_steps(span, photo_m) for span in spans]
-        strip = [np.array([[x0, level], [x1, level]]) for x0, x1 in ends]
+    for index, (level, parts) in enumerate(zip(levels, spans)):
+        strip = _passes(level, [span for part in parts for span in part], gap_m=2 * length_m, photo_m=photo_m)
         passes += strip if index % 2 == 0 else [each[::-1] for each in reversed(strip)]
     return FlightPlan(
         np.array(passes) @ strip_from_site, settings.height_m, settings.speed_m_s, photo_m, spacing_m,
         float(bearing_deg % 360),
     )
+
+
+def _passes(
+    level: float, spans: Sequence[tuple[float, float]], *, gap_m: float, photo_m: float
+) -> list[Floats]:
+    """The passes, (2, 2) each, along y = `level` over spans of x, in strip axes."""
+    ends = [_whole_steps(span, photo_m) for span in join_spans(spans, gap_m)]
+    return [np.array([[x0, level], [x1, level]]) for x0, x1 in ends]
 
 
 def longest_bearing_deg(points_m: PointsM) -> float:

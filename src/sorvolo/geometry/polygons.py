@@ -57,13 +57,22 @@ def first_crossing(ring: PointsM) -> tuple[int, int] | None:
     return int(meeting[0]), int(meeting[len(meeting) // 2])
 
 
-def band_spans(rings: Sequence[PointsM], low: float, high: float) -> list[tuple[float, float]]:
-    """The x-extents of the polygon's parts with low <= y <= high, in order of x, touching ones joined."""
-    outline = rings[0]
-    left, right = float(outline[:, 0].min()) - 1.0, float(outline[:, 0].max()) + 1.0
-    parts = shapely.get_parts(shapely.clip_by_rect(_polygon(rings), left, low, right, high))
-    bounds = shapely.bounds(parts)
-    return join_spans([(float(x0), float(x1)) for x0, _, x1, _ in bounds if np.isfinite(x0)], 0.0)
+def band_spans(
+    rings: Sequence[PointsM], bands: Sequence[tuple[float, float]]
+) -> list[list[tuple[float, float]]]:
+    """For each band low <= y <= high the x-extents of the polygon's parts in it, in order, touching ones joined.
+
+    A polygon that crosses itself is first made one that does not, by the even-odd rule.
+    """
+    polygon = _polygon(rings)
+    if not shapely.is_valid(polygon):
+        polygon = shapely.make_valid(polygon)
+    left, _, right, _ = shapely.bounds(polygon)
+    found = []
+    for low, high in bands:
+        bounds = shapely.bounds(shapely.get_parts(shapely.clip_by_rect(polygon, left - 1.0, low, right + 1.0, high)))
+        found.append(join_spans([(float(x0), float(x1)) for x0, _, x1, _ in bounds if np.isfinite(x0)], 0.0))
+    return found
 
 
 def join_spans(spans: Sequence[tuple[float, float]], gap: float) -> list[tuple[float, float]]:

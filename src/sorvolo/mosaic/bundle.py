@@ -26,6 +26,8 @@ the calibration left over, the constant offsets of the altitude's zero and of GP
 turn of the camera, about its own axes, against the attitude that telemetry states (mounting, gimbal, compass)."""
 
 
+_STEPS_AS_ONE = 4  # of the whole map at once, before its cameras move one by one
+
 _Scatter: TypeAlias = Callable[[Anything, Anything, Floats], None]  # rows, columns (n,); blocks (n, h, w)
 _Gather: TypeAlias = Callable[[Anything, Floats], None]  # rows (n,); blocks (n, h)
 
@@ -156,6 +158,8 @@ def solve(
     `shared_sigma` (8,) is each shared unknown's prior sigma about 0; 0 holds it at its present value.
     """
     damping = 1e-6
+    if iterations and free.sum() > 2 and np.array_equal(free, nodes.own):
+        nodes, shared = _moved_as_one(nodes, pairs, shared, shared_sigma, robust_sigmas)
     cost, normal, gradient, position = _normal_equations(nodes, pairs, shared, shared_sigma, free, robust_sigmas)
     for _ in range(iterations):
         step = _damped_step(normal, gradient, damping)
@@ -173,6 +177,53 @@ def solve(
         if gain < 1e-5 * cost + 1e-9:
             break
     return Solution(nodes, shared, cost, normal, position)
+
+
+def _moved_as_one(
+    nodes: Nodes, pairs: Pairs, shared: Floats, shared_sigma: Floats, robust_sigmas: float
+) -> tuple[Nodes, Floats]:
+    """All own cameras shifted, turned about the vertical and scaled as one, and the shared unknowns, to the least cost.
+
+    Links hardly notice such a motion, so telemetry alone decides it. Camera by camera it is a long way: straight steps
+    along a turn stretch the map, and Levenberg-Marquardt allows only short ones. Here the turn is exact.
+    """
+    state = _normal_equations(nodes, pairs, shared, shared_sigma, nodes.own, robust_sigmas)
+    for _ in range(_STEPS_AS_ONE):
+        cost, normal, gradient, _ = state
+        middle_m = nodes.centres_m[nodes.own].mean(axis=0) * [1, 1, 0]
+        basis = _common_motions(nodes.centres_m[nodes.own] - middle_m)
+        step = np.linalg.lstsq(basis.T @ (normal @ basis), basis.T @ gradient, rcond=None)[0]
+        trial_nodes, trial_shared = _move_as_one(nodes, middle_m, step[:4]), shared + step[4:]
+        trial = _normal_equations(trial_nodes, pairs, trial_shared, shared_sigma, nodes.own, robust_sigmas)
+        if not trial[0] < cost * (1 - 1e-4):
+            break
+        nodes, shared, state = trial_nodes, trial_shared, trial
+    return nodes, shared
+
+
+def _common_motions(offsets_m: Floats) -> Floats:
+    """(6 n + 8, 12) how n cameras' six unknowns, and the shared ones, follow a shift east and north, a turn, a scale.
+
+    `offsets_m` (n, 3): the cameras from the point on the ground about which they turn and grow.
+    """
+    count = len(offsets_m)
+    motions = np.zeros((count, 6, 4))
+    motions[:, 3, 0] = motions[:, 4, 1] = motions[:, 2, 2] = 1.0
+    motions[:, 3, 2], motions[:, 4, 2] = -offsets_m[:, 1], offsets_m[:, 0]
+    motions[:, 3:, 3] = offsets_m
+    basis = np.zeros((6 * count + len(SHARED), 4 + len(SHARED)))
+    basis[: 6 * count, :4] = motions.reshape(-1, 4)
+    basis[6 * count:, 4:] = np.eye(len(SHARED))
+    return basis
+
+
+def _move_as_one(nodes: Nodes, middle_m: Floats, step: Floats) -> Nodes:
+    turn = rotation_from_vector(np.array([[0.0, 0.0, step[2]]]))[0]
+    shift_m = np.array([step[0], step[1], 0.0])
+    rotations, centres_m = nodes.rotations.copy(), nodes.centres_m.copy()
+    rotations[nodes.own] = turn @ rotations[nodes.own]
+    centres_m[nodes.own] = middle_m + shift_m + np.exp(step[3]) * (centres_m[nodes.own] - middle_m) @ turn.T
+    return replace(nodes, rotations=rotations, centres_m=centres_m)
 
 
 def _normal_equations(

@@ -50,35 +50,44 @@ def true_events(flight: SimulatedFlight) -> list[TruthEvent]:
     """
     if flight.number == 1:
         return []
-    first, bodies = flight.before
+    came, left = _came_and_left(flight)
+    events = [_arrival(flight, thing, None if thing.is_moving else _take_near(thing, left)) for thing in came]
+    movers = [thing for thing in flight.day.things if thing.is_moving]
+    return events + [_departure(flight, thing, movers) for thing in left]
+
+
+def _came_and_left(flight: SimulatedFlight) -> tuple[list[Thing], list[Thing]]:
+    """The flight's things that are not where they were on the first, and the first flight's that are not there now."""
+    first, _ = flight.before
     today = {thing.id: thing for thing in flight.day.things}
     known = {thing.id: thing for thing in first}
     left = [thing for thing in first if has_changed(thing, today.get(thing.id))]
-    came = [
-        thing for thing in flight.day.things if thing.id not in known or has_changed(known[thing.id], thing)
-    ]
-    events = []
-    for thing in came:
-        views = _clear_views(flight, thing, flight.day.things, flight.day.bodies)
-        old = None if thing.is_moving else _take_near(thing, left)
-        places = np.array([thing.place_m(float(flight.from_middle_s[index]))[:2] for index in views])
-        if thing.is_moving:
-            middle_s = float(flight.from_middle_s[views[len(views) // 2]]) if views else 0.0
-            events.append(TruthEvent("moving", None, thing, thing.footprint_m(middle_s), views, places.reshape(-1, 2)))
-        elif old is None:
-            events.append(TruthEvent("appeared", None, thing, thing.footprint_m(), views, places.reshape(-1, 2)))
-        else:
-            both = convex_hull(np.concatenate([old.footprint_m(), thing.footprint_m()]))
-            events.append(TruthEvent("replaced", old, thing, both, views, places.reshape(-1, 2)))
-    movers = [thing for thing in flight.day.things if thing.is_moving]
-    for thing in left:
-        views = tuple(
-            index for index in _clear_views(flight, thing, first, bodies)
-            if not _is_trodden(thing, movers, float(flight.from_middle_s[index]))
-        )
-        places = np.tile(thing.place_m(0.0)[:2], (len(views), 1))
-        events.append(TruthEvent("disappeared", thing, None, thing.footprint_m(), views, places))
-    return events
+    came = [thing for thing in flight.day.things if thing.id not in known or has_changed(known[thing.id], thing)]
+    return came, left
+
+
+def _arrival(flight: SimulatedFlight, thing: Thing, old: Thing | None) -> TruthEvent:
+    """Something that came, in place of an old one or not, or that moves."""
+    views = _clear_views(flight, thing, flight.day.things, flight.day.bodies)
+    places = np.array([thing.place_m(float(flight.from_middle_s[index]))[:2] for index in views]).reshape(-1, 2)
+    if thing.is_moving:
+        middle_s = float(flight.from_middle_s[views[len(views) // 2]]) if views else 0.0
+        return TruthEvent("moving", None, thing, thing.footprint_m(middle_s), views, places)
+    if old is None:
+        return TruthEvent("appeared", None, thing, thing.footprint_m(), views, places)
+    both = convex_hull(np.concatenate([old.footprint_m(), thing.footprint_m()]))
+    return TruthEvent("replaced", old, thing, both, views, places)
+
+
+def _departure(flight: SimulatedFlight, thing: Thing, movers: Sequence[Thing]) -> TruthEvent:
+    """Something that is gone."""
+    first, bodies = flight.before
+    views = tuple(
+        index for index in _clear_views(flight, thing, first, bodies)
+        if not _is_trodden(thing, movers, float(flight.from_middle_s[index]))
+    )
+    places = np.tile(thing.place_m(0.0)[:2], (len(views), 1))
+    return TruthEvent("disappeared", thing, None, thing.footprint_m(), views, places)
 
 
 def event_features(flight: SimulatedFlight) -> list[dict[str, Any]]:

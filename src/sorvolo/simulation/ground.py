@@ -1,7 +1,9 @@
 """The simulated site's ground: a picture of level ground in site metres, procedural or a given orthophoto."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -19,6 +21,8 @@ from sorvolo.simulation.canvas import (
     soft,
 )
 from sorvolo.simulation.noise import FieldF32
+
+_Block: TypeAlias = tuple[float, float, float, float]  # west, south, east, north, m
 
 
 class GroundKind(StrEnum):
@@ -172,26 +176,13 @@ def _urban(canvas: Canvas) -> Layout:
     blocks = _city_blocks(area, rng)
     lawns = [block for block in blocks if rng.uniform() < 0.35]
     yards = [block for block in blocks if block not in lawns]
-    for west, south, east, north in lawns:
-        inside = rectangle_cover(canvas, west + 1.8, south + 1.8, east - 1.8, north - 1.8)
-        canvas.lay(inside, (96, 112, 62), 0.18, 0.1 * field(5, 1.5, 0.4), is_plant=True)
-    for west, south, east, north in yards:
-        inside = rectangle_cover(canvas, west + 1.8, south + 1.8, east - 1.8, north - 1.8)
-        canvas.lay(inside, (118, 117, 115), 0.09, 0.05 * field(6, 1.5, 0.5))
-    for west, south, east, north in blocks:
-        rim = rectangle_cover(canvas, west, south, east, north)
-        rim = rim * (1 - rectangle_cover(canvas, west + 1.8, south + 1.8, east - 1.8, north - 1.8))
-        canvas.lay(rim, (168, 164, 156), 0.06, 0.04 * field(3, 0.8))
+    _paint_blocks(canvas, blocks, lawns, yards)
     # oil, repairs and wear
     canvas.lay(0.5 * soft(field(3, 0.9, 0.4), 1.6, 0.4), (62, 62, 64), 0.08, 0.03 * field(0.5))
     canvas.develop()
     _paint_kerbs(canvas, blocks)
     _paint_cracks(canvas, 0.03)
-    houses, parkings = [], []
-    for west, south, east, north in yards:
-        parkings += _paint_parking(canvas, west + 2.2, south + 2.2, east - 2.2)
-        if north - south > 22 and east - west > 18:
-            houses.append(((west + east) / 2, north - 8.5, 0.0))
+    houses, parkings = _build_yards(canvas, yards)
     _paint_roads(canvas, blocks)
     garden = sum((rectangle_cover(canvas, w + 3, s + 3, e - 3, n - 3) for w, s, e, n in lawns), 0 * ones)
     trees = scatter(canvas, 1 / 90, 5.0, 1.0, garden)
@@ -203,7 +194,35 @@ def _urban(canvas: Canvas) -> Layout:
     )
 
 
-def _city_blocks(area: Area, rng: np.random.Generator) -> list[tuple[float, float, float, float]]:
+def _build_yards(
+    canvas: Canvas, yards: Sequence[_Block]
+) -> tuple[list[tuple[float, float, float]], list[tuple[float, float, float]]]:
+    """The places (east, north, yaw) of houses in the yards, and of the parked cars, whose places are painted."""
+    houses: list[tuple[float, float, float]] = []
+    parkings: list[tuple[float, float, float]] = []
+    for west, south, east, north in yards:
+        parkings += _paint_parking(canvas, west + 2.2, south + 2.2, east - 2.2)
+        if north - south > 22 and east - west > 18:
+            houses.append(((west + east) / 2, north - 8.5, 0.0))
+    return houses, parkings
+
+
+def _paint_blocks(canvas: Canvas, blocks: Sequence[_Block], lawns: Sequence[_Block], yards: Sequence[_Block]) -> None:
+    """Lawns and paved yards within their pavements."""
+    field = canvas.field
+    for west, south, east, north in lawns:
+        inside = rectangle_cover(canvas, west + 1.8, south + 1.8, east - 1.8, north - 1.8)
+        canvas.lay(inside, (96, 112, 62), 0.18, 0.1 * field(5, 1.5, 0.4), is_plant=True)
+    for west, south, east, north in yards:
+        inside = rectangle_cover(canvas, west + 1.8, south + 1.8, east - 1.8, north - 1.8)
+        canvas.lay(inside, (118, 117, 115), 0.09, 0.05 * field(6, 1.5, 0.5))
+    for west, south, east, north in blocks:
+        rim = rectangle_cover(canvas, west, south, east, north)
+        rim = rim * (1 - rectangle_cover(canvas, west + 1.8, south + 1.8, east - 1.8, north - 1.8))
+        canvas.lay(rim, (168, 164, 156), 0.06, 0.04 * field(3, 0.8))
+
+
+def _city_blocks(area: Area, rng: np.random.Generator) -> list[_Block]:
     """West, south, east, north of the blocks that roads leave between them."""
     def cuts(low: float, high: float) -> list[tuple[float, float]]:
         spans, at = [], low - rng.uniform(5, 25)
@@ -216,7 +235,7 @@ def _city_blocks(area: Area, rng: np.random.Generator) -> list[tuple[float, floa
     return [(w, s, e, n) for w, e in columns for s, n in rows]
 
 
-def _paint_kerbs(canvas: Canvas, blocks: list[tuple[float, float, float, float]]) -> None:
+def _paint_kerbs(canvas: Canvas, blocks: Sequence[_Block]) -> None:
     for west, south, east, north in blocks:
         for inset, tone in ((0.0, 196.0), (1.8, 140.0)):
             ring = np.array([
@@ -232,7 +251,7 @@ def _paint_kerbs(canvas: Canvas, blocks: list[tuple[float, float, float, float]]
                 canvas.stroke(np.array([[low, at], [high, at]]), 0.02, np.array([146, 143, 138]))
 
 
-def _paint_roads(canvas: Canvas, blocks: list[tuple[float, float, float, float]]) -> None:
+def _paint_roads(canvas: Canvas, blocks: Sequence[_Block]) -> None:
     white = np.array([222.0, 222, 216])
     for west, south, east, north in blocks:
         for at in np.arange(west, east - 2, 5.0):  # the dashed middle of the road to the south

@@ -188,13 +188,8 @@ class Light:
 
 def new_size(label: Label, kind: str, rng: np.random.Generator) -> tuple[float, float, float]:
     """A likely length, width and height in metres."""
-    if label is Label.PERSON and kind in POSES:
-        stature = float(rng.uniform(0.95, 1.4) if rng.uniform() < 0.1 else rng.uniform(1.5, 1.95))
-        length, width, high = POSES[kind]
-        return length * stature, width * stature, high * stature
     if label is Label.PERSON:
-        height = float(rng.uniform(1.6, 1.88))
-        return (height, 0.5, 0.24) if kind == LYING else (0.34, 0.52, height)
+        return _person_size(kind, rng)
     if label is Label.CAR:
         return _CAR_SIZES_M[kind]
     if label is Label.SMALL:
@@ -205,6 +200,16 @@ def new_size(label: Label, kind: str, rng: np.random.Generator) -> tuple[float, 
         return float(rng.uniform(8, 11)), float(rng.uniform(6, 7.5)), float(rng.uniform(4.6, 6.0))
     width = float(rng.uniform(2.4, 4.6)) if kind == "tree" else float(rng.uniform(0.8, 1.8))
     return width, width, width * float(rng.uniform(0.9, 1.5)) if kind == "tree" else width * 0.7
+
+
+def _person_size(kind: str, rng: np.random.Generator) -> tuple[float, float, float]:
+    """Of adults, and in a pose of children now and then."""
+    if kind in POSES:
+        stature = float(rng.uniform(0.95, 1.4) if rng.uniform() < 0.1 else rng.uniform(1.5, 1.95))
+        length, width, high = POSES[kind]
+        return length * stature, width * stature, high * stature
+    height = float(rng.uniform(1.6, 1.88))
+    return (height, 0.5, 0.24) if kind == LYING else (0.34, 0.52, height)
 
 
 def new_kind(label: Label, rng: np.random.Generator) -> str:

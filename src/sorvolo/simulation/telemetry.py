@@ -59,8 +59,8 @@ def observe(
 ) -> Observation:
     """Sample the flown path as an instrument of this format does.
 
-    `at_s` (N,) samples at these moments, as a camera does for its photos; else the rate is the settings'
-    or the format's own, on the clock's whole ticks.
+    `at_s` (N,) samples at these moments, as a camera does for its photos, which carry the fix of `clock_offset_s`
+    earlier; else the rate is the settings' or the format's own, on the clock's whole ticks.
     """
     if at_s is None:
         rate_hz = settings.rate_hz or _RATES_HZ[format_name]
@@ -70,7 +70,7 @@ def observe(
         true_s = ticks / rate_hz - settings.clock_offset_s
         true_s = true_s[_outside_gaps(true_s, settings.gaps, path.duration_s, rng)]
     else:
-        true_s = np.asarray(at_s, dtype=np.float64)
+        true_s = np.asarray(at_s, dtype=np.float64) - settings.clock_offset_s
     count = len(true_s)
     error_m = rng.standard_normal((count, 3)) * settings.noise_m + np.array(settings.bias_m)
     if settings.wander_m:

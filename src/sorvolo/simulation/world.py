@@ -112,26 +112,14 @@ def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px:
     ground."""
     rng = np.random.default_rng([settings.seed, 3, flight])
     weather = settings.later.weather if flight > 1 else WeatherSettings(False, False, 0.0)
-    is_other = weather.has_other_light
-    azimuth = np.radians(rng.uniform(0, 360) if is_other else 215.0)
-    elevation = np.radians(rng.uniform(28, 62) if is_other else 48.0)
-    light = Light(np.array([
-        np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)
-    ]))
-    warmth = rng.uniform(-0.06, 0.06) if is_other else 0.0
-    gains = np.array([1 + warmth, 1.0, 1 - warmth]) * (rng.uniform(0.82, 1.12) if is_other else 1.0)
-    gains = gains * weather.brightness
+    light, gains = _daylight(weather, rng)
     things = world.days[flight - 1]
     ground = world.ground.resampled(0.72 * m_per_px)
     if weather.snow:
         ground = _snowed_in(ground, weather.snow, np.random.default_rng([settings.seed, 9, flight]))
-    wind_m = weather.wind_m
-    if wind_m:
-        ground = _blown(ground, wind_m, rng)
-        things = tuple(
-            replace(thing, sway_m=(rng.normal(0, 2.0 * wind_m), rng.normal(0, 2.0 * wind_m)))
-            if thing.label is Label.TREE else thing for thing in things
-        )
+    if weather.wind_m:
+        ground = _blown(ground, weather.wind_m, rng)
+        things = _swayed(things, weather.wind_m, rng)
     bodies = {thing.id: build_body(thing, light, m_per_px) for thing in things}
     standing = [thing for thing in things if not thing.is_moving]
     ground = _with_shadows(ground, standing, bodies, light)
@@ -140,6 +128,27 @@ def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px:
     }
     cloud_shade = 0.38 if weather.has_clouds else 0.0
     return Day(ground, things, bodies, shadows, light, gains, cloud_shade)
+
+
+def _daylight(weather: WeatherSettings, rng: np.random.Generator) -> tuple[Light, Floats]:
+    """The sun and the camera's gains, (3,), of a day."""
+    is_other = weather.has_other_light
+    azimuth = np.radians(rng.uniform(0, 360) if is_other else 215.0)
+    elevation = np.radians(rng.uniform(28, 62) if is_other else 48.0)
+    light = Light(np.array([
+        np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)
+    ]))
+    warmth = rng.uniform(-0.06, 0.06) if is_other else 0.0
+    gains = np.array([1 + warmth, 1.0, 1 - warmth]) * (rng.uniform(0.82, 1.12) if is_other else 1.0)
+    return light, gains * weather.brightness
+
+
+def _swayed(things: tuple[Thing, ...], wind_m: float, rng: np.random.Generator) -> tuple[Thing, ...]:
+    """The things, trees moved by the wind."""
+    return tuple(
+        replace(thing, sway_m=(rng.normal(0, 2.0 * wind_m), rng.normal(0, 2.0 * wind_m)))
+        if thing.label is Label.TREE else thing for thing in things
+    )
 
 
 def scenery(ground: str, layout: Layout, rng: np.random.Generator) -> tuple[Thing, ...]:
@@ -180,18 +189,7 @@ def _next_day(first: tuple[Thing, ...], layout: Layout, waypoints_m: Floats, set
     """The things of a later flight: some targets of the first are gone, some moved, some are new, some
     move."""
     rng = np.random.default_rng([settings.seed, 4, flight])
-    targets = [thing for thing in first if thing.label.is_target]
-    order = rng.permutation(len(targets))
-    removed = {targets[i].id for i in order[:settings.later.removed]}
-    shifted = {
-        targets[i].id for i in order[settings.later.removed : settings.later.removed + settings.later.moved]
-    }
-    today = [thing for thing in first if thing.id not in removed]
-    for i, thing in enumerate(today):
-        if thing.id in shifted:
-            others = [other for other in today if other.id != thing.id]
-            place = _place(thing.label, thing.id, others, layout, waypoints_m, settings, rng)
-            today[i] = replace(thing, east_m=place.east_m, north_m=place.north_m, yaw_deg=place.yaw_deg)
+    today = _left_and_moved(first, layout, waypoints_m, settings, rng)
     next_id = 1000 * flight
     later = settings.later
     came = [Label.PERSON] * later.people + [Label.CAR] * later.cars + [Label.SMALL] * later.small_objects
@@ -202,6 +200,22 @@ def _next_day(first: tuple[Thing, ...], layout: Layout, waypoints_m: Floats, set
         if thing.label in (Label.PERSON, Label.CAR) and rng.uniform() < settings.scene.moving_share else thing
         for thing in today
     )
+
+
+def _left_and_moved(first: tuple[Thing, ...], layout: Layout, waypoints_m: Floats, settings: SimulationSettings,
+                    rng: np.random.Generator) -> list[Thing]:
+    """The first flight's things, some of its targets taken away, some moved."""
+    targets = [thing for thing in first if thing.label.is_target]
+    order = [targets[i].id for i in rng.permutation(len(targets))]
+    removed = set(order[:settings.later.removed])
+    shifted = set(order[settings.later.removed : settings.later.removed + settings.later.moved])
+    today = [thing for thing in first if thing.id not in removed]
+    for i, thing in enumerate(today):
+        if thing.id in shifted:
+            others = [other for other in today if other.id != thing.id]
+            place = _place(thing.label, thing.id, others, layout, waypoints_m, settings, rng)
+            today[i] = replace(thing, east_m=place.east_m, north_m=place.north_m, yaw_deg=place.yaw_deg)
+    return today
 
 
 def _place(label: Label, thing_id: int, others: list[Thing], layout: Layout, waypoints_m: Floats,

@@ -67,12 +67,15 @@ def split_by_blocks(
     for part in shares:
         smaller = [row for other in by_share[by_share.index(part) + 1:] for row in members[other]]
         kept = _far_from(members[part], smaller, places, gap)
-        dropped = len(members[part]) - len(kept)
-        text = f"{dropped} pictures of {part} are within {gap} frames of another part and were left out"
-        notices = (Notice("left_out_at_borders", dropped, text),) if dropped else ()
-        pictures = tuple(labelled.pictures[row] for row in kept)
-        parts[part] = LabelledSet(labelled.name, labelled.classes, pictures, labelled.unlabelled, notices)
+        text = f"{{}} pictures of {part} are within {gap} frames of another part and were left out"
+        parts[part] = _part_of(labelled, kept, len(members[part]) - len(kept), text)
     return parts
+
+
+def _part_of(labelled: LabelledSet, rows: Sequence[int], left_out: int, text: str) -> LabelledSet:
+    notices = (Notice("left_out_at_borders", left_out, text.format(left_out)),) if left_out else ()
+    pictures = tuple(labelled.pictures[row] for row in rows)
+    return LabelledSet(labelled.name, labelled.classes, pictures, labelled.unlabelled, notices)
 
 
 def shared_groups(first: LabelledSet, second: LabelledSet) -> tuple[Notice, ...]:

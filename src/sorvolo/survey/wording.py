@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-_PLURALS = {"person": "people", "bus": "buses", "is": "are", "was": "were"}
+_PLURALS = {"person": "people", "bus": "buses", "is": "are", "was": "were", "shows": "show"}
 
 
 def plural(noun: str, count: int) -> str:

@@ -17,6 +17,7 @@ from sorvolo.capture.live.telemetry_log import TelemetryLog
 from sorvolo.capture.photo_metadata import PhotoMetadata, read_photo_metadata
 from sorvolo.capture.photos import read_picture
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
+from sorvolo.capture.sync import FIX_DELAY_S, PHOTO_TIE
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.errors import InputError
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
@@ -37,7 +38,7 @@ class GrowingFolder:
     kind = "photos"
     is_live = True
     frame_rate_hz = ground_elevation_m = nan
-    telemetry_tie, telemetry_sigma_s = "each photo carries its own fix", 0.0
+    telemetry_tie, telemetry_sigma_s = PHOTO_TIE, FIX_DELAY_S
 
     def __init__(self, folder: Path, settings: LiveSettings, until: threading.Event) -> None:
         self._folder, self._settings, self._until = folder, settings, until

@@ -1,7 +1,7 @@
 """MISB ST 0601 as Sorvolo's records: telemetry columns, the camera's angles, the ground's height, the lens."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, nan, radians, tan
 from pathlib import Path
@@ -15,7 +15,7 @@ from sorvolo.capture.telemetry.cleaning import clean, notice
 from sorvolo.geometry.arrays import Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import gimbal_angles_from_rotation, site_from_gimbal_rotation
-from sorvolo.survey.flight import CameraModel, Notice, Telemetry
+from sorvolo.survey.flight import TELEMETRY_COLUMNS, CameraModel, Notice, Telemetry
 
 FORMAT = "klv"
 """The name that `Telemetry.format` carries."""
@@ -122,40 +122,51 @@ def read_klv_file(path: Path) -> FileMetadata | None:
     InputError when there is metadata but no usable sample in it.
     """
     counts: Counter[str] = Counter()
-    found: list[tuple[int, LocalSet]] = []
-    first_ns: int | None = None
-    try:
-        with av.open(f"file:{path}", options={"protocol_whitelist": "file"}) as container:
-            streams = klv_streams(container)
-            if not streams or not container.streams.video:
-                return None
-            for packet in container.demux([container.streams.video[0], *streams]):
-                stamp = packet.pts if packet.pts is not None else packet.dts
-                stamp_ns = -1 if stamp is None else round(stamp * packet.time_base * 1_000_000_000)
-                if packet.stream.type == "video":
-                    first_ns = min(stamp_ns, stamp_ns if first_ns is None else first_ns) if stamp_ns >= 0 else first_ns
-                else:
-                    found += [(stamp_ns, each) for each in local_sets(bytes(packet), counts)]
-    except (av.FFmpegError, IndexError):
-        pass  # a damaged place: what came before it is used, and the video's reader counts the damage
-    if not found and not counts:
-        return None
-    told = [(stamp_ns, each) for stamp_ns, each in found if each.time_ns]
-    counts["no_time"] += len(found) - len(told)
-    rows = [columns_of(each) for _, each in told]
-    names = sorted({name for row in rows for name in row})
-    video_ns = [stamp_ns - (first_ns or 0) if stamp_ns >= 0 else -1 for stamp_ns, _ in told]
+    sets = _sets_in(path, counts)
+    return metadata_of(sets, counts, path.name) if sets or counts else None
+
+
+def metadata_of(sets: Sequence[tuple[int, LocalSet]], counts: Counter[str], name: str) -> FileMetadata:
+    """What local sets state, each with its time in the video (ns; negative where the packet has none).
+
+    `counts` are what `klv.local_sets` counted. Raises InputError, which calls the file `name`, without a usable sample.
+    """
+    video_ns = [stamp_ns for stamp_ns, each in sets if each.time_ns]
+    timed = [each for _, each in sets if each.time_ns]
+    counts["no_time"] += len(sets) - len(timed)
+    rows = [columns_of(each) for each in timed]
     telemetry = clean(
-        FORMAT, path.name, [each.time_ns for _, each in told],
-        {name: [row.get(name, nan) for row in rows] for name in names},
+        FORMAT, name, [each.time_ns for each in timed],
+        {column: [row.get(column, nan) for row in rows] for column in TELEMETRY_COLUMNS},
         # a tie to the video holds for all samples or for none
         video_ns if min(video_ns, default=-1) >= 0 else None,
         notices=klv_notices(counts),
     )
-    lens = next((each for _, each in told if isfinite(each["sensor_horizontal_fov_deg"])), None)
-    grounds_m = [ground_elevation_m(each) for _, each in told]
-    known_m = [each for each in grounds_m if isfinite(each)]
-    return FileMetadata(telemetry, lens, median(known_m) if known_m else nan)
+    lens = next((each for each in timed if isfinite(each["sensor_horizontal_fov_deg"])), None)
+    grounds_m = list(filter(isfinite, map(ground_elevation_m, timed)))
+    return FileMetadata(telemetry, lens, median(grounds_m) if grounds_m else nan)
+
+
+def _sets_in(path: Path, counts: Counter[str]) -> list[tuple[int, LocalSet]]:
+    """The local sets of a file with their times since its first frame; -1 where a packet has none."""
+    found: list[tuple[int, LocalSet]] = []
+    firsts_ns: list[int] = []
+    try:
+        with av.open(f"file:{path}", options={"protocol_whitelist": "file"}) as container:
+            streams = klv_streams(container)
+            if not streams or not container.streams.video:
+                return []
+            for packet in container.demux([container.streams.video[0], *streams]):
+                stamp = packet.pts if packet.pts is not None else packet.dts
+                stamp_ns = -1 if stamp is None else round(stamp * packet.time_base * 1_000_000_000)
+                if packet.stream.type != "video":
+                    found += [(stamp_ns, each) for each in local_sets(bytes(packet), counts)]
+                elif stamp_ns >= 0:
+                    firsts_ns.append(stamp_ns)
+    except (av.FFmpegError, IndexError):
+        pass  # a damaged place: what came before it is used, and the video's reader counts the damage
+    first_ns = min(firsts_ns, default=0)
+    return [(stamp_ns - first_ns if stamp_ns >= 0 else -1, each) for stamp_ns, each in found]
 
 
 # ---- inside ---------------------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """Telemetry files: the content decides which reader a file needs, and where a video's telemetry lies."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -76,17 +77,26 @@ def find_telemetry_beside(video: Path) -> Path | None:
         (each for each in files if each.suffix.lower() in _SUFFIXES),
         key=lambda each: (_SUFFIXES.index(each.suffix.lower()), each.name),
     )
-    stem = video.stem.lower()
-    for wanted in (stem, *(pattern.format(stem) for pattern in _BESIDE)):
-        for candidate in candidates:
-            # "path1.mp4.csv" belongs to path1.mp4 too
-            if candidate.stem.lower() in (wanted, video.name.lower()) and is_telemetry(candidate):
-                return candidate
+    if named := _named_like(video, candidates):
+        return named
     if any(each.suffix.lower() in _VIDEO_SUFFIXES for each in files):
         return None
-    known = [candidate for candidate in candidates if is_telemetry(candidate)]
-    named = [candidate for candidate in known if "telemetry" in candidate.stem.lower()]
-    for group in (named, known):
+    return _only_one(list(filter(is_telemetry, candidates)))
+
+
+def _named_like(video: Path, candidates: Sequence[Path]) -> Path | None:
+    stem = video.stem.lower()
+    for wanted in (stem, *(pattern.format(stem) for pattern in _BESIDE)):
+        # "path1.mp4.csv" belongs to path1.mp4 too
+        alike = (each for each in candidates if each.stem.lower() in (wanted, video.name.lower()))
+        if found := next(filter(is_telemetry, alike), None):
+            return found
+    return None
+
+
+def _only_one(known: Sequence[Path]) -> Path | None:
+    """The only file, or the only one with "telemetry" in its name."""
+    for group in ([each for each in known if "telemetry" in each.stem.lower()], known):
         if len(group) == 1:
             return group[0]
     return None

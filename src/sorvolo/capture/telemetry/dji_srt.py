@@ -20,7 +20,8 @@ from sorvolo.capture.telemetry.cleaning import (
     time_ns_from_text,
 )
 from sorvolo.errors import InputError
-from sorvolo.survey.flight import Telemetry
+from sorvolo.geometry.arrays import Floats
+from sorvolo.survey.flight import Notice, Telemetry
 
 SMALLEST_SIGMA_M = 1.5
 """Horizontal sigma of a consumer drone's GPS in hover, which no number of printed decimals improves."""
@@ -104,37 +105,46 @@ def read(data: bytes, name: str) -> Telemetry:
     _forget_empty_heights(cues)
     video_ns = np.array([cue.video_time_ns for cue in cues], dtype=np.int64)
     stamps_ns = np.array([cue.stamp_ns for cue in cues], dtype=np.int64)
-    dated = stamps_ns != NO_TIME_NS
     times_ns, refined = refine_clock(fill_stamps(stamps_ns, video_ns), video_ns)
+    counts["refined"] = len(cues) if refined else 0
+    return clean(
+        "dji_srt", name, times_ns, _columns_of(cues), video_ns,
+        notices=_notices(counts, int((stamps_ns != NO_TIME_NS).sum()), len(cues)),
+        position_decimals=max(decimals) or None,
+    )
+
+
+def _columns_of(cues: list[_Cue]) -> dict[str, Floats]:
     names = sorted({key for cue in cues for key in cue.values})
     columns = {key: np.array([cue.values.get(key, np.nan) for cue in cues]) for key in names}
     if "latitude_deg" in columns:
         placed = np.isfinite(columns["latitude_deg"])
         columns["horizontal_sigma_m"] = np.where(placed, SMALLEST_SIGMA_M, np.nan)
-    return clean(
-        "dji_srt", name, times_ns, columns, video_ns,
-        notices=[
-            *notice("truncated", counts["truncated"], "the last cue is cut off"),
-            *notice(
-                "time_zone_unknown", int(dated.sum()) - counts["zoned"],
-                "{} cues print a time without its zone; it is taken as UTC and may be hours off",
-            ),
-            *notice(
-                "no_date", int((~dated).sum()),
-                "{} cues print no date; they are stamped by their place in the video"
-                + ("" if dated.any() else ", which dates them, else they count from 1970-01-01"),
-            ),
-            *notice(
-                "clock_refined", len(cues) if refined else 0,
-                "times are printed in whole seconds; the {} samples are timed by their cues instead",
-            ),
-            *notice(
-                "latitude_first", counts["latitude_first"],
-                "{} positions are followed by a height: such files put latitude before longitude",
-            ),
-        ],
-        position_decimals=max(decimals) or None,
-    )
+    return columns
+
+
+def _notices(counts: Counter[str], dated: int, cues: int) -> list[Notice]:
+    """What was found in a file of so many cues, of which `dated` print a date."""
+    return [
+        *notice("truncated", counts["truncated"], "the last cue is cut off"),
+        *notice(
+            "time_zone_unknown", dated - counts["zoned"],
+            "{} cues print a time without its zone; it is taken as UTC and may be hours off",
+        ),
+        *notice(
+            "no_date", cues - dated,
+            "{} cues print no date; they are stamped by their place in the video"
+            + ("" if dated else ", which dates them, else they count from 1970-01-01"),
+        ),
+        *notice(
+            "clock_refined", counts["refined"],
+            "times are printed in whole seconds; the {} samples are timed by their cues instead",
+        ),
+        *notice(
+            "latitude_first", counts["latitude_first"],
+            "{} positions are followed by a height: such files put latitude before longitude",
+        ),
+    ]
 
 
 def _cues_in(text: str, name: str) -> Iterator[tuple[re.Match[str], str]]:
@@ -204,19 +214,23 @@ def _place(group: str) -> _Place | None:
         return None
     first, second = parts[0], parts[1]
     has_height = len(parts) > 2 and bool(parts[2][3] or "." in parts[2][2])
-    if first[1] or second[1]:
-        is_latitude_first = first[1] in ("N", "S") or second[1] in ("E", "W")
-    elif max(abs(float(first[2])), abs(float(second[2]))) > 90:
-        is_latitude_first = abs(float(first[2])) <= 90
-    else:
-        is_latitude_first = has_height
+    has_letters = bool(first[1] or second[1])
+    is_latitude_first = _latitude_comes_first(first, second, has_height=has_height)
     latitude, longitude = (first, second) if is_latitude_first else (second, first)
     return _Place(
         _signed(latitude), _signed(longitude),
         height_m=float(parts[2][2]) if has_height else float("nan"),
         decimals=max(decimals_of(first[2]), decimals_of(second[2])),
-        is_latitude_first=is_latitude_first and not (first[1] or second[1]),
+        is_latitude_first=is_latitude_first and not has_letters,
     )
+
+
+def _latitude_comes_first(first: re.Match[str], second: re.Match[str], *, has_height: bool) -> bool:
+    if first[1] or second[1]:
+        return first[1] in ("N", "S") or second[1] in ("E", "W")
+    if max(abs(float(first[2])), abs(float(second[2]))) > 90:
+        return abs(float(first[2])) <= 90
+    return has_height
 
 
 def _signed(part: re.Match[str]) -> float:

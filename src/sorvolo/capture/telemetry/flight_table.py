@@ -39,6 +39,13 @@ _DAY = re.compile(r"(\d{1,4})[/.-](\d{1,2})[/.-](\d{1,4})")
 _CLOCK = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([.,]\d{1,9})?\s*([AP]M)?", re.IGNORECASE)
 _UNKNOWN_WORDS = {"", "nan", "na", "n/a", "null", "none", "-", "--"}
 
+_DIRECT_COLUMNS = {
+    "latitude": "latitude_deg", "longitude": "longitude_deg", "altitude": "orthometric_height_m",
+    "relative_height": "height_above_takeoff_m", "speed": "speed_m_s", "course": "course_deg",
+    **{key: f"{key}_deg" for key in COLUMN_NAMES if key.startswith(("camera_", "body_"))},
+}
+
+
 @dataclass(frozen=True)
 class _Table:
     """The table as texts: which cell of a row holds each quantity, its factor to our unit, and the rows.
@@ -127,6 +134,16 @@ def _table(text: str, name: str) -> _Table:
             f"{name}: no header line with Latitude and Longitude columns; add one, "
             "separated by commas, semicolons or tabs"
         )
+    places, factors, notices = _known_columns(header)
+    if "latitude" not in places or "longitude" not in places:
+        raise InputError(f"{name}: {notices[0].text}; latitude and longitude must be in degrees or radians")
+    is_utc = "utc" in places and bool(re.search("utc|gps", " ".join(header.columns[places["utc"]])))
+    rows, found = _rows(text, header, list(places.values()), 1 + max(places["latitude"], places["longitude"]))
+    return _Table({key: index for index, key in enumerate(places)}, factors, is_utc, rows, notices + found)
+
+
+def _known_columns(header: _Header) -> tuple[dict[str, int], dict[str, float], list[Notice]]:
+    """Where each known quantity stands and its factor to our unit; columns of unknown units are named."""
     places: dict[str, int] = {}
     factors: dict[str, float] = {}
     notices: list[Notice] = []
@@ -139,24 +156,19 @@ def _table(text: str, name: str) -> _Table:
         factor = unit_factor(key, unit)
         if factor is None:
             notices += notice("unknown_unit", 1, f"column {label} is not used: its unit ({unit}) is unknown")
-            continue
-        places[key], factors[key] = labels.index(label), factor
-    if "latitude" not in places or "longitude" not in places:
-        raise InputError(f"{name}: {notices[0].text}; latitude and longitude must be in degrees or radians")
-    is_utc = "utc" in places and bool(re.search("utc|gps", " ".join(header.columns[places["utc"]])))
-    rows, found = _rows(text, header, list(places.values()), 1 + max(places["latitude"], places["longitude"]))
-    return _Table({key: index for index, key in enumerate(places)}, factors, is_utc, rows, notices + found)
+        else:
+            places[key], factors[key] = labels.index(label), factor
+    return places, factors, notices
 
 
 def _rows(text: str, header: _Header, places: list[int], needed: int) -> tuple[list[list[str]], list[Notice]]:
     """The cells at `places` of the rows that reach the position's columns, decimal commas made points."""
     rows: list[list[str]] = []
-    short = 0
-    width = 0
+    short = width = 0
     for line in _LINE.finditer(text, header.rows_from):
         if not line[0].strip():
             continue
-        cells = _split(line[0], header.delimiter)
+        cells = _split(line[0] if header.delimiter == "," else line[0].replace(",", "."), header.delimiter)
         width = len(cells)
         if width < needed:
             short += 1
@@ -164,15 +176,11 @@ def _rows(text: str, header: _Header, places: list[int], needed: int) -> tuple[l
             rows.append([cells[place].strip() if place < width else "" for place in places])
     # a last line without its end that lacks cells was being written when the recording stopped
     is_cut = 0 < width < len(header.columns) and text[-1] not in "\r\n"
-    if is_cut and width < needed:
-        short -= 1
-    elif is_cut:
+    if is_cut and width >= needed:
         rows.pop()
-    if header.delimiter != ",":
-        rows = [[cell.replace(",", ".") for cell in row] for row in rows]
     return rows, [
         *notice("truncated", int(is_cut), "the last row is cut off"),
-        *notice("short_row", short, "{} rows dropped: they end before the position"),
+        *notice("short_row", short - (is_cut and width < needed), "{} rows dropped: they end before the position"),
     ]
 
 
@@ -196,34 +204,36 @@ def _numbers(table: _Table, key: str, is_text_allowed: bool = False) -> tuple[Fl
 
 def _columns(numbers: Mapping[str, Floats]) -> tuple[dict[str, Floats], list[Notice]]:
     """The telemetry's columns from the table's."""
-    notices: list[Notice] = []
-    direct = {
-        "latitude": "latitude_deg", "longitude": "longitude_deg", "altitude": "orthometric_height_m",
-        "relative_height": "height_above_takeoff_m", "speed": "speed_m_s", "course": "course_deg",
-        **{key: f"{key}_deg" for key in COLUMN_NAMES if key.startswith(("camera_", "body_"))},
-    }
-    columns = {direct[key]: values for key, values in numbers.items() if key in direct}
+    columns = {_DIRECT_COLUMNS[key]: values for key, values in numbers.items() if key in _DIRECT_COLUMNS}
     if _repeats_height(columns):
         del columns["orthometric_height_m"]
-    if not np.isfinite(columns.get("height_above_takeoff_m", np.nan)).any() and "barometer" in numbers:
+    notices: list[Notice] = []
+    if not _has_numbers(columns, "height_above_takeoff_m") and _has_numbers(numbers, "barometer"):
         barometer = numbers["barometer"]
         known = np.flatnonzero(np.isfinite(barometer))
-        if len(known):
-            columns["height_above_takeoff_m"] = barometer - barometer[known[0]]
-            notices += notice(
-                "height_from_barometer", len(known),
-                "no relativeHeight: heights are baroAlt above the first sample, perhaps not above take-off",
-            )
+        columns["height_above_takeoff_m"] = barometer - barometer[known[0]]
+        notices += notice(
+            "height_from_barometer", len(known),
+            "no relativeHeight: heights are baroAlt above the first sample, perhaps not above take-off",
+        )
     if "velocity_north" in numbers and "velocity_east" in numbers:
         north, east = numbers["velocity_north"], numbers["velocity_east"]
         columns["speed_m_s"] = np.hypot(north, east)
         columns["course_deg"] = np.degrees(np.arctan2(east, north)) % 360
-    quaternion = [numbers[f"quaternion_{axis}"] for axis in "wxyz" if f"quaternion_{axis}" in numbers]
-    if len(quaternion) == 4:
-        for key, values in zip(("body_yaw_deg", "body_pitch_deg", "body_roll_deg"), _angles(*quaternion)):
-            if not np.isfinite(columns.get(key, np.nan)).any():
-                columns[key] = values
-    return columns, notices
+    stated = {key: values for key, values in columns.items() if _has_numbers(columns, key)}
+    return _attitude_of(numbers) | stated, notices
+
+
+def _attitude_of(numbers: Mapping[str, Floats]) -> dict[str, Floats]:
+    """The body's angles from its quaternion, where there is a whole one."""
+    parts = [numbers[f"quaternion_{axis}"] for axis in "wxyz" if f"quaternion_{axis}" in numbers]
+    if len(parts) < 4:
+        return {}
+    return dict(zip(("body_yaw_deg", "body_pitch_deg", "body_roll_deg"), _angles(*parts)))
+
+
+def _has_numbers(columns: Mapping[str, Floats], key: str) -> bool:
+    return key in columns and bool(np.isfinite(columns[key]).any())
 
 
 def _repeats_height(columns: Mapping[str, Floats]) -> bool:

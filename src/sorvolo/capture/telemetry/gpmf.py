@@ -56,7 +56,6 @@ class _Stream:
     """The items of one STRM: its data's values by key, and the sticky items that scale them."""
 
     values: dict[str, Values] = field(default_factory=dict)
-    types: str = ""
     scales: tuple[float, ...] = ()
     texts: dict[str, str] = field(default_factory=dict)
 
@@ -81,19 +80,7 @@ def read_gpmf_file(path: Path) -> Telemetry | None:
     payloads: list[Payload] = []
     try:
         with av.open(f"file:{path}", options={"protocol_whitelist": "file"}) as container:
-            streams = [each for each in container.streams if each.type == "data" and each.name == "bin_data"]
-            if not streams or not container.streams.video:
-                return None
-            for each in container.streams:
-                each.discard = Discard.default if each in streams else Discard.all
-            video = container.streams.video[0]
-            first_ns = round((video.start_time or 0) * (video.time_base or 0) * SECOND_NS)
-            for packet in container.demux(streams):
-                data = bytes(packet) if packet.size else b""
-                if is_gpmf(data) and packet.pts is not None and packet.time_base:
-                    base_ns = packet.time_base * SECOND_NS
-                    when_ns = round(packet.pts * base_ns) - first_ns
-                    payloads.append(Payload(max(0, when_ns), round((packet.duration or 0) * base_ns), data))
+            payloads.extend(_payloads_in(container))
     except (av.FFmpegError, IndexError, ValueError):
         pass  # a damaged place: what came before it is used, and the video's reader counts the damage
     if not payloads:
@@ -135,6 +122,28 @@ def read_payloads(payloads: Sequence[Payload], name: str) -> Telemetry:
             ),
         ],
     )
+
+
+def _payloads_in(container: Any) -> Iterator[Payload]:
+    """The payloads of a container's GPMF stream, if it has one."""
+    streams = [each for each in container.streams if each.type == "data" and each.name == "bin_data"]
+    if not streams or not container.streams.video:
+        return
+    for each in container.streams:
+        each.discard = Discard.default if each in streams else Discard.all
+    video = container.streams.video[0]
+    first_ns = round((video.start_time or 0) * (video.time_base or 0) * SECOND_NS)
+    for packet in container.demux(streams):
+        if payload := _payload_of(packet, first_ns):
+            yield payload
+
+
+def _payload_of(packet: Any, first_ns: int) -> Payload | None:
+    data = bytes(packet) if packet.size else b""
+    if not is_gpmf(data) or packet.pts is None or not packet.time_base:
+        return None
+    base_ns = packet.time_base * SECOND_NS
+    return Payload(max(0, round(packet.pts * base_ns) - first_ns), round((packet.duration or 0) * base_ns), data)
 
 
 def _samples_of(payload: Payload, streams: Sequence[_Stream]) -> list[_Sample]:
@@ -315,17 +324,14 @@ def _stream(data: bytes) -> _Stream:
     for key, kind, size, count, value in _items(data):
         if kind in ("c", "U"):
             stream.texts[key] = value.decode("latin-1").rstrip("\0 ")
-            if key == "TYPE":
-                stream.types = stream.texts[key]
         elif key == "SCAL":
             stream.scales = tuple(float(row[0]) for row in _rows(value, kind, size, count))
+        elif kind == "?":
+            stream.values[key] = _scaled(_rows(value, stream.texts.get("TYPE", ""), size, count), stream.scales)
         elif kind:
-            rows = _rows(value, stream.types if kind == "?" else kind, size, count)
-            # GPS5 and its like are scaled; single sticky values (GPSF, GPSP) are not
-            is_data = kind == "?" or size > struct.calcsize(f">{_CODES.get(kind, 'b')}")
-            stream.values[key] = [_scaled(row, stream.scales) for row in rows] if is_data else [
-                tuple(map(float, row)) for row in rows
-            ]
+            # samples are scaled; single sticky values (GPSF, GPSP) are not
+            is_single = size <= struct.calcsize(f">{_CODES.get(kind, 'b')}")
+            stream.values[key] = _scaled(_rows(value, kind, size, count), () if is_single else stream.scales)
     return stream
 
 
@@ -341,8 +347,10 @@ def _rows(value: bytes, types: str, size: int, count: int) -> list[tuple[Any, ..
     return [struct.unpack_from(f">{codes}", value, index * size) for index in range(count)]
 
 
-def _scaled(row: tuple[Any, ...], scales: tuple[float, ...]) -> tuple[float, ...]:
-    divisors = scales * len(row) if len(scales) == 1 else scales
-    if len(divisors) < len(row):
-        divisors = (*divisors, *[1.0] * (len(row) - len(divisors)))
-    return tuple(float(value) / divisor if divisor else nan for value, divisor in zip(row, divisors))
+def _scaled(rows: list[tuple[Any, ...]], scales: tuple[float, ...]) -> Values:
+    """The rows divided by one scale for all their values, or one for each; what has none stays as it is."""
+    found: Values = []
+    for row in rows:
+        divisors = scales * len(row) if len(scales) == 1 else (*scales, *[1.0] * len(row))
+        found.append(tuple(float(value) / divisor if divisor else nan for value, divisor in zip(row, divisors)))
+    return found

@@ -23,6 +23,10 @@ from sorvolo.survey.flight import Telemetry
 _ROOT = re.compile(rb"<(?:[A-Za-z_][\w.-]*:)?gpx[\s>]")
 _ROOT_WIDE = re.compile("<(?:[A-Za-z_][\\w.-]*:)?gpx[\\s>]")
 _END_OF_POINT = re.compile(rb"</((?:[A-Za-z_][\w.-]*:)?)(trkpt|rtept)\s*>")
+_TAG_OF_COLUMN = {
+    "latitude_deg": "lat", "longitude_deg": "lon", "orthometric_height_m": "ele", "speed_m_s": "speed",
+    "course_deg": "course",
+}
 _CLOSING = {b"trkpt": (b"trkseg", b"trk", b"gpx"), b"rtept": (b"rte", b"gpx")}
 
 
@@ -46,32 +50,33 @@ def read(data: bytes, name: str) -> Telemetry:
     points = list(_elements(root, "trkpt")) or list(_elements(root, "rtept"))
     if not points:
         raise InputError(f"{name}: a GPX file without track points; export the flight as a track with times")
-    said = [_values(point) for point in points]
-    stamps = [time_ns_from_text(texts.get("time", "")) for texts in said]
-    timed = [index for index, stamp in enumerate(stamps) if stamp]
+    texts = [_values(point) for point in points]
+    stamps_ns = [_time_ns(each) for each in texts]
+    timed = [each for each, stamp_ns in zip(texts, stamps_ns) if stamp_ns != NO_TIME_NS]
     if not timed:
         raise InputError(
             f"{name}: none of its {len(points)} GPX points has a <time>; export the track with its times, "
             "without them no picture can be given a place"
         )
-    decimals = max(decimals_of(said[index].get(axis, "")) for index in timed for axis in ("lat", "lon"))
+    decimals = max(decimals_of(each.get(axis, "")) for each in timed for axis in ("lat", "lon"))
     return clean(
-        "gpx", name,
-        [stamp[0] if stamp else NO_TIME_NS for stamp in stamps],
-        {
-            "latitude_deg": [_number(texts, "lat") for texts in said],
-            "longitude_deg": [_number(texts, "lon") for texts in said],
-            "orthometric_height_m": [_number(texts, "ele") for texts in said],
-            "speed_m_s": [_number(texts, "speed") for texts in said],
-            "course_deg": [_number(texts, "course") for texts in said],
-            "horizontal_sigma_m": [sigma_from_hdop_m(_number(texts, "hdop")) for texts in said],
-        },
+        "gpx", name, stamps_ns, _columns_of(texts),
         notices=[
             *notice("truncated", counts["truncated"], "the file is cut off; read up to its last whole point"),
             *notice("unreadable_line", len(points) - len(timed), "{} points dropped: no readable <time>"),
         ],
         position_decimals=decimals or None,
     )
+
+
+def _columns_of(points: list[dict[str, str]]) -> dict[str, list[float]]:
+    columns = {column: [_number(each, tag) for each in points] for column, tag in _TAG_OF_COLUMN.items()}
+    return columns | {"horizontal_sigma_m": [sigma_from_hdop_m(_number(each, "hdop")) for each in points]}
+
+
+def _time_ns(texts: dict[str, str]) -> int:
+    stamp = time_ns_from_text(texts.get("time", ""))
+    return stamp[0] if stamp else NO_TIME_NS
 
 
 def _root(data: bytes, name: str, counts: Counter[str]) -> Any:

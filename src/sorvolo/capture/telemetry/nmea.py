@@ -107,7 +107,7 @@ def messages_in(data: bytes, counts: Counter[str]) -> list[Any]:
 
 
 def epochs_of(messages: list[Any]) -> tuple[list[Epoch], bool]:
-    """The sentences by moment, in the file's order, and whether any of them tells the date."""
+    """The sentences by moment, in the file's order, and whether any of them states the date."""
     dated = [message for message in messages if isinstance(getattr(message, "date", None), date)]
     # a receiver without a fix often invents its date
     trusted = [message for message in dated if message.status == "A"] or dated
@@ -119,19 +119,23 @@ def epochs_of(messages: list[Any]) -> tuple[list[Epoch], bool]:
         if not epochs or epochs[-1].time_ns != now_ns or message.msgID in epochs[-1].kinds:
             epochs.append(Epoch(now_ns))
         epochs[-1].kinds.add(message.msgID)
-        _tell(epochs[-1], message)
-    for epoch in epochs:
-        if not epoch.has_fix:
-            epoch.values = {}
+        _add(epochs[-1], message)
+    _forget_without_fix(epochs)
     return epochs, bool(trusted)
 
 
-def _tell(epoch: Epoch, message: Any) -> None:
-    said = {}
+def _forget_without_fix(epochs: list[Epoch]) -> None:
+    for epoch in epochs:
+        if not epoch.has_fix:
+            epoch.values = {}
+
+
+def _add(epoch: Epoch, message: Any) -> None:
+    """Add a sentence's values to its moment; a GGA's position goes before an RMC's."""
     if message.msgID == "GGA":
         epoch.has_fix &= message.quality != 0
         altitude_m, separation_m = _number(message, "alt"), _number(message, "sep")
-        said = {
+        values = {
             "latitude_deg": _number(message, "lat"),
             "longitude_deg": _number(message, "lon"),
             "orthometric_height_m": altitude_m,
@@ -140,13 +144,13 @@ def _tell(epoch: Epoch, message: Any) -> None:
         }
     else:
         epoch.has_fix &= message.status == "A"
-        said = {
+        values = {
             "speed_m_s": _number(message, "spd") * _M_S_PER_KNOT,
             "course_deg": _number(message, "cog"),
         }
         if "GGA" not in epoch.kinds:
-            said |= {"latitude_deg": _number(message, "lat"), "longitude_deg": _number(message, "lon")}
-    epoch.values |= said
+            values |= {"latitude_deg": _number(message, "lat"), "longitude_deg": _number(message, "lon")}
+    epoch.values |= values
 
 
 def _number(message: Any, attribute: str) -> float:

@@ -152,7 +152,7 @@ class CompareRun:
             shown = picture(self._writer.tiles, 800).rgba  # a day without change should cost little
         report = self._report(changes, suppressed, shown_as_well, placed, notices, started_s)
         report["objects"] = self._objects.summary(search)
-        page = report_page(report, shown, crops_of(search))
+        page = report_page(report, shown, crops_of(search), self._archive.site())
         self._writer.commit(placed, self._extension.images, report, page, changes=changes, search=search)
 
     # ---- inside -----------------------------------------------------------------------------------------------

@@ -3,11 +3,9 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from sorvolo.change.metrics import (
     ComparedGround,
@@ -22,17 +20,18 @@ from sorvolo.change.metrics import (
     score_events,
 )
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.geometry.arrays import Matrix3, PointsM
+from sorvolo.geometry.arrays import Matrix3, PointsM, floats
 from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.level_ground import is_on_ground
 from sorvolo.missions.evaluate.frame_rows import (
-    PairedFlights,
+    paired_flights,
     read_features,
     refuse_simulation,
-    site_points,
     time_ns_of,
     truth_file,
 )
 from sorvolo.missions.evaluate.mask_folders import MaskScores, compare_mask_folders, has_masks
+from sorvolo.mosaic.paired_flights import PairedFlights
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import ChangeKind
@@ -44,7 +43,7 @@ VIDEO_VIEWS, PHOTO_VIEWS = 3, 2
 
 @dataclass(frozen=True)
 class ClassCounts:
-    """Found events of the right kind: what they were or are is told rightly, wrongly, or not at all."""
+    """Found events of the right kind: their classes are right, wrong, or missing."""
 
     right: int
     wrong: int
@@ -78,24 +77,33 @@ def evaluate_changes(
     the same frames.
     """
     refuse_simulation(found)
-    is_site = (found / "flights").is_dir()
     true_flights = _true_flights(truth)
-    if not is_site:
+    if not (found / "flights").is_dir():
         if not found.is_dir():
             raise InputError(f"{found}: no such folder; give a site folder, or a folder of masks")
-        masks = compare_mask_folders(found, _true_masks(truth, true_flights, flight), least_px)
-        return (FlightChanges(found.name, masks, None, None, math.nan, ()),)
+        return (_masks_alone(found.name, found, _true_masks(truth, true_flights, flight), least_px),)
     names = _compared_flights(found, flight)
     if not true_flights:
-        folders = [_own_masks(found, name) for name in names]
-        scored = [compare_mask_folders(folder, truth, least_px) for folder in folders]
-        return tuple(FlightChanges(name, masks, None, None, math.nan, ()) for name, masks in zip(names, scored))
+        folders = [(name, _own_masks(found, name)) for name in names]
+        return tuple(_masks_alone(name, folder, truth, least_px) for name, folder in folders)
+    return _against_simulation(found, names, truth, true_flights, least_px)
+
+
+def _masks_alone(name: str, found: Path, true: Path, least_px: int) -> FlightChanges:
+    """A folder of masks against another."""
+    return FlightChanges(name, compare_mask_folders(found, true, least_px), None, None, math.nan, ())
+
+
+def _against_simulation(
+    found: Path, names: Sequence[str], truth: Path, true_flights: Mapping[str, Path], least_px: int
+) -> tuple[FlightChanges, ...]:
+    """The site's compared flights, as far as the truth knows them."""
     with Archive.open(found, write=False) as archive:
         described = archive.site()
     if described.is_local:
         raise InputError(f"{found}: a map without geo-reference cannot be compared with a simulation's truth")
     _check_whole(found, names)
-    flights = PairedFlights.read(found, truth_file(truth), described)
+    flights = paired_flights(found, truth_file(truth), described)
     known = [name for name in names if flights.true_name(name) in true_flights]
     if not known:
         raise InputError(
@@ -218,17 +226,13 @@ def _evaluate(
         masks = compare_mask_folders(_own_masks(site, flight), true_folder / "changes", least_px)
     else:
         remarks.append("no masks were written: frames and pixels are judged after `sorvolo compare` with --masks")
-    others = [name for name in flights.mine if name != flight]
-    # what was compared itself may have been laid onto the map less well than the flights that made it
-    makers = [name for name in others if not (site / "flights" / name / "changes.geojson").is_file()] or others
+    makers = _map_makers(site, flights, flight)
     map_from_truth, shift_m = flights.map_from_truth(makers)
     if math.isnan(shift_m):
         remarks.append("no frame of the map is known to the truth: events are compared as they lie")
     ground = compared_ground(*([row.outline_m for _, row in flights.placed(names)] for names in ([flight], makers)))
-    is_photos = any(not row.name.isdecimal() for row in flights.mine[flight])
     settings = EventSettings(views=VIDEO_VIEWS)
-    least_views = PHOTO_VIEWS if is_photos else VIDEO_VIEWS
-    true = _read_true(true_folder / "events.geojson", described, map_from_truth, ground, least_views)
+    true = _read_true(true_folder / "events.geojson", described, map_from_truth, ground, _least_views(flights, flight))
     found = _read_found(site / "flights" / flight / "changes.geojson", described, flights.clock(flight))
     match = match_events(found, true, settings)
     scores = score_events(match, ground.area_m2, settings)
@@ -238,29 +242,40 @@ def _evaluate(
     return FlightChanges(flight, masks, scores, match, shift_m, tuple(remarks), classes)
 
 
+def _map_makers(site: Path, flights: PairedFlights, flight: str) -> list[str]:
+    """The flights that made the map: those not compared themselves, which may have been laid onto it less well."""
+    others = [name for name in flights.mine if name != flight]
+    return [name for name in others if not (site / "flights" / name / "changes.geojson").is_file()] or others
+
+
+def _least_views(flights: PairedFlights, flight: str) -> int:
+    is_photos = any(not row.name.isdecimal() for row in flights.mine[flight])
+    return PHOTO_VIEWS if is_photos else VIDEO_VIEWS
+
+
 def _class_counts(match: EventMatch, found: Path, true: Path) -> ClassCounts | None:
     """How many of the pairs of one kind have the truth's classes, before and after as far as the kind has them."""
-    told = {str(each["properties"]["id"]): _classes_of(each) for each in read_features(found)}
-    if not any(name for classes in told.values() for name in classes):
+    reported = {str(each["properties"]["id"]): _classes_of(each) for each in read_features(found)}
+    if not any(name for classes in reported.values() for name in classes):
         return None
     known = {_event_name(each["properties"]): _classes_of(each) for each in read_features(true)}
     counts = {"right": 0, "wrong": 0, "unnamed": 0}
     for pair in match.pairs:
         if pair.found.kind is pair.true.kind:
-            mine = told[pair.found.id]
+            mine = reported[pair.found.id]
             counts["right" if mine == known[pair.true.id] else "wrong" if any(mine) else "unnamed"] += 1
     return ClassCounts(**counts)
 
 
 def _classes_of(feature: Mapping[str, Any]) -> tuple[str, str]:
     """What was there, and what is; of what moves only what it is."""
-    said = feature["properties"]
-    before = "" if said["kind"] == ChangeKind.MOVING else said.get("class_before") or ""
-    return before, said.get("class_after") or ""
+    properties = feature["properties"]
+    before = "" if properties["kind"] == ChangeKind.MOVING else properties.get("class_before") or ""
+    return before, properties.get("class_after") or ""
 
 
-def _event_name(said: Mapping[str, Any]) -> str:
-    return f"{said['number']} {said['class_before'] or said['class_after']}"
+def _event_name(properties: Mapping[str, Any]) -> str:
+    return f"{properties['number']} {properties['class_before'] or properties['class_after']}"
 
 
 def _read_true(
@@ -271,43 +286,50 @@ def _read_true(
     events = []
     for feature in read_features(path):
         try:
-            said = feature["properties"]
-            outline_m = _ring(feature, described, map_from_truth, path)
-            kind = ChangeKind(said["kind"])
-            clear_ns = np.array([time_ns_of(text) for text in said["clear_views"]], np.int64)
-            places = np.array(said["path"], np.float64).reshape(-1, 2)
-            path_m = apply_homography(map_from_truth, site_points(described.frame, places)) if len(places) else places
-            if kind is ChangeKind.MOVING:
-                is_seen = int(np.count_nonzero(ground.holds(path_m))) >= max(views, VIDEO_VIEWS)
-            else:
-                is_seen = len(clear_ns) >= views and bool(ground.holds(outline_m).all())
-            name = _event_name(said)
-            events.append(TrueEvent(name, kind, outline_m, float(said["length_m"]), clear_ns, path_m, is_seen))
+            events.append(_true_event(feature, described, map_from_truth, ground, views, path))
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(f"{path}: an event is not as docs/simulation.md says ({error!r})") from error
     return events
 
 
+def _true_event(
+    feature: Mapping[str, Any], described: Site, map_from_truth: Matrix3, ground: ComparedGround, views: int, path: Path
+) -> TrueEvent:
+    properties = feature["properties"]
+    outline_m = apply_homography(map_from_truth, _ring(feature, described, path))
+    places = properties["path"]
+    path_m = apply_homography(map_from_truth, described.frame.ground_from_lonlat(places)) if places else floats(())
+    event = TrueEvent(
+        _event_name(properties), ChangeKind(properties["kind"]), outline_m, float(properties["length_m"]),
+        [time_ns_of(text) for text in properties["clear_views"]], path_m,
+    )
+    return replace(event, must_find=event.is_shown(ground, views, max(views, VIDEO_VIEWS)))
+
+
 def _read_found(path: Path, described: Site, clock: tuple[int, int]) -> list[FoundEvent]:
-    """The reported events; those that were told only at the end were announced with the last frame."""
+    """The reported events; those reported only in the end were announced with the last frame."""
     ended_ns, behind_ns = clock
     events = []
     for feature in read_features(path):
         try:
-            said = feature["properties"]
+            properties = feature["properties"]
             announced_ns = None
-            if "announced" in said:
-                announced_ns = behind_ns + (time_ns_of(said["announced"]) if said["announced"] else ended_ns)
-            sigma_m = math.nan if said.get("sigma_m") is None else float(said["sigma_m"])
-            outline_m = _ring(feature, described, np.eye(3), path)
-            events.append(FoundEvent(str(said["id"]), ChangeKind(said["kind"]), outline_m, sigma_m, announced_ns))
+            if "announced" in properties:
+                announced = properties["announced"]
+                announced_ns = behind_ns + (time_ns_of(announced) if announced else ended_ns)
+            sigma_m = math.nan if properties.get("sigma_m") is None else float(properties["sigma_m"])
+            events.append(FoundEvent(
+                str(properties["id"]), ChangeKind(properties["kind"]), _ring(feature, described, path), sigma_m,
+                announced_ns,
+            ))
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(f"{path}: a change is not as docs/formats.md says ({error!r})") from error
     return events
 
 
-def _ring(feature: Mapping[str, Any], described: Site, matrix: Matrix3, path: Path) -> PointsM:
-    ring = np.array(feature["geometry"]["coordinates"][0][:-1], np.float64)
-    if ring.ndim != 2 or len(ring) < 3 or not np.isfinite(ring).all():
-        raise InputError(f"{path}: an outline needs at least three corners, got {json.dumps(ring.tolist())[:80]}")
-    return apply_homography(matrix, site_points(described.frame, ring[:, :2]))
+def _ring(feature: Mapping[str, Any], described: Site, path: Path) -> PointsM:
+    corners = feature["geometry"]["coordinates"][0][:-1]
+    ring_m = described.frame.ground_from_lonlat(corners)
+    if len(ring_m) < 3 or not is_on_ground(ring_m):
+        raise InputError(f"{path}: an outline needs at least three corners, got {json.dumps(corners)[:80]}")
+    return ring_m

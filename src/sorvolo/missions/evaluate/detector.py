@@ -2,12 +2,10 @@
 
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
-
-import numpy as np
 
 from sorvolo.capture.photos import read_picture
 from sorvolo.detection.detector import Detector
@@ -26,7 +24,7 @@ from sorvolo.store.exports.plain import json_bytes
 from sorvolo.store.pages.detector import detector_page
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
-from sorvolo.survey.objects import Detections
+from sorvolo.survey.objects import Detections, no_detections
 
 LEAST_SCORE = 0.02
 """Candidates from this score on are measured: average precision needs the doubtful ones too."""
@@ -128,27 +126,42 @@ def evaluate_detector(
     that cannot be read is left out for all models, and named in `notices`.
     """
     settings = settings or EvaluationSettings()
+    _demand_distinct(labelled)
+    damaged: dict[str, str] = {}
+    seen = _seen_by_all(arms, labelled, settings, told, damaged)
+    labelled = [_readable(each, damaged) for each in labelled]
+    first = seen[0][0]
+    scores = tuple(_scores(each, first, settings) for each in labelled)
+    comparisons = tuple(_side_by_side(each, seen, settings) for each in labelled if len(seen) > 1)
+    worst = {each.name: tuple(_worst(each, score, first.sets[each.name])) for each, score in zip(labelled, scores)}
+    return DetectorEvaluation(first, scores, comparisons, worst, (*_damage_notices(damaged), *_model_notices(seen)))
+
+
+def _scores(labelled: LabelledSet, found: FoundSets, settings: EvaluationSettings) -> SetScores:
+    mine = found.sets[labelled.name]
+    return score_set(
+        labelled, mine.detections, found.classes, mine.thresholds, draws=settings.draws, seed=settings.seed
+    )
+
+
+def _seen_by_all(
+    arms: Sequence[Sequence[str]], labelled: Sequence[LabelledSet], settings: EvaluationSettings,
+    told: Callable[[EvaluationProgress], None], damaged: dict[str, str],
+) -> list[list[FoundSets]]:
+    """What every model of every arm finds in the pictures that can be read; the others join `damaged`."""
+    seen = [[_found(place, labelled, settings, told, damaged) for place in arm] for arm in arms]
+    return [[_without(each, labelled, damaged) for each in arm] for arm in seen]
+
+
+def _demand_distinct(labelled: Sequence[LabelledSet]) -> None:
     names = [each.name for each in labelled]
     if len(set(names)) < len(names):
         raise InputError(f"two data sets have one name ({', '.join(names)}); rename a folder")
-    damaged: dict[str, str] = {}
-    seen = [[_found(place, labelled, settings, told, damaged) for place in arm] for arm in arms]
-    seen = [[_without(each, labelled, damaged) for each in arm] for arm in seen]
-    labelled = [_readable(each, damaged) for each in labelled]
-    first = seen[0][0]
-    scores = tuple(
-        score_set(each, mine.detections, first.classes, mine.thresholds, draws=settings.draws, seed=settings.seed)
-        for each, mine in ((each, first.sets[each.name]) for each in labelled)
-    )
-    comparisons: tuple[SetComparison, ...] = ()
-    if len(seen) > 1:
-        comparisons = tuple(_side_by_side(each, seen, settings) for each in labelled)
-    worst = {
-        each.name: tuple(_worst(each, score, first.sets[each.name]))
-        for each, score in zip(labelled, scores)
-    }
-    told_by_models = dict.fromkeys(text for arm in seen for each in arm for text in each.notices)
-    return DetectorEvaluation(first, scores, comparisons, worst, (*_told_of_damaged(damaged), *told_by_models))
+
+
+def _model_notices(seen: Sequence[Sequence[FoundSets]]) -> tuple[str, ...]:
+    """What the models note, each once."""
+    return tuple(dict.fromkeys(text for arm in seen for each in arm for text in each.notices))
 
 
 def write_evaluation(evaluation: DetectorEvaluation, folder: Path, description: Mapping[str, Any]) -> None:
@@ -212,7 +225,7 @@ def _found(
         for picture in each.pictures:
             image = _picture(picture.path, damaged)
             if image is None:
-                detections.append(_nothing(detector.classes))
+                detections.append(no_detections(detector.classes))
             else:
                 started = time.perf_counter()
                 detections.append(detector.detect(
@@ -246,10 +259,6 @@ def _picture(path: str, damaged: dict[str, str]) -> ImageRGB | None:
         return None
 
 
-def _nothing(classes: tuple[str, ...]) -> Detections:
-    return Detections(np.zeros((0, 4), np.float32), np.zeros(0), np.zeros(0, np.int64), classes)
-
-
 def _readable(labelled: LabelledSet, damaged: Mapping[str, str]) -> LabelledSet:
     """The set without damaged pictures. Raises InputError where none is left."""
     kept = [each for each in labelled.pictures if each.path not in damaged]
@@ -273,7 +282,7 @@ def _without(found: FoundSets, labelled: Sequence[LabelledSet], damaged: Mapping
     return replace(found, sets=sets)
 
 
-def _told_of_damaged(damaged: Mapping[str, str]) -> tuple[str, ...]:
+def _damage_notices(damaged: Mapping[str, str]) -> tuple[str, ...]:
     if not damaged:
         return ()
     some = "; ".join(f"{path}: {reason}" for path, reason in list(damaged.items())[:_NAMED])
@@ -299,17 +308,23 @@ def _same_pictures(
     if one.files == wanted:
         return one
     by_name = dict(zip(one.files, one.detections))
-    missing = [
-        name for name, picture in zip(wanted, labelled.pictures)
-        if name not in by_name and _picture(picture.path, damaged) is not None
-    ]
-    if missing or len(by_name) < len(one.files) or len(set(wanted)) < len(wanted):
+    missing = _readable_beside(labelled, by_name, damaged)
+    repeats = len(by_name) < len(one.files) or len(set(wanted)) < len(wanted)
+    if missing or repeats:
         raise InputError(
             f"{place}: made on other pictures of {labelled.name}"
             + (f"; {len(missing)} are missing, such as {missing[0]}" if missing else "")
         )
-    nothing = _nothing(found.classes)
+    nothing = no_detections(found.classes)
     return replace(one, files=wanted, detections=tuple(by_name.get(name, nothing) for name in wanted))
+
+
+def _readable_beside(labelled: LabelledSet, known: Container[str], damaged: dict[str, str]) -> list[str]:
+    """The set's pictures that are not known by name, and can be read."""
+    return [
+        name for name, picture in zip(_names(labelled), labelled.pictures)
+        if name not in known and _picture(picture.path, damaged) is not None
+    ]
 
 
 def _side_by_side(

@@ -3,16 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
-import numpy as np
-
 from sorvolo.change.metrics import Counts, frame_counts, pixel_counts
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Mask
-
-_PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".pbm", ".ppm", ".gif"}
-_LOSSY = {".jpg", ".jpeg", ".webp"}
-_UNKNOWN = 128
+from sorvolo.store.mask_pictures import MASK_ENDINGS, read_mask
 
 
 @dataclass(frozen=True)
@@ -43,8 +36,8 @@ def compare_mask_folders(found: Path, truth: Path, least_px: int = 1) -> MaskSco
         )
     pixels, frames = Counts(), Counts()
     for name in common:
-        changed, unknown = _read(mine[name], may_be_unknown=True)
-        there, _ = _read(true[name], may_be_unknown=False)
+        changed, unknown = read_mask(mine[name], may_be_unknown=True)
+        there, _ = read_mask(true[name], may_be_unknown=False)
         if changed.shape != there.shape:
             sizes = " and ".join(f"{mask.shape[1]}x{mask.shape[0]}" for mask in (changed, there))
             raise InputError(
@@ -57,7 +50,7 @@ def compare_mask_folders(found: Path, truth: Path, least_px: int = 1) -> MaskSco
 
 def has_masks(folder: Path) -> bool:
     """Whether the folder holds any picture."""
-    return folder.is_dir() and any(path.suffix.lower() in _PICTURES for path in folder.iterdir())
+    return folder.is_dir() and any(path.suffix.lower() in MASK_ENDINGS for path in folder.iterdir())
 
 
 def _masks(folder: Path) -> dict[str, Path]:
@@ -65,7 +58,7 @@ def _masks(folder: Path) -> dict[str, Path]:
         raise InputError(f"{folder}: no such folder; give a folder of masks, one picture a frame")
     found: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in _PICTURES:
+        if path.suffix.lower() not in MASK_ENDINGS:
             continue
         name = str(int(path.stem)) if path.stem.isdecimal() else path.stem
         if name in found:
@@ -74,24 +67,6 @@ def _masks(folder: Path) -> dict[str, Path]:
     if not found:
         raise InputError(f"{folder}: no masks in it; give a folder of masks, one picture a frame")
     return found
-
-
-def _read(path: Path, *, may_be_unknown: bool) -> tuple[Mask, Mask]:
-    """Where a mask says change, and where it says that nothing is known, (height, width) each."""
-    data = np.frombuffer(path.read_bytes(), np.uint8)
-    picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
-    if picture is None:
-        raise InputError(f"{path}: cannot be read as a picture; make this mask anew")
-    values = np.asarray(picture)
-    if values.ndim == 3:  # alpha says nothing of change
-        values = values[..., :3].max(axis=2) if values.shape[2] != 2 else values[..., 0]
-    if path.suffix.lower() in _LOSSY:
-        changed: Mask = values >= 128
-        return changed, np.zeros(values.shape, bool)
-    unknown = values == _UNKNOWN
-    if not (may_be_unknown and unknown.any() and np.isin(values, (0, _UNKNOWN, 255)).all()):
-        unknown = np.zeros(values.shape, bool)
-    return (values > 0) & ~unknown, unknown
 
 
 def _some(masks: dict[str, Path]) -> str:

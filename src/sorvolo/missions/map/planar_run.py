@@ -121,7 +121,7 @@ class PlanarRun(FlightRun):
             [*notices, *self._detector_notices], time.monotonic() - started_s,
         )
         report["objects"] = self._search_summary(search)
-        page = report_page(report, shown, crops_of(search))
+        page = report_page(report, shown, crops_of(search), self._archive.site())
         writer.commit(placed, self.images, report, page, crs=self._settings.crs, search=search)
 
     # ---- inside -----------------------------------------------------------------------------------------------
@@ -169,7 +169,7 @@ class PlanarRun(FlightRun):
     def _find_offset(self) -> OffsetEstimate | None:
         """The clock offset that motion shows, applied when it is well seen and none was given."""
         telemetry = self._setup.telemetry
-        if telemetry is None or telemetry.clock.sigma_s == 0:
+        if telemetry is None:
             return None
         estimate = None
         applied_s = 0.0

@@ -85,7 +85,7 @@ class ThesisRun(FlightRun):
             writer.tiles, [*notices, *self._detector_notices], time.monotonic() - started_s,
         )
         report["objects"] = self._search_summary(search)
-        page = report_page(report, shown, crops_of(search))
+        page = report_page(report, shown, crops_of(search), self._archive.site())
         writer.commit(placed, paths, report, page, crs=self._settings.crs, search=search)
 
     # ---- inside -----------------------------------------------------------------------------------------------

@@ -5,12 +5,9 @@ import platform
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-
-import av
-import cv2
-import numpy as np
 
 from sorvolo import __version__
 from sorvolo.errors import SettingsError
@@ -48,8 +45,8 @@ def simulation_description(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "made_by": _MADE_BY,
         "versions": {
-            "sorvolo": __version__, "python": platform.python_version(), "numpy": np.__version__,
-            "opencv": cv2.__version__, "av": av.__version__,
+            "sorvolo": __version__, "python": platform.python_version(), "numpy": version("numpy"),
+            "opencv": version("opencv-contrib-python-headless"), "av": version("av"),
         },
         "settings": settings,
     }

@@ -2,31 +2,27 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from sorvolo.geometry.arrays import Anything, ImageRGB
-from sorvolo.store.pages.plots import Scale
-from sorvolo.store.pages.report_style import STYLE
-from sorvolo.store.pages.words import bullet_list, escaped, page_of, picture_uri, table_of
+from sorvolo.store.pages.plots import Axes, Label, Line, Scale, colour_class, line_plot
+from sorvolo.store.pages.render import cell, render
+from sorvolo.store.pages.words import known, picture_uri
 
-_STYLE = """
-.crops{display:grid;grid-template-columns:repeat(auto-fill,minmax(150px,1fr));gap:12px}
-.crops figure{margin:0}.crops img{display:block;width:100%;border-radius:8px}
-.crops figcaption{margin:2px 0 0;font-size:.78rem;overflow-wrap:anywhere}
-.hit{background:color-mix(in srgb,var(--vision) 22%,transparent)}
-.key.c0{background:var(--east)}.key.c1{background:var(--gps)}.key.c2{background:var(--vision)}
-.key.c3{background:var(--north)}
-svg .c0{stroke:var(--east)}svg .c1{stroke:var(--gps)}svg .c2{stroke:var(--vision)}svg .c3{stroke:var(--north)}
-.within{display:block;color:var(--soft);font-size:.82rem;white-space:nowrap}
-"""
-_COLOURS = 4
 _KIND_WORDS = {
-    "false alarm": "The surest false alarms", "miss": "The largest misses", "confusion": "The surest confusions",
+    "false alarm": "The most certain false alarms", "miss": "The largest misses",
+    "confusion": "The most certain confusions",
 }
 _SIDE_PX, _MARGIN_PX = 420.0, 44.0
+_SET_NAMES = ("set", "pictures", "videos", "AP", "AP50", "AP75", "AP small", "medium", "large", "thesis mAP")
+_CLASS_NAMES = (
+    "class", "labels", "AP", "AP50", "AP75", "reported from", "precision", "recall", "F1", "thesis AP", "best F1",
+    "from",
+)
+_SIZE_NAMES = ("class", "longer side", "labels", "recall as reported", "with any candidate")
 
 
 def detector_page(
@@ -41,22 +37,26 @@ def detector_page(
     `worst` holds each set's mistakes (fields of detection.metrics.Mistake), the picture's name and a crop. All text is
     escaped.
     """
-    parts = [_header(model, sets), _overview(sets)]
-    parts += [_comparison(each) for each in comparisons]
-    for scores in sets:
-        parts += [_classes(scores), _curves(scores), _sizes(scores), _confusion(scores)]
-        parts.append(_mistakes(scores, worst.get(scores.name, ())))
-    parts.append(_how(description))
-    return page_of(f"{escaped(model)} - detector", STYLE + _STYLE, parts)
-
-
-def _header(model: str, sets: Sequence[Any]) -> str:
-    told = "; ".join(f"{escape(each.name)}: AP50 {_class_words(each.classes)}" for each in sets)
-    return (
-        f'<header><p class="over">Detector <b>{escaped(model)}</b></p><h1>{told}</h1>'
-        f"<p>Measured on {sum(each.pictures for each in sets)} labelled pictures of {_videos(sets)}. All shares are in "
-        "per cent.</p></header>"
+    pictures = sum(each.pictures for each in sets)
+    page = render(
+        "detector.html", title=f"{model} - detector", model=known(model),
+        headline="; ".join(f"{each.name}: AP50 {_class_words(each.classes)}" for each in sets),
+        summary=f"Measured on {pictures} labelled pictures of {_videos(sets)}. All shares are in per cent.",
+        overview_names=_SET_NAMES, overview=[_overview_row(each) for each in sets], remarks=_remarks(sets),
+        comparisons=[_comparison(each) for each in comparisons], class_names=_CLASS_NAMES, size_names=_SIZE_NAMES,
+        sets=[_set(each, worst.get(each.name, ())) for each in sets],
+        description=[(str(key), known(value)) for key, value in description.items()],
     )
+    return str(page)
+
+
+def _set(scores: Any, worst: Sequence[tuple[Any, str, ImageRGB]]) -> dict[str, Any]:
+    labels = [row.label for row in scores.classes]
+    return {
+        "name": scores.name, "classes": _class_rows(scores), "curves": _curves(scores), "sizes": _sizes(scores),
+        "confusion_names": ["label", *(f"reported as {name}" for name in labels), "missed"],
+        "confusion": _confusion(scores, labels), "mistakes": _mistakes(scores, worst),
+    }
 
 
 def _videos(sets: Sequence[Any]) -> str:
@@ -65,180 +65,133 @@ def _videos(sets: Sequence[Any]) -> str:
 
 
 def _class_words(classes: Sequence[Any]) -> str:
-    return ", ".join(f"{escape(row.label)} {_share(row.coco.ap50)}" for row in classes if row.labels) or "unknown"
+    return ", ".join(f"{row.label} {_share(row.coco.ap50)}" for row in classes if row.labels) or "unknown"
 
 
-def _overview(sets: Sequence[Any]) -> str:
-    names = ("set", "pictures", "videos", "AP", "AP50", "AP75", "AP small", "medium", "large", "thesis mAP")
-    rows = []
-    for each in sets:
-        known = each.intervals
-        coco = each.coco
-        rows.append([
-            escape(each.name), str(each.pictures), str(each.groups),
-            *(_with_interval(known[name]) for name in ("AP", "AP50", "AP75")),
-            *(_share(value) for value in (coco.ap_small, coco.ap_medium, coco.ap_large)),
-            _with_interval(known["thesis_map"]),
-        ])
-    remarks = [f"{escape(each.name)}: {escape(text)}" for each in sets for text in each.remarks]
-    remarks += [
-        f"{escape(each.name)}: {escape(', '.join(each.left_out))} not labelled there, so not judged"
-        for each in sets if each.left_out
+def _overview_row(each: Any) -> list[Any]:
+    return [
+        each.name, each.pictures, each.groups,
+        *(_with_interval(each.intervals[name]) for name in ("AP", "AP50", "AP75")),
+        *(_share(value) for value in (each.coco.ap_small, each.coco.ap_medium, each.coco.ap_large)),
+        _with_interval(each.intervals["thesis_map"]),
     ]
-    return (
-        f"<section><h2>Average precision</h2>{table_of(rows, names)}"
-        '<p class="note">COCO\'s AP is the mean over IoU 0.50 to 0.95; small is below 32\u00b2 px, large above '
-        "96\u00b2. Below a value the interval that holds it with 95 %, by drawing whole videos. The thesis's mAP "
-        "(eqs 4.3, 4.4) is the mean precision at the reporting thresholds: it says nothing of what was missed.</p>"
-        + (bullet_list(remarks) if remarks else "") + "</section>"
-    )
 
 
-def _comparison(each: Any) -> str:
-    names = [name for name, value in each.arms[0].mean.items() if math.isfinite(value)]
-    head = ["measure", *(escape(arm.name) for arm in each.arms)]
-    head += [f"{escape(arm.name)} less {escape(each.arms[0].name)}" for arm in each.arms[1:]]
-    rows = []
-    for name in names:
-        row = ["thesis mAP" if name == "thesis_map" else escape(name)]
-        for arm in each.arms:
-            spread = _within(arm.lowest[name], arm.highest[name], _share) if arm.seeds > 1 else ""
-            row.append(_share(arm.mean[name]) + spread)
-        for found in each.differences:
-            told = found[name]
-            words = _points(told.value) + _within(told.low, told.high, _points)
-            row.append(f"<b>{words}</b>" if told.is_clear else words)
-        rows.append(row)
-    labels = ", ".join(f"{count} {escape(name)}" for name, count in each.labels.items())
-    return (
-        f"<section><h2>Side by side: {escape(each.name)}</h2>{table_of(rows, head)}"
-        f'<p class="note">{each.pictures} pictures of {each.groups} videos, labels: {labels}. Differences in '
-        "percentage points with their 95 % interval, on the same draws of videos (and of seeds, where an arm has "
-        "several); bold where the interval leaves zero out.</p></section>"
-    )
+def _remarks(sets: Sequence[Any]) -> list[str]:
+    remarks = [f"{each.name}: {text}" for each in sets for text in each.remarks]
+    return remarks + [
+        f"{each.name}: {', '.join(each.left_out)} not labelled there, so not judged" for each in sets if each.left_out
+    ]
 
 
-def _classes(scores: Any) -> str:
-    names = (
-        "class", "labels", "AP", "AP50", "AP75", "reported from", "precision", "recall", "F1", "thesis AP",
-        "best F1", "from",
-    )
-    rows = [
+def _comparison(each: Any) -> dict[str, Any]:
+    first = each.arms[0]
+    names = [name for name, value in first.mean.items() if math.isfinite(value)]
+    labels = ", ".join(f"{count} {name}" for name, count in each.labels.items())
+    return {
+        "name": each.name, "basis": f"{each.pictures} pictures of {each.groups} videos, labels: {labels}.",
+        "head": ["measure", *(arm.name for arm in each.arms),
+                 *(f"{arm.name} less {first.name}" for arm in each.arms[1:])],
+        "rows": [_comparison_row(each, name) for name in names],
+    }
+
+
+def _comparison_row(each: Any, name: str) -> list[Any]:
+    row: list[Any] = ["thesis mAP" if name == "thesis_map" else name]
+    for arm in each.arms:
+        low, high = (arm.lowest[name], arm.highest[name]) if arm.seeds > 1 else (math.nan, math.nan)
+        row.append(_interval(arm.mean[name], low, high, _share))
+    for found in each.differences:
+        measured = found[name]
+        words = _interval(measured.value, measured.low, measured.high, _points)
+        row.append(cell("strong", words) if measured.is_clear else words)
+    return row
+
+
+def _class_rows(scores: Any) -> list[list[Any]]:
+    return [
         [
-            escape(row.label), str(row.labels), _with_interval(scores.intervals[f"AP {row.label}"]),
+            row.label, row.labels, _with_interval(scores.intervals[f"AP {row.label}"]),
             _with_interval(scores.intervals[f"AP50 {row.label}"]), _share(row.coco.ap75), _number(row.reported.score),
             *(_share(value) for value in (row.reported.precision, row.reported.recall, row.reported.f1)),
             _share(row.thesis_ap), _share(row.best.f1), _number(row.best.score),
         ]
         for row in scores.classes
     ]
-    return (
-        f"<section><h2>{escape(scores.name)}: classes</h2>{table_of(rows, names)}"
-        '<p class="note">Precision, recall and F1 at IoU 0.5 of what the model reports; the best F1 is chosen on these '
-        "very pictures and flatters a little.</p></section>"
-    )
 
 
-def _curves(scores: Any) -> str:
+def _curves(scores: Any) -> dict[str, Any] | None:
     shown = [row for row in scores.classes if len(row.curve) and row.labels]
     if not shown:
-        return ""
+        return None
     x = Scale(0, 1, _MARGIN_PX, _SIDE_PX - 12)
     y = Scale(0, 1, _SIDE_PX - _MARGIN_PX, 12)
-    parts = []
-    for tick in (0.0, 0.25, 0.5, 0.75, 1.0):
-        parts.append(f'<path class="grid" d="M{x(tick):.1f},12 V{y(0):.1f} M{x(0):.1f},{y(tick):.1f} H{x(1):.1f}"/>')
-        parts.append(f'<text class="label" x="{x(tick):.1f}" y="{y(0) + 16:.1f}" text-anchor="middle">{tick:g}</text>')
-        parts.append(f'<text class="label" x="{x(0) - 6:.1f}" y="{y(tick) + 4:.1f}" text-anchor="end">{tick:g}</text>')
-    parts.append(f'<text class="label" x="{x(1):.1f}" y="{_SIDE_PX - 8:.0f}" text-anchor="end">recall</text>')
-    parts.append(f'<text class="label" x="6" y="{_SIDE_PX - 8:.0f}">precision upwards</text>')
-    keys = []
+    ticks = (0.0, 0.25, 0.5, 0.75, 1.0)
+    labels = [Label(x(tick), y(0) + 16, f"{tick:g}") for tick in ticks]
+    labels += [Label(x(0) - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
+    labels += [Label(x(1), _SIDE_PX - 8, "recall", "end"), Label(6, _SIDE_PX - 8, "precision upwards", "start")]
+    frame = Axes(
+        x(0), x(1), 12, y(0), tuple(("grid", y(tick)) for tick in ticks), tuple(("grid", x(tick)) for tick in ticks),
+        tuple(labels),
+    )
+    lines = []
     for place, row in enumerate(shown):
-        colour = f"c{place % _COLOURS}"
-        points = " ".join(f"{x(recall):.1f},{y(precision):.1f}" for _, precision, recall in row.curve)
-        parts.append(f'<polyline class="line {colour}" points="{points}"/>')
-        if math.isfinite(row.reported.precision) and math.isfinite(row.reported.recall):
-            where = f'cx="{x(row.reported.recall):.1f}" cy="{y(row.reported.precision):.1f}"'
-            parts.append(f'<circle class="line {colour}" {where} r="4.5"><title>reported</title></circle>')
-        keys.append(f'<span class="key {colour}"></span>{escape(row.label)}')
-    drawing = (
-        f'<svg viewBox="0 0 {_SIDE_PX:.0f} {_SIDE_PX:.0f}" role="img" style="max-width:{_SIDE_PX:.0f}px">'
-        f"<title>Precision over recall</title>{''.join(parts)}</svg>"
-    )
-    return (
-        f"<section><h2>{escape(scores.name)}: precision over recall</h2>{drawing}<p>{' '.join(keys)}</p>"
-        '<p class="note">At IoU 0.5; the circle is where the model reports.</p></section>'
-    )
+        at = (row.reported.recall, row.reported.precision)
+        dots = [(x(at[0]), y(at[1]))] if all(map(math.isfinite, at)) else []
+        points = [(x(recall), y(precision)) for _, precision, recall in row.curve]
+        lines.append(Line(colour_class(place), points, dots, "reported", 4.5))
+    keys = [(colour_class(place), row.label) for place, row in enumerate(shown)]
+    return {"drawing": line_plot("Precision over recall", lines, frame, _SIDE_PX, _SIDE_PX), "legend": keys}
 
 
-def _sizes(scores: Any) -> str:
+def _sizes(scores: Any) -> list[tuple[str, list[list[Any]]]]:
     tables = []
-    for rows_of, unit, words in (
+    for found_by_label, unit, words in (
         (scores.by_size_px, "px", "in the picture"), (scores.by_size_m, "m", "on the ground"),
     ):
         rows = [
             [
-                escape(label), f'<span class="whole">{_range(row.low, row.high, unit)}</span>', str(row.count),
-                f'{_share(row.recall)}<div class="bar" style="width:{100 * row.recall:.0f}%"></div>',
+                label, _range(row.low, row.high, unit), row.count, cell("share", _share(row.recall), row.recall),
                 _share(row.candidates / row.count),
             ]
-            for label, found in rows_of.items() for row in found
+            for label, found in found_by_label.items() for row in found
         ]
         if rows:
-            names = ("class", "longer side", "labels", "recall as reported", "with any candidate")
-            tables.append(f"<div><h3>Size {words}</h3>{table_of(rows, names)}</div>")
-    if not tables:
-        return ""
-    both = f'<div class="pair">{"".join(tables)}</div>'
-    return f"<section><h2>{escape(scores.name)}: recall by size</h2>{both}</section>"
+            tables.append((f"Size {words}", rows))
+    return tables
 
 
-def _confusion(scores: Any) -> str:
-    labels = [row.label for row in scores.classes]
-    head = ["label", *(f"reported as {escape(name)}" for name in labels), "missed"]
+def _confusion(scores: Any, labels: Sequence[str]) -> list[list[Any]]:
     rows = []
     for k, name in enumerate([*labels, "nothing there"]):
-        cells = [
-            f'<span class="hit">{int(value)}</span>' if k == c else str(int(value))
-            for c, value in enumerate(scores.confusion[k])
-        ]
-        rows.append([escape(name), *cells[:-1], cells[-1] if k < len(labels) else ""])
-    return f"<section><h2>{escape(scores.name)}: what is taken for what</h2>{table_of(rows, head)}</section>"
+        counts = [int(value) for value in scores.confusion[k]]
+        cells: list[Any] = [cell("hit", count) if k == c else count for c, count in enumerate(counts)]
+        rows.append([name, *cells[:-1], cells[-1] if k < len(labels) else ""])
+    return rows
 
 
-def _mistakes(scores: Any, worst: Sequence[tuple[Any, str, ImageRGB]]) -> str:
+def _mistakes(
+    scores: Any, worst: Sequence[tuple[Any, str, ImageRGB]]
+) -> list[tuple[str, list[dict[str, str]]]]:
     blocks = []
     for kind, words in _KIND_WORDS.items():
-        figures = [_figure(mistake, name, crop) for mistake, name, crop in worst if mistake.kind == kind]
+        figures = [
+            {"words": _mistake_words(mistake), "picture": name, "address": picture_uri(_opaque(crop), 24_000)}
+            for mistake, name, crop in worst if mistake.kind == kind
+        ]
         if figures:
             total = sum(each.kind == kind for each in scores.mistakes)
-            blocks.append(f'<h3>{words} ({len(figures)} of {total})</h3><div class="crops">{"".join(figures)}</div>')
-    if not blocks:
-        return ""
-    return (
-        f"<section><h2>{escape(scores.name)}: worst mistakes</h2>{''.join(blocks)}"
-        '<p class="note">Labels are green, what was reported is orange.</p></section>'
-    )
+            blocks.append((f"{words} ({len(figures)} of {total})", figures))
+    return blocks
 
 
-def _figure(mistake: Any, name: str, crop: ImageRGB) -> str:
+def _mistake_words(mistake: Any) -> str:
     if mistake.kind == "miss":
-        words = f"{mistake.true_label} missed" + (f", best candidate {mistake.score:.2f}" if mistake.score else "")
-    elif mistake.kind == "confusion":
-        words = f"{mistake.true_label} reported as {mistake.label}, {mistake.score:.2f}"
-    else:
-        placed = f", overlaps a label by {mistake.overlap:.2f}" if mistake.overlap >= 0.1 else ""
-        words = f"{mistake.label}, {mistake.score:.2f}{placed}"
-    rgba = _opaque(crop)
-    return (
-        f'<figure><img src="{picture_uri(rgba, 24_000)}" alt="{escape(words)}">'
-        f"<figcaption>{escape(words)}<br>{escape(name)}</figcaption></figure>"
-    )
-
-
-def _how(description: Mapping[str, Any]) -> str:
-    rows = [[escaped(key), escaped(value)] for key, value in description.items()]
-    return f"<section><h2>How it was measured</h2>{table_of(rows)}</section>"
+        return f"{mistake.true_label} missed" + (f", best candidate {mistake.score:.2f}" if mistake.score else "")
+    if mistake.kind == "confusion":
+        return f"{mistake.true_label} reported as {mistake.label}, {mistake.score:.2f}"
+    beside = f", overlaps a label by {mistake.overlap:.2f}" if mistake.overlap >= 0.1 else ""
+    return f"{mistake.label}, {mistake.score:.2f}{beside}"
 
 
 def _opaque(rgb: ImageRGB) -> Anything:
@@ -263,10 +216,10 @@ def _number(value: float) -> str:
     return f"{value:.2f}" if math.isfinite(value) else "-"
 
 
-def _with_interval(told: Any) -> str:
-    return _share(told.value) + _within(told.low, told.high, _share)
+def _with_interval(measured: Any) -> Markup:
+    return _interval(measured.value, measured.low, measured.high, _share)
 
 
-def _within(low: float, high: float, words: Callable[[float], str]) -> str:
-    """The bounds on a line of their own; "" where they are not known."""
-    return f'<span class="within">{words(low)} to {words(high)}</span>' if math.isfinite(low) else ""
+def _interval(value: float, low: float, high: float, words: Callable[[float], str]) -> Markup:
+    """The value, and its bounds on a line of their own where they are known."""
+    return cell("interval", words(value), *((words(low), words(high)) if math.isfinite(low) else ("", "")))

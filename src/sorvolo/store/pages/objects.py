@@ -1,91 +1,86 @@
-"""What stands on the map, as a section of the flight's report."""
+"""The objects on the map, as a section of the flight's report."""
 
-import base64
 from collections.abc import Mapping
 from typing import Any
 
-from sorvolo.store.pages.words import at, escaped, finite_or_none, number_at, seconds_words, table_of
+import numpy as np
+from markupsafe import Markup
+
+from sorvolo.store.exports.places import SYSTEMS, place_words
+from sorvolo.store.pages.render import render
+from sorvolo.store.pages.words import at, count_words, finite_or_none, jpeg_uri, known, number_at, plural, seconds_words
+from sorvolo.survey.flight import Site
 
 _MOST_CROP_BYTES = 250_000  # of all pictures together: the page stays one that can be mailed
 _MOST_ROWS = 200
 
-OBJECTS_STYLE = """
-.crop{display:block;width:72px;height:72px;object-fit:cover;border-radius:6px}
-"""
 
-
-def objects_section(report: Mapping[str, Any], crops: Mapping[str, bytes]) -> str:
+def objects_section(report: Mapping[str, Any], crops: Mapping[str, bytes], site: Site | None = None) -> Markup:
     """The section on a flight's objects: `report` as in report.json, `crops` JPEG pictures by id.
 
-    Empty for a report that says nothing of objects.
+    `site` gives the places their coordinates; without it they are metres east and north of the site's origin. Empty
+    for a report without objects.
     """
-    told = at(report, "objects")
-    if not isinstance(told, Mapping):
-        return ""
-    if told.get("model") is None:
-        return (
-            "<section><h2>What stands here</h2>"
-            f"<p>Nothing was looked for: {escaped(told.get('why_not'))}.</p></section>"
-        )
-    rows = at(told, "list") or []
-    return (
-        f"<section><h2>What stands here</h2><p>{_words(told)}</p>{_table(rows, crops)}"
-        f"<p class='note'>{_how(told)}</p></section>"
+    search = at(report, "objects")
+    if not isinstance(search, Mapping):
+        return Markup("")
+    why_not = known(search.get("why_not")) if search.get("model") is None else None
+    rows = at(search, "list") or []
+    is_local = site.is_local if site is not None else not report.get("georeferenced", True)
+    return render(
+        "objects.html", why_not=why_not, words=_words(search), rows=_rows(rows[:_MOST_ROWS], crops, site),
+        more=max(0, len(rows) - _MOST_ROWS), has_metres=not is_local, how=_how(search, is_local),
+        systems=() if site is None or is_local else tuple(SYSTEMS.items()),
+        file="objects.json" if is_local else "objects.geojson",
     )
 
 
-def _words(told: Mapping[str, Any]) -> str:
-    counts = [f"{count} {escaped(name)}" for name, count in (at(told, "classes") or {}).items() if count]
-    if not counts:
-        return f"None of {escaped(', '.join(at(told, 'looked_for') or []))} was found."
-    moving = int(number_at(told, "moving") or 0)
-    return f"Found: {', '.join(counts)}" + (f"; {moving} of them moved" if moving else "") + "."
+def _words(search: Mapping[str, Any]) -> str:
+    counts = at(search, "classes") or {}
+    if not any(counts.values()):
+        return f"No {' and no '.join(map(str, at(search, 'looked_for') or ['object']))} was found."
+    moving = int(number_at(search, "moving") or 0)
+    return f"Objects found: {count_words(counts)}" + (f"; {moving} of them moved" if moving else "") + "."
 
 
-def _how(told: Mapping[str, Any]) -> str:
+def _how(search: Mapping[str, Any], is_local: bool) -> str:
+    files = "objects.json" if is_local else "objects.geojson, objects.kml, objects.gpx"
     return (
-        f"The model {escaped(told.get('model'))} looked at {escaped(told.get('frames'))} frames and saw "
-        f"{escaped(told.get('sightings'))} times something, {escaped(told.get('dropped'))} of them in too few of the "
-        f"frames that show the place: these are left out. It took {seconds_words(number_at(told, 'seconds'))} beside "
-        "the mapping. The list as a file: objects.geojson; the pictures: objects/."
+        f"The model {known(search.get('model'))} searched {known(search.get('frames'))} frames and made "
+        f"{plural(number_at(search, 'sightings') or 0, 'detection')}. {known(search.get('dropped'))} of them are left "
+        "out: too few of the frames that show the place confirm them. The search took "
+        f"{seconds_words(number_at(search, 'seconds'))}, beside the mapping. Files: {files}, and the pictures in "
+        "objects/."
     )
 
 
-def _table(rows: list[Mapping[str, Any]], crops: Mapping[str, bytes]) -> str:
-    if not rows:
-        return ""
-    left, cells = _MOST_CROP_BYTES, []
-    for row in rows[:_MOST_ROWS]:
+def _rows(
+    rows: list[Mapping[str, Any]], crops: Mapping[str, bytes], site: Site | None
+) -> list[dict[str, Any]]:
+    left, listed = _MOST_CROP_BYTES, []
+    for row in rows:
         crop = crops.get(str(row.get("id")), b"")
         left -= len(crop)
-        cells.append((
-            _picture(crop) if left > 0 else "", escaped(row.get("id")),
-            escaped(row.get("class")) + (", moving" if row.get("moving") else ""), _share(row.get("score")),
-            _place(row), _size(row), f"{escaped(row.get('views'))} of {escaped(row.get('possible_views'))}",
-        ))
-    more = f"<p>and {len(rows) - _MOST_ROWS} more in objects.geojson</p>" if len(rows) > _MOST_ROWS else ""
-    return table_of(cells, ("", "id", "class", "score", "east, north", "size", "views")) + more
+        score, sigma_m = finite_or_none(row.get("score")), finite_or_none(row.get("sigma_m"))
+        listed.append({
+            "crop": jpeg_uri(crop) if crop and left > 0 else "", "id": known(row.get("id")),
+            "name": known(row.get("class")) + (", moving" if row.get("moving") else ""),
+            "place": _place(row, site), "accuracy": "" if sigma_m is None else f"{sigma_m:.1f} m", "size": _size(row),
+            "frames": f"{known(row.get('views'))} of {known(row.get('possible_views'))}",
+            "score": "" if score is None else f"{score:.2f}",
+        })
+    return listed
 
 
-def _picture(crop: bytes) -> str:
-    if not crop:
-        return ""
-    return f'<img class="crop" alt="" src="data:image/jpeg;base64,{base64.b64encode(crop).decode()}">'
-
-
-def _share(value: Any) -> str:
-    score = finite_or_none(value)
-    return "" if score is None else f"{score:.2f}"
-
-
-def _place(row: Mapping[str, Any]) -> str:
-    east, north, sigma = (finite_or_none(row.get(name)) for name in ("east_m", "north_m", "sigma_m"))
+def _place(row: Mapping[str, Any], site: Site | None) -> list[tuple[str, str]]:
+    east, north = finite_or_none(row.get("east_m")), finite_or_none(row.get("north_m"))
     if east is None or north is None:
-        return ""
-    within = "" if sigma is None else f" \u00b1 {sigma:.1f}"
-    return f'<span class="whole">{east:+.1f}, {north:+.1f}{within} m</span>'
+        return []
+    if site is None:
+        return [("site", f"{east:+.1f}, {north:+.1f}")]
+    return list(place_words(np.array([east, north]), site).items())
 
 
 def _size(row: Mapping[str, Any]) -> str:
     length, width = finite_or_none(row.get("length_m")), finite_or_none(row.get("width_m"))
-    return "" if length is None or width is None else f'<span class="whole">{length:.1f} x {width:.1f} m</span>'
+    return "" if length is None or width is None else f"{length:.1f} x {width:.1f} m"

@@ -1,20 +1,23 @@
-"""The plots of the flight report: inline SVG made of text, without a script."""
+"""The plots of the pages: places and numbers worked out here, drawn as inline SVG by the templates in plots/."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from html import escape
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from sorvolo.geometry.arrays import Floats
-from sorvolo.survey.mosaic import Status
+from sorvolo.store.pages.render import render
 
 _WIDE_PX = 720
 _LOW_PX = 250
 _MARGIN_PX = 46.0
 _PLAN_HIGHEST_PX = 620.0
-_MARK_PX = 3.2
+_SCATTER_PX = 360.0
+_COLOURS = 5
+_STATUS_WORDS = {"vision": "matched", "gps-only": "GPS only", "rejected": "not placed"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +44,8 @@ class Scale:
     low_px: float
     high_px: float
 
-    def __call__(self, value: float) -> float:
-        """Where the value lies, px."""
+    def __call__(self, value: Any) -> Any:
+        """Where the value lies, or the values, px."""
         share = (value - self.low) / (self.high - self.low)
         return self.low_px + share * (self.high_px - self.low_px)
 
@@ -60,62 +63,98 @@ def round_length(about: float) -> float:
     return power * max(each for each in (1, 2, 5) if each <= about / power * (1 + 1e-9) or each == 1)
 
 
-def track_plan(track: TrackColumns, *, unit: str) -> str:
-    """Camera places seen from above, coloured by status, each tied to its GPS fix; north is up.
+@dataclass(frozen=True)
+class Mark:
+    """One frame in a plot: a disc where it was matched, a square by GPS alone, a cross where it was not placed."""
 
-    The fix is the camera's place less its GPS residual. Frames without a place are left out; "" without any.
+    x: float
+    y: float
+    status: str
+    words: str
+
+
+@dataclass(frozen=True)
+class Label:
+    """A text in a plot."""
+
+    x: float
+    y: float
+    text: str
+    anchor: str = "middle"
+
+
+@dataclass(frozen=True)
+class Axes:
+    """The frame of a plot: lines across and down by style and place, and labels."""
+
+    left: float
+    right: float
+    top: float
+    bottom: float
+    across: tuple[tuple[str, float], ...] = ()
+    down: tuple[tuple[str, float], ...] = ()
+    labels: tuple[Label, ...] = ()
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line in a plot, and dots on it that its words explain; `style` is a class of the style sheet."""
+
+    style: str
+    points: Sequence[tuple[float, float]]
+    dots: Sequence[tuple[float, float]] = field(default=())
+    words: str = ""
+    dot_px: float = 2.0
+
+
+def colour_class(place: int) -> str:
+    """The style of a line, by its place in the list."""
+    return f"c{place % _COLOURS}"
+
+
+def line_plot(title: str, lines: Sequence[Line], frame: Axes, width: float, height: float) -> Markup:
+    """Lines over their axes."""
+    return render("plots/lines.svg", title=title, lines=lines, frame=frame, width=width, height=height)
+
+
+def track_plan(track: TrackColumns, *, unit: str) -> str:
+    """Camera positions seen from above, coloured by status, each tied to its GPS fix; north is up.
+
+    The fix is the camera's position less its GPS residual. Frames without a position are left out; "" without any.
     """
     east, north = track["east_m"], track["north_m"]
     fix_east, fix_north = east - track["gps_east_m"], north - track["gps_north_m"]
     shown = np.isfinite(east) & np.isfinite(north)
     if not shown.any():
         return ""
-    known = shown & np.isfinite(fix_east) & np.isfinite(fix_north)
-    x_low, x_high = _extent(np.concatenate([east[shown], fix_east[known]]))
-    y_low, y_high = _extent(np.concatenate([north[shown], fix_north[known]]))
-    room_x, room_y = _WIDE_PX - 2 * _MARGIN_PX, _PLAN_HIGHEST_PX - 2 * _MARGIN_PX
-    px = min(room_x / (x_high - x_low), room_y / (y_high - y_low))
-    left = (_WIDE_PX - px * (x_high - x_low)) / 2
-    height = px * (y_high - y_low) + 2 * _MARGIN_PX
-    x = Scale(x_low, x_high, left, _WIDE_PX - left)
-    y = Scale(y_low, y_high, height - _MARGIN_PX, _MARGIN_PX)
-    path = " ".join(f"{x(east[k]):.1f},{y(north[k]):.1f}" for k in np.flatnonzero(shown))
-    parts = [f'<polyline class="path" points="{path}"/>']
-    for k in np.flatnonzero(known):
-        fx, fy = x(fix_east[k]), y(fix_north[k])
-        parts.append(f'<path class="tie" d="M{x(east[k]):.1f},{y(north[k]):.1f} L{fx:.1f},{fy:.1f}"/>')
-        parts.append(f'<circle class="fix" cx="{fx:.1f}" cy="{fy:.1f}" r="2.4"/>')
-    parts += [_mark(x(east[k]), y(north[k]), track, int(k)) for k in np.flatnonzero(shown)]
-    first = int(np.flatnonzero(shown)[0])
-    second = int(np.flatnonzero(shown)[:2][-1])
-    around = [x(east[first])] + ([x(fix_east[first])] if known[first] else [])
-    # on the side to which the track does not go, clear of the fix
-    if east[second] < east[first]:
-        parts.append(_label(max(around) + 9, y(north[first]) + 4, "start", "start"))
-    else:
-        parts.append(_label(min(around) - 9, y(north[first]) + 4, "start", "end"))
-    length = round_length((x_high - x_low + y_high - y_low) / 6)
-    bar_y = height - 12
-    parts.append(
-        f'<path class="ink" d="M12,{bar_y:.1f} h{length * px:.1f} m0,-4 v8 m{-length * px:.1f},-8 v8"/>'
-        f'<text class="label" x="12" y="{bar_y - 8:.1f}">{length:g} {escape(unit)}</text>'
+    fixed = shown & np.isfinite(fix_east) & np.isfinite(fix_north)
+    x, y, height, px = _plan_scales(
+        np.concatenate([east[shown], fix_east[fixed]]), np.concatenate([north[shown], fix_north[fixed]])
     )
-    if unit == "m":
-        parts.append(
-            f'<path class="arrow" d="M{_WIDE_PX - 20},14 l6,18 l-6,-5 l-6,5 z"/>'
-            f'<text class="label" x="{_WIDE_PX - 20}" y="46" text-anchor="middle">N</text>'
-        )
-    return _svg(height, "Plan of the flight: camera places and GPS fixes", parts)
+    length = round_length((x.high - x.low + y.high - y.low) / 6)
+    return render(
+        "plots/track.svg", width=_WIDE_PX, height=height,
+        path=[(x(east[k]), y(north[k])) for k in np.flatnonzero(shown)],
+        fixes=[(x(east[k]), y(north[k]), x(fix_east[k]), y(fix_north[k])) for k in np.flatnonzero(fixed)],
+        marks=[_mark(x(east[k]), y(north[k]), track, int(k)) for k in np.flatnonzero(shown)],
+        start=_start_label(x(east[shown]), y(north[shown]), x(fix_east) if fixed[np.flatnonzero(shown)[0]] else None,
+                           int(np.flatnonzero(shown)[0])),
+        bar=length * px, bar_words=f"{length:g} {unit}".strip(), has_north=unit == "m",
+    )
 
 
 def residuals_along(track: TrackColumns) -> str:
-    """Residuals of the frames in the order of the flight; frames without one are marks on the axis."""
+    """Misalignment of the frames in the order of the flight; frames without one are marks on the axis."""
     values = track["residual_px"]
     highest = float(np.nanmax(values)) if np.isfinite(values).any() else 1.0
-    x, y, parts = _frame_axes(len(track), 0.0, max(highest, 1e-3) * 1.08, "px")
-    for k, value in enumerate(values):
-        parts.append(_mark(x(k + 1), y(value if math.isfinite(value) else 0.0), track, k))
-    return _svg(_LOW_PX, "Residual of each frame along the flight", parts)
+    x, y, frame = _frame_axes(len(track), 0.0, max(highest, 1e-3) * 1.08, "px")
+    marks = [
+        _mark(x(k + 1), y(value if math.isfinite(value) else 0.0), track, k) for k, value in enumerate(values)
+    ]
+    return render(
+        "plots/marks.svg", title="Misalignment of each frame along the flight", frame=frame, marks=marks, circle=None,
+        width=_WIDE_PX, height=_LOW_PX,
+    )
 
 
 def gps_along(track: TrackColumns, *, unit: str) -> str:
@@ -126,15 +165,13 @@ def gps_along(track: TrackColumns, *, unit: str) -> str:
     if not len(known):
         return ""
     reach = max(float(np.abs(known).max()) * 1.08, 0.1)
-    x, y, parts = _frame_axes(len(track), -reach, reach, unit)
+    x, y, frame = _frame_axes(len(track), -reach, reach, unit)
+    lines = []
     for name, values in zip(names, series):
         for run in _runs(np.isfinite(values)):
-            points = " ".join(f"{x(k + 1):.1f},{y(values[k]):.1f}" for k in run)
-            parts.append(f'<polyline class="line {name}" points="{points}"/>')
-            if len(run) == 1:
-                cx, cy = x(run[0] + 1), y(values[run[0]])
-                parts.append(f'<circle class="dot {name}" cx="{cx:.1f}" cy="{cy:.1f}" r="2"/>')
-    return _svg(_LOW_PX, "Camera place less GPS fix, along the flight", parts)
+            points = [(x(k + 1), y(values[k])) for k in run]
+            lines.append(Line(name, points, points if len(run) == 1 else ()))
+    return line_plot("Camera position less GPS fix, along the flight", lines, frame, _WIDE_PX, _LOW_PX)
 
 
 def gps_scatter(track: TrackColumns, *, unit: str) -> str:
@@ -143,70 +180,66 @@ def gps_scatter(track: TrackColumns, *, unit: str) -> str:
     known = np.isfinite(east) & np.isfinite(north)
     if not known.any():
         return ""
-    distances = np.hypot(east[known], north[known])
     reach = max(float(np.abs(np.concatenate([east[known], north[known]])).max()) * 1.12, 0.1)
-    size = 360.0
-    x, y = Scale(-reach, reach, _MARGIN_PX, size - 12), Scale(-reach, reach, size - _MARGIN_PX, 12)
-    parts = []
-    for tick in x.ticks(6):
-        parts.append(f'<path class="grid" d="M{x(tick):.1f},12 V{size - _MARGIN_PX:.1f}"/>')
-        parts.append(f'<path class="grid" d="M{_MARGIN_PX:.1f},{y(tick):.1f} H{size - 12:.1f}"/>')
-        parts.append(_label(x(tick), size - _MARGIN_PX + 16, f"{tick:g}", "middle"))
-        parts.append(_label(_MARGIN_PX - 6, y(tick) + 4, f"{tick:g}", "end"))
-    parts.append(_label(size - 12, size - 10, f"east, {unit}", "end"))
-    parts.append(_label(8, 22, f"north, {unit}", "start"))
-    parts.append(f'<path class="zero" d="M{x(0):.1f},12 V{size - _MARGIN_PX:.1f}"/>')
-    parts.append(f'<path class="zero" d="M{_MARGIN_PX:.1f},{y(0):.1f} H{size - 12:.1f}"/>')
-    half = float(np.median(distances)) / (2 * reach) * (size - 12 - _MARGIN_PX)
-    parts.append(f'<circle class="median" cx="{x(0):.1f}" cy="{y(0):.1f}" r="{half:.1f}"/>')
-    parts += [_mark(x(east[k]), y(north[k]), track, int(k)) for k in np.flatnonzero(known)]
-    return _svg(size, "Camera place less GPS fix, east and north", parts, width=size)
-
-
-def _svg(height: float, title: str, parts: Sequence[str], width: float = _WIDE_PX) -> str:
-    return (
-        f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" style="max-width:{1.2 * width:.0f}px">'
-        f"<title>{escape(title)}</title>{''.join(parts)}</svg>"
+    size, low = _SCATTER_PX, _SCATTER_PX - _MARGIN_PX
+    x, y = Scale(-reach, reach, _MARGIN_PX, size - 12), Scale(-reach, reach, low, 12)
+    ticks = list(x.ticks(6))
+    labels = [Label(x(tick), low + 16, f"{tick:g}") for tick in ticks]
+    labels += [Label(_MARGIN_PX - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
+    labels += [Label(size - 12, size - 10, f"east, {unit}", "end"), Label(8, 22, f"north, {unit}", "start")]
+    frame = Axes(
+        _MARGIN_PX, size - 12, 12, low, tuple((_line_style(tick), y(tick)) for tick in ticks),
+        tuple((_line_style(tick), x(tick)) for tick in ticks), tuple(labels),
+    )
+    half_px = float(np.median(np.hypot(east[known], north[known]))) / (2 * reach) * (size - 12 - _MARGIN_PX)
+    return render(
+        "plots/marks.svg", title="Camera position less GPS fix, east and north", frame=frame,
+        marks=[_mark(x(east[k]), y(north[k]), track, int(k)) for k in np.flatnonzero(known)],
+        circle=(x(0), y(0), half_px), width=size, height=size,
     )
 
 
-def _frame_axes(count: int, low: float, high: float, unit: str) -> tuple[Scale, Scale, list[str]]:
+def _plan_scales(east: Floats, north: Floats) -> tuple[Scale, Scale, float, float]:
+    """Scales that show all of these at one scale, north up; the drawing's height, and pixels a metre."""
+    x_low, x_high = _extent(east)
+    y_low, y_high = _extent(north)
+    room_x, room_y = _WIDE_PX - 2 * _MARGIN_PX, _PLAN_HIGHEST_PX - 2 * _MARGIN_PX
+    px = min(room_x / (x_high - x_low), room_y / (y_high - y_low))
+    left = (_WIDE_PX - px * (x_high - x_low)) / 2
+    height = px * (y_high - y_low) + 2 * _MARGIN_PX
+    x = Scale(x_low, x_high, left, _WIDE_PX - left)
+    return x, Scale(y_low, y_high, height - _MARGIN_PX, _MARGIN_PX), height, px
+
+
+def _start_label(x: Floats, y: Floats, fix_x: Floats | None, first: int) -> Label:
+    """The word at the track's start, on the side to which the track does not go, clear of the fix."""
+    around = [float(x[0])] + ([] if fix_x is None else [float(fix_x[first])])
+    if x[:2][-1] < x[0]:
+        return Label(max(around) + 9, float(y[0]) + 4, "start", "start")
+    return Label(min(around) - 9, float(y[0]) + 4, "start", "end")
+
+
+def _frame_axes(count: int, low: float, high: float, unit: str) -> tuple[Scale, Scale, Axes]:
     """Scales and axes of a plot along the flight: frames to the right in order, values up."""
     x = Scale(1, max(count, 2), _MARGIN_PX + 8, _WIDE_PX - 14)
     y = Scale(low, high, _LOW_PX - 34, 18)
-    parts = []
-    for tick in y.ticks(5):
-        style = "zero" if abs(tick) < 1e-12 else "grid"
-        parts.append(f'<path class="{style}" d="M{_MARGIN_PX:.1f},{y(tick):.1f} H{_WIDE_PX - 8}"/>')
-        parts.append(_label(_MARGIN_PX - 6, y(tick) + 4, f"{tick:g}", "end"))
-    for tick in x.ticks(8):
-        if tick == round(tick):
-            parts.append(_label(x(tick), _LOW_PX - 16, f"{tick:g}", "middle"))
-    parts.append(_label(8, 12, unit, "start"))
-    parts.append(_label(_WIDE_PX - 8, _LOW_PX - 2, "selected frame, in order", "end"))
-    return x, y, parts
+    ticks = list(y.ticks(5))
+    labels = [Label(_MARGIN_PX - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
+    labels += [Label(x(tick), _LOW_PX - 16, f"{tick:g}") for tick in x.ticks(8) if tick == round(tick)]
+    labels += [Label(8, 12, unit, "start"), Label(_WIDE_PX - 8, _LOW_PX - 2, "selected frame, in order", "end")]
+    across = tuple((_line_style(tick), y(tick)) for tick in ticks)
+    return x, y, Axes(_MARGIN_PX, _WIDE_PX - 8, 18, _LOW_PX - 34, across, (), tuple(labels))
 
 
-def _mark(x: float, y: float, track: TrackColumns, k: int) -> str:
-    """A frame: a disc by vision, a square by GPS alone, a cross when rejected; hovering names it."""
-    status, r = track.statuses[k], _MARK_PX
-    if status == Status.VISION:
-        shape = f'<circle class="vision" cx="{x:.1f}" cy="{y:.1f}" r="{r}">'
-        end = "</circle>"
-    elif status == Status.GPS_ONLY:
-        shape = f'<rect class="gps-only" x="{x - r:.1f}" y="{y - r:.1f}" width="{2 * r}" height="{2 * r}">'
-        end = "</rect>"
-    else:
-        d = f"M{x - r:.1f},{y - r:.1f} l{2 * r},{2 * r} m0,{-2 * r} l{-2 * r},{2 * r}"
-        shape, end = f'<path class="rejected" d="{d}">', "</path>"
-    residual = track["residual_px"][k]
-    tail = f", residual {residual:.2f} px" if math.isfinite(residual) else ""
-    words = f"{track.names[k]}: {status}{tail}"
-    return f"{shape}<title>{escape(words)}</title>{end}"
+def _line_style(tick: float) -> str:
+    return "zero" if abs(tick) < 1e-12 else "grid"
 
 
-def _label(x: float, y: float, text: str, anchor: str) -> str:
-    return f'<text class="label" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
+def _mark(x: float, y: float, track: TrackColumns, k: int) -> Mark:
+    """A frame's mark, whose words name it."""
+    status, residual = track.statuses[k], track["residual_px"][k]
+    tail = f", misalignment {residual:.2f} px" if math.isfinite(residual) else ""
+    return Mark(float(x), float(y), status, f"{track.names[k]}: {_STATUS_WORDS.get(status, status)}{tail}")
 
 
 def _extent(values: Floats) -> tuple[float, float]:

@@ -1,9 +1,8 @@
-"""What the pages of HTML are made of: text, numbers in words, tables, pictures inside the page."""
+"""What pages are made of: values looked up in a report, numbers in words, pictures inside the page."""
 
 import base64
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from html import escape
+from collections.abc import Mapping
 from typing import Any
 
 import cv2
@@ -14,6 +13,7 @@ from sorvolo.store.images import shrink
 
 _MOST_PICTURE_BYTES = 1_450_000  # base64 makes four bytes of three: below 2 MB in the page
 _BACKGROUND = 236.0  # of what was never seen, a light grey
+_PLURALS = {"person": "people"}
 
 
 def at(report: Mapping[str, Any], *keys: str) -> Any:
@@ -34,9 +34,19 @@ def finite_or_none(value: Any) -> float | None:
     return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
 
 
-def escaped(value: Any) -> str:
-    """The value as HTML text; None is unknown."""
-    return "unknown" if value is None else escape(str(value))
+def known(value: Any) -> str:
+    """The value as text; None is unknown."""
+    return "unknown" if value is None else str(value)
+
+
+def plural(count: float, name: str) -> str:
+    """A number of things: "1 car", "3 cars", "4 people"."""
+    return f"{count:.0f} {name if count == 1 else _PLURALS.get(name, f'{name}s')}"
+
+
+def count_words(counts: Mapping[str, int]) -> str:
+    """What was found: "4 people, 3 cars"; "nothing" for nothing."""
+    return ", ".join(plural(count, name) for name, count in counts.items() if count) or "nothing"
 
 
 def with_unit(pattern: str, value: Any) -> str | None:
@@ -51,10 +61,12 @@ def join_words(*parts: str | None) -> str:
 
 
 def length_words(value_m: float | None) -> str | None:
-    """A length in centimetres or metres."""
+    """A length in centimetres below 10 cm, else in metres."""
     if value_m is None:
         return None
-    return f"{100 * value_m:.3g} cm" if value_m < 0.995 else f"{value_m:.3g} m"
+    if value_m < 0.0995:
+        return f"{100 * value_m:.2g} cm"
+    return f"{value_m:.2f} m" if value_m < 9.995 else f"{value_m:.3g} m"
 
 
 def area_words(value_m2: float | None) -> str:
@@ -73,29 +85,6 @@ def seconds_words(value: float | None) -> str:
     return f"{value:.2g} s" if value < 10 else f"{value:.0f} s" if value < 180 else f"{value / 60:.1f} min"
 
 
-def bullet_list(items: Iterable[str]) -> str:
-    """A list of items that are HTML already."""
-    return f"<ul>{''.join(f'<li>{each}</li>' for each in items)}</ul>"
-
-
-def table_of(rows: Sequence[Sequence[str]], names: Sequence[str] = ()) -> str:
-    """A table of cells that are HTML already."""
-    head = f"<tr>{''.join(f'<th>{each}</th>' for each in names)}</tr>" if names else ""
-    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
-    return f'<div class="wide"><table>{head}{body}</table></div>'
-
-
-def page_of(title: str, style: str, parts: Iterable[str], script: str = "") -> str:
-    """A whole page of its parts, those that are not empty; all are HTML already."""
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{title}</title>\n<style>{style}</style>\n</head>\n<body>\n<main>\n"
-        + "\n".join(part for part in parts if part)
-        + "\n</main>\n" + (f"<script>{script}</script>\n" if script else "") + "</body>\n</html>\n"
-    )
-
-
 def picture_uri(picture: ImageRGBA, most_bytes: int = _MOST_PICTURE_BYTES) -> str:
     """The picture as a JPEG on grey inside an address, below a size: that which a page can carry."""
     small = picture
@@ -107,3 +96,8 @@ def picture_uri(picture: ImageRGBA, most_bytes: int = _MOST_PICTURE_BYTES) -> st
             if len(data) <= most_bytes or max(small.shape[:2]) <= 32:
                 return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
         small = shrink(small, max(1, small.shape[1] // 2), max(1, small.shape[0] // 2))
+
+
+def jpeg_uri(jpeg: bytes) -> str:
+    """A JPEG file inside an address."""
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()

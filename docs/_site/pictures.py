@@ -1,0 +1,91 @@
+"""Make the pictures of the tutorial anew: python docs/_site/pictures.py DEMO (the folder that `sorvolo demo` made).
+
+Runs the tutorial's commands on the demo's flights in a temporary folder, keeps what they print as SVG and the pages as
+JPEG, taken by Chromium (`chromium` on the PATH). Only simulated flights are shown.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from PIL import Image
+from rich.console import Console
+from rich.text import Text
+
+IMAGES = Path(__file__).parents[1] / "images"
+COLUMNS = 104
+FLIGHT = "demo-site/simulation/flight{0}/flight{0}.mp4"
+CAMERA = ["--camera", "demo-site/simulation/camera.xml"]
+COMMANDS = {
+    "inspect": ["inspect", FLIGHT.format(1), *CAMERA],
+    "plan": ["plan", "--camera", "Mavic 2 Pro", "--area", "area.geojson", "--out", "field.plan", "--out", "field.kmz"],
+    "map": ["map", FLIGHT.format(1), *CAMERA, "--site", "field"],
+    "compare": ["compare", FLIGHT.format(2), *CAMERA, "--site", "field"],
+    "watch": ["watch", FLIGHT.format(2), *CAMERA, "--out", "search"],
+    "review": ["review", "field"],
+}
+PAGES = {  # name: page, width and height of the window, px
+    "report": ("field/flights/flight1/report.html", 1100, 1500),
+    "changes": ("field/flights/flight2/changes.html", 1100, 1500),
+    "watch": ("search/report.html", 1100, 1500),
+}
+AREA = """{"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [[[12.6030, 41.8920],
+[12.6050, 41.8920], [12.6050, 41.8932], [12.6030, 41.8932], [12.6030, 41.8920]]]}}"""
+
+
+def main() -> None:
+    """Run the commands, picture what they print and the pages that they write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("demo", type=Path)
+    parser.add_argument("--keep", type=Path, help="folder to run in, and to use again, instead of a temporary one")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = options.keep or Path(scratch)
+        folder.mkdir(exist_ok=True)
+        if not (folder / "demo-site").exists():
+            (folder / "demo-site").symlink_to(options.demo.resolve())
+        (folder / "area.geojson").write_text(AREA)
+        for made in ("field", "search"):
+            shutil.rmtree(folder / made, ignore_errors=True)
+        for name, words in COMMANDS.items():
+            printed(name, words, folder)
+        for name, (page, width, height) in PAGES.items():
+            pictured(name, folder / page, width, height)
+
+
+def printed(name: str, words: list[str], folder: Path) -> None:
+    """What a command prints, as SVG without fonts from elsewhere."""
+    environment = {**os.environ, "COLUMNS": str(COLUMNS), "FORCE_COLOR": "1", "TERM": "xterm-256color"}
+    done = subprocess.run(
+        [sys.executable, "-m", "sorvolo", *words], cwd=folder, env=environment, capture_output=True, text=True,
+        check=True,
+    )
+    if name == "watch":
+        return
+    console = Console(record=True, width=COLUMNS, file=open(os.devnull, "w"), force_terminal=True)  # noqa: SIM115
+    shown = " ".join(f'"{word}"' if " " in word else word for word in words)
+    console.print(f"$ sorvolo {shown}", style="bold", highlight=False, markup=False)
+    console.print(Text.from_ansi(done.stdout.rstrip()))
+    drawn = console.export_svg(title=f"sorvolo {words[0]}")
+    while "@font-face" in drawn:
+        begin = drawn.index("@font-face")
+        drawn = drawn[:begin] + drawn[drawn.index("}", begin) + 1 :]
+    (IMAGES / f"{name}.svg").write_text(drawn.replace("Fira Code", "DejaVu Sans Mono"), encoding="utf-8")
+
+
+def pictured(name: str, page: Path, width: int, height: int) -> None:
+    """The top of a page as a browser shows it."""
+    with tempfile.TemporaryDirectory() as scratch:
+        shot = Path(scratch) / "page.png"
+        command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+        command += [f"--window-size={width},{height}", f"--screenshot={shot}", page.resolve().as_uri()]
+        subprocess.run(command, check=True, capture_output=True, timeout=120)
+        Image.open(shot).convert("RGB").save(IMAGES / f"{name}.jpg", quality=72, optimize=True, progressive=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,69 @@
+"""How far a map's frames lie from the truth, or from known camera places."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sorvolo.geometry.arrays import Floats
+from sorvolo.mosaic.quality import CornerErrors, Spread, corner_errors, position_errors, spread_of
+from sorvolo.survey.frame_rows import FrameRow
+from sorvolo.survey.mosaic import Status
+
+
+@dataclass(frozen=True)
+class TruthErrors:
+    """A flight's errors against truth ("all" for all together): frames placed by vision, and by GPS alone."""
+
+    flight: str
+    corners: CornerErrors
+    gps_only: Spread
+    cameras: Spread
+
+
+@dataclass(frozen=True)
+class PositionErrors:
+    """Camera positions against a table: as they lie, and after the best similarity."""
+
+    absolute: Spread
+    shape: Spread
+    missing: int
+
+
+def truth_errors(name: str, pairs: Sequence[tuple[FrameRow, FrameRow]], m_per_px: float) -> TruthErrors:
+    """The errors of a flight's frames, each given beside the true one."""
+    placed = [(mine, true) for mine, true in pairs if mine.has_outline and true.has_outline]
+    seen = [pair for pair in placed if pair[0].status == Status.VISION]
+    by_gps = [pair for pair in placed if pair[0].status == Status.GPS_ONLY]
+    fixed = [true for _, true in pairs if true.has_fix and true.has_camera]
+    corners = corner_errors(
+        _outlines([mine for mine, _ in seen]), _outlines([true for _, true in seen]), m_per_px,
+        np.array([true.camera_m for true in fixed]).reshape(-1, 2),
+        np.array([true.fix_m for true in fixed]).reshape(-1, 2),
+    )
+    off_m = [np.linalg.norm(mine.outline_m - true.outline_m, axis=1) for mine, true in by_gps]
+    cameras_m = [
+        float(np.linalg.norm(mine.camera_m - true.camera_m)) for mine, true in pairs
+        if mine.has_camera and true.has_camera
+    ]
+    return TruthErrors(
+        name, corners, spread_of(np.array(off_m), m_per_px), spread_of(np.array(cameras_m), m_per_px)
+    )
+
+
+def table_errors(
+    cameras: Sequence[FrameRow], places_m: Sequence[Sequence[float]], missing: int, m_per_px: float
+) -> PositionErrors:
+    """Cameras against a table's places (east, north, height of each); heights count where all are known.
+
+    `missing` of the table's frames have no camera.
+    """
+    mine = np.array([[*each.camera_m, each.camera_height_m] for each in cameras])
+    reference = np.array(places_m, np.float64)
+    if not (np.isfinite(mine).all() and np.isfinite(reference).all()):
+        mine, reference = mine[:, :2], reference[:, :2]
+    return PositionErrors(*position_errors(mine, reference, m_per_px), missing)
+
+
+def _outlines(rows: Sequence[FrameRow]) -> Floats:
+    return np.array([each.outline_m for each in rows]).reshape(-1, 4, 2)
