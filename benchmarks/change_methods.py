@@ -1,4 +1,4 @@
-"""Which method tells changes from disturbances: robust, thesis, plain difference and SSIM on the same pairs.
+"""Which method distinguishes changes from disturbances: robust, thesis, plain difference and SSIM on the same pairs.
 
 python benchmarks/change_methods.py [--seeds 1 2 3] --split test
   [--count 30] [--suites hard none] [--data ../shared/data]

@@ -162,14 +162,14 @@ def measured(name: str, method: str, photos: Path, site: Path, pictures: Path | 
     crown_m2 = crown_area_m2(ground, crowns)
     events = []
     for feature in json.loads((site / "flights" / flight / "changes.geojson").read_text())["features"]:
-        said = feature["properties"]
+        properties = feature["properties"]
         ring = described.frame.ground_from_lonlat(feature["geometry"]["coordinates"][0][:-1])
         in_crown = bool(within(crowns, ring.mean(axis=0)[None])[0])
         keys = ("id", "kind", "score", "views", "area_m2", "length_m", "sigma_m")
-        events.append({**{key: said[key] for key in keys}, "in_crown": in_crown})
+        events.append({**{key: properties[key] for key in keys}, "in_crown": in_crown})
         if pictures is not None:
             crops = site / "flights" / flight / "changes"
-            side_by_side(crops, said["id"], pictures / f"{site.parent.name}-{method}")
+            side_by_side(crops, properties["id"], pictures / f"{site.parent.name}-{method}")
     return {
         **json.loads(done.stdout.splitlines()[-1]), "outside_m2": round(ground.area_m2 - crown_m2),
         "crowns_m2": round(crown_m2), "outside": sum(not each["in_crown"] for each in events),

@@ -3,7 +3,7 @@
 The grounds are real photos; objects are painted on the reference's ground (they disappeared) or on the query's (they
 appeared), half of the pairs have none. `real` pairs neighbouring photos of one flight. Development and test use
 different photos, flights and random numbers. Shadows that objects cast are left out of the score. Without the photos
-the grounds are procedural, and `Ground.source` says so.
+the grounds are procedural, and `Ground.source` is "procedural".
 """
 
 from collections.abc import Iterator

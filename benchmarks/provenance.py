@@ -63,7 +63,7 @@ def seeds_or_drawn(benchmark: str, seeds: Sequence[int], count: int) -> list[int
 
 
 def note_scoring(held_out: str, ledger: Path = SCORED) -> dict[str, str | int]:
-    """Count one more scoring of a held-out set; what a result file says of it: `held_out` and `times_scored`."""
+    """Count one more scoring of a held-out set; what a result file holds of it: `held_out` and `times_scored`."""
     known = json.loads(ledger.read_text(encoding="utf-8")) if ledger.is_file() else {}
     known[held_out] = known.get(held_out, 0) + 1
     ledger.parent.mkdir(exist_ok=True)

@@ -80,11 +80,12 @@ def withheld_rms_m(folder: Path, parity: int) -> float:
     frame = LocalFrame(Geodetic(*next(iter(taken_out.values()))))
     misses = []
     for feature in found["features"]:
-        said = feature["properties"]
-        if said["frame"] in taken_out:
-            latitude, longitude = taken_out[said["frame"]]
+        placed = feature["properties"]
+        if placed["frame"] in taken_out:
+            latitude, longitude = taken_out[placed["frame"]]
             places = frame.site_from_wgs84(
-                np.array([latitude, said["camera_latitude_deg"]]), np.array([longitude, said["camera_longitude_deg"]]),
+                np.array([latitude, placed["camera_latitude_deg"]]),
+                np.array([longitude, placed["camera_longitude_deg"]]),
                 np.zeros(2),
             )
             misses.append(float(np.linalg.norm((places[1] - places[0])[:2])))

@@ -53,20 +53,22 @@ def main() -> None:
         kept = [dict(np.load(path)) for path in options.rows]
         names = "rows", "answers", "suites"
         rows, answers, suites = (np.concatenate([each[name] for each in kept]) for name in names)
-        told = [str(each["told"]) for each in kept]
+        command_line = [str(each["command_line"]) for each in kept]
     else:
         rows, answers, suites, sources = collect_all(options)
         command = f"--count {options.count} --sites {options.sites} --painted {options.painted} --seed {options.seed}"
         if options.suites != list(SUITES):
             command += " --suites " + shlex.join(options.suites)
-        told = [f"{command}: {len(rows)} regions of {', '.join(sources)}"]
+        command_line = [f"{command}: {len(rows)} regions of {', '.join(sources)}"]
         if options.collect:
-            np.savez_compressed(options.collect, rows=rows, answers=answers, suites=suites, told=told[0])
+            np.savez_compressed(
+                options.collect, rows=rows, answers=answers, suites=suites, command_line=command_line[0]
+            )
             return
     before = json.loads(options.onto.read_text()) if options.onto else None
     trees = train(rows, answers, suites == "simulated", before)
     print(f"{len(rows)} regions, {int(answers.sum())} of them changes")
-    trees["trained"] = {"regions": len(rows), "changes": int(answers.sum()), "collected": told}
+    trees["trained"] = {"regions": len(rows), "changes": int(answers.sum()), "collected": command_line}
     if before:
         trees["trained"]["onto"] = before["trained"]
     options.output.write_text(json.dumps(trees) + "\n")
@@ -153,7 +155,7 @@ def train(
 ) -> dict[str, object]:
     """Boosted oblivious trees: each level of a tree asks one question of all; logistic loss.
 
-    `simulated` (N,) tells regions of simulated flights; as a whole they weigh as much as all others. `onto` are trees
+    `simulated` (N,) marks regions of simulated flights; as a whole they weigh as much as all others. `onto` are trees
     whose answers the new ones correct.
     """
     rng = np.random.default_rng(5)

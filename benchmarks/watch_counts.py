@@ -1,4 +1,4 @@
-"""Simulated patrols with returns: is each object counted once, and does it stand where a watch says?
+"""Simulated patrols with returns: is each object counted once, and how far off is its place?
 
 python benchmarks/watch_counts.py [--seeds 304 305 306 307] [--height 60] [--output FILE]
 
@@ -68,14 +68,14 @@ def main() -> None:
         ])),
         "missed": sum(each["missed"] for each in patrols), "extra": sum(each["extra"] for each in patrols),
         "rms_m": _rms(errors_m), "standing_rms_m": _rms(standing_m), "inside_95": float(np.mean(inside)),
-        "patrols": [{key: value for key, value in each.items() if key in _TOLD} for each in patrols],
+        "patrols": [{key: value for key, value in each.items() if key in _OF_A_PATROL} for each in patrols],
     }
     options.output.parent.mkdir(exist_ok=True)
     options.output.write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps(result, indent=1))
 
 
-_TOLD = ("seed", "seen", "counted", "missed", "extra", "rms_m")
+_OF_A_PATROL = ("seed", "seen", "counted", "missed", "extra", "rms_m")
 
 
 def patrol(seed: int, height_m: float) -> dict[str, Any]:
