@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import BoxesPx, TimesNs, frozen
+from sorvolo.geometry.arrays import BoxesPx, Labels, frozen
 from sorvolo.survey.flight import Notice
 
 
@@ -24,7 +24,7 @@ class LabelledPicture:
     height_px: int
     group: str
     boxes_px: BoxesPx
-    labels: TimesNs
+    labels: Labels
     ignored_px: BoxesPx
     m_per_px: float = float("nan")
 
