@@ -51,8 +51,8 @@ Rows: TypeAlias = NDArray[np.integer[Any]]
 Descriptors: TypeAlias = NDArray[np.uint8] | NDArray[np.float32]
 """(N, B) features: B bytes each (ORB, A-KAZE), or B float32 (SIFT, learned ones)."""
 
-Labels: TypeAlias = NDArray[np.integer[Any]]
-"""(N,) or (height, width) class or region numbers."""
+Labels: TypeAlias = NDArray[np.int64]
+"""(N,) class numbers."""
 
 Anything: TypeAlias = NDArray[Any]
 """An array of any type."""
