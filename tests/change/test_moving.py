@@ -54,12 +54,6 @@ def test_a_walker_straight_against_the_drone_keeps_its_size_and_so_is_no_ghost()
     assert [each.kind for each in final] == [ChangeKind.MOVING]
 
 
-@pytest.mark.parametrize(("length_m", "speed"), [(1.2, 1.3), (1.6, 1.3), (2.0, 1.3), (2.0, 1.6)])
-def test_a_long_walker_against_the_drone_is_no_change_of_the_ground_in_the_end(length_m, speed):
-    _, final = events(flight([Thing(4, 3, (length_m, 0.4), velocity_m_s=(-speed, 0))]))
-    assert [each.kind for each in final] == [ChangeKind.MOVING]
-
-
 def test_what_stays_where_somebody_walks_by_is_kept():
     walks, stays = Thing(0, -2, (0.5, 0.5), velocity_m_s=(0.2, 1.4)), Thing(0.7, 0, (0.6, 0.6), colour=(40, 40, 200))
     _, final = events(flight([walks, stays]))

@@ -59,7 +59,8 @@ def test_where_nothing_else_was_seen_twice_nothing_is_known():
 
 def test_calm_ground_leaves_a_score_as_it_is_and_restless_ground_hardly_anything():
     def score(restless: float) -> float:
-        tally = Tally(0, 0, 4, 8, 1, 2, 2.8, whole=4, camera_low_m=(0, 0, 10), camera_high_m=(20, 0, 10))
+        far_apart = {"camera_low_m": (0, 0, 10), "camera_high_m": (20, 0, 10)}
+        tally = Tally(0, 0, views=4, asked=8, score_sum=2.8, whole=4, **far_apart)
         return sureness(replace(tally, restless=restless), AnnounceSettings())
 
     assert score(0.01) > 0.9 * score(0.0)

@@ -19,8 +19,6 @@ from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 SHOWS = 0.12
 """Share of a candidate's cells that a view must flag to show it: from above a person covers few of them."""
 
-_ASIDE = 0.15  # of the flying height: views from further aside count less
-_LEAST_WEIGHT = 0.1
 _SEEN, _ALL_SEEN = 0.5, 0.99  # shares of its cells: a view that sees fewer is not asked; the place is that of all
 _MOST_PLACES = 64
 _MOST_SEEDS = 256
@@ -38,10 +36,6 @@ class KeptView:
     valid: Mask
     residual_m: float  # of its alignment with the map
     counts: bool
-
-    def weight(self, window: CellWindow, cell_m: float) -> float:
-        """What it counts in the share of a candidate there; nothing if the camera stands where it stood before."""
-        return upright_weight(self.camera_m, np.mean(window.box_m(cell_m), axis=0)) * self.counts
 
 
 class Candidate:
@@ -80,9 +74,9 @@ class Candidate:
         if report.seen < _SEEN:
             return
         if report.flagged < SHOWS * report.seen:
-            self.miss(view.weight(self._cells, cell_m))
+            self.miss()
             return
-        self._count(view, report, cell_m, residual_m=0.0, knows_place=True)
+        self._count(view, report, residual_m=0.0, knows_place=True)
         self.pictures.vote(view.site_from_image, view.changed, view.valid)
 
     def see(self, view: KeptView, cells: Mask, cell_m: float) -> bool:
@@ -93,9 +87,9 @@ class Candidate:
         if report.seen < _SEEN and not (is_large and report.flagged > 0):
             return False
         if report.flagged < SHOWS * report.seen:
-            self.miss(view.weight(self._cells, cell_m))
+            self.miss()
             return False
-        self._count(view, report, cell_m, view.residual_m, knows_place=report.seen > _ALL_SEEN)
+        self._count(view, report, view.residual_m, knows_place=report.seen > _ALL_SEEN)
         self._note_rim(view, cells)
         return True
 
@@ -103,18 +97,15 @@ class Candidate:
         """Count this view as for a seed: whatever shows some of it shows it; and its mask."""
         report = view.laid.report(self._cells, cells, cell_m)
         if report.flagged >= max(SHOWS * report.seen, 1e-9):
-            self._count(view, report, cell_m, view.residual_m, knows_place=report.seen > _ALL_SEEN)
+            self._count(view, report, view.residual_m, knows_place=report.seen > _ALL_SEEN)
             self.pictures.vote(view.site_from_image, view.changed, view.valid)
             self._note_rim(view, cells)
-            shown = view.laid.part_of(view.laid.flagged, self._cells, cells)
-            may_move = bool(np.mean(view.laid.part_of(view.laid.held, self._cells, cells)[shown]) > 0.5)
-            self._tally = replace(self._tally, held=self._tally.held + may_move)
         elif report.seen >= _SEEN:
-            self.miss(view.weight(self._cells, cell_m))
+            self.miss()
 
-    def miss(self, weight: float, times: int = 1) -> None:
+    def miss(self, times: int = 1) -> None:
         """One more view that could have shown it, or several, do not."""
-        self._tally = self._tally.without_view(weight, times)
+        self._tally = self._tally.without_view(times)
 
     def recount(self, views: int, asked: int) -> None:
         """Count anew what views reported: `views` of `asked` flagged what is left of it."""
@@ -167,11 +158,8 @@ class Candidate:
         self.extend(other.cells)
         return self
 
-    def _count(
-        self, view: KeptView, report: CellReport, cell_m: float, residual_m: float, *, knows_place: bool
-    ) -> None:
-        weight = view.weight(self._cells, cell_m)
-        self._tally = self._tally.with_view(view.time_ns, report.score, weight, residual_m, view.camera_m)
+    def _count(self, view: KeptView, report: CellReport, residual_m: float, *, knows_place: bool) -> None:
+        self._tally = self._tally.with_view(view.time_ns, report.score, residual_m, view.camera_m)
         if knows_place and len(self._places) < _MOST_PLACES:
             self._places.append(report.place_m)
 
@@ -230,12 +218,3 @@ class Seeds:
             if np.count_nonzero(piece & weak[part]) >= self._least_cells
         ]
         return [window for _, window in sorted(found, key=lambda each: -each[0])]
-
-
-def upright_weight(camera_m: Floats, place_m: Floats) -> float:
-    """How much a view's report on a place (2,) counts: most from right above, where also the map was seen from.
-
-    What stands tall leans away on either date when seen from aside, least from above; a change is there in all views.
-    """
-    aside = float(np.hypot(*(camera_m[:2] - place_m))) / max(float(camera_m[2]), 1e-6)
-    return _LEAST_WEIGHT + float(np.exp(-0.5 * (aside / _ASIDE) ** 2))

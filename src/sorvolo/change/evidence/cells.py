@@ -91,7 +91,7 @@ class CellReport(NamedTuple):
 class LaidView:
     """One view as cells of a window: `flagged` where it shows a change, `seen` where it knows the ground.
 
-    `score` is 255 times the sureness of the change there; `held` marks cells under things that seem to move.
+    `score` is 255 times the sureness of the change there; `held` marks cells under things that may move.
     """
 
     window: CellWindow
@@ -151,7 +151,7 @@ def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask) -> LaidVie
 
     changed = small(view.changed)
     valid = small(view.valid.view(np.uint8) * np.uint8(255))
-    score, keep_out = np.zeros((rows, columns), np.uint8), np.zeros((rows, columns), np.uint8)
+    score, in_held = np.zeros((rows, columns), np.uint8), np.zeros((rows, columns), np.uint8)
     for index in np.argsort(view.scores, kind="stable"):
         x, y, w, h = view.boxes[index]
         part = np.s_[y // shrink : -(-(y + h) // shrink), x // shrink : -(-(x + w) // shrink)]
@@ -160,7 +160,7 @@ def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask) -> LaidVie
             valid = valid if valid.flags.writeable else valid.copy()
             valid[part][changed[part] > 0] = 0
         if held[index]:
-            keep_out[part] = 255
+            in_held[part] = 255
     window = _window_of(view, cell_m)
     image_from_small = np.array([
         [shrink, 0, (shrink - 1) / 2], [0, shrink, (shrink - 1) / 2], [0, 0, 1.0]
@@ -174,8 +174,8 @@ def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask) -> LaidVie
     seen = laid(valid, cv2.INTER_LINEAR) >= 250
     _clear_behind(seen, cell_from_small)
     flagged = (laid(changed, cv2.INTER_LINEAR) >= 128) & seen
-    keeps_out = laid(keep_out, cv2.INTER_NEAREST) > 0 if held.any() else np.zeros_like(seen)
-    return LaidView(window, flagged, seen, np.where(flagged, laid(score, cv2.INTER_NEAREST), 0), keeps_out)
+    may_move = laid(in_held, cv2.INTER_NEAREST) > 0 if held.any() else np.zeros_like(seen)
+    return LaidView(window, flagged, seen, np.where(flagged, laid(score, cv2.INTER_NEAREST), 0), may_move)
 
 
 def pieces(cells: Mask, gap: int) -> Iterator[tuple[Mask, tuple[slice, slice]]]:

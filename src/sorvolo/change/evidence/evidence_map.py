@@ -35,22 +35,19 @@ from sorvolo.change.evidence.pictures import BETTER
 from sorvolo.change.motion.blob_tracker import BlobTracker, MovingSettings, Track
 from sorvolo.change.motion.moving_changes import Movers
 from sorvolo.change.shape.parts import Parts
-from sorvolo.change.shape.shadows import is_of_shade
+from sorvolo.change.shape.shadows import is_mostly_shade
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.survey.findings import Change, ComparedView
 
 _CELL_PX = 3
 _LEAST_CELL_M = 0.05
-_LASTING = 0.3  # share of all views that must flag a cell
 _PICTURES_A_VIEW, _MOST_PICTURES = 6, 30  # cut anew at most, which bounds the time a view takes ...
 _VIEWS_S = 5.0  # ... where so many come in a second; where they are seldom there is more time
 _MOVED_HEIGHTS = 0.01  # the camera's way, in flying heights, after which a view counts anew
 _ALL_CHANGED = 0.5  # share of the frame beyond which nothing in it can be followed
 _PASSING, _PASSING_VIEWS = 0.5, 8  # flagged in so much smaller a share of at least so many views than ...
 _SUREST = 97  # ... the surest of a change's cells, in per cent of them, cells are no part of it
-_NEARLY_ALL, _MOST_STAY = 0.8, 0.6  # of the views that see a cell; of the cells that any view flagged
-_GONE_VIEWS = 2  # that saw the ground without it
 _STANDS_S = 2.0  # what the same ground shows for so long stands there, however unsteady its blobs are
 _AROUND_M = 5.0  # of a change its ground may be restless: a crown's width
 _APART_M, _LEAN = 0.5, 0.2  # nearer lies the change's own rim, and within so many of its lengths what leans with it
@@ -89,7 +86,7 @@ class EvidenceMap:
 
     def __init__(self, m_per_px: float, settings: EvidenceSettings, id_prefix: str) -> None:
         self._settings, self._prefix = settings, id_prefix
-        self._rules = replace(settings.announcing, k=settings.k)
+        self._rules = settings.announcing
         self._m_per_px = m_per_px
         self._cell_m = max(_LEAST_CELL_M, _CELL_PX * m_per_px)
         self._join_m = max(settings.join_m, 3 * self._cell_m) if settings.join_m else 0.0
@@ -138,7 +135,7 @@ class EvidenceMap:
     def conclude(self) -> tuple[Change, ...]:
         """After the last view: all changes, with those that fewer than n views could see.
 
-        A change that too small a share of all views of its ground shows is withdrawn. One that a single view saw, and
+        A change that the views of its ground did not confirm is withdrawn. One that a single view saw, and
         no other could, is announced if that view was very sure, with half the score.
         """
         for seed in self._seeds:
@@ -217,9 +214,8 @@ class EvidenceMap:
     ) -> list[int]:
         """Give the cells that are certain to the candidates that they belong to, in `evidence` as well; the numbers of
         the candidates that begin with this view."""
-        laid, settings = kept_view.laid, self._settings
-        lasting = evidence.changed >= _LASTING * evidence.seen
-        sure = (evidence.votes >= settings.k) & lasting & laid.flagged
+        laid = kept_view.laid
+        sure = (evidence.votes >= self._settings.k) & laid.flagged
         if not (sure & (evidence.owner == 0)).any():
             return []
         begun = []
@@ -380,28 +376,18 @@ class EvidenceMap:
 
     def _judged(self, candidate: Candidate, *, is_over: bool) -> tuple[Verdict, Change | None]:
         """Whether a candidate is a change, and its record if its views alone make it one."""
-        tally, rules = candidate.tally, self._rules
-        is_worth_it = views_score(tally, rules) >= rules.least_score
+        rules = self._rules
+        is_worth_it = views_score(candidate.tally, rules) >= rules.least_score
         candidate.note_restlessness(self._restlessness(candidate) if is_worth_it else 0.0)
-        was_mover = is_over and candidate.number in self._announced_ns and self._was_mover(candidate)
-        tally = replace(candidate.tally, was_mover=was_mover)
-        verdict = judge(tally, rules, is_over=is_over)
+        verdict = judge(candidate.tally, rules, is_over=is_over)
         whole = self._record(candidate) if isinstance(verdict, Announce) else None
         if whole is None:
             return verdict, None
-        look = Look(whole.area_m2, whole.length_m, is_of_shade(whole))
-        return judge(replace(tally, look=look), rules, is_over=is_over), whole
+        look = Look(whole.area_m2, whole.length_m, is_mostly_shade(whole))
+        return judge(replace(candidate.tally, look=look), rules, is_over=is_over), whole
 
     def _restlessness(self, candidate: Candidate) -> float:
         return restlessness(self._grid, candidate.cells, self._cells_of(candidate), self._cell_m)
-
-    def _was_mover(self, candidate: Candidate) -> bool:
-        """Whether it is what a moving thing left in the evidence before it was known to move."""
-        tally = candidate.tally
-        if tally.asked < tally.views + _GONE_VIEWS:
-            return False
-        box = candidate.cells.box_m(self._cell_m)
-        return self._movers.were_at(*box, tally.first_seen_ns, tally.last_seen_ns)
 
     def _part(self, candidate: Candidate, now_ns: int, whole: Change | None) -> list[Change]:
         """Part a candidate, whose record is `whole`, into its things; those announced for the first time."""
@@ -442,9 +428,8 @@ class EvidenceMap:
 
     def _grow_late(self, seed: Candidate) -> None:
         """Make a candidate of what fewer than n views could see: the same share of them must show it as k of n."""
-        evidence, tally = self._grid.read(seed.cells), seed.tally
-        is_short = (tally.last_seen_ns - tally.first_seen_ns) * 1e-9 < _STANDS_S
-        if seed.number or (tally.held > 2 and is_short and not _stays(evidence)):
+        evidence = self._grid.read(seed.cells)
+        if seed.number:
             return
         cells, is_single = self._late_cells(seed, evidence)
         if is_single is None:
@@ -454,9 +439,9 @@ class EvidenceMap:
                 cells[part] &= ~piece
         if np.count_nonzero(cells) < self._least_cells:
             return
-        missed = int(evidence.seen[cells].max()) - tally.asked
+        missed = int(evidence.seen[cells].max()) - seed.tally.asked
         if missed > 0:
-            seed.miss(1.0, missed)
+            seed.miss(missed)
         seed.become(self._next_number(), is_single=is_single)
         self._grid.own(seed.cells, cells, seed.number)
         self._found[seed.number] = seed
@@ -522,13 +507,6 @@ def _passing_cells(evidence: CellEvidence, own: Mask) -> Mask:
     if share.size:
         passing[own] = (share < _PASSING * np.percentile(share, _SUREST)) & (evidence.seen[own] >= _PASSING_VIEWS)
     return passing
-
-
-def _stays(evidence: CellEvidence) -> bool:
-    """Whether most cells that any view flagged were flagged by nearly all views: what moves leaves them."""
-    ever = evidence.changed > 0
-    steady = np.count_nonzero(evidence.changed[ever] >= _NEARLY_ALL * evidence.seen[ever])
-    return bool(steady >= _MOST_STAY * np.count_nonzero(ever))
 
 
 def _number_of(change: Change) -> int:

@@ -12,9 +12,6 @@ from sorvolo.change.shape.patches import PatchWindow, cut, patch_of
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 
-# of its places in a time, how much of that time they span, and how far beside the ground they may lie
-_LEAST_POINTS, _NEARLY_ALL, _BESIDE_M = 3, 0.7, 0.3
-
 
 class Movers:
     """What moved during one flight. `see` changes it.
@@ -26,7 +23,6 @@ class Movers:
     def __init__(self, id_prefix: str, m_per_px: float, cell_m: float) -> None:
         self._prefix, self._m_per_px, self._cell_m = id_prefix, m_per_px, cell_m
         self._known: dict[int, Change] = {}  # by the tracker's number
-        self._ways: dict[int, dict[int, Floats]] = {}  # by the same number: places (2,) by time, ns
 
     @property
     def changes(self) -> tuple[Change, ...]:
@@ -48,20 +44,7 @@ class Movers:
                     announced_ns=known.announced_ns,
                 )
             self._known[track.mover] = change
-            way = self._ways.setdefault(track.mover, {})
-            way |= {each.time_ns: each.blob.place_m for each in track.points}
         return told
-
-    def were_at(self, low_m: Floats, high_m: Floats, first_ns: int, last_ns: int) -> bool:
-        """Whether one of them was in a box of ground, or right beside it, for nearly all of a time."""
-        for way in self._ways.values():
-            times = [each for each in way if first_ns <= each <= last_ns]
-            if len(times) < _LEAST_POINTS or max(times) - min(times) < _NEARLY_ALL * (last_ns - first_ns):
-                continue
-            places = np.array([way[each] for each in times])
-            if ((places > low_m - _BESIDE_M) & (places < high_m + _BESIDE_M)).all():
-                return True
-        return False
 
     def _change(self, view: ComparedView, track: Track, change_id: str) -> Change:
         """A moving thing as this view shows it."""

@@ -15,13 +15,12 @@ from sorvolo.geometry.arrays import Anything, Floats, ImageRGBA, Mask
 from sorvolo.survey.findings import ChangeKind, Patch
 
 _SIGNS = 6
-_REPLACED_PRIOR = 0.5  # seldom does one thing leave where another comes
+_REPLACED_PRIOR = 0.5  # seldom does one thing leave where another comes; else snow is a hundred things
 # seeds 241 and 242 of the presets compare, compare-urban and compare-dirt with 44 changes each: as they are, in another
 # light, with the thing's contrast shrunk to 45 %, and replaced by a thing of other colours
 _OWN = np.array([0.88, 0.39, 0.61, 1.53, 1.5, 0.17])  # of the date's own signs
 _OTHER = np.array([-0.32, -0.12, -0.3, -0.36, -0.4, 0.11])  # of the other date's
 _BIAS = 0.55
-_FAR = 4.0  # spreads of the ground's colours
 _MOST_SAMPLED = 8192  # pixels: more do not make a median surer
 _LEVELS = np.arange(256, dtype=np.float32)
 
@@ -71,21 +70,6 @@ def stands_out(picture: ImageRGBA, changed: Mask) -> Floats:
         float(np.mean(slope[rim])) / rest, float(np.mean(outward)) / rest, float(np.mean(slope[inside])) / rest,
     ]
     return np.log(np.array(signs) + 0.05)
-
-
-def unlike_ground(picture: ImageRGBA, changed: Mask) -> Mask:
-    """Where (h, w) a picture's colours lie far from those of the ground around a changed region, in its own spread."""
-    known = picture[..., 3] == 255
-    reach = _reach_px(changed)
-    grown, near = (
-        cv2.dilate(changed.view(np.uint8), np.ones((side, side), np.uint8)) > 0 for side in (2 * reach + 7, 7)
-    )
-    around = known & grown & ~near
-    if not around.any():
-        return np.zeros(changed.shape, bool)
-    lab = _lab(cv2.medianBlur(_rgb(picture), 5))
-    middle, spread = _middle_and_spread(lab, around)
-    return np.asarray((_length((lab - middle) / spread) > _FAR) & known)
 
 
 def _rgb(picture: ImageRGBA) -> Anything:

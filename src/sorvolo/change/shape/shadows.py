@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.shape.kinds import kind_of, median_ratio, unlike_ground
+from sorvolo.change.shape.kinds import kind_of, median_ratio
 from sorvolo.change.shape.outlines import measures, outline_of
 from sorvolo.geometry.arrays import Anything, ImageRGB, Mask
 from sorvolo.survey.findings import Change, ChangeKind, Patch
@@ -25,16 +25,9 @@ _APART_M = 0.5  # things so far from each other are two ...
 _NECK_M, _GAP_M = 0.25, 0.4  # what hangs together by less, or lies so far apart, is not one piece
 _LEAST_THING_M2 = 0.035  # ... if each is as large as a football at least ...
 _COMPACT, _CAR_M = 0.8, (1.2, 6.0)  # ... and both together do not fill what may be one dark car with bright parts
-_CAR_WIDTH_M, _BRIGHT = 2.7, 0.5  # at most; share of a dark car that its bright parts are at most
-_SLIVER_M, _LEAST_CONTRARY_M2, _MOSTLY = 0.15, 0.15, 0.5  # what came beside what left: its width, size, and share ...
-_LEAST_HALF_M = 0.12  # ... how far its middle lies from its rim: a painted line is narrower ...
-_SOLID, _MOST_SHARED = 0.45, 0.05  # ... how much of its hull it fills, and of the smaller hull the other's shares
-_LEAST_CAR_M2, _MOST_UNLIKE, _TOUCHING_M = 3.0, 2.0, 0.2  # a car; sizes of two that are alike; no gap is seen
+_SOLID = 0.45  # a thing fills so much of its hull: specks of a dark thing scatter
 _CLEARLY, _SHADE = 0.8, 0.7  # of the light: darker is a shadow's core; and so much of a piece of shade is
-_SPECK_M2, _SPECK_SCORE = 0.2, 0.6  # smaller and less sure it is taken for one
-_LEAST_SHADE, _LEAST_SAME = 0.15, 0.2  # of a change, where a shadow left and where it came; where nothing changed
-_SAME = 1.1  # of the light
-_COARSE_M = 0.05  # a pixel: finer shows no more of what came and what left
+_SPECK_M2 = 0.2  # what is smaller may be a speck of shade
 _CONTRARY = {ChangeKind.APPEARED: ChangeKind.DISAPPEARED, ChangeKind.DISAPPEARED: ChangeKind.APPEARED}
 
 
@@ -55,23 +48,13 @@ def without_shadow(change: Change) -> Change:
     return replace(change, outline_m=outline_m, area_m2=size.area_m2, length_m=size.length_m)
 
 
-def is_of_shade(change: Change) -> bool:
-    """Whether a change is so unsure, and so much of it shade, that it is a shadow of something that stays.
-
-    Most of something small is ground that grew darker or brighter, all colours alike: where a shadow came, left, or
-    both, for it moved. Of something larger a shadow left one side and came on another, and what is between is the same.
-    """
-    if change.score >= _SPECK_SCORE:
+def is_mostly_shade(change: Change) -> bool:
+    """Whether most of a small change is ground that all colours show darker or brighter: a shadow came or left."""
+    if change.area_m2 >= _SPECK_M2:
         return False
+    came, left = _OneLight(change.patch).shades()
     changed = change.patch.changed
-    light = _OneLight(change.patch)
-    came, left = light.shades()
-    if change.area_m2 < _SPECK_M2 and _is_part(changed, came | left):
-        return True
-    same = changed & light.same()
-    of_moved = (came, _LEAST_SHADE), (left, _LEAST_SHADE), (same, _LEAST_SAME)
-    has_moved = all(np.count_nonzero(each) >= least * np.count_nonzero(changed) for each, least in of_moved)
-    return has_moved and _is_part(changed, came | left | same)
+    return bool(np.count_nonzero(changed & (came | left)) >= _SHADE * np.count_nonzero(changed))
 
 
 def thing_of(changed: Mask, shadow: Mask) -> Mask:
@@ -132,24 +115,14 @@ def _things_of_group(
     patch: Patch, kind: ChangeKind, changed: Mask, light: "_OneLight"
 ) -> list[tuple[Mask, ChangeKind]]:
     """The things in one piece of a change, as `things_of` gives them."""
+    if _may_be_a_car(changed, patch.m_per_px):
+        return [(changed, kind)]
     shadow = changed & light.shadow(kind)
-    lit = (changed & ~shadow).view(np.uint8)
-    lit = np.asarray(cv2.morphologyEx(lit, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), np.uint8)
-    left, came = _contraries(patch, changed, light)
-    lit |= (left | came).view(np.uint8)
-    shadow &= ~left
-    of_left = np.where(came, 0, _joined(left, patch.m_per_px))
-    labels = _joined((lit > 0) & (of_left == 0), patch.m_per_px)
-    labels = np.where(of_left > 0, labels.max() + of_left, labels)
+    lit: Anything = cv2.morphologyEx((changed & ~shadow).view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    labels = _joined(np.asarray(lit > 0), patch.m_per_px)
     areas_m2 = np.bincount(labels[lit > 0]) * patch.m_per_px**2
-    large = [label for label in np.argsort(-areas_m2) if areas_m2[label] >= max(_LEAST_THING_M2, 1e-9)]
-    things = [(labels == each) & (lit > 0) for each in large]
-    if len(things) > 1 and not left.any():
-        if _may_be_a_car(changed, patch.m_per_px):
-            return [(changed, kind)]
-        # specks of a dark thing scatter
-        solid = [each for each in things if np.count_nonzero(each) >= _SOLID * np.count_nonzero(_hull(each))]
-        things = _with_cars_whole(solid, changed, patch.m_per_px)
+    large = [(labels == each) & (lit > 0) for each in np.argsort(-areas_m2) if areas_m2[each] >= _LEAST_THING_M2]
+    things = [each for each in large if np.count_nonzero(each) >= _SOLID * np.count_nonzero(_hull(each))]
     if len(things) < 2:
         return [(changed, kind)]
     distances = [cv2.distanceTransform((~each).view(np.uint8), cv2.DIST_L2, 5) for each in things]
@@ -173,75 +146,6 @@ def _joined(mask: Mask, m_per_px: float) -> NDArray[np.int32]:
     padded = cv2.copyMakeBorder(mask.view(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0)
     joined = cv2.dilate(padded, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
     return np.asarray(cv2.connectedComponents(joined[reach:-reach, reach:-reach], connectivity=8)[1], np.int32)
-
-
-def _contraries(patch: Patch, changed: Mask, light: "_OneLight") -> tuple[Mask, Mask]:
-    """What left and what came beside it (h, w), part of what `changed`; both empty where not both happened.
-
-    What only the earlier picture tells from the ground around left, what only the later one does came; each must be
-    most of what its picture shows, for a thing that took another's place is no neighbour of it.
-    """
-    nothing = np.zeros_like(changed)
-    if np.count_nonzero(changed) * patch.m_per_px**2 < 2 * _LEAST_CONTRARY_M2:
-        return nothing, nothing
-    size = tuple(max(1, round(side * min(1.0, patch.m_per_px / _COARSE_M))) for side in changed.shape[::-1])
-    before, after, small = (
-        np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_AREA), np.uint8)
-        for each in (patch.before, patch.after, changed.view(np.uint8) * np.uint8(255))
-    )
-    m_per_px = patch.m_per_px * changed.shape[1] / size[0]
-    was_there, is_there = ((small > 127) & unlike_ground(each, small > 127) for each in (before, after))
-    side = max(3, round(_SLIVER_M / m_per_px) | 1)
-    left, came = (
-        cv2.morphologyEx((own & ~other).view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
-        for own, other in ((was_there, is_there), (is_there, was_there))
-    )
-    is_both = all(
-        np.count_nonzero(own) * m_per_px**2 >= _LEAST_CONTRARY_M2
-        and cv2.distanceTransform(own.view(np.uint8), cv2.DIST_L2, 3).max() * m_per_px > _LEAST_HALF_M
-        and np.count_nonzero(own) >= _MOSTLY * np.count_nonzero(whole)
-        for own, whole in ((left, was_there), (came, is_there))
-    )
-    if is_both:
-        hulls = _hull(left), _hull(came)
-        sizes = [np.count_nonzero(each) for each in hulls]
-        is_solid = all(np.count_nonzero(own) >= _SOLID * size for own, size in zip((left, came), sizes, strict=True))
-        if is_solid and np.count_nonzero(hulls[0] & hulls[1]) <= _MOST_SHARED * min(sizes):
-            left, came = (changed & (cv2.resize(each.view(np.uint8), changed.shape[::-1]) > 0) for each in (left, came))
-            if _are_one_place(left, came, patch.m_per_px):
-                return nothing, nothing
-            # the shadow of something that stays leaves one side and comes on another
-            new_shade, old_shade = light.shades()
-            if not (_is_part(left, old_shade) and _is_part(came, new_shade)):
-                return left, came & ~left
-    return nothing, nothing
-
-
-def _are_one_place(left: Mask, came: Mask, m_per_px: float) -> bool:
-    """Whether a car left and one of about its size came so close that it took its place."""
-    sizes_m2 = sorted(np.count_nonzero(each) * m_per_px**2 for each in (left, came))
-    if sizes_m2[0] < max(_LEAST_CAR_M2, sizes_m2[1] / _MOST_UNLIKE):
-        return False
-    distance = cv2.distanceTransform((~left).view(np.uint8), cv2.DIST_L2, 5)
-    return float(distance[came].min()) * m_per_px < _TOUCHING_M
-
-
-def _is_part(mask: Mask, other: Mask) -> bool:
-    return bool(np.count_nonzero(mask & other) >= _SHADE * np.count_nonzero(mask))
-
-
-def _with_cars_whole(things: list[Mask], changed: Mask, m_per_px: float) -> list[Mask]:
-    """The things, the largest first; bright ends of one dark car, with change all between them, are made one."""
-    things = list(things)
-    for first, second in combinations(range(len(things)), 2):
-        both = things[first] | things[second]
-        hull = _hull(both)
-        wide_m = min(float(each) for each in cv2.minAreaRect(cv2.findNonZero(both.view(np.uint8)))[1]) * m_per_px
-        is_dark = np.count_nonzero(both) < _BRIGHT * np.count_nonzero(hull)
-        if is_dark and wide_m <= _CAR_WIDTH_M and _may_be_a_car(hull & changed, m_per_px):
-            things[first], things[second] = np.zeros_like(both), both
-    kept = [each for each in things if each.any()]
-    return sorted(kept, key=lambda each: -np.count_nonzero(each))
 
 
 def _may_be_a_car(changed: Mask, m_per_px: float) -> bool:
@@ -291,12 +195,6 @@ class _OneLight:
         """Where what changed is clearly darker on the later date, all colours alike, and where on the earlier."""
         came, left = (self._whole(dark & (most < _CLEARLY)) & self._changed for dark, most in self._dark)
         return came, left
-
-    def same(self) -> Mask:
-        """Where both dates show about the same, up to a pixel beside."""
-        window = np.ones((3, 3), np.uint8)
-        lowest, highest = cv2.erode(self._before, window) / _SAME, cv2.dilate(self._before, window) * _SAME
-        return self._whole(np.asarray(((self._after >= lowest) & (self._after <= highest)).all(axis=-1)))
 
     @cached_property
     def _dark(self) -> tuple[tuple[Mask, Anything], tuple[Mask, Anything]]:
