@@ -18,6 +18,7 @@ from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import prepare
 from sorvolo.missions.map.planar_run import PlanarRun
+from sorvolo.missions.site.history import site_history
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Frame, PosedFrame
 from sorvolo.survey.mosaic import Status
@@ -316,6 +317,17 @@ def test_the_same_flight_again_doubles_nothing(photographed: Path, tmp_path: Pat
         assert np.abs(moved_deg).max() < 1e-8  # a millimetre
     with Archive.open(site, write=False) as archive:
         assert len(archive.flights()) == 1 and len(archive.keyframes()) == 8
+    (notice,) = [each for each in report_of(site, "few")["notices"] if each["code"] == "repeated"]
+    assert "few is in this site already (version 1): it was mapped again" in notice["text"]
+
+
+def test_a_map_is_dated_by_its_flight(photographed: Path, tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    run_map(site, _some_photos(photographed, tmp_path / "few", 0, 4), "--camera", photographed / "camera.xml")
+    frames = json.loads((photographed / "truth" / "frames.geojson").read_text())["features"]
+    (version,) = site_history(site)
+    assert version.flown_utc[:19] == frames[0]["properties"]["time"][:19]
+    assert version.flown_utc[:10] != version.date_utc[:10]
 
 
 def test_the_map_does_not_depend_on_when_it_was_shown_while_it_grew(
@@ -323,10 +335,10 @@ def test_the_map_does_not_depend_on_when_it_was_shown_while_it_grew(
 ) -> None:
     film = tmp_path / "film.mp4"
     shutil.copy(_film(filmed), film)  # without telemetry, whose offsets would move every frame at last
-    monkeypatch.setattr("sorvolo.missions.map.planar_run._PAINT_REST", 0)
+    monkeypatch.setattr("sorvolo.missions.map.painting._PAINT_REST", 0)
     maps = []
     for paint_every in (1, 1000):  # keyframes
-        monkeypatch.setattr("sorvolo.missions.map.planar_run._PAINT_EVERY", paint_every)
+        monkeypatch.setattr("sorvolo.missions.map.painting._PAINT_EVERY", paint_every)
         run_map(tmp_path / f"every {paint_every}", film, "--camera", filmed / "camera.xml")
         maps.append((tmp_path / f"every {paint_every}" / "mosaic.tif").read_bytes())
     assert maps[0] == maps[1]

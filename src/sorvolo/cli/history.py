@@ -60,7 +60,7 @@ def _show(entries: Sequence["HistoryEntry"], console: Console) -> None:
         console.print("no map yet: sorvolo map makes one")
         return
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in ("no", "complete (UTC)", "flight", "by", "tiles", "MB", "changes", "reviewed"):
+    for name in ("no", "flown", "complete (UTC)", "flight", "by", "tiles", "MB", "changes", "reviewed"):
         table.add_column(name, no_wrap=name not in ("flight", "changes", "reviewed"), overflow="fold")
     for each in entries:
         removed = f" (-{each.tiles_removed})" if each.tiles_removed else ""
@@ -70,7 +70,8 @@ def _show(entries: Sequence["HistoryEntry"], console: Console) -> None:
         )
         again = " (repeated later)" if each.is_replaced else ""
         table.add_row(
-            str(each.version), each.date_utc[:16].replace("T", " "), escape(each.flight) + again, each.kind,
+            str(each.version), each.flown_utc[:10] or "-", each.date_utc[:16].replace("T", " "),
+            escape(each.flight) + again, each.kind,
             f"{each.tiles_changed}/{each.tiles}{removed}", f"{each.bytes_changed / 1e6:.1f}",
             changes or ("none" if each.kind == "compare" else ""), reviewed,
         )

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sorvolo.missions.flight.settings import MapSettings
 
 _MOST_REASONS = 6
+_TO_CHECK = 3  # exit code of a flight that is mapped, but is no map, or one to check before use
 
 
 class Method(StrEnum):
@@ -92,6 +93,8 @@ def map_command(
         typer.echo(json.dumps({"site": str(site), **files, "flights": plain}, indent=1))
     else:
         show_reports(reports, site, Console())
+    if any(each["headline"]["quality"] != "map" for each in reports):
+        raise typer.Exit(_TO_CHECK)
 
 
 def map_and_read_reports(
@@ -160,6 +163,7 @@ def _show_report(report: Mapping[str, Any], console: Console) -> None:
     for name, text in (*_frame_rows(report["frames"]), *_quality_rows(report)):
         if text:
             table.add_row(name, text)
+    console.print(escape(report["headline"]["text"]), style="bold", highlight=False)
     console.print(table)
     show_notices_and_warnings(report, console)
 

@@ -16,8 +16,9 @@ from sorvolo.survey.mosaic import PlacedFrame, Status
 class FlightFigures:
     """Figures over the frames that have a place; None where nothing is known.
 
-    `gps_*` are distances between the camera and its fix; `sigma_m` is the median error stated per frame;
-    `reach_m` how far the frames' centres spread; `tilt_deg` how far the camera usually looked from straight down.
+    `gps_*` are distances between the camera and its fix; `sigma_m` is the median error stated per frame; `reach_m` is
+    how far the frames' centres spread, `diagonal_m` how long a frame is on the ground; `tilt_deg` how far the camera
+    usually looked from straight down.
     """
 
     residual_median_px: float | None
@@ -29,6 +30,7 @@ class FlightFigures:
     height_m: float | None
     native_m_per_px: float | None
     reach_m: float
+    diagonal_m: float
     tilt_deg: float
 
 
@@ -46,6 +48,7 @@ def flight_figures(placed: Sequence[PlacedFrame], focal_px: float) -> FlightFigu
         median_of_known(horizontal_m), rms_of_known(horizontal_m), median_of_known(np.abs(gps[:, 2])),
         median_of_known([each.sigma_m for each in seen]), median_of_known(heights_m),
         float(np.median(heights_m) / focal_px) if heights_m else None, _reach_m(seen),
+        float(np.median([np.linalg.norm(each.outline_m[2] - each.outline_m[0]) for each in seen])) if seen else 0.0,
         float(np.degrees(np.arccos(np.clip(-np.median(axes_up), -1, 1)))) if axes_up else 0.0,
     )
 

@@ -16,7 +16,7 @@ from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.map_objects import open_detector
 from sorvolo.missions.flight.settings import CompareSettings
-from sorvolo.missions.flight.setup import FlightSetup, known_flights, known_ground_m, prepare
+from sorvolo.missions.flight.setup import FlightSetup, known_flights, known_ground_m, prepare, repeated
 from sorvolo.mosaic.selection import every
 from sorvolo.registration.opencv_threads import single_threaded_opencv
 from sorvolo.store.site.archive import Archive
@@ -71,6 +71,7 @@ def _compare_one(
         source, settings.mapping, archive.site(), telemetry_named=telemetry_named, finds_itself=True,
         ground_m=known_ground_m(archive),
     )
+    setup = replace(setup, notices=(*setup.notices, *repeated(archive, source.name, "compared")))
     inside = setup.inside(area)
     step_s = 0.0 if source.kind == "photos" else 1.0 / settings.views_per_second
     base, is_newest = _base_version(archive, source)

@@ -200,10 +200,10 @@ class CompareRun:
         self, changes: Sequence[Change], suppressed: int, shown_as_well: int, placed: Sequence[PlacedFrame],
         notices: Sequence[Notice], started_s: float,
     ) -> dict[str, Any]:
+        result = FlightResult(placed, self._setup.source.camera.camera, makes_map=False)
         report = build_report(
-            self._setup, self._settings.mapping, self._log, FlightResult(placed, self._setup.source.camera.camera),
-            self._archive.site(), self._writer.tiles, [*notices, *self._objects.notices],
-            time.monotonic() - started_s,
+            self._setup, self._settings.mapping, self._log, result, self._archive.site(), self._writer.tiles,
+            [*notices, *self._objects.notices], time.monotonic() - started_s,
         )
         warnings = comparison_warnings(self._counts, self._views.brightness)
         comparison = comparison_summary(

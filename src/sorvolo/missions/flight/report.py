@@ -13,12 +13,14 @@ from sorvolo.capture.sync import OffsetEstimate
 from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import TileIndex
+from sorvolo.missions.flight.headline import map_headline
 from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.flight.warnings import flight_warnings
 from sorvolo.mosaic.flight_figures import FlightFigures, flight_figures, shown_m2, track_row
 from sorvolo.mosaic.pose_graph import GraphReport
+from sorvolo.store.exports.plain import utc_text
 from sorvolo.survey.flight import CameraModel, Notice, Site
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
@@ -35,6 +37,7 @@ class FlightResult:
     offset: OffsetEstimate | None = None
     graph: GraphReport | None = None
     colour_spread: float = float("nan")
+    makes_map: bool = True  # else it was compared with one
 
 
 def build_report(
@@ -54,6 +57,8 @@ def build_report(
         "method": settings.method,
         "inputs": list(source.inputs),
         "georeferenced": not site.is_local,
+        "flown": utc_text(setup.flown_ns) if setup.flown_ns else None,
+        **_headline(result, figures, is_video=source.kind == "video"),
         "frames": _frames(placed, source.frame_count),
         "camera": _camera(source.camera, result.camera, graph),
         "telemetry": _telemetry(setup),
@@ -74,6 +79,12 @@ def build_report(
         "versions": {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}},
         "track": [track_row(each) for each in placed],
     }
+
+
+def _headline(result: FlightResult, figures: FlightFigures, *, is_video: bool) -> dict[str, Any]:
+    if not result.makes_map:
+        return {}
+    return {"headline": asdict(map_headline(result.placed, figures, is_video=is_video))}
 
 
 def _frames(placed: Sequence[PlacedFrame], total: int) -> dict[str, Any]:

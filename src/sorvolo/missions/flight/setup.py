@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sorvolo.capture.flight_telemetry import FlightTelemetry, TelemetryWishes, distance_m, duration_s, local_prior
 from sorvolo.capture.source import LiveSource, Source
-from sorvolo.capture.sync import Clock, Track, site_origin
+from sorvolo.capture.sync import DATED_NS, Clock, Track, site_origin
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame, utm_epsg
@@ -62,6 +62,12 @@ class FlightSetup:
         if self.clock is None or self.source.kind == "photos":
             return time_ns
         return time_ns - self.source.start_ns + self.clock.first_frame_utc_ns
+
+    @property
+    def flown_ns(self) -> int:
+        """UTC of the first frame; 0 where neither the frames nor the telemetry are dated."""
+        first_ns = self.utc_ns(self.source.start_ns)
+        return first_ns if first_ns > DATED_NS else 0
 
     def inside(self, area: Area | None) -> Callable[[PosedFrame], bool]:
         """Whether a frame was taken within the area of interest; frames of unknown place count as inside."""
@@ -180,6 +186,20 @@ def new_site(setup: FlightSetup, name: str, m_per_px: float, ground_up_m: float)
     origin = Geodetic(setup.frame.origin.latitude_deg, setup.frame.origin.longitude_deg, round(ground_m, 3))
     crs = f"EPSG:{utm_epsg(origin.latitude_deg, origin.longitude_deg)}"
     return Site(name, origin, crs, m_per_px, height_reference=reference)
+
+
+def repeated(archive: Archive, flight: str, done: str) -> tuple[Notice, ...]:
+    """The notice of a flight that the site has already: the version that it made is replaced, not painted over."""
+    if not archive.has_site:
+        return ()
+    made = [each.id for each in archive.versions() if each.complete and each.flight_id == flight]
+    if not made:
+        return ()
+    return (Notice(
+        "repeated", 1,
+        f"{flight} is in this site already (version {made[-1]}): it was {done} again, and the new version replaces "
+        "what it had made",
+    ),)
 
 
 def known_ground_m(archive: Archive) -> PointsM | None:

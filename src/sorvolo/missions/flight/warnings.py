@@ -6,8 +6,9 @@ from sorvolo.missions.flight.log import FlightLog
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.flight_figures import FlightFigures
 from sorvolo.survey.mosaic import PlacedFrame, Status
+from sorvolo.survey.wording import counted, plural
 
-_OBLIQUE_DEG = 35.0  # pictures that look to opposite sides share too little to be linked
+OBLIQUE_DEG = 35.0  # pictures that look to opposite sides share too little to be linked
 _MANY = 0.1  # share of the frames
 _BAD_FIT_PX = 3.0
 _OFF_M, _OFF_SHARE = 8.0, 0.25  # by which telemetry may disagree: metres, and a share of how far the flight reaches
@@ -19,24 +20,27 @@ def flight_warnings(
 ) -> list[str]:
     """The warnings of a flight's report."""
     return [
-        *_frame_warnings(placed), *_fit_warnings(placed, figures), *_camera_warnings(figures, setup),
+        *_frame_warnings(placed), *contradictions(placed, figures), *_camera_warnings(figures, setup),
         *_clock_warnings(setup, log),
     ]
 
 
 def _frame_warnings(placed: Sequence[PlacedFrame]) -> list[str]:
-    warnings = []
     lost = sum(each.status is Status.REJECTED for each in placed)
-    if lost > _MANY * len(placed):
-        warnings.append(f"{lost} of {len(placed)} frames have no place in the map; `reasons` lists why")
+    if lost <= _MANY * len(placed):
+        return []
+    return [f"{lost} of {counted(len(placed), 'frame')} have no place in the map; `reasons` lists why"]
+
+
+def contradictions(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
+    """What makes the map itself doubtful: steps in it, or pictures and telemetry that do not agree."""
+    warnings = []
     by_gps = sum(each.status is Status.GPS_ONLY for each in placed)
     if by_gps > _MANY * len(placed):
-        warnings.append(f"{by_gps} frames are placed by GPS alone: expect steps of some metres at their edges")
-    return warnings
-
-
-def _fit_warnings(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
-    warnings = []
+        warnings.append(
+            f"{counted(by_gps, 'frame')} {plural('is', by_gps)} placed by GPS alone: expect steps of some metres at "
+            "their edges"
+        )
     seen = sum(each.status is not Status.REJECTED for each in placed)
     off_m = figures.gps_median_m
     if off_m is not None and seen > 3 and off_m > max(_OFF_SHARE * figures.reach_m, _OFF_M):
@@ -51,7 +55,7 @@ def _fit_warnings(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list
 
 def _camera_warnings(figures: FlightFigures, setup: FlightSetup) -> list[str]:
     warnings = []
-    if setup.track is not None and setup.track.attitude == "none" and figures.tilt_deg > _OBLIQUE_DEG:
+    if setup.track is not None and setup.track.attitude == "none" and figures.tilt_deg > OBLIQUE_DEG:
         warnings.append(
             f"the camera looks {figures.tilt_deg:.0f} deg away from straight down and telemetry has no camera angles: "
             "strips flown in opposite directions may not fit each other; give telemetry with the camera's angles"

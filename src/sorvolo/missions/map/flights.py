@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Generator, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from sorvolo.capture.areas import read_area
@@ -12,7 +13,7 @@ from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.glimpses import refuse_without_texture
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.settings import MapSettings
-from sorvolo.missions.flight.setup import known_flights, known_ground_m, prepare
+from sorvolo.missions.flight.setup import known_flights, known_ground_m, prepare, repeated
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.missions.map.thesis_run import ThesisRun
@@ -58,6 +59,7 @@ def _map_one(
         ground_m=known_ground_m(archive),
     )
     refuse_without_texture(source)
+    setup = replace(setup, notices=(*setup.notices, *repeated(archive, source.name, "mapped")))
     make = ThesisRun if settings.method == "thesis" else PlanarRun
     finder = None if detector is None else ObjectFinder(detector, source.camera.camera)
     with make(setup, archive, settings, finder=finder) as run:

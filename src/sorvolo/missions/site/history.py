@@ -1,7 +1,7 @@
 """The map of a site as it was: its versions listed, one found by number or date, one written as a file."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, time, timedelta
 from pathlib import Path
@@ -21,6 +21,7 @@ _ENDINGS = (".tif", ".tiff", ".png", ".kmz")
 class HistoryEntry:
     """One version of the map. `changes` counts by kind, `{}` for a version that mapping made.
 
+    `date_utc` is when the version was complete, `flown_utc` when its flight's first frame was taken ("": not known).
     `over` is the version it was painted over (0: none), `tiles_changed` and `bytes_changed` what it has that that one
     has not. `confirmed` and `rejected` count the verdicts on the changes its flight has now; 0 for a version whose
     flight was mapped or compared again since (`is_replaced`).
@@ -28,6 +29,7 @@ class HistoryEntry:
 
     version: int
     date_utc: str
+    flown_utc: str
     flight: str
     kind: str  # map | compare
     over: int
@@ -48,19 +50,32 @@ def site_history(site: Path) -> list[HistoryEntry]:
         last_of = {version.flight_id: version.id for version in versions}
         comparisons = archive.comparisons()
         verdicts = [(each.flight_id, each.verdict) for each in archive.changes()]
-        result = []
-        for version in versions:
-            difference = archive.tile_difference(version)
-            is_last = last_of[version.flight_id] == version.id
-            result.append(HistoryEntry(
-                version.id, version.created_utc, version.flight_id, "compare" if version.id in comparisons else "map",
-                version.parent_id, version.tiles, difference.changed, difference.removed, difference.changed_bytes,
-                {kind: count for kind, count in comparisons.get(version.id, {}).items() if count},
-                verdicts.count((version.flight_id, Verdict.CONFIRMED)) if is_last else 0,
-                verdicts.count((version.flight_id, Verdict.REJECTED)) if is_last else 0,
-                not is_last,
-            ))
-        return result
+        return [
+            _entry(archive, each, comparisons.get(each.id), verdicts if last_of[each.flight_id] == each.id else None)
+            for each in versions
+        ]
+
+
+def _entry(
+    archive: Archive, version: VersionEntry, changes: Mapping[str, int] | None,
+    verdicts: Sequence[tuple[str, Verdict | None]] | None,
+) -> HistoryEntry:
+    """A version; `changes` is None for one that mapping made, `verdicts` for one that was replaced since."""
+    difference = archive.tile_difference(version)
+    given = verdicts or ()
+    return HistoryEntry(
+        version.id, version.created_utc, flown_utc(archive, version.flight_id), version.flight_id,
+        "map" if changes is None else "compare",
+        version.parent_id, version.tiles, difference.changed, difference.removed, difference.changed_bytes,
+        {kind: count for kind, count in (changes or {}).items() if count},
+        given.count((version.flight_id, Verdict.CONFIRMED)), given.count((version.flight_id, Verdict.REJECTED)),
+        verdicts is None,
+    )
+
+
+def flown_utc(archive: Archive, flight_id: str) -> str:
+    """When the flight's first frame was taken, ISO 8601 UTC; "" where nothing of it is dated."""
+    return str(archive.report(flight_id).get("flown") or "")
 
 
 def find_version(archive: Archive, at: str) -> VersionEntry:

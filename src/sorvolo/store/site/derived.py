@@ -88,7 +88,7 @@ def write_change_files(files: SiteFiles, flight_id: str, version: VersionEntry |
     made = {each.id: each for each in files.versions()}
     page = changes_page(
         files.report(flight_id), changes, before, after, site, crops,
-        before_words=_words_of(made.get(version.parent_id)), after_words=_words_of(version),
+        before_words=_words_of(files, made.get(version.parent_id)), after_words=_words_of(files, version),
     )
     atomic_write_bytes(folder / "changes.html", page.encode())
 
@@ -136,10 +136,13 @@ def _before_and_after(
     return before, after
 
 
-def _words_of(version: VersionEntry | None) -> str:
+def _words_of(files: SiteFiles, version: VersionEntry | None) -> str:
+    """A version by its flight and when that was flown; where nothing of it is dated, when the version was made."""
     if version is None:
         return "no map yet"
-    return f"version {version.id}: flight {version.flight_id}, {version.created_utc[:10]}"
+    flown = str(files.report(version.flight_id).get("flown") or "")
+    date = f"flown {flown[:10]}" if flown else f"mapped {version.created_utc[:10]}"
+    return f"version {version.id}: flight {version.flight_id}, {date}"
 
 
 def _crops(files: SiteFiles, flight_id: str, change_id: str) -> tuple[ImageRGBA | None, ImageRGBA | None]:

@@ -1,0 +1,76 @@
+"""The first line of a mapped flight: no map, a map to check, or a map; the exit code says the same."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sorvolo.cli.main import main
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.homography import site_from_image_homography
+from sorvolo.geometry.level_ground import footprint
+from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
+from sorvolo.missions.flight.headline import MapQuality, map_headline
+from sorvolo.mosaic.flight_figures import flight_figures
+from sorvolo.store.exports.flight_files import video_writer
+from sorvolo.survey.mosaic import PlacedFrame, Status
+
+_CAMERA = Camera.from_angle_of_view(640, 480, 60)
+
+
+def placed(
+    east_m: float, status: Status = Status.VISION, pitch_deg: float = -90.0, residual_px: float = 0.3,
+    off_m: float = 0.4,
+) -> PlacedFrame:
+    pose = Pose(site_from_gimbal_rotation(0, pitch_deg, 0), np.array([east_m, 0.0, 30.0]))
+    return PlacedFrame(
+        str(east_m), int(east_m), 0, status, "", _CAMERA, pose, site_from_image_homography(_CAMERA, pose),
+        footprint(_CAMERA, pose), residual_px, 0.5, gps_residual_m=np.array([off_m, 0.0, 0.0]),
+    )
+
+
+def quality_of(frames: list[PlacedFrame], *, is_video: bool = True) -> MapQuality:
+    return map_headline(frames, flight_figures(frames, _CAMERA.fx_px), is_video=is_video).quality
+
+
+def test_frames_that_fit_each_other_are_a_map() -> None:
+    frames = [placed(10.0 * k) for k in range(8)]
+    assert quality_of(frames) is MapQuality.MAP
+    headline = map_headline(frames, flight_figures(frames, _CAMERA.fx_px), is_video=True)
+    assert headline.text == "8 of 8 frames matched"
+
+
+@pytest.mark.parametrize("frames, why", [
+    ([placed(0.0)], "hovered"), ([placed(0.1 * k) for k in range(5)], "5 frames show one view"),
+    ([placed(0.0, pitch_deg=-45.0)], "45 deg away from straight down"),
+])
+def test_a_video_of_one_view_is_no_map(frames: list[PlacedFrame], why: str) -> None:
+    headline = map_headline(frames, flight_figures(frames, _CAMERA.fx_px), is_video=True)
+    assert headline.quality is MapQuality.ONE_VIEW and headline.text.startswith("no map:") and why in headline.text
+    assert quality_of(frames, is_video=False) is MapQuality.MAP, "each photo was meant"
+
+
+@pytest.mark.parametrize("frames, why", [
+    ([placed(10.0 * k, Status.GPS_ONLY if k == 2 else Status.VISION) for k in range(8)], "1 frame is placed by GPS"),
+    ([placed(10.0 * k, residual_px=4.0) for k in range(8)], "badly"),
+    ([placed(10.0 * k, off_m=60.0) for k in range(8)], "disagree by 60 m"),
+])
+def test_steps_and_contradictions_make_a_map_to_check(frames: list[PlacedFrame], why: str) -> None:
+    headline = map_headline(frames, flight_figures(frames, _CAMERA.fx_px), is_video=True)
+    assert headline.quality is MapQuality.DOUBTFUL and why in headline.text
+
+
+def test_a_video_from_one_place_ends_with_a_warning_and_its_own_exit_code(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(5)
+    ground = cv2.resize(rng.integers(0, 255, (60, 80, 3), np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
+    with video_writer(tmp_path / "hover.mp4", (320, 240), 10.0, 1_780_000_000 * 10**9, 18) as write:
+        for _ in range(30):
+            write(ground)
+    assert main(["map", str(tmp_path / "hover.mp4"), "--site", str(tmp_path / "site"), "--model", "none"]) == 3
+    assert "no map:" in capsys.readouterr().out
+    report = json.loads((tmp_path / "site/flights/hover/report.json").read_text())
+    assert report["headline"]["quality"] == "one-view"
