@@ -62,7 +62,7 @@ def main() -> None:
             measured = evaluate_detector([[options.model]], [labelled], settings)
         runs[name] = figures(measured.sets[0]) | {
             "seconds_per_picture": measured.found.seconds_per_picture,
-            "people_by_centre": people_by_centre(labelled, measured.found.sets[labelled.name]),
+            "people_by_centre": people_by_centre(labelled, measured.found.sets[labelled.name], measured.found.classes),
         }
         print(name, json.dumps(plain_json(runs[name]["classes"])), flush=True)
         if options.out is not None:
@@ -151,13 +151,15 @@ def figures(scores) -> dict[str, object]:
     }
 
 
-def people_by_centre(labelled: LabelledSet, found: FoundSet) -> dict[str, float | int] | None:
+def people_by_centre(
+    labelled: LabelledSet, found: FoundSet, classes: tuple[str, ...]
+) -> dict[str, float | int] | None:
     """How many people are found if a told box's centre within the label is enough, for sets with loose boxes.
 
     At the model's own threshold; None where no person is labelled. `found` and `right` are shares of the labels and of
     the told boxes; boxes whose centre lies in a region to ignore are left out.
     """
-    own, told = labelled.classes.index("person"), found.classes.index("person")
+    own, told = labelled.classes.index("person"), classes.index("person")
     labels = hits = boxes = right = 0
     for picture, seen in zip(labelled.pictures, found.detections):
         people = picture.boxes_px[picture.labels == own]

@@ -40,7 +40,7 @@ def main() -> None:
     for model in wishes.models:
         detector = Detector.load(model, provider="cpu", threads=1)
         name = Path(model).stem
-        found[name] = {flight: looked(detector, wishes.flights / flight, wishes.out) for flight in FIRST}
+        found[name] = {flight: looked(detector, wishes.flights / flight, wishes.out and wishes.out / name) for flight in FIRST}
         for flight, rows in found[name].items():
             for label in SHOWN:
                 if (count := right.get(f"{name}:{flight}:{label}")) is not None:
@@ -71,7 +71,7 @@ def looked(detector: Detector, folder: Path, out: Path | None) -> dict:
         out.mkdir(parents=True, exist_ok=True)
         for label, each in crops.items():
             if each:
-                cv2.imwrite(str(out / f"{detector.info.name}-{folder.name}-{label}.png"), sheet(each))
+                cv2.imwrite(str(out / f"{folder.name}-{label}.png"), sheet(each))
     return {"photos": len(paths)} | {
         label: {
             "threshold": detector.info.thresholds[label], "reports": len(each),

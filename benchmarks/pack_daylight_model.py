@@ -62,7 +62,7 @@ def main() -> None:
     model = joined(wishes.nanodet, wishes.aerial, wishes.judge / "judge.pt", learnt)
     sources = (*SOURCES, *TRAINED_ON)
     info: dict[str, Any] = {
-        "name": "default", "version": VERSION, "preset": "daylight", "classes": list(CLASSES), "thermal": False,
+        "name": "default", "version": VERSION, "preset": "fast", "classes": list(CLASSES), "thermal": False,
         "thermal_by": "thermal", "thresholds": {**learnt["thresholds"], CLASSES[2]: SMALL_THRESHOLD},
         "on_request": [CLASSES[2]], "best_px": BEST_PX, "stride": model.stride,
         "licence": "CC-BY-SA-4.0", "created": CREATED,

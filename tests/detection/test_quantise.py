@@ -122,7 +122,7 @@ def test_convolutions_of_the_head_before_a_fully_connected_layer_are_whole_numbe
 
 
 def test_parts_that_are_named_stay_in_float(model: Path) -> None:
-    packaged = find_model("default")
+    packaged = find_model("thermal")
     whole = quantise(packaged, _pictures(8))
     backbone = quantise(packaged, _pictures(8), float_parts=("neck", "proposals"))
     assert 20 < backbone.convolutions < whole.convolutions
@@ -133,6 +133,21 @@ def test_parts_that_are_named_stay_in_float(model: Path) -> None:
         quantise(packaged, _pictures(8), float_parts=("tail",))
     with pytest.raises(SettingsError, match="no part neck"):
         quantise(model, _pictures(8), float_parts=("neck",))
+
+
+def test_weights_stored_in_half_are_quantised_as_others(model: Path, tmp_path: Path) -> None:
+    graph = onnx.load_model(model)
+    for each in list(graph.graph.initializer):
+        values = onnx.numpy_helper.to_array(each)
+        if values.ndim == 4:
+            graph.graph.initializer.remove(each)
+            half = onnx.numpy_helper.from_array(values.astype(np.float16), f"{each.name}_half")
+            graph.graph.initializer.append(half)
+            cast = onnx.helper.make_node("Cast", [half.name], [each.name], to=onnx.TensorProto.FLOAT)
+            graph.graph.node.insert(0, cast)
+    onnx.save(graph, tmp_path / "half.onnx")
+    whole, half = (quantise(path, _pictures(8)) for path in (model, tmp_path / "half.onnx"))
+    assert whole.convolutions == half.convolutions > 0
 
 
 def _weights(model: bytes, part: str) -> list[onnx.TensorProto]:

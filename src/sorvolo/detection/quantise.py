@@ -24,6 +24,7 @@ _CARRIERS = frozenset({
 })
 # carry features on, but one interpolates at places that eight bits cannot name, the other means away their rounding
 _FLOAT = frozenset({"RoiAlign", "ReduceMean"})
+_HALF = 10  # ONNX's number for float16, in which a model may store weights
 _READERS = frozenset({"Conv", "Gemm"})
 
 
@@ -127,8 +128,16 @@ class _Samples:
 
 
 def _prepare(model: Any) -> None:
-    """What the quantiser asks for: weights given directly, not through Identity nodes, and a name for every node."""
+    """What the quantiser asks for: weights given directly, not through Identity or Cast, and a name for every node."""
+    from onnx import numpy_helper
+
     graph = model.graph
+    halves = {each.name: each for each in graph.initializer if each.data_type == _HALF}
+    for node in [each for each in graph.node if each.op_type == "Cast" and each.input[0] in halves]:
+        values = numpy_helper.to_array(halves[node.input[0]]).astype(np.float32)
+        graph.initializer.remove(halves[node.input[0]])
+        graph.initializer.append(numpy_helper.from_array(values, node.output[0]))
+        graph.node.remove(node)
     weights = {each.name for each in graph.initializer}
     given: dict[str, str] = {}
     for node in list(graph.node):
