@@ -35,19 +35,25 @@ WRITING := build/docs-env
 docs: $(WRITING)/.ready
 	NO_MKDOCS_2_WARNING=1 $(WRITING)/bin/python -m mkdocs build --strict --site-dir build/site
 
-# New models in the packaged ones' place: make model DATA=FOLDER LITE0=WEIGHTS, the labelled sets and EfficientNet-Lite0's
-# weights; or trained on from the one that is there: make model DATA=FOLDER START=default. `thermal` begins with the new
-# `default`. Models of the same kind, not the same ones: see "Not reproducible" in docs/detector.md.
+# New models in the packaged ones' place: make model DATA=FOLDER LITE0=WEIGHTS NANODET=JSON, the labelled sets, EfficientNet-
+# Lite0's weights and NanoDet's graph (benchmarks/convert_nanodet.py); or trained on: START=default instead of LITE0. `thermal`
+# begins with the new aerial network. Models of the same kind, not the same ones: see "Not reproducible" in docs/detector.md.
 STEPS ?= 20000
+AERIAL := build/model/aerial
 THERMAL_STEPS ?= 2600
 model: $(TRAINS)
 	$(BIN)/python benchmarks/train_default_model.py $(DATA) build/model --steps $(STEPS) \
 	  $(if $(START),--start $(START),--weights $(LITE0))
-	$(BIN)/python benchmarks/pack_default_model.py build/model/weights.pt $(DATA) --steps $(STEPS)
-	$(BIN)/python benchmarks/pack_int8_model.py $(DATA)
+	$(BIN)/python benchmarks/pack_default_model.py build/model/weights.pt $(DATA) --steps $(STEPS) --out $(AERIAL)
+	$(BIN)/python benchmarks/pack_int8_model.py $(DATA) --home $(AERIAL)
+	cp $(AERIAL)/default-int8.* src/sorvolo/detection/data/
 	$(BIN)/python benchmarks/train_default_model.py $(DATA) build/model/thermal --steps $(THERMAL_STEPS) \
-	  --thermal --start default --simulated build/model/simulated
+	  --thermal --start $(AERIAL)/default.onnx --simulated build/model/simulated
 	$(BIN)/python benchmarks/pack_thermal_model.py build/model/thermal/weights.pt $(DATA) --steps $(THERMAL_STEPS)
+	$(BIN)/python benchmarks/train_judge.py $(DATA) build/model/judge --nanodet $(NANODET) \
+	  --aerial $(AERIAL)/default.onnx
+	$(BIN)/python benchmarks/pack_daylight_model.py $(DATA) --nanodet $(NANODET) --judge build/model/judge \
+	  --aerial $(AERIAL)/default.onnx
 
 $(WRITING)/.ready: requirements-docs.lock
 	$(PYTHON) -m venv $(WRITING)

@@ -40,7 +40,8 @@ def main() -> None:
     for model in wishes.models:
         detector = Detector.load(model, provider="cpu", threads=1)
         name = Path(model).stem
-        found[name] = {flight: looked(detector, wishes.flights / flight, wishes.out and wishes.out / name) for flight in FIRST}
+        out = wishes.out and wishes.out / name
+        found[name] = {flight: looked(detector, wishes.flights / flight, out) for flight in FIRST}
         for flight, rows in found[name].items():
             for label in SHOWN:
                 if (count := right.get(f"{name}:{flight}:{label}")) is not None:
