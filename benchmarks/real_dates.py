@@ -36,7 +36,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from sorvolo.store.flight_files import write_camera, write_photo
 
 from mosaic_methods import commit, machine
 from sorvolo.geometry.geodesy import LocalFrame
@@ -57,6 +56,7 @@ from sorvolo.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
+from sorvolo.store.exports.flight_files import write_camera, write_photo
 from sorvolo.store.site.archive import Archive
 
 HERE = Path(__file__).parent

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from sorvolo.change.alignment import Aligned, Aligner, AlignmentSettings, NotAligned, _nearer
+from sorvolo.change.map_search import SearchSettings
 from sorvolo.change.reference import ReferenceMap, level_for
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic
@@ -16,6 +17,7 @@ from sorvolo.survey.flight import CameraPrior
 M_PER_PX = 0.05
 TILE_PX = 256
 CAMERA = Camera.from_angle_of_view(640, 360, 62.0)
+NO_SEARCH = SearchSettings(least_pairs=10**6)
 DOWN = np.diag([1.0, -1.0, -1.0])
 
 
@@ -132,7 +134,7 @@ def test_other_ground_does_not_fit_and_says_so(tiles):
 
 def test_a_fit_that_is_too_bad_keeps_the_residual_of_the_best_try(tiles):
     pose = Pose(turned(0.0), np.array([0.0, 0.0, 30.0]))
-    strict = AlignmentSettings(most_residual_px=0.01, doubtful_px=0.01)
+    strict = AlignmentSettings(most_residual_px=0.01, doubtful_px=0.01, search=NO_SEARCH)
     found = Aligner(ReferenceMap(tiles, SITE_GRID.grid), SITE_GRID, strict).align(
         photographed(pose, gain=0.7), CAMERA, prior_at(pose), 0
     )
@@ -142,6 +144,53 @@ def test_a_fit_that_is_too_bad_keeps_the_residual_of_the_best_try(tiles):
     unlike = NotAligned("no plane fits", np.nan)
     bad, worse = NotAligned("bad", 3.0), NotAligned("worse", 5.0)
     assert _nearer(_nearer(_nearer(unlike, worse), bad), unlike) is bad
+
+
+def rebuilt(share: float) -> np.ndarray:
+    """The ground with so much of it replaced, in blocks, in other light; the rest has moved by some 0.2 m."""
+    rng = np.random.default_rng(8)
+    side = GROUND.shape[0]
+    blocks = (rng.random((20, 20)) < share).astype(np.uint8)
+    new = cv2.resize(blocks, (side, side), interpolation=cv2.INTER_NEAREST)[..., None] > 0
+    waves = [cv2.resize(rng.normal(0, 3.0, (12, 12)).astype(np.float32), (side, side)) for _ in range(2)]
+    x, y = np.meshgrid(np.arange(side, dtype=np.float32), np.arange(side, dtype=np.float32))
+    moved = cv2.remap(GROUND, x + waves[0], y + waves[1], cv2.INTER_LINEAR)
+    other = textured(side, 77)
+    fine = other - cv2.GaussianBlur(other, (0, 0), 5).astype(np.float32)
+    worn = np.clip(cv2.GaussianBlur(moved, (0, 0), 2.5) + fine, 0, 255)  # what is small has changed everywhere
+    later = np.where(new, other, worn)
+    return (255 * (later / 255.0) ** 1.5).astype(np.uint8)
+
+
+@pytest.mark.parametrize("yaw_off_deg,height_factor", [(0.0, 1.0), (90.0, 1.0), (0.0, 1.18)])
+def test_ground_that_is_mostly_rebuilt_is_found_by_learned_features(tiles, yaw_off_deg, height_factor):
+    pose = Pose(turned(10.0, 1.0), np.array([3.0, -2.0, 30.0]))
+    image = photographed(pose, rebuilt(0.6))
+    prior = prior_at(Pose(turned(10.0 + yaw_off_deg), pose.translation_m * [1, 1, height_factor]), (1.0, -0.5, 0.0))
+    if height_factor > 1:
+        prior = CameraPrior(prior.position_m, np.array([2.0, 2.0, 6.0]), prior.rotation, prior.attitude_sigma_deg)
+    reference = ReferenceMap(tiles, SITE_GRID.grid)
+    without = Aligner(reference, SITE_GRID, AlignmentSettings(search=NO_SEARCH)).align(image, CAMERA, prior, 0)
+    assert isinstance(without, NotAligned)
+    found = Aligner(reference, SITE_GRID).align(image, CAMERA, prior, 0)
+    assert isinstance(found, Aligned)
+    assert error_px(found, pose) * 30 / CAMERA.fx_px < 0.6  # m
+
+
+def test_neighbours_hold_a_frame_of_ground_that_hardly_stayed(tiles):
+    reference = ReferenceMap(tiles, SITE_GRID.grid)
+    aligner, alone_px, beside_px = Aligner(reference, SITE_GRID), [], []
+    ground = np.concatenate([rebuilt(0.3)[:, :1000], textured(8 * TILE_PX, 31)[:, 1000:]], axis=1)
+    for number, east_m in enumerate((-12.0, -6.0, 0.0, 6.0)):
+        pose = Pose(turned(0.0), np.array([east_m, 0.0, 30.0]))
+        image, prior = photographed(pose, ground), prior_at(pose, (1.0, 1.0, 0.0))
+        beside = aligner.align(image, CAMERA, prior, number * 3 * 10**9)
+        alone = Aligner(reference, SITE_GRID).align(image, CAMERA, prior, 0)
+        assert isinstance(beside, Aligned) and isinstance(alone, Aligned)
+        alone_px.append(error_px(alone, pose))
+        beside_px.append(error_px(beside, pose))
+    assert max(beside_px) * 30 / CAMERA.fx_px < 0.6  # m
+    assert max(beside_px[2:]) < 0.6 * max(alone_px[2:])
 
 
 def test_beyond_the_map_is_outside(tiles):

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cached_property
 
 import cv2
 import numpy as np
 
+from sorvolo.change.map_search import MapSearch, SearchSettings
 from sorvolo.change.reference import ReferenceMap, normalised, resized
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, Matrix3, PointsM, PointsPx, Vector3
@@ -30,6 +31,8 @@ from sorvolo.survey.mosaic import Features, Keyframe, Link
 _UNKNOWN = CameraPrior(np.zeros(3), np.full(3, np.inf), np.eye(3), np.full(3, np.inf))
 _NO_FEATURES = Features("orb", np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
 _SMALL = 4  # times smaller are the copies that are shifted onto each other
+_SEARCHED_MISSES = 8  # frames in a row
+_CELLS = 4, 3
 _TRACKED_S = 2.0  # a fit older than this foretells nothing
 
 
@@ -40,11 +43,13 @@ class AlignmentSettings:
     side_px: int = 640  # longest side at which frames are aligned
     least_known: float = 0.1  # share of the frame that must lie on known ground
     most_residual_px: float = 2.2  # of the registered image: worse, and what differs is the fit, not the ground
-    doubtful_px: float = 1.5  # a foretold fit that leaves more is checked against the features
+    doubtful_px: float = 1.5  # a fit that leaves more is checked: a foretold one by features, others by the search
+    least_spread: float = 0.6  # share of a frame's cells with points: with less a homography may swing
     most_features: int = 60_000  # of the whole map, to look for a frame whose place is not known at all
     links: LinkSettings = field(
         default_factory=lambda: LinkSettings(FeatureSettings(orb_count=900), min_inliers=20, max_pairs=150)
     )
+    search: SearchSettings = field(default_factory=SearchSettings)  # for frames that no homography places
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +87,30 @@ class _Fit:
     site_from_image: Matrix3
 
 
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Where a frame lies, in pixels of the size at which frames are aligned. `ratio` is how sure the search is of it:
+    infinite for homographies with points all over the frame, 0 for those that may swing where they have none."""
+
+    site_from_image: Matrix3
+    pose: Pose
+    residual_px: float
+    followed: bool
+    ratio: float
+
+
+class _Share:
+    """The share of a frame that lies on known ground by telemetry, counted when it is first asked for."""
+
+    def __init__(self, count: Callable[[], float]) -> None:
+        self._count = count
+
+    @cached_property
+    def known(self) -> float:
+        """From 0 to 1."""
+        return self._count()
+
+
 class Aligner:
     """Lays the frames of one flight over a map, in order of time. Only `align` changes it."""
 
@@ -90,6 +119,7 @@ class Aligner:
     ) -> None:
         self._reference, self._site_grid, self._settings = reference, site_grid, settings
         self._fits: list[_Fit] = []
+        self._search = MapSearch(reference, site_grid, settings.search, settings.links.features)
         self._count = 0
         self._misses = 0  # frames since the last fit
 
@@ -98,48 +128,70 @@ class Aligner:
         scale = min(1.0, self._settings.side_px / max(image.shape[:2]))
         size = max(16, round(image.shape[1] * scale)), max(16, round(image.shape[0] * scale))
         small_camera = camera.resized(*size)
-        gray = gray_from_rgb(image)
-        new = self._keyframe(
-            small_camera, normalise_contrast(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))  # type: ignore[arg-type]
-        )
-        told = self._told(small_camera, prior)
-
-        @cache
-        def share_known() -> float:
-            return 1.0 if told is None else self._share_known(told, small_camera)
+        gray = cv2.resize(gray_from_rgb(image), size, interpolation=cv2.INTER_AREA)
+        new = self._keyframe(small_camera, normalise_contrast(gray))  # type: ignore[arg-type]
+        told = self._told_pose(prior)
+        site_from_told = None if told is None else _homography_of(small_camera, told)
+        share = _Share(lambda: 1.0 if site_from_told is None else self._share_known(site_from_told, small_camera))
 
         def told_inside() -> Matrix3 | None:
-            return told if share_known() >= self._settings.least_known else None
+            return site_from_told if share.known >= self._settings.least_known else None
 
+        placed = self._by_homographies(new, prior, time_ns, told_inside)
+        if self._is_doubtful(placed, prior) and told is not None and told_inside() is not None and self._may_search():
+            placed = self._by_search(gray, new, prior, told) or placed  # type: ignore[arg-type]
+        if isinstance(placed, NotAligned):
+            is_outside = share.known < self._settings.least_known
+            reason = self._beside() if is_outside else placed.reason
+            return NotAligned(reason, placed.residual_px / scale, is_outside)
+        self._remember(time_ns, placed, prior, new)
+        small_from_full = resized(size[0] / image.shape[1], size[1] / image.shape[0])
+        return Aligned(
+            placed.site_from_image @ small_from_full, placed.pose.translation_m, placed.residual_px / scale,
+            placed.followed,
+        )
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _by_homographies(
+        self, new: Keyframe, prior: CameraPrior, time_ns: int, told_inside: Callable[[], Matrix3 | None]
+    ) -> "_Place | NotAligned":
+        """The frame placed by the first guess that its points confirm to a part of a pixel, or why none is."""
         nearest = NotAligned("its features are found nowhere in the map where it could be", np.nan)
-        for guess, followed in self._guesses(new, small_camera, prior, time_ns, told_inside):
+        for guess, followed in self._guesses(new, new.camera, prior, time_ns, told_inside):
             found = self._fit(new, guess, self._settings.doubtful_px if followed else self._settings.most_residual_px)
             if isinstance(found, NotAligned):
                 nearest = _nearer(nearest, found)
                 continue
-            site_from_small, residual_px = found
-            pose = pose_from_homography(site_from_small, small_camera)
-            if pose is None:
-                nearest = _nearer(
-                    nearest, NotAligned("the fit is none that a camera above the ground could have", np.nan)
-                )
-                continue
-            self._remember(time_ns, pose, prior, site_from_small, small_camera)
-            self._misses = 0
-            small_from_full = resized(size[0] / image.shape[1], size[1] / image.shape[0])
-            return Aligned(site_from_small @ small_from_full, pose.translation_m, residual_px / scale, followed)
-        is_outside = share_known() < self._settings.least_known
-        reason = self._beside() if is_outside else nearest.reason
-        return NotAligned(reason, nearest.residual_px / scale, is_outside)
+            pose = pose_from_homography(found[0], new.camera)
+            if pose is not None:
+                return _Place(found[0], pose, found[1], followed, np.inf if found[2] else 0.0)
+            nearest = _nearer(nearest, NotAligned("the fit is none that a camera above the ground could have", np.nan))
+        return nearest
 
-    # ---- inside -----------------------------------------------------------------------------------------------
+    def _is_doubtful(self, placed: "_Place | NotAligned", prior: CameraPrior) -> bool:
+        """Whether a frame is nowhere, or where telemetry, as it was so far, hardly can have it."""
+        if isinstance(placed, NotAligned):
+            return True
+        return not placed.followed and (placed.ratio == 0 or self._search.is_odd(placed.pose, prior))
+
+    def _may_search(self) -> bool:
+        """Whether the dear search is worth its time: a flight that fits nowhere is asked every fifth frame."""
+        return self._misses < _SEARCHED_MISSES or self._misses % 5 == 1
+
+    def _by_search(self, gray: ImageGray, new: Keyframe, prior: CameraPrior, told: Pose) -> "_Place | None":
+        """The frame placed by learned features, telemetry and its neighbours."""
+        found = self._search.find(gray, new.gray, new.camera, prior, told)
+        if found is None:
+            return None
+        return _Place(found.fit.site_from_image, found.fit.pose, found.fit.residual_px, False, found.ratio)
 
     def _keyframe(self, camera: Camera, gray: ImageGray) -> Keyframe:
         self._count += 1
         return Keyframe(self._count, camera, gray, _NO_FEATURES, _UNKNOWN)
 
-    def _told(self, camera: Camera, prior: CameraPrior) -> Matrix3 | None:
-        """site_from_image as telemetry alone gives it."""
+    def _told_pose(self, prior: CameraPrior) -> Pose | None:
+        """site_from_camera as telemetry alone gives it; None where it has no place."""
         if not prior.knows_place:
             return None
         up_m = float(prior.position_m[2])
@@ -147,11 +199,7 @@ class Aligner:
             last_up_m = float(self._fits[-1].pose.translation_m[2])
             if not np.isfinite(prior.position_sigma_m[2]) or up_m < 0.3 * last_up_m:
                 up_m = last_up_m
-        try:
-            pose = Pose(prior.rotation, np.array([*prior.position_m[:2], max(up_m, 0.5)]))
-            return site_from_image_homography(camera, pose)
-        except GeometryError:
-            return None
+        return Pose(prior.rotation, np.array([*prior.position_m[:2], max(up_m, 0.5)]))
 
     def _guesses(
         self, new: Keyframe, camera: Camera, prior: CameraPrior, time_ns: int, told_inside: Callable[[], Matrix3 | None]
@@ -205,12 +253,16 @@ class Aligner:
             return None
         return ideal @ np.linalg.inv(last.seen_from_ideal)
 
-    def _remember(self, time_ns: int, pose: Pose, prior: CameraPrior, site_from_image: Matrix3, camera: Camera) -> None:
+    def _remember(self, time_ns: int, placed: "_Place", prior: CameraPrior, new: Keyframe) -> None:
         # ideal @ inv(seen_from_ideal) gives the fit back
-        ideal = site_from_image_homography(camera, pose)
-        seen_from_ideal = np.linalg.inv(site_from_image) @ ideal
-        fit = _Fit(time_ns, pose, prior.rotation, seen_from_ideal / seen_from_ideal[2, 2], site_from_image)
+        ideal = site_from_image_homography(new.camera, placed.pose)
+        seen_from_ideal = np.linalg.inv(placed.site_from_image) @ ideal
+        fit = _Fit(
+            time_ns, placed.pose, prior.rotation, seen_from_ideal / seen_from_ideal[2, 2], placed.site_from_image
+        )
         self._fits = [*self._fits[-1:], fit]
+        self._misses = 0
+        self._search.remember(new.gray, new.camera, prior, placed.pose, placed.site_from_image, placed.ratio)
 
     def _on_grid(self, site_from_image: Matrix3, camera: Camera) -> Matrix3 | None:
         """grid_from_image of a guess; None when the image's centre sees no ground."""
@@ -312,8 +364,9 @@ class Aligner:
         seen = self._seen(site_from_image, camera)
         return 0.0 if seen is None else float(seen[1].mean())
 
-    def _fit(self, new: Keyframe, guess: Matrix3, most_residual_px: float) -> tuple[Matrix3, float] | NotAligned:
-        """site_from_image to a part of a pixel with its residual, or why not."""
+    def _fit(self, new: Keyframe, guess: Matrix3, most_residual_px: float) -> tuple[Matrix3, float, bool] | NotAligned:
+        """site_from_image to a part of a pixel, its residual, and whether points all over the frame hold it; or why
+        not."""
         seen = self._seen(guess, new.camera)
         if seen is None:
             return NotAligned("it would look at the horizon", np.nan)
@@ -329,7 +382,18 @@ class Aligner:
         if residual_px > most_residual_px:
             return NotAligned("its points fit the map badly", residual_px)
         fit: Matrix3 = guess @ np.linalg.inv(found.new_from_old)
-        return _stiffened(fit, found, guess, new.camera), residual_px
+        is_held = residual_px <= self._settings.doubtful_px and (
+            _spread_of(found.new_px, seen[1]) >= self._settings.least_spread
+        )
+        return _stiffened(fit, found, guess, new.camera), residual_px, is_held
+
+
+def _homography_of(camera: Camera, pose: Pose) -> Matrix3 | None:
+    """site_from_image of a camera at a pose; None where it stands below the ground."""
+    try:
+        return site_from_image_homography(camera, pose)
+    except GeometryError:
+        return None
 
 
 def _nearer(first: NotAligned, second: NotAligned) -> NotAligned:
@@ -337,6 +401,17 @@ def _nearer(first: NotAligned, second: NotAligned) -> NotAligned:
     if not np.isfinite(first.residual_px):
         return second
     return second if second.residual_px < first.residual_px else first
+
+
+def _spread_of(points_px: PointsPx, known: Mask) -> float:
+    """The share of the frame's cells on known ground, 4 x 3 in all, that hold points."""
+    height, width = known.shape
+    cells = np.array(_CELLS)
+    on_map = cv2.resize(known.astype(np.float32), _CELLS, interpolation=cv2.INTER_AREA) > 0.5
+    held = np.zeros_like(on_map)
+    x, y = (points_px * cells / [width, height]).astype(int).clip(0, cells - 1).T
+    held[y, x] = True
+    return float((held & on_map).sum() / max(1, on_map.sum()))
 
 
 def _stiffened(site_from_image: Matrix3, link: Link, site_from_old: Matrix3, camera: Camera) -> Matrix3:

@@ -7,13 +7,16 @@ from typing import Any
 import cv2
 import numpy as np
 import onnxruntime
+from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Anything, ImageGray, PointsPx
+from sorvolo.geometry.arrays import Anything, ImageGray, Matrix3, PointsPx
+from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.mosaic import Features
 
 _CELL_PX = 8  # the network gives one descriptor a cell of this side
 _WHOLE_PX = 32  # its input's sides are multiples of this
 _LEAST_POINT = 0.05  # of a place's probability of being a point, as published
+_LEAST_LIKENESS = 0.5  # cosine of two descriptors: less is no pair, however alone
 _APART_PX = 5  # side of the window in which a point must be the likeliest
 
 LEARNED = "xfeat"
@@ -40,6 +43,28 @@ def learned_features(gray: ImageGray, most: int = 2048) -> Features:
     found = _sampled(descriptors[0], points)
     found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-6)
     return Features(LEARNED, points, found.astype(np.float32))
+
+
+def match_learned(
+    new: Features, old: Features, new_from_old: Matrix3 | None = None, radius_px: float = np.inf
+) -> NDArray[np.int64]:
+    """(N, 2) index pairs (new, old) of learned features that are each other's likest.
+
+    With `new_from_old` only points that it puts within `radius_px` of each other compete: where the place is nearly
+    known, many more right pairs survive the competition.
+    """
+    if not len(new) or not len(old):
+        return np.zeros((0, 2), np.int64)
+    likeness = new.descriptors @ old.descriptors.T
+    if new_from_old is not None:
+        expected = np.nan_to_num(apply_homography(new_from_old, old.points_px), nan=1e9).astype(np.float32)
+        here = new.points_px.astype(np.float32)
+        far = (here[:, :1] - expected[:, 0]) ** 2 + (here[:, 1:] - expected[:, 1]) ** 2 > radius_px**2
+        likeness[far] = -1.0
+    nearest, back = likeness.argmax(axis=1), likeness.argmax(axis=0)
+    rows = np.arange(len(new))
+    mutual = (back[nearest] == rows) & (likeness[rows, nearest] > _LEAST_LIKENESS)
+    return np.column_stack([rows[mutual], nearest[mutual]]).astype(np.int64)
 
 
 def _sampled(planes: Anything, points_px: PointsPx) -> Anything:

@@ -82,7 +82,7 @@ def _compare_one(
         def ahead() -> int:  # a live view's changes are announced at once, unless the next view waits already
             return 0 if isinstance(source, LiveSource) and not source.is_behind else _AHEAD
 
-        for each in _begun(source.frames(every(step_s)), setup, inside, run, ahead):
+        for each in _ended(source, step_s, setup, inside, run, ahead):
             if isinstance(each, Pending):
                 outcome, announced = run.add(each)
                 frame: Frame | LostFrame = each.posed.frame
@@ -95,6 +95,22 @@ def _compare_one(
                 source.frame_count, run.views, run.compared, time.monotonic() - started_s,
             )
         run.finish(source.notices(), started_s)
+
+
+def _ended(
+    source: Source, step_s: float, setup: FlightSetup, inside: Callable[[PosedFrame], bool], run: CompareRun,
+    ahead: Callable[[], int],
+) -> Iterator[Pending | LostFrame]:
+    """The frames as their comparisons end; photos that were not found on the map are tried again after the others,
+    beside those that were (a video shows the same ground again anyway)."""
+    again: set[int] = set()
+    for each in _begun(source.frames(every(step_s)), setup, inside, run, ahead):
+        if source.kind == "photos" and isinstance(each, Pending) and each.is_unplaced:
+            again.add(each.posed.frame.index)
+        else:
+            yield each
+    if again:
+        yield from _begun(source.frames(lambda index, _: index in again), setup, inside, run, ahead)
 
 
 def _begun(

@@ -47,6 +47,11 @@ class Pending:
     posed: PosedFrame
     outcome: "Future[ViewOutcome]"
 
+    @property
+    def is_unplaced(self) -> bool:
+        """Whether the frame was not found on the map; waits for its comparison."""
+        return self.outcome.result().status is ViewStatus.NOT_ALIGNED
+
 
 class CompareRun:
     """A later flight on its way into a site. A context manager: leaving without `finish` leaves the site as it was."""
