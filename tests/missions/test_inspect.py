@@ -68,14 +68,20 @@ def texts(inspection: Inspection, level: Level) -> str:
     return "\n".join(finding.text for finding in inspection.findings if finding.level == level)
 
 
-def write_video(path: Path, metadata: dict[str, str] | None = None, rate: int = 10) -> Path:
-    ground = np.random.default_rng(0).integers(0, 255, (120, 260, 3), np.uint8)
+def write_video(
+    path: Path, metadata: dict[str, str] | None = None, rate: int = 10, step_px: int = 1, grain_px: int = 1
+) -> Path:
+    """Ground of random grains that the camera passes over by `step_px` a frame."""
+    wide = 160 + 4 * rate * step_px
+    ground = np.random.default_rng(0).integers(0, 255, (120 // grain_px, wide // grain_px + 1, 3), np.uint8)
+    ground = np.kron(ground, np.ones((grain_px, grain_px, 1), np.uint8))
     with av.open(str(path), "w") as container:
         container.metadata.update(metadata or {})
         stream = container.add_stream("libx264", rate=rate)
         stream.width, stream.height, stream.pix_fmt = 160, 90, "yuv420p"
+        stream.codec_context.gop_size = rate // 2 or 1  # glimpses are at whole pictures
         for index in range(4 * rate):
-            image = np.ascontiguousarray(ground[:90, index: index + 160])
+            image = np.ascontiguousarray(ground[:90, index * step_px: index * step_px + 160])
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode(None))
     return path
@@ -185,6 +191,15 @@ def test_telemetry_of_another_hour_or_another_day(tmp_path: Path) -> None:
     assert "2 h behind the telemetry's: a time zone?" in texts(zone, Level.PROBLEM)
     day = one(video, telemetry=write_gpx(tmp_path / "day.gpx", "2021-07-09T10:00:00"))
     assert "of another time" in texts(day, Level.PROBLEM)
+
+
+def test_a_hovering_drone_is_no_flight(tmp_path: Path) -> None:
+    still = write_video(tmp_path / "still.mp4", step_px=0, grain_px=6)
+    assert "the drone hovers: all pictures show" in texts(one(still), Level.PROBLEM)
+    moving = write_video(tmp_path / "moving.mp4", step_px=8, grain_px=6)
+    assert "hovers" not in texts(one(moving), Level.PROBLEM)
+    write_srt(tmp_path / "moving.SRT", 5, speed_m_s=0.1)
+    assert "the drone hovers: 0." in texts(one(moving), Level.PROBLEM)
 
 
 def test_a_video_alone_has_no_scale_and_a_guessed_camera(tmp_path: Path) -> None:

@@ -1,0 +1,266 @@
+"""What a flight's inputs hold, before it is mapped: its pictures, its telemetry, and how it was flown."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sorvolo.capture.live.stream import LiveStream
+from sorvolo.capture.photos import PhotoSource
+from sorvolo.capture.source import LiveSource, Source
+from sorvolo.capture.video import VideoSource
+from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.geodesy import Geodetic, LocalFrame
+from sorvolo.geometry.planning import footprint_size_m, minimum_frame_rate, px_per_m
+from sorvolo.geometry.track import find_strips, length_m, speeds_m_s
+from sorvolo.registration.features import sharpness_and_texture
+from sorvolo.registration.shared_view import shared_view
+from sorvolo.survey.flight import Frame, Telemetry
+
+WANTED_OVERLAP = 0.7
+"""Of consecutive frames, for a good map."""
+
+_SECOND_NS = 1_000_000_000
+_MOVING_M_S = 0.5
+_FEWEST_GLIMPSES = 3
+
+
+@dataclass(frozen=True)
+class FrameFacts:
+    """The pictures. `rate_hz` is NaN for photos, `interval_s` NaN for videos; `start_ns` is 0 if unknown.
+
+    `sharpness` and `texture_levels` (the spread of gray about its surroundings) are medians over a few. `shared_view`
+    is the least share of the first of these few that each other one shows, NaN for photos.
+    """
+
+    count: int
+    rate_hz: float
+    interval_s: float
+    duration_s: float
+    width_px: int
+    height_px: int
+    codec: str
+    container: str
+    size_bytes: int
+    start_ns: int
+    start_origin: str
+    sharpness: float
+    texture_levels: float
+    shared_view: float
+
+
+@dataclass(frozen=True)
+class TelemetryFacts:
+    """The telemetry. `tie` says how it belongs to the frames, `covered_s` how long both run, NaN unknown."""
+
+    format: str
+    samples: int
+    positions: int
+    rate_hz: float
+    longest_gap_s: float
+    start_ns: int
+    end_ns: int
+    tie: str
+    covered_s: float
+
+
+@dataclass(frozen=True)
+class FlightFacts:
+    """The flight, as far as telemetry and camera tell; NaN where they do not.
+
+    `height_reference` says above what `height_m` is. `forward_overlap` is that of consecutive photos;
+    `frame_interval_s` the longest time between two frames that keeps 70 % overlap (eqs 3.16-3.17).
+    """
+
+    height_m: float
+    height_spread_m: float
+    height_reference: str
+    speed_m_s: float
+    distance_m: float
+    gsd_m: float
+    footprint_m: tuple[float, float]
+    forward_overlap: float
+    frame_interval_s: float
+    strips: int
+    side_overlap: float
+    camera_pitch_deg: float
+
+
+def frame_facts(source: Source, glimpses: Sequence[Frame]) -> FrameFacts:
+    """What a source's header and a few of its frames, spread over the flight, tell of its pictures."""
+    camera = source.camera.camera
+    seen = [sharpness_and_texture(frame.image) for frame in glimpses]
+    sharp, texture = np.median(seen, axis=0).tolist() if seen else (math.nan, math.nan)
+    if isinstance(source, VideoSource):
+        info = source.info
+        return FrameFacts(
+            info.frame_count, info.frame_rate_hz, math.nan, info.duration_s, camera.width_px,
+            camera.height_px, info.codec, info.container, info.path.stat().st_size, info.start_ns,
+            info.start_origin, sharp, texture, _shared_view(glimpses),
+        )
+    times_s, suffixes, container, size = np.zeros(0), "", "", 0
+    if isinstance(source, LiveSource):
+        times_s = np.array([frame.time_ns for frame in glimpses]) / _SECOND_NS
+    if isinstance(source, LiveStream):
+        suffixes, container = source.facts.codec, source.facts.container
+    if isinstance(source, PhotoSource):
+        photos = source.album.photos
+        times_s = np.array([photo.time_ns for photo in photos]) / _SECOND_NS
+        suffixes = ", ".join(sorted({photo.path.suffix.lower().lstrip(".") for photo in photos}))
+        size = sum(photo.path.stat().st_size for photo in photos)
+    return FrameFacts(
+        source.frame_count, source.frame_rate_hz,
+        _median(np.diff(times_s)) if source.kind == "photos" else math.nan,
+        float(np.ptp(times_s)) if len(times_s) else math.nan, camera.width_px, camera.height_px,
+        suffixes, container, size, source.start_ns, source.start_origin, sharp, texture,
+        math.nan,
+    )
+
+
+def _shared_view(glimpses: Sequence[Frame]) -> float:
+    """The least share of the first glimpse that another one shows; 0 where one shows none.
+
+    NaN where fewer than three are of different times, as in a video with few whole pictures to seek to.
+    """
+    different = list({frame.index: frame for frame in glimpses}.values())
+    if len(different) < _FEWEST_GLIMPSES:
+        return math.nan
+    shares: list[float] = []
+    for other in different[1:]:
+        shares.append(shared_view(different[0].image, other.image))
+        if not shares[-1] > 0:
+            return 0.0
+    return min(shares)
+
+
+def telemetry_facts(source: Source, frames: FrameFacts) -> TelemetryFacts:
+    """What the telemetry holds, and how it fits the frames in time."""
+    telemetry = source.telemetry
+    placed = telemetry.time_ns[np.isfinite(telemetry["latitude_deg"])]
+    steps_s = np.diff(placed) / _SECOND_NS
+    tie, covered_s = _tie(source, frames)
+    return TelemetryFacts(
+        telemetry.format, len(telemetry), len(placed),
+        1 / float(np.median(steps_s)) if len(steps_s) else math.nan, float(steps_s.max(initial=0.0)),
+        int(telemetry.time_ns[0]) if len(telemetry) else 0,
+        int(telemetry.time_ns[-1]) if len(telemetry) else 0, tie, covered_s,
+    )
+
+
+def _tie(source: Source, frames: FrameFacts) -> tuple[str, float]:
+    """How telemetry and frames belong together, in words, and for how many seconds both run."""
+    telemetry = source.telemetry
+    if not len(telemetry):
+        return "no telemetry", math.nan
+    if isinstance(source, LiveSource):
+        return source.telemetry_tie, frames.duration_s
+    if telemetry.format == "exif":
+        return "in each photo", frames.duration_s
+    tied_ns = telemetry.video_time_ns[telemetry.video_time_ns >= 0]
+    if len(tied_ns) and source.kind == "video":
+        return "by time since the video's start", max(0.0, min(frames.duration_s, tied_ns[-1] / _SECOND_NS))
+    if any(notice.code == "no_date" for notice in telemetry.notices):
+        return "unknown: the telemetry has no date", math.nan
+    if not source.start_ns:
+        return "unknown: the video does not say when it began", math.nan
+    both_ns = common_ns(telemetry, source.start_ns, frames.duration_s)
+    return "by UTC", both_ns / _SECOND_NS
+
+
+def while_filming(source: Source, frames: FrameFacts) -> Telemetry:
+    """The telemetry between the first and the last frame; all of it where that cannot be told."""
+    telemetry = source.telemetry
+    duration_ns = round(frames.duration_s * _SECOND_NS) if frames.duration_s > 0 else 0
+    since_start_ns = telemetry.video_time_ns
+    if not (since_start_ns >= 0).any() and source.start_ns:
+        since_start_ns = telemetry.time_ns - source.start_ns
+    during = (since_start_ns >= 0) & (since_start_ns <= duration_ns)
+    if source.kind != "video" or not np.isfinite(telemetry["latitude_deg"][during]).any():
+        return telemetry
+    columns = {name: values[during] for name, values in telemetry.columns.items()}
+    return Telemetry(telemetry.format, telemetry.time_ns[during], columns, notices=telemetry.notices)
+
+
+def common_ns(telemetry: Telemetry, start_ns: int, duration_s: float) -> int:
+    """For how long telemetry and frames from `start_ns` on run both."""
+    end_ns = start_ns + round(duration_s * _SECOND_NS)
+    return max(0, min(end_ns, int(telemetry.time_ns[-1])) - max(start_ns, int(telemetry.time_ns[0])))
+
+
+def flight_facts(telemetry: Telemetry, camera: Camera, frames: FrameFacts) -> FlightFacts:
+    """How the drone flew while it filmed, as far as telemetry and camera tell."""
+    placed = np.isfinite(telemetry["latitude_deg"])
+    points_m = _track_m(telemetry["latitude_deg"][placed], telemetry["longitude_deg"][placed])
+    times_s = (telemetry.time_ns[placed] - telemetry.time_ns[placed][:1]) / _SECOND_NS
+    height_m, spread_m, reference = _height(telemetry)
+    speed_m_s = _speed(telemetry, points_m, times_s)
+    footprint_m, gsd_m = (math.nan, math.nan), math.nan
+    interval_s = forward = side = math.nan
+    strips = find_strips(points_m)
+    if height_m > 0.5:
+        footprint_m, gsd_m = footprint_size_m(camera, height_m), 1 / px_per_m(height_m, camera.fx_px)
+        across_m, along_m = _across_and_along(footprint_m, telemetry, strips.bearing_deg)
+        if speed_m_s > _MOVING_M_S:
+            interval_s = 1 / minimum_frame_rate(speed_m_s, along_m, WANTED_OVERLAP)
+        if math.isnan(frames.rate_hz) and len(points_m) > 1:
+            steps_m = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
+            forward = max(0.0, 1 - float(np.median(steps_m)) / along_m)
+        side = max(0.0, 1 - strips.spacing_m / across_m) if strips.spacing_m > 0 else math.nan
+    return FlightFacts(
+        height_m, spread_m, reference, speed_m_s, length_m(points_m), gsd_m, footprint_m, forward, interval_s,
+        strips.count, side, _median(telemetry["camera_pitch_deg"]),
+    )
+
+
+def _track_m(latitude_deg: Floats, longitude_deg: Floats) -> PointsM:
+    """(N, 2) east, north of the track about its first point."""
+    if not len(latitude_deg):
+        return np.zeros((0, 2))
+    frame = LocalFrame(Geodetic(float(latitude_deg[0]), float(longitude_deg[0])))
+    return frame.site_from_wgs84(latitude_deg, longitude_deg, np.zeros(len(latitude_deg)))[:, :2]
+
+
+def _height(telemetry: Telemetry) -> tuple[float, float, str]:
+    """Median height above ground and its spread (5 to 95 %), NaN if unknown; and above what it is."""
+    above_takeoff_m = telemetry["height_above_takeoff_m"]
+    if np.isfinite(above_takeoff_m).any():
+        return _median(above_takeoff_m), _spread(above_takeoff_m), "above take-off"
+    for column, words in (("orthometric_height_m", "sea level"), ("ellipsoidal_height_m", "the ellipsoid")):
+        if np.isfinite(telemetry[column]).any():
+            usual_m = _median(telemetry[column])
+            text = f"unknown: telemetry gives heights above {words} only, median {usual_m:.1f} m"
+            return math.nan, _spread(telemetry[column]), text
+    return math.nan, math.nan, "unknown: telemetry gives no height"
+
+
+def _speed(telemetry: Telemetry, points_m: PointsM, times_s: Floats) -> float:
+    """Median speed while moving; from positions where telemetry does not tell it."""
+    told = telemetry["speed_m_s"]
+    speeds = told[np.isfinite(told)] if np.isfinite(told).any() else speeds_m_s(points_m, times_s)
+    moving = speeds[speeds > _MOVING_M_S]
+    return float(np.median(moving)) if len(moving) else (0.0 if len(speeds) else math.nan)
+
+
+def _across_and_along(
+    footprint_m: tuple[float, float], telemetry: Telemetry, bearing_deg: float
+) -> tuple[float, float]:
+    """The footprint's size across and along the flight; without a yaw the image's top is forward."""
+    yaw_deg = telemetry["camera_yaw_deg"]
+    yaw_deg = yaw_deg if np.isfinite(yaw_deg).any() else telemetry["body_yaw_deg"]
+    turns = np.radians(yaw_deg[np.isfinite(yaw_deg)] - bearing_deg)
+    # half turns change nothing, hence doubled angles: below zero the image lies across the flight
+    lies_across = len(turns) > 0 and float(np.cos(2 * turns).mean()) < 0
+    width_m, height_m = footprint_m
+    return (height_m, width_m) if lies_across else (width_m, height_m)
+
+
+def _median(values: Floats) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else math.nan
+
+
+def _spread(values: Floats) -> float:
+    low, high = np.nanpercentile(values, [5, 95])
+    return float(high - low)
