@@ -25,6 +25,16 @@ class Strips:
     spacing_m: float
 
 
+def known_points(points_m: PointsM) -> PointsM:
+    """The points, (N, 2), that are known: those without NaN."""
+    return points_m[np.isfinite(points_m).all(axis=1)]
+
+
+def corners_around(points_m: PointsM, margin_m: float) -> PointsM:
+    """(2, 2) the south-west and north-east corners of the points' box, (N, 2), made `margin_m` larger on each side."""
+    return np.array([points_m.min(axis=0) - margin_m, points_m.max(axis=0) + margin_m])
+
+
 def speeds_m_s(points_m: PointsM, times_s: Floats) -> Floats:
     """Speeds of a track, points (N, 2) at times (N,), each over two seconds or one longer step."""
     later = np.searchsorted(times_s, times_s + _WINDOW_S)

@@ -44,6 +44,14 @@ def frame_doubles(boxes_px: BoxesPx | Floats, labels: Sequence[str], scores: Flo
     return doubles
 
 
+
+def without_doubles(found: Detections) -> tuple[Detections, list[int]]:
+    """A frame's detections, each object's surest one only, and their rows in `found`."""
+    doubles = frame_doubles(found.boxes_px, found.names, found.scores)
+    rows = [row for row in range(len(found)) if row not in doubles]
+    return found.only(np.array(rows, int)), rows
+
+
 def inward_m(outline_m: PointsM, points_m: PointsM) -> Floats:
     """(N,) how deep points lie within a convex outline (4, 2), corners in either turn; below 0 outside."""
     edges = np.roll(outline_m, -1, axis=0) - outline_m

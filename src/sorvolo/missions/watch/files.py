@@ -11,8 +11,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import numpy as np
-
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.missions.watch.settings import WatchOutputs
 from sorvolo.store.atomic import atomic_write_bytes, writing
@@ -34,7 +32,7 @@ from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.flight import Frame, Site
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections, Sighting, Track
-from sorvolo.tracking.joining import frame_doubles
+from sorvolo.tracking.joining import without_doubles
 
 _MOST_WAITING = 4  # frames; a disk that is slower than the detector slows the watch, it does not fill the memory
 _TRACKS_EVERY_S = 5.0
@@ -227,9 +225,8 @@ def _rows(seen: SeenFrame, site: Site) -> list[dict[str, Any]]:
 
 def _drawn(seen: SeenFrame) -> ImageRGB:
     """The frame with a box for each object, the surest of those that show it."""
-    doubles = frame_doubles(seen.detections.boxes_px, seen.detections.names, seen.detections.scores)
-    rows = [row for row in range(len(seen.detections)) if row not in doubles]
-    found, track_ids = seen.detections.only(np.array(rows, int)), [seen.track_ids[row] for row in rows]
+    found, rows = without_doubles(seen.detections)
+    track_ids = [seen.track_ids[row] for row in rows]
     counted = [track_id in seen.confirmed for track_id in track_ids]
     words = [
         f"{name} {track_id} {score:.2f}" if is_counted else ""

@@ -1,13 +1,13 @@
-"""The ground under a watch where a height model tells it, in the heights of the flight's own telemetry."""
+"""The ground under a watch from a height model, in the heights of the flight's own telemetry."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.geometry.track import corners_around, known_points
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.store.rasters.height_model import read_height_model
@@ -27,16 +27,15 @@ def over_heights(
     """
     setup = prepare(mapping)
     if setup.track is None:
-        raise InputError(f"{setup.source.name} has no fixes, so {model} cannot say what ground lies below it")
-    fixes_m = setup.track.east_north_m[np.isfinite(setup.track.east_north_m[:, 0])]
-    corners_m = np.array([fixes_m.min(axis=0) - _AROUND_M, fixes_m.max(axis=0) + _AROUND_M])
-    (south, north), (west, east), _ = setup.frame.wgs84_from_site(corners_m)
+        raise InputError(f"{setup.source.name} has no GPS fixes, so {model} cannot be used: leave out --height-model")
+    fixes_m = known_points(setup.track.east_north_m)
+    (south, north), (west, east), _ = setup.frame.wgs84_from_site(corners_around(fixes_m, _AROUND_M))
     heights = read_height_model(model, (float(west), float(south), float(east), float(north)))
     latitudes, longitudes, _ = setup.frame.wgs84_from_site(fixes_m[:1])
     zero_m = float(heights.at(longitudes, latitudes)[0])
-    if not np.isfinite(zero_m):
+    if not math.isfinite(zero_m):
         raise InputError(
-            f"{model} knows no height at {latitudes[0]:.5f}, {longitudes[0]:.5f}, where the telemetry begins; give one "
+            f"{model} has no height at {latitudes[0]:.5f}, {longitudes[0]:.5f}, where the telemetry begins; give one "
             "without a hole there, or --ground-elevation"
         )
     if not setup.track.counts_from_takeoff:

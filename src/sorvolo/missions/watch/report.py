@@ -2,6 +2,7 @@
 
 import platform
 import resource
+import statistics
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,8 +10,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from typing import Any
-
-import numpy as np
 
 import sorvolo
 from sorvolo.capture.source import Source
@@ -79,7 +78,6 @@ def build_watch_report(
     source, camera = setup.source, setup.source.camera
     total = sum(log.found.values())
     seconds = log.seconds
-    latency = np.array(log.latency_s)
     height = setup.track.height_words if setup.track else "none"
     return {
         "sorvolo": sorvolo.__version__,
@@ -111,8 +109,8 @@ def build_watch_report(
             "attitude": setup.track.attitude if setup.track else "none",
         },
         "latency_s": {
-            "median": float(np.median(latency)) if len(latency) else None,
-            "max": float(latency.max()) if len(latency) else None,
+            "median": statistics.median(log.latency_s) if log.latency_s else None,
+            "max": max(log.latency_s, default=None),
         },
         "frames_per_second": log.detected / seconds if seconds > 0 else None,
         "seconds": {"total": round(seconds, 3), **{name: round(value, 3) for name, value in log.wall_s.items()}},

@@ -1,0 +1,196 @@
+"""A flight's detections, frame by frame, placed and given to their tracks: on the ground, or in the picture."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.geometry.level_ground import footprint
+from sorvolo.geometry.pose import Pose, rotation_from_vector, site_from_gimbal_rotation
+from sorvolo.survey.flight import CameraModel, CameraPrior, Frame
+from sorvolo.survey.objects import Detections, Sighting, Track
+from sorvolo.tracking.heading import CompassError, HeadingFromMotion
+from sorvolo.tracking.image_motion import ImageMotion
+from sorvolo.tracking.locate import TOO_SHORT, GroundHeight, LocateSettings, locate
+from sorvolo.tracking.tracker import IN_PICTURES, Tracker, TrackerSettings, TrackUpdate
+
+_MOST_DRONE_PLACES = 200_000
+_GIMBAL_TILT_SIGMA_DEG = 1.0  # a mapping doubts gimbals more, since its pictures measure tilt; here nothing else does
+_LEAST_DOWN = 0.1  # of the optical axis: nearer to the horizon a sampling distance means nothing
+_OVER_MODEL = LocateSettings(ground_sigma_m=1.0)  # of a height model, where it stands on its own
+
+
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """What became of a frame's detections, each with its sighting, if it has a place, and its track (0: none).
+
+    `merged` are ids of tracks that turned out to be objects seen before. `segment` counts the stretches of a flight
+    that is followed in the picture, from 1, each with places in the pixels of its own first frame; 0 on the ground.
+    """
+
+    sightings: Sequence[Sighting | None]
+    track_ids: Sequence[int]
+    new_ids: frozenset[int]
+    merged: frozenset[int]
+    segment: int = 0
+
+
+def watched_prior(prior: CameraPrior, height_sigma_m: float, *, has_gimbal: bool) -> CameraPrior:
+    """A mapping's prior as a watch needs it: the ground's own `height_sigma_m` in the height's, a gimbal's angles
+    trusted."""
+    position_sigma_m = prior.position_sigma_m.copy()
+    position_sigma_m[2] = np.hypot(position_sigma_m[2], height_sigma_m)
+    attitude_sigma_deg = prior.attitude_sigma_deg.copy()
+    if has_gimbal:
+        attitude_sigma_deg[:2] = np.minimum(attitude_sigma_deg[:2], _GIMBAL_TILT_SIGMA_DEG)
+    return replace(prior, position_sigma_m=position_sigma_m, attitude_sigma_deg=attitude_sigma_deg)
+
+
+class GroundFollower:
+    """Detections of a flight with telemetry, placed on the ground and tracked in site metres. Only `take` changes it.
+
+    All detections score `sure_score` or more. `ground` gives the ground's height over the flight's zero; None: it is
+    level. Without `knows_heading` the camera's heading comes from the pictures' motion. `unlocated` counts detections
+    without a place by reason.
+    """
+
+    def __init__(
+        self, camera: CameraModel, sure_score: float, ground: GroundHeight | None, *, knows_heading: bool
+    ) -> None:
+        self._camera, self._ground = camera, ground
+        self._tracker = Tracker(TrackerSettings(sure_score=sure_score))
+        self._heading = None if knows_heading else _HeadingFromPictures()
+        self._compass = CompassError()
+        self._path: list[Floats] = []
+        self.unlocated: Counter[str] = Counter()
+
+    def m_per_px(self, prior: CameraPrior) -> float | None:
+        """The ground's sampling distance along the optical axis; None at the horizon and without a height."""
+        down = -float(prior.rotation[2, 2])
+        height_m = float(prior.position_m[2]) - self._below_m(prior)
+        if down < _LEAST_DOWN or height_m <= 0:
+            return None
+        return height_m / down / self._camera.camera.fx_px
+
+    @property
+    def too_short(self) -> int:
+        """Detections so far that are far too short for their class."""
+        return self.unlocated[TOO_SHORT]
+
+    @property
+    def compass_clockwise_deg(self) -> float:
+        """How far too far clockwise the compass reads, by what stands."""
+        return self._compass.clockwise_deg
+
+    def take(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> Taken:
+        """Place a frame's detections, seen from `prior`, on the ground and give them to their tracks."""
+        if self._heading is not None:
+            prior = self._heading.take(frame, time_ns, found, prior)
+        else:
+            site_from_read = rotation_from_vector(np.array([0.0, 0.0, np.radians(self._compass.clockwise_deg)]))
+            prior = replace(prior, rotation=site_from_read @ prior.rotation)
+        sightings, unlocated = locate(
+            found, frame.index, frame.name, time_ns, self._camera.camera, prior, focal_sigma=self._camera.focal_sigma,
+            ground_height_m=self._ground or 0.0, settings=LocateSettings() if self._ground is None else _OVER_MODEL,
+        )
+        self.unlocated.update(unlocated)
+        outline_m = footprint(self._camera.camera, Pose(prior.rotation, prior.position_m), self._below_m(prior))
+        update = self._tracker.update(
+            [each for each in sightings if each is not None], time_ns=time_ns,
+            footprint_m=outline_m if np.isfinite(outline_m).all() else None,
+        )
+        if prior.knows_place and self._heading is None:
+            self._compass.add(time_ns / 1e9, prior.position_m[:2], self._tracker.shift_m)
+        if prior.knows_place and len(self._path) < _MOST_DRONE_PLACES:
+            self._path.append(prior.position_m[:2])
+        return _taken(sightings, update)
+
+    def tracks(self) -> Sequence[Track]:
+        """All tracks as they are known now."""
+        return self._tracker.tracks()
+
+    def finish(self) -> Sequence[Track]:
+        """All tracks when nothing more comes."""
+        return self._tracker.finish()
+
+    def path_m(self) -> PointsM:
+        """(N, 2) where the camera was, in site metres."""
+        return np.array(self._path).reshape(-1, 2)
+
+    def _below_m(self, prior: CameraPrior) -> float:
+        """The ground's height below the camera; 0 where it is not known."""
+        if self._ground is None or not prior.knows_place:
+            return 0.0
+        below_m = float(self._ground(prior.position_m[None, :2])[0])
+        return below_m if np.isfinite(below_m) else 0.0
+
+
+class _HeadingFromPictures:
+    """The heading of a camera whose telemetry has none, from the motion that its pictures show."""
+
+    def __init__(self) -> None:
+        self._motion, self._heading = ImageMotion(), HeadingFromMotion()
+        self._segments = 1
+
+    def take(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> CameraPrior:
+        """The prior with the heading in it, where that is known by now."""
+        _, outline_px = self._motion.locate(found, frame, time_ns)
+        if self._motion.segments != self._segments:
+            self._segments = self._motion.segments
+            self._heading.lose()
+        if not prior.knows_place:
+            return prior
+        heading = self._heading.add(time_ns / 1e9, outline_px, prior.position_m[:2])
+        if not np.isfinite(heading.sigma_deg):
+            return prior
+        sigma_deg = np.array([*prior.attitude_sigma_deg[:2], heading.sigma_deg])
+        rotation = site_from_gimbal_rotation(heading.heading_deg, -90.0, 0.0)
+        return replace(prior, rotation=rotation, attitude_sigma_deg=sigma_deg)
+
+
+class PictureFollower:
+    """Detections of a flight that nothing places, tracked in the first frame's pixels; after a cut all begins anew.
+
+    `segment` counts the stretches between cuts, from 1.
+    """
+
+    def __init__(self, sure_score: float) -> None:
+        self._settings = replace(IN_PICTURES, sure_score=sure_score)
+        self._motion, self._tracker = ImageMotion(), Tracker(self._settings)
+        self._earlier = list[Track]()
+        self.segment = 1
+
+    @property
+    def guessed(self) -> int:
+        """Frames so far that show no motion that fits."""
+        return self._motion.guessed
+
+    def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
+        """Take the camera's motion out of a frame's detections and give them to their tracks."""
+        sightings, outline = self._motion.locate(found, frame, time_ns)
+        if self._motion.segments != self.segment:
+            self.segment = self._motion.segments
+            self._earlier += self._tracker.finish()
+            self._tracker = Tracker(self._settings, first_id=self._tracker.next_id)
+        update = self._tracker.update(sightings, time_ns=time_ns, footprint_m=outline)
+        return replace(_taken(sightings, update), segment=self.segment)
+
+    def tracks(self) -> Sequence[Track]:
+        """All tracks as they are known now."""
+        return [*self._earlier, *self._tracker.tracks()]
+
+    def finish(self) -> Sequence[Track]:
+        """All tracks when nothing more comes."""
+        return [*self._earlier, *self._tracker.finish()]
+
+    def path_m(self) -> PointsM:
+        """(0, 2): nothing is known of where the camera was."""
+        return np.zeros((0, 2))
+
+
+def _taken(sightings: Sequence[Sighting | None], update: TrackUpdate) -> Taken:
+    ids = iter(update.track_ids)
+    of_detections = [0 if each is None else next(ids) for each in sightings]
+    return Taken(sightings, of_detections, frozenset(update.new), frozenset(update.merged))
