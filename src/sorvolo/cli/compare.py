@@ -161,7 +161,7 @@ def _show_progress(
             for change in update.announced:
                 announced.append(change.id)
                 words = words or _announcement(folder, form)
-                console.print(words(change), highlight=False)
+                console.print(words(change), highlight=False, soft_wrap=True)
             compared = f"{update.compared:,} of {counted(update.views, 'view')} compared"
             progress.show(
                 "comparing, frame", update.frames_read, max(update.frames_expected, update.frames_read),

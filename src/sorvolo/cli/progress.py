@@ -57,7 +57,8 @@ class ProgressReport:
         elif self._clock() - self._last_s >= _LINE_EVERY_S:
             self._last_s = self._clock()
             so_far = f" {done:,} of {total:,}" if total else f" {done:,}" if done else ""
-            self.console.print(f"{task}{so_far}{', ' + words if words else ''}", highlight=False, markup=False)
+            line = f"{task}{so_far}{', ' + words if words else ''}"
+            self.console.print(line, highlight=False, markup=False, soft_wrap=True)
         self._task = task
 
 

@@ -165,7 +165,7 @@ def _show_progress(
         progress.show("opening")
         for update in updates:
             for track in update.new if not is_quiet else ():
-                console.print(_words_of(track, update.site, form), highlight=False)
+                console.print(_words_of(track, update.site, form), highlight=False, soft_wrap=True)
             delay = f"{1000 * update.latency_s:.0f} ms delay"
             progress.show(
                 "watching, frame", update.frames_read,

@@ -6,6 +6,7 @@ import numpy as np
 
 from sorvolo.geometry.arrays import BoxesPx, Floats, PointsM
 from sorvolo.geometry.box_overlap import iou_matrix, nesting_matrix
+from sorvolo.survey.objects import Detections
 from sorvolo.tracking.followed import Followed
 from sorvolo.tracking.motion import MOVES, log_density, predicted
 

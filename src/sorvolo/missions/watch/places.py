@@ -121,7 +121,7 @@ class GroundPlaces:
         if abs(clockwise_deg) <= _COMPASS_REPORTED_DEG:
             return ()
         side = "clockwise" if clockwise_deg > 0 else "counter-clockwise"
-        off = f"the compass reads about {abs(clockwise_deg):.0f} degrees too far {side}: corrected, by what stands still"
+        off = f"the compass reads about {abs(clockwise_deg):.0f} degrees too far {side}: corrected by what stands"
         return (Notice("compass_off", 1, off),)
 
     def _size_notices(self) -> tuple[Notice, ...]:
