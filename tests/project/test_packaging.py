@@ -56,13 +56,19 @@ def test_licence_expression_names_a_full_text_each() -> None:
 def test_every_shipped_model_is_under_a_licence_of_the_package_and_its_sources_are_credited(card: Path) -> None:
     written = json.loads(card.read_text(encoding="utf-8"))
     assert written["licence"] in PROJECT["project"]["license"]
-    notice = (ROOT / "NOTICE").read_text(encoding="utf-8")
-    name = written.get("of", written["name"])
-    section = re.search(rf"^Model `{name}`.*?\n-+\n(.*?)(?=^(?:Model `|The region score\n)|\Z)", notice, re.M | re.S)
-    assert section, f"NOTICE has no section for the model {name}"
+    credited = section_of(written["name"])
+    for other in re.findall(r"^All sources of the model `([^`]+)`", credited, re.M):
+        credited += section_of(other)
     for source in written["trained_on"]:
         what = source["what"].partition(", seed")[0]  # how many pictures, and which seed, is the card's
-        assert what in section[1], f"NOTICE does not credit {source['what']} under the model {name}"
+        assert what in credited, f"NOTICE does not credit {source['what']} under the model {written['name']}"
+
+
+def section_of(model: str) -> str:
+    notice = (ROOT / "NOTICE").read_text(encoding="utf-8")
+    found = re.search(rf"^Model `{model}`.*?\n-+\n(.*?)(?=^[^\n]+\n-{{5,}}\n|\Z)", notice, re.M | re.S)
+    assert found, f"NOTICE has no section for the model {model}"
+    return found[1]
 
 
 def test_build_lock_holds_what_the_build_requires() -> None:
