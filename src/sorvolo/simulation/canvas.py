@@ -30,7 +30,7 @@ class Area:
 class GroundRaster:
     """A picture of the ground: the outer corner of its top-left pixel lies at (west_m, north_m), north is up.
 
-    `vegetation` (height, width) uint8 tells how much a pixel can move in the wind.
+    `vegetation` (height, width) uint8 is how much a pixel can move in the wind.
     """
 
     rgb: ImageRGB

@@ -50,7 +50,7 @@ class Layout:
 
 @dataclass(frozen=True, eq=False)
 class PaintedGround:
-    """The ground's picture and what it says about where things stand."""
+    """The ground's picture and the places on it where things stand."""
 
     raster: GroundRaster
     layout: Layout

@@ -37,7 +37,7 @@ class _Clothes:
 def build_person(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Part]:
     """The limbs of a person of one of the POSES, lowest first, the light from above painted in.
 
-    `thing.size_m` tells the stature: its height divided by the pose's share of it, or its length for one who lies.
+    `thing.size_m` gives the stature: its height divided by the pose's share of it, or its length for one who lies.
     """
     lying = thing.kind == "lying"
     stature_m = thing.size_m[0] / POSES[thing.kind][0] if lying else thing.size_m[2] / POSES[thing.kind][2]

@@ -103,19 +103,19 @@ def read_sets(
 
 
 def known_classes(arms: Iterable[Iterable[str]]) -> tuple[str, ...]:
-    """All classes that any model of the arms tells apart. Raises InputError as `evaluate_detector`."""
-    told = (
+    """All classes that any model of the arms detects. Raises InputError as `evaluate_detector`."""
+    found = (
         read_found(Path(place)).classes if Path(place).suffix == ".json" else read_info(find_model(place)).classes
         for arm in arms for place in arm
     )
-    return tuple(dict.fromkeys(name for classes in told for name in classes))
+    return tuple(dict.fromkeys(name for classes in found for name in classes))
 
 
 def evaluate_detector(
     arms: Sequence[Sequence[str]],
     labelled: Sequence[LabelledSet],
     settings: EvaluationSettings | None = None,
-    told: Callable[[EvaluationProgress], None] = lambda _: None,
+    progress: Callable[[EvaluationProgress], None] = lambda _: None,
 ) -> DetectorEvaluation:
     """Measure `arms[0]` on each set, and the other arms beside it.
 
@@ -128,7 +128,7 @@ def evaluate_detector(
     settings = settings or EvaluationSettings()
     _demand_distinct(labelled)
     damaged: dict[str, str] = {}
-    seen = _seen_by_all(arms, labelled, settings, told, damaged)
+    seen = _seen_by_all(arms, labelled, settings, progress, damaged)
     labelled = [_readable(each, damaged) for each in labelled]
     first = seen[0][0]
     scores = tuple(_scores(each, first, settings) for each in labelled)
@@ -146,10 +146,10 @@ def _scores(labelled: LabelledSet, found: FoundSets, settings: EvaluationSetting
 
 def _seen_by_all(
     arms: Sequence[Sequence[str]], labelled: Sequence[LabelledSet], settings: EvaluationSettings,
-    told: Callable[[EvaluationProgress], None], damaged: dict[str, str],
+    progress: Callable[[EvaluationProgress], None], damaged: dict[str, str],
 ) -> list[list[FoundSets]]:
     """What every model of every arm finds in the pictures that can be read; the others join `damaged`."""
-    seen = [[_found(place, labelled, settings, told, damaged) for place in arm] for arm in arms]
+    seen = [[_found(place, labelled, settings, progress, damaged) for place in arm] for arm in arms]
     return [[_without(each, labelled, damaged) for each in arm] for arm in seen]
 
 
@@ -165,7 +165,7 @@ def _model_notices(seen: Sequence[Sequence[FoundSets]]) -> tuple[str, ...]:
 
 
 def write_evaluation(evaluation: DetectorEvaluation, folder: Path, description: Mapping[str, Any]) -> None:
-    """Write detector.html, detector.json and detections.json; `description` says what was measured on what.
+    """Write detector.html, detector.json and detections.json; `description` is what was measured on what.
 
     Raises StoreError on a full disk.
     """
@@ -204,9 +204,9 @@ def _held_out(labelled: LabelledSet, share: float, seed: int) -> LabelledSet:
 
 def _found(
     place: str, labelled: Sequence[LabelledSet], settings: EvaluationSettings,
-    told: Callable[[EvaluationProgress], None], damaged: dict[str, str],
+    progress: Callable[[EvaluationProgress], None], damaged: dict[str, str],
 ) -> FoundSets:
-    """What the model of this name or file finds, or what a file says that it found.
+    """What the model of this name or file finds, or what it found by an earlier file.
 
     Pictures that cannot be read join `damaged`, by path with the reason; of them nothing is found.
     """
@@ -234,11 +234,11 @@ def _found(
                 seconds += time.perf_counter() - started
                 count += 1
                 lights.append(detector.thresholds_for(image))
-            told(EvaluationProgress(detector.info.name, each.name, len(detections), len(each)))
+            progress(EvaluationProgress(detector.info.name, each.name, len(detections), len(each)))
         usual = max(lights, key=lights.count, default=detector.info.thresholds)
         if others := len(lights) - lights.count(usual):
             mixed.append(
-                f"{each.name}: {others} of {len(lights)} pictures are of another light than most and are told from "
+                f"{each.name}: {others} of {len(lights)} pictures are of another light than most and are reported from "
                 "other scores on; what is reported is counted by the thresholds of most"
             )
         sets[each.name] = FoundSet(_names(each), tuple(detections), usual)

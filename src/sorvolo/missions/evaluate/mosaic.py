@@ -190,7 +190,7 @@ def _rows_of(
 
 
 def _positions(path: Path) -> dict[tuple[str, str], _TablePlace]:
-    """The places of a table by flight ("": not said) and frame; raises InputError where it cannot be read."""
+    """The places of a table by flight ("": any) and frame; raises InputError where it cannot be read."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             table = csv.DictReader(file)

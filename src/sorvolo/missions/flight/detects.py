@@ -14,11 +14,11 @@ class Detects(Protocol):
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """The names of what it tells apart, in the order of its labels."""
+        """The names of the classes that it detects, in the order of its labels."""
 
     @property
     def info(self) -> ModelInfo:
-        """What the model says of itself."""
+        """The model's own description."""
 
     @property
     def provider(self) -> str:
@@ -29,7 +29,7 @@ class Detects(Protocol):
         """What a user should know of the pictures seen so far."""
 
     def thresholds_for(self, picture: ImageRGB) -> Mapping[str, float]:
-        """From which score on each class is told in a picture (H, W, 3) like this."""
+        """From which score on each class is reported in a picture (H, W, 3) like this."""
 
     def detect(
         self, image: ImageRGB, *, tiles: Literal["auto"] | int | None = None, m_per_px: float | None = None,

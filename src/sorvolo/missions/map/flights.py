@@ -34,9 +34,9 @@ def map_flights(
 
     `inputs` are videos, folders of photos, photos, or live sources (see `open_sources`); `telemetry` a file of the
     only flight (else what lies in or beside it is used), or a receiver's link; `camera` a calibration file, a preset's
-    name, "aov=DEG" or "focal_px=PX"; `area` a polygon outside of which frames are not used; `detector` one that looks
-    for objects in place of the model that the settings name. A live flight is read as `live` says until it ends or
-    `until` is set; then its map is finished like any other's.
+    name, "aov=DEG" or "focal_px=PX"; `area` a polygon outside of which frames are not used; `detector` one that finds
+    objects in place of the model that the settings name. A live flight is read, by the settings `live`, until it ends
+    or `until` is set; then its map is finished like any other's.
     Nothing of a flight is part of the site until its last update was yielded.
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being mapped is left out, those before it are in.

@@ -15,7 +15,7 @@ from sorvolo.store.atomic import writing
 from sorvolo.store.exports.flight_files import write_json
 
 MARK = "simulation.json"
-"""The file that says that a folder holds simulated flights, and may be replaced by another simulation."""
+"""The file that marks a folder that holds simulated flights, and may be replaced by another simulation."""
 
 PICTURES_MARK = "boxes.json"
 """The same of simulated pictures: their COCO file, so that it is the one JSON file of its folder."""

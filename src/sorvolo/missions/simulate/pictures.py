@@ -36,7 +36,7 @@ def simulate_pictures(
 ) -> Iterator[PicturesProgress]:
     """Write `images/*.jpg` and `boxes.json` (COCO) to `folder`, which appears whole or not at all.
 
-    Each picture is a site of its own; its `flight` in the COCO file says so. `ground_file` is the orthophoto of
+    Each picture is a site of its own; its `flight` in the COCO file names it. `ground_file` is the orthophoto of
     settings whose ground is "orthophoto". Raises SettingsError for a folder that holds anything but an earlier
     simulation, InputError for an unreadable orthophoto and StoreError for a full disk.
     """

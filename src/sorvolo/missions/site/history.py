@@ -125,7 +125,7 @@ def export_version(site: Path, at: str | None, path: Path) -> VersionEntry:
 def _moment(text: str) -> datetime:
     """The end of an ISO date, or of the hour, minute or second that an ISO date-time names, UTC unless it names a zone.
 
-    A list shows times without their seconds: what it says was complete at a minute was so at the minute's end.
+    A list shows times without their seconds: what it lists as complete at a minute was so at the minute's end.
     """
     try:
         return datetime.combine(date.fromisoformat(text), time.max, UTC)

@@ -1,4 +1,4 @@
-"""What people say of changes: listed with their verdicts, confirmed, rejected."""
+"""Changes and people's verdicts on them: listed, confirmed, rejected."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,7 +25,7 @@ def review_changes(
     """Confirm or reject changes by id, or by number when `flight` says whose; return them as they are now.
 
     The flight's changes.geojson and changes.html follow. Rejected changes do not come back in later flights. Raises
-    InputError for an unknown id or flight (then nothing is said of any), StoreError when another process is writing.
+    InputError for an unknown id or flight (then no verdict is given), StoreError when another process is writing.
     """
     if not ids:
         raise InputError("no change was named; give the ids that `sorvolo review SITE` lists")
@@ -33,13 +33,10 @@ def review_changes(
         pass
     with Archive.open(site, write=True) as archive:
         _require_flight(archive, flight)
+        if flight is None:
+            _demand_whole_ids(archive, ids)
         by_number = {str(each.number): each.id for each in archive.changes(flight)} if flight is not None else {}
         wanted = {by_number.get(each, each) for each in ids}
-        if flight is None and (bare := next((each for each in ids if each.isdecimal()), "")):
-            raise InputError(
-                f"{archive.folder} has no change {bare}: a number is one flight's; give --flight as well, or the whole "
-                f"id as `sorvolo review {archive.folder}` lists it"
-            )
         archive.review(wanted, verdict, note)
         return [each for each in archive.changes() if each.id in wanted]
 
@@ -48,3 +45,12 @@ def _require_flight(archive: Archive, flight: str | None) -> None:
     known = [entry.id for entry in archive.flights()]
     if flight is not None and flight not in known:
         raise InputError(f"{archive.folder} has no flight {flight}; it has {', '.join(known) or 'none'}")
+
+
+def _demand_whole_ids(archive: Archive, ids: Sequence[str]) -> None:
+    """Raise InputError for a number: it is one flight's."""
+    if bare := next((each for each in ids if each.isdecimal()), ""):
+        raise InputError(
+            f"{archive.folder} has no change {bare}: a number is one flight's; give --flight as well, or the whole "
+            f"id as `sorvolo review {archive.folder}` lists it"
+        )

@@ -87,6 +87,9 @@ def _headline(report: Mapping[str, Any]) -> str:
         return f"{vision} of {selected} frames matched the map{ground}."
     if not vision + blind:
         return f"None of {selected} frames could be placed: there is no map of this flight."
+    if at(report, "headline", "quality") not in (None, "map"):
+        text = str(at(report, "headline", "text"))
+        return f"{text[:1].upper()}{text[1:]}."
     counts = f"{vision} of {selected} frames matched"
     more = f", {blind} placed by GPS only" if blind else ""
     lost = f", {rejected} not placed" if rejected else ""
