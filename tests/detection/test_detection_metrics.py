@@ -15,6 +15,7 @@ from sorvolo.detection.metrics import (
     match_pictures,
     precision_recall,
     recall_by_size,
+    reporting_threshold,
     thesis_ap,
     thesis_map,
 )
@@ -40,6 +41,19 @@ def seen(*rows):
 
 def square(x, y, side=10):
     return [x, y, x + side, y + side]
+
+
+def test_a_reporting_threshold_does_not_hang_on_one_picture_s_chance():
+    """Of 25 people 20 are found from 0.995 on, two from 0.6 on, with five alarms between: F1 is highest at 0.997."""
+    people = [square(20 * index, 0) for index in range(25)]
+    truth = LabelledSet("flat", CLASSES, (picture(people, [0] * 25),))
+    sure = [(box, 0, 0.999 - 1e-4 * index) for index, box in enumerate(people[:20])]
+    alarms = [(square(20 * index, 50), 0, 0.9 - 0.01 * index) for index in range(5)]
+    late = [(box, 0, 0.6 - 0.01 * index) for index, box in enumerate(people[20:22])]
+    (match, _), _, _ = match_pictures(truth, [seen(*sure, *alarms, *late)], CLASSES)
+    best, reported = best_threshold(match), reporting_threshold(match)
+    assert best.score > 0.99 and best.f1 > reported.f1 > best.f1 - 0.1
+    assert reported.score == pytest.approx(0.59) and reported.recall == pytest.approx(22 / 25)
 
 
 def test_average_precision_worked_by_hand():

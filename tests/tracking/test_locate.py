@@ -19,7 +19,7 @@ from sorvolo.simulation.settings import (
 from sorvolo.simulation.truth import coco_boxes
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.objects import CLASSES, TYPICAL_SIZE_M, Detections, no_detections
-from sorvolo.tracking.locate import TOO_SHORT, LocateSettings, locate
+from sorvolo.tracking.locate import IMPOSSIBLE_SIZE, LocateSettings, locate
 from sorvolo.tracking.tracker import Tracker
 
 CAMERA = Camera.from_angle_of_view(960, 540, 62.0)
@@ -53,7 +53,7 @@ def test_below_the_camera_lies_what_is_in_the_middle():
 def test_what_is_far_too_short_for_its_class_is_set_aside():
     window_px = 0.8 * CAMERA.fx_px / 59.25  # of a car that is 0.8 m long
     sighting, unlocated = place(one([400.0, 300.0], side_px=window_px))
-    assert sighting is None and unlocated == {TOO_SHORT: 1}
+    assert sighting is None and unlocated == {IMPOSSIBLE_SIZE: 1}
     for found, prior in (
         (one([400.0, 300.0], side_px=5.0 * window_px), PRIOR),
         (one([400.0, 300.0], "person", window_px), PRIOR),
@@ -62,6 +62,17 @@ def test_what_is_far_too_short_for_its_class_is_set_aside():
     ):
         sighting, unlocated = place(found, prior)
         assert sighting is not None and not unlocated
+
+
+def test_what_is_far_too_wide_for_its_class_is_set_aside():
+    m_px = CAMERA.fx_px / 59.25
+    sighting, unlocated = place(one([400.0, 300.0], "person", 6 * m_px))
+    assert sighting is None and unlocated == {IMPOSSIBLE_SIZE: 1}
+    for name, side_m in (("person", 3.0), ("car", 9.0)):
+        sighting, _ = place(one([400.0, 300.0], name, side_m * m_px))
+        assert sighting is not None
+    unsure = replace(PRIOR, position_sigma_m=np.array([0.5, 0.5, 20.0]))
+    assert place(one([400.0, 300.0], "person", 6 * m_px), unsure)[0] is not None
 
 
 def test_the_middle_of_an_object_stands_above_its_foot():

@@ -203,6 +203,23 @@ def best_threshold(match: ClassMatch) -> Threshold:
     return Threshold(*(float(each[best]) for each in (scores, precision, recall, f1)))
 
 
+def reporting_threshold(match: ClassMatch) -> Threshold:
+    """The lowest score at which F1 is not worse than the highest by more than chance explains; NaN as there.
+
+    Of few labels the highest F1 may lie anywhere on a flat curve, at 0.99 even, where little is found in other
+    pictures. F1 of G labels is known to about half of one over the root of G; at most a tenth is given away.
+    """
+    best = best_threshold(match)
+    if not np.isfinite(best.score):
+        return best
+    scores, precision, recall = precision_recall(match)
+    f1 = 2 * precision * recall / np.maximum(precision + recall, 1e-12)
+    f1[:-1][scores[:-1] == scores[1:]] = 0.0
+    margin = min(0.1, 0.5 / np.sqrt(len(match.true_pictures)))
+    row = int(np.flatnonzero(f1 >= best.f1 - margin)[-1])
+    return Threshold(*(float(each[row]) for each in (scores, precision, recall, f1)))
+
+
 def recall_by_size(
     matches: Sequence[ClassMatch], thresholds: Mapping[str, float], scale: Floats, edges: Sequence[float]
 ) -> dict[str, tuple[SizeRow, ...]]:

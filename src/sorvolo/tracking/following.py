@@ -13,7 +13,7 @@ from sorvolo.survey.flight import CameraModel, CameraPrior, Frame
 from sorvolo.survey.objects import Detections, Sighting, Track
 from sorvolo.tracking.heading import CompassError, HeadingFromMotion
 from sorvolo.tracking.image_motion import ImageMotion
-from sorvolo.tracking.locate import TOO_SHORT, GroundHeight, LocateSettings, locate
+from sorvolo.tracking.locate import IMPOSSIBLE_SIZE, GroundHeight, LocateSettings, locate
 from sorvolo.tracking.tracker import IN_PICTURES, Tracker, TrackerSettings, TrackUpdate
 
 _MOST_DRONE_PLACES = 200_000
@@ -77,7 +77,7 @@ class GroundFollower:
     @property
     def too_short(self) -> int:
         """Detections so far that are far too short for their class."""
-        return self.unlocated[TOO_SHORT]
+        return self.unlocated[IMPOSSIBLE_SIZE]
 
     @property
     def compass_clockwise_deg(self) -> float:

@@ -11,7 +11,7 @@ from sorvolo.geometry.pose import Pose
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.objects import TYPICAL_SIZE_M, Detections, Sighting
 from sorvolo.tracking.cut_boxes import beyond_edges, cut_edges
-from sorvolo.tracking.plausible import TOO_SHORT_CUT_PX, far_too_short
+from sorvolo.tracking.plausible import TOO_SHORT_CUT_PX, impossible_size
 
 _BOX_SIGMA = 0.06  # of a box's middle, in shares of its side
 _LEAST_SIGMA_PX = 1.0
@@ -49,7 +49,7 @@ class LaidSighting:
 def lay_on_ground(seen: Detections, frame: PlacedFrame, *, has_metres: bool = True) -> list[LaidSighting | None]:
     """Where each detection of a frame stands on level ground, None where that is at the horizon or unknown.
 
-    None as well for what is far too short for its class, as a window is for a car, and not cut by the picture's edge.
+    None as well for what is of a size that its class cannot have (`plausible`).
 
     A box's middle is taken as the middle of the body, half its class's usual height above the ground (TYPICAL_SIZE_M);
     without metres it lies on the ground. Boxes are in the frame's own pixels, lens distortion and all.
@@ -75,7 +75,7 @@ def lay_on_ground(seen: Detections, frame: PlacedFrame, *, has_metres: bool = Tr
             continue
         spans_m = np.array([around_m[2] - around_m[1], around_m[4] - around_m[3]])
         sides_m = np.hypot(*spans_m.T)
-        if has_metres and far_too_short((name,), sides_m[None], cut[k:k + 1])[0]:
+        if has_metres and impossible_size((name,), sides_m[None], cut[k:k + 1])[0]:
             result.append(None)
             continue
         m_per_px = float(np.sqrt(np.prod(sides_m) / max(np.prod(boxes[k, 2:] - boxes[k, :2]), 1e-6)))

@@ -12,12 +12,12 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.objects import TYPICAL_SIZE_M, Detections, Sighting
 from sorvolo.tracking.cut_boxes import beyond_edges, cut_edges
-from sorvolo.tracking.plausible import TOO_SHORT_CUT_PX, far_too_short
+from sorvolo.tracking.plausible import TOO_SHORT_CUT_PX, impossible_size
 
 GroundHeight = Callable[[PointsM], Floats]
 """Heights (N,) of the ground above the site's level plane, m, at east, north (N, 2); NaN where it is not known."""
 
-TOO_SHORT = "far too short for its class"
+IMPOSSIBLE_SIZE = "of a size that its class cannot have"
 """The words for what could be placed, and is set aside: it is not what the detector took it for."""
 
 _OTHER_HEIGHT_M = 1.0  # of a class that nothing is known of
@@ -92,7 +92,7 @@ def locate(
     sizes_m = slopes_m * sides_px
     axes = per_px.transpose(0, 2, 1) / np.maximum(slopes_m, 1e-9)[:, :, None]
     cut = cut_edges(boxes, camera.width_px, camera.height_px)
-    short = far_too_short(
+    short = impossible_size(
         found.names, sizes_m, cut_edges(boxes, camera.width_px, camera.height_px, TOO_SHORT_CUT_PX),
         _scale_sigma(prior, reach * -rays_site[:, 2], focal_sigma, settings),
     )
@@ -115,7 +115,7 @@ def locate(
         elif not sigmas[row] <= settings.most_sigma_m:
             unlocated[f"the place is known no better than {settings.most_sigma_m:g} m"] += 1
         elif short[row]:
-            unlocated[TOO_SHORT] += 1
+            unlocated[IMPOSSIBLE_SIZE] += 1
         else:
             sightings[row] = Sighting(
                 frame_index, frame_name, time_ns, label, float(found.scores[row]), found.boxes_px[row], places_m[row],

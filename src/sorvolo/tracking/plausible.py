@@ -11,7 +11,8 @@ TOO_SHORT_CUT_PX = 3.0
 """Pieces of cars at the picture's edge end up to so far from it: nearer, their length says nothing."""
 
 _LEAST_LENGTH = 0.4  # of a class's usual length: what is shorter is none, however sure the detector is
-_SCALE_SIGMAS = 2.0  # by which heights may be off before something is called too short
+_MOST_WIDTH = 2.5  # times a class's largest dimension: what is wider is none; trucks are as wide as cars are long
+_SCALE_SIGMAS = 2.0  # by which heights may be off before something is called too short or too wide
 
 
 def usual_length_m(name: str) -> float:
@@ -19,13 +20,17 @@ def usual_length_m(name: str) -> float:
     return TYPICAL_SIZE_M[name][0] if name in TYPICAL_SIZE_M else 0.0
 
 
-def far_too_short(names: Sequence[str], sides_m: Floats, cut: Mask, scale_sigma: float | Floats = 0.0) -> Mask:
-    """(N,) bool: what is far too short for its class, as a window is for a car, and not cut by the picture's edge.
+def impossible_size(names: Sequence[str], sides_m: Floats, cut: Mask, scale_sigma: float | Floats = 0.0) -> Mask:
+    """(N,) bool: what is far too short or far too wide for its class, as a window or a lawn is for a car.
 
     `sides_m` (N, 2) are the box's sides on the ground, known to the relative error `scale_sigma`, one or (N,); `cut`
-    (N, 4) as `cut_edges` tells it with `TOO_SHORT_CUT_PX`.
+    (N, 4) as `cut_edges` gives it with `TOO_SHORT_CUT_PX`: what the picture's edge cuts may look too short, not too
+    wide. Seen aslant, a standing person's box is long on the ground, but not wide: the shorter side is compared.
     """
     longest_m = sides_m.max(axis=1, initial=0.0) * (1.0 + _SCALE_SIGMAS * scale_sigma)
     usual_m = np.array([usual_length_m(name) for name in names])
-    short: Mask = ~cut.any(axis=1) & (longest_m < _LEAST_LENGTH * usual_m)
-    return short
+    short = ~cut.any(axis=1) & (longest_m < _LEAST_LENGTH * usual_m)
+    shortest_m = sides_m.min(axis=1, initial=np.inf) * np.maximum(0.0, 1.0 - _SCALE_SIGMAS * scale_sigma)
+    largest_m = np.array([max(TYPICAL_SIZE_M.get(name, (np.inf,))) for name in names])
+    wide: Mask = shortest_m > _MOST_WIDTH * largest_m
+    return np.asarray(short | wide, bool)

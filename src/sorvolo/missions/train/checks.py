@@ -5,7 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sorvolo.detection.metrics import ClassMatch, CocoNumbers, Threshold, best_threshold, judged_classes, match_pictures
+from sorvolo.detection.metrics import (
+    ClassMatch,
+    CocoNumbers,
+    Threshold,
+    judged_classes,
+    match_pictures,
+    reporting_threshold,
+)
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
@@ -31,9 +38,9 @@ class Checked:
         return Check(step, _mean_known(of50.values()), _mean_known(of_all.values()), of50)
 
     def thresholds(self, classes: Sequence[str]) -> dict[str, Threshold]:
-        """The score from which on each class is best reported (highest F1, all sets together)."""
+        """The score from which each class is reported: `metrics.reporting_threshold` over all sets together."""
         unknown = Threshold(_FALLBACK_THRESHOLD, float("nan"), float("nan"), float("nan"))
-        found = {name: best_threshold(_pooled(self.matches[name])) for name in classes if name in self.matches}
+        found = {name: reporting_threshold(_pooled(self.matches[name])) for name in classes if name in self.matches}
         return {
             name: replace(found[name], score=round(found[name].score, 3))
             if name in found and np.isfinite(found[name].score) else unknown

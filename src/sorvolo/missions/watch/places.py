@@ -11,7 +11,7 @@ from sorvolo.survey.flight import CameraPrior, Frame, Notice, Site
 from sorvolo.survey.objects import Detections, Track
 from sorvolo.survey.wording import counted
 from sorvolo.tracking.following import GroundFollower, PictureFollower, Taken, watched_prior
-from sorvolo.tracking.locate import TOO_SHORT, GroundHeight
+from sorvolo.tracking.locate import IMPOSSIBLE_SIZE, GroundHeight
 from sorvolo.tracking.tracker import TrackerSettings
 
 _COMPASS_REPORTED_DEG = 2.0
@@ -108,7 +108,7 @@ class GroundPlaces:
         return (
             *self._setup.notices, Notice("placed_by", 1, text), *self._compass_notices(),
             *(Notice("not_placed", count, f"{counted(count, 'detection')} without a place on the ground: {reason}")
-              for reason, count in self._follower.unlocated.most_common() if reason != TOO_SHORT),
+              for reason, count in self._follower.unlocated.most_common() if reason != IMPOSSIBLE_SIZE),
             *self._size_notices(),
         )
 

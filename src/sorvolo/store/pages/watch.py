@@ -232,7 +232,7 @@ def _course(report: Mapping[str, Any]) -> list[tuple[str, str]]:
 def _detections(report: Mapping[str, Any]) -> str:
     missing = f"{known(at(report, 'detections', 'not_placed'))} without" if report.get("georeferenced") else "none with"
     short = at(report, "detections", "set_aside")
-    aside = f"; {short} dropped, far too short for their class" if short else ""
+    aside = f"; {short} dropped, of a size that their class cannot have" if short else ""
     return f"{known(at(report, 'detections', 'total'))}, of which {missing} a place on the ground{aside}"
 
 
