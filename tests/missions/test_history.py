@@ -1,6 +1,7 @@
 """The versions of a map listed, found by date, and written as they were."""
 
 import json
+import sqlite3
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -51,6 +52,9 @@ def test_a_version_that_was_made_again_keeps_its_counts(site: Path) -> None:
 
 
 def test_a_date_means_its_whole_day_and_a_time_its_minute_or_second(site: Path) -> None:
+    with sqlite3.connect(site / "site.db") as connection:  # flights whose clocks have no date
+        connection.execute("UPDATE flown SET first_ns = 7, last_ns = 8")
+    connection.close()
     with Archive.open(site, write=False) as archive:
         made = [datetime.fromisoformat(version.created_utc) for version in archive.versions()]
         assert find_version(archive, "1").id == 1
@@ -70,6 +74,14 @@ def test_a_date_means_its_whole_day_and_a_time_its_minute_or_second(site: Path) 
         assert find_version(archive, made[1].isoformat("_")).id == 2
         with pytest.raises(SettingsError, match="yesterday"):
             find_version(archive, "yesterday")
+
+
+def test_maps_are_dated_by_their_flights(site: Path) -> None:
+    assert [each.flown_utc[:10] for each in site_history(site)] == ["2023-11-14"] * 2
+    with Archive.open(site, write=False) as archive:
+        assert find_version(archive, "2023-11-14").id == 2
+        with pytest.raises(InputError, match="had no map"):
+            find_version(archive, "2023-11-13")
 
 
 def test_the_map_is_written_as_it_was(site: Path, tmp_path: Path) -> None:

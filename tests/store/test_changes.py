@@ -4,8 +4,10 @@ import json
 import sqlite3
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from xml.etree import ElementTree
 
 import cv2
+import gpxpy
 import numpy as np
 import pytest
 from fake_changes import SEEN_NS, fake_change, fake_comparison
@@ -16,6 +18,8 @@ from hypothesis import strategies as st
 from sorvolo.errors import InputError, StoreError
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.store.exports.change_files import changes_geojson, mask_name, write_view_masks
+from sorvolo.store.exports.placemarks import Placemark, gpx_bytes, kml_bytes
+from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.site import schema
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.change_records import StoredChange, stored_changes
@@ -74,7 +78,7 @@ def test_changes_come_back_as_they_were_found(folder: Path) -> None:
     assert np.array_equal(cv2.cvtColor(written, cv2.COLOR_BGRA2RGBA), made[1].patch.before)
     page = (folder / "flights/b/changes.html").read_text()
     assert "2 changes" not in page and "1 change " in page and "1 moving object" in page
-    assert "version 1: flight a" in page and "version 2: flight b" in page
+    assert "version 1: flight a, flown 2023-11-14" in page and "version 2: flight b" in page
 
 
 def test_the_geojson_says_what_is_promised_in_wgs84(folder: Path) -> None:
@@ -101,16 +105,47 @@ def test_the_geojson_says_what_is_promised_in_wgs84(folder: Path) -> None:
     assert np.allclose(feature["outline_m"], fake_change(3).outline_m, atol=1e-4)
 
 
-def test_a_local_site_gives_its_own_units(tmp_path: Path) -> None:
+def test_a_local_site_writes_no_places_on_earth_and_says_why(tmp_path: Path) -> None:
     with Archive.open(tmp_path / "site", write=True) as archive:
         archive.create_site(LOCAL_SITE)
         map_flight(archive, "a", 20, count=1)
         compare(archive, "b", [fake_change(1)])
-    collection = json.loads((tmp_path / "site/flights/b/changes.geojson").read_text())
-    assert collection["crs"] is None
+    for kind in ("geojson", "kml", "gpx", "kmz"):
+        assert not list((tmp_path / "site").rglob(f"*.{kind}"))
+    frames = json.loads((tmp_path / "site/flights/b/frames.json").read_text())
+    collection = json.loads((tmp_path / "site/flights/b/changes.json").read_text())
+    assert "no GPS" in collection["note"] and "no GPS" in frames["note"]
+    assert collection["crs"] is None and "type" not in collection and "type" not in collection["features"][0]
     ring = np.array(collection["features"][0]["geometry"]["coordinates"][0])
     assert np.allclose(ring.max(axis=0), fake_change(1).outline_m.max(axis=0))
-    assert " m²" not in (tmp_path / "site/flights/b/changes.html").read_text().split("All changes")[1]
+    page = (tmp_path / "site/flights/b/changes.html").read_text().split("All changes")[1]
+    assert " m²" not in page and "unit" not in page and "MGRS" not in page and "changes.geojson" not in page
+
+
+def test_changes_are_places_for_google_earth_and_receivers(folder: Path) -> None:
+    with Archive.open(folder, write=True) as archive:
+        compare(archive, "b", [fake_change(1, east_m=30.0), fake_change(2, kind=ChangeKind.DISAPPEARED)])
+        archive.review("b-2", Verdict.REJECTED)
+    flight = folder / "flights" / "b"
+    (waypoint,) = gpxpy.parse((flight / "changes.gpx").read_text()).waypoints
+    longitudes, latitudes = longitude_latitude(np.array([[30.0, -4.0]]), SITE)
+    assert waypoint.name == "b-1 appeared" and "score 0.80" in waypoint.description
+    assert (waypoint.longitude, waypoint.latitude) == pytest.approx((longitudes[0], latitudes[0]), abs=1e-7)
+    assert waypoint.time is not None and waypoint.time.isoformat() == "2023-11-14T22:13:20+00:00"
+    document = ElementTree.fromstring((flight / "changes.kml").read_bytes())
+    kml = "{http://www.opengis.net/kml/2.2}"
+    (mark,) = document.iter(f"{kml}Placemark")
+    assert [name.text for name in mark.iter(f"{kml}name")] == ["b-1 appeared"]
+    assert len(list(mark.iter(f"{kml}Point"))) == len(list(mark.iter(f"{kml}Polygon"))) == 1
+    point = next(mark.iter(f"{kml}Point"))
+    assert str(point.findtext(f"{kml}coordinates")).startswith(f"{longitudes[0]:.6f}"[:8])
+
+
+def test_names_from_elsewhere_stay_xml() -> None:
+    odd = Placemark("<&\x00\x1b>\"", "]]> & <b>", 13.0, 46.0, 0)
+    for data in (kml_bytes(odd.name, [odd]), gpx_bytes(odd.name, [odd])):
+        texts = [each.text for each in ElementTree.fromstring(data).iter() if each.text and each.text.strip()]
+        assert '<&>"' in texts and "]]> & <b>" in texts
 
 
 @given(st.lists(st.tuples(st.floats(-5e3, 5e3), st.floats(-5e3, 5e3), st.floats(0.05, 50)), max_size=4))
@@ -145,7 +180,8 @@ def test_comparing_again_replaces_everything(folder: Path) -> None:
         assert archive.changes()[1].centre_m[0] == pytest.approx(2)
     flight = folder / "flights" / "b"
     assert {path.name for path in flight.iterdir()} == {
-        "frames.geojson", "report.json", "report.html", "changes.geojson", "changes.html", "changes", "notes-2.txt",
+        "frames.geojson", "report.json", "report.html", "changes.geojson", "changes.kml", "changes.gpx",
+        "changes.html", "changes", "notes-2.txt",
     }
     assert {path.name for path in (flight / "changes").iterdir()} == {
         "b-2-before.png", "b-2-after.png", "b-3-before.png", "b-3-after.png"
@@ -283,10 +319,22 @@ def test_a_version_is_found_by_its_time_and_differs_by_its_tiles(folder: Path) -
         blob = max(folder.glob("tiles/*/*"), key=lambda path: path.stat().st_mtime_ns)
         assert (difference.changed, difference.removed, difference.changed_bytes) == (1, 0, blob.stat().st_size)
         assert archive.tile_difference(first).changed == 4
-        made = [datetime.fromisoformat(version.created_utc) for version in (first, second)]
+        # both were flown in 2023, whenever they were mapped
+        assert [version.flown_utc[:10] for version in (first, second)] == ["2023-11-14"] * 2
+        flown = datetime(2023, 11, 14, 22, 13, 21, tzinfo=UTC)
+        assert archive.version_at(flown).id == archive.version_at(flown.replace(tzinfo=None)).id == 2
+        with pytest.raises(InputError, match=r"had no map.*2023-11-14T22:13:20"):
+            archive.version_at(flown - timedelta(seconds=2))
+    page = (folder / "flights/b/changes.html").read_text()
+    assert "flight a, flown 2023-11-14" in page and "flight b, flown 2023-11-14" in page
+    with sqlite3.connect(folder / "site.db") as connection:  # flights whose clocks have no date
+        connection.execute("UPDATE flown SET first_ns = 7, last_ns = 8")
+    connection.close()
+    with Archive.open(folder, write=False) as archive:
+        made = [datetime.fromisoformat(version.created_utc) for version in archive.versions()]
         assert archive.version_at(made[0]).id == archive.version_at(made[1] - timedelta(milliseconds=1)).id == 1
         assert archive.version_at(made[1]).id == archive.version_at(datetime.now(UTC)).id == 2
-        assert archive.version_at(made[1].replace(tzinfo=None)).id == 2
+        assert {version.flown_utc for version in archive.versions()} == {""}
         with pytest.raises(InputError, match="had no map"):
             archive.version_at(made[0] - timedelta(seconds=1))
 
@@ -294,7 +342,7 @@ def test_a_version_is_found_by_its_time_and_differs_by_its_tiles(folder: Path) -
 def older_format(folder: Path) -> None:
     """Take away what the second format added."""
     connection = sqlite3.connect(folder / "site.db")
-    for name in ("changes", "comparisons", "leftovers", "reviews"):
+    for name in ("changes", "comparisons", "leftovers", "reviews", "flown"):
         connection.execute(f"DROP TABLE {name}")
     connection.execute("PRAGMA user_version = 1")
     connection.commit()
@@ -313,6 +361,7 @@ def test_a_site_of_the_first_format_is_read_as_it_is_and_upgraded_to_be_written(
         assert len(archive.tiles()) == 4 and len(archive.keyframes()) == 4
         compare(archive, "b", [fake_change(1)])
         assert len(archive.changes()) == 1
+        assert [version.flown_utc[:10] for version in archive.versions()] == ["2023-11-14"] * 2
     with sqlite3.connect(folder / "site.db") as connection:
         assert connection.execute("PRAGMA user_version").fetchone() == (schema.SCHEMA_VERSION,)
     connection.close()

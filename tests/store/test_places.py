@@ -1,13 +1,11 @@
-"""Places in words: MGRS against NGA's GEOTRANS (PyPI's mgrs 1.5), the zones' exceptions, and back by PROJ."""
+"""Places in words: MGRS against NGA's GEOTRANS (PyPI's mgrs 1.5), the zones' exceptions."""
 
 import numpy as np
 import pytest
 from fake_flights import LOCAL_SITE, SITE
-from hypothesis import given
-from hypothesis import strategies as st
-from pyproj import Transformer
 
-from sorvolo.store.exports.places import grid_words, place_words
+from sorvolo.geometry.coordinates import Coordinates, place_text
+from sorvolo.store.exports.places import degrees_words, place_words
 
 
 @pytest.mark.parametrize(("latitude_deg", "longitude_deg", "mgrs"), [
@@ -18,25 +16,14 @@ from sorvolo.store.exports.places import grid_words, place_words
     (-0.0001, 36.8, "37M BV 55134 99988"),
 ])
 def test_as_geotrans_has_it(latitude_deg: float, longitude_deg: float, mgrs: str) -> None:
-    words = grid_words(latitude_deg, longitude_deg)["mgrs"]
-    assert words[:6] == mgrs[:6]
+    words = place_text(latitude_deg, longitude_deg, Coordinates.MGRS)
+    assert words[:len(mgrs[:6].lstrip("0"))] == mgrs[:6].lstrip("0")
     assert np.allclose([int(each) for each in words.split()[2:]], [int(each) for each in mgrs.split()[2:]], atol=1)
-
-
-@given(st.floats(-80, 83.99), st.floats(-180, 179.9999))
-def test_utm_leads_back_to_the_place(latitude_deg: float, longitude_deg: float) -> None:
-    zone, east, north = grid_words(latitude_deg, longitude_deg)["utm"].split()
-    code = (32700 if latitude_deg < 0 else 32600) + int(zone[:-1])
-    back = Transformer.from_crs(f"EPSG:{code}", "EPSG:4326", always_xy=True)
-    longitude, latitude = back.transform(int(east) + 0.5, int(north) + 0.5)
-    assert abs(latitude - latitude_deg) < 1e-5
-    across = abs((longitude - longitude_deg + 180) % 360 - 180) * np.cos(np.radians(latitude_deg))
-    assert across < 1e-5
-    assert grid_words(latitude_deg, longitude_deg)["mgrs"].split()[2] == east[-5:]
 
 
 def test_a_site_has_all_three_and_a_local_one_none() -> None:
     words = place_words(np.array([10.0, 20.0]), SITE)
-    assert list(words) == ["degrees", "mgrs", "utm"]
-    assert words["degrees"] == "46.500180, 13.250130"
+    assert list(words) == ["latlon", "utm", "mgrs"]
+    assert words["latlon"] == "46.500180, 13.250130"
+    assert list(degrees_words(85.0, 10.0)) == ["latlon"]
     assert place_words(np.array([10.0, 20.0]), LOCAL_SITE) == {"site": "10.0, 20.0"}

@@ -140,11 +140,13 @@ def show_results(
     results: Sequence[Mapping[str, Any]], site: Path, console: Console, form: PlaceFormat = PlaceFormat.LATLON
 ) -> None:
     """Print what changed, what could not be compared, and where the files are."""
+    from sorvolo.store.exports.plain import features_path
+
     for result in results:
         _show_result(result, console, form)
         folder = site / "flights" / result["flight"]
         show_path("page", folder / "changes.html", console)
-        show_path("GeoJSON", folder / "changes.geojson", console)
+        show_path("list", features_path(folder, "changes"), console)
         show_path("report", folder / "report.html", console)
     show_path("map", site / "preview.png", console)
 
@@ -194,8 +196,10 @@ def _class_words(before: str | None, after: str | None) -> str:
 
 def _result(folder: Path, announced: Sequence[str]) -> dict[str, Any]:
     """What a flight's files say, and which changes were announced on the way and withdrawn in the end."""
+    from sorvolo.store.exports.plain import features_path
+
     report = read_json(folder / "report.json")
-    changes = read_json(folder / "changes.geojson")
+    changes = read_json(features_path(folder, "changes"))
     kept = {feature["properties"]["id"] for feature in changes["features"]}
     withdrawn = [each for each in announced if each.rpartition("-")[0] == report["flight"] and each not in kept]
     return {

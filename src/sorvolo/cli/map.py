@@ -224,5 +224,8 @@ def _with_unit(pattern: str, number: float | None) -> str:
 
 
 def _map_files(site: Path) -> dict[str, Path]:
-    named = {"picture": "preview.png", "GeoTIFF": "mosaic.tif", "KMZ": "mosaic.kmz", "objects": "objects.geojson"}
-    return {name: site / file for name, file in named.items() if (site / file).is_file()}
+    from sorvolo.store.exports.plain import features_path
+
+    named = {"picture": "preview.png", "GeoTIFF": "mosaic.tif", "KMZ": "mosaic.kmz"}
+    paths = {name: site / file for name, file in named.items()} | {"objects": features_path(site, "objects")}
+    return {name: path for name, path in paths.items() if path.is_file()}

@@ -32,7 +32,7 @@ from sorvolo.missions.evaluate.frame_rows import (
 )
 from sorvolo.missions.evaluate.mask_folders import MaskScores, compare_mask_folders, has_masks
 from sorvolo.mosaic.paired_flights import PairedFlights
-from sorvolo.store.exports.plain import plain_json
+from sorvolo.store.exports.plain import features_path, plain_json
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import ChangeKind
 from sorvolo.survey.flight import Site
@@ -194,7 +194,7 @@ def _true_masks(truth: Path, true_flights: Mapping[str, Path], flight: str | Non
 
 
 def _compared_flights(site: Path, flight: str | None) -> list[str]:
-    names = sorted(path.parent.name for path in (site / "flights").glob("*/changes.geojson"))
+    names = sorted(path.parent.name for path in (site / "flights").glob("*/changes.*json"))
     if not names:
         raise InputError(f"{site}: no flight of it was compared; run `sorvolo compare INPUT --site {site}` first")
     if flight is None:
@@ -205,7 +205,7 @@ def _compared_flights(site: Path, flight: str | None) -> list[str]:
 
 
 def _check_whole(site: Path, flights: Sequence[str]) -> None:
-    for path in (site / "flights" / name / "frames.geojson" for name in flights):
+    for path in (features_path(site / "flights" / name, "frames") for name in flights):
         if not path.is_file():
             raise InputError(f"{path} is missing: this flight is there only in part; run `sorvolo compare` again")
 
@@ -233,19 +233,19 @@ def _evaluate(
     ground = compared_ground(*([row.outline_m for _, row in flights.placed(names)] for names in ([flight], makers)))
     settings = EventSettings(views=VIDEO_VIEWS)
     true = _read_true(true_folder / "events.geojson", described, map_from_truth, ground, _least_views(flights, flight))
-    found = _read_found(site / "flights" / flight / "changes.geojson", described, flights.clock(flight))
+    found = _read_found(features_path(site / "flights" / flight, "changes"), described, flights.clock(flight))
     match = match_events(found, true, settings)
     scores = score_events(match, ground.area_m2, settings)
     if match.pairs and not scores.judged_late:
         remarks.append("when events were announced is not known: none is judged late")
-    classes = _class_counts(match, site / "flights" / flight / "changes.geojson", true_folder / "events.geojson")
+    classes = _class_counts(match, features_path(site / "flights" / flight, "changes"), true_folder / "events.geojson")
     return FlightChanges(flight, masks, scores, match, shift_m, tuple(remarks), classes)
 
 
 def _map_makers(site: Path, flights: PairedFlights, flight: str) -> list[str]:
     """The flights that made the map: those not compared themselves, which may have been laid onto it less well."""
     others = [name for name in flights.mine if name != flight]
-    return [name for name in others if not (site / "flights" / name / "changes.geojson").is_file()] or others
+    return [name for name in others if not features_path(site / "flights" / name, "changes").is_file()] or others
 
 
 def _least_views(flights: PairedFlights, flight: str) -> int:

@@ -34,7 +34,7 @@ def true_frames(frames_file: Path, frame: LocalFrame) -> dict[str, dict[str, Fra
 
 def map_frames(site: Path, described: Site) -> dict[str, list[FrameRow]]:
     """The frames of every flight in a site folder; raises InputError for a site without any."""
-    files = sorted((site / "flights").glob("*/frames.geojson"))
+    files = sorted((site / "flights").glob("*/frames.*json"))
     if not files:
         raise InputError(f"{site}: no flights/*/frames.geojson; map a flight into it first")
     return {

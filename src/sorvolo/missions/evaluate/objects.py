@@ -17,6 +17,7 @@ from sorvolo.missions.evaluate.frame_rows import (
     truth_file,
 )
 from sorvolo.mosaic.paired_flights import PairedFlights
+from sorvolo.store.exports.plain import features_path
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Site
 from sorvolo.survey.objects import CLASSES
@@ -52,7 +53,7 @@ def evaluate_objects(site: Path, truth: Path, *, flight: str | None = None) -> t
 
 def _searched_flights(site: Path, known: Container[str]) -> list[str]:
     """The flights that were searched for objects; raises InputError for none, and for one that is not in `known`."""
-    searched = sorted(path.parent.name for path in (site / "flights").glob("*/objects.geojson"))
+    searched = sorted(path.parent.name for path in (site / "flights").glob("*/objects.*json"))
     if not searched:
         raise InputError(f"{site}: no flight of it was searched for objects; run `sorvolo map` with --model")
     unknown = [name for name in searched if name not in known]
@@ -71,7 +72,7 @@ def _evaluate(
     map_from_truth, shift_m = flights.map_from_truth([flight])
     times_ns = [row.time_ns for row in flights.true[true_name].values()]
     middle_ns = (min(times_ns) + max(times_ns)) // 2
-    found = _read_found(site / "flights" / flight / "objects.geojson", flights.clock(flight)[1])
+    found = _read_found(features_path(site / "flights" / flight, "objects"), flights.clock(flight)[1])
     true = _read_true(folder, described, true_name, outlines_m, map_from_truth)
     return score_objects(flight, found, true, middle_ns, map_from_truth, shift_m)
 

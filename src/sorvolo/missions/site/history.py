@@ -64,7 +64,7 @@ def _entry(
     difference = archive.tile_difference(version)
     given = verdicts or ()
     return HistoryEntry(
-        version.id, version.created_utc, flown_utc(archive, version.flight_id), version.flight_id,
+        version.id, version.created_utc, version.flown_utc, version.flight_id,
         "map" if changes is None else "compare",
         version.parent_id, version.tiles, difference.changed, difference.removed, difference.changed_bytes,
         {kind: count for kind, count in (changes or {}).items() if count},
@@ -73,14 +73,9 @@ def _entry(
     )
 
 
-def flown_utc(archive: Archive, flight_id: str) -> str:
-    """When the flight's first frame was taken, ISO 8601 UTC; "" where nothing of it is dated."""
-    return str(archive.report(flight_id).get("flown") or "")
-
-
 def find_version(archive: Archive, at: str) -> VersionEntry:
-    """The version of a number; or the newest one complete by the end of an ISO date, or of the minute or second that
-    an ISO date-time names; UTC.
+    """The version of a number; or the newest one flown by the end of an ISO date, or of the minute or second that
+    an ISO date-time names; UTC. A flight whose clock has no date counts from when its map was made.
 
     Raises InputError when there is none, SettingsError when `at` is neither.
     """
@@ -107,7 +102,10 @@ def export_version(site: Path, at: str | None, path: Path) -> VersionEntry:
     if path.is_dir():
         raise InputError(f"{path} is a folder, a file was needed; choose another name")
     with Archive.open(site, write=False) as archive:
-        version = archive.version_at(datetime.now(UTC)) if at is None else find_version(archive, at)
+        complete = [version for version in archive.versions() if version.complete]
+        if not complete:
+            raise InputError(f"{site} has no map yet; map a flight into it first")
+        version = complete[-1] if at is None else find_version(archive, at)
         tiles, current = archive.tiles(version.id), archive.site()
         if not tiles:
             raise StoreError(f"version {version.id} of the map of {site} is empty; there is nothing to write")

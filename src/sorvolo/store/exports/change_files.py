@@ -7,14 +7,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, Boxes, Floats, ImageGray, Mask
+from sorvolo.geometry.arrays import Anything, Boxes, Floats, ImageGray, Mask, PointsM
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.exports.placemarks import Placemark
 from sorvolo.store.exports.places import longitude_latitude
-from sorvolo.store.exports.plain import rounded, utc_text
+from sorvolo.store.exports.plain import feature_collection, rounded, time_words, utc_text
 from sorvolo.store.images import png_from_rgba
 from sorvolo.store.site.change_records import StoredChange
-from sorvolo.survey.findings import Change
+from sorvolo.survey.findings import Change, Verdict
 from sorvolo.survey.flight import Site
 
 CHANGED, UNCHANGED, UNKNOWN = 255, 0, 128
@@ -28,13 +29,20 @@ def changes_geojson(changes: Iterable[StoredChange], site: Site) -> dict[str, An
     """The changes of a flight as a GeoJSON FeatureCollection, one polygon each (docs/formats.md).
 
     Rings turn counter-clockwise, ten decimals. Longitudes run on beyond 180 degrees where a site meets the
-    antimeridian. For a local site the coordinates are the site's own units and "crs" is null.
+    antimeridian. For a local site it is plain JSON with coordinates in pixels of the site.
     """
-    collection: dict[str, Any] = {"type": "FeatureCollection", "name": "changes"}
-    if site.is_local:
-        collection["crs"] = None
-    collection["features"] = [_feature(change, site) for change in changes]
-    return collection
+    return feature_collection("changes", [_feature(change, site) for change in changes], is_local=site.is_local)
+
+
+def change_placemarks(changes: Iterable[StoredChange], site: Site) -> list[Placemark]:
+    """The changes of a site with a place on Earth as placemarks, rejected ones left out."""
+    return [
+        Placemark(
+            f"{each.id} {each.kind.value}", _description(each), *_point(each.centre_m, site), each.first_seen_ns,
+            tuple((x, y) for x, y in _ring(each.outline_m, site)[:-1]),
+        )
+        for each in changes if each.verdict is not Verdict.REJECTED
+    ]
 
 
 def crop_files(changes: Sequence[Change]) -> dict[str, bytes]:
@@ -114,6 +122,26 @@ def _feature(change: StoredChange, site: Site) -> dict[str, Any]:
         "properties": properties,
         "outline_m": [[rounded(east, 4), rounded(north, 4)] for east, north in change.outline_m],
     }
+
+
+def _description(change: StoredChange) -> str:
+    """A change in words, a line each."""
+    lines = [
+        f"score {change.score:.2f} (0 to 1), {change.views} views, first seen {time_words(change.first_seen_ns)}",
+        f"length {change.length_m:.2f} m, area {change.area_m2:.2f} m2",
+        f"position accuracy {change.sigma_m:.2f} m (1 sigma)",
+    ]
+    lines += [
+        f"{words}: {name}" for words, name in (("before", change.class_before), ("now", change.class_after)) if name
+    ]
+    if change.verdict is not None:
+        lines.append(change.verdict.value + (f": {change.note}" if change.note else ""))
+    return "\n".join(lines)
+
+
+def _point(position_m: PointsM, site: Site) -> tuple[float, float]:
+    longitudes, latitudes = longitude_latitude(position_m[None], site)
+    return float(longitudes[0]), float(latitudes[0])
 
 
 def _ring(outline_m: Floats, site: Site) -> list[list[float]]:

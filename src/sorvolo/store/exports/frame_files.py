@@ -7,7 +7,7 @@ import numpy as np
 
 from sorvolo.geometry.pose import gimbal_angles_from_rotation
 from sorvolo.store.exports.places import longitude_latitude
-from sorvolo.store.exports.plain import rounded, utc_text
+from sorvolo.store.exports.plain import feature_collection, rounded, utc_text
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame
 
@@ -15,14 +15,10 @@ from sorvolo.survey.mosaic import PlacedFrame
 def frames_geojson(placed: Sequence[PlacedFrame], site: Site) -> dict[str, Any]:
     """The frames of a flight as a GeoJSON FeatureCollection, one feature each (docs/formats.md).
 
-    Longitudes run on beyond 180 degrees where a flight crosses the antimeridian. For a local site the
-    coordinates are the site's own units and "crs" is null.
+    Longitudes run on beyond 180 degrees where a flight crosses the antimeridian. For a local site it is plain JSON with
+    coordinates in pixels of the site.
     """
-    collection: dict[str, Any] = {"type": "FeatureCollection", "name": "frames"}
-    if site.is_local:
-        collection["crs"] = None
-    collection["features"] = [_feature(frame, site) for frame in placed]
-    return collection
+    return feature_collection("frames", [_feature(frame, site) for frame in placed], is_local=site.is_local)
 
 
 def _feature(frame: PlacedFrame, site: Site) -> dict[str, Any]:

@@ -5,13 +5,16 @@ from typing import Any
 
 import numpy as np
 
+from sorvolo.store.exports.placemarks import Placemark
 from sorvolo.store.exports.places import longitude_latitude
-from sorvolo.store.exports.plain import rounded, utc_text
+from sorvolo.store.exports.plain import feature_collection, rounded, time_words, utc_text
 from sorvolo.store.site.object_records import StoredObject
 from sorvolo.survey.flight import Site
 from sorvolo.survey.map_objects import MapObject
 
-OBJECTS = "objects.geojson"
+OBJECTS = "objects"
+"""The name, without ending, of the files that list a flight's or a site's objects."""
+
 CROPS = "objects"
 """The folder of a flight's crops."""
 
@@ -19,14 +22,27 @@ CROPS = "objects"
 def objects_geojson(objects: Iterable[StoredObject], site: Site, *, crops_from_site: bool) -> dict[str, Any]:
     """Objects as a GeoJSON FeatureCollection, a point each (docs/formats.md).
 
-    `crop` is relative to the site folder or to the flight's. For a local site coordinates are the site's own units and
-    "crs" is null.
+    `crop` is relative to the site folder or to the flight's. For a local site it is plain JSON with coordinates in
+    pixels of the site.
     """
-    collection: dict[str, Any] = {"type": "FeatureCollection", "name": "objects"}
-    if site.is_local:
-        collection["crs"] = None
-    collection["features"] = [_feature(each, site, crops_from_site) for each in objects]
-    return collection
+    features = [_feature(each, site, crops_from_site) for each in objects]
+    return feature_collection(OBJECTS, features, is_local=site.is_local)
+
+
+def object_placemarks(objects: Iterable[StoredObject], site: Site) -> list[Placemark]:
+    """The objects of a site with a place on Earth as placemarks."""
+    placemarks = []
+    for each in (stored.thing for stored in objects):
+        longitudes, latitudes = longitude_latitude(np.asarray(each.position_m)[None], site)
+        words = (
+            f"score {each.score:.2f} (0 to 1), {each.views} of {each.possible_views} frames, first seen "
+            f"{time_words(each.first_seen_ns)}\nposition accuracy {each.sigma_m:.2f} m (1 sigma)"
+            + ("\nmoving" if each.moving else "")
+        )
+        placemarks.append(Placemark(
+            f"{each.id} {each.label}", words, float(longitudes[0]), float(latitudes[0]), each.first_seen_ns
+        ))
+    return placemarks
 
 
 def crop_name(object_id: str) -> str:

@@ -1,19 +1,13 @@
 """Places of a site in WGS84, and in the words that people pass on: degrees, MGRS, UTM."""
 
-from functools import lru_cache
-
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats
-from sorvolo.geometry.geodesy import Projection, utm_epsg
+from sorvolo.geometry.coordinates import Coordinates, place_text
 from sorvolo.survey.flight import Site
 
-SYSTEMS = {"degrees": "latitude, longitude", "mgrs": "MGRS", "utm": "UTM"}
+SYSTEMS = {system.value: system.heading for system in Coordinates}
 """The notations of a place, and what they are called."""
-
-_BANDS = "CDEFGHJKLMNPQRSTUVWX"  # of 8 degrees of latitude from 80 S; the last has 12
-_ROWS = "ABCDEFGHJKLMNPQRSTUV"
-_COLUMNS = ("STUVWXYZ", "ABCDEFGH", "JKLMNPQR")  # by zone modulo 3
 
 
 def longitude_latitude(points_m: Floats, site: Site) -> tuple[Floats, Floats]:
@@ -45,31 +39,6 @@ def place_words(point_m: Floats, site: Site) -> dict[str, str]:
 
 def degrees_words(latitude_deg: float, longitude_deg: float) -> dict[str, str]:
     """A place of WGS84 in each notation of SYSTEMS that it has."""
-    longitude_deg = wrapped_deg(longitude_deg)
-    words = {"degrees": f"{latitude_deg:.6f}, {longitude_deg:.6f}"}
-    if -80 <= latitude_deg < 84:
-        words |= grid_words(latitude_deg, longitude_deg)
-    return words
-
-
-def grid_words(latitude_deg: float, longitude_deg: float) -> dict[str, str]:
-    """A place from 80 S to below 84 N in MGRS and UTM, cut to whole metres, as both have it.
-
-    Source: NGA.STND.0037, "Universal Grids and Grid Reference Systems", 2014.
-    """
-    epsg = utm_epsg(latitude_deg, longitude_deg)
-    zone = epsg % 100
-    band = _BANDS[min(int((latitude_deg + 80) // 8), len(_BANDS) - 1)]
-    east_m, north_m = _projection(epsg).projected_from_wgs84(np.array([latitude_deg]), np.array([longitude_deg]))[0]
-    east, north = int(east_m), int(north_m)
-    column = _COLUMNS[zone % 3][east // 100_000 - 1]
-    row = _ROWS[(north // 100_000 + (5 if zone % 2 == 0 else 0)) % 20]
-    return {
-        "mgrs": f"{zone:02d}{band} {column}{row} {east % 100_000:05d} {north % 100_000:05d}",
-        "utm": f"{zone:02d}{band} {east} {north}",
-    }
-
-
-@lru_cache(maxsize=8)
-def _projection(epsg: int) -> Projection:
-    return Projection(f"EPSG:{epsg}")
+    words = {system.value: place_text(latitude_deg, longitude_deg, system) for system in Coordinates}
+    degrees = words[Coordinates.LATLON.value]
+    return {name: text for name, text in words.items() if name == Coordinates.LATLON.value or text != degrees}

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from datetime import UTC, datetime
 from enum import Enum
@@ -12,6 +12,10 @@ from typing import Any
 import numpy as np
 
 _DAY_NS = 86_400_000_000_000
+_NO_PLACE = (
+    "The flight has no GPS: coordinates are pixels of its own map, x to the right and y up, without metres and north. "
+    "No GeoJSON, KML or GPX is written, since these hold places on Earth."
+)
 
 
 def plain_json(value: Any) -> Any:
@@ -53,6 +57,28 @@ def geojson_bytes(collection: Mapping[str, Any]) -> bytes:
         for feature in collection["features"]
     ]
     return (opening + ', "features": [\n' + ",\n".join(features) + "\n]}\n").encode()
+
+
+def feature_collection(name: str, features: Sequence[Mapping[str, Any]], *, is_local: bool) -> dict[str, Any]:
+    """Features with a geometry as a GeoJSON FeatureCollection; of a local site as plain JSON, which no map would open.
+
+    A local site has no place on Earth: its coordinates are pixels of its own map, x east and y north.
+    """
+    if not is_local:
+        return {"type": "FeatureCollection", "name": name, "features": list(features)}
+    plain = [{key: value for key, value in each.items() if key != "type"} for each in features]
+    return {"name": name, "crs": None, "note": _NO_PLACE, "features": plain}
+
+
+def features_name(name: str, *, is_local: bool) -> str:
+    """The file name of a collection: GeoJSON, or plain JSON for a local site."""
+    return f"{name}.json" if is_local else f"{name}.geojson"
+
+
+def features_path(folder: Path, name: str) -> Path:
+    """Where a collection lies in a folder, of whichever kind its site is."""
+    local = folder / features_name(name, is_local=True)
+    return local if local.is_file() else folder / features_name(name, is_local=False)
 
 
 def utc_text(time_ns: int) -> str:

@@ -130,15 +130,18 @@ class Archive:
         return self._files.versions()
 
     def version_at(self, moment: datetime) -> VersionEntry:
-        """The newest version that was complete at a moment, taken as UTC when it names no time zone.
+        """The newest version of flights flown by a moment, taken as UTC when it names no time zone.
 
-        Raises InputError when there was no map yet.
+        A flight whose clock has no date counts from when its map was made. Raises InputError when there was no map yet.
         """
         utc = moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
         complete = [entry for entry in self.versions() if entry.complete]
-        known = [entry for entry in complete if datetime.fromisoformat(entry.created_utc) <= utc]
+        known = [entry for entry in complete if entry.moment <= utc]
         if not known:
-            first = f"; its first version is of {complete[0].created_utc}" if complete else ", and has none now"
+            earliest = min((entry.moment for entry in complete), default=None)
+            first = ", and has none now" if earliest is None else (
+                f"; its first version shows {earliest.isoformat(timespec='seconds')}"
+            )
             raise InputError(f"{self.folder} had no map at {utc.isoformat(timespec='seconds')}{first}")
         return known[-1]
 

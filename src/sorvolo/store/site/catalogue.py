@@ -25,6 +25,8 @@ from sorvolo.store.site.schema import SCHEMA_VERSION
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 
+_DAY_NS = 86_400_000_000_000
+
 
 @dataclass(frozen=True)
 class FlightEntry:
@@ -48,7 +50,10 @@ class FlightEntry:
 
 @dataclass(frozen=True)
 class VersionEntry:
-    """One state of the map; versions share the tiles in which they agree."""
+    """One state of the map; versions share the tiles in which they agree.
+
+    `flown_ns` is the time of its flight's first frame, UTC; -1 where it was not stored.
+    """
 
     id: int
     parent_id: int
@@ -58,6 +63,19 @@ class VersionEntry:
     complete: bool
     export_crs: str
     run_id: int
+    flown_ns: int = -1
+
+    @property
+    def flown_utc(self) -> str:
+        """When its flight's first frame was taken, ISO 8601 UTC to the second; "" where no clock has a date."""
+        return self.moment.strftime("%Y-%m-%dT%H:%M:%SZ") if self.flown_ns >= _DAY_NS else ""
+
+    @property
+    def moment(self) -> datetime:
+        """Which moment the map shows: the flight's; where no clock has a date, that at which it was made."""
+        if self.flown_ns >= _DAY_NS:
+            return datetime.fromtimestamp(self.flown_ns / 1e9, UTC)
+        return datetime.fromisoformat(self.created_utc)
 
 
 @dataclass(frozen=True)
@@ -228,6 +246,7 @@ def list_flights(connection: Connection) -> list[FlightEntry]:
 def list_versions(connection: Connection) -> list[VersionEntry]:
     """Every version, oldest first."""
     tiles = func.count(schema.version_tiles.c.sha256)
+    flown_ns = _flown_ns(connection)
     rows = connection.execute(
         select(schema.versions, tiles.label("tiles"))
         .outerjoin(schema.version_tiles, schema.version_tiles.c.version_id == schema.versions.c.id)
@@ -237,10 +256,17 @@ def list_versions(connection: Connection) -> list[VersionEntry]:
     return [
         VersionEntry(
             row.id, row.parent_id, row.flight_id, row.created_utc, row.tiles, row.complete,
-            checked_crs(row.export_crs), row.run_id,
+            checked_crs(row.export_crs), row.run_id, flown_ns.get(row.id, -1),
         )
         for row in rows
     ]
+
+
+def _flown_ns(connection: Connection) -> dict[int, int]:
+    """When the flights were flown that made the versions, by version; none in a file of a format before 4."""
+    if connection.exec_driver_sql("PRAGMA user_version").scalar_one() < 4:
+        return {}
+    return {row.version_id: row.first_ns for row in connection.execute(select(schema.flown))}
 
 
 def newest_version(connection: Connection, *, complete: bool = True) -> int:
@@ -331,6 +357,7 @@ def complete_run(
     frames: Mapping[str, int],
     notes: Sequence[str],
     export_crs: str,
+    flown_ns: tuple[int, int] | None,
 ) -> None:
     """Switch a flight from its former run to this one, and the map to this version."""
     this_run = schema.runs.c.id == run_id
@@ -352,6 +379,9 @@ def complete_run(
     connection.execute(update(schema.versions).where(schema.versions.c.id == version_id).values(
         complete=True, created_utc=utc_now(), export_crs=export_crs
     ))
+    if flown_ns is not None:
+        first_ns, last_ns = flown_ns
+        connection.execute(insert(schema.flown).values(version_id=version_id, first_ns=first_ns, last_ns=last_ns))
     if keyframes:
         connection.execute(insert(schema.keyframes), [_row_of(keyframe, run_id) for keyframe in keyframes])
     if documents:

@@ -2,15 +2,18 @@
 
 import os
 import shutil
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.store.atomic import atomic_write_bytes, sync_file, temporary_beside, writing
-from sorvolo.store.exports.change_files import changes_geojson, crop_names
+from sorvolo.store.exports.change_files import change_placemarks, changes_geojson, crop_names
 from sorvolo.store.exports.map_pictures import Picture, pictures, write_kmz, write_preview
-from sorvolo.store.exports.object_files import CROPS, OBJECTS, objects_geojson
-from sorvolo.store.exports.plain import geojson_bytes
+from sorvolo.store.exports.object_files import CROPS, OBJECTS, object_placemarks, objects_geojson
+from sorvolo.store.exports.placemarks import Placemark, gpx_bytes, kml_bytes
+from sorvolo.store.exports.plain import features_name, features_path, geojson_bytes
 from sorvolo.store.images import rgba_from_png
 from sorvolo.store.nofollow import read_below
 from sorvolo.store.pages.changes import changes_page
@@ -76,51 +79,73 @@ def write_change_files(files: SiteFiles, flight_id: str, version: VersionEntry |
     """
     folder = files.flight_folder(flight_id)
     if version is None:
-        for name in ("changes.geojson", "changes.html"):
-            (folder / name).unlink(missing_ok=True)
+        _remove_list(folder, "changes")
+        (folder / "changes.html").unlink(missing_ok=True)
         return
     with files.catalogue.reading() as connection:
         changes = change_records.load_changes(connection, flight_id)
     site = files.site()
-    atomic_write_bytes(folder / "changes.geojson", geojson_bytes(changes_geojson(changes, site)))
+    placemarks = [] if site.is_local else change_placemarks(changes, site)
+    _write_list(folder, "changes", changes_geojson(changes, site), placemarks, is_local=site.is_local)
     crops = {each.id: _crops(files, flight_id, each.id) for each in changes}
     before, after = _before_and_after(files, version, _PICTURE_PX if changes else _UNCHANGED_PX)
     made = {each.id: each for each in files.versions()}
     page = changes_page(
         files.report(flight_id), changes, before, after, site, crops,
-        before_words=_words_of(files, made.get(version.parent_id)), after_words=_words_of(files, version),
+        before_words=_words_of(made.get(version.parent_id)), after_words=_words_of(version),
     )
     atomic_write_bytes(folder / "changes.html", page.encode())
 
 
 def write_object_files(files: SiteFiles, flight_id: str, *, is_searched: bool) -> None:
     """Write objects.geojson of a flight; remove it when the flight's frames were not searched for objects."""
-    path = files.document_path(flight_id, OBJECTS)
+    folder, site = files.flight_folder(flight_id), files.site()
     if not is_searched:
-        path.unlink(missing_ok=True)
+        _remove_list(folder, OBJECTS)
         return
     with files.catalogue.reading() as connection:
         found = object_records.load_objects(connection, flight_id)
-    atomic_write_bytes(path, geojson_bytes(objects_geojson(found, files.site(), crops_from_site=False)))
+    placemarks = [] if site.is_local else object_placemarks(found, site)
+    collection = objects_geojson(found, site, crops_from_site=False)
+    _write_list(folder, OBJECTS, collection, placemarks, is_local=site.is_local)
 
 
 def write_site_objects(files: SiteFiles) -> None:
     """Write objects.geojson of the site, the newest of each place; remove it when no flight was ever searched."""
-    path = files.folder / OBJECTS
     with files.catalogue.reading() as connection:
         searches = object_records.load_searches(connection)
         found = object_records.newest_objects(object_records.load_objects(connection), searches)
-    if searches:
-        atomic_write_bytes(path, geojson_bytes(objects_geojson(found, files.site(), crops_from_site=True)))
-    else:
-        path.unlink(missing_ok=True)
+    if not searches:
+        _remove_list(files.folder, OBJECTS)
+        return
+    site = files.site()
+    placemarks = [] if site.is_local else object_placemarks(found, site)
+    collection = objects_geojson(found, site, crops_from_site=True)
+    _write_list(files.folder, OBJECTS, collection, placemarks, is_local=site.is_local)
 
 
 def site_objects_are_there(files: SiteFiles) -> bool:
     """Whether the site's objects.geojson is there if, and only if, any flight was searched."""
     with files.catalogue.reading() as connection:
         is_searched = bool(object_records.load_searches(connection))
-    return is_searched == (files.folder / OBJECTS).is_file()
+    return is_searched == features_path(files.folder, OBJECTS).is_file()
+
+
+def _write_list(
+    folder: Path, name: str, collection: Mapping[str, Any], placemarks: Sequence[Placemark], *, is_local: bool
+) -> None:
+    """Write a list of places as GeoJSON, KML and GPX; of a local site as plain JSON alone: it has no place on Earth."""
+    _remove_list(folder, name, but=features_name(name, is_local=is_local))
+    atomic_write_bytes(folder / features_name(name, is_local=is_local), geojson_bytes(collection))
+    if not is_local:
+        atomic_write_bytes(folder / f"{name}.kml", kml_bytes(name, placemarks))
+        atomic_write_bytes(folder / f"{name}.gpx", gpx_bytes(name, placemarks))
+
+
+def _remove_list(folder: Path, name: str, but: str = "") -> None:
+    for file in (f"{name}.geojson", f"{name}.json", *((f"{name}.kml", f"{name}.gpx") if not but else ())):
+        if file != but:
+            (folder / file).unlink(missing_ok=True)
 
 
 def _before_and_after(
@@ -136,12 +161,11 @@ def _before_and_after(
     return before, after
 
 
-def _words_of(files: SiteFiles, version: VersionEntry | None) -> str:
+def _words_of(version: VersionEntry | None) -> str:
     """A version by its flight and when that was flown; where nothing of it is dated, when the version was made."""
     if version is None:
         return "no map yet"
-    flown = str(files.report(version.flight_id).get("flown") or "")
-    date = f"flown {flown[:10]}" if flown else f"mapped {version.created_utc[:10]}"
+    date = f"flown {version.flown_utc[:10]}" if version.flown_utc else f"mapped {version.created_utc[:10]}"
     return f"version {version.id}: flight {version.flight_id}, {date}"
 
 

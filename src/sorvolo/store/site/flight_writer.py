@@ -15,7 +15,7 @@ from sorvolo.store.atomic import atomic_write_bytes, sync_file, writing
 from sorvolo.store.exports.change_files import BOXES_FILE, boxes_json, crop_files, mask_name, write_view_masks
 from sorvolo.store.exports.frame_files import frames_geojson
 from sorvolo.store.exports.object_files import CROPS, object_crops
-from sorvolo.store.exports.plain import geojson_bytes, json_bytes
+from sorvolo.store.exports.plain import features_name, geojson_bytes, json_bytes
 from sorvolo.store.images import ImageCache, jpeg_from_image
 from sorvolo.store.rasters.geotiff import parse_crs
 from sorvolo.store.site import catalogue as records
@@ -157,20 +157,23 @@ class FlightWriter:
             for frame in placed
             if frame.index in image_paths and frame.status is not Status.REJECTED
         ]
+        site = self._files.site()
         found = change_records.stored_changes(self._flight_id, changes or ())
         texts = {
             **(documents or {}),
-            "frames.geojson": geojson_bytes(frames_geojson(placed, self._files.site())),
+            features_name("frames", is_local=site.is_local): geojson_bytes(frames_geojson(placed, site)),
             "report.json": json_bytes(report),
             "report.html": report_html.encode(),
         }
+        times_ns = [int(frame.time_ns) for frame in placed]
+        flown_ns = (min(times_ns), max(times_ns)) if times_ns else None
         frames = {status.value: sum(frame.status is status for frame in placed) for status in Status}
         self.flush()
         self._stage(changes or (), search)
         self._sync()
         with self._files.catalogue.changing() as connection:
             records.complete_run(
-                connection, self._run_id, self._version_id, keyframes, texts, frames, notes, crs or ""
+                connection, self._run_id, self._version_id, keyframes, texts, frames, notes, crs or "", flown_ns
             )
             if changes is not None:
                 change_records.add_comparison(connection, self._run_id, self._version_id, found)

@@ -23,7 +23,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.pool import QueuePool
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 OLDEST_VERSION = 1
 """The oldest format that is still read, and brought up to date when it is opened to be written."""
 APPLICATION_ID = 0x536F7256  # "SorV", in the file's header
@@ -148,8 +148,15 @@ objects = Table(
     Column("id", String, nullable=False),
     Column("properties", JSON, nullable=False),
 )
+flown = Table(
+    "flown", metadata,  # when the flight was flown that made a version; kept when its run is replaced
+    Column("version_id", ForeignKey("versions.id", ondelete="CASCADE"), primary_key=True),
+    Column("first_ns", Integer, nullable=False),  # UTC; from 1970 on where no clock has a date
+    Column("last_ns", Integer, nullable=False),
+)
 _NEW_IN_2 = [leftovers, comparisons, changes, reviews]
 _NEW_IN_3 = [searches, objects]
+_NEW_IN_4 = [flown]
 
 
 def create_tables(path: Path) -> None:
@@ -170,6 +177,12 @@ def upgrade(connection: Connection, version: int) -> None:
         metadata.create_all(connection, tables=_NEW_IN_2)
     if version < 3:
         metadata.create_all(connection, tables=_NEW_IN_3)
+    if version < 4:
+        metadata.create_all(connection, tables=_NEW_IN_4)
+        connection.exec_driver_sql(  # the flights whose keyframes are stored
+            "INSERT OR IGNORE INTO flown SELECT versions.id, min(time_ns), max(time_ns) FROM versions "
+            "JOIN keyframes ON keyframes.run_id = versions.run_id GROUP BY versions.id"
+        )
     connection.exec_driver_sql(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
 
