@@ -19,6 +19,7 @@ from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import prepare
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.site.history import site_history
+from sorvolo.store.exports.plain import features_path
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Frame, PosedFrame
 from sorvolo.survey.mosaic import Status
@@ -39,7 +40,7 @@ def report_of(site: Path, flight: str) -> dict[str, Any]:
 
 
 def frames_of(site: Path, flight: str) -> dict[str, Any]:
-    return json.loads((site / "flights" / flight / "frames.geojson").read_text())
+    return json.loads(features_path(site / "flights" / flight, "frames").read_text())
 
 
 def corner_errors_m(site: Path, flight: str, truth: Path) -> tuple[float, float]:
@@ -148,7 +149,9 @@ def test_a_video_without_telemetry_is_mapped_in_a_frame_of_its_own(filmed: Path,
     assert report["frames"]["vision"] >= 0.9 * report["frames"]["selected"]
     with rasterio.open(site / "mosaic.tif") as mosaic:
         assert mosaic.crs is None
-    assert not (site / "mosaic.kmz").exists()
+    for kind in ("kmz", "geojson", "kml", "gpx"):  # these hold places on Earth
+        assert not list(site.rglob(f"*.{kind}"))
+    assert "no GPS" in frames["note"]
 
 
 def test_telemetry_that_ends_before_the_video(filmed: Path, tmp_path: Path) -> None:
