@@ -22,7 +22,8 @@ def picture_of_detections(
     """What a detector saw in a picture, as labels to correct and to learn from; scores are not kept."""
     no_regions = np.zeros((0, 4), np.float32)
     return LabelledPicture(
-        path, width_px, height_px, group, detections.boxes_px, np.asarray(detections.labels, np.int64), no_regions, m_per_px
+        path, width_px, height_px, group, detections.boxes_px, np.asarray(detections.labels, np.int64), no_regions,
+        m_per_px,
     )
 
 
