@@ -22,6 +22,7 @@ from sorvolo.store.exports.detection_files import (
     claim_folder,
     crop_around,
     detection_row,
+    track_placemarks,
     tracks_geojson,
     write_crop,
     write_detections_geojson,
@@ -125,6 +126,14 @@ def test_tracks_carry_path_and_crop(tmp_path: Path) -> None:
     assert told["path"]["coordinates"][1] == first["geometry"]["coordinates"]
     local = tracks_geojson([_track()], _LOCAL, {})
     assert local["crs"] is None and local["features"][0]["geometry"]["coordinates"] == [100.0, 200.0]
+
+
+def test_tracks_are_placemarks_where_they_were_last() -> None:
+    track = _track()
+    (mark,) = track_placemarks([track], _SITE)
+    (feature,) = tracks_geojson([track], _SITE, {})["features"]
+    assert (mark.longitude_deg, mark.latitude_deg) == pytest.approx(feature["geometry"]["coordinates"], abs=1e-8)
+    assert mark.name == f"{track.label} {track.id}" and "position accuracy" in mark.description
 
 
 def test_a_kill_leaves_every_line_written(tmp_path: Path) -> None:

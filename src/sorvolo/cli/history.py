@@ -25,6 +25,9 @@ def history(
         str | None, typer.Option(help="Version number, or a date or time (UTC): the newest version by then.")
     ] = None,
     export: Annotated[Path | None, typer.Option(help="Write the map as it was: FILE.tif, .png or .kmz.")] = None,
+    compress: Annotated[
+        str, typer.Option(help="Of a .tif: deflate (without loss) or jpeg (a fraction of the size).")
+    ] = "deflate",
     coordinates: PlaceFormatOption = PlaceFormat.LATLON,
     as_json: AsJson = False,
 ) -> None:
@@ -47,7 +50,7 @@ def history(
             _show(entries, Console())
             _show_place(site, coordinates, Console())
         return
-    version = export_version(site, at, export)
+    version = export_version(site, at, export, compress=compress)
     if as_json:
         entry = next(each for each in entries if each.version == version.id)
         typer.echo(json.dumps({"site": str(site), "file": str(export), "version": plain_json(entry)}, indent=1))

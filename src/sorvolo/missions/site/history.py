@@ -88,7 +88,7 @@ def find_version(archive: Archive, at: str) -> VersionEntry:
     return archive.version_at(_moment(at))
 
 
-def export_version(site: Path, at: str | None, path: Path) -> VersionEntry:
+def export_version(site: Path, at: str | None, path: Path, *, compress: str = "deflate") -> VersionEntry:
     """Write the map as it was at a version or date (see `find_version`; None: now) to a .tif, .png or .kmz file.
 
     Returns the version. Raises SettingsError for another ending, InputError when there was no map or the file's
@@ -116,7 +116,7 @@ def export_version(site: Path, at: str | None, path: Path) -> VersionEntry:
                 raise SettingsError(f"{site} has no place on Earth, so its map cannot be a KMZ; write .tif or .png")
             write_kmz(tiles, archive.site_grid(), current.name, path)
         else:
-            write_cog(tiles, archive.site_grid(), path, crs=version.export_crs or None)
+            write_cog(tiles, archive.site_grid(), path, crs=version.export_crs or None, compress=compress)
     return version
 
 

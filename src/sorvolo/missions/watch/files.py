@@ -20,13 +20,17 @@ from sorvolo.store.exports.detection_files import (
     ANNOTATED_VIDEO,
     LABELS,
     TRACKS,
+    TRACKS_GPX,
+    TRACKS_KML,
     DetectionLines,
     crop_around,
     detection_row,
+    track_placemarks,
     tracks_geojson,
     write_crop,
 )
 from sorvolo.store.exports.label_files import picture_of_detections, write_coco, write_yolo
+from sorvolo.store.exports.placemarks import gpx_bytes, kml_bytes
 from sorvolo.store.exports.plain import geojson_bytes
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.flight import Frame, Site
@@ -123,13 +127,21 @@ class WatchFiles:
             self.write_tracks(tracks)
 
     def write_tracks(self, tracks: Iterable[Track]) -> list[dict[str, Any]]:
-        """Replace `tracks.geojson`: readers see the old one or the new one. Returns each track's properties there."""
+        """Replace `tracks.geojson`, .kml and .gpx: readers see the old one or the new one.
+
+        Returns each track's properties there.
+        """
+        tracks = list(tracks)
         collection = tracks_geojson(tracks, self._site, self.crop_names)
         rows = [each["properties"] for each in collection["features"]]
         if self._site.is_local:
             for row in rows:
                 row["segment"] = self._segments[row["id"]]
         atomic_write_bytes(self.folder / TRACKS, geojson_bytes(collection), durable=False)
+        if not self._site.is_local:
+            placemarks = track_placemarks(tracks, self._site)
+            atomic_write_bytes(self.folder / TRACKS_KML, kml_bytes("tracks", placemarks), durable=False)
+            atomic_write_bytes(self.folder / TRACKS_GPX, gpx_bytes("tracks", placemarks), durable=False)
         return rows
 
     def close(self) -> None:

@@ -12,8 +12,9 @@ import numpy as np
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, TimesNs
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes, remove_leftovers, writing
+from sorvolo.store.exports.placemarks import Placemark
 from sorvolo.store.exports.places import longitude_latitude
-from sorvolo.store.exports.plain import json_bytes, plain_json, rounded, utc_text
+from sorvolo.store.exports.plain import json_bytes, plain_json, rounded, time_words, utc_text
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.flight import Frame, Site
 from sorvolo.survey.objects import Sighting, Track
@@ -22,10 +23,12 @@ MARK = "watch.json"
 """The file that says that a folder is a watch's, and of which source."""
 
 LINES, DETECTIONS, TRACKS, CROPS = "detections.jsonl", "detections.geojson", "tracks.geojson", "objects"
+TRACKS_KML, TRACKS_GPX = "tracks.kml", "tracks.gpx"
 ANNOTATED_VIDEO, ANNOTATED_PICTURES, LABELS = "annotated.mp4", "annotated", "labels"
 
 _OURS = (
-    LINES, DETECTIONS, TRACKS, CROPS, ANNOTATED_VIDEO, ANNOTATED_PICTURES, LABELS, "report.json", "report.html",
+    LINES, DETECTIONS, TRACKS, TRACKS_KML, TRACKS_GPX, CROPS, ANNOTATED_VIDEO, ANNOTATED_PICTURES, LABELS,
+    "report.json", "report.html",
 )
 _MADE_BY = "sorvolo watch"
 
@@ -157,6 +160,21 @@ def tracks_geojson(tracks: Iterable[Track], site: Site, crops: Mapping[int, str]
         })
     collection["features"] = features
     return collection
+
+
+def track_placemarks(tracks: Iterable[Track], site: Site) -> list[Placemark]:
+    """Confirmed tracks as placemarks, each where it was last; the site must have a place on Earth."""
+    placemarks = []
+    for each in tracks:
+        longitude, latitude = longitude_latitude(each.position_m[None], site)
+        words = (
+            f"score {each.score:.2f} (0 to 1), {each.views} views, last seen {time_words(each.last_seen_ns)}\n"
+            f"position accuracy {each.sigma_m:.1f} m (1 sigma)" + ("\nmoving" if each.moving else "")
+        )
+        placemarks.append(Placemark(
+            f"{each.label} {each.id}", words, float(longitude[0]), float(latitude[0]), each.last_seen_ns
+        ))
+    return placemarks
 
 
 def crop_around(image: ImageRGB, box_px: Anything | Sequence[float], *, margin: float = 0.6) -> ImageRGB:

@@ -32,6 +32,8 @@ _LETTER_PX, _LINE_PX = 7.5, 12.0  # of the map's labels
 _ROWS = 3  # so many lines a label may lie from its dot
 _CROPS_BYTES = 8_000_000  # of all crops in the page together
 _COLOURS = 6
+_FILES = "tracks.geojson, tracks.kml (Google Earth), tracks.gpx (GPS receivers)"
+_LOCAL_FILES = "tracks.geojson (coordinates in pixels)"
 _Box = tuple[float, float, float, float]  # left, top, right, bottom
 _Track = Mapping[str, Any]
 
@@ -56,7 +58,7 @@ def watch_page(
         looked_for=", ".join(map(str, looked_for)), warning_lines=report.get("warnings") or [],
         maps=_maps(report, tracks, drone_m), rows=_rows(tracks, is_local=is_local),
         systems=() if is_local else tuple(SYSTEMS.items()),
-        files="tracks.json" if is_local else "tracks.geojson, tracks.kml (Google Earth), tracks.gpx (GPS receivers)",
+        files=_LOCAL_FILES if is_local else _FILES,
         crops=shown, without_crop=len(tracks) - len(shown), course=_course(report),
         notices=[str(each["text"]) for each in report.get("notices") or []],
         model=[(str(name), known(_plain(value))) for name, value in (report.get("model") or {}).items()],

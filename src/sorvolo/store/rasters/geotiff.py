@@ -22,7 +22,7 @@ from rasterio.warp import calculate_default_transform, reproject
 from rasterio.windows import Window
 
 from sorvolo.errors import InputError, SettingsError, StoreError
-from sorvolo.geometry.arrays import ImageRGBA
+from sorvolo.geometry.arrays import Anything, ImageRGBA
 from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
 from sorvolo.store.atomic import atomic_path, scratch_folder, writing
 from sorvolo.store.images import shrink
@@ -40,6 +40,12 @@ _COG = {
 }
 
 
+_JPEG = {"compress": "JPEG", "quality": 90}  # of the colours; what was never seen becomes a lossless mask
+_MOST_JPEG_LEVELS = 12.0  # mean difference of a block's colours: noise at quality 90 stays below 6
+COMPRESSIONS = ("deflate", "jpeg")
+"""How the map's GeoTIFF may be compressed: without loss, or with a tenth of the size."""
+
+
 @dataclass(frozen=True, eq=False)
 class Raster:
     """A north-up map: `rgba` (H, W, 4), the centre of pixel (0, 0) at `origin_m` in `crs` ("": none)."""
@@ -51,16 +57,23 @@ class Raster:
 
 
 def write_cog(
-    tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, path: Path, *, crs: str | None = None
+    tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, path: Path, *, crs: str | None = None,
+    compress: str = "deflate",
 ) -> None:
     """Write the map as a Cloud Optimized GeoTIFF with alpha and overviews, in place of what was at `path`.
 
     Tiles are read one at a time. `crs` reprojects (bilinear); the site's own CRS is the default, a local site
-    has none. The file is read back before it takes its place. Raises SettingsError for an unknown `crs` and
-    StoreError for an empty map, a full disk, or a file that reads back differently.
+    has none. `compress` is one of COMPRESSIONS; JPEG has three bands and a mask. The file is read back before it takes
+    its place. Raises SettingsError for an unknown `crs` or `compress`, and StoreError for an empty map, a full disk, or
+    a file that reads back differently.
     """
     if not tiles:
         raise StoreError("the map has no tiles; there is nothing to write as GeoTIFF")
+    if compress not in COMPRESSIONS:
+        raise SettingsError(f"--compress {compress}: choose one of {', '.join(COMPRESSIONS)}")
+    is_jpeg = compress == "jpeg"
+    lossless = {"level", "predictor"}
+    options = {key: value for key, value in _COG.items() if key not in lossless} | _JPEG if is_jpeg else _COG
     grid = site_grid.grid
     target = None if crs is None or crs == grid.crs else parse_crs(crs, grid)
     with (
@@ -75,9 +88,9 @@ def write_cog(
             plain = _warped(plain, target)
         filled = None if target is not None else _filled_blocks(tiles, grid)
         with rasterio.open(_pyramid(plain, filled), driver="VRT") as source:
-            rasterio.shutil.copy(source, temporary, **_COG)
+            rasterio.shutil.copy(source, temporary, **options)
         with rasterio.open(plain, driver="GTiff") as source:
-            _verify(temporary, source)
+            _verify(temporary, source, is_jpeg=is_jpeg)
 
 
 def parse_crs(crs: str, grid: Grid) -> CRS:
@@ -223,15 +236,23 @@ def _halved(larger: Path, path: Path, filled: set[TileIndex] | None) -> Path | N
     return path
 
 
-def _verify(path: Path, source: rasterio.DatasetReader) -> None:
+def _verify(path: Path, source: rasterio.DatasetReader, *, is_jpeg: bool) -> None:
     with rasterio.open(path, driver="GTiff") as written:
-        if (written.width, written.height, written.count) != (source.width, source.height, 4):
+        if (written.width, written.height, written.count) != (source.width, source.height, 3 if is_jpeg else 4):
             raise StoreError(_differs(path))
         # the last block lies last in the file: a cut file cannot give it
         windows = [window for _, window in written.block_windows(1)]
         for window in _spread(windows, _VERIFIED_BLOCKS):
-            if not np.array_equal(written.read(window=window), source.read(window=window)):
+            read, wanted = written.read(window=window), source.read(window=window)
+            if not (_is_close(read, wanted) if is_jpeg else np.array_equal(read, wanted)):
                 raise StoreError(_differs(path))
+
+
+def _is_close(read: Anything, wanted: ImageRGBA) -> bool:
+    """Whether a block's colours, (3, H, W), are those wanted, (4, H, W), up to JPEG's loss."""
+    seen = wanted[3] > 0
+    differences = np.abs(read[:, seen].astype(np.int16) - wanted[:3, seen])
+    return not seen.any() or float(differences.mean()) <= _MOST_JPEG_LEVELS
 
 
 def _spread(items: list, count: int) -> Iterator:  # type: ignore[type-arg]
