@@ -68,6 +68,8 @@ def main() -> None:
     parser.add_argument("cache", type=Path)
     parser.add_argument("--record", action="store_true")
     parser.add_argument("--real", type=Path, help="folder of real flights, recorded as well")
+    parser.add_argument("--presets", nargs="*", help="record flights of these presets only")
+    parser.add_argument("--seeds-from", default=SEEDS_FROM, help="hash of a commit that seeds are drawn from")
     parser.add_argument("--digest", action="store_true")
     parser.add_argument("--stage", choices=("evidence", "pair"), default="evidence")
     parser.add_argument("--rules", nargs="*", help="names of RULES; all of the stage without it")
@@ -76,7 +78,7 @@ def main() -> None:
     options = parser.parse_args()
     cv2.setNumThreads(1)
     if options.record:
-        record_all(options.cache, options.real)
+        record_all(options.cache, options.real, options.presets, options.seeds_from)
         return
     recorded = [each for each in read_all(options.cache) if not options.flights or each.name in options.flights]
     if options.digest:
@@ -140,19 +142,19 @@ class RecordingViewMaker(views.ViewMaker):
         return outcome
 
 
-def seed_of(name: str, number: int) -> int:
+def seed_of(name: str, number: int, seeds_from: str = SEEDS_FROM) -> int:
     """A seed that nobody chose."""
-    return int(hashlib.sha256(f"{SEEDS_FROM} {name} {number}".encode()).hexdigest()[:6], 16)
+    return int(hashlib.sha256(f"{seeds_from} {name} {number}".encode()).hexdigest()[:6], 16)
 
 
-def record_all(cache: Path, real: Path | None) -> None:
+def record_all(cache: Path, real: Path | None, presets: Sequence[str] | None, seeds_from: str) -> None:
     """Simulate, map and compare each flight once; what is there already is kept."""
     for number, (name, length_m) in enumerate(FLIGHTS):
         folder = cache / f"{number}-{name}"
-        if (folder / "recorded.pickle").is_file():
+        if (folder / "recorded.pickle").is_file() or (presets and name not in presets):
             continue
         started = time.process_time()
-        settings = replace(preset(name), seed=seed_of(name, number))
+        settings = replace(preset(name), seed=seed_of(name, number, seeds_from))
         settings = replace(settings, path=replace(settings.path, length_m=length_m))
         # no more frames than are compared: five a second
         settings = replace(

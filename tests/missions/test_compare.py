@@ -108,9 +108,9 @@ def files(folder: Path) -> dict[str, bytes]:
 def test_most_changes_are_found_and_few_are_false(compared, flown):
     measured = evaluate_changes(compared[0], truth=flown)
     events = measured[0].events
-    assert events.found >= 0.7 * events.must_find
-    assert events.false <= 2
-    assert events.twice == 0
+    assert events.must_find == 6
+    assert events.found == events.must_find
+    assert events.false == events.twice == 0
 
 
 def test_changes_are_announced_once_while_the_flight_lasts(compared):

@@ -12,25 +12,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.motion.blobs import RIM_PX, Blob, blobs_of
-from sorvolo.change.shape.shadows import shadow_of_arrival
+from sorvolo.change.motion.blobs import Blob, blobs_of
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats
-from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import ComparedView
 
 _MOST_PARALLAX = 0.6 / (1 - 0.6)  # h / (H - h) of a thing 0.6 times as high as the camera flies
 _UNLIKELY_PARALLAX = 0.5  # no thing that came is a third as high as the camera flies
 _POINTS = 12  # of a track, that its velocity is fitted to
-_MUCH_LARGER = 4.0  # times a blob's box
-_NEAR_PX = 8  # what is looked at around a place to tell shadows
 _RIGID_POINTS, _RIGID_LENGTHS, _RIGID_LENGTH_M = 5, 2.0, 2.5
-_VERY_STEADY = 1.3, 1.15  # largest by smallest area and length: what leans changes more on less of a way
-_STEADY_POINTS, _STEADY_LENGTHS, _STEADY_MOVE = 8, 1.2, 0.5
 _FLOATS_LENGTH_M = 1.3
+_STEADY_AREA, _STEADY_LENGTH = 1.7, 1.35  # of the largest by the smallest, for one that keeps its size
 _PHOTOS_APART_S = 0.7  # at least, on average
-# two that move alike so near each other, in metres or lengths, are one thing, seen now with its shadow, now without
-_ONE_THING_M, _ONE_THING_LENGTHS = 0.4, 0.3
+# two that move alike so near each other are one thing, seen now with its shadow, now without
+_ONE_THING_M = 0.4
 _LOST_FOR_S = 45.0  # a thing that moves steadily is known again after so long: on the next strip, too
 
 
@@ -86,6 +81,11 @@ class Motion:
     path_m: float
     error_m: float
 
+    @property
+    def speed_m_s(self) -> float:
+        """The length of its velocity."""
+        return float(np.hypot(*self.velocity_m_s))
+
 
 @dataclass(frozen=True, eq=False)
 class Track:
@@ -122,7 +122,7 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """What one view says about motion. For each box of the view: whether it shows something that moves, and whether
+    """What moves in one view. For each box of the view: whether it shows something that moves, and whether
     it may (so that nobody should call it a change of the ground yet). `movers` are the tracks that moved in this view.
     """
 
@@ -166,62 +166,52 @@ class BlobTracker:
 
     def follow(self, view: ComparedView) -> Followed:
         """Take the next view's blobs; views come in order of time."""
-        now_ns, settings = view.time_ns, self._settings
-        oldest_ns = min([now_ns - round(settings.forget_s * 1e9), *self._times_ns])
+        now_ns, camera_m = view.time_ns, np.array(view.camera_m[:2])
+        tracks = self._still_followed(now_ns)
         self._times_ns.append(now_ns)
-        gone = [each for each in self._tracks if each.last.time_ns < oldest_ns]
-        self._lost += [each for each in gone if each.mover]
-        self._lost = [each for each in self._lost if (now_ns - each.last.time_ns) * 1e-9 <= _LOST_FOR_S]
-        tracks = [each for each in self._tracks if each not in gone]
         blobs = blobs_of(view)
         is_moving, may_move = np.zeros(len(view.boxes), bool), np.zeros(len(view.boxes), bool)
         movers: list[Track] = []
-        pairs = _pairs(tracks, blobs, now_ns, settings)
-        taken = {blob for _, blob in pairs}
+        pairs = _pairs(tracks, blobs, now_ns, self._settings)
         for index, blob_index in pairs:
             blob = blobs[blob_index]
-            track = tracks[index].with_point(TrackPoint(now_ns, blob, np.array(view.camera_m[:2])))
+            track = tracks[index].with_point(TrackPoint(now_ns, blob, camera_m))
             move = motion(track.points)
-            if not track.mover and self._moves(track, move, view):
+            if not track.mover and self._moves(track, move):
                 track = replace(track, mover=self._number_of(track, move, tracks))
             if track.mover:
                 movers.append(track)
             # a thing that stopped is a change of the ground, whatever it was before
-            recent = motion(track.points[-5:])
-            may_move[blob.box] = _may_move(track, recent)
+            may_move[blob.box] = _may_move(track, motion(track.points[-5:]))
             is_moving[blob.box] = bool(track.mover) and may_move[blob.box]
             tracks[index] = track
-        camera_m = np.array(view.camera_m[:2])
-        for blob_index, blob in enumerate(blobs):
-            if blob_index not in taken:
-                point = TrackPoint(now_ns, blob, camera_m)
-                tracks.append(Track(point, (point,), 1, blob.score, np.zeros(2)))
-                may_move[blob.box] = True  # nobody knows yet
-        whole = {blob.box for blob in blobs}
-        unsteady = [
-            each for each in tracks
-            if each.mover or (each.count > 2 and _may_move(each, motion(each.points[-5:])))
-        ]
-        _follow_over_rim(view, unsteady, whole, is_moving, may_move)
+        taken = {blob for _, blob in pairs}
+        for blob in (each for index, each in enumerate(blobs) if index not in taken):
+            point = TrackPoint(now_ns, blob, camera_m)
+            tracks.append(Track(point, (point,), 1, blob.score, np.zeros(2)))
+            may_move[blob.box] = True  # nobody knows yet
         self._tracks = tracks
         return Followed(is_moving, may_move, tuple(movers))
 
-    def _moves(self, track: Track, move: Motion, view: ComparedView) -> bool:
-        settings = self._settings
+    def _still_followed(self, now_ns: int) -> list[Track]:
+        """The tracks that are not too old; movers among the others are lost for a while."""
+        oldest_ns = min([now_ns - round(self._settings.forget_s * 1e9), *self._times_ns])
+        gone = [each for each in self._tracks if each.last.time_ns < oldest_ns]
+        self._lost += [each for each in gone if each.mover]
+        self._lost = [each for each in self._lost if (now_ns - each.last.time_ns) * 1e-9 <= _LOST_FOR_S]
+        return [each for each in self._tracks if each not in gone]
+
+    def _moves(self, track: Track, move: Motion) -> bool:
+        """Whether enough views show a plausible thing that moves steadily, by more than parallax explains."""
+        settings, are_photos = self._settings, self._are_photos(track)
         length_m = float(np.median([each.blob.length_m for each in track.points]))
-        lengths = _STEADY_MOVE if _is_very_steady(track) else settings.least_lengths
-        needed_m = max(settings.least_move_m, lengths * length_m)
-        speed_m_s = float(np.hypot(*move.velocity_m_s))
-        is_own = move.path_m > needed_m and float(np.hypot(*move.own_m_s)) > 0.35 * speed_m_s
-        return (
-            track.count >= (settings.least_photos if self._are_photos(track) else settings.least_views)
-            and settings.least_length_m <= length_m
-            and speed_m_s <= settings.fastest_m_s(length_m)
-            and (is_own or _is_rigid(track, length_m) or (self._are_photos(track) and _floats(track, move, length_m)))
-            and float(np.hypot(*(move.velocity_m_s - move.camera_m_s))) > 0.3 * float(np.hypot(*move.camera_m_s))
-            and move.error_m < 0.05 + 0.03 * (speed_m_s * track.seconds + length_m)
-            and not _is_still_there(track, view)
-        )
+        if track.count < (settings.least_photos if are_photos else settings.least_views):
+            return False
+        if not _is_plausible(track, move, length_m, settings) or _goes_with_camera(move):
+            return False
+        needed_m = max(settings.least_move_m, settings.least_lengths * length_m)
+        is_own = move.path_m > needed_m and float(np.hypot(*move.own_m_s)) > 0.35 * move.speed_m_s
+        return is_own or _is_rigid(track, length_m) or (are_photos and _floats(track, move, length_m))
 
     def _are_photos(self, track: Track) -> bool:
         """Whether the views were taken seldom while the track lasted."""
@@ -233,20 +223,29 @@ class BlobTracker:
         now_ns, start = track.last.time_ns, track.points[0]
         for other in others:
             expected_m = other.last.blob.place_m + (now_ns - other.last.time_ns) * 1e-9 * other.velocity_m_s
-            reach_m = max(_ONE_THING_M, _ONE_THING_LENGTHS * other.last.blob.length_m)
-            is_there = float(np.hypot(*(track.last.blob.place_m - expected_m))) < reach_m
+            is_there = float(np.hypot(*(track.last.blob.place_m - expected_m))) < _ONE_THING_M
             if other.mover and is_there and _goes_with(move, other):
                 return other.mover
         for lost in self._lost:
             gap_s = (start.time_ns - lost.last.time_ns) * 1e-9
             expected_m = lost.last.blob.place_m + gap_s * lost.velocity_m_s
-            speed_m_s = float(np.hypot(*move.velocity_m_s))
-            is_near = float(np.hypot(*(start.blob.place_m - expected_m))) < 1.0 + 0.4 * gap_s * speed_m_s
+            is_near = float(np.hypot(*(start.blob.place_m - expected_m))) < 1.0 + 0.4 * gap_s * move.speed_m_s
             if gap_s > 0 and is_near and _goes_with(move, lost) and _alike(lost.last.blob, start.blob):
                 self._lost.remove(lost)
                 return lost.mover
         self._movers += 1
         return self._movers
+
+
+def _is_plausible(track: Track, move: Motion, length_m: float, settings: MovingSettings) -> bool:
+    """Whether a thing of this length may be so fast, and its track is steady enough."""
+    is_steady = move.error_m < 0.05 + 0.03 * (move.speed_m_s * track.seconds + length_m)
+    return settings.least_length_m <= length_m and move.speed_m_s <= settings.fastest_m_s(length_m) and is_steady
+
+
+def _goes_with_camera(move: Motion) -> bool:
+    apart_m_s = float(np.hypot(*(move.velocity_m_s - move.camera_m_s)))
+    return apart_m_s <= 0.3 * float(np.hypot(*move.camera_m_s))
 
 
 def _goes_with(move: Motion, track: Track) -> bool:
@@ -262,9 +261,7 @@ def _is_rigid(track: Track, length_m: float) -> bool:
     """
     if len(track.points) < _RIGID_POINTS or length_m > _RIGID_LENGTH_M:
         return False
-    is_steady = len(track.points) >= _STEADY_POINTS and _is_very_steady(track)
-    lengths = _STEADY_LENGTHS if is_steady else _RIGID_LENGTHS
-    return _way_m(track) > max(1.0, lengths * length_m) and _keeps_its_size(track)
+    return _way_m(track) > max(1.0, _RIGID_LENGTHS * length_m) and _keeps_its_size(track)
 
 
 def _floats(track: Track, move: Motion, length_m: float) -> bool:
@@ -286,16 +283,11 @@ def _way_m(track: Track) -> float:
     return float(np.hypot(*(track.last.blob.place_m - track.points[0].blob.place_m)))
 
 
-def _is_very_steady(track: Track) -> bool:
-    """Whether a track's size has hardly changed over enough views: nothing that grew explains its motion."""
-    return len(track.points) >= _RIGID_POINTS and _keeps_its_size(track, *_VERY_STEADY)
-
-
-def _keeps_its_size(track: Track, most_area: float = 1.7, most_length: float = 1.35) -> bool:
-    """Whether a track's largest area and length are less than so many times the smallest."""
+def _keeps_its_size(track: Track) -> bool:
+    """Whether a track's area and length have hardly changed: nothing that grew explains its motion."""
     areas = [each.blob.area_m2 for each in track.points]
     lengths = [each.blob.length_m for each in track.points]
-    return max(areas) < most_area * min(areas) and max(lengths) < most_length * min(lengths)
+    return max(areas) < _STEADY_AREA * min(areas) and max(lengths) < _STEADY_LENGTH * min(lengths)
 
 
 def _may_move(track: Track, move: Motion) -> bool:
@@ -308,50 +300,6 @@ def _may_move(track: Track, move: Motion) -> bool:
     against_m = -float(way_m @ camera_m) / camera_way_m if camera_way_m > 0.1 else 0.0
     is_ghost = against_m > max(_UNLIKELY_PARALLAX * camera_way_m, 0.25)
     return bool(move.path_m > max(0.25, 2 * move.error_m) or is_ghost)
-
-
-def _follow_over_rim(
-    view: ComparedView, tracks: Sequence[Track], whole: set[int], is_moving: NDArray[np.bool_],
-    may_move: NDArray[np.bool_],
-) -> None:
-    """Mark the boxes that are cut by the view's rim, thus no blobs, and lie where an unsteady thing must be by now."""
-    if not tracks:
-        return
-    m_per_px = view.m_per_px
-    image_from_site = np.linalg.inv(view.site_from_image)
-    for track in tracks:
-        ahead_s = (view.time_ns - track.last.time_ns) * 1e-9
-        expected_m = track.last.blob.place_m + ahead_s * track.velocity_m_s
-        pixel = apply_homography(image_from_site, expected_m[None])[0]
-        reach_px = 0.75 * track.last.blob.length_m / m_per_px + RIM_PX
-        for index, (x, y, w, h) in enumerate(view.boxes):
-            nearest = np.clip(pixel, [x, y], [x + w, y + h])
-            if index not in whole and float(np.hypot(*(pixel - nearest))) < reach_px:
-                may_move[index] = True
-                is_moving[index] |= bool(track.mover)
-
-
-def _is_still_there(track: Track, view: ComparedView) -> bool:
-    """Whether the view still shows a change where the track began; not if it cannot tell.
-
-    What is much larger than what the track shows now is another thing, which it set out from or passed.
-    """
-    pixel = apply_homography(np.linalg.inv(view.site_from_image), track.points[0].blob.place_m[None])[0]
-    height, width = view.changed.shape
-    if not np.isfinite(pixel).all() or not (0 <= pixel[0] < width - 1 and 0 <= pixel[1] < height - 1):
-        return False
-    x, y = round(pixel[0]), round(pixel[1])
-    own = track.last.blob.box
-    sizes = view.boxes[:, 2] * view.boxes[:, 3]
-    corners, sides = view.boxes[:, :2], view.boxes[:, 2:]
-    holds = np.all((corners <= [x, y]) & ([x, y] < corners + sides), axis=1)
-    if holds.any() and not holds[own] and (sizes[holds] > _MUCH_LARGER * sizes[own]).all():
-        return False
-    window = slice(max(y - _NEAR_PX, 0), y + _NEAR_PX), slice(max(x - _NEAR_PX, 0), x + _NEAR_PX)
-    changed = view.changed[window] > 0
-    dark = shadow_of_arrival(view.reference[window], view.image[window], changed)
-    # the shadow of what walked on may lie where it set out
-    return bool((changed & ~dark)[y - window[0].start, x - window[1].start])
 
 
 def _alike(a: Blob, b: Blob) -> bool:

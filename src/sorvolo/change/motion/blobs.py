@@ -14,6 +14,7 @@ from sorvolo.survey.findings import ComparedView
 RIM_PX = 2  # a blob that comes nearer to the view's rim may be cut by it
 _MOST_BOXES = 64
 _AROUND_PX = 4
+_MOST_OF_VIEW = 0.15
 _UPRIGHT_M, _PERSON_M = 1.0, 1.9  # narrower than this it may be a person, who leans as this height does at most
 
 
@@ -31,37 +32,39 @@ class Blob:
 
 def blobs_of(view: ComparedView) -> list[Blob]:
     """The blobs that lie whole inside the view; one cut by its rim would seem to move with the camera."""
+    chosen = np.argsort(-view.scores, kind="stable")[:_MOST_BOXES]
+    blobs = [_blob(view, int(index)) for index in chosen if _is_whole(view, int(index))]
+    return [each for each in blobs if each is not None]
+
+
+def _is_whole(view: ComparedView, index: int) -> bool:
+    """Whether a box lies on known ground, off the view's rim, and is no large part of the view."""
     height, width = view.changed.shape
-    m_per_px = view.m_per_px
-    blobs = []
-    for index in np.argsort(-view.scores, kind="stable")[:_MOST_BOXES]:
-        x, y, w, h = (int(each) for each in view.boxes[index])
-        if x < RIM_PX or y < RIM_PX or x + w > width - RIM_PX or y + h > height - RIM_PX:
-            continue
-        if w * h > 0.15 * width * height or not _is_known_around(view.valid, x, y, w, h):
-            continue
-        left, top, _, thing = _around(view, index)
-        ys, xs = np.nonzero(thing)
-        if not len(xs):
-            continue
-        x, y, w, h = left + int(xs.min()), top + int(ys.min()), int(np.ptp(xs)) + 1, int(np.ptp(ys)) + 1
-        part = thing[ys.min():ys.max() + 1, xs.min():xs.max() + 1].view(np.uint8) * np.uint8(255)
-        moments = cv2.moments(part, binaryImage=True)
-        if moments["m00"] <= 0:
-            continue
-        hull = cv2.convexHull(cv2.findNonZero(part)).reshape(-1, 2) + np.array([x, y])
-        hull_m = apply_homography(view.site_from_image, hull.astype(np.float64))
-        middle = np.array([[x + moments["m10"] / moments["m00"], y + moments["m01"] / moments["m00"]]])
-        place_m = apply_homography(view.site_from_image, middle)[0]
-        if not (np.isfinite(hull_m).all() and np.isfinite(place_m).all()):
-            continue
-        foot_m = _foot_m(hull_m, hull_m, view.camera_m, m_per_px)
-        place_m = place_m if foot_m is None else foot_m.mean(axis=0)
-        colour = np.array(cv2.mean(view.image[y : y + h, x : x + w], part)[:3])
-        area_m2 = moments["m00"] * m_per_px**2
-        score = float(view.scores[index])
-        blobs.append(Blob(int(index), place_m, max(w, h) * m_per_px, area_m2, colour, score))
-    return blobs
+    x, y, w, h = (int(each) for each in view.boxes[index])
+    is_inside = x >= RIM_PX and y >= RIM_PX and x + w <= width - RIM_PX and y + h <= height - RIM_PX
+    return is_inside and w * h <= _MOST_OF_VIEW * width * height and _is_known_around(view.valid, x, y, w, h)
+
+
+def _blob(view: ComparedView, index: int) -> Blob | None:
+    """The thing in a box where it stands on the ground; None where nothing of it is left, or beyond the horizon."""
+    left, top, _, thing = _around(view, index)
+    ys, xs = np.nonzero(thing)
+    if not len(xs):
+        return None
+    x, y, w, h = left + int(xs.min()), top + int(ys.min()), int(np.ptp(xs)) + 1, int(np.ptp(ys)) + 1
+    part = thing[ys.min():ys.max() + 1, xs.min():xs.max() + 1].view(np.uint8) * np.uint8(255)
+    moments = cv2.moments(part, binaryImage=True)
+    hull = cv2.convexHull(cv2.findNonZero(part)).reshape(-1, 2) + np.array([x, y])
+    hull_m = apply_homography(view.site_from_image, hull.astype(np.float64))
+    middle = np.array([[x + moments["m10"] / moments["m00"], y + moments["m01"] / moments["m00"]]])
+    place_m = apply_homography(view.site_from_image, middle)[0]
+    if not (np.isfinite(hull_m).all() and np.isfinite(place_m).all()):
+        return None
+    foot_m = _foot_m(hull_m, hull_m, view.camera_m, view.m_per_px)
+    place_m = place_m if foot_m is None else foot_m.mean(axis=0)
+    colour = np.array(cv2.mean(view.image[y : y + h, x : x + w], part)[:3])
+    area_m2 = moments["m00"] * view.m_per_px**2
+    return Blob(index, place_m, max(w, h) * view.m_per_px, area_m2, colour, float(view.scores[index]))
 
 
 def standing_outline_m(view: ComparedView, blob: Blob) -> PointsM | None:
@@ -94,7 +97,7 @@ def _foot_m(thing_m: PointsM, changed_m: PointsM, camera_m: Floats, m_per_px: fl
     """(4, 2) the ground under something narrow that leans away from the camera; None for what does not.
 
     The feet are at its near end, no nearer than a person's would be, and a person is about as long as wide from above.
-    `thing_m` are points of the lit thing: dark trousers may be missing, so `changed_m` says how near it begins.
+    `thing_m` are points of the lit thing: dark trousers may be missing, so `changed_m` bounds how near it begins.
     """
     away = thing_m.mean(axis=0) - camera_m[:2]
     distance_m = float(np.hypot(*away))

@@ -21,7 +21,6 @@ from sorvolo.kernels import looked_up
 LEAST_SIDE_PX = 32
 CLOSES_PX = 9
 LEAST_CONVEXITY = 0.5
-SEVERAL_CONVEXITY = 0.85  # where two whole things touch, what lies between them is none
 LEAST_GROWN = 0.5  # sureness: what is doubted is shown as it differs, and takes no ground from around
 SAME_PLACE_PX = 0.6  # half size pixels
 ALL_KNOWN = 0x0101  # two True side by side
@@ -269,26 +268,15 @@ def _filled(
     things = np.s_[max(0, y - CLOSES_PX) : y + high + CLOSES_PX, max(0, x - CLOSES_PX) : x + wide + CLOSES_PX]
     closed: Anything = cv2.morphologyEx(around[things], cv2.MORPH_CLOSE, np.ones((CLOSES_PX, CLOSES_PX), np.uint8))
     outlines, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    inner = [_inner_px(pieces[int(each)], things) for each in np.flatnonzero(chosen & ~alone)]
     for outline in outlines:
         hull = cv2.convexHull(outline)
-        held_pieces = sum(cv2.pointPolygonTest(outline, place, False) >= 0 for place in inner)
-        least = LEAST_CONVEXITY if held_pieces < 2 else SEVERAL_CONVEXITY
-        is_full = cv2.contourArea(outline) > least * cv2.contourArea(hull)
+        is_full = cv2.contourArea(outline) > LEAST_CONVEXITY * cv2.contourArea(hull)
         cv2.drawContours(closed, [hull if is_full else outline], -1, 255.0, cv2.FILLED)
     outlined = np.zeros(size, np.uint8)
     outlined[things] = _outlined(closed, regions.strength[things])
     if regions.known is not None:
         outlined[~regions.known] = 0
     return outlined
-
-
-def _inner_px(piece: Piece, window: tuple[slice, slice]) -> tuple[float, float]:
-    """x, y of one of a piece's pixels in a window of the picture."""
-    rows, columns = np.nonzero(piece.mask)
-    middle = len(rows) // 2
-    x, y = columns[middle] + piece.window[1].start, rows[middle] + piece.window[0].start
-    return float(x - window[1].start), float(y - window[0].start)
 
 
 def _outlined(thing: ImageGray, strength: Anything) -> ImageGray:
