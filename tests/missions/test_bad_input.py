@@ -33,9 +33,9 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     return told[0]
 
 
-def mapped(site: Path, *arguments: str | Path) -> dict[str, Any]:
-    """The report of the only flight of a command that must succeed."""
-    assert cli.main(["map", "--model", "none", *map(str, arguments), "--site", str(site)]) == 0
+def mapped(site: Path, *arguments: str | Path, code: int = 0) -> dict[str, Any]:
+    """The report of the only flight of a command that must succeed; code 3: with a map to check before use."""
+    assert cli.main(["map", "--model", "none", *map(str, arguments), "--site", str(site)]) == code
     (path,) = site.glob("flights/*/report.json")
     return json.loads(path.read_text())
 
@@ -189,7 +189,7 @@ def test_telemetry_of_another_path_at_the_same_time(film: Path, filmed: Path, tm
     assert not right["warnings"]
     again = shutil.copy(film, tmp_path / "again.mp4")  # over ground that is known the pictures decide
     command = ["map", "--model", "none", again, "--telemetry", telemetry, *camera, "--site", tmp_path / "site"]
-    assert cli.main([*map(str, command)]) == 0
+    assert cli.main([*map(str, command)]) == 3, "the map is one to check before use"
     report = json.loads((tmp_path / "site" / "flights" / "again" / "report.json").read_text())
     assert any("disagree by" in words for words in report["warnings"])
     assert report["frames"]["vision"] == report["frames"]["selected"]
@@ -333,7 +333,7 @@ def test_water_is_placed_by_gps_alone(photos: Path, photographed: Path, tmp_path
         with Image.open(path) as image:
             water = np.clip(rng.normal((40, 90, 120), 2, (270, 480, 3)), 0, 255).astype(np.uint8)
             Image.fromarray(water).save(path, exif=image.getexif(), xmp=image.info["xmp"], quality=95)
-    mapped(tmp_path / "site", photos, "--camera", photographed / "camera.xml")
+    mapped(tmp_path / "site", photos, "--camera", photographed / "camera.xml", code=3)
     ended = endings(tmp_path / "site")
     assert all(ended[path.name][0] == "gps-only" and ended[path.name][1] for path in files[5:7])
     assert sum(status == "vision" for status, _ in ended.values()) == 10
@@ -343,7 +343,7 @@ def test_frames_without_overlap_keep_their_own_fixes(photos: Path, photographed:
     for path in sorted(photos.iterdir()):
         if path.name not in ("IMG_0001.jpg", "IMG_0007.jpg"):
             path.unlink()
-    mapped(tmp_path / "site", photos, "--camera", photographed / "camera.xml")
+    mapped(tmp_path / "site", photos, "--camera", photographed / "camera.xml", code=3)
     ended = endings(tmp_path / "site")
     assert len(ended) == 2 and all(status != "rejected" for status, _ in ended.values())
     assert "gps-only" in {status for status, _ in ended.values()}

@@ -109,7 +109,7 @@ def test_report_crops_and_site_file(mapped: Path) -> None:
     for each in own:
         assert (mapped / "flights/flight1" / each["properties"]["crop"]).read_bytes().startswith(b"\xff\xd8")
     page = (mapped / "flights/flight1/report.html").read_text()
-    assert "What stands here" in page
+    assert "Objects on the map" in page
     assert own[0]["id"] in page
 
 
@@ -133,7 +133,7 @@ def test_without_a_model(simulated: Path, tmp_path: Path) -> None:
     for _ in map_flights([simulated / "flight1/flight1.mp4"], tmp_path / "site", MapSettings(model="none")):
         pass
     assert report_of(tmp_path / "site", "flight1")["objects"]["why_not"] == "no model was wanted"
-    assert "Nothing was looked for" in (tmp_path / "site/flights/flight1/report.html").read_text()
+    assert "No objects were searched for" in (tmp_path / "site/flights/flight1/report.html").read_text()
     assert not (tmp_path / "site/objects.geojson").exists()
     with pytest.raises(InputError, match="no flight of it was searched"):
         evaluate_objects(tmp_path / "site", simulated)
