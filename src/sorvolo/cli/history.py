@@ -64,7 +64,11 @@ def _show(entries: Sequence["HistoryEntry"], console: Console) -> None:
         return
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for name in ("no", "flown", "complete (UTC)", "flight", "by", "tiles", "MB", "changes", "reviewed"):
-        table.add_column(name, no_wrap=name not in ("flight", "changes", "reviewed"), overflow="fold")
+        # folded between words, never within: "2 appeared,", "2026-11-22"
+        table.add_column(
+            name, no_wrap=name in ("no", "flown", "tiles", "MB"), overflow="fold",
+            min_width={"complete (UTC)": 10, "changes": 11, "reviewed": 9, "by": 7}.get(name),
+        )
     for each in entries:
         removed = f" (-{each.tiles_removed})" if each.tiles_removed else ""
         changes = ", ".join(f"{count} {kind}" for kind, count in each.changes.items())

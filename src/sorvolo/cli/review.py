@@ -76,7 +76,10 @@ def _show(changes: Sequence["StoredChange"], site: "Site", form: PlaceFormat, co
     table, place = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0)), place_words(site, form)
     place_name = place_heading(site.is_local, form)
     for name in ("id", "kind", place_name, f"length {unit_of(site)}", "score", "first seen (UTC)", "verdict"):
-        table.add_column(name, no_wrap=name in ("id", place_name), overflow="fold")
+        table.add_column(
+            name, no_wrap=name in ("id", place_name), overflow="fold",
+            min_width=10 if name.startswith("first") else None,
+        )
     for each in changes:
         verdict = ""
         if each.verdict is not None:

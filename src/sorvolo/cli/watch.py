@@ -47,7 +47,7 @@ def watch_command(
     camera: Camera = "",
     model: Annotated[str, typer.Option(help="Detector: a model's name (sorvolo models list), or a file.")] = "default",
     classes: Annotated[
-        str, typer.Option(help="Classes to search for, such as person,car.", show_default="all that the model knows")
+        str, typer.Option(help="Classes to search for, such as person,car.", show_default="all but those on request")
     ] = "",
     out: Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="SOURCE-watch")] = None,
     save: Annotated[Save, typer.Option(help="Keep the frames with the objects drawn in.")] = Save.NONE,

@@ -91,6 +91,11 @@ def shared_groups(first: LabelledSet, second: LabelledSet) -> tuple[Notice, ...]
     )),)
 
 
+def shuffled(count: int, seed: int = 0) -> list[int]:
+    """The numbers from 0 to `count` - 1 in random order, always the same for a seed."""
+    return [int(each) for each in np.random.default_rng(seed).permutation(count)]
+
+
 def frame_number(path: str) -> int | None:
     """The last number in a picture's file name, by which neighbours in time are known; None without one."""
     numbers = re.findall(r"\d+", stem_of(path))

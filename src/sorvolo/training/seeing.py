@@ -30,3 +30,9 @@ def see(model: FasterRCNN, classes: Sequence[str], picture: ImageRGB, device: st
     boxes = np.clip(boxes / scale, 0, [width, height, width, height])
     kept = (boxes[:, 2:] > boxes[:, :2]).all(1)
     return Detections(boxes[kept], scores[kept], labels[kept], tuple(classes))
+
+
+def padded_to(picture: ImageRGB, side_px: int) -> ImageRGB:
+    """The picture, padded with gray where a side is shorter than `side_px`."""
+    down, right = (max(0, side_px - side) for side in picture.shape[:2])
+    return np.pad(picture, ((0, down), (0, right), (0, 0)), constant_values=114)

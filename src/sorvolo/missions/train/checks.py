@@ -1,66 +1,21 @@
-"""How good a network in training is on the held-out pictures, and what its model file says of itself."""
+"""How good a network in training is on the held-out pictures."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
 
-import numpy as np
-
-from sorvolo.detection.metrics import (
-    ClassMatch,
-    CocoNumbers,
-    Threshold,
-    judged_classes,
-    match_pictures,
-    reporting_threshold,
-)
+from sorvolo.detection.held_out import Checked, mean_known
+from sorvolo.detection.metrics import ClassMatch, CocoNumbers, judged_classes, match_pictures
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.mosaic.selection import evenly
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.progress import Check
 from sorvolo.training.seeing import see
 
-_FALLBACK_THRESHOLD = 0.5  # where nothing was held out to choose one
-_FEW = 10  # objects found, from which on the range of their sizes says something
 
-
-@dataclass(frozen=True, eq=False)
-class Checked:
-    """One look at the held-out sets: of each class the matches in each set that labels it, and COCO's numbers there."""
-
-    matches: Mapping[str, tuple[ClassMatch, ...]]
-    numbers: Mapping[str, tuple[CocoNumbers, ...]]
-
-    def check(self, step: int) -> Check:
-        """AP50 and AP: of each class the mean over its sets, weighted by labels; over all classes the plain mean."""
-        of50 = {name: self._mean(name, "ap50") for name in self.matches}
-        of_all = {name: self._mean(name, "ap") for name in self.matches}
-        return Check(step, _mean_known(of50.values()), _mean_known(of_all.values()), of50)
-
-    def thresholds(self, classes: Sequence[str]) -> dict[str, Threshold]:
-        """The score from which each class is reported: `metrics.reporting_threshold` over all sets together."""
-        unknown = Threshold(_FALLBACK_THRESHOLD, float("nan"), float("nan"), float("nan"))
-        found = {name: reporting_threshold(_pooled(self.matches[name])) for name in classes if name in self.matches}
-        return {
-            name: replace(found[name], score=round(found[name].score, 3))
-            if name in found and np.isfinite(found[name].score) else unknown
-            for name in classes
-        }
-
-    def found_sides_px(self, name: str, score: float) -> Floats:
-        """(N,) longer sides of the labels of a class that were found at this score."""
-        sides = [np.zeros(0)]
-        for match in self.matches.get(name, ()):
-            found = match.true_boxes_px[match.true_scores >= score]
-            sides.append(np.asarray((found[:, 2:] - found[:, :2]).max(1, initial=0), float))
-        return np.concatenate(sides)
-
-    def _mean(self, name: str, field: str) -> float:
-        rows = [
-            (getattr(numbers, field), len(match.true_scores))
-            for numbers, match in zip(self.numbers[name], self.matches[name]) if len(match.true_scores)
-        ]
-        return float(np.average([row[0] for row in rows], weights=[row[1] for row in rows])) if rows else float("nan")
+def check_of(checked: Checked, step: int) -> Check:
+    """The figures of a check: AP50 and AP over all classes, the plain mean, and AP50 of each class."""
+    return Check(step, mean_known(checked.ap50.values()), mean_known(checked.ap.values()), checked.ap50)
 
 
 def check_model(
@@ -73,10 +28,9 @@ def check_model(
     numbers: dict[str, tuple[CocoNumbers, ...]] = {}
     for whole in held_out:
         count = min(len(whole), max(1, round(most * len(whole) / total)))
-        rows = np.unique(np.linspace(0, len(whole) - 1, count).round().astype(int))
         seen: list[LabelledPicture] = []
         found = []
-        for picture in (whole.pictures[row] for row in rows):
+        for picture in (whole.pictures[row] for row in evenly(len(whole), count)):
             try:
                 image = read(picture.path)
             except InputError:
@@ -89,56 +43,3 @@ def check_model(
             matches[match.label] = (*matches.get(match.label, ()), match)
             numbers[match.label] = (*numbers.get(match.label, ()), by_class[match.label])
     return Checked(matches, numbers)
-
-
-def best_sizes_px(
-    checked: Checked, thresholds: Mapping[str, float], learnt: Sequence[LabelledSet], classes: Sequence[str]
-) -> dict[str, tuple[float, float]]:
-    """Of each class the longer sides between which nine of ten objects lie: of those found where enough were held out,
-    else of those learnt from."""
-    found = found_sizes_px(checked, thresholds, classes)
-    learnt_px = {name: np.concatenate([np.zeros(0), *(_sides_px(each, name) for each in learnt)]) for name in classes}
-    return {name: found.get(name) or _most_of(learnt_px[name]) for name in classes}
-
-
-def found_sizes_px(
-    checked: Checked, thresholds: Mapping[str, float], classes: Sequence[str]
-) -> dict[str, tuple[float, float]]:
-    """Of each class the longer sides between which nine of ten of the held-out objects that were found lie; nothing of
-    a class of which too few were."""
-    sides = {name: checked.found_sides_px(name, thresholds[name]) for name in classes}
-    return {name: _most_of(each) for name, each in sides.items() if len(each) >= _FEW}
-
-
-def _most_of(sides_px: Floats) -> tuple[float, float]:
-    low, high = np.percentile(sides_px, [5, 95]) if len(sides_px) else (8.0, 256.0)
-    low = max(1.0, round(float(low), 1))
-    return low, max(low + 1, round(float(high), 1))
-
-
-def _sides_px(labelled: LabelledSet, name: str) -> Floats:
-    if name not in labelled.classes:
-        return np.zeros(0)
-    boxes = [_of_class(picture, labelled.classes.index(name)) for picture in labelled.pictures]
-    return np.concatenate([np.zeros(0), *boxes])
-
-
-def _of_class(picture: LabelledPicture, label: int) -> Floats:
-    boxes = picture.boxes_px[picture.labels == label]
-    return np.asarray((boxes[:, 2:] - boxes[:, :2]).max(1, initial=0), float)
-
-
-def _pooled(matches: Sequence[ClassMatch]) -> ClassMatch:
-    """The matches of several sets as one, best first; which picture each is of is lost."""
-    scores = np.concatenate([each.scores for each in matches])
-    order = np.argsort(-scores, kind="stable")
-    return replace(
-        matches[0], scores=scores[order], right=np.concatenate([each.right for each in matches], 1)[:, order],
-        ignored=np.concatenate([each.ignored for each in matches], 1)[:, order],
-        true_scores=np.concatenate([each.true_scores for each in matches]),
-    )
-
-
-def _mean_known(values: Iterable[float]) -> float:
-    known = [value for value in values if np.isfinite(value)]
-    return float(np.mean(known)) if known else float("nan")

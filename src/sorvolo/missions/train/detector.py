@@ -11,13 +11,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sorvolo import __version__
 from sorvolo.capture.photos import read_picture
+from sorvolo.detection.held_out import Checked, best_sizes_px, found_sizes_px
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.missions.train.checks import Checked, best_sizes_px, check_model, found_sizes_px
+from sorvolo.missions.train.checks import check_model, check_of
 from sorvolo.missions.train.sets import DataOptions, TrainingSets, read_labels, simulate_samples, training_sets
 from sorvolo.missions.train.settings import TrainSettings
 from sorvolo.missions.train.start import load_start, told_of_classes
@@ -39,6 +38,7 @@ from sorvolo.training.four_steps import STEP_NAMES, FourStepTraining
 from sorvolo.training.joint import Progress
 from sorvolo.training.progress import Check, History, Learner, seconds_left
 from sorvolo.training.samples import Augmentation, Sample
+from sorvolo.training.seeing import padded_to
 from sorvolo.training.starting import device_of, start_learner, without_denormals
 from sorvolo.training.weights import ImageNetWeights
 
@@ -239,7 +239,7 @@ def _is_check_due(run: _Run) -> bool:
 
 def _check(run: _Run) -> Check:
     """Look at held-out pictures; the best weights so far are kept."""
-    check = _look(run, run.learner.average, _MOST_CHECKED).check(run.learner.step)
+    check = check_of(_look(run, run.learner.average, _MOST_CHECKED), run.learner.step)
     run.history = run.history.checked(check)
     if run.history.best is check:
         atomic_write_bytes(run.out / BEST, weights_bytes(run.learner.average))
@@ -279,7 +279,7 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     exported = export_onnx(model, info)
     agreement = check_export(model.cpu(), exported, _some_pictures(run))
     atomic_write_bytes(run.out / MODEL, exported)
-    check = checked.check(run.learner.step if best is None else best.step) if run.sets.held_out else None
+    check = check_of(checked, run.learner.step if best is None else best.step) if run.sets.held_out else None
     told = _closing_notices(run, agreement, check)
     report = _report(run, info, agreement, len(exported), check, told) | {
         "reported": {name: asdict(each) for name, each in thresholds.items()},
@@ -310,16 +310,10 @@ def _some_pictures(run: _Run) -> list[ImageRGB]:
         if len(found) == _EXPORT_PICTURES:
             break
         try:
-            found.append(_at_least(run.reader(picture.path)[:_EXPORT_PX, :_EXPORT_PX], run.learner.model.stride))
+            found.append(padded_to(run.reader(picture.path)[:_EXPORT_PX, :_EXPORT_PX], run.learner.model.stride))
         except InputError:
             continue
     return found
-
-
-def _at_least(picture: ImageRGB, side_px: int) -> ImageRGB:
-    """The picture, padded where a side is shorter than the network's stride."""
-    down, right = (max(0, side_px - side) for side in picture.shape[:2])
-    return np.pad(picture, ((0, down), (0, right), (0, 0)), constant_values=114)
 
 
 def _closing_notices(run: _Run, agreement: ExportCheck, check: Check | None) -> tuple[str, ...]:

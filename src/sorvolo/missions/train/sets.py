@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sorvolo.capture.photos import read_picture
 from sorvolo.detection.light import is_thermal
 from sorvolo.errors import InputError, SettingsError
@@ -18,7 +16,7 @@ from sorvolo.simulation.pictures import PictureSettings
 from sorvolo.store.datasets import read_dataset, read_datasets
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.survey.splits import shared_groups
+from sorvolo.survey.splits import shared_groups, shuffled
 from sorvolo.training.samples import Share
 
 _SMALL = CLASSES[2]
@@ -188,7 +186,7 @@ def _honest(labelled: LabelledSet, classes: Sequence[str]) -> LabelledSet:
 
 def _by_light(labelled: LabelledSet) -> list[Share]:
     """The set as one share, thermal or not by some of its pictures; as two where these are of both kinds."""
-    rows = np.random.default_rng(0).permutation(len(labelled))[:_LOOKED_AT]  # not evenly: lights may take turns
+    rows = shuffled(len(labelled))[:_LOOKED_AT]  # not evenly: lights may take turns
     told = [_is_thermal(labelled.pictures[row]) for row in rows]
     known = [each for each in told if each is not None]
     ratio = sum(known) / max(1, len(known))

@@ -1,0 +1,110 @@
+"""How well a detector does on pictures that were held out while it learnt: per class, over several sets."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sorvolo.detection.metrics import ClassMatch, CocoNumbers, Threshold, reporting_threshold
+from sorvolo.geometry.arrays import Floats
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
+
+_FALLBACK_THRESHOLD = 0.5  # where nothing was held out to choose one
+_FEW = 10  # objects found, from which on the range of their sizes means something
+
+
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """One look at the held-out sets: of each class the matches in each set that labels it, and COCO's numbers there."""
+
+    matches: Mapping[str, tuple[ClassMatch, ...]]
+    numbers: Mapping[str, tuple[CocoNumbers, ...]]
+
+    @property
+    def ap50(self) -> dict[str, float]:
+        """AP50 of each class: the mean over its sets, weighted by labels; NaN without any."""
+        return {name: self._mean(name, "ap50") for name in self.matches}
+
+    @property
+    def ap(self) -> dict[str, float]:
+        """AP of each class, as `ap50`."""
+        return {name: self._mean(name, "ap") for name in self.matches}
+
+    def thresholds(self, classes: Sequence[str]) -> dict[str, Threshold]:
+        """The score from which each class is reported: `metrics.reporting_threshold` over all sets together."""
+        unknown = Threshold(_FALLBACK_THRESHOLD, float("nan"), float("nan"), float("nan"))
+        found = {name: reporting_threshold(_pooled(self.matches[name])) for name in classes if name in self.matches}
+        return {
+            name: replace(found[name], score=round(found[name].score, 3))
+            if name in found and np.isfinite(found[name].score) else unknown
+            for name in classes
+        }
+
+    def found_sides_px(self, name: str, score: float) -> Floats:
+        """(N,) longer sides of the labels of a class that were found at this score."""
+        sides = [np.zeros(0)]
+        for match in self.matches.get(name, ()):
+            found = match.true_boxes_px[match.true_scores >= score]
+            sides.append(np.asarray((found[:, 2:] - found[:, :2]).max(1, initial=0), float))
+        return np.concatenate(sides)
+
+    def _mean(self, name: str, field: str) -> float:
+        rows = [
+            (getattr(numbers, field), len(match.true_scores))
+            for numbers, match in zip(self.numbers[name], self.matches[name]) if len(match.true_scores)
+        ]
+        return float(np.average([row[0] for row in rows], weights=[row[1] for row in rows])) if rows else float("nan")
+
+
+def best_sizes_px(
+    checked: Checked, thresholds: Mapping[str, float], learnt: Sequence[LabelledSet], classes: Sequence[str]
+) -> dict[str, tuple[float, float]]:
+    """Of each class the longer sides between which nine of ten objects lie: of those found where enough were held out,
+    else of those learnt from."""
+    found = found_sizes_px(checked, thresholds, classes)
+    learnt_px = {name: np.concatenate([np.zeros(0), *(_sides_px(each, name) for each in learnt)]) for name in classes}
+    return {name: found.get(name) or _most_of(learnt_px[name]) for name in classes}
+
+
+def found_sizes_px(
+    checked: Checked, thresholds: Mapping[str, float], classes: Sequence[str]
+) -> dict[str, tuple[float, float]]:
+    """Of each class the longer sides between which nine of ten of the held-out objects that were found lie; nothing of
+    a class of which too few were."""
+    sides = {name: checked.found_sides_px(name, thresholds[name]) for name in classes}
+    return {name: _most_of(each) for name, each in sides.items() if len(each) >= _FEW}
+
+
+def _most_of(sides_px: Floats) -> tuple[float, float]:
+    low, high = np.percentile(sides_px, [5, 95]) if len(sides_px) else (8.0, 256.0)
+    low = max(1.0, round(float(low), 1))
+    return low, max(low + 1, round(float(high), 1))
+
+
+def _sides_px(labelled: LabelledSet, name: str) -> Floats:
+    if name not in labelled.classes:
+        return np.zeros(0)
+    boxes = [_of_class(picture, labelled.classes.index(name)) for picture in labelled.pictures]
+    return np.concatenate([np.zeros(0), *boxes])
+
+
+def _of_class(picture: LabelledPicture, label: int) -> Floats:
+    boxes = picture.boxes_px[picture.labels == label]
+    return np.asarray((boxes[:, 2:] - boxes[:, :2]).max(1, initial=0), float)
+
+
+def _pooled(matches: Sequence[ClassMatch]) -> ClassMatch:
+    """The matches of several sets as one, best first; which picture each is of is lost."""
+    scores = np.concatenate([each.scores for each in matches])
+    order = np.argsort(-scores, kind="stable")
+    return replace(
+        matches[0], scores=scores[order], right=np.concatenate([each.right for each in matches], 1)[:, order],
+        ignored=np.concatenate([each.ignored for each in matches], 1)[:, order],
+        true_scores=np.concatenate([each.true_scores for each in matches]),
+    )
+
+
+def mean_known(values: Iterable[float]) -> float:
+    """The plain mean of those that are known; NaN where none is."""
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.mean(known)) if known else float("nan")
