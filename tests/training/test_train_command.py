@@ -112,8 +112,8 @@ def test_ctrl_c_waits_for_the_step_and_leaves_a_checkpoint(
     assert main(["train", str(data), "--out", str(tmp_path / "out"), *options]) == 130
     alarm.join()
     told = capsys.readouterr()
-    assert "stopping after this step" in told.err and "stopped; the same command with --resume goes on" in told.err
-    assert "left out" not in told.err
+    assert "stopping after this step" in told.err and "stopped; the same command with --resume continues the run" in told.err
+    assert "discarded" not in told.err
     last = json.loads(told.out.splitlines()[-1])["step"]
     content = (tmp_path / "out" / "checkpoint.pt").read_bytes()
     assert read_checkpoint(content, "checkpoint").state["step"] == last
@@ -176,7 +176,7 @@ def test_what_was_remarked_is_told_on_the_terminal_too(
     command = ["train", str(data), "--val", str(other), "--out", str(tmp_path / "out"), *options]
     assert main(command) == 0
     told = " ".join(capsys.readouterr().out.split())
-    assert "note: other: 4 boxes of classes that stand for none of ours left out: boat (4)" in told
+    assert "note other: 4 boxes of classes that stand for none of ours left out: boat (4)" in told
     assert "lie in both" in told and "flight0" in told
     notices = json.loads((tmp_path / "out" / "training.json").read_text())["notices"]
     assert all(" ".join(each.split()) in told for each in notices)
