@@ -112,7 +112,8 @@ def test_ctrl_c_waits_for_the_step_and_leaves_a_checkpoint(
     assert main(["train", str(data), "--out", str(tmp_path / "out"), *options]) == 130
     alarm.join()
     told = capsys.readouterr()
-    assert "stopping after this step" in told.err and "stopped; the same command with --resume continues the run" in told.err
+    assert "stopping after this step" in told.err
+    assert "stopped; the same command with --resume continues the run" in told.err
     assert "discarded" not in told.err
     last = json.loads(told.out.splitlines()[-1])["step"]
     content = (tmp_path / "out" / "checkpoint.pt").read_bytes()

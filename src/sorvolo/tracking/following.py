@@ -75,8 +75,8 @@ class GroundFollower:
         return height_m / down / self._camera.camera.fx_px
 
     @property
-    def too_short(self) -> int:
-        """Detections so far that are far too short for their class."""
+    def impossible_size(self) -> int:
+        """Detections so far of a size that their class cannot have."""
         return self.unlocated[IMPOSSIBLE_SIZE]
 
     @property

@@ -30,7 +30,7 @@ class Places(Protocol):
 
     @property
     def set_aside(self) -> int:
-        """Detections so far that are far too short for their class: they have a place, but are no such thing."""
+        """Detections so far of a size that their class cannot have: they have a place, but are no such thing."""
 
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
         """Place a frame's detections and give them to their tracks."""
@@ -81,7 +81,7 @@ class GroundPlaces:
     @property
     def set_aside(self) -> int:
         """See `Places.set_aside`."""
-        return self._follower.too_short
+        return self._follower.impossible_size
 
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
         """Place a frame's detections on the ground and give them to their tracks."""
@@ -127,7 +127,7 @@ class GroundPlaces:
     def _size_notices(self) -> tuple[Notice, ...]:
         if not self.set_aside:
             return ()
-        text = f"{counted(self.set_aside, 'detection')} left out: far too short for the class"
+        text = f"{counted(self.set_aside, 'detection')} left out: {IMPOSSIBLE_SIZE}"
         return (Notice("too_short", self.set_aside, text),)
 
     def _prior(self, frame: Frame) -> CameraPrior:
