@@ -6,13 +6,13 @@ is sharpest unmixed; the coarser bands, which carry colour, are averaged with th
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Anything, ImageRGB, Mask
+from sorvolo.geometry.arrays import ImageGray, ImageRGB, Mask, Numbers
 
 BANDS = 5
 """Bands of the pyramid: four Laplacians and the residual."""
@@ -28,7 +28,9 @@ WINDOW_APRON_PX = 80
 
 _HARD_BANDS = 2
 
-Labels: TypeAlias = NDArray[np.int16]
+_Pixel = TypeVar("_Pixel", np.uint8, np.float32)
+
+Winners: TypeAlias = NDArray[np.int16]
 """(height, width) number of the layer that wins each pixel, -1 where there is none."""
 
 
@@ -45,54 +47,29 @@ class Layer:
     image: ImageRGB
 
 
-def blend(labels: Labels, layers: Iterable[Layer]) -> ImageRGB:
+def blend(labels: Winners, layers: Iterable[Layer]) -> ImageRGB:
     """Blend the layers of a window, shape (height, width, 3); pixels labelled -1 have no meaning.
 
     The window's sides and the layers' places and sides are multiples of ALIGN_PX. Each layer should reach
     LAYER_APRON_PX beyond the pixels that it wins, as far as the window goes.
     """
     height, width = labels.shape
-    fine = [np.zeros((height >> k, width >> k, 3), np.int16) for k in range(_HARD_BANDS)]
-    sums = [np.zeros((height >> k, width >> k, 3), np.float32) for k in range(_HARD_BANDS, BANDS)]
-    weights = [np.full((height >> k, width >> k), 1e-9, np.float32) for k in range(_HARD_BANDS, BANDS)]
+    bands = _Bands(height, width)
     for layer in layers:
         rows = slice(layer.y_px, layer.y_px + layer.image.shape[0])
         columns = slice(layer.x_px, layer.x_px + layer.image.shape[1])
-        mask = pixels_of(labels[rows, columns], layer.number)
-        gaussian: Anything = layer.image
-        share: Anything = mask
-        for k in range(BANDS):
-            here = slice(rows.start >> k, rows.stop >> k), slice(columns.start >> k, columns.stop >> k)
-            coarser = _coarser(gaussian) if k < BANDS - 1 else None
-            if k < _HARD_BANDS:
-                band = _laplacian(gaussian, coarser, cv2.CV_16S)
-                winner = mask[:: 1 << k, :: 1 << k]
-                fine[k][here] = cv2.copyTo(band, np.ascontiguousarray(winner), fine[k][here])
-                share = _coarser(share if k else mask.astype(np.float32))
-            else:
-                band = _laplacian(gaussian, coarser, cv2.CV_32F)
-                sums[k - _HARD_BANDS][here] += band * share[..., None]
-                weights[k - _HARD_BANDS][here] += share
-                share = _coarser(share) if k < BANDS - 1 else share
-            gaussian = gaussian if coarser is None else coarser
-    coarse: list[Anything] = [total / weight[..., None] for total, weight in zip(sums, weights)]
-    picture = coarse[-1]
-    for band in coarse[-2::-1]:
-        picture = cv2.pyrUp(picture, dstsize=band.shape[1::-1]) + band
-    picture = cv2.pyrUp(picture.round().astype(np.int16), dstsize=fine[-1].shape[1::-1])
-    for k in range(_HARD_BANDS - 1, 0, -1):
-        picture = cv2.pyrUp(cv2.add(picture, fine[k]), dstsize=fine[k - 1].shape[1::-1])
-    return cv2.add(picture, fine[0], dtype=cv2.CV_8U)  # type: ignore[return-value]
+        bands.add(layer, pixels_of(labels[rows, columns], layer.number))
+    return bands.picture()
 
 
-def pixels_of(labels: Labels, number: int) -> NDArray[np.uint8]:
+def pixels_of(labels: Winners, number: int) -> ImageGray:
     """(height, width) 255 where this layer wins, else 0."""
     return (labels == number).view(np.uint8) * np.uint8(255)
 
 
 def winners_from_shares(
     shares: Iterable[tuple[int, int, int, NDArray[np.uint8]]], height: int, width: int
-) -> Labels:
+) -> Winners:
     """(height, width) the number of the layer with the largest share at each pixel, the first of equals.
 
     Each share is (number, x_px, y_px, values): a patch of the window where the layer may win, 0 where it must
@@ -115,12 +92,11 @@ def fill_invalid(image: ImageRGB, valid: Mask) -> ImageRGB:
     if valid.all():
         return image
     known = valid.astype(np.float32)
-    colours: Anything = image.astype(np.float32) * known[..., None]
-    weights: Anything = known
+    colours, weights = image.astype(np.float32) * known[..., None], known
     levels = []
     while min(weights.shape) > 2 and weights.min() <= 0:
         levels.append((colours, weights))
-        colours, weights = cv2.pyrDown(colours), cv2.pyrDown(weights)
+        colours, weights = _coarser(colours), _coarser(weights)
     filled = colours / np.maximum(weights, 1e-6)[..., None]
     for colours, weights in reversed(levels):
         wider = cv2.pyrUp(filled, dstsize=weights.shape[1::-1])
@@ -130,11 +106,49 @@ def fill_invalid(image: ImageRGB, valid: Mask) -> ImageRGB:
     return result
 
 
-def _coarser(gaussian: Anything) -> Anything:
-    return cv2.pyrDown(gaussian)
+class _Bands:
+    """A window's pyramid while its layers are added; only `add` changes it."""
+
+    def __init__(self, height: int, width: int) -> None:
+        soft = range(_HARD_BANDS, BANDS)
+        self._fine = [np.zeros((height >> k, width >> k, 3), np.int16) for k in range(_HARD_BANDS)]
+        self._sums = [np.zeros((height >> k, width >> k, 3), np.float32) for k in soft]
+        self._weights = [np.full((height >> k, width >> k), 1e-9, np.float32) for k in soft]
+
+    def add(self, layer: Layer, mask: ImageGray) -> None:
+        """Add a layer where its `mask`, of its image's height and width, is 255."""
+        gaussian, share = layer.image, mask.astype(np.float32)
+        for k in range(BANDS):
+            rows = slice(layer.y_px >> k, (layer.y_px + layer.image.shape[0]) >> k)
+            here = rows, slice(layer.x_px >> k, (layer.x_px + layer.image.shape[1]) >> k)
+            coarser = _coarser(gaussian) if k < BANDS - 1 else None
+            if k < _HARD_BANDS:
+                winner = np.ascontiguousarray(mask[:: 1 << k, :: 1 << k])
+                self._fine[k][here] = cv2.copyTo(_laplacian(gaussian, coarser, cv2.CV_16S), winner, self._fine[k][here])
+            else:
+                self._sums[k - _HARD_BANDS][here] += _laplacian(gaussian, coarser, cv2.CV_32F) * share[..., None]
+                self._weights[k - _HARD_BANDS][here] += share
+            if coarser is not None:
+                gaussian, share = coarser, _coarser(share)
+
+    def picture(self) -> ImageRGB:
+        """The bands added up again, (height, width, 3)."""
+        coarse = [total / weight[..., None] for total, weight in zip(self._sums, self._weights)]
+        soft: Numbers = coarse[-1]
+        for band in coarse[-2::-1]:
+            soft = cv2.pyrUp(soft, dstsize=band.shape[1::-1]) + band
+        picture = cv2.pyrUp(soft.round().astype(np.int16), dstsize=self._fine[-1].shape[1::-1])
+        for k in range(_HARD_BANDS - 1, 0, -1):
+            picture = cv2.pyrUp(cv2.add(picture, self._fine[k]), dstsize=self._fine[k - 1].shape[1::-1])
+        return cv2.add(picture, self._fine[0], dtype=cv2.CV_8U)  # type: ignore[return-value]
 
 
-def _laplacian(gaussian: Anything, coarser: Anything | None, depth: int) -> Anything:
+def _coarser(picture: NDArray[_Pixel]) -> NDArray[_Pixel]:
+    return np.asarray(cv2.pyrDown(picture), picture.dtype)
+
+
+def _laplacian(gaussian: ImageRGB, coarser: ImageRGB | None, depth: int) -> Numbers:
+    """(height, width, 3) of OpenCV's `depth`; of the coarsest band, without a `coarser` one, float32."""
     if coarser is None:
         return gaussian.astype(np.float32)
-    return cv2.subtract(gaussian, cv2.pyrUp(coarser, dstsize=gaussian.shape[1::-1]), dtype=depth)
+    return cv2.subtract(gaussian, cv2.pyrUp(coarser, dstsize=gaussian.shape[1::-1]), dtype=depth)  # type: ignore[return-value]

@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
-from sorvolo.geometry.arrays import Anything, Floats
+from sorvolo.geometry.arrays import Floats, Rows
 from sorvolo.geometry.pose import rotation_from_vector
 
 SHARED = (
@@ -28,13 +29,13 @@ turn of the camera, about its own axes, against the attitude that telemetry stat
 
 _STEPS_AS_ONE = 4  # of the whole map at once, before its cameras move one by one
 
-_Scatter: TypeAlias = Callable[[Anything, Anything, Floats], None]  # rows, columns (n,); blocks (n, h, w)
-_Gather: TypeAlias = Callable[[Anything, Floats], None]  # rows (n,); blocks (n, h)
+_Scatter: TypeAlias = Callable[[Rows, Rows, Floats], None]  # rows, columns (n,); blocks (n, h, w)
+_Gather: TypeAlias = Callable[[Rows, Floats], None]  # rows (n,); blocks (n, h)
 
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """The unknown cameras, N of them, and what telemetry says of each (infinite sigma: nothing)."""
+    """The unknown cameras, N of them, and what telemetry reports of each (infinite sigma: nothing)."""
 
     rotations: Floats  # (N, 3, 3) site_from_camera
     centres_m: Floats  # (N, 3)
@@ -42,15 +43,15 @@ class Nodes:
     prior_sigma_m: Floats  # (N, 3)
     prior_rotations: Floats  # (N, 3, 3)
     prior_sigma_rad: Floats  # (N, 3) about the camera's own axes
-    own: Anything  # (N,) bool: of the flight being mapped; the others are the known map and never move
+    own: NDArray[np.bool_]  # (N,) bool: of the flight being mapped; the others are the known map and never move
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
     """Matched points of L links, K pairs each (padded; weight 0), in focal lengths from the optical centre."""
 
-    old: Anything  # (L,) node index
-    new: Anything  # (L,)
+    old: Rows  # (L,) node index
+    new: Rows  # (L,)
     old_ideal: Floats  # (L, K, 2)
     new_ideal: Floats  # (L, K, 2)
     weight: Floats  # (L, K)
@@ -58,7 +59,7 @@ class Pairs:
     sigma_px: Floats  # (L,) across the parallax
     sigma_relief_m: Floats  # (L,) height of things above the ground, from what residuals along the parallax show
 
-    def of(self, chosen: Anything) -> "Pairs":
+    def of(self, chosen: NDArray[np.bool_]) -> "Pairs":
         """The pairs of some links only."""
         return Pairs(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
@@ -76,7 +77,7 @@ class Linearised:
     by_new: Floats
     by_shared: Floats
     parallax: Floats
-    seen: Anything
+    seen: NDArray[np.bool_]
 
 
 def linearise(nodes: Nodes, pairs: Pairs, shared: Floats) -> Linearised:
@@ -146,11 +147,11 @@ class Solution:
     shared: Floats
     cost: float
     normal: csc_matrix  # sparse (6 n + 8) square information matrix
-    position: Anything  # (N,) place of each node in it, -1 for those held
+    position: Rows  # (N,) place of each node in it, -1 for those held
 
 
 def solve(
-    nodes: Nodes, pairs: Pairs, shared: Floats, shared_sigma: Floats, free: Anything, iterations: int,
+    nodes: Nodes, pairs: Pairs, shared: Floats, shared_sigma: Floats, free: NDArray[np.bool_], iterations: int,
     robust_sigmas: float = 3.0,
 ) -> Solution:
     """Levenberg-Marquardt with a Cauchy loss over the free nodes, (N,) bool, and the shared unknowns.
@@ -227,8 +228,8 @@ def _move_as_one(nodes: Nodes, middle_m: Floats, step: Floats) -> Nodes:
 
 
 def _normal_equations(
-    nodes: Nodes, pairs: Pairs, shared: Floats, shared_sigma: Floats, free: Anything, robust_sigmas: float
-) -> tuple[float, csc_matrix, Floats, Anything]:
+    nodes: Nodes, pairs: Pairs, shared: Floats, shared_sigma: Floats, free: NDArray[np.bool_], robust_sigmas: float
+) -> tuple[float, csc_matrix, Floats, Rows]:
     position = np.full(len(free), -1)
     position[free] = np.arange(int(free.sum()))
     count = 6 * int(free.sum())
@@ -237,7 +238,7 @@ def _normal_equations(
     rows, columns, values = [], [], []
     cost = 0.0
 
-    def scatter(row_start: Anything, column_start: Anything, blocks: Floats) -> None:
+    def scatter(row_start: Rows, column_start: Rows, blocks: Floats) -> None:
         keep = (row_start >= 0) & (column_start >= 0)
         height, width = blocks.shape[1:]
         r = row_start[keep, None, None] + np.arange(height)[None, :, None]
@@ -246,7 +247,7 @@ def _normal_equations(
         columns.append(np.broadcast_to(c, (len(c), height, width)).ravel())
         values.append(blocks[keep].ravel())
 
-    def gather(start: Anything, blocks: Floats) -> None:
+    def gather(start: Rows, blocks: Floats) -> None:
         keep = start >= 0
         np.add.at(gradient, start[keep, None] + np.arange(blocks.shape[1]), blocks[keep])
 
@@ -287,7 +288,7 @@ def _normal_equations(
 
 
 def _add_priors(
-    nodes: Nodes, shared: Floats, position: Anything, count: int, scatter: _Scatter, gather: _Gather, robust: float
+    nodes: Nodes, shared: Floats, position: Rows, count: int, scatter: _Scatter, gather: _Gather, robust: float
 ) -> float:
     index = np.flatnonzero(position >= 0)
     start = 6 * position[index]
@@ -344,7 +345,7 @@ def _damped_step(normal: csc_matrix, gradient: Floats, damping: float) -> Floats
     return splu(damped, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(gradient)
 
 
-def _advance(nodes: Nodes, shared: Floats, step: Floats, position: Anything) -> tuple[Nodes, Floats]:
+def _advance(nodes: Nodes, shared: Floats, step: Floats, position: Rows) -> tuple[Nodes, Floats]:
     index = np.flatnonzero(position >= 0)
     steps = step[: 6 * len(index)].reshape(-1, 6)
     rotations, centres = nodes.rotations.copy(), nodes.centres_m.copy()
@@ -360,7 +361,7 @@ def _advance(nodes: Nodes, shared: Floats, step: Floats, position: Anything) -> 
     return replace(nodes, rotations=rotations, centres_m=centres), shared + step[6 * len(index):]
 
 
-def _start(position: Anything) -> Anything:
+def _start(position: Rows) -> Rows:
     return np.where(position >= 0, 6 * position, -1)
 
 

@@ -6,7 +6,7 @@ frame changes the winners of some cells, and only the ground around those is ren
 images.
 """
 
-from collections.abc import Callable, Iterable, Iterator, MutableMapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Anything, ImageRGB, ImageRGBA, Mask, PointsPx
+from sorvolo.geometry.arrays import ImageRGB, ImageRGBA, Mask, PointsPx
 from sorvolo.geometry.grid import Grid, TileIndex
 from sorvolo.mosaic.blending import (
     ALIGN_PX,
     LAYER_APRON_PX,
     WINDOW_APRON_PX,
-    Labels,
     Layer,
+    Winners,
     blend,
     pixels_of,
     winners_from_shares,
@@ -96,11 +96,7 @@ class Canvas:
         """
         changed = {frame.id: frame for frame in frames if self._differs(frame)}
         gone = {each for each in forget if each in self._frames} | (changed.keys() & self._frames.keys())
-        touched: set[TileIndex] = set()
-        for each in [*gone, *changed]:
-            touched |= self._chunks_of(changed[each] if each in changed else self._frames[each])
-            if each in self._frames:
-                touched |= self._chunks_of(self._frames[each])
+        touched = self._chunks_before_and_after(changed, gone)
         if self._known is not None:
             for key in touched:
                 self._bound(key, self._known)
@@ -139,6 +135,15 @@ class Canvas:
     @staticmethod
     def _chunks_of(frame: CanvasFrame) -> frozenset[TileIndex]:
         return Grid((0.0, 0.0), 1.0, CELL_PX * _CHUNK_CELLS).tiles_touched(frame.outline_px)
+
+    def _chunks_before_and_after(self, changed: Mapping[int, CanvasFrame], gone: set[int]) -> set[TileIndex]:
+        """The chunks under changed and gone frames, where they lie now and where they will lie."""
+        touched: set[TileIndex] = set()
+        for each in [*gone, *changed]:
+            touched |= self._chunks_of(changed[each] if each in changed else self._frames[each])
+            if each in self._frames:
+                touched |= self._chunks_of(self._frames[each])
+        return touched
 
     def _add(self, frame: CanvasFrame) -> None:
         self._frames[frame.id] = frame
@@ -263,7 +268,7 @@ class Canvas:
         rgba = cv2.merge([*cv2.split(picture[inner, inner]), alpha])
         return cv2.copyTo(rgba, alpha)  # type: ignore[return-value]
 
-    def _layers(self, ids: list[int], labels: Labels, x: int, y: int) -> Iterator[Layer]:
+    def _layers(self, ids: list[int], labels: Winners, x: int, y: int) -> Iterator[Layer]:
         for number, each in enumerate(ids):
             left, top, width, height = cv2.boundingRect(pixels_of(labels, number))
             if not width:
@@ -304,23 +309,28 @@ class Canvas:
         changed: set[TileIndex] = set()
         for row in range(y // side, (y + rgba.shape[0] - 1) // side + 1):
             for column in range(x // side, (x + rgba.shape[1] - 1) // side + 1):
-                index = (column, row)
-                lasting = None if self._known is None else self._known.lasting(*self._grid.tile_window(index))
-                known = self._tiles.get(index)
-                tile = np.zeros((side, side, 4), np.uint8) if known is None else known.copy()
-                _paste(tile, rgba, x - column * side, y - row * side)
-                if lasting is not None and known is not None:
-                    tile[lasting] = known[lasting]
-                if known is None and not tile[..., 3].any():
-                    continue
-                if known is not None and np.array_equal(tile, known):
-                    continue
-                changed.add(index)
-                if tile[..., 3].any():
-                    self._tiles[index] = tile
-                else:
-                    del self._tiles[index]
+                if self._store_in((column, row), x, y, rgba):
+                    changed.add((column, row))
         return changed
+
+    def _store_in(self, index: TileIndex, x: int, y: int, rgba: ImageRGBA) -> bool:
+        """Put what of a rendered window falls into a tile there, but for lasting ground; whether that changed it."""
+        side = self._grid.tile_px
+        lasting = None if self._known is None else self._known.lasting(*self._grid.tile_window(index))
+        known = self._tiles.get(index)
+        tile = np.zeros((side, side, 4), np.uint8) if known is None else known.copy()
+        _paste(tile, rgba, x - index[0] * side, y - index[1] * side)
+        if lasting is not None and known is not None:
+            tile[lasting] = known[lasting]
+        shows_ground = bool(tile[..., 3].any())
+        is_unchanged = not shows_ground if known is None else np.array_equal(tile, known)
+        if is_unchanged:
+            return False
+        if shows_ground:
+            self._tiles[index] = tile
+        else:
+            del self._tiles[index]
+        return True
 
 
 def _share(
@@ -335,8 +345,8 @@ def _share(
     left, top, columns, rows = cv2.boundingRect(wins.astype(np.uint8))
     c0, c1 = max(0, left - 2), min(wins.shape[1], left + columns + 2)
     r0, r1 = max(0, top - 2), min(wins.shape[0], top + rows + 2)
-    cells: Anything = cv2.GaussianBlur(wins[r0:r1, c0:c1].astype(np.uint8) * 255, (3, 3), 0)
-    share: Anything = cv2.resize(cells, None, fx=CELL_PX, fy=CELL_PX, interpolation=cv2.INTER_LINEAR)
+    cells = cv2.GaussianBlur(wins[r0:r1, c0:c1].astype(np.uint8) * 255, (3, 3), 0)
+    share = np.asarray(cv2.resize(cells, None, fx=CELL_PX, fy=CELL_PX, interpolation=cv2.INTER_LINEAR), np.uint8)
     # the padding cells were needed for smoothing only
     x0, y0 = (c0 - pad) * CELL_PX, (r0 - pad) * CELL_PX
     cut_x, cut_y = max(0, -x0), max(0, -y0)

@@ -6,15 +6,14 @@ undoes its exposure: what two frames a and b show of the same ground agrees when
 V(r_a) = log I_b + log g_b - log V(r_b). That is linear in log g, a2 and a4.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sorvolo.errors import GeometryError, SettingsError
-from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, PointsPx, frozen
+from sorvolo.geometry.arrays import Floats, ImageRGB, PointsPx, Rows, frozen
 
 _SHRINK = 4
 _ITERATIONS = 8
@@ -85,7 +84,7 @@ def tie_colours(
     """The mean colours around matched points, (N, 2) each, of two undistorted images.
 
     Means are over about 8 px, from quarter-size copies. Points that are clipped or nearly black in either
-    image say nothing of exposure and are left out.
+    image show nothing of exposure and are left out.
     """
     colours_a, colours_b = _sample(image_a, points_a_px), _sample(image_b, points_b_px)
     both = np.hstack([colours_a, colours_b])
@@ -103,40 +102,19 @@ def solve_exposure(
 ) -> Exposure:
     """Gains of all frames named in `pairs` (frame a, frame b), by robust least squares of log colours.
 
-    `camera_of` tells frames of different cameras apart, each with its own vignette; without it there is one,
-    0. Frames and cameras of which the pairs say little stay near gain 1 and near no vignette.
+    `camera_of` is the camera of each frame, each with its own vignette; without it there is one, 0. Frames and
+    cameras with few pairs stay near gain 1 and near no vignette.
     """
     ids = sorted({each for link in pairs for each in link})
     camera_of = camera_of or dict.fromkeys(ids, 0)
-    cameras = sorted({camera_of[each] for each in ids})
-    if not ids:
-        return Exposure({}, {}, 0.0)
-    column = {each: i for i, each in enumerate(ids)}
-    lens = {camera: len(ids) + 2 * i for i, camera in enumerate(cameras)}
-    rows = [
-        _rows(link, pairs[link], column, lens, camera_of, settings)
-        for link in sorted(pairs) if len(pairs[link])
-    ]
-    prior = np.repeat(
-        [settings.gain_sigma**-2, settings.vignette_sigma**-2], [len(ids), 2 * len(cameras)]
-    )
-    if not rows:
-        return Exposure({e: np.ones(3) for e in ids}, {c: np.zeros(2) for c in cameras}, 0.0)
-    columns = np.concatenate([r[0] for r in rows])
-    factors = np.concatenate([r[1] for r in rows])
-    difference = np.concatenate([r[2] for r in rows])
-    solution = np.zeros((len(prior), 3))
-    spread = settings.colour_sigma
-    for _ in range(_ITERATIONS):
-        residual = difference + np.einsum("nk,nkc->nc", factors, solution[columns])
-        length = np.linalg.norm(residual, axis=1) / np.sqrt(3)
-        spread = max(settings.colour_sigma, _SIGMA_FROM_MEDIAN * float(np.median(length)))
-        weight = 1 / (1 + (length / spread) ** 2) / spread**2
-        solution = _solve(columns, factors, difference, weight, prior, len(ids))
+    unknowns = _unknowns(ids, camera_of)
+    if not any(len(each) for each in pairs.values()):
+        return Exposure({e: np.ones(3) for e in ids}, {c: np.zeros(2) for c in unknowns.lens}, 0.0)
+    solution, spread = _robust_solution(_equations(pairs, unknowns, settings), unknowns, settings)
     limit = np.log(settings.largest_gain)
-    gains = {e: np.exp(np.clip(solution[i], -limit, limit)) for e, i in column.items()}
-    vignettes = {c: solution[i:i + 2, 0].copy() for c, i in lens.items()}
-    return Exposure(gains, vignettes, float(np.median(length)) * _SIGMA_FROM_MEDIAN)
+    gains = {e: np.exp(np.clip(solution[i], -limit, limit)) for e, i in unknowns.column.items()}
+    vignettes = {c: solution[i:i + 2, 0].copy() for c, i in unknowns.lens.items()}
+    return Exposure(gains, vignettes, spread)
 
 
 def corrected(image: ImageRGB, gains: Floats, vignette: Floats) -> ImageRGB:
@@ -163,31 +141,75 @@ def corrected(image: ImageRGB, gains: Floats, vignette: Floats) -> ImageRGB:
     ])
 
 
-def _rows(
-    link: tuple[int, int],
-    pairs: ColourPairs,
-    column: Mapping[int, int],
-    lens: Mapping[int, int],
-    camera_of: Mapping[int, int],
-    settings: ExposureSettings,
-) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """A link's equations: unknowns' columns (n, 6) and factors (n, 6), and log-colour differences (n, 3)."""
+@dataclass(frozen=True)
+class _Unknowns:
+    """The places of the unknowns: a column for each frame's gain, then two for each camera's vignette."""
+
+    column: Mapping[int, int]  # of each frame
+    lens: Mapping[int, int]  # of each camera: the first of its two
+    lens_of: Mapping[int, int]  # of each frame: that of its camera
+
+
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """Colour pairs as equations: unknowns' columns (n, 6) and factors (n, 6), log-colour differences (n, 3)."""
+
+    columns: Rows
+    factors: Floats
+    difference: Floats
+
+
+def _unknowns(ids: Sequence[int], camera_of: Mapping[int, int]) -> _Unknowns:
+    cameras = sorted({camera_of[each] for each in ids})
+    lens = {camera: len(ids) + 2 * i for i, camera in enumerate(cameras)}
+    return _Unknowns({each: i for i, each in enumerate(ids)}, lens, {each: lens[camera_of[each]] for each in ids})
+
+
+def _equations(
+    pairs: Mapping[tuple[int, int], ColourPairs], unknowns: _Unknowns, settings: ExposureSettings
+) -> _Equations:
+    """The equations of all links, at least one of which has pairs."""
+    links = [_link_equations(each, pairs[each], unknowns, settings) for each in sorted(pairs) if len(pairs[each])]
+    return _Equations(
+        np.concatenate([each.columns for each in links]), np.concatenate([each.factors for each in links]),
+        np.concatenate([each.difference for each in links]),
+    )
+
+
+def _link_equations(
+    link: tuple[int, int], pairs: ColourPairs, unknowns: _Unknowns, settings: ExposureSettings
+) -> _Equations:
     pick = np.linspace(0, len(pairs) - 1, min(len(pairs), settings.points_per_link)).astype(int)
     a, b = link
-    lens_a, lens_b = lens[camera_of[a]], lens[camera_of[b]]
-    columns = np.tile([column[a], column[b], lens_a, lens_a + 1, lens_b, lens_b + 1], (len(pick), 1))
+    lens_a, lens_b = unknowns.lens_of[a], unknowns.lens_of[b]
+    row = [unknowns.column[a], unknowns.column[b], lens_a, lens_a + 1, lens_b, lens_b + 1]
     ra, rb = pairs.radius2_a[pick], pairs.radius2_b[pick]
     one = np.ones(len(pick))
     factors = np.column_stack([one, -one, -ra, -(ra**2), rb, rb**2])
     colours_a, colours_b = np.maximum(pairs.colours_a[pick], 1.0), np.maximum(pairs.colours_b[pick], 1.0)
-    return columns, factors, np.log(colours_a) - np.log(colours_b)
+    return _Equations(np.tile(row, (len(pick), 1)), factors, np.log(colours_a) - np.log(colours_b))
 
 
-def _solve(
-    columns: NDArray[np.int64], factors: Floats, difference: Floats, weight: Floats, prior: Floats,
-    frames: int,
-) -> Floats:
+def _robust_solution(
+    equations: _Equations, unknowns: _Unknowns, settings: ExposureSettings
+) -> tuple[Floats, float]:
+    """(U, 3) unknowns per channel, logarithms of gains first, and the robust spread of what is left."""
+    frames = len(unknowns.column)
+    prior = np.repeat([settings.gain_sigma**-2, settings.vignette_sigma**-2], [frames, 2 * len(unknowns.lens)])
+    solution, typical = np.zeros((len(prior), 3)), 0.0
+    for _ in range(_ITERATIONS):
+        fitted = np.einsum("nk,nkc->nc", equations.factors, solution[equations.columns])
+        length = np.linalg.norm(equations.difference + fitted, axis=1) / np.sqrt(3)
+        typical = float(np.median(length))
+        spread = max(settings.colour_sigma, _SIGMA_FROM_MEDIAN * typical)
+        weight = 1 / (1 + (length / spread) ** 2) / spread**2
+        solution = _solve(equations, weight, prior, frames)
+    return solution, typical * _SIGMA_FROM_MEDIAN
+
+
+def _solve(equations: _Equations, weight: Floats, prior: Floats, frames: int) -> Floats:
     """(U, 3) unknowns from weighted normal equations; the vignette is one for all channels."""
+    columns, factors, difference = equations.columns, equations.factors, equations.difference
     unknowns = len(prior)
     normal = np.zeros((unknowns, unknowns))
     np.add.at(
@@ -216,10 +238,10 @@ def _sample(image: ImageRGB, points_px: PointsPx) -> Floats:
     grid = padded.reshape(-1, columns, 2)
     if not len(at):
         return np.zeros((0, 3))
-    colours: Anything = cv2.remap(  # type: ignore[call-overload]
+    colours = cv2.remap(  # type: ignore[call-overload]
         smooth, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
-    return colours.reshape(-1, 3)[:len(at)].astype(np.float64)
+    return np.asarray(colours.reshape(-1, 3)[:len(at)], np.float64)
 
 
 def _radius2(points_px: PointsPx, image: ImageRGB) -> Floats:

@@ -8,6 +8,7 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, ImageRGBA
 from sorvolo.geometry.grid import TileIndex
+from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.summary import median_of_known, percentile_of_known, rms_of_known
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
@@ -42,14 +43,12 @@ def flight_figures(placed: Sequence[PlacedFrame], focal_px: float) -> FlightFigu
     poses = [each.site_from_camera for each in seen if each.site_from_camera is not None]
     heights_m = [float(each.translation_m[2]) for each in poses]
     residuals = [each.residual_px for each in seen]
-    axes_up = [each.rotation[2, 2] for each in poses]
     return FlightFigures(
         median_of_known(residuals), percentile_of_known(residuals, 95),
         median_of_known(horizontal_m), rms_of_known(horizontal_m), median_of_known(np.abs(gps[:, 2])),
         median_of_known([each.sigma_m for each in seen]), median_of_known(heights_m),
         float(np.median(heights_m) / focal_px) if heights_m else None, _reach_m(seen),
-        float(np.median([np.linalg.norm(each.outline_m[2] - each.outline_m[0]) for each in seen])) if seen else 0.0,
-        float(np.degrees(np.arccos(np.clip(-np.median(axes_up), -1, 1)))) if axes_up else 0.0,
+        _diagonal_m(seen), _tilt_deg(poses),
     )
 
 
@@ -76,3 +75,17 @@ def _reach_m(seen: Sequence[PlacedFrame]) -> float:
         return 0.0
     centres: Floats = np.array([each.outline_m.mean(axis=0) for each in seen])
     return float(np.linalg.norm(centres.std(axis=0)))
+
+
+def _diagonal_m(seen: Sequence[PlacedFrame]) -> float:
+    if not seen:
+        return 0.0
+    return float(np.median([np.linalg.norm(each.outline_m[2] - each.outline_m[0]) for each in seen]))
+
+
+def _tilt_deg(poses: Sequence[Pose]) -> float:
+    """The angle whose cosine is the median of how far the cameras' axes point down."""
+    if not poses:
+        return 0.0
+    axes_up = [each.rotation[2, 2] for each in poses]
+    return float(np.degrees(np.arccos(np.clip(-np.median(axes_up), -1, 1))))

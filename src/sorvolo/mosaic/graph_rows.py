@@ -3,8 +3,9 @@
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Anything, Floats
+from sorvolo.geometry.arrays import Floats, Rows
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
 from sorvolo.mosaic.bundle import Nodes, Pairs
@@ -15,11 +16,11 @@ _UNKNOWN_SIGMA_M = 1e6  # stands in for an infinite sigma; its weight is nothing
 _FIRST_ROOM = 16
 
 
-class _Rows:
+class _Columns:
     """Equally long columns, each (N, ...); appending costs the same however long they are."""
 
     def __init__(self, **shapes: tuple[type, tuple[int, ...]]) -> None:
-        self._columns: dict[str, Anything] = {
+        self._columns: dict[str, NDArray[Any]] = {
             name: np.zeros((_FIRST_ROOM, *shape), dtype) for name, (dtype, shape) in shapes.items()
         }
         self._count = 0
@@ -27,7 +28,7 @@ class _Rows:
     def __len__(self) -> int:
         return self._count
 
-    def column(self, name: str) -> Anything:
+    def column(self, name: str) -> NDArray[Any]:
         """(N, ...) a view, good until the next `append` or `keep`."""
         return self._columns[name][:self._count]
 
@@ -39,7 +40,7 @@ class _Rows:
             self._columns[name][self._count] = value
         self._count += 1
 
-    def keep(self, chosen: Anything) -> None:
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
         """Drop the rows where `chosen` (N,) is False."""
         count = int(np.sum(chosen))
         for each in self._columns.values():
@@ -48,10 +49,10 @@ class _Rows:
 
 
 class NodeRows:
-    """Where each keyframe stands and what telemetry says of it; rows are views and may be written to."""
+    """Where each keyframe stands and what telemetry reports of it; rows are views and may be written to."""
 
     def __init__(self) -> None:
-        self._rows = _Rows(
+        self._rows = _Columns(
             rotations=(float, (3, 3)), centres_m=(float, (3,)), prior_centres_m=(float, (3,)),
             prior_sigma_m=(float, (3,)), prior_rotations=(float, (3, 3)), prior_sigma_rad=(float, (3,)), own=(bool, ()),
         )
@@ -90,7 +91,7 @@ class NodeRows:
         return self._rows.column("prior_sigma_rad")
 
     @property
-    def own(self) -> Anything:
+    def own(self) -> NDArray[np.bool_]:
         """(N,) bool: of the flight that is mapped."""
         return self._rows.column("own")
 
@@ -100,11 +101,11 @@ class NodeRows:
         self.set_prior(len(self) - 1, prior)
 
     def set_prior(self, at: int, prior: CameraPrior) -> None:
-        """What telemetry says of a keyframe."""
+        """Replace the telemetry of a keyframe."""
         self.prior_centres_m[at], self.stated_sigma_m[at] = prior.position_m, prior.position_sigma_m
         self.prior_rotations[at], self.stated_sigma_rad[at] = prior.rotation, np.radians(prior.attitude_sigma_deg)
 
-    def nodes(self, place: Floats, attitude: Floats, contradicted: Anything) -> Nodes:
+    def nodes(self, place: Floats, attitude: Floats, contradicted: Rows) -> Nodes:
         """For the solver: stated sigmas times `place` and `attitude`, (3,) each, no angles where contradicted."""
         sigma_m, sigma_rad = self.stated_sigma_m * place, self.stated_sigma_rad * attitude
         sigma_rad[contradicted] = np.inf
@@ -121,7 +122,7 @@ class LinkRows:
 
     def __init__(self, pairs_per_link: int, independent_pairs: float) -> None:
         self._count, self._independent = pairs_per_link, independent_pairs
-        self._rows = _Rows(
+        self._rows = _Columns(
             old=(int, ()), new=(int, ()), old_ideal=(float, (pairs_per_link, 2)),
             new_ideal=(float, (pairs_per_link, 2)), weight=(float, (pairs_per_link,)), focal_px=(float, ()),
             sigma_px=(float, ()), relief_m=(float, ()),
@@ -131,12 +132,12 @@ class LinkRows:
         return len(self._rows)
 
     @property
-    def old(self) -> Anything:
+    def old(self) -> Rows:
         """(L,) node index."""
         return self._rows.column("old")
 
     @property
-    def new(self) -> Anything:
+    def new(self) -> Rows:
         """(L,) node index."""
         return self._rows.column("new")
 
@@ -164,7 +165,7 @@ class LinkRows:
             sigma_px=sigma_px, relief_m=float(np.median(self.relief_m)) if len(self) else 0.1,
         )
 
-    def keep(self, chosen: Anything) -> None:
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
         """Drop the links where `chosen` (L,) is False."""
         self._rows.keep(chosen)
 

@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Anything, ImageRGB, ImageRGBA, Mask
+from sorvolo.geometry.arrays import ImageRGB, ImageRGBA, Mask
 from sorvolo.geometry.grid import Grid, TileIndex
 
 SETTLING_PX = 64
 """How far beyond a window its known ground must be seen for `settled` not to depend on where the window ends."""
 
 _SHRINK = 4
-_RIM_PX = 3.0  # known pixels so deep within the rim tell the step at it
+_RIM_PX = 3.0  # known pixels so deep within the rim show the step at it
 _REACH_PX = 48
 _LARGEST_STEP = 24  # gray levels: more is no light but another thing
 
@@ -99,7 +99,7 @@ def settled(picture: ImageRGB, stored: ImageRGB, lasting: Mask) -> ImageRGB:
     small = (width // _SHRINK, height // _SHRINK)
     inwards_px = cv2.distanceTransform(lasting.view(np.uint8), cv2.DIST_L2, 3)
     outwards_px = cv2.distanceTransform((~lasting).view(np.uint8), cv2.DIST_L2, 3)
-    rim: Anything = np.exp(inwards_px / -_RIM_PX) * lasting
+    rim = np.exp(inwards_px / -_RIM_PX) * lasting
     step = np.clip(cv2.subtract(stored, picture, dtype=cv2.CV_16S), -_LARGEST_STEP, _LARGEST_STEP) * rim[..., None]
     side = 2 * (_REACH_PX // _SHRINK) + 1
     steps, shares = (
@@ -109,6 +109,6 @@ def settled(picture: ImageRGB, stored: ImageRGB, lasting: Mask) -> ImageRGB:
     at_rim = steps / np.maximum(shares, 1e-6)[..., None]
     kept = np.clip(1 - outwards_px / _REACH_PX, 0, 1) ** 2
     fitted = picture + cv2.resize(at_rim, (width, height), interpolation=cv2.INTER_LINEAR) * kept[..., None]
-    result: Anything = np.clip(fitted + 0.5, 0, 255).astype(np.uint8)
+    result = np.clip(fitted + 0.5, 0, 255).astype(np.uint8)
     result[lasting] = picture[lasting]
     return result

@@ -74,6 +74,11 @@ class _Tie:
     links: list[Link] = field(default_factory=list)
     refusals: dict[int, _Refusal] = field(default_factory=dict)
 
+    @property
+    def refusal_reason(self) -> str:
+        """Why the picture that refused first did."""
+        return next(iter(self.refusals.values())).reason if self.refusals else "nothing of the map lies under it"
+
 
 class PlanarMapper:
     """Everything `--method planar` knows of one flight. `add` takes a keyframe; `retime` and `settle` end it."""
@@ -115,7 +120,7 @@ class PlanarMapper:
         return self._graph.conclude()
 
     def retime(self, priors: Mapping[int, CameraPrior]) -> frozenset[int]:
-        """What telemetry says under another clock offset."""
+        """Take the telemetry of another clock offset; the keyframes that moved."""
         return self._graph.retime({each: prior for each, prior in priors.items() if each in self._graph})
 
     def pose(self, keyframe_id: int) -> Pose:
@@ -200,8 +205,8 @@ class PlanarMapper:
     def _tie(self, new: Keyframe) -> tuple[list[Link], Pose | None, str]:
         """The links of a new keyframe, where it stands by them or by telemetry, and what failed.
 
-        All candidates are asked the cheap way first. Only where few of them say yes those that refused are
-        asked with SIFT and correlation, until enough do: few links let tall trees bend a strip.
+        All candidates are tried the cheap way first. Only where few of them link are those that refused tried
+        with SIFT and correlation, until enough link: few links let tall trees bend a strip.
         """
         previous = self._own[::-1][: self._settings.previous]
         tie = _Tie(new, self._guess_by_telemetry(new))
@@ -212,18 +217,16 @@ class PlanarMapper:
             self._ask_dearly(tie)
             self._ask_under(tie, previous)
         if not tie.links and not new.prior.knows_place:
-            for each in [*self._own[::-1][1:10], *self._own[:: max(1, len(self._own) // 20)]]:
-                if each not in tie.refusals and len(tie.refusals) < self._settings.recovery and not tie.links:
-                    self._ask(tie, each, None, Effort.ALL)
+            self._ask_everywhere(tie)
         if not self._own and tie.guess is None:
             tie.guess = Pose(new.prior.rotation, new.prior.position_m)
-        reason = next(iter(tie.refusals.values())).reason if tie.refusals else "nothing of the map lies under it"
+        reason = tie.refusal_reason
         if not tie.links and self._own and not new.prior.knows_place:
-            return [], None, f"no picture of the map fits it ({reason}) and telemetry does not say where it is"
+            return [], None, f"no picture of the map fits it ({reason}) and telemetry reports no position"
         return tie.links, tie.guess, reason
 
     def _ask(self, tie: _Tie, other: int, prediction: LinkPrediction | None, effort: Effort) -> None:
-        """Try to link one picture; the first link says where the new keyframe stands."""
+        """Try to link one picture; the first link places the new keyframe."""
         found = link(tie.new, self._picture(other), prediction, self._settings.links, self._cache, effort)
         if isinstance(found, NoLink):
             tie.refusals[other] = _Refusal(found.reason, prediction)
@@ -250,6 +253,12 @@ class PlanarMapper:
                 self._ask(tie, other, None, Effort.ALL)
             if len(tie.links) >= self._settings.wanted_links:
                 return
+
+    def _ask_everywhere(self, tie: _Tie) -> None:
+        """Ask the last pictures and some of all the flight until one links: nobody knows where the new one is."""
+        for each in [*self._own[::-1][1:10], *self._own[:: max(1, len(self._own) // 20)]]:
+            if each not in tie.refusals and len(tie.refusals) < self._settings.recovery and not tie.links:
+                self._ask(tie, each, None, Effort.ALL)
 
     def _guess_by_telemetry(self, new: Keyframe) -> Pose | None:
         prior = new.prior
@@ -294,9 +303,25 @@ class PlanarMapper:
         self, new: Keyframe, guess: Pose, tried: set[int], previous: Sequence[int], linked: bool
     ) -> list[int]:
         """The keyframes to try: those before, and the ones of other strips that lie most under the view."""
-        ids = np.array([*self._own, *self._known], dtype=int)
-        if not len(ids):
-            return []
+        ids = [*self._own, *self._known]
+        overlap = self._overlaps(new, guess)
+        chosen = [each for each in previous if each not in tried and overlap[ids.index(each)] > 0.1]
+        order = [ids[k] for k in np.argsort(-overlap, kind="stable") if overlap[k] > self._settings.least_overlap]
+        limit = len(chosen) + self._settings.spatial + (0 if linked else 3)
+        near = {*tried, *previous}
+        for each in order:
+            if len(chosen) >= limit:
+                break
+            if each not in near:
+                chosen.append(each)
+                near |= {each - 1, each, each + 1}  # neighbours along a strip show the same again
+        return chosen
+
+    def _overlaps(self, new: Keyframe, guess: Pose) -> Floats:
+        """(N,) the share of the new view that each keyframe shows, the flight's own first, then the known map's.
+
+        All are taken for as large as the new view; 0 where the guess does not see the ground.
+        """
         centres = np.concatenate([self._graph.centres_m(self._own), self._known_centres_m])
         axes = np.concatenate([
             self._graph.axes(self._own),
@@ -306,24 +331,11 @@ class PlanarMapper:
         try:
             image_from_site = np.linalg.inv(site_from_image_homography(new.camera, guess))
         except GeometryError:
-            return []
+            return np.zeros(len(centres))
         seen = apply_homography(image_from_site, centres[:, :2])
         offset = np.abs(seen - [new.camera.cx_px, new.camera.cy_px]) / [new.camera.width_px, new.camera.height_px]
         with np.errstate(invalid="ignore"):
-            overlap = np.nan_to_num(np.clip(1 - offset, 0, 1).prod(axis=1))
-        chosen = [each for each in previous if each not in tried and overlap[list(ids).index(each)] > 0.1]
-        order = [int(k) for k in np.argsort(-overlap, kind="stable") if overlap[k] > self._settings.least_overlap]
-        limit = len(chosen) + self._settings.spatial + (0 if linked else 3)
-        near = {*tried, *previous}
-        for k in order:
-            each = int(ids[k])
-            if len(chosen) >= limit:
-                break
-            if each in near or each in chosen:
-                continue
-            chosen.append(each)
-            near |= {each - 1, each + 1}  # neighbours along a strip say the same again
-        return chosen
+            return np.nan_to_num(np.clip(1 - offset, 0, 1).prod(axis=1))
 
     def _site_from_image(self, other: int) -> Matrix3:
         if other in self._graph:

@@ -4,9 +4,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
-from sorvolo.geometry.arrays import Anything, Floats, PointsM
+from sorvolo.geometry.arrays import Floats, PointsM, Rows
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import fit_similarity, pose_from_homography, site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
@@ -19,7 +21,8 @@ from sorvolo.survey.mosaic import Link
 _ENOUGH = 8  # frames from which telemetry's own errors are learnt
 _OFFSET_GROUPS = ((2,), (5, 6), (7,))  # of SHARED: altitude's zero, tilt, heading; judged together
 _OFFSETS = tuple(k for group in _OFFSET_GROUPS for k in group)
-_AT_WORD = np.array([np.inf, np.inf, 0.1, np.inf, np.inf, 0.002, 0.002, 0.003])  # sigma of an offset not believed in
+# prior sigma of an offset that is taken as telemetry reports it
+_AS_REPORTED_SIGMA = np.array([np.inf, np.inf, 0.1, np.inf, np.inf, 0.002, 0.002, 0.003])
 _CALIBRATED = 0.005  # relative: a focal length known so well is held
 _RADIAL_SIGMA = 0.03  # of a lens that nobody calibrated
 _FREE_M = 1e4  # a zero of heights that nothing is known of
@@ -54,11 +57,10 @@ class PoseGraphSettings:
         calibrated = focal_sigma <= _CALIBRATED
         has_telemetry = altitude_offset_sigma_m is not None
         height_known = altitude_offset_sigma_m is not None and bool(np.isfinite(altitude_offset_sigma_m))
-        offset_sigma_m = altitude_offset_sigma_m if altitude_offset_sigma_m is not None and height_known else _FREE_M
         return cls(
             focal_sigma=0.0 if calibrated or not height_known else focal_sigma,
             radial_sigma=0.0 if calibrated else _RADIAL_SIGMA,
-            altitude_offset_sigma_m=offset_sigma_m if has_telemetry else 0.0,
+            altitude_offset_sigma_m=_altitude_offset_prior_m(altitude_offset_sigma_m),
             gps_offset_sigma_m=_GPS_OFFSET_M if joins_map else 0.0,
             tilt_offset_sigma_deg=_TILT_OFFSET_DEG if has_telemetry else 0.0,
             heading_offset_sigma_deg=_HEADING_OFFSET_DEG if has_telemetry else 0.0,
@@ -85,7 +87,7 @@ class _Trust:
 
     place: Floats = field(default_factory=lambda: np.ones(3))
     attitude: Floats = field(default_factory=lambda: np.ones(3))
-    contradicted: Anything = field(default_factory=lambda: np.zeros(0, int))
+    contradicted: Rows = field(default_factory=lambda: np.zeros(0, int))
 
 
 @dataclass(eq=False)
@@ -113,7 +115,7 @@ class PoseGraph:
         self._dropped = 0
         self._solved_at = 0
         self._trust = _Trust()
-        self._at_word = np.zeros(len(SHARED), bool)
+        self._as_reported = np.zeros(len(SHARED), bool)
 
     def __contains__(self, keyframe_id: int) -> bool:
         return keyframe_id in self._ids
@@ -202,14 +204,14 @@ class PoseGraph:
         return self._moved(np.flatnonzero(self._own()))
 
     def retime(self, priors: Mapping[int, CameraPrior]) -> frozenset[int]:
-        """Replace what telemetry says of some keyframes (another clock offset) and solve again."""
+        """Replace the telemetry of some keyframes (another clock offset) and solve again."""
         for keyframe_id, prior in priors.items():
             self._rows.set_prior(self._ids[keyframe_id], prior)
         return self.conclude()
 
     def conclude(self) -> frozenset[int]:
         """The flight is over: settle with every offset free, judge which are real, and settle again."""
-        self._at_word[:] = False
+        self._as_reported[:] = False
         moved = self.settle()
         self._judge_offsets()
         return moved | self.settle()
@@ -280,7 +282,7 @@ class PoseGraph:
         return float(0.7 * np.median(stated_m) * max(1.0, self._trust.place[0])) if fixes else 0.0
 
     def gps_residuals_m(self) -> dict[int, Floats]:
-        """Own keyframes' camera position minus what telemetry said, (3,) east, north, up; NaN where it said nothing."""
+        """Own keyframes' camera position minus the reported one, (3,) east, north, up; NaN where none is reported."""
         miss_m = np.where(np.isfinite(self._rows.stated_sigma_m), self._gps_miss_m(), np.nan)
         return {self._names[at]: miss_m[at] for at in np.flatnonzero(self._own())}
 
@@ -299,7 +301,7 @@ class PoseGraph:
             max(self._settings.sigma_px, each.sigma_px),
         )
 
-    def _own(self) -> Anything:
+    def _own(self) -> NDArray[np.bool_]:
         return self._rows.own
 
     def _state(self) -> Nodes:
@@ -308,7 +310,7 @@ class PoseGraph:
     def _gps_miss_m(self) -> Floats:
         return self._rows.centres_m + self._shared[[3, 4, 2]] - self._rows.prior_centres_m
 
-    def _solve(self, free: Anything, *, shared: bool, iterations: int) -> Solution:
+    def _solve(self, free: NDArray[np.bool_], *, shared: bool, iterations: int) -> Solution:
         pairs = self._links.pairs()
         if len(pairs.old):
             pairs = pairs.of(free[pairs.old] | free[pairs.new])
@@ -320,17 +322,17 @@ class PoseGraph:
         return solution
 
     def _shared_sigma(self) -> Floats:
-        """(8,) prior sigma of each shared unknown; those taken at telemetry's word are held close to zero."""
+        """(8,) prior sigma of each shared unknown; those taken as reported are held close to zero."""
         settings = self._settings
         tilt, heading = np.radians([settings.tilt_offset_sigma_deg, settings.heading_offset_sigma_deg])
         sigma = np.array([
             settings.focal_sigma, settings.radial_sigma, settings.altitude_offset_sigma_m,
             settings.gps_offset_sigma_m, settings.gps_offset_sigma_m, tilt, tilt, heading,
         ])
-        return np.where(self._at_word, np.minimum(sigma, _AT_WORD), sigma)
+        return np.where(self._as_reported, np.minimum(sigma, _AS_REPORTED_SIGMA), sigma)
 
     def _judge_offsets(self) -> None:
-        """Take telemetry at its word where this flight does not speak against it.
+        """Take telemetry's offsets as reported where this flight does not contradict them.
 
         An offset that all frames share (altitude's zero, gimbal, compass) and that the rest of the flight sees at
         less than two of its own sigmas is noise: left free, it would only turn, tilt or scale the whole map.
@@ -346,13 +348,13 @@ class PoseGraph:
             unit = np.zeros(size)
             unit[first + k] = 1.0
             variance = max(float(_solve_sparse(solution.normal, unit)[first + k]), 1e-30)
-            told = 1 / variance - 1 / sigma[k] ** 2  # what the flight, without the prior, knows of it
-            estimate = self._shared[k] / variance / told if told > 0 else 0.0
-            if estimate**2 * max(told, 0.0) <= 4.0:
+            information = 1 / variance - 1 / sigma[k] ** 2  # of the flight alone, without the prior
+            estimate = self._shared[k] / variance / information if information > 0 else 0.0
+            if estimate**2 * max(information, 0.0) <= 4.0:
                 silent.add(k)
         for group in _OFFSET_GROUPS:
             if silent.issuperset(group):
-                self._at_word[list(group)] = True
+                self._as_reported[list(group)] = True
 
     def _due(self) -> bool:
         """Whether it is time for a global solve: often at first, then with each tenth more; loops bend the map."""
@@ -441,7 +443,7 @@ class PoseGraph:
         if used.sum() >= _ENOUGH:
             scatter = error_rad[used] - np.median(error_rad[used], axis=0)
             spread = 1.4826 * np.median(np.abs(scatter), axis=0)
-            # pictures see heading well, tilt hardly: a small scatter of tilt only says that it was believed
+            # pictures see heading well, tilt hardly: a small scatter of tilt only shows that it was believed
             attitude = np.clip(spread / np.median(stated_rad[used], axis=0), [1.0, 1.0, 0.25], 5.0)
         self._trust = _Trust(place, attitude, contradicted)
 
@@ -468,6 +470,13 @@ class PoseGraph:
         return np.concatenate([turn, flat], axis=1)[:2]
 
 
+def _altitude_offset_prior_m(sigma_m: float | None) -> float:
+    """The prior sigma of the altitude's zero: 0 holds it (no telemetry), a wide one where `sigma_m` is infinite."""
+    if sigma_m is None:
+        return 0.0
+    return sigma_m if np.isfinite(sigma_m) else _FREE_M
+
+
 def pose_from_link(each: Link, new: Camera, old: Camera, site_from_old: Pose) -> Pose | None:
     """The new keyframe's pose as one link gives it."""
     site_from_new = site_from_image_homography(old, site_from_old) @ np.linalg.inv(each.new_from_old)
@@ -475,5 +484,5 @@ def pose_from_link(each: Link, new: Camera, old: Camera, site_from_old: Pose) ->
     return pose_from_homography(site_from_new * np.sign(centre[2]), new)
 
 
-def _solve_sparse(normal: Anything, right: Floats) -> Floats:
+def _solve_sparse(normal: csc_matrix, right: Floats) -> Floats:
     return splu(normal, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(right)

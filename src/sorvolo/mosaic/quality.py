@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Anything, Floats, ImageGray, ImageRGB, Mask, PointsM, frozen
+from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, PointsM, frozen
 from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.registration.features import gray_from_rgb
 
 DEVIATION_BINS = 32
 """Bins of a deviation's histogram; each is 8 gray levels wide."""
@@ -146,7 +147,7 @@ def deviation(mosaic: ImageRGB, frame: ImageRGB, mask: Mask) -> Deviation:
     """
     if mosaic.shape != frame.shape or mosaic.shape[:2] != mask.shape:
         raise GeometryError(f"cannot compare {mosaic.shape}, {frame.shape} and mask {mask.shape}")
-    difference = cv2.absdiff(_gray(mosaic), _gray(frame))[mask]
+    difference = cv2.absdiff(gray_from_rgb(mosaic), gray_from_rgb(frame))[mask]
     if not len(difference):
         return Deviation(float("nan"), np.zeros(DEVIATION_BINS), 0)
     counts = np.bincount(difference // (256 // DEVIATION_BINS), minlength=DEVIATION_BINS)
@@ -178,7 +179,7 @@ def residual_shift(a: Floats | ImageGray, b: Floats | ImageGray, mask: Mask) -> 
     if min(a.shape) < 16 or not mask.any():
         return Shift(float("nan"), float("nan"), 0.0)
     inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(np.float64)
-    edges: list[Anything] = []
+    edges: list[Floats] = []
     for picture in (a, b):
         smooth = cv2.GaussianBlur(picture.astype(np.float64), (0, 0), 1.0)
         slope = np.hypot(cv2.Sobel(smooth, cv2.CV_64F, 1, 0), cv2.Sobel(smooth, cv2.CV_64F, 0, 1))
@@ -187,7 +188,3 @@ def residual_shift(a: Floats | ImageGray, b: Floats | ImageGray, mask: Mask) -> 
     window = cv2.createHanningWindow(a.shape[::-1], cv2.CV_64F)
     (x, y), response = cv2.phaseCorrelate(edges[0], edges[1], window)
     return Shift(float(x), float(y), float(response))
-
-
-def _gray(image: ImageRGB) -> ImageGray:
-    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)  # type: ignore[return-value]

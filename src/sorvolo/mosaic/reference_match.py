@@ -4,10 +4,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Anything, ImageGray, ImageRGBA, Mask, PointsPx
+from sorvolo.geometry.arrays import ImageGray, ImageRGBA, Mask, PointsPx
 from sorvolo.geometry.geodesy import Projection
 from sorvolo.mosaic.quality import Shift, correlation, residual_shift
+from sorvolo.registration.features import gray_from_rgb
 
 _LEAST_PX = 1000  # of common ground
 _LATTICE_PX = 64  # between the points that are taken from CRS to CRS
@@ -42,11 +44,11 @@ def match_reference(mine: MapPicture, other: MapPicture) -> ReferenceMatch | Non
     mask = known & (mine.rgba[..., 3] > 0)
     if mask.sum() < _LEAST_PX:
         return None
-    own: Anything = cv2.cvtColor(np.ascontiguousarray(mine.rgba[..., :3]), cv2.COLOR_RGB2GRAY)
+    own = gray_from_rgb(np.ascontiguousarray(mine.rgba[..., :3]))
     shift = residual_shift(gray, own, mask)
     moved = np.array([[1, 0, -shift.x_px], [0, 1, -shift.y_px]])
     size = own.shape[1], own.shape[0]
-    back: Anything = cv2.warpAffine(own, moved, size, borderMode=cv2.BORDER_REPLICATE)
+    back = np.asarray(cv2.warpAffine(own, moved, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
     still = mask & (cv2.warpAffine(mask.astype(np.uint8), moved, size, flags=cv2.INTER_NEAREST) > 0)
     return ReferenceMatch(
         correlation(gray, own, mask), correlation(gray, back, still), shift,
@@ -61,16 +63,15 @@ def _resampled(raster: MapPicture, onto: MapPicture) -> tuple[ImageGray, Mask]:
     source, m_per_px = raster.rgba, raster.m_per_px
     while onto.m_per_px > 2 * m_per_px and min(source.shape[:2]) > 32:
         source = cv2.pyrDown(source)  # type: ignore[assignment]
-        places = places / 2
+        places = np.asarray(places / 2, np.float32)
         m_per_px *= 2
-    moved: Anything = cv2.remap(  # type: ignore[call-overload]
+    moved = cv2.remap(  # type: ignore[call-overload]
         source, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
     )
-    gray: Anything = cv2.cvtColor(np.ascontiguousarray(moved[..., :3]), cv2.COLOR_RGB2GRAY)
-    return gray, moved[..., 3] > 254
+    return gray_from_rgb(np.ascontiguousarray(moved[..., :3])), moved[..., 3] > 254
 
 
-def _places(raster: MapPicture, onto: MapPicture) -> Anything:
+def _places(raster: MapPicture, onto: MapPicture) -> NDArray[np.float32]:
     """(H, W, 2) where the pixels of `onto` lie in the raster."""
     height, width = onto.rgba.shape[:2]
     step = _LATTICE_PX

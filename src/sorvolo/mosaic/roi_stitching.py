@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sorvolo.errors import GeometryError, SettingsError
 from sorvolo.geometry.arrays import (
-    Anything,
+    Descriptors,
     Floats,
     ImageGray,
     ImageRGB,
@@ -27,6 +27,7 @@ from sorvolo.geometry.arrays import (
 from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.geometry.polygons import polygon_area
 from sorvolo.mosaic.blending import fill_invalid
+from sorvolo.registration.features import gray_from_rgb
 
 _CHUNK_PX = 1024
 
@@ -50,7 +51,7 @@ class RoiStitchingSettings:
     largest_px: int = 300_000_000  # of the whole picture: beyond, a frame was surely misplaced
 
     def __post_init__(self) -> None:
-        if self.akaze_threshold <= 0 or self.ransac_px <= 0 or not 0 < self.ratio <= 1:
+        if min(self.akaze_threshold, self.ransac_px) <= 0 or not 0 < self.ratio <= 1:
             raise SettingsError("thesis method: akaze_threshold, ransac_px must be positive, ratio in (0, 1]")
         if self.max_features < 1:
             raise SettingsError(f"thesis method: max_features must be at least 1, got {self.max_features}")
@@ -129,7 +130,7 @@ class RoiStitcher:
         height, width = image.shape[:2]
         roi, mask, origin = self._roi(last.barycentre_px, width, height)
         in_mosaic = self._features(roi, mask)
-        in_frame = self._features(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+        in_frame = self._features(gray_from_rgb(image), None)
         if min(len(in_mosaic[0]), len(in_frame[0])) < self._settings.min_inliers:
             return NotStitched(
                 frame_id,
@@ -158,16 +159,16 @@ class RoiStitcher:
         painted = cv2.copyMakeBorder(np.ascontiguousarray(part[..., 3]), 1, 1, 1, 1, cv2.BORDER_CONSTANT)
         # a feature on the mosaic's own border describes where it ends, not the ground
         mask = cv2.erode(painted, np.ones((11, 11), np.uint8))[1:-1, 1:-1]
-        gray = cv2.cvtColor(np.ascontiguousarray(part[..., :3]), cv2.COLOR_RGB2GRAY)
+        gray = gray_from_rgb(np.ascontiguousarray(part[..., :3]))
         return gray, mask, np.array([x0, y0], dtype=np.float64) + self._offset  # type: ignore[return-value]
 
-    def _features(self, gray: Anything, mask: Anything | None) -> tuple[PointsPx, Anything]:
+    def _features(self, gray: ImageGray, mask: ImageGray | None) -> tuple[PointsPx, Descriptors]:
         keypoints, descriptors = self._detector.detectAndCompute(gray, mask)
         if descriptors is None or not len(keypoints):
             return np.zeros((0, 2)), np.zeros((0, 61), np.uint8)
         return np.array([keypoint.pt for keypoint in keypoints]), descriptors
 
-    def _match(self, mosaic: Anything, frame: Anything) -> NDArray[np.int64]:
+    def _match(self, mosaic: Descriptors, frame: Descriptors) -> NDArray[np.int64]:
         """(N, 2) indices of mosaic and frame features that match, each at most once."""
         if self._settings.matching == "cross-check":
             found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(frame, mosaic)
@@ -249,7 +250,7 @@ class RoiStitcher:
             image, part_from_image, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
         )
         full = np.full(image.shape[:2], 255, np.uint8)
-        mask: Anything = cv2.warpPerspective(full, part_from_image, size, flags=cv2.INTER_NEAREST)
+        mask = np.asarray(cv2.warpPerspective(full, part_from_image, size, flags=cv2.INTER_NEAREST), np.uint8)
         painted = np.ascontiguousarray(part[..., 3])
         known = np.ascontiguousarray(part[..., :3])
         shared = (mask > 0) & (painted > 0)

@@ -47,7 +47,7 @@ class FramePlan:
 
 @dataclass(frozen=True, eq=False)
 class Selected:
-    """A selected frame; `reason` is empty, or says why it cannot be used after all."""
+    """A selected frame; `reason` is empty, or why it cannot be used after all."""
 
     posed: PosedFrame
     reason: str
@@ -108,7 +108,7 @@ def select_keyframes(
 ) -> Iterator[Selected | LostFrame]:
     """The frames that the map needs, in order; lost ones pass through.
 
-    `inside` tells frames of the area of interest (UAV_path, eq. 3.1); the others are dropped. `keep_all`: photos,
+    `inside` is True for frames in the area of interest (UAV_path, eq. 3.1); the others are dropped. `keep_all`: photos,
     each of which was meant. The shift since the last keyframe is measured in the pictures by phase correlation of
     small copies, so it needs no telemetry; where that fails (a turn, water) each candidate is taken.
     """
@@ -126,15 +126,12 @@ def select_keyframes(
         texture = normalise_contrast(gray)
         overlap = 0.0 if last is None or keep_all else _overlap(last, texture)
         usual.append(clarity)
-        if overlap > settings.overlap:
+        reason = _reason_if_selected(overlap, clarity, typical, len(usual), settings)
+        if reason is None:
             continue
-        if clarity < settings.useless * typical and len(usual) > 3:
-            yield Selected(each, f"blurred: {clarity / typical:.0%} of the usual sharpness")
-            continue
-        if clarity < settings.blurred * typical and overlap > settings.least_overlap:
-            continue
-        last = texture
-        yield Selected(each, "")
+        if not reason:
+            last = texture
+        yield Selected(each, reason)
 
 
 class StretchSelection:
@@ -171,6 +168,19 @@ def has_texture(image: ImageRGB, settings: SelectionSettings) -> bool:
     size = (max(4, round(gray.shape[1] * scale)), max(4, round(gray.shape[0] * scale)))
     coarse = cv2.resize(gray.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return float((coarse - cv2.boxFilter(coarse, -1, (9, 9))).std()) >= settings.bare_levels
+
+
+def _reason_if_selected(
+    overlap: float, clarity: float, typical: float, count: int, settings: SelectionSettings
+) -> str | None:
+    """The `reason` of a selected frame; None for a frame to leave out. `count` frames gave the `typical` sharpness."""
+    if overlap > settings.overlap:
+        return None
+    if clarity < settings.useless * typical and count > 3:
+        return f"blurred: {clarity / typical:.0%} of the usual sharpness"
+    if clarity < settings.blurred * typical and overlap > settings.least_overlap:
+        return None
+    return ""
 
 
 def _overlap(last: ImageGray, new: ImageGray) -> float:

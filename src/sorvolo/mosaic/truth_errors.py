@@ -32,22 +32,14 @@ class PositionErrors:
 
 def truth_errors(name: str, pairs: Sequence[tuple[FrameRow, FrameRow]], m_per_px: float) -> TruthErrors:
     """The errors of a flight's frames, each given beside the true one."""
-    placed = [(mine, true) for mine, true in pairs if mine.has_outline and true.has_outline]
-    seen = [pair for pair in placed if pair[0].status == Status.VISION]
-    by_gps = [pair for pair in placed if pair[0].status == Status.GPS_ONLY]
-    fixed = [true for _, true in pairs if true.has_fix and true.has_camera]
-    corners = corner_errors(
-        _outlines([mine for mine, _ in seen]), _outlines([true for _, true in seen]), m_per_px,
-        np.array([true.camera_m for true in fixed]).reshape(-1, 2),
-        np.array([true.fix_m for true in fixed]).reshape(-1, 2),
-    )
-    off_m = [np.linalg.norm(mine.outline_m - true.outline_m, axis=1) for mine, true in by_gps]
+    corners = corner_errors(*_outlines_m(pairs, Status.VISION), m_per_px, *_true_cameras_and_fixes_m(pairs))
+    by_gps_m = [np.linalg.norm(mine - true, axis=1) for mine, true in zip(*_outlines_m(pairs, Status.GPS_ONLY))]
     cameras_m = [
         float(np.linalg.norm(mine.camera_m - true.camera_m)) for mine, true in pairs
         if mine.has_camera and true.has_camera
     ]
     return TruthErrors(
-        name, corners, spread_of(np.array(off_m), m_per_px), spread_of(np.array(cameras_m), m_per_px)
+        name, corners, spread_of(np.array(by_gps_m), m_per_px), spread_of(np.array(cameras_m), m_per_px)
     )
 
 
@@ -65,5 +57,15 @@ def table_errors(
     return PositionErrors(*position_errors(mine, reference, m_per_px), missing)
 
 
-def _outlines(rows: Sequence[FrameRow]) -> Floats:
-    return np.array([each.outline_m for each in rows]).reshape(-1, 4, 2)
+def _outlines_m(pairs: Sequence[tuple[FrameRow, FrameRow]], status: Status) -> tuple[Floats, Floats]:
+    """(N, 4, 2) the estimated and the true outlines of the frames with this status that have both."""
+    both = [pair for pair in pairs if pair[0].status == status and pair[0].has_outline and pair[1].has_outline]
+    mine = np.array([each.outline_m for each, _ in both]).reshape(-1, 4, 2)
+    return mine, np.array([each.outline_m for _, each in both]).reshape(-1, 4, 2)
+
+
+def _true_cameras_and_fixes_m(pairs: Sequence[tuple[FrameRow, FrameRow]]) -> tuple[Floats, Floats]:
+    """(N, 2) the true camera positions and the GPS fixes of the frames that have both."""
+    fixed = [true for _, true in pairs if true.has_fix and true.has_camera]
+    cameras_m = np.array([true.camera_m for true in fixed]).reshape(-1, 2)
+    return cameras_m, np.array([true.fix_m for true in fixed]).reshape(-1, 2)
