@@ -1,8 +1,9 @@
 """How good change detection is: the thesis's counts (Tables 4.3 to 4.5) of pixels and frames, events, ground."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -15,6 +16,9 @@ from sorvolo.survey.findings import ChangeKind
 
 _FINEST_CELL_M = 0.1
 _MOST_CELLS = 4_000_000  # of compared ground, which bounds its memory
+
+
+_Event = TypeVar("_Event")
 
 
 @dataclass(frozen=True)
@@ -235,30 +239,37 @@ def match_events(
     near = np.array([
         [_is_near(each, truth, offsets[i][j], settings) for j, truth in enumerate(true)] for i, each in enumerate(found)
     ], bool).reshape(len(found), len(true))
-    wishes = sorted(
+    of_found = _paired(
         (found[i].kind != true[j].kind, float(np.hypot(*offsets[i][j])), i, j) for i, j in np.argwhere(near).tolist()
     )
+    must_find = np.array([truth.must_find for truth in true], bool)
+    is_matched, is_paired = np.zeros(len(true), bool), np.zeros(len(found), bool)
+    is_matched[list(of_found.values())], is_paired[list(of_found)] = True, True
+    is_twice = ~is_paired & (near & must_find).any(axis=1)
+    is_false = ~is_paired & ~near.any(axis=1)
+    needed = [each for each in sorted(of_found.items()) if must_find[each[1]]]
+    is_found = np.zeros(len(found), bool)
+    is_found[[i for i, _ in needed]] = True
+    return EventMatch(
+        tuple(
+            EventPair(true[j], found[i], offsets[i][j], _delay_s(found[i], true[j], settings.views)) for i, j in needed
+        ),
+        _chosen(true, must_find & ~is_matched), _chosen(true, ~must_find), _chosen(found, is_twice),
+        _chosen(found, is_false), _chosen(found, ~(is_twice | is_false | is_found)),
+    )
+
+
+def _chosen(events: Sequence[_Event], which: NDArray[np.bool_]) -> tuple[_Event, ...]:
+    return tuple(each for each, is_chosen in zip(events, which, strict=True) if is_chosen)
+
+
+def _paired(wishes: Iterable[tuple[bool, float, int, int]]) -> dict[int, int]:
+    """The true event of each found one: pairs (is of another kind, distance, found, true) by rank, each used once."""
     of_found: dict[int, int] = {}
-    for _, _, i, j in wishes:
+    for _, _, i, j in sorted(wishes):
         if i not in of_found and j not in of_found.values():
             of_found[i] = j
-    matched = set(of_found.values())
-    pairs = tuple(
-        EventPair(true[j], found[i], offsets[i][j], _delay_s(found[i], true[j], settings.views))
-        for i, j in sorted(of_found.items()) if true[j].must_find
-    )
-    others = [i for i in range(len(found)) if i not in of_found]
-    must_find = np.array([truth.must_find for truth in true], bool)
-    twice = {i for i in others if (near[i] & must_find).any()}
-    optional = ({i for i in others if near[i].any()} - twice) | {i for i, j in of_found.items() if not must_find[j]}
-    return EventMatch(
-        pairs,
-        tuple(truth for j, truth in enumerate(true) if truth.must_find and j not in matched),
-        tuple(truth for j, truth in enumerate(true) if not truth.must_find),
-        tuple(found[i] for i in sorted(twice)),
-        tuple(found[i] for i in others if not near[i].any()),
-        tuple(found[i] for i in sorted(optional)),
-    )
+    return of_found
 
 
 def score_events(
@@ -266,21 +277,25 @@ def score_events(
 ) -> EventScores:
     """The numbers of a match; `compared_m2` is the ground that was compared with the map."""
     still = [pair for pair in match.pairs if pair.true.kind != ChangeKind.MOVING]
-    errors_m = np.array([pair.error_m for pair in still])
     stated = [pair for pair in still if math.isfinite(pair.found.sigma_m)]
     within = np.array([np.abs(pair.offset_m) <= 2 * pair.found.sigma_m for pair in stated])
     delays_s = np.array([pair.delay_s for pair in match.pairs])
+    errors_m, sigmas_m = [pair.error_m for pair in still], [pair.found.sigma_m for pair in stated]
     return EventScores(
         must_find=len(match.pairs) + len(match.missed), found=len(match.pairs),
         judged_late=int(np.isfinite(delays_s).sum()), late=_late(match.pairs, settings),
         twice=len(match.twice), false=len(match.false), optional=len(match.optional),
-        named_right=sum(pair.true.kind == pair.found.kind for pair in match.pairs), compared_m2=compared_m2,
-        error_median_m=float(np.median(errors_m)) if len(still) else math.nan,
-        error_p95_m=float(np.percentile(errors_m, 95)) if len(still) else math.nan,
-        sigma_median_m=float(np.median([pair.found.sigma_m for pair in stated])) if stated else math.nan,
+        named_right=_named_right(match.pairs), compared_m2=compared_m2,
+        error_median_m=_percentile(errors_m, 50),
+        error_p95_m=_percentile(errors_m, 95),
+        sigma_median_m=_percentile(sigmas_m, 50),
         within_two_sigma=float(within.mean()) if stated else math.nan,
         by_kind={str(kind): _kind_score(match, kind, settings) for kind in ChangeKind},
     )
+
+
+def _percentile(values: Sequence[float], share: float) -> float:
+    return float(np.percentile(values, share)) if values else math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,9 +350,13 @@ def _kind_score(match: EventMatch, kind: ChangeKind, settings: EventSettings) ->
     pairs = [pair for pair in match.pairs if pair.true.kind == kind]
     return KindScore(
         len(pairs) + sum(truth.kind == kind for truth in match.missed), len(pairs),
-        sum(pair.found.kind == kind for pair in pairs), _late(pairs, settings),
+        _named_right(pairs), _late(pairs, settings),
         sum(each.kind == kind for each in match.twice), sum(each.kind == kind for each in match.false),
     )
+
+
+def _named_right(pairs: Sequence[EventPair]) -> int:
+    return sum(pair.true.kind == pair.found.kind for pair in pairs)
 
 
 def _late(pairs: Sequence[EventPair], settings: EventSettings) -> int:

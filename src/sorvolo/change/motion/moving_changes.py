@@ -1,4 +1,4 @@
-"""The moving things of a flight as they are told: one change each, brought up to date while it is seen."""
+"""The moving things of a flight as they are announced: one change each, brought up to date while it is seen."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -30,13 +30,13 @@ class Movers:
         return tuple(self._known.values())
 
     def see(self, view: ComparedView, tracks: Sequence[Track], next_number: Callable[[], int]) -> list[Change]:
-        """Bring what moves in this view up to date; those told for the first time, which `next_number` gives an id."""
-        told = []
+        """Bring what moves in this view up to date; those announced first, whose ids `next_number` gives."""
+        announced = []
         for track in tracks:
             known = self._known.get(track.mover)
             if known is None:
                 change = self._change(view, track, f"{self._prefix}-{next_number()}")
-                told.append(change)
+                announced.append(change)
             else:
                 change = self._change(view, track, known.id)
                 change = replace(
@@ -44,7 +44,7 @@ class Movers:
                     announced_ns=known.announced_ns,
                 )
             self._known[track.mover] = change
-        return told
+        return announced
 
     def _change(self, view: ComparedView, track: Track, change_id: str) -> Change:
         """A moving thing as this view shows it."""

@@ -34,15 +34,8 @@ def compare_images(
     `method` is "thesis" (section 3.2 of the thesis, with `ThesisSettings`; the reference may come from
     `prepare_reference`) or "robust" (`RobustSettings`, one thread). Raises InputError and SettingsError.
     """
-    if method not in METHODS:
-        raise SettingsError(f"method is {method!r}; give one of {', '.join(METHODS)}")
-    wanted = ThesisSettings if method == "thesis" else RobustSettings
-    if settings is not None and not isinstance(settings, wanted):
-        raise SettingsError(f"settings are {type(settings).__name__}; method {method!r} needs {wanted.__name__}")
-    if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
-        raise SettingsError(f"threads is {threads!r}; give a whole number from 1")
-    prepared = isinstance(reference, ThesisReference)
-    if prepared and method != "thesis":
+    _check_choice(method, settings, threads)
+    if isinstance(reference, ThesisReference) and method != "thesis":
         raise InputError("the reference is a ThesisReference; method 'robust' needs a picture")
     before = _checked("reference", reference.picture if isinstance(reference, ThesisReference) else reference)
     query = _checked("query", query)
@@ -51,12 +44,24 @@ def compare_images(
             f"reference is {_size(before)}, query {_size(query)}; give aligned pictures of the same size"
         )
     _check_valid(valid, query)
-    if isinstance(settings, RobustSettings) or (settings is None and method == "robust"):
-        robust = compare_robust(before, query, valid, settings)
+    if method == "robust":
+        robust = compare_robust(before, query, valid, settings if isinstance(settings, RobustSettings) else None)
         return Comparison(robust.mask, robust.boxes)
-    found = compare_thesis(reference if isinstance(reference, ThesisReference) else before, query, valid, settings,
-                           threads)
+    found = compare_thesis(
+        reference if isinstance(reference, ThesisReference) else before, query, valid,
+        settings if isinstance(settings, ThesisSettings) else None, threads,
+    )
     return Comparison(found.mask, found.boxes)
+
+
+def _check_choice(method: str, settings: ThesisSettings | RobustSettings | None, threads: int) -> None:
+    if method not in METHODS:
+        raise SettingsError(f"method is {method!r}; give one of {', '.join(METHODS)}")
+    wanted = ThesisSettings if method == "thesis" else RobustSettings
+    if settings is not None and not isinstance(settings, wanted):
+        raise SettingsError(f"settings are {type(settings).__name__}; method {method!r} needs {wanted.__name__}")
+    if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
+        raise SettingsError(f"threads is {threads!r}; give a whole number from 1")
 
 
 def _checked(name: str, image: Any) -> NDArray[np.uint8]:

@@ -20,7 +20,7 @@ class TuningLimits:
 
 
 class FlightTuning:
-    """What a flight's unchanged ground says about noise, misalignment, parallax and light. Only `observe` changes it.
+    """What a flight's unchanged ground shows of noise, misalignment, parallax and light. Only `observe` changes it.
 
     Every pair of pictures adapts itself already; this makes what they have in common a property of the flight, so
     that one odd frame (a gust, a cloud, a frame changed all over) does not decide for itself.
@@ -33,7 +33,7 @@ class FlightTuning:
         self._frames = 0
 
     def observe(self, result: RobustResult) -> bool:
-        """Learn from a comparison; says whether the settings are others now. Pictures are not kept."""
+        """Learn from a comparison; whether the settings are others now. Pictures are not kept."""
         before = self.settings()
         self._frames += 1
         if result.known >= LEAST_KNOWN:

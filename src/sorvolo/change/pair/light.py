@@ -26,7 +26,7 @@ FLAT = 6.0  # what noise leaves of the variance of details, in squared steps of 
 FLAT_TRUST = 0.003  # of cells without any structure: they tell where nothing better is near
 REACHES_CELLS = ((3, 1.0), (7, 0.1), (17, 0.01), (49, 1e-3))  # how far a cell's gain tells about its neighbours'
 NEAR_CELLS = 11  # around things: there the ground tells the light once it is known what hides it
-LEAST_HIDDEN = 12  # of 255: cells that are hidden to more say nothing
+LEAST_HIDDEN = 12  # of 255: cells that are hidden to more do not count
 LEAST_GAIN = 0.02  # of a gain: less makes no difference
 STEPS_PER_OCTAVE = 48.0
 GAIN_ONE = 4096
@@ -61,7 +61,7 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """What each cell alone says of the local gain: `steps` (h, w, 3) float32, `STEPS_PER_OCTAVE` to an octave.
+    """The local gain by each cell alone: `steps` (h, w, 3) float32, `STEPS_PER_OCTAVE` to an octave.
 
     `trust` (h, w) float32, 0 to 1, is how sure it shows the same ground; nothing is known of it where not `known`.
     """
@@ -167,7 +167,7 @@ def _chosen(values: NDArray[np.float32], sure: Mask | None) -> NDArray[np.float3
 def _sameness(reference: Bgr, query: Bgr) -> NDArray[np.float32]:
     """How sure each cell (h, w) of `FINE` pixels a side shows the same ground, 0 to 1: both have its finest structure.
 
-    Things put on the ground, however large, hide its structure: their cells say nothing about the light.
+    Things put on the ground, however large, hide its structure: their cells do not count for the light.
     """
     before, after = (cv2.cvtColor(each, cv2.COLOR_BGR2GRAY) for each in (reference, query))
     products = detail_products(np.asarray(before, np.uint8), np.asarray(after, np.uint8), _LOG, DETAIL_PX, FINE)

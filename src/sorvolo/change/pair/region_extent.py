@@ -1,5 +1,6 @@
 """How far the thing of a region reaches: with what of it differs little, without the halo that light left around it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import ceil, floor
@@ -65,23 +66,13 @@ def without_halos(regions: Regions, chosen: Mask, views: Views, light: Light) ->
     plain ground beside it tells the light. If that explains the rest of a region only to a part, the rest is a weaker
     part of the thing, and everything stays as it was; nowhere do the pictures differ more than before.
     """
-    size = regions.labels.shape
-    things = np.zeros(size, np.uint8)
     numbers = [int(each) for each in np.flatnonzero(chosen)]
-    for region in numbers:
-        x, y, wide, high = regions.boxes[region]
-        window = np.s_[y : y + high, x : x + wide]
-        values = np.where(regions.labels[window] == region + 1, regions.strength[window], 0)
-        things[window][values >= max(STANDS_OUT * values.max(), 1)] = 255
+    things = _standing_out(regions, numbers)
     around = light_around(light, things)
     if around is light:
         return regions, views
     windows = {region: _window(regions, region) for region in numbers}
-    rows, columns = ([each[axis] for each in windows.values()] for axis in (0, 1))
-    place = (
-        slice(min(each.start for each in rows), max(each.stop for each in rows)),
-        slice(min(each.start for each in columns), max(each.stop for each in columns)),
-    )
+    place = _around_all(list(windows.values()))
     parts = list(windows.values()) if sum(map(_area, windows.values())) < _area(place) else [place]
     wide = [_widened(each, place, views.settings.reach_px + 2) for each in parts]  # two blurs and the search look there
     lit, anew = relit_parts(views.before, around, wide), np.empty_like(regions.strength)
@@ -90,19 +81,45 @@ def without_halos(regions: Regions, chosen: Mask, views: Views, light: Light) ->
     strength, known_lit = regions.strength.copy(), views.lit.copy()
     clear = cv2.dilate(things, np.ones((5, 5), np.uint8)) == 0
     for region, window in windows.items():
-        core = regions.labels[window] == region + 1
-        rest = core & clear[window]
-        if np.count_nonzero(rest) > LEAST_TAKEN * np.count_nonzero(core):
-            left_over, held = (_quantile(each[window], rest, 0.9) for each in (anew, regions.strength))
-            if left_over > MOST_LEFT * held:
-                continue
+        if _is_weaker_part(regions, region, window, clear, anew):
+            continue
         strength[window] = cv2.min(anew[window], strength[window])
         known_lit[window] = lit[window]
     return replace(regions, strength=strength), replace(views, lit=known_lit)
 
 
+def _standing_out(regions: Regions, numbers: Sequence[int]) -> Image:
+    """(h, w) 255 where something stands out in one of these regions."""
+    things = np.zeros(regions.labels.shape, np.uint8)
+    for region in numbers:
+        x, y, wide, high = regions.boxes[region]
+        window = np.s_[y : y + high, x : x + wide]
+        values = np.where(regions.labels[window] == region + 1, regions.strength[window], 0)
+        things[window][values >= max(STANDS_OUT * values.max(), 1)] = 255
+    return things
+
+
+def _around_all(windows: Sequence[Window]) -> Window:
+    """The window around all of several."""
+    rows, columns = ([each[axis] for each in windows] for axis in (0, 1))
+    return (
+        slice(min(each.start for each in rows), max(each.stop for each in rows)),
+        slice(min(each.start for each in columns), max(each.stop for each in columns)),
+    )
+
+
+def _is_weaker_part(regions: Regions, region: int, window: Window, clear: Mask, anew: Image) -> bool:
+    """Whether the new light explains what is `clear` of a region's thing only to a part: it belongs to the thing."""
+    core = regions.labels[window] == region + 1
+    rest = core & clear[window]
+    if np.count_nonzero(rest) <= LEAST_TAKEN * np.count_nonzero(core):
+        return False
+    left_over, held = (_quantile(each[window], rest, 0.9) for each in (anew, regions.strength))
+    return left_over > MOST_LEFT * held
+
+
 def grown(regions: Regions, region: int, came: bool, views: Views) -> Piece | None:
-    """The thing that `region` (0 .. N - 1) is a part of; None where it cannot be told from what is around.
+    """The thing that `region` (0 .. N - 1) is a part of; None where it does not stand out from what is around.
 
     Its difference stands out of that of the quiet ground near: at the lowest limit at which it is one nearly convex
     piece with a sharp rim. Its own soft shadow, in the picture that shows it (the query where it `came`), is left out.

@@ -25,7 +25,7 @@ class Trees:
 
 
 def how_sure(features: Floats, names: tuple[str, ...], trees: Trees | None = None) -> Floats:
-    """The chance (N,) from 0 to 1 that each row of `features` (N, F) is a change; `names` says what the columns are.
+    """The chance (N,) from 0 to 1 that each row of `features` (N, F) is a change; `names` names the columns are.
 
     Raises SettingsError if the trees were trained on other columns.
     """

@@ -204,7 +204,7 @@ def _standing_out(boxes: NDArray[np.int32], strength: Floats) -> tuple[Floats, F
 
 
 def _looked_at(boxes: NDArray[np.int32], shape: tuple[int, ...]) -> tuple[tuple[slice, slice], NDArray[np.int32]]:
-    """The part of a picture of `shape` (h, w) that says what is to be known of regions in boxes (N, 4); its corner."""
+    """The part of a picture of `shape` (h, w) that determines the measures of regions in boxes (N, 4); its corner."""
     corner = np.maximum(boxes[:, :2].min(axis=0) - LOOKED_AT_PX, 0)
     right, bottom = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) + LOOKED_AT_PX
     part = np.s_[int(corner[1]) : min(int(bottom), shape[0]), int(corner[0]) : min(int(right), shape[1])]

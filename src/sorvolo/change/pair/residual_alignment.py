@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sorvolo.geometry.arrays import Anything, Mask, Matrix3
 from sorvolo.kernels import fit_moves, flow_on_grid
 
-LARGEST_PX = 6.0  # at the pictures' corners, in their own pixels; what says more has lost its way
+LARGEST_PX = 6.0  # at the pictures' corners, in their own pixels; a larger one has lost its way
 SMALLEST_PX = 0.12  # a resampling costs more than this is worth
 GRID = (28, 16)
 RIDGE = 1e-4 * np.array([0, 0.01, 0.01, 0, 0.01, 0.01, 1, 1])  # parts of the size: bends are small, or seen

@@ -132,7 +132,7 @@ def median_ratio(
 ) -> NDArray[np.float32]:
     """(3,) the medians of (above + `offset`) / (below + `offset`) by channel of two pictures (h, w, 3 or more).
 
-    `where` (h, w) says in which pixels, in one at least; of many, some are asked. Offsets keep black from weighing
+    `where` (h, w) marks the pixels that count, in one at least; of many, some. Offsets keep black from weighing
     too much.
     """
     places = np.flatnonzero(where)
@@ -145,7 +145,7 @@ def median_ratio(
 def middle_and_deviation(picture: NDArray[np.uint8], where: Mask) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Medians (3,) of a picture's channels, (h, w, 3), and of how far they stray from these, in some pixels.
 
-    `where` (h, w) says in which pixels, in one at least.
+    `where` (h, w) marks the pixels that count, in one at least.
     """
     middles, deviations = np.zeros(3, np.float32), np.zeros(3, np.float32)
     mask = where.view(np.uint8)

@@ -17,7 +17,7 @@ _LEAST_PART = 0.1  # of the largest piece: smaller ones do not stretch an outlin
 
 @dataclass(frozen=True, eq=False)
 class KnownPlace:
-    """A place on the ground, `outline_m` (N, 2) in site metres, where one kind of change is not to be told again."""
+    """A place on the ground, `outline_m` (N, 2) in site metres, where one kind of change is known already."""
 
     outline_m: PointsM
     kind: ChangeKind
@@ -57,10 +57,7 @@ def outline_of(mask: Mask, site_from_mask: Matrix3, tolerance_px: float, join_px
     if join_px >= 1:
         size = 2 * round(join_px) + 1
         part = cv2.morphologyEx(part, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
-    contours, _ = cv2.findContours(part, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    areas = [float(cv2.contourArea(each)) for each in contours]
-    large = [each for each, area in zip(contours, areas) if area >= _LEAST_PART * max(areas)]
-    ring = large[0] if len(large) == 1 else cv2.convexHull(np.vstack(large))
+    ring = _ring_around(part)
     simple = cv2.approxPolyDP(ring, max(2 * tolerance_px, 0.5), True).reshape(-1, 2)
     points = simple.astype(np.float64) / 2 - 0.25 - pad + np.array([x0, y0])
     outline_m = apply_homography(site_from_mask, points) if len(points) >= 3 else None
@@ -68,6 +65,14 @@ def outline_of(mask: Mask, site_from_mask: Matrix3, tolerance_px: float, join_px
         box = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], np.float64) - 0.5
         outline_m = apply_homography(site_from_mask, box)
     return outline_m
+
+
+def _ring_around(part: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """The contour of the one piece of a mask, or the hull of those that are not tiny beside the largest."""
+    contours, _ = cv2.findContours(part, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    areas = [float(cv2.contourArea(each)) for each in contours]
+    large = [each for each, area in zip(contours, areas) if area >= _LEAST_PART * max(areas)]
+    return np.asarray(large[0] if len(large) == 1 else cv2.convexHull(np.vstack(large)), np.int32)
 
 
 def mask_of(outline_m: PointsM, site_from_mask: Matrix3, shape: tuple[int, int]) -> Mask:
@@ -92,7 +97,7 @@ def overlap(a_m: PointsM, b_m: PointsM) -> tuple[float, float]:
 
 
 def is_known(outline_m: PointsM, kind: ChangeKind, places: Sequence[KnownPlace]) -> bool:
-    """Whether a change of this kind at this place is among those not to be told again.
+    """Whether a change of this kind at this place is among those not to be announced again.
 
     It is where the outlines' intersection is more than half of the change's own area or of their union.
     """

@@ -1,4 +1,4 @@
-"""The things that one piece of changed ground holds, each told under an id of its own that stays."""
+"""The things that one piece of changed ground holds, each announced under an id of its own that stays."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,49 +15,47 @@ class Parts:
 
     def __init__(self) -> None:
         self.things: tuple[Change, ...] = ()
-        self._told: dict[str, Change] = {}  # by id, also those that do not show any more
-        self._seen: tuple[Change, ...] = ()  # when last looked at, told or not
+        self._announced: dict[str, Change] = {}  # by id, also those that do not show any more
+        self._seen: tuple[Change, ...] = ()  # when last parted, announced or not
         self._views = 0
 
     def is_due(self, views: int) -> bool:
         """Whether, with so many views, it is time to look again for things to part."""
         return views >= _MORE_VIEWS * self._views
 
-    def join(self, told: Sequence[Change]) -> None:
-        """Remember what was told of a change that has become one with this: its things keep their ids."""
-        self._told |= {each.id: each for each in told}
+    def join(self, announced: Sequence[Change]) -> None:
+        """Remember what was announced of a change that has become one with this: its things keep their ids."""
+        self._announced |= {each.id: each for each in announced}
         self._views = 0
 
     def take(
         self, things: Sequence[Change], views: int, now_ns: int, next_id: Callable[[], str]
     ) -> list[Change]:
-        """The things as they are seen after so many views, the largest first; those told for the first time, now.
+        """The things as they are seen after so many views, the largest first; those announced for the first time, now.
 
-        All come under the id of the whole. Each keeps the id that what lies under it was told with; the largest of the
+        All come under the id of the whole. Each keeps the id of what was announced there; the largest of the
         others keeps that of the whole. Any more are new and get ids from `next_id`, if they were there already when
         last looked at: pictures of few views may show anything. At the end, `now_ns` = -1, all of them do.
         """
         self._views = views
-        whole = things[0].id
         named = dict(enumerate(things[:1])) if len(things) == 1 else self._known_again(things)
-        new = []
         for row, thing in enumerate(things):
-            if row not in named:
-                if all(each.id != whole for each in named.values()):
-                    named[row] = thing
-                elif now_ns < 0 or any(_is_same(thing, each) for each in self._seen):
-                    named[row] = replace(thing, id=next_id(), announced_ns=now_ns)
-            if row in named and named[row].id not in self._told:
-                new.append(named[row])
+            if row in named:
+                continue
+            if all(each.id != things[0].id for each in named.values()):
+                named[row] = thing
+            elif now_ns < 0 or any(_is_same(thing, each) for each in self._seen):
+                named[row] = replace(thing, id=next_id(), announced_ns=now_ns)
         self._seen = tuple(things)
         self.things = tuple(named[row] for row in sorted(named))
-        self._told |= {each.id: each for each in self.things}
+        new = [each for each in self.things if each.id not in self._announced]
+        self._announced |= {each.id: each for each in self.things}
         return new
 
     def _known_again(self, things: Sequence[Change]) -> dict[int, Change]:
-        """Those things, by row, that lie where something was told already, under its id; each id once."""
+        """Those things, by row, that lie where something was announced already, under its id; each id once."""
         found: dict[int, Change] = {}
-        free = dict(self._told)
+        free = dict(self._announced)
         for row, thing in enumerate(things):
             same = next((each for each in free.values() if _is_same(thing, each)), None)
             if same is not None:

@@ -1,5 +1,6 @@
-"""Things told from the shadows they throw: a shadow is part of what changed, but not where the thing is."""
+"""Things without the shadows they throw: a shadow is part of what changed, but not where the thing is."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import combinations
@@ -18,7 +19,7 @@ _ALIKE = 0.22  # a shadow takes about the same share of each colour
 _LEAST_SHARE = 0.02  # of the change: if less is no shadow, all of it is a dark thing
 _LEAST_PX = 6
 _RIM_PX = 4  # around a change: outlines are drawn a little beside the masks that they are drawn of
-_BLACK = 8.0  # grey levels: light that black has, so that ratios of dark pictures say something
+_BLACK = 8.0  # grey levels: light that black has, so that ratios of dark pictures mean something
 _LEAST_PIECE = 0.15  # of the largest lit piece: smaller ones are specks of the shadow's rim
 _TOLERANCE_PX = 0.7
 _APART_M = 0.5  # things so far from each other are two ...
@@ -74,7 +75,7 @@ def things_of(patch: Patch, kind: ChangeKind, changed: Mask) -> list[tuple[Mask,
     """The things in a change, each with its own kind and the part of `changed` that lies nearest to it, the largest
     first; the shadow of what came does not go to what left.
 
-    They are told apart by the ground or the shadow between them, what left from what came also where they touch;
+    They are separated by the ground or the shadow between them, what left from what came also where they touch;
     `changed` alone where it is but one thing. A dark car has bright parts far from each other: what fills a rectangle
     of about its size stays whole, unless something left beside what came.
     """
@@ -97,18 +98,24 @@ def _groups(patch: Patch, changed: Mask, light: "_OneLight") -> list[tuple[Mask,
     pieces = [labels == each for each in range(1, count) if bare_m2[each] >= _LEAST_THING_M2]
     if len(pieces) < 2:
         return []
-    kinds = [kind_of(replace(patch, changed=each)) for each in pieces]
-    distances = [cv2.distanceTransform((~each).view(np.uint8), cv2.DIST_L2, 5) * patch.m_per_px for each in pieces]
-    group = list(range(len(pieces)))
-    for first, second in combinations(range(len(pieces)), 2):
-        is_contrary = _CONTRARY.get(kinds[first]) is kinds[second]
-        if not is_contrary and float(distances[first][pieces[second]].min()) < _GAP_M:
-            group = [group[first] if each == group[second] else each for each in group]
+    distances = [_distance(each) * patch.m_per_px for each in pieces]
+    group = _group_of_pieces(patch, pieces, distances)
     if len(set(group)) < 2:
         return []
     nearest = np.array(group)[np.argmin(distances, axis=0)]
     found = [changed & (nearest == each) for each in dict.fromkeys(group)]
     return [(each, kind_of(replace(patch, changed=each))) for each in found]
+
+
+def _group_of_pieces(patch: Patch, pieces: Sequence[Mask], distances_m: Sequence[Anything]) -> list[int]:
+    """The group of each piece: those near each other are one, unless one came and the other left."""
+    kinds = [kind_of(replace(patch, changed=each)) for each in pieces]
+    group = list(range(len(pieces)))
+    for first, second in combinations(range(len(pieces)), 2):
+        is_contrary = _CONTRARY.get(kinds[first]) is kinds[second]
+        if not is_contrary and float(distances_m[first][pieces[second]].min()) < _GAP_M:
+            group = [group[first] if each == group[second] else each for each in group]
+    return group
 
 
 def _things_of_group(
@@ -118,20 +125,30 @@ def _things_of_group(
     if _may_be_a_car(changed, patch.m_per_px):
         return [(changed, kind)]
     shadow = changed & light.shadow(kind)
-    lit: Anything = cv2.morphologyEx((changed & ~shadow).view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    labels = _joined(np.asarray(lit > 0), patch.m_per_px)
-    areas_m2 = np.bincount(labels[lit > 0]) * patch.m_per_px**2
-    large = [(labels == each) & (lit > 0) for each in np.argsort(-areas_m2) if areas_m2[each] >= _LEAST_THING_M2]
-    things = [each for each in large if np.count_nonzero(each) >= _SOLID * np.count_nonzero(_hull(each))]
+    things = _lit_things(changed & ~shadow, patch.m_per_px)
     if len(things) < 2:
         return [(changed, kind)]
-    distances = [cv2.distanceTransform((~each).view(np.uint8), cv2.DIST_L2, 5) for each in things]
+    distances = [_distance(each) for each in things]
     contrary = _CONTRARY.get(kind)
     kinds = [kind_of(replace(patch, changed=_hull(each) & changed)) for each in things]
     if contrary is not None and any(each is not contrary for each in kinds):
         distances = [np.where(shadow & (own is contrary), np.inf, each) for own, each in zip(kinds, distances)]
     nearest = np.argmin(distances, axis=0)
     return [(changed & (nearest == index), own) for index, own in enumerate(kinds)]
+
+
+def _lit_things(bare: Mask, m_per_px: float) -> list[Mask]:
+    """The solid things, the largest first, in the part of a change that is no shadow."""
+    lit: Anything = cv2.morphologyEx(bare.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    labels = _joined(np.asarray(lit > 0), m_per_px)
+    areas_m2 = np.bincount(labels[lit > 0]) * m_per_px**2
+    large = [(labels == each) & (lit > 0) for each in np.argsort(-areas_m2) if areas_m2[each] >= _LEAST_THING_M2]
+    return [each for each in large if np.count_nonzero(each) >= _SOLID * np.count_nonzero(_hull(each))]
+
+
+def _distance(mask: Mask) -> Anything:
+    """(h, w) how far each pixel lies from a mask, pixels."""
+    return cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 5)
 
 
 def _hull(mask: Anything) -> Mask:
