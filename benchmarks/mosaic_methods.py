@@ -30,7 +30,7 @@ from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.mosaic.quality import corner_errors
+from sorvolo.mosaic.map_quality import corner_errors
 from sorvolo.simulation.presets import preset
 
 METHODS = ("planar", "thesis", "opencv-scans")

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sensor_noise import camera
 
-from sorvolo.change.pair.light import fit_light, light_around, relit, relit_parts
+from sorvolo.change.pair.illumination import fit_light, light_around, relit, relit_parts
 from sorvolo.change.pair.region_extent import Views, _moved, _strength, _widened
 from sorvolo.change.pair.regions import RegionSettings
 from sorvolo.change.pair.robust import RobustResult, compare_robust

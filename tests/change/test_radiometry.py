@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo import kernels
-from sorvolo.change.pair.light import fit_light, relit
-from sorvolo.kernels import reference_robust
+from sorvolo.change.pair.illumination import fit_light, relit
+from sorvolo.kernels import numpy_robust
 
 
 def textured(seed: int) -> np.ndarray:
@@ -80,7 +80,7 @@ def test_relighting_agrees(seed: int, height: int, width: int, lines: int) -> No
     curves = rng.integers(0, 16384, (3, 256)).astype(np.int32)
     gains = rng.integers(0, 65536, (lines, width, 3)).astype(np.float32)
     plain = np.empty_like(image)
-    reference_robust.relight(image, curves, gains, 0, 0, width, height, plain)
+    numpy_robust.relight(image, curves, gains, 0, 0, width, height, plain)
     np.testing.assert_array_equal(kernels.relight(image, curves, gains), plain)
     part = np.s_[height // 3 : height // 2 + 1, width // 4 : width]
     alone = kernels.relight(image, curves, gains, [part], np.zeros_like(image))

@@ -14,7 +14,7 @@ from sorvolo.change.pair.regions import FEATURES
 from sorvolo.change.pair.residual_alignment import settle
 from sorvolo.change.pair.robust import RobustSettings, compare_robust, examine
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.kernels import reference_robust
+from sorvolo.kernels import numpy_robust
 
 
 def with_box(image: np.ndarray, colour: tuple[int, int, int] = (190, 60, 40)) -> np.ndarray:
@@ -156,7 +156,7 @@ def test_core_regions_agree(
     values = rng.integers(0, 90, (height, width), dtype=np.uint8)
     thresholds = rng.integers(20, 100, (height, width), dtype=np.uint8)
     ours = kernels.core_regions(values, thresholds, strong, core, least, 6)
-    plain = reference_robust.core_regions(values, thresholds, strong, core, least, 6)
+    plain = numpy_robust.core_regions(values, thresholds, strong, core, least, 6)
     for one, other in zip(ours, plain):
         np.testing.assert_array_equal(one, other)
 
@@ -170,7 +170,7 @@ def test_matches_agree(rng: np.random.Generator, height: int, width: int, reach:
     boxes = np.hstack([corner, rng.integers(1, np.array([width, height]) - corner + 1)]).astype(np.int32)
     np.testing.assert_array_equal(
         kernels.match_regions(query, searched, boxes, reach),
-        reference_robust.match_regions(query, searched, boxes, reach),
+        numpy_robust.match_regions(query, searched, boxes, reach),
     )
 
 
@@ -183,7 +183,7 @@ def test_measures_agree(rng: np.random.Generator, height: int, width: int, chann
     boxes = np.hstack([corner, rng.integers(1, np.array([width, height]) - corner + 1)]).astype(np.int32)
     np.testing.assert_array_equal(
         kernels.measure_regions(labels, boxes, stack, margin),
-        reference_robust.measure_regions(labels, boxes, stack, margin),
+        numpy_robust.measure_regions(labels, boxes, stack, margin),
     )
 
 
@@ -196,7 +196,7 @@ def test_trees_agree(rng: np.random.Generator, rows: int, trees: int, depth: int
     features = rng.integers(0, 5, (rows, width)).astype(float)
     asked = rng.integers(0, width, (trees, depth)).astype(np.int32)
     thresholds, leaves = rng.integers(0, 5, (trees, depth)).astype(float), rng.normal(size=(trees, 2**depth))
-    expected = reference_robust.tree_margins(features, asked, thresholds, leaves)
+    expected = numpy_robust.tree_margins(features, asked, thresholds, leaves)
     assert np.array_equal(kernels.tree_margins(features, asked, thresholds, leaves), expected)
 
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.change.pair.light import fit_light, relit
+from sorvolo.change.pair.illumination import fit_light, relit
 from sorvolo.change.pair.moved_shadows import STEPS, moved_shades
 from sorvolo.change.pair.robust import compare_robust
 

@@ -18,7 +18,7 @@ from sorvolo.change.pair.thesis import (
     thesis_steps,
 )
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.kernels import reference as twins
+from sorvolo.kernels import numpy_thesis as twins
 
 SMALL = ThesisSettings(averaging_px=(4, 3), pattern_px=(5, 4), isolation_px=(6, 7), area_share=0.02, gray_threshold=30)
 

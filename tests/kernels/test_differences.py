@@ -11,7 +11,7 @@ from sorvolo import kernels
 from sorvolo.change.pair.regions import RegionSettings, find_regions
 from sorvolo.change.pair.robust import compare_robust
 from sorvolo.change.pair.scratch import MOST_KEPT_PX, Scratch
-from sorvolo.kernels import reference_robust
+from sorvolo.kernels import numpy_robust
 
 SIDES = st.integers(2, 40)
 
@@ -34,7 +34,7 @@ def test_differences_are_as_specified(
     before, after = pictures(height, width, seed)
     known = np.random.default_rng(seed).random((height, width)) < 0.7 if masked else None
     plain = np.empty((6, height, width), np.uint8)
-    reference_robust.differences(
+    numpy_robust.differences(
         before, after, None if known is None else known.view(np.uint8), reach, weight, plain
     )
     assert np.array_equal(kernels.differences(before, after, known, reach, weight), plain)
@@ -47,7 +47,7 @@ def test_shades_are_as_specified(height: int, width: int, apart: int, seed: int)
     darker[: height // 2] = lighter[: height // 2] * 0.7 + 0.5
     part = np.s_[height // 4 : height // 4 + max(2, height // 2), 0:width]
     plain = np.empty((max(2, height // 2), width), np.uint8)
-    reference_robust.darker_alike(lighter, darker, 0, height // 4, width, len(plain), apart, plain)
+    numpy_robust.darker_alike(lighter, darker, 0, height // 4, width, len(plain), apart, plain)
     assert np.array_equal(kernels.darker_alike(lighter, darker, part, apart), plain)
 
 
@@ -56,7 +56,7 @@ def test_shades_are_as_specified(height: int, width: int, apart: int, seed: int)
 def test_held_parts_are_as_specified(height: int, width: int, share: float, seeded: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     mask, seeds = ((rng.random((height, width)) < each).astype(np.uint8) * 255 for each in (share, seeded))
-    assert np.array_equal(kernels.held_parts(mask, seeds), reference_robust.held_parts(mask, seeds))
+    assert np.array_equal(kernels.held_parts(mask, seeds), numpy_robust.held_parts(mask, seeds))
 
 
 @settings(max_examples=40, deadline=None)
@@ -71,11 +71,11 @@ def test_tint_and_rims_are_as_specified(height: int, width: int, seed: int) -> N
     )
     found, plain = (np.full((height, width), 7, np.uint8) for _ in range(2))
     kernels.tint(before, after, logs, boxes, 2, found)
-    reference_robust.tint(before, after, logs, boxes, 2, plain)
+    numpy_robust.tint(before, after, logs, boxes, 2, plain)
     assert np.array_equal(found, plain)
     came, went = before[..., 0], after[..., 1]
     assert np.array_equal(
-        kernels.rim_balance(labels, boxes, came, went), reference_robust.rim_balance(labels, boxes, came, went)
+        kernels.rim_balance(labels, boxes, came, went), numpy_robust.rim_balance(labels, boxes, came, went)
     )
 
 
@@ -89,7 +89,7 @@ def test_the_same_target_is_written_over_and_returned() -> None:
 def test_labels_are_looked_up_and_strangers_refused() -> None:
     labels = np.random.default_rng(3).integers(0, 5, (7, 9)).astype(np.int32)
     table, plain = np.uint8([0, 255, 3, 0, 9]), np.empty((7, 9), np.uint8)
-    reference_robust.looked_up(labels, table, plain)
+    numpy_robust.looked_up(labels, table, plain)
     assert np.array_equal(kernels.looked_up(labels, table), plain)
     with pytest.raises(ValueError, match="out of 0"):
         kernels.looked_up(labels, table[:3])
@@ -158,4 +158,4 @@ def test_narrow_wide_and_stepped_windows_are_matched_as_specified(wide: int, hig
     searched = rng.integers(0, 256, (high + 3 + 2 * reach, wide + 5 + 2 * reach), dtype=np.uint8)
     boxes = np.int32([[5, 3, wide, high], [0, 0, wide, high]])
     found = kernels.match_regions(query, searched, boxes, reach)
-    assert np.array_equal(found, reference_robust.match_regions(query, searched, boxes, reach))
+    assert np.array_equal(found, numpy_robust.match_regions(query, searched, boxes, reach))

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo import kernels
-from sorvolo.kernels import reference_light
+from sorvolo.kernels import numpy_light
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -19,7 +19,7 @@ def test_slopes_are_as_specified(count: int, channels: int, is_coarse: bool, see
     after = (before * rng.uniform(0.5, 2) + rng.normal(0, 0.1, before.shape)).astype(np.float32)
     if is_coarse:  # many equal values
         before, after = before.round(1), after.round(1)
-    found, plain = (each.slopes(before, after, 1e-3) for each in (kernels, reference_light))
+    found, plain = (each.slopes(before, after, 1e-3) for each in (kernels, numpy_light))
     np.testing.assert_allclose(found, plain, rtol=1e-9)
 
 
@@ -41,7 +41,7 @@ def test_moves_are_fitted_as_specified(count: int, seed: int) -> None:
     trust = rng.uniform(0.05, 1, count) * (rng.random(count) < 0.9)
     trust[0] = 1.0
     ridge = np.array([0, 1e-6, 1e-6, 0, 1e-6, 1e-6, 1e-4, 1e-4])
-    ours, plain = (each.fit_moves(rows_x, rows_y, moves, trust, ridge, 640, 360) for each in (kernels, reference_light))
+    ours, plain = (each.fit_moves(rows_x, rows_y, moves, trust, ridge, 640, 360) for each in (kernels, numpy_light))
     np.testing.assert_allclose(ours[0], plain[0], rtol=1e-7, atol=1e-9)
     assert ours[1] == pytest.approx(plain[1], rel=1e-7)
 
@@ -52,7 +52,7 @@ def test_products_of_details_are_as_specified(height: int, width: int, window: i
     rng = np.random.default_rng(seed)
     before, after = rng.integers(0, 256, (2, height, width), dtype=np.uint8)
     table = np.log2(np.arange(256, dtype=np.float32) + 8) * np.float32(48)
-    found, plain = (each.detail_products(before, after, table, window, cell) for each in (kernels, reference_light))
+    found, plain = (each.detail_products(before, after, table, window, cell) for each in (kernels, numpy_light))
     assert found.shape == (3, height // cell, width // cell)
     np.testing.assert_allclose(found, plain, rtol=1e-4, atol=1e-2)  # squared steps, of thousands
 
@@ -63,7 +63,7 @@ def test_a_flow_is_laid_on_a_grid_as_specified(height: int, width: int, rows: in
     rng = np.random.default_rng(seed)
     flow = rng.normal(0, 2, (height, width, 2)).astype(np.float32)
     details = rng.integers(0, 256, (height, width), dtype=np.uint8)
-    ours, plain = (each.flow_on_grid(flow, details, rows, columns) for each in (kernels, reference_light))
+    ours, plain = (each.flow_on_grid(flow, details, rows, columns) for each in (kernels, numpy_light))
     np.testing.assert_allclose(ours, plain, rtol=1e-4, atol=1e-4)
     if height % rows == 0 and width % columns == 0:
         means = flow.reshape(rows, height // rows, columns, width // columns, 2).mean(axis=(1, 3))

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo import kernels
-from sorvolo.kernels import reference
+from sorvolo.kernels import numpy_thesis
 
 needs_compiler = pytest.mark.skipif(not kernels.COMPILED, reason="the kernels were not compiled here")
 sizes = st.tuples(st.integers(1, 40), st.integers(1, 170))
@@ -37,7 +37,7 @@ def some(seed: int, size: tuple[int, int]) -> Any:
 @given(seeds, sizes, threads, st.booleans())
 def test_equalising_tables_agree(seed: int, size: tuple[int, int], threads: int, holes: bool) -> None:
     image, known = picture(seed, size), some(seed, size) if holes else None
-    expected = reference.equalising_tables(image, known, 1)
+    expected = numpy_thesis.equalising_tables(image, known, 1)
     np.testing.assert_array_equal(kernels.equalising_tables(image, known, threads), expected)
 
 
@@ -47,7 +47,7 @@ def test_equalising_tables_agree(seed: int, size: tuple[int, int], threads: int,
 def test_averaged_agrees(seed: int, size: tuple[int, int], window: tuple[int, int], threads: int) -> None:
     image = picture(seed, size)
     tables = np.random.default_rng(seed).integers(0, 256, (3, 256), np.uint8)
-    expected = reference.averaged(image, tables, *window, 1)
+    expected = numpy_thesis.averaged(image, tables, *window, 1)
     for found, right in zip(kernels.averaged(image, tables, *window, threads), expected, strict=True):
         np.testing.assert_array_equal(found, right)
 
@@ -60,7 +60,7 @@ def test_texture_changes_agree(
 ) -> None:
     before, after = (np.ascontiguousarray(picture(seed + k, size).transpose(2, 0, 1)) for k in range(2))
     asked, most = some(seed, size), int(share * 3 * window[0] * window[1])
-    expected = reference.texture_changes(before, after, asked, *window, most, 1)
+    expected = numpy_thesis.texture_changes(before, after, asked, *window, most, 1)
     np.testing.assert_array_equal(kernels.texture_changes(before, after, asked, *window, most, threads), expected)
 
 
@@ -71,7 +71,7 @@ def test_isolations_agree(
     seed: int, size: tuple[int, int], window: tuple[int, int], threads: int, share: float
 ) -> None:
     mask, most = some(seed, size), int(share * window[0] * window[1])
-    expected = reference.without_isolations(mask, *window, most, 1)
+    expected = numpy_thesis.without_isolations(mask, *window, most, 1)
     np.testing.assert_array_equal(kernels.without_isolations(mask, *window, most, threads), expected)
 
 
@@ -81,11 +81,11 @@ def test_isolations_agree(
 def test_regions_and_their_histograms_agree(seed: int, size: tuple[int, int], share: float) -> None:
     rng = np.random.default_rng(seed)
     mask = (rng.random(size) < share).astype(np.uint8) * 255
-    boxes = reference.region_boxes(mask)
+    boxes = numpy_thesis.region_boxes(mask)
     np.testing.assert_array_equal(kernels.region_boxes(mask), boxes)
     image, tables = picture(seed, size), rng.integers(0, 256, (3, 256), np.uint8)
     for known in (None, some(seed, size)):
-        expected = reference.gray_histograms(image, tables, boxes, known)
+        expected = numpy_thesis.gray_histograms(image, tables, boxes, known)
         np.testing.assert_array_equal(kernels.gray_histograms(image, tables, boxes, known), expected)
 
 
@@ -100,10 +100,10 @@ def test_regions_are_those_of_opencv() -> None:
 
 def test_equalisation_and_gray_are_those_of_opencv() -> None:
     image = picture(3, (90, 120))
-    equalised = reference.looked_up(image, kernels.equalising_tables(image))
+    equalised = numpy_thesis.looked_up(image, kernels.equalising_tables(image))
     expected = np.stack([cv2.equalizeHist(np.ascontiguousarray(image[..., each])) for each in range(3)], axis=-1)
     assert np.abs(equalised.astype(int) - expected).max() <= 1  # OpenCV rounds a float product
-    np.testing.assert_array_equal(reference.gray_of(image), cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    np.testing.assert_array_equal(numpy_thesis.gray_of(image), cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
 
 
 def test_a_window_of_ten_is_the_mean_from_five_before_to_four_after() -> None:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.mosaic.quality import (
+from sorvolo.mosaic.map_quality import (
     corner_errors,
     correlation,
     deviation,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sorvolo.change.metrics import EventScores
     from sorvolo.missions.evaluate.changes import FlightChanges
     from sorvolo.missions.evaluate.mosaic import MosaicEvaluation
-    from sorvolo.mosaic.quality import Spread
+    from sorvolo.mosaic.map_quality import Spread
     from sorvolo.tracking.metrics import FlightObjects
 
 evaluate_app = typer.Typer(no_args_is_help=True)

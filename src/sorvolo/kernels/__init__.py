@@ -1,6 +1,6 @@
 """The few loops that must be fast; numbers in, numbers out. This module is the only door.
 
-Each kernel exists twice with one signature: compiled in `_native`, and in NumPy in `reference`, which says what it
+Each kernel exists twice with one signature: compiled in `_native`, and in NumPy in `numpy_*.py`, which specify what it
 computes. Both give the same numbers, sums of real numbers but for their rounding. Where nothing was compiled the slow
 ones are used, with one warning.
 """
@@ -12,7 +12,7 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.kernels import reference, reference_light, reference_robust
+from sorvolo.kernels import numpy_light, numpy_robust, numpy_thesis
 
 _native: ModuleType | None
 try:
@@ -35,20 +35,20 @@ LARGEST_WINDOW_PX = 127
 MOST_REACH_PX = 32
 """How far `differences` looks around at most."""
 
-_thesis = reference if _native is None else _native
+_thesis = numpy_thesis if _native is None else _native
 
 Bytes = NDArray[np.uint8]
 
 
 def equalising_tables(image: Bytes, known: Bytes | None = None, threads: int = 1) -> Bytes:
-    """The tables (3, 256) that equalise an image's channels, (h, w, 3): see reference."""
+    """The tables (3, 256) that equalise an image's channels, (h, w, 3): see numpy_thesis."""
     _check_image(image)
     tables: Bytes = _thesis.equalising_tables(_bytes(image), _known(known, image), threads)
     return tables
 
 
 def averaged(image: Bytes, tables: Bytes, width: int, height: int, threads: int = 1) -> tuple[Bytes, Bytes]:
-    """An equalised image's window means as planes (3, h, w), and their gray (h, w): see reference."""
+    """An equalised image's window means as planes (3, h, w), and their gray (h, w): see numpy_thesis."""
     _check_image(image)
     _check_tables(tables)
     _check_window(width, height)
@@ -59,7 +59,7 @@ def averaged(image: Bytes, tables: Bytes, width: int, height: int, threads: int 
 def texture_changes(
     reference: Bytes, query: Bytes, asked: Bytes, width: int, height: int, most: int, threads: int = 1
 ) -> Bytes:
-    """Which of the pixels `asked` (h, w) differ in their patterns, planes being (3, h, w): see reference."""
+    """Which of the pixels `asked` (h, w) differ in their patterns, planes being (3, h, w): see numpy_thesis."""
     _check_window(width, height)
     if not reference.shape == query.shape == (3, *asked.shape) or asked.ndim != 2:
         raise ValueError(f"texture_changes: {reference.shape}, {query.shape} and asked {asked.shape} do not fit")
@@ -70,7 +70,7 @@ def texture_changes(
 
 
 def without_isolations(mask: Bytes, width: int, height: int, most_black: int, threads: int = 1) -> Bytes:
-    """A mask (h, w) black wherever the window around has more than `most_black` black, else white: see reference."""
+    """A mask (h, w) black wherever the window around has more than `most_black` black, else white: see numpy_thesis."""
     _check_mask(mask)
     _check_window(width, height)
     kept: Bytes = _thesis.without_isolations(_bytes(mask), width, height, most_black, threads)
@@ -78,7 +78,7 @@ def without_isolations(mask: Bytes, width: int, height: int, most_black: int, th
 
 
 def region_boxes(mask: Bytes) -> NDArray[np.int64]:
-    """The boxes (N, 4) x, y, width, height of a mask's 8-connected regions: see reference."""
+    """The boxes (N, 4) x, y, width, height of a mask's 8-connected regions: see numpy_thesis."""
     _check_mask(mask)
     boxes: NDArray[np.int64] = _thesis.region_boxes(_bytes(mask))
     return boxes
@@ -87,7 +87,7 @@ def region_boxes(mask: Bytes) -> NDArray[np.int64]:
 def gray_histograms(
     image: Bytes, tables: Bytes, boxes: NDArray[np.int64], known: Bytes | None = None
 ) -> NDArray[np.int64]:
-    """The gray histograms (N, 256) of boxes of an equalised image: see reference."""
+    """The gray histograms (N, 256) of boxes of an equalised image: see numpy_thesis."""
     _check_image(image)
     _check_tables(tables)
     boxes = np.ascontiguousarray(boxes, np.int64).reshape(-1, 4)
@@ -100,14 +100,14 @@ def gray_histograms(
     return counts
 
 
-_robust = reference_robust if _native is None else _native
+_robust = numpy_robust if _native is None else _native
 
 
 def relight(
     image: NDArray[np.uint8], curves: NDArray[np.int32], gains: NDArray[np.float32],
     parts: Sequence[tuple[slice, slice]] | None = None, out: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.uint8]:
-    """A picture (h, w, 3) through curves (3, 256) and times lines of gains (H, w, 3) over it: see reference_robust.
+    """A picture (h, w, 3) through curves (3, 256) and times lines of gains (H, w, 3) over it: see numpy_robust.
 
     Only `parts` of it, rows and columns from a start to a stop, are filled where they are given. `out` (h, w, 3) is
     written over where it is given, and returned.
@@ -133,7 +133,7 @@ def relight(
 def looked_up(
     labels: NDArray[np.int32], table: NDArray[np.uint8], out: NDArray[np.uint8] | None = None
 ) -> NDArray[np.uint8]:
-    """The values (h, w) of labels (h, w), all of 0 .. len(table) - 1, in a table: see reference_robust.
+    """The values (h, w) of labels (h, w), all of 0 .. len(table) - 1, in a table: see numpy_robust.
 
     `out` (h, w) is written over where it is given, and returned.
     """
@@ -151,7 +151,7 @@ def differences(
     before: NDArray[np.uint8], after: NDArray[np.uint8], known: NDArray[np.bool_] | None, reach: int, weight: int,
     out: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.uint8]:
-    """How far each value of two pictures (h, w, 3) lies outside the other's, planes (6, h, w): see reference_robust.
+    """How far each value of two pictures (h, w, 3) lies outside the other's, planes (6, h, w): see numpy_robust.
 
     `out` (6, h, w) is written over where it is given, and returned.
     """
@@ -173,7 +173,7 @@ def differences(
 def darker_alike(
     lighter: NDArray[np.uint8], darker: NDArray[np.uint8], part: tuple[slice, slice], apart: int
 ) -> NDArray[np.bool_]:
-    """Where in a part of two pictures (h, w, 3) one is darker in all colours alike: see reference_robust."""
+    """Where in a part of two pictures (h, w, 3) one is darker in all colours alike: see numpy_robust."""
     (height, width), (rows, columns) = lighter.shape[:2], part
     if lighter.shape != (height, width, 3) or darker.shape != lighter.shape:
         raise ValueError(f"darker_alike: pictures {lighter.shape} and {darker.shape} do not fit")
@@ -189,7 +189,7 @@ def tint(
     before: NDArray[np.uint8], after: NDArray[np.uint8], logs: NDArray[np.uint8], boxes: NDArray[np.int32], margin: int,
     out: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.uint8]:
-    """How much redder than blue a picture became, (h, w), in boxes and `margin` around only: see reference_robust.
+    """How much redder than blue a picture became, (h, w), in boxes and `margin` around only: see numpy_robust.
 
     `out` (h, w) is written over there where it is given, and returned; elsewhere it keeps what it held.
     """
@@ -207,7 +207,7 @@ def tint(
 def rim_balance(
     labels: NDArray[np.uint8], boxes: NDArray[np.int32], came: NDArray[np.uint8], went: NDArray[np.uint8]
 ) -> NDArray[np.int64]:
-    """By how much `came` exceeds `went` along the rims of regions, (N,): see reference_robust."""
+    """By how much `came` exceeds `went` along the rims of regions, (N,): see numpy_robust."""
     boxes = np.ascontiguousarray(boxes, np.int32).reshape(-1, 4)
     _check_boxes("rim_balance", boxes, labels.shape)
     if not labels.shape == came.shape == went.shape or labels.ndim != 2:
@@ -223,7 +223,7 @@ def rim_balance(
 def tree_margins(
     rows: NDArray[np.float64], asked: NDArray[np.int32], thresholds: NDArray[np.float64], leaves: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """What trees say of rows (N, F), (N,): see reference_robust."""
+    """The sums of trees for rows (N, F), (N,): see numpy_robust."""
     trees, depth = asked.shape
     if thresholds.shape != asked.shape or leaves.shape != (trees, 1 << depth) or trees < 1 or rows.ndim != 2:
         raise ValueError(
@@ -242,7 +242,7 @@ def tree_margins(
 def core_regions(
     values: NDArray[np.uint8], thresholds: NDArray[np.uint8], strong: float, core: float, least_area: int, most: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
-    """Where values lie over thresholds, both (h, w), each part cut to its core: see reference_robust."""
+    """Where values lie over thresholds, both (h, w), each part cut to its core: see numpy_robust."""
     if not 0 <= most <= 255:
         raise ValueError(f"core_regions: a byte holds the labels of 0 .. 255 regions, not of {most}")
     if values.shape != thresholds.shape or values.ndim != 2:
@@ -255,7 +255,7 @@ def core_regions(
 
 
 def held_parts(mask: Bytes, seeds: Bytes) -> Bytes:
-    """The parts of a mask (h, w) that hold a pixel of `seeds` (h, w), 255 or 0: see reference_robust."""
+    """The parts of a mask (h, w) that hold a pixel of `seeds` (h, w), 255 or 0: see numpy_robust."""
     _check_mask(mask)
     if seeds.shape != mask.shape:
         raise ValueError(f"held_parts: mask {mask.shape} and seeds {seeds.shape} do not fit")
@@ -266,7 +266,7 @@ def held_parts(mask: Bytes, seeds: Bytes) -> Bytes:
 def measure_regions(
     labels: NDArray[np.uint8], boxes: NDArray[np.int32], channels: Sequence[NDArray[np.uint8]], margin: int
 ) -> NDArray[np.int64]:
-    """Sums over regions and over what is around them, (N, 2, 2 C + 1): see reference_robust."""
+    """Sums over regions and over what is around them, (N, 2, 2 C + 1): see numpy_robust."""
     shapes = {each.shape for each in channels}
     if shapes != {labels.shape} or labels.ndim != 2:
         raise ValueError(f"measure_regions: labels {labels.shape} and channels {shapes} do not fit")
@@ -281,7 +281,7 @@ def measure_regions(
 def match_regions(
     query: NDArray[np.uint8], searched: NDArray[np.uint8], boxes: NDArray[np.int32], reach: int
 ) -> NDArray[np.float64]:
-    """How well boxes of one picture are found again in another, (N, 6): see reference_robust."""
+    """How well boxes of one picture are found again in another, (N, 6): see numpy_robust."""
     boxes = np.ascontiguousarray(boxes, np.int32).reshape(-1, 4)
     height, width = query.shape
     if searched.shape != (height + 2 * reach, width + 2 * reach):
@@ -293,11 +293,11 @@ def match_regions(
     return found
 
 
-_light = reference_light if _native is None else _native
+_light = numpy_light if _native is None else _native
 
 
 def slopes(before: NDArray[np.float32], after: NDArray[np.float32], prior: float) -> NDArray[np.float64]:
-    """By how much one of two (N, C), N > 0, is spread wider than the other, (C,): see reference_light."""
+    """By how much one of two (N, C), N > 0, is spread wider than the other, (C,): see numpy_light."""
     if before.shape != after.shape or before.ndim != 2 or len(before) == 0:
         raise ValueError(f"slopes: before {before.shape} and after {after.shape} do not fit")
     if not (np.isfinite(before).all() and np.isfinite(after).all()):
@@ -312,7 +312,7 @@ def fit_moves(
     rows_x: NDArray[np.float64], rows_y: NDArray[np.float64], moves: NDArray[np.float64], trust: NDArray[np.float64],
     ridge: NDArray[np.float64], wide: float, high: float,
 ) -> tuple[NDArray[np.float64], float]:
-    """A robust linear fit (8,) of displacements (N, 2), and its median rest: see reference_light."""
+    """A robust linear fit (8,) of displacements (N, 2), and its median rest: see numpy_light."""
     count = len(trust)
     if not rows_x.shape == rows_y.shape == (count, 8) or moves.shape != (count, 2) or ridge.shape != (8,):
         raise ValueError(f"fit_moves: rows {rows_x.shape}, {rows_y.shape} and moves {moves.shape} do not fit")
@@ -330,7 +330,7 @@ def fit_moves(
 def detail_products(
     before: Bytes, after: Bytes, table: NDArray[np.float32], window: int, cell: int
 ) -> NDArray[np.float32]:
-    """What the details of two pictures (h, w) have in common in cells, (3, h / cell, w / cell): see reference_light."""
+    """What the details of two pictures (h, w) have in common in cells, (3, h / cell, w / cell): see numpy_light."""
     if before.shape != after.shape or before.ndim != 2 or table.shape != (256,):
         raise ValueError(f"detail_products: pictures {before.shape}, {after.shape}, table {table.shape} do not fit")
     if not (window % 2 == 1 and 1 <= window <= min(before.shape) and 1 <= cell <= min(before.shape)):
@@ -344,7 +344,7 @@ def detail_products(
 def flow_on_grid(
     flow: NDArray[np.float32], details: NDArray[np.uint8], rows: int, columns: int
 ) -> NDArray[np.float32]:
-    """A flow (h, w, 2) and how strong details (h, w) are, on a grid (rows, columns, 3): see reference_light."""
+    """A flow (h, w, 2) and how strong details (h, w) are, on a grid (rows, columns, 3): see numpy_light."""
     if details.ndim != 2 or flow.shape != (*details.shape, 2):
         raise ValueError(f"flow_on_grid: flow {flow.shape} and details {details.shape} do not fit")
     if not (1 <= rows <= details.shape[0] and 1 <= columns <= details.shape[1]):

@@ -8,7 +8,7 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats, ImageRGB, ImageRGBA, Matrix3
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.mosaic.canvas_frame import CanvasFrame, coverage, warp
-from sorvolo.mosaic.quality import DEVIATION_BINS, Deviation, deviation
+from sorvolo.mosaic.map_quality import DEVIATION_BINS, Deviation, deviation
 
 _RECENT = 64  # tiles remembered: neighbouring frames share most
 

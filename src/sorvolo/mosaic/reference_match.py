@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import ImageGray, ImageRGBA, Mask, PointsPx
 from sorvolo.geometry.geodesy import Projection
-from sorvolo.mosaic.quality import Shift, correlation, residual_shift
+from sorvolo.mosaic.map_quality import Shift, correlation, residual_shift
 from sorvolo.registration.features import gray_from_rgb
 
 _LEAST_PX = 1000  # of common ground

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats
-from sorvolo.mosaic.quality import CornerErrors, Spread, corner_errors, position_errors, spread_of
+from sorvolo.mosaic.map_quality import CornerErrors, Spread, corner_errors, position_errors, spread_of
 from sorvolo.survey.frame_rows import FrameRow
 from sorvolo.survey.mosaic import Status
 

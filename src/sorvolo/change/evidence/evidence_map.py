@@ -34,8 +34,8 @@ from sorvolo.change.evidence.cells import (
 from sorvolo.change.evidence.pictures import BETTER
 from sorvolo.change.motion.blob_tracker import BlobTracker, MovingSettings, Track
 from sorvolo.change.motion.moving_changes import Movers
-from sorvolo.change.shape.parts import Parts
 from sorvolo.change.shape.shadows import is_mostly_shade
+from sorvolo.change.shape.things import Parts
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.survey.findings import Change, ComparedView

@@ -8,7 +8,7 @@ from math import ceil, floor
 import cv2
 import numpy as np
 
-from sorvolo.change.pair.light import Light, light_around, relit_parts
+from sorvolo.change.pair.illumination import Light, light_around, relit_parts
 from sorvolo.change.pair.regions import Image, Regions, RegionSettings
 from sorvolo.geometry.arrays import Anything, Mask
 from sorvolo.kernels import darker_alike, differences, held_parts

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.pair.light import Light, fit_light, relit
+from sorvolo.change.pair.illumination import Light, fit_light, relit
 from sorvolo.change.pair.region_extent import Piece, Views, grown, without_halos
 from sorvolo.change.pair.region_score import how_sure
 from sorvolo.change.pair.regions import FEATURES, Regions, RegionSettings, find_regions

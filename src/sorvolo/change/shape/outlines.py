@@ -57,7 +57,7 @@ def outline_of(mask: Mask, site_from_mask: Matrix3, tolerance_px: float, join_px
     if join_px >= 1:
         size = 2 * round(join_px) + 1
         part = cv2.morphologyEx(part, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
-    ring = _ring_around(part)
+    ring = _ring_around(np.asarray(part, np.uint8))
     simple = cv2.approxPolyDP(ring, max(2 * tolerance_px, 0.5), True).reshape(-1, 2)
     points = simple.astype(np.float64) / 2 - 0.25 - pad + np.array([x0, y0])
     outline_m = apply_homography(site_from_mask, points) if len(points) >= 3 else None
