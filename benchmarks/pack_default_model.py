@@ -52,7 +52,7 @@ FAILS = (
     "small objects were never seen in real labelled pictures, only composed and simulated",
     "daylight people come from beaches, one pond and simulation: other clothing, poses and ground are not known",
     "trucks and buses count as nothing in particular; bicycles and their riders likewise",
-    "windows and hatches on roofs are told as small objects, cones and birds as people",
+    "windows and hatches on roofs are reported as small objects, cones and birds as people",
     "false-colour thermal palettes look like daylight to it",
     "thermal frames are seen by the model `thermal` (thermal_by): the figures of hituav and pictures_thermal are its",
 )

@@ -25,7 +25,7 @@ TRAINING = (
     "750th and 3,200 until the 1,500th, so that the rate fell later than the recipe's"
 )
 FAILS = (
-    "crowds: people who overlap by half are told as one",
+    "crowds: people who overlap by half are reported as one",
     "people below 10 px: many are missed",
     "small objects were never seen in real labelled thermal frames, only simulated",
     "trucks and buses count as nothing in particular; bicycles and their riders likewise",

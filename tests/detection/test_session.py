@@ -93,12 +93,12 @@ def test_missing_outputs_and_answers_that_break_the_contract(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("told", "says"),
+    ("fields", "message"),
     [
         ({"format": 2}, "update sorvolo"),
         ({"classes": []}, "classes"),
         ({"classes": ["person", "person"]}, "classes"),
-        ({"thresholds": {"person": 0.5}}, "says nothing of 'car'"),
+        ({"thresholds": {"person": 0.5}}, "it lacks 'car'"),
         ({"best_px": {"person": [9, 3], "car": [1, 2], "small object": [1, 2]}}, "best_px"),
         ({"stride": 0}, "stride"),
         ({"on_request": ["dog"]}, "on_request must be some of its classes"),
@@ -106,9 +106,9 @@ def test_missing_outputs_and_answers_that_break_the_contract(tmp_path: Path) -> 
         ({"thresholds": None}, "cannot be used"),
     ],
 )
-def test_metadata_that_contradicts_itself(tmp_path: Path, told: dict[str, Any], says: str) -> None:
-    with pytest.raises(InputError, match=says):
-        Session(rectangle_model(tmp_path / "toy.onnx", **told), "cpu")
+def test_metadata_that_contradicts_itself(tmp_path: Path, fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Session(rectangle_model(tmp_path / "toy.onnx", **fields), "cpu")
 
 
 def test_metadata_that_is_no_json(tmp_path: Path) -> None:

@@ -16,9 +16,9 @@ from typing import IO, Any
 import numpy as np
 
 from sorvolo.detection.contract import METADATA_KEY, info_from_metadata
-from sorvolo.detection.engine import CUDA, OUTPUTS, Engine, Provider, describe, open_engine
+from sorvolo.detection.engine import CUDA, OUTPUTS, Engine, Planes, Provider, describe, open_engine
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.geometry.arrays import Anything
+from sorvolo.geometry.arrays import Numbers
 
 MOST_BYTES = 6 << 30
 """Of memory that such a process may map on Linux: twice what the package's own models take for the largest tile."""
@@ -84,7 +84,7 @@ class _Process:
             None if fixed is None else (int(fixed[0]), int(fixed[1])),
         )
 
-    def _run(self, batch: Anything) -> tuple[Anything, ...]:
+    def _run(self, batch: Planes) -> tuple[Numbers, ...]:
         self._send({"shape": list(batch.shape)}, np.ascontiguousarray(batch, np.uint8).tobytes())
         head, data = self._receive()
         try:
@@ -128,7 +128,7 @@ def _end(child: "subprocess.Popen[bytes]") -> None:
     child.wait()
 
 
-def _arrays(head: dict[str, Any], data: bytes) -> tuple[Anything, ...]:
+def _arrays(head: dict[str, Any], data: bytes) -> tuple[Numbers, ...]:
     """Boxes, scores and labels from their shapes and bytes. Raises ValueError where they do not fit."""
     out, start = [], 0
     for name in OUTPUTS:

@@ -1,7 +1,7 @@
-"""What a model file says of itself: the metadata that `sorvolo` writes into its ONNX files, checked."""
+"""What a model file states about itself: the metadata that `sorvolo` writes into its ONNX files, checked."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -16,15 +16,16 @@ FORMAT = 1
 
 _FALLBACK_STRIDE = 32
 _NEEDED = ("name", "classes", "thresholds", "best_px")
+_TEXTS = ("thermal_by", "preset", "version", "precision", "licence", "trained_on", "created")
 
 
 @dataclass(frozen=True)
 class ModelInfo:
-    """One model, as its file tells it.
+    """One model, as its file describes it.
 
-    `thresholds` says from which score on each class is reported; `best_px` from which to which longer side, in
-    pixels, the model finds a class well. `stride`: the sides of its input are multiples of it. `thermal`: it was
-    trained on thermal frames; `daylight`: on daylight. `thermal_by`: the installed model that looks at thermal frames
+    `thresholds`: each class is reported from this score on. `best_px`: from which to which longer side, in pixels, the
+    model finds a class well. `stride`: the sides of its input are multiples of it. `thermal`: it was trained on
+    thermal frames; `daylight`: on daylight. `thermal_by`: the installed model that looks at thermal frames
     in its place, "" for none. `precision` is float32 or int8. `on_request`: classes too unsure to be reported unless a
     person asks for them.
     """
@@ -63,53 +64,64 @@ def info_from_metadata(metadata: Mapping[str, str], where: str) -> ModelInfo:
             "classes; train and export one with `sorvolo train`, or add the metadata as docs/detector.md shows"
         )
     try:
-        told = json.loads(text)
-        if not isinstance(told, dict):
+        fields = json.loads(text)
+        if not isinstance(fields, dict):
             raise ValueError("not an object")
-        if int(told["format"]) > FORMAT:
+        if int(fields["format"]) > FORMAT:
             raise InputError(
-                f"{where} follows contract {told['format']}, this version reads up to {FORMAT}: update sorvolo"
+                f"{where} follows contract {fields['format']}, this version reads up to {FORMAT}: update sorvolo"
             )
-        return _info(told)
+        return _info(fields)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{where}: its '{METADATA_KEY}' metadata cannot be used ({_reason(error)}); export the model again"
         ) from error
 
 
-def _info(told: dict[str, Any]) -> ModelInfo:
-    if missing := [name for name in _NEEDED if name not in told]:
+def _info(fields: Mapping[str, Any]) -> ModelInfo:
+    if missing := [name for name in _NEEDED if name not in fields]:
         raise ValueError(f"it lacks {', '.join(missing)}")
-    classes = tuple(str(each) for each in told["classes"])
-    if not classes or len(set(classes)) != len(classes):
-        raise ValueError(f"its classes must be one or more different names, not {list(classes)}")
-    thresholds = {each: float(told["thresholds"][each]) for each in classes}
-    if not all(0 <= each <= 1 for each in thresholds.values()):
-        raise ValueError(f"its thresholds must lie in 0 to 1, not {thresholds}")
-    best_px = {each: (float(told["best_px"][each][0]), float(told["best_px"][each][1])) for each in classes}
-    if not all(0 < least < most for least, most in best_px.values()):
-        raise ValueError(f"its best_px must be smallest and largest side, not {best_px}")
-    stride = int(told.get("stride", _FALLBACK_STRIDE))
+    classes = _classes(fields)
+    thresholds, best_px = _thresholds(fields, classes), _best_px(fields, classes)
+    stride = int(fields.get("stride", _FALLBACK_STRIDE))
     if not 1 <= stride <= 256:
         raise ValueError(f"its stride must lie in 1 to 256, not {stride}")
-    on_request = tuple(str(each) for each in told.get("on_request", ()))
+    on_request = tuple(str(each) for each in fields.get("on_request", ()))
     if not set(on_request) < set(classes):
         raise ValueError(f"its on_request must be some of its classes, not {list(on_request)}")
-    texts = {
-        each: _words(told[each])
-        for each in ("thermal_by", "preset", "version", "precision", "licence", "trained_on", "created") if each in told
-    }
+    texts = {each: _words(fields[each]) for each in _TEXTS if each in fields}
     return ModelInfo(
-        str(told["name"]), classes, MappingProxyType(thresholds), MappingProxyType(best_px), stride,
-        bool(told.get("thermal", False)), bool(told.get("daylight", True)), on_request=on_request, **texts,
+        str(fields["name"]), classes, MappingProxyType(thresholds), MappingProxyType(best_px), stride,
+        bool(fields.get("thermal", False)), bool(fields.get("daylight", True)), on_request=on_request, **texts,
     )
 
 
-def _words(told: object) -> str:
-    return ", ".join(map(str, told)) if isinstance(told, list) else str(told)
+def _classes(fields: Mapping[str, Any]) -> tuple[str, ...]:
+    classes = tuple(str(each) for each in fields["classes"])
+    if not classes or len(set(classes)) != len(classes):
+        raise ValueError(f"its classes must be one or more different names, not {list(classes)}")
+    return classes
+
+
+def _thresholds(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, float]:
+    thresholds = {each: float(fields["thresholds"][each]) for each in classes}
+    if not all(0 <= each <= 1 for each in thresholds.values()):
+        raise ValueError(f"its thresholds must lie in 0 to 1, not {thresholds}")
+    return thresholds
+
+
+def _best_px(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, tuple[float, float]]:
+    best_px = {each: (float(fields["best_px"][each][0]), float(fields["best_px"][each][1])) for each in classes}
+    if not all(0 < least < most for least, most in best_px.values()):
+        raise ValueError(f"its best_px must be smallest and largest side, not {best_px}")
+    return best_px
+
+
+def _words(value: object) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def _reason(error: Exception) -> str:
     if isinstance(error, KeyError):
-        return f"it says nothing of {error}"
+        return f"it lacks {error}"
     return str(error)

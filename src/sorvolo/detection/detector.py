@@ -10,13 +10,13 @@ import numpy as np
 
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.engine import Provider
-from sorvolo.detection.light import is_thermal, rgb_from_picture
+from sorvolo.detection.light import Picture, is_thermal, rgb_from_picture
 from sorvolo.detection.models import find_model, thermal_model
 from sorvolo.detection.session import Seen, Session
 from sorvolo.detection.suppression import SeenTile, merge_tiles
 from sorvolo.detection.tiling import Tiles, plan_tiles
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Anything, Floats, ImageRGB
+from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.objects import Detections
 
@@ -52,12 +52,12 @@ class Detector:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """The names of what it tells apart, in the order of its labels."""
+        """The names of what it finds, in the order of its labels."""
         return self._session.info.classes
 
     @property
     def info(self) -> ModelInfo:
-        """What the model file says of itself."""
+        """What the model file states about itself."""
         return self._session.info
 
     @property
@@ -68,41 +68,41 @@ class Detector:
     @property
     def notices(self) -> tuple[Notice, ...]:
         """What to know of the pictures seen so far: whose light the model does not know, who looked at them."""
-        own, told = self.info.name, []
+        own, notices = self.info.name, []
         if (count := self._thermal_frames) and self._at_night is not None:
             night = self._at_night.info.name
             why = "which was trained for them" if self.info.thermal else f"since '{own}' knows only daylight"
             text = f"{count} thermal frames were seen by the model '{night}', {why}"
-            told.append(Notice("thermal_model", count, text))
+            notices.append(Notice("thermal_model", count, text))
         elif count and not self.info.thermal:
             known = "daylight and no installed one on thermal frames" if self._any_may_stand_in else "daylight alone"
             text = (
-                f"{count} frames are thermal, but the model '{own}' was trained on {known}: little of what it says of "
-                "them holds"
+                f"{count} frames are thermal, but the model '{own}' was trained on {known}: what it "
+                "finds in them is unreliable"
             )
-            told.append(Notice("thermal_untrained", count, text))
+            notices.append(Notice("thermal_untrained", count, text))
         if count := self._daylight_frames:
             text = (
-                f"{count} frames are in colour, but the model '{own}' was trained on thermal frames alone: little of "
-                "what it says of them holds; take another model"
+                f"{count} frames are in colour, but the model '{own}' was trained on thermal frames alone: "
+                "what it finds in them is unreliable; take another model"
             )
-            told.append(Notice("daylight_untrained", count, text))
-        return tuple(told)
+            notices.append(Notice("daylight_untrained", count, text))
+        return tuple(notices)
 
     @overload
     def detect(
-        self, image: Anything, *, tiles: Tiles = None, m_per_px: float | None = None,
+        self, image: Picture, *, tiles: Tiles = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None,
     ) -> Detections: ...
 
     @overload
     def detect(
-        self, image: Sequence[Anything], *, tiles: Tiles = None, m_per_px: float | None = None,
+        self, image: Sequence[Picture], *, tiles: Tiles = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None,
     ) -> list[Detections]: ...
 
     def detect(
-        self, image: Anything | Sequence[Anything], *, tiles: Tiles = None, m_per_px: float | None = None,
+        self, image: Picture | Sequence[Picture], *, tiles: Tiles = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None,
     ) -> Detections | list[Detections]:
         """The objects in a picture, best first; for a sequence of pictures, or an array (N, H, W, C), a list of them.
@@ -121,8 +121,8 @@ class Detector:
             return self._seen(image, tiles, sampling, wanted, least_score)
         return [self._seen(each, tiles, sampling, wanted, least_score) for each in image]
 
-    def thresholds_for(self, picture: Anything) -> Mapping[str, float]:
-        """From which score on each class is told in such a picture: those of the model that looks at it."""
+    def thresholds_for(self, picture: Picture) -> Mapping[str, float]:
+        """From which score on each class is reported in such a picture: those of the model that looks at it."""
         if self._is_own(thermal=is_thermal(picture)):
             return self.info.thresholds
         return {**self.info.thresholds, **self._night_session().info.thresholds}
@@ -135,11 +135,11 @@ class Detector:
         if not classes or (unknown := [name for name in classes if name not in self.classes]):
             named = ", ".join(map(repr, unknown)) if classes else "no class"
             there = ", ".join(self.classes)
-            raise SettingsError(f"{named} cannot be asked of the model '{self.info.name}'; it tells apart {there}")
+            raise SettingsError(f"the model '{self.info.name}' does not find {named}; it finds {there}")
         return tuple(name for name in self.classes if name in classes)
 
     def _seen(
-        self, picture: Anything, tiles: Tiles, m_per_px: float, wanted: Sequence[str],
+        self, picture: Picture, tiles: Tiles, m_per_px: float, wanted: Sequence[str],
         least_score: float | None,
     ) -> Detections:
         thermal = is_thermal(picture)
@@ -154,12 +154,12 @@ class Detector:
         looks = [SeenTile(place, _look(session, rgb, place, plan.scale)) for place in plan.places_px]
         seen = looks[0].seen if len(looks) == 1 else merge_tiles(looks, size_px)
         least = _least_scores(session.info, asked, least_score)
-        told = seen.scores >= least[seen.labels]
-        labels = seen.labels[told]
+        kept = seen.scores >= least[seen.labels]
+        labels = seen.labels[kept]
         if session is not self._session:
             own = [self.classes.index(name) if name in self.classes else -1 for name in session.info.classes]
             labels = np.array(own, np.int64)[labels]
-        return Detections(seen.boxes_px[told], seen.scores[told], labels, self.classes)
+        return Detections(seen.boxes_px[kept], seen.scores[kept], labels, self.classes)
 
     def _session_for(self, thermal: bool) -> Session:
         """This model, or for a thermal frame an installed one: the one it names, or any where one may stand in."""
@@ -185,7 +185,7 @@ class Detector:
 
 
 def _least_scores(info: ModelInfo, wanted: Sequence[str], least_score: float | None) -> Floats:
-    """(classes,) the score from which on the model's classes are told; what is not wanted never."""
+    """(classes,) the score from which on each of the model's classes is reported; infinite where it is not wanted."""
     least = [info.thresholds[name] if least_score is None else least_score for name in info.classes]
     return np.where([name in wanted for name in info.classes], least, np.inf)
 

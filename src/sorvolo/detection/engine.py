@@ -1,20 +1,25 @@
 """An ONNX model made ready to run, here and now, by ONNX Runtime or OpenVINO; the only place that knows them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
+import numpy as np
 import onnxruntime
+from numpy.typing import NDArray
 
 from sorvolo.detection.contract import METADATA_KEY, ModelInfo, info_from_metadata
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.geometry.arrays import Anything
+from sorvolo.geometry.arrays import Numbers
 
 Provider = Literal["auto", "cpu", "cuda", "openvino"]
 """Where a model runs; "auto" takes CUDA where there is one, else OpenVINO where it is installed, else the CPU."""
 
-Run = Callable[[Anything], tuple[Anything, ...]]
-"""A picture (1, 3, H, W) uint8 to boxes, scores and labels."""
+Planes: TypeAlias = NDArray[np.uint8]
+"""(1, 3, H, W): a picture as a model takes it."""
+
+Run = Callable[[Planes], tuple[Numbers, ...]]
+"""A picture's planes to boxes, scores and labels."""
 
 INPUT, OUTPUTS = "image", ("boxes", "scores", "labels")
 CUDA = "CUDAExecutionProvider"
@@ -38,10 +43,8 @@ class Engine:
 def open_engine(model: bytes, where: str, provider: Provider, threads: int) -> Engine:
     """The model `where` made ready. Raises InputError where it is damaged or none of ours, SettingsError for a
     provider that is not installed."""
-    if provider in ("auto", "cuda") and CUDA in onnxruntime.get_available_providers():
-        session = _onnx_session(model, where, threads, [CUDA, "CPUExecutionProvider"])
-        if session.get_providers()[0] == CUDA:
-            return _engine(_runner(session), "ONNX Runtime on the GPU (CUDA)", session, where)
+    if provider in ("auto", "cuda") and (on_gpu := _cuda_engine(model, where, threads)):
+        return on_gpu
     if provider == "cuda":
         raise SettingsError(
             "CUDA is not to be had here: install onnxruntime-gpu in place of onnxruntime, with a driver and CUDA of "
@@ -75,6 +78,16 @@ def describe(model: bytes, where: str) -> Engine:
     return _engine(_runner(session), "nowhere yet", session, where)
 
 
+def _cuda_engine(model: bytes, where: str, threads: int) -> Engine | None:
+    """The model on the GPU; None where the runtime finds none."""
+    if CUDA not in onnxruntime.get_available_providers():
+        return None
+    session = _onnx_session(model, where, threads, [CUDA, "CPUExecutionProvider"])
+    if session.get_providers()[0] != CUDA:
+        return None
+    return _engine(_runner(session), "ONNX Runtime on the GPU (CUDA)", session, where)
+
+
 def _engine(run: Run, provider: str, session: Any, where: str) -> Engine:
     metadata = session.get_modelmeta().custom_metadata_map
     info = info_from_metadata(metadata, where)
@@ -101,19 +114,19 @@ def _onnx_session(
         raise InputError(f"{where} cannot be run: {_refusal(str(error))}") from error
 
 
-def _refusal(told: str) -> str:
+def _refusal(message: str) -> str:
     """Why the runtime refuses a model, and what to do."""
     runtime = f"ONNX Runtime {onnxruntime.__version__}"
-    first = " ".join(told.split())[:200]
-    if "IR version" in told or "opset" in told.lower():
+    first = " ".join(message.split())[:200]
+    if "IR version" in message or "opset" in message.lower():
         return f"it is of a newer ONNX than {runtime} reads ({first}); update onnxruntime, or export with opset 17"
-    if "Protobuf" in told or "protobuf" in told:
+    if "Protobuf" in message or "protobuf" in message:
         return f"it is damaged or no ONNX file ({first}); copy or fetch it again"
     return f"{runtime} refuses it ({first}); export it again with opset 17"
 
 
 def _runner(session: Any) -> Run:
-    def run(batch: Anything) -> tuple[Anything, ...]:
+    def run(batch: Planes) -> tuple[Numbers, ...]:
         return tuple(session.run(list(OUTPUTS), {INPUT: batch}))
 
     return run
@@ -130,7 +143,7 @@ def _openvino_runner(model: bytes, threads: int) -> Run:
     compiled = core.compile_model(core.read_model(model=model), "CPU", wishes)
     request = compiled.create_infer_request()
 
-    def run(batch: Anything) -> tuple[Anything, ...]:
+    def run(batch: Planes) -> tuple[Numbers, ...]:
         request.infer({INPUT: batch}, share_inputs=True)
         return tuple(request.get_tensor(name).data.copy() for name in OUTPUTS)
 
@@ -149,13 +162,22 @@ def _input_size(session: Any, where: str, stride: int) -> tuple[int, int] | None
         lacking, given = ", ".join(sorted(missing)), ", ".join(sorted(outputs))
         raise InputError(f"{where} gives no {lacking}, but {given}; needed is {needed}")
     shape = inputs[0].shape
-    if len(shape) != 4 or (isinstance(shape[0], int) and shape[0] != 1) or shape[1] != 3:
+    if not _is_one_picture(shape):
         raise InputError(f"{where} takes {found}; needed is {needed}")
+    return _fixed_size(shape, stride, f"{where} takes {found}")
+
+
+def _is_one_picture(shape: Sequence[int | str]) -> bool:
+    """Whether an input's shape is (1 or free, 3, height, width)."""
+    return len(shape) == 4 and (shape[0] == 1 or not isinstance(shape[0], int)) and shape[1] == 3
+
+
+def _fixed_size(shape: Sequence[Any], stride: int, found: str) -> tuple[int, int] | None:
     fixed = [isinstance(each, int) for each in shape[2:]]
     if not any(fixed):
         return None
     if not all(fixed):
-        raise InputError(f"{where} takes {found}: height and width must be both free or both fixed; export it again")
+        raise InputError(f"{found}: height and width must be both free or both fixed; export it again")
     if shape[2] % stride or shape[3] % stride:
-        raise InputError(f"{where} takes {found}, but its stride is {stride}; export it again")
+        raise InputError(f"{found}, but its stride is {stride}; export it again")
     return int(shape[2]), int(shape[3])

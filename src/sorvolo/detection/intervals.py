@@ -4,13 +4,13 @@ Pictures of one video or flight resemble each other, so that whole groups are dr
 Tibshirani 1993, the percentile interval). Two models are compared on the same draws: what is hard is hard for both.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sorvolo.detection.metrics import IOUS, ClassMatch
-from sorvolo.geometry.arrays import Floats, TimesNs
+from sorvolo.geometry.arrays import Floats, Rows
 
 DRAWS = 1000
 _RECALLS = np.linspace(0.0, 1.0, 101)
@@ -47,7 +47,7 @@ class _ClassTable:
     (N,), and the false positives of every group before each of them (N, groups)."""
 
     label: str
-    true_groups: tuple[TimesNs, ...]
+    true_groups: tuple[Rows, ...]
     false_before: tuple[Floats, ...]
     labels: Floats  # (groups,)
     reported_right: Floats  # (groups,) at the reporting threshold, IoU 0.5
@@ -60,6 +60,11 @@ class GroupTables:
 
     tables: tuple[_ClassTable, ...]
     groups: int
+
+    @property
+    def label_counts(self) -> dict[str, int]:
+        """How many labels each class has."""
+        return {table.label: int(table.labels.sum()) for table in self.tables}
 
     def measure(self, weights: Floats) -> dict[str, Floats]:
         """Each measure (draws,) for weights (draws, groups): how often each group was drawn.
@@ -90,7 +95,7 @@ class GroupTables:
         return dict(zip(("AP", "AP50", "AP75", "thesis_map"), means)) | single
 
 
-def group_tables(matches: Sequence[ClassMatch], groups: TimesNs, thresholds: Mapping[str, float]) -> GroupTables:
+def group_tables(matches: Sequence[ClassMatch], groups: Rows, thresholds: Mapping[str, float]) -> GroupTables:
     """The tables of a set's matches; `groups` (P,) is the index of each picture's group, from 0 without gaps."""
     count = int(groups.max()) + 1 if len(groups) else 0
     tables = []
@@ -137,31 +142,32 @@ def differences(
     group and one seed an arm there is nothing to draw: the bounds are NaN.
     """
     groups = a[0].groups
-    exact = [_mean([each.measure(np.ones((1, groups))) for each in arm]) for arm in (a, b)]
-    names = [name for name in exact[0] if name in exact[1]]
+    exact = [_means(arm) for arm in (a, b)]
+    values = {name: float(exact[1][name][0] - exact[0][name][0]) for name in exact[0] if name in exact[1]}
     if groups < 2 and len(a) < 2 and len(b) < 2:
-        return {
-            name: Difference(float(exact[1][name][0] - exact[0][name][0]), np.nan, np.nan, np.nan) for name in names
-        }
+        return {name: Difference(value, np.nan, np.nan, np.nan) for name, value in values.items()}
     weights = draw_groups(groups, draws, seed)
     rng = np.random.default_rng([seed, 4302])
-    arms = []
-    for arm in (a, b):
-        measured = [each.measure(weights) for each in arm]
-        chosen = rng.integers(len(arm), size=(len(arm), draws))
-        arms.append({
-            name: np.stack([each[name] for each in measured])[chosen, np.arange(draws)].mean(axis=0) for name in names
-        })
-    drawn = {name: arms[1][name] - arms[0][name] for name in names}
-    return {
-        name: Difference(
-            float(exact[1][name][0] - exact[0][name][0]), *_bounds(drawn[name]), _share_above(drawn[name])
-        )
-        for name in names
-    }
+    of_a, of_b = (_drawn_means(arm, weights, values, rng) for arm in (a, b))
+    return {name: _difference(value, of_b[name] - of_a[name]) for name, value in values.items()}
 
 
-def _average_precision(labels: Floats, groups: TimesNs, before: Floats, weights: Floats) -> Floats:
+def _difference(value: float, drawn: Floats) -> Difference:
+    known = drawn[~np.isnan(drawn)]
+    return Difference(value, *_bounds(drawn), float((known > 0).mean()) if len(known) else np.nan)
+
+
+def _drawn_means(
+    arm: Sequence[GroupTables], weights: Floats, names: Iterable[str], rng: np.random.Generator
+) -> dict[str, Floats]:
+    """Each measure (draws,) of an arm: in every draw the mean over as many of its seeds, drawn with replacement."""
+    measured = [each.measure(weights) for each in arm]
+    draws = len(weights)
+    chosen = rng.integers(len(arm), size=(len(arm), draws))
+    return {name: np.stack([each[name] for each in measured])[chosen, np.arange(draws)].mean(axis=0) for name in names}
+
+
+def _average_precision(labels: Floats, groups: Rows, before: Floats, weights: Floats) -> Floats:
     """(draws,) COCO's average of precision at 101 recalls; NaN where the draw has no label."""
     total = weights @ labels
     result = np.where(total > 0, 0.0, np.nan)
@@ -177,11 +183,13 @@ def _average_precision(labels: Floats, groups: TimesNs, before: Floats, weights:
     return result
 
 
-def _counted(groups: TimesNs, count: int) -> Floats:
+def _counted(groups: Rows, count: int) -> Floats:
     return np.bincount(groups, minlength=count).astype(np.float64)
 
 
-def _mean(measured: Sequence[Mapping[str, Floats]]) -> dict[str, Floats]:
+def _means(arm: Sequence[GroupTables]) -> dict[str, Floats]:
+    """Each measure (1,) of an arm on all groups: the mean over its seeds."""
+    measured = [each.measure(np.ones((1, each.groups))) for each in arm]
     return {name: np.mean([each[name] for each in measured], axis=0) for name in measured[0]}
 
 
@@ -191,8 +199,3 @@ def _bounds(values: Floats) -> tuple[float, float]:
         return np.nan, np.nan
     low, high = np.percentile(known, (2.5, 97.5))
     return float(low), float(high)
-
-
-def _share_above(values: Floats) -> float:
-    known = values[~np.isnan(values)]
-    return float((known > 0).mean()) if len(known) else np.nan

@@ -2,15 +2,15 @@
 
 Matching and average precision are pycocotools' own (COCOeval: boxes best first, each takes the label of its class that
 it overlaps most; IoU 0.50 to 0.95 in steps of 0.05) but for one number: up to 300 boxes a class and picture are looked
-at where COCO stops at 100, because a beach from above holds more. What COCO does not tell follows from its matches at
-IoU 0.5.
+at where COCO stops at 100, because a beach from above holds more. What COCO does not measure follows from its matches
+at IoU 0.5.
 """
 
 import io
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, TimesNs
+from sorvolo.geometry.arrays import BoxesPx, Counts, Floats, Mask, Rows
 from sorvolo.geometry.box_overlap import iou_matrix
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections
@@ -47,12 +47,12 @@ class ClassMatch:
 
     label: str
     scores: Floats
-    pictures: TimesNs
+    pictures: Rows
     boxes_px: BoxesPx
-    right: Anything
-    ignored: Anything
-    found: TimesNs
-    true_pictures: TimesNs
+    right: Mask
+    ignored: Mask
+    found: Rows
+    true_pictures: Rows
     true_boxes_px: BoxesPx
     true_scores: Floats
 
@@ -165,7 +165,7 @@ def counts_at(match: ClassMatch, score: float) -> tuple[int, int, int]:
 def thesis_ap(match: ClassMatch, score: float) -> float:
     """The thesis's AP of a class (eq. 4.3): TP / (TP + FP) of what is reported at this score.
 
-    It is precision at one threshold, not the area under a curve, and says nothing of what was missed. 0 where labels
+    It is precision at one threshold, not the area under a curve, and does not count what was missed. 0 where labels
     exist and nothing was reported; NaN without labels.
     """
     right, wrong, _ = counts_at(match, score)
@@ -192,7 +192,7 @@ def precision_recall(match: ClassMatch) -> tuple[Floats, Floats, Floats]:
 def best_threshold(match: ClassMatch) -> Threshold:
     """The score from which on F1 is highest; NaN where nothing is right.
 
-    It is chosen on the very pictures that it is told of, so it flatters a little.
+    It is chosen on the very pictures that it is measured on, so it flatters a little.
     """
     scores, precision, recall = precision_recall(match)
     if not match.right[0].any():
@@ -243,14 +243,14 @@ def recall_by_size(
 
 def confusion(
     matches: Sequence[ClassMatch], thresholds: Mapping[str, float]
-) -> tuple[TimesNs, tuple[Mistake, ...]]:
+) -> tuple[Counts, tuple[Mistake, ...]]:
     """(C + 1, C + 1) true class by reported class, the last row and column being background; and every mistake.
 
     First each class's own matches at IoU 0.5; then what is left, best first, takes what is left of other classes at IoU
     0.5 or more. The rest of the reported are false alarms (last row), the rest of the labels are missed (last column).
     """
     size = len(matches)
-    table: TimesNs = np.zeros((size + 1, size + 1), np.int64)
+    table: Counts = np.zeros((size + 1, size + 1), np.int64)
     wrong: list[tuple[float, int, int]] = []  # score, class, detection
     missed: dict[int, list[tuple[int, int]]] = {}  # picture -> class, label
     for k, match in enumerate(matches):
@@ -263,26 +263,34 @@ def confusion(
         for g in np.flatnonzero(~(match.true_scores >= thresholds[match.label])).tolist():
             missed.setdefault(int(match.true_pictures[g]), []).append((k, g))
     mistakes = []
-    for score, k, d in sorted(wrong, key=lambda row: (-row[0], row[1], row[2])):
-        match, picture = matches[k], int(matches[k].pictures[d])
-        box = match.boxes_px[d]
-        left = [row for row in missed.get(picture, []) if row[0] != k]
-        overlaps = iou_matrix(box[None], np.reshape([matches[c].true_boxes_px[g] for c, g in left], (-1, 4)))[0]
-        if len(left) and overlaps.max() >= IOUS[0]:
-            c, g = left[int(np.argmax(overlaps))]
-            missed[picture].remove((c, g))
-            table[c, k] += 1
-            mistakes.append(Mistake("confusion", picture, _tuple(box), match.label, score, matches[c].label))
-        else:
-            table[size, k] += 1
-            near = max((_best_overlap(box, each, picture) for each in matches), default=0.0)
-            mistakes.append(Mistake("false alarm", picture, _tuple(box), match.label, score, overlap=near))
+    for _, k, d in sorted(wrong, key=lambda row: (-row[0], row[1], row[2])):
+        mistake, taken = _wrong_detection(matches, k, d, missed.get(int(matches[k].pictures[d]), []))
+        if taken is not None:
+            missed[mistake.picture].remove(taken)
+        table[size if taken is None else taken[0], k] += 1
+        mistakes.append(mistake)
     for picture, rows in missed.items():
         for c, g in rows:
             table[c, size] += 1
             box, score = matches[c].true_boxes_px[g], float(np.nan_to_num(matches[c].true_scores[g]))
             mistakes.append(Mistake("miss", picture, _tuple(box), "", score, matches[c].label))
     return table, tuple(mistakes)
+
+
+def _wrong_detection(
+    matches: Sequence[ClassMatch], k: int, d: int, missed: Sequence[tuple[int, int]]
+) -> tuple[Mistake, tuple[int, int] | None]:
+    """What detection d of class k is: a confusion with one of its picture's missed (class, label), which is named, or
+    a false alarm."""
+    match, picture = matches[k], int(matches[k].pictures[d])
+    box, score = match.boxes_px[d], float(match.scores[d])
+    left = [row for row in missed if row[0] != k]
+    overlaps = iou_matrix(box[None], np.reshape([matches[c].true_boxes_px[g] for c, g in left], (-1, 4)))[0]
+    if len(left) and overlaps.max() >= IOUS[0]:
+        c, g = left[int(np.argmax(overlaps))]
+        return Mistake("confusion", picture, _tuple(box), match.label, score, matches[c].label), (c, g)
+    near = max((_best_overlap(box, each, picture) for each in matches), default=0.0)
+    return Mistake("false alarm", picture, _tuple(box), match.label, score, overlap=near), None
 
 
 def _truth(labelled: LabelledSet, judged: Sequence[str]) -> tuple[dict[str, Any], dict[int, tuple[int, BoxesPx]]]:
@@ -333,9 +341,9 @@ def _indexed(dataset: dict[str, Any]) -> COCO:
     return records
 
 
-def _numbers(precision: Anything) -> CocoNumbers:
+def _numbers(precision: Floats) -> CocoNumbers:
     """COCO's averages of (IoU, recall, class, area); -1 stands where there is no label."""
-    def mean(part: Anything) -> float:
+    def mean(part: Floats) -> float:
         known = part[part > -1]
         return float(known.mean()) if known.size else float("nan")
     every = precision[..., 0]
@@ -348,26 +356,39 @@ def _class_match(
 ) -> ClassMatch:
     """The class's pictures of COCO's evaluation (all areas) as columns."""
     seen = [row for row in rows if row is not None]
-    true_ids = [
-        gt for row in seen for gt, ignored in zip(row["gtIds"], np.asarray(row["gtIgnore"])) if not ignored
-    ]
-    row_of = {gt: k for k, gt in enumerate(true_ids)}
-    scores = np.array([score for row in seen for score in row["dtScores"]], np.float64)
-    order = np.argsort(-scores, kind="mergesort")
-    pictures = np.array([row["image_id"] for row in seen for _ in row["dtIds"]], np.int64)
-    ids = [dt for row in seen for dt in row["dtIds"]]
+    true_ids = _counted_labels(seen)
+    scores = np.array(list(chain.from_iterable(row["dtScores"] for row in seen)), np.float64)
+    ids = chain.from_iterable(row["dtIds"] for row in seen)
     boxes = np.array([_edges(judge.cocoDt.anns[dt]["bbox"]) for dt in ids], np.float32).reshape(-1, 4)
-    shape = (len(IOUS), -1)
-    matched = np.concatenate([np.zeros((len(IOUS), 0))] + [row["dtMatches"].reshape(shape) for row in seen], axis=1)
-    ignored = np.concatenate([np.zeros((len(IOUS), 0))] + [row["dtIgnore"].reshape(shape) for row in seen], axis=1) > 0
+    pictures = np.array([row["image_id"] for row in seen for _ in row["dtIds"]], np.int64)
+    matched, ignored = _by_iou(seen, "dtMatches"), _by_iou(seen, "dtIgnore") > 0
     right = (matched > 0) & ~ignored
-    found = np.array([row_of.get(int(gt), -1) for gt in matched[0]], np.int64)
+    found = _rows_of(matched[0], true_ids)
     true_scores = np.full(len(true_ids), np.nan)
     true_scores[found[found >= 0]] = scores[found >= 0]
+    order = np.argsort(-scores, kind="mergesort")
     return ClassMatch(
         name, scores[order], pictures[order], boxes[order], right[:, order], ignored[:, order], found[order],
         np.array([truth_rows[gt][0] for gt in true_ids], np.int64),
         np.array([truth_rows[gt][1] for gt in true_ids], np.float32).reshape(-1, 4), true_scores,
+    )
+
+
+def _counted_labels(rows: Sequence[dict[str, Any]]) -> list[int]:
+    """COCO's ids of the labels that are not to be ignored, one picture after another."""
+    return [gt for row in rows for gt, ignored in zip(row["gtIds"], np.asarray(row["gtIgnore"])) if not ignored]
+
+
+def _rows_of(ids: Floats, wanted: Sequence[int]) -> Rows:
+    """(N,) where each of `ids` (N,) stands among the wanted; -1 for what does not."""
+    row_of = {each: row for row, each in enumerate(wanted)}
+    return np.array([row_of.get(int(each), -1) for each in ids], np.int64)
+
+
+def _by_iou(rows: Sequence[dict[str, Any]], key: str) -> Floats:
+    """(10, D) one of COCO's results for the detections of all pictures, at each of IOUS."""
+    return np.concatenate(
+        [np.zeros((len(IOUS), 0)), *(np.reshape(row[key], (len(IOUS), -1)) for row in rows)], axis=1
     )
 
 

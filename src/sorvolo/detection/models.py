@@ -30,7 +30,7 @@ class InstalledModel:
 
 
 class Integrity(StrEnum):
-    """What a model file's hash says."""
+    """Whether a model file is still the one whose hash its card records."""
 
     GOOD = "good"
     CHANGED = "changed"
@@ -87,7 +87,7 @@ def thermal_model(classes: Sequence[str], name: str = "") -> Path | None:
     """An installed model that was trained on thermal frames and knows one of `classes`, None where there is none.
 
     `name`: no other than this one. The user's own come before the packaged ones, and of these those for thermal frames
-    alone first. Files that cannot be used are passed over: `sorvolo models list` tells of them.
+    alone first. Files that cannot be used are passed over: `sorvolo models list` shows why.
     """
     found: list[tuple[bool, bool, Path]] = []
     for each in installed_models():
@@ -103,7 +103,7 @@ def thermal_model(classes: Sequence[str], name: str = "") -> Path | None:
 
 
 def read_card(model: InstalledModel) -> dict[str, Any]:
-    """What the model's card says; empty where it has none. Raises InputError where it is damaged."""
+    """The model's card; empty where it has none. Raises InputError where it is damaged."""
     path = model.path.with_suffix(".json")
     if not path.is_file():
         return {}
@@ -117,7 +117,7 @@ def read_card(model: InstalledModel) -> dict[str, Any]:
 
 
 def integrity(model: InstalledModel) -> Integrity:
-    """Whether the file is still what its card says. Raises InputError where one of them cannot be read."""
+    """Whether the file is still the one that its card describes. Raises InputError where one of them cannot be read."""
     recorded = str(read_card(model).get(HASH_KEY, "")).lower()
     if not recorded:
         return Integrity.NOT_RECORDED

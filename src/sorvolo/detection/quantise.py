@@ -12,9 +12,10 @@ from typing import Any, Literal
 import numpy as np
 
 from sorvolo.detection.contract import METADATA_KEY
+from sorvolo.detection.engine import INPUT, Planes
 from sorvolo.detection.session import Session
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.geometry.arrays import Anything, ImageRGB
+from sorvolo.geometry.arrays import ImageRGB
 
 LEAST_PICTURES = 8
 """With fewer pictures the ranges of the numbers are a matter of chance."""
@@ -26,6 +27,7 @@ _CARRIERS = frozenset({
 _FLOAT = frozenset({"RoiAlign", "ReduceMean"})
 _HALF = 10  # ONNX's number for float16, in which a model may store weights
 _READERS = frozenset({"Conv", "Gemm"})
+_PARTS = ("backbone", "head", "neck", "proposals")  # of a network
 
 
 @dataclass(frozen=True)
@@ -40,13 +42,13 @@ class Quantised:
 def quantise(
     path: Path, pictures: Iterable[ImageRGB], *, float_parts: Sequence[str] = (), weight_bits: Literal[7, 8] = 8
 ) -> Quantised:
-    """The model file `path` with its convolutions in int8, by the same contract (its metadata says so).
+    """The model file `path` with its convolutions in int8, by the same contract (its metadata names the precision).
 
     `pictures` (H, W, 3) are what it will have to see: all lights and grounds, some dozens. Weights are scaled per
     channel, activations by the least and the greatest value that occurs (static quantisation, Q and DQ nodes:
     Jacob et al. 2018). CPUs without VNNI instructions add two products in 16 bits, which eight-bit weights may
     overflow without a word; those of `weight_bits` 7 never do, and round a little more. In float remain the last
-    convolutions of each branch, which say how likely and where, and all that handles boxes, and the network's parts
+    convolutions of each branch, which give scores and places, and all that handles boxes, and the network's parts
     that `float_parts` names ("neck", "proposals", or a piece of one, "backbone/_blocks.0"): what is narrow gains
     little speed and loses most. Whether it is good enough must be measured: `sorvolo evaluate detector` on both.
     Raises InputError for a file that is no model of ours or is in eight bits already and for too few pictures,
@@ -63,14 +65,10 @@ def quantise(
     if session.info.precision == "int8":
         raise InputError(f"{path} is in eight bits already; give the model that it was made from")
     model = onnx.load_model(path)
-    _prepare(model)
-    parts = {node.name.split("/")[1] for node in model.graph.node if node.name.startswith("/")}
-    if unknown := [each for each in float_parts if not any(_lies_in(node.name, each) for node in model.graph.node)]:
-        there = ", ".join(sorted(parts & {"backbone", "neck", "proposals", "head"}))
-        raise SettingsError(f"{path} has no part {', '.join(unknown)}; it has {there}")
-    chosen = [name for name in _quantisable(model) if not any(_lies_in(name, each) for each in float_parts)]
-    if not chosen:
-        raise InputError(f"{path} has no convolutions that lead to others: eight bits would gain nothing")
+    _fold_half_weights(model.graph)
+    _fold_identities(model.graph)
+    _name_nodes(model.graph)
+    chosen = _chosen(model.graph, path, float_parts)
     samples = _Samples(session, pictures)
     with tempfile.TemporaryDirectory() as folder, _quiet():
         out = Path(folder) / "int8.onnx"
@@ -83,15 +81,34 @@ def quantise(
         quantised = onnx.load_model(out)
     if samples.count < LEAST_PICTURES:
         raise InputError(
-            f"{samples.count} pictures are too few to tell how large a model's numbers become; needed are "
+            f"{samples.count} pictures are too few to measure how large a model's numbers become; needed are "
             f"{LEAST_PICTURES} or more, of all lights and grounds"
         )
     metadata = {each.key: each.value for each in model.metadata_props}
-    told = json.loads(metadata[METADATA_KEY])
-    metadata[METADATA_KEY] = json.dumps(told | {"precision": "int8"})
+    metadata[METADATA_KEY] = json.dumps(json.loads(metadata[METADATA_KEY]) | {"precision": "int8"})
     onnx.helper.set_model_props(quantised, metadata)
     convolutions = {node.name for node in model.graph.node if node.op_type == "Conv"}
     return Quantised(quantised.SerializeToString(), len(convolutions & set(chosen)), len(convolutions))
+
+
+def _chosen(graph: Any, path: Path, float_parts: Sequence[str]) -> list[str]:
+    """The nodes to quantise. Raises SettingsError for a part that the graph lacks, InputError where none is left."""
+    names = [node.name for node in graph.node]
+    if unknown := [part for part in float_parts if not _has_part(names, part)]:
+        there = ", ".join(part for part in _PARTS if _has_part(names, part))
+        raise SettingsError(f"{path} has no part {', '.join(unknown)}; it has {there}")
+    chosen = [name for name in _quantisable(graph) if not _lies_in_any(name, float_parts)]
+    if not chosen:
+        raise InputError(f"{path} has no convolutions that lead to others: eight bits would gain nothing")
+    return chosen
+
+
+def _has_part(nodes: Sequence[str], part: str) -> bool:
+    return any(_lies_in(node, part) for node in nodes)
+
+
+def _lies_in_any(node: str, parts: Sequence[str]) -> bool:
+    return any(_lies_in(node, part) for part in parts)
 
 
 def _lies_in(node: str, part: str) -> bool:
@@ -101,7 +118,7 @@ def _lies_in(node: str, part: str) -> bool:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """The quantiser advises on the terminal to do what `_prepare` did."""
+    """The quantiser advises on the terminal to do what was done already."""
     logging.disable(logging.WARNING)
     try:
         yield
@@ -114,61 +131,80 @@ class _Samples:
 
     def __init__(self, session: Session, pictures: Iterable[ImageRGB]) -> None:
         self.count = 0
-        self._inputs: Iterator[Anything] = (session.input_from(each) for each in pictures)
+        self._inputs: Iterator[Planes] = (session.input_from(each) for each in pictures)
 
-    def get_next(self) -> dict[str, Anything] | None:
+    def get_next(self) -> dict[str, Planes] | None:
         batch = next(self._inputs, None)
         if batch is None:
             return None
         self.count += 1
-        return {"image": np.array(batch)}
+        return {INPUT: np.array(batch)}
 
     def set_range(self, start_index: int, end_index: int) -> None:
         """Not for inputs of different sizes; the quantiser asks only where it may go in strides."""
 
 
-def _prepare(model: Any) -> None:
-    """What the quantiser asks for: weights given directly, not through Identity or Cast, and a name for every node."""
+def _fold_half_weights(graph: Any) -> None:
+    """Weights stored in float16 become float32 where they stand, without a Cast: the quantiser wants them direct."""
     from onnx import numpy_helper
 
-    graph = model.graph
     halves = {each.name: each for each in graph.initializer if each.data_type == _HALF}
     for node in [each for each in graph.node if each.op_type == "Cast" and each.input[0] in halves]:
         values = numpy_helper.to_array(halves[node.input[0]]).astype(np.float32)
         graph.initializer.remove(halves[node.input[0]])
         graph.initializer.append(numpy_helper.from_array(values, node.output[0]))
         graph.node.remove(node)
+
+
+def _fold_identities(graph: Any) -> None:
+    """Weights that come through Identity nodes are read directly, and those nodes go."""
     weights = {each.name for each in graph.initializer}
     given: dict[str, str] = {}
     for node in list(graph.node):
         if node.op_type == "Identity" and given.get(node.input[0], node.input[0]) in weights:
             given[node.output[0]] = given.get(node.input[0], node.input[0])
             graph.node.remove(node)
-    for index, node in enumerate(graph.node):
-        node.name = node.name or f"{node.op_type}_{index}"
+    for node in graph.node:
         for place, name in enumerate(node.input):
             node.input[place] = given.get(name, name)
 
 
-def _quantisable(model: Any) -> list[str]:
+def _name_nodes(graph: Any) -> None:
+    """Give each node without a name one of its own: the quantiser knows nodes by name."""
+    for index, node in enumerate(graph.node):
+        node.name = node.name or f"{node.op_type}_{index}"
+
+
+def _quantisable(graph: Any) -> list[str]:
     """Names of the nodes that carry features from one layer with weights to the next, convolutions included.
 
     The last convolution of a branch (its output reaches no such layer) is not among them, nor is what works on boxes.
     """
-    makers = {name: node for node in model.graph.node for name in node.output}
-    carried: set[str] = set()  # tensors that come from a convolution through carriers alone
-    leads_on: set[str] = set()  # tensors from which another layer with weights is reached so
-    nodes = list(model.graph.node)
-    for node in nodes:
-        if node.op_type == "Conv" or (node.op_type in _CARRIERS and _features_in(node) & carried):
-            carried.update(node.output[:1])
-    for node in reversed(nodes):
-        if node.op_type in _READERS or (node.op_type in _CARRIERS and node.output[0] in leads_on):
-            leads_on.update(name for name in _features_in(node) if name in makers)
+    nodes = list(graph.node)
+    carried, leads_on = _carried(nodes), _leading_on(nodes)
     return [
         node.name for node in nodes
         if node.op_type in _CARRIERS - _FLOAT and node.output[0] in carried and node.output[0] in leads_on
     ]
+
+
+def _carried(nodes: Sequence[Any]) -> set[str]:
+    """The tensors that come from a convolution through carriers alone."""
+    carried: set[str] = set()
+    for node in nodes:
+        if node.op_type == "Conv" or (node.op_type in _CARRIERS and _features_in(node) & carried):
+            carried.update(node.output[:1])
+    return carried
+
+
+def _leading_on(nodes: Sequence[Any]) -> set[str]:
+    """The tensors from which another layer with weights is reached through carriers alone."""
+    made = {name for node in nodes for name in node.output}
+    leads_on: set[str] = set()
+    for node in reversed(nodes):
+        if node.op_type in _READERS or (node.op_type in _CARRIERS and node.output[0] in leads_on):
+            leads_on.update(name for name in _features_in(node) if name in made)
+    return leads_on
 
 
 def _features_in(node: Any) -> set[str]:

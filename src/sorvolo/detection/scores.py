@@ -24,7 +24,7 @@ from sorvolo.detection.metrics import (
     thesis_map,
 )
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, TimesNs
+from sorvolo.geometry.arrays import Counts, Floats, Rows
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import Detections
 
@@ -65,7 +65,7 @@ class SetScores:
     thesis_map: float
     intervals: Mapping[str, Interval]
     classes: tuple[ClassScores, ...]
-    confusion: TimesNs
+    confusion: Counts
     by_size_px: Mapping[str, tuple[SizeRow, ...]]
     by_size_m: Mapping[str, tuple[SizeRow, ...]]
     mistakes: tuple[Mistake, ...]
@@ -151,29 +151,31 @@ def compare_arms(
     shared = [name for name in arms[0].classes if all(name in arm.classes for arm in arms)]
     judged = judged_classes(labelled, shared)
     groups = _groups(labelled)
-    labels: dict[str, int] = {}
-    tables: list[list[GroupTables]] = []
-    for arm in arms:
-        tables.append([])
-        for found, thresholds in zip(arm.found, arm.thresholds):
-            matches, _, _ = match_pictures(labelled, found, judged)
-            tables[-1].append(group_tables(matches, groups, thresholds))
-            labels = {match.label: len(match.true_scores) for match in matches}
+    tables = [_arm_tables(labelled, arm, judged, groups) for arm in arms]
+    first = tables[0][0]
     return SetComparison(
-        labelled.name, len(labelled), tables[0][0].groups, labels,
+        labelled.name, len(labelled), first.groups, first.label_counts,
         tuple(_arm_scores(arm.name, each) for arm, each in zip(arms, tables)),
         tuple(differences(tables[0], each, draws=draws, seed=seed) for each in tables[1:]),
     )
 
 
+def _arm_tables(labelled: LabelledSet, arm: Arm, judged: Sequence[str], groups: Rows) -> list[GroupTables]:
+    """The tables of each of an arm's seeds."""
+    return [
+        group_tables(match_pictures(labelled, found, judged)[0], groups, thresholds)
+        for found, thresholds in zip(arm.found, arm.thresholds)
+    ]
+
+
 def _arm_scores(name: str, tables: Sequence[GroupTables]) -> ArmScores:
     measured = [each.measure(np.ones((1, each.groups))) for each in tables]
     values = {key: np.array([each[key][0] for each in measured]) for key in measured[0]}
-    told = [{key: float(how(value)) for key, value in values.items()} for how in (np.mean, np.min, np.max)]
-    return ArmScores(name, len(tables), *told)
+    summed = [{key: float(how(value)) for key, value in values.items()} for how in (np.mean, np.min, np.max)]
+    return ArmScores(name, len(tables), *summed)
 
 
-def _groups(labelled: LabelledSet) -> TimesNs:
+def _groups(labelled: LabelledSet) -> Rows:
     """(P,) the index of each picture's video or flight."""
     names = [picture.group for picture in labelled.pictures]
     return np.asarray(np.unique(names, return_inverse=True)[1], np.int64)
@@ -190,7 +192,7 @@ def _remarks(scores: Sequence[ClassScores], tables: GroupTables, pictures: int) 
         f"only {each.labels} labels of {each.label}: read its numbers with their intervals"
         for each in scores if 0 < each.labels < 100
     ]
-    remarks += [f"no label of {each.label}: nothing can be said of it" for each in scores if not each.labels]
+    remarks += [f"no label of {each.label}: it is not scored" for each in scores if not each.labels]
     if tables.groups == 1 and pictures > 1:
         remarks.append("all pictures are of one video or flight: no interval can be given")
     elif tables.groups < 10:

@@ -12,9 +12,9 @@ import numpy as np
 
 from sorvolo.detection.confined import confined_engine, described_confined
 from sorvolo.detection.contract import ModelInfo
-from sorvolo.detection.engine import Engine, Provider, describe, open_engine
+from sorvolo.detection.engine import Engine, Planes, Provider, describe, open_engine
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, ImageRGB, Labels
+from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Labels, Numbers
 
 PACKAGED = Path(__file__).parent / "data"
 """The folder of the models that come with the package; all others run in a process of their own."""
@@ -25,7 +25,7 @@ _RUN_CODE = frozenset({".pt", ".pth", ".pkl", ".pickle", ".ckpt", ".bin", ".jobl
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a model tells of one picture, best first: BoxesPx (N, 4), scores (N,), labels (N,)."""
+    """What a model finds in one picture, best first: BoxesPx (N, 4), scores (N,), labels (N,)."""
 
     boxes_px: BoxesPx
     scores: Floats
@@ -33,7 +33,7 @@ class Seen:
 
 
 class Session:
-    """A model that runs; `info` is what it says of itself, `provider` in words where it runs.
+    """A model that runs; `info` is what its file states, `provider` in words where it runs.
 
     `fixed_px` is the (height, width) of its input where the model takes only one size, else None: pictures are then
     letterboxed. Pictures given from several threads are seen one after another.
@@ -54,7 +54,7 @@ class Session:
         engine = _engine(model, path, provider, self._threads)
         self._run, self.provider, self.info, self.fixed_px = engine.run, engine.provider, engine.info, engine.fixed_px
         self._path = path
-        self._buffer: Anything = np.zeros((1, 3, 0, 0), np.uint8)
+        self._buffer: Planes = np.zeros((1, 3, 0, 0), np.uint8)
         self._lock = threading.Lock()
 
     def see(self, picture: ImageRGB, scale: float = 1.0) -> Seen:
@@ -70,7 +70,7 @@ class Session:
         back = np.array([width / shown.shape[1], height / shown.shape[0]] * 2, np.float32)
         return self._checked(boxes, scores, labels, back, width, height)
 
-    def input_from(self, picture: ImageRGB) -> Anything:
+    def input_from(self, picture: ImageRGB) -> Planes:
         """(1, 3, H, W) what the model is given for a picture, (H, W, 3): a size of its own, padded."""
         with self._lock:
             return self._padded(self._shown(picture, 1.0)).copy()
@@ -79,7 +79,7 @@ class Session:
         most = self.fixed_px or (math.inf, math.inf)
         return _resized(picture, min(scale, most[0] / picture.shape[0], most[1] / picture.shape[1]))
 
-    def _padded(self, picture: ImageRGB) -> Anything:
+    def _padded(self, picture: ImageRGB) -> Planes:
         """(1, 3, H, W) with the picture in its top-left corner, and beyond it the grey that training fills with."""
         height, width = picture.shape[:2]
         stride = self.info.stride
@@ -94,7 +94,7 @@ class Session:
         return self._buffer
 
     def _checked(
-        self, boxes: Anything, scores: Anything, labels: Anything, back: Anything, width: int, height: int
+        self, boxes: Numbers, scores: Numbers, labels: Numbers, back: Numbers, width: int, height: int
     ) -> Seen:
         count = len(scores)
         if boxes.shape != (count, 4) or labels.shape != (count,):
@@ -107,16 +107,17 @@ class Session:
                 f"{self._path} answers with label {labels.max()}, but names {len(self.info.classes)} classes: "
                 "export it again"
             )
-        boxes = np.clip(boxes.astype(np.float32) * back, 0, np.array([width, height, width, height], np.float32))
+        edges = np.array([width, height, width, height], np.float32)
+        inside = np.asarray(np.clip(boxes.astype(np.float32) * back, 0, edges), np.float32)
         # what lies in the padding, or is not a number, is no object of the picture
-        real = (boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1]) & np.isfinite(scores)
+        real = (inside[:, 2] > inside[:, 0]) & (inside[:, 3] > inside[:, 1]) & np.isfinite(scores)
         order = np.flatnonzero(real)
         order = order[np.argsort(-scores[order], kind="stable")]
-        return Seen(boxes[order], scores[order].astype(np.float64), labels[order].astype(np.int64))
+        return Seen(inside[order], scores[order].astype(np.float64), labels[order].astype(np.int64))
 
 
 def read_info(path: Path) -> ModelInfo:
-    """What a model file says of itself, without making it ready to run. Raises InputError as Session does."""
+    """What a model file states about itself, without making it ready to run. Raises InputError as Session does."""
     model = read_model(path)
     return (describe if _is_packaged(path) else described_confined)(model, str(path)).info
 

@@ -2,17 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
 from sorvolo.detection.session import Seen
-from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, Mask
+from sorvolo.geometry.arrays import BoxesPx, Floats, Labels, Mask, Numbers, Rows
 from sorvolo.geometry.box_overlap import areas, cover_matrix, iou_matrix
 
 SAME_IOU = 0.4
 """Two tiles' boxes of a class are one object if they overlap this much in what both tiles show."""
 
-_COVERED = 0.7  # so much of a cut piece within a box that another tile saw whole: the piece says nothing new
+_COVERED = 0.7  # so much of a cut piece within a box that another tile saw whole: the piece adds nothing
 _TOUCH_SHARE, _TOUCH_PX = 0.2, 2.0  # a box that ends so near its tile's border may go on beyond; boxes are imprecise
 _MORE = 1.1
 
@@ -31,8 +32,8 @@ class _Views:
 
     boxes_px: BoxesPx
     scores: Floats
-    labels: Anything
-    tiles: Anything
+    labels: Labels
+    tiles: Rows
     cut: Mask  # (N,)
     room_px: Floats  # (N,) to the nearest border within the picture
 
@@ -42,7 +43,7 @@ def merge_tiles(tiles: Sequence[SeenTile], size_px: tuple[int, int]) -> Seen:
 
     Boxes of one class in two tiles are the same object if, seen through the window that both tiles share, they are
     the same box: so a cut piece finds its whole. At most one box of a tile goes into an object. Where a tile saw it
-    whole, the one that saw it most centrally says where it is; where none did (it is longer than the overlap), its
+    whole, the one that saw it most centrally gives its place; where none did (it is longer than the overlap), its
     pieces are joined. The score is the best of all. What is left of cut pieces goes if another tile's box covers it,
     whatever its class: a car's corner that alone looked like something else.
     """
@@ -58,8 +59,8 @@ def merge_tiles(tiles: Sequence[SeenTile], size_px: tuple[int, int]) -> Seen:
             pieces = views.boxes_px[members]
             boxes[row] = [*pieces[:, :2].min(axis=0), *pieces[:, 2:].max(axis=0)]
         scores[row], labels[row], is_piece[row] = views.scores[members].max(), views.labels[members[0]], not len(whole)
-    told = _not_covered(boxes, is_piece, [set(views.tiles[members].tolist()) for members in objects])
-    order = told[np.argsort(-scores[told], kind="stable")]
+    kept = _not_covered(boxes, is_piece, [set(views.tiles[members].tolist()) for members in objects])
+    order = kept[np.argsort(-scores[kept], kind="stable")]
     return Seen(boxes[order], scores[order], labels[order])
 
 
@@ -83,11 +84,10 @@ def _views(tiles: Sequence[SeenTile], size_px: tuple[int, int]) -> _Views:
     )
 
 
-def _gathered(views: _Views, tiles: Sequence[SeenTile]) -> list[Anything]:
+def _gathered(views: _Views, tiles: Sequence[SeenTile]) -> list[Rows]:
     """Indices of the boxes that are one object, most alike first; no two from one tile."""
     pairs = [
-        pair for first in range(len(tiles)) for second in range(first + 1, len(tiles))
-        for pair in _alike(views, tiles, first, second)
+        pair for first, second in combinations(range(len(tiles)), 2) for pair in _alike(views, tiles, first, second)
     ]
     groups = [[each] for each in range(len(views.scores))]
     for _, one, other in sorted(pairs, key=lambda pair: -pair[0]):
@@ -117,7 +117,7 @@ def _alike(
     return [(float(alike[row, column]), int(ones[row]), int(others[column])) for row, column in zip(rows, columns)]
 
 
-def _not_covered(boxes: BoxesPx, is_piece: Mask, tiles: Sequence[set[int]]) -> Anything:
+def _not_covered(boxes: BoxesPx, is_piece: Mask, tiles: Sequence[set[int]]) -> Rows:
     """Indices of the objects, without the pieces that lie in a larger box of other tiles."""
     pieces = np.flatnonzero(is_piece)
     cover = cover_matrix(boxes[pieces], boxes)
@@ -132,7 +132,7 @@ def _not_covered(boxes: BoxesPx, is_piece: Mask, tiles: Sequence[set[int]]) -> A
     return np.setdiff1d(np.arange(len(boxes)), np.array(gone, np.int64))
 
 
-def _within(boxes: BoxesPx, window: Anything) -> BoxesPx:
+def _within(boxes: BoxesPx, window: Numbers) -> BoxesPx:
     return np.concatenate(
         [np.clip(boxes[:, :2], window[:2], window[2:]), np.clip(boxes[:, 2:], window[:2], window[2:])], axis=1
     )

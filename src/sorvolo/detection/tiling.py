@@ -89,26 +89,41 @@ def plan_tiles(
     if tiles is None:
         if fixed_px is not None or height * width <= MOST_AT_ONCE_PX:
             return TilePlan(1.0, ((0, 0, width, height),))
-        m_per_px = math.nan
-    elif tiles != "auto" and (type(tiles) is not int or tiles < _LEAST_SIDE_PX):
+        return _auto_plan(size_px, info, wanted, math.nan, 1.0, fixed_px)
+    if tiles == "auto":
+        scale = _auto_scale(height * width, info, wanted, m_per_px, thermal)
+        return _auto_plan(size_px, info, wanted, m_per_px, scale, fixed_px)
+    if type(tiles) is not int or tiles < _LEAST_SIDE_PX:
         raise SettingsError(f"tiles must be 'auto' or at least {_LEAST_SIDE_PX} px a side, not {tiles!r}")
-    scale = 1.0
-    if isinstance(tiles, int):
-        sides = float(tiles), float(tiles)
-    else:
-        if not math.isnan(m_per_px):
-            scale = scale_for(info, m_per_px, wanted, thermal)
-        elif tiles == "auto" and thermal and height * width * _THERMAL_LARGER**2 <= MOST_WHOLE_PX:
-            scale = _THERMAL_LARGER
-        if fixed_px is None and height * width * scale**2 <= MOST_WHOLE_PX:
-            return TilePlan(scale, ((0, 0, width, height),))
-        sides = (
-            (_SIDE_PX / scale, _SIDE_PX / scale) if fixed_px is None else (fixed_px[0] / scale, fixed_px[1] / scale)
-        )
-    overlap_px = _overlap_px(info, wanted, m_per_px, scale)
-    rows = _spans(height, sides[0], overlap_px, info.stride / scale)
-    columns = _spans(width, sides[1], overlap_px, info.stride / scale)
-    return TilePlan(scale, tuple((left, top, right, bottom) for top, bottom in rows for left, right in columns))
+    return TilePlan(1.0, _places(size_px, (tiles, tiles), _overlap_px(info, wanted, m_per_px, 1.0), info.stride))
+
+
+def _auto_scale(area_px: int, info: ModelInfo, wanted: Sequence[str], m_per_px: float, thermal: bool) -> float:
+    if not math.isnan(m_per_px):
+        return scale_for(info, m_per_px, wanted, thermal)
+    return _THERMAL_LARGER if thermal and area_px * _THERMAL_LARGER**2 <= MOST_WHOLE_PX else 1.0
+
+
+def _auto_plan(
+    size_px: tuple[int, int], info: ModelInfo, wanted: Sequence[str], m_per_px: float, scale: float,
+    fixed_px: tuple[int, int] | None,
+) -> TilePlan:
+    """One tile where the picture at this scale is small enough for that, else tiles of the model's usual size."""
+    height, width = size_px
+    if fixed_px is None and height * width * scale**2 <= MOST_WHOLE_PX:
+        return TilePlan(scale, ((0, 0, width, height),))
+    side_px = fixed_px or (_SIDE_PX, _SIDE_PX)
+    sides = side_px[0] / scale, side_px[1] / scale
+    return TilePlan(scale, _places(size_px, sides, _overlap_px(info, wanted, m_per_px, scale), info.stride / scale))
+
+
+def _places(
+    size_px: tuple[int, int], sides: tuple[float, float], overlap_px: float, step: float
+) -> tuple[tuple[int, int, int, int], ...]:
+    """Left, top, right and bottom of tiles of at most (height, width) `sides`, row by row."""
+    rows = _spans(size_px[0], sides[0], overlap_px, step)
+    columns = _spans(size_px[1], sides[1], overlap_px, step)
+    return tuple((left, top, right, bottom) for top, bottom in rows for left, right in columns)
 
 
 def _overlap_px(info: ModelInfo, wanted: Sequence[str], m_per_px: float, scale: float) -> float:

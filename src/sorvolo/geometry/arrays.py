@@ -54,6 +54,9 @@ Descriptors: TypeAlias = NDArray[np.uint8] | NDArray[np.float32]
 Labels: TypeAlias = NDArray[np.int64]
 """(N,) class numbers."""
 
+Counts: TypeAlias = NDArray[np.int64]
+"""Whole numbers that count something; the docstring gives their shape."""
+
 Anything: TypeAlias = NDArray[Any]
 """An array of any type."""
 
