@@ -31,7 +31,7 @@ def read_dataset(
 ) -> LabelledSet:
     """Labelled pictures from a file or folder, in our classes (docs/datasets.md).
 
-    `form` is one of `READERS`; without it the form is told from the files. `classes` maps the set's names to ours,
+    `form` is one of `READERS`; without it the files show the form. `classes` maps the set's names to ours,
     such as {"Pedestrian": "person"}, letters' case aside; without it common names are known. Boxes of names in
     `ignore` become ignored regions; those of any other name are left out and counted in a notice. `unlabelled` names
     classes of ours that may be in the pictures without a label. `group_pattern` is a regular expression whose one
@@ -91,7 +91,7 @@ def _read(
 
 
 def _parsed(place: Path, form: str | None, findings: Findings) -> ParsedSet:
-    """What the form's reader finds; an error of a form that was asked for says what it looks like instead."""
+    """What the form's reader finds; an error of a form that was asked for adds what it looks like instead."""
     if form is None:
         return _parsed_as_recognised(place, findings)
     try:

@@ -11,7 +11,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.store.datasets.groups import group_of
 from sorvolo.store.datasets.naming import Naming, nothing_maps, of_one_unnamed
-from sorvolo.store.datasets.parsed import SHARES, Findings, ParsedPicture, ParsedSet
+from sorvolo.store.datasets.parsed import SHARES, Findings, ParsedBox, ParsedPicture, ParsedSet
 from sorvolo.store.datasets.picture_files import shown_size_px
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
@@ -27,12 +27,7 @@ def labelled_set(
 ) -> LabelledSet:
     """The set in our classes. Raises InputError when no name maps, or no picture can be opened."""
     counts = Counter(box.name for picture in parsed.pictures for box in picture.boxes if not box.is_ignored)
-    every = dict.fromkeys([*counts, *parsed.declared])
-    if list(every) == ["0"] and not parsed.declared:
-        names = of_one_unnamed(names)
-    classes = names.classes(every)
-    if not classes:
-        raise nothing_maps(str(place), {name: counts[name] for name in every}, names.targets)
+    names, classes = _mapped(parsed, place, names, counts)
     made = (_labelled(picture, place, names, classes, pattern, findings) for picture in parsed.pictures)
     pictures = tuple(picture for picture in made if picture is not None)
     if not pictures:
@@ -42,6 +37,19 @@ def labelled_set(
         )
     notices = (*findings.notices(), *_left_out(counts, names))
     return LabelledSet(place.stem if place.is_file() else place.name, classes, pictures, frozenset(unlabelled), notices)
+
+
+def _mapped(
+    parsed: ParsedSet, place: Path, names: Naming, counts: Counter[str]
+) -> tuple[Naming, tuple[str, ...]]:
+    """The naming that holds for this set, and our classes in it. Raises InputError when no name maps."""
+    every = dict.fromkeys([*counts, *parsed.declared])
+    if list(every) == ["0"] and not parsed.declared:
+        names = of_one_unnamed(names)
+    classes = names.classes(every)
+    if not classes:
+        raise nothing_maps(str(place), {name: counts[name] for name in every}, names.targets)
+    return names, classes
 
 
 def _labelled(
@@ -59,21 +67,29 @@ def _labelled(
     if fitted is None:
         return None
     inside, keep = _clipped(fitted, width_px, height_px, name, findings)
-    boxes, labels = [], []
-    ignored = [(0.0, 0.0, float(width_px), float(height_px))] if parsed.is_ignored else []
-    for box, edge_px, is_kept in zip(parsed.boxes, inside, keep):
-        if not is_kept:
-            continue
-        if box.is_ignored or names.is_ignored(box.name):
-            ignored.append(tuple(edge_px.tolist()))
-        elif names.is_target(box.name):
-            boxes.append(edge_px)
-            labels.append(classes.index(names.target(box.name)))
+    kept = ((box, edge_px) for box, edge_px, is_kept in zip(parsed.boxes, inside, keep) if is_kept)
+    boxes, labels, ignored = _targets_and_ignored(kept, names, classes)
+    if parsed.is_ignored:
+        ignored = [(0.0, 0.0, float(width_px), float(height_px)), *ignored]
     group = group_of(parsed.path, place, pattern) if pattern or not parsed.group else parsed.group
     return LabelledPicture(
         str(parsed.path), width_px, height_px, group, np.array(boxes, np.float32), np.array(labels, np.int64),
         np.array(list(dict.fromkeys(ignored)), np.float32), parsed.m_per_px,
     )
+
+
+def _targets_and_ignored(
+    kept: Iterable[tuple[ParsedBox, Floats]], names: Naming, classes: tuple[str, ...]
+) -> tuple[list[Floats], list[int], list[tuple[float, ...]]]:
+    """Boxes of our classes with their class numbers, and boxes to ignore; boxes of other names are left out."""
+    boxes, labels, ignored = [], [], []
+    for box, edge_px in kept:
+        if box.is_ignored or names.is_ignored(box.name):
+            ignored.append(tuple(edge_px.tolist()))
+        elif names.is_target(box.name):
+            boxes.append(edge_px)
+            labels.append(classes.index(names.target(box.name)))
+    return boxes, labels, ignored
 
 
 def _in_picture_px(

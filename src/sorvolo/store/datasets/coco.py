@@ -2,7 +2,8 @@
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache, partial
 from math import isfinite
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -111,21 +112,27 @@ def _rows(whole: Mapping[str, Any], key: str, path: Path) -> list[dict[str, Any]
 
 def _box(row: Mapping[str, Any], categories: Mapping[Any, str]) -> ParsedBox | None:
     """The annotation's box, else the one around its polygons; None when it has none."""
-    numbers = _finite(row.get("bbox"))
-    if len(numbers) != 4:
-        points = row.get("segmentation")
-        flat = [_finite(ring) for ring in points] if isinstance(points, list) else []
-        xs = [x for ring in flat for x in ring[0::2]]
-        ys = [y for ring in flat for y in ring[1::2]]
-        if len(xs) < 2 or len(xs) != len(ys):
-            return None
-        left, top, right, bottom = min(xs), min(ys), max(xs), max(ys)
-    else:
-        left, top, width, height = numbers
-        right, bottom = left + width, top + height
+    edges = _edges(row)
+    if edges is None:
+        return None
     is_ignored = bool(row.get("iscrowd")) or bool(row.get("ignore"))
     category = row.get("category_id")
-    return ParsedBox(categories.get(category, str(category)), left, top, right, bottom, is_ignored)
+    return ParsedBox(categories.get(category, str(category)), *edges, is_ignored)
+
+
+def _edges(row: Mapping[str, Any]) -> tuple[float, float, float, float] | None:
+    """Left, top, right, bottom; None without a box and without polygons."""
+    numbers = _finite(row.get("bbox"))
+    if len(numbers) == 4:
+        left, top, width, height = numbers
+        return left, top, left + width, top + height
+    points = row.get("segmentation")
+    flat = [_finite(ring) for ring in points] if isinstance(points, list) else []
+    xs = [x for ring in flat for x in ring[0::2]]
+    ys = [y for ring in flat for y in ring[1::2]]
+    if len(xs) < 2 or len(xs) != len(ys):
+        return None
+    return min(xs), min(ys), max(xs), max(ys)
 
 
 def _finite(value: Any) -> list[float]:
@@ -140,23 +147,38 @@ def _pictures(
     path: Path, images: Mapping[Any, Mapping[str, Any]], boxes: Mapping[Any, list[ParsedBox]], findings: Findings
 ) -> Iterator[ParsedPicture]:
     folders = _folders(path)
-    by_name: dict[str, list[Path]] | None = None
+    by_name = cache(partial(_by_name, path.parent))  # for pictures that are not where the file has them
     for image_id, row in images.items():
         name = _inside(path, str(row.get("file_name", "")).replace("\\", "/"))
-        found = next((folder / name for folder in folders if name and os.path.isfile(folder / name)), None)
-        if found is None and name:
-            by_name = _by_name(path.parent) if by_name is None else by_name
-            same = by_name.get(Path(name).name, [])
-            found = same[0] if len(same) == 1 else None
+        found = _found(name, folders, by_name) if name else None
         if found is None:
             findings.add("labels_without_picture", name or f"image {image_id} without file_name")
             continue
-        group = next((str(row[field]) for field in _VIDEO_FIELDS if row.get(field) not in (None, "")), "")
-        size = _finite([row.get("width"), row.get("height")])
         yield ParsedPicture(
-            found, tuple(boxes.get(image_id, ())), (size[0], size[1]) if size and min(size) > 0 else None, group,
+            found, tuple(boxes.get(image_id, ())), _labelled_size(row), _video(row),
             next(iter(_finite([row.get("m_per_px")])), float("nan")),
         )
+
+
+def _found(
+    name: str, folders: Sequence[Path], by_name: Callable[[], Mapping[str, Sequence[Path]]]
+) -> Path | None:
+    """The picture in one of the folders, else the only one of its name."""
+    found = next((folder / name for folder in folders if os.path.isfile(folder / name)), None)
+    if found is None:
+        same = by_name().get(Path(name).name, [])
+        found = same[0] if len(same) == 1 else None
+    return found
+
+
+def _labelled_size(row: Mapping[str, Any]) -> tuple[float, float] | None:
+    size = _finite([row.get("width"), row.get("height")])
+    return (size[0], size[1]) if size and min(size) > 0 else None
+
+
+def _video(row: Mapping[str, Any]) -> str:
+    """The name of the video that the picture is of; empty where the file names none."""
+    return next((str(row[field]) for field in _VIDEO_FIELDS if row.get(field) not in (None, "")), "")
 
 
 def _inside(path: Path, name: str) -> str:
@@ -195,7 +217,7 @@ def _no_picture(path: Path, images: Mapping[Any, Mapping[str, Any]]) -> InputErr
         if videos:
             return InputError(
                 f"{path} labels frames of a video ({videos[0].name}), not pictures; extract its frames first, as "
-                f"{names[0] if names else 'the file_name says'}, into images/ beside the labels"
+                f"{names[0] if names else 'its file_name has it'}, into images/ beside the labels"
             )
     if not names:
         return InputError(f"{path} lists no images")

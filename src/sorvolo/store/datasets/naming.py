@@ -21,7 +21,7 @@ DEFAULT_CLASSES: Mapping[str, str] = {
          "backpack", "handbag", "luggage", "tire", "tyre", "gas bottle"), SMALL,
     ),
 }
-"""Common names and the class they stand for where nobody says otherwise; compared as `plain` writes them."""
+"""Common names and the class they stand for unless the user maps them; compared as `plain` writes them."""
 
 DEFAULT_IGNORED = frozenset({
     "ignored regions", "ignored", "ignore", "dontcare", "dont care", "others", "crowd",
@@ -82,6 +82,6 @@ def nothing_maps(place: str, counts: Mapping[str, int], known: Iterable[str]) ->
     """The error for a set none of whose names becomes a class."""
     found = ", ".join(f"{name} ({count} boxes)" for name, count in counts.items()) or "none"
     return InputError(
-        f"{place}: none of its class names ({found}) is one of those looked for ({', '.join(sorted(known))}); say "
+        f"{place}: none of its class names ({found}) is one of those looked for ({', '.join(sorted(known))}); state "
         f"which stand for which class, such as --classes {next(iter(counts), 'name')}=person"
     )

@@ -28,22 +28,22 @@ def read_okutama(place: Path, findings: Findings) -> ParsedSet:
     form, or no frame is there.
     """
     files = [place] if place.is_file() else [path for path in files_below(place, ".txt") if is_okutama_file(path)]
-    boxes = {}
-    for path in reversed(files):
-        boxes[path.stem] = path
-    labelled = {video: _boxes(path, findings) for video, path in sorted(boxes.items())}
+    files_of = {path.stem: path for path in reversed(files)}
+    labelled = {video: _boxes(path, findings) for video, path in sorted(files_of.items())}
     if not any(labelled.values()):
         raise InputError(f"{place}: no line is an {FORM} label (track, four edges, frame, three flags, \"Person\")")
     frames = frames_by_video(pictures_around(place, FORM), labelled)
     if not any(frames.values()):
         raise no_frames(place, FORM, labelled)
-    result = []
+    result: list[ParsedPicture] = []
     for video, by_frame in labelled.items():
-        size = _labelled_size(boxes[video])
-        lonely = sorted(set(by_frame) - set(frames[video]))
-        findings.add("labels_without_picture", f"{video}, frame {lonely[0] if lonely else 0}", len(lonely))
-        for number, path in sorted(frames[video].items()):
-            result.append(ParsedPicture(path, tuple(by_frame.get(number, ())), size, video))
+        lonely = set(by_frame) - set(frames[video])
+        findings.add("labels_without_picture", f"{video}, frame {min(lonely, default=0)}", len(lonely))
+        size = _labelled_size(files_of[video])
+        result += [
+            ParsedPicture(path, tuple(by_frame.get(number, ())), size, video)
+            for number, path in sorted(frames[video].items())
+        ]
     return ParsedSet(FORM, tuple(result), ("Person",))
 
 

@@ -1,11 +1,12 @@
 """Which label file belongs to which picture, and which picture to which frame of a video."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from sorvolo.errors import InputError
 from sorvolo.store.datasets.groups import group_of
+from sorvolo.store.datasets.parsed import Findings
 from sorvolo.store.datasets.picture_files import PICTURE_ENDINGS, pictures_below
 from sorvolo.survey.splits import frame_number
 
@@ -28,15 +29,23 @@ def pictures_around(place: Path, form: str) -> list[Path]:
     return found
 
 
-def labels_of_pictures(pictures: Iterable[Path], labels: Iterable[Path]) -> dict[Path, Path]:
-    """The label file of each picture that has one: of the same stem and, of several, with most folders in common."""
-    by_stem: dict[str, list[Path]] = {}
-    for path in labels:
-        by_stem.setdefault(path.stem, []).append(path)
-    return {
-        picture: max(by_stem[picture.stem], key=lambda path: _folders_in_common(path, picture))
-        for picture in pictures if picture.stem in by_stem
-    }
+def paired(
+    pictures: Sequence[Path], labels: Collection[Path], place: Path, form: str, findings: Findings
+) -> dict[Path, Path]:
+    """The label file of each picture that has one; files and pictures that are left over are counted.
+
+    A file belongs to the picture of the same stem, of several to that with most folders in common. Raises InputError
+    when no picture has one.
+    """
+    label_of = _labels_of_pictures(pictures, labels)
+    for path in sorted(set(labels) - set(label_of.values())):
+        findings.add("labels_without_picture", path.name)
+    if not label_of:
+        raise InputError(f"{place}: none of its {len(labels)} {form} files has a picture of the same name")
+    for path in pictures:
+        if path not in label_of:
+            findings.add("pictures_without_labels", path.name)
+    return label_of
 
 
 def frames_by_video(pictures: Iterable[Path], videos: Iterable[str]) -> Mapping[str, Mapping[int, Path]]:
@@ -60,6 +69,16 @@ def no_frames(place: Path, form: str, videos: Iterable[str]) -> InputError:
         f"{place}: {form} labels of videos, but none of their frames is there; extract them as pictures into a folder "
         f"of the video's name, numbered as in the labels (such as {first}/000123.jpg)"
     )
+
+
+def _labels_of_pictures(pictures: Iterable[Path], labels: Iterable[Path]) -> dict[Path, Path]:
+    by_stem: dict[str, list[Path]] = {}
+    for path in labels:
+        by_stem.setdefault(path.stem, []).append(path)
+    return {
+        picture: max(by_stem[picture.stem], key=lambda path: _folders_in_common(path, picture))
+        for picture in pictures if picture.stem in by_stem
+    }
 
 
 def _folders_in_common(path: Path, other: Path) -> int:

@@ -1,4 +1,4 @@
-"""What a reader of one form hands over: pictures with boxes as their files say, before names and edges are checked."""
+"""What a reader of one form hands over: pictures with boxes as in their files, before names and edges are checked."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -25,7 +25,7 @@ class ParsedBox(NamedTuple):
 @dataclass(frozen=True)
 class ParsedPicture:
     """One picture's labels. `labelled_size` is the picture's width and height in units of the boxes: None for the
-    picture's own pixels. `group` is empty where the form does not tell videos apart. `is_ignored`: nothing but its
+    picture's own pixels. `group` is empty where the form does not name videos. `is_ignored`: nothing but its
     boxes is known of the picture, so the rest of it is a region to ignore.
     """
 
@@ -63,14 +63,14 @@ FINDINGS: Mapping[str, str] = {
     "labels_without_picture": "label files or records belong to no picture that is there",
     "pictures_without_labels": "pictures have no label file and count as pictures of nothing",
     "unreadable_pictures": "pictures could not be opened and were left out",
-    "other_size": "pictures have another shape than their labels say and were left out",
-    "scaled_labels": "pictures have another size than their labels say; boxes were scaled",
+    "other_size": "pictures have another shape than their labels state and were left out",
+    "scaled_labels": "pictures have another size than their labels state; boxes were scaled",
     "clipped_boxes": "boxes reached beyond the picture and were clipped",
     "outside_boxes": "boxes lay outside their picture and were left out",
     "empty_boxes": "boxes were empty or inverted and were left out",
     "duplicate_pictures": "pictures were listed twice; their boxes were joined",
     "counted_from_zero": "files count pixels from 0, not from 1 as the VOC devkit does, and were read so",
-    "no_boxes_for_frame": "frames show objects at places that nothing tells; they are ignored as a whole",
+    "no_boxes_for_frame": "frames show objects at unknown places; they are ignored as a whole",
 }
 
 

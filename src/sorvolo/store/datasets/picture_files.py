@@ -29,11 +29,13 @@ def files_below(folder: Path, *endings: str) -> list[Path]:
     seen: set[str] = set()
     for parent, folders, files in os.walk(folder, followlinks=True):
         real = os.path.realpath(parent)
-        folders[:] = [] if real in seen else sorted(name for name in folders if not _is_hidden(name))
-        if real not in seen:
-            names = (name for name in files if not _is_hidden(name))
-            found += [Path(parent, name) for name in names if not endings or Path(name).suffix.lower() in endings]
+        if real in seen:
+            folders.clear()
+            continue
         seen.add(real)
+        folders[:] = sorted(name for name in folders if not _is_hidden(name))
+        names = (name for name in files if not _is_hidden(name))
+        found += [Path(parent, name) for name in names if not endings or Path(name).suffix.lower() in endings]
     return sorted(found)
 
 

@@ -12,25 +12,33 @@ from sorvolo.store.datasets.voc import looks_like_voc
 from sorvolo.store.datasets.yolo import looks_like_yolo
 
 _MOST_LOOKED_AT = 200  # files; the first ones may be empty, of pictures of nothing
+_PARTS = frozenset({"images", "train", "val", "valid", "test"})
 
 
 def form_of(place: Path) -> str | None:
     """The form's name among READERS; None for what is of none of them."""
     if place.is_file():
-        ending = place.suffix.lower()
-        known = {".json": "coco", ".yaml": "yolo", ".yml": "yolo", ".xml": "voc"}
-        return known.get(ending) or (_form_of_text(place) if ending == ".txt" else None)
+        return _form_of_file(place)
     if coco_files(place):
         return "coco"
     if any(looks_like_voc(path) for path in files_below(place, ".xml")[:_MOST_LOOKED_AT]):
         return "voc"
-    texts = [path for path in files_below(place, ".txt") if is_label_file(path)]
-    folder = place
-    if not texts and place.name.lower() in ("images", "train", "val", "valid", "test"):  # one part: labels lie beside
-        folder = place.parent
-        texts = [path for path in files_below(folder, ".txt") if is_label_file(path)]
-    found = (_form_of_text(path) for path in texts[:_MOST_LOOKED_AT])
+    found = (_form_of_text(path) for path in _label_texts(place)[:_MOST_LOOKED_AT])
     return next((form for form in found if form), None)
+
+
+def _form_of_file(path: Path) -> str | None:
+    ending = path.suffix.lower()
+    known = {".json": "coco", ".yaml": "yolo", ".yml": "yolo", ".xml": "voc"}
+    return known.get(ending) or (_form_of_text(path) if ending == ".txt" else None)
+
+
+def _label_texts(folder: Path) -> list[Path]:
+    """The folder's text files of labels; of one part of a set without any, those beside the part."""
+    texts = [path for path in files_below(folder, ".txt") if is_label_file(path)]
+    if not texts and folder.name.lower() in _PARTS:
+        texts = [path for path in files_below(folder.parent, ".txt") if is_label_file(path)]
+    return texts
 
 
 def _form_of_text(path: Path) -> str | None:

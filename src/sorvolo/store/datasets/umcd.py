@@ -1,6 +1,7 @@
 """UMCD: a metadata text file for each video, a block for each object: what it is and when it is in view."""
 
 import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
@@ -38,32 +39,23 @@ class _Video:
 def read_umcd(place: Path, findings: Findings) -> ParsedSet:
     """A folder with metadata files (`path1.txt`) and frames in folders of the videos' names (`path1/000123.jpg`).
 
-    The thesis (section 2.2) says what such a file holds of each object: type, shape, dimension in cm, colour, movement;
+    The thesis (section 2.2) lists what a file holds of each object: type, shape, dimension in cm, colour, movement;
     Table 2.4 adds from which second to which it is in view. It gives no places in the picture. So a frame in which
-    no object is in view is a picture of nothing; one with an object whose place nothing tells is ignored as a whole.
-    Lines `Box: FRAME LEFT TOP WIDTH HEIGHT` in an object's block (ours, in pixels) tell its places. Raises InputError
+    no object is in view is a picture of nothing; one with an object of unknown place is ignored as a whole.
+    Lines `Box: FRAME LEFT TOP WIDTH HEIGHT` in an object's block (ours, in pixels) give its places. Raises InputError
     when nothing is of this form, times are given without `Fps:`, or no frame is there or of use.
     """
-    files = [place] if place.is_file() else [path for path in files_below(place, ".txt") if looks_like_umcd(path)]
-    videos = {path: _parsed(path, findings) for path in files}
-    videos = {path: video for path, video in videos.items() if video.objects}
-    if not videos:
-        raise InputError(f"{place}: no text file describes objects as {FORM}'s do (Type:, Shape:, Dimension:, ...)")
+    videos = _videos(place, findings)
     frames = frames_by_video(pictures_around(place, FORM), [path.stem for path in videos])
     if not any(frames.values()):
         raise no_frames(place, FORM, frames)
-    result = []
+    result: list[ParsedPicture] = []
     for path, video in videos.items():
         _demand_times(path, video)
-        for number, picture in sorted(frames[path.stem].items()):
-            boxes = [_box(each, number) for each in video.objects if number in each.boxes]
-            unplaced = any(_is_in_view(each, number, video.fps) for each in video.objects if number not in each.boxes)
-            if unplaced:
-                findings.add("no_boxes_for_frame", picture.name)
-            result.append(ParsedPicture(picture, tuple(boxes), None, path.stem, is_ignored=unplaced))
+        result += _labelled_frames(path.stem, video, frames[path.stem], findings)
     if all(each.is_ignored and not each.boxes for each in result):
         raise InputError(
-            f"{place}: {FORM} metadata says what is in its videos but not where in the frames, so nothing can be "
+            f"{place}: {FORM} metadata names what is in its videos but not where in the frames, so nothing can be "
             "learnt from them; add lines 'Box: FRAME LEFT TOP WIDTH HEIGHT' to the objects, or label the frames anew"
         )
     return ParsedSet(FORM, tuple(result), tuple(dict.fromkeys(e.name for v in videos.values() for e in v.objects)))
@@ -74,6 +66,27 @@ def looks_like_umcd(path: Path) -> bool:
     fields = [_field(line) for line in read_text(path).splitlines()]
     keys = {key for key, value in fields if value} & _KNOWN
     return len(keys) >= 2 and ("type" in keys or any(key == "object" and value for key, value in fields))
+
+
+def _videos(place: Path, findings: Findings) -> dict[Path, _Video]:
+    """The videos of all metadata files that describe objects. Raises InputError when none does."""
+    files = [place] if place.is_file() else [path for path in files_below(place, ".txt") if looks_like_umcd(path)]
+    videos = {path: _parsed(path, findings) for path in files}
+    videos = {path: video for path, video in videos.items() if video.objects}
+    if not videos:
+        raise InputError(f"{place}: no text file describes objects as {FORM}'s do (Type:, Shape:, Dimension:, ...)")
+    return videos
+
+
+def _labelled_frames(
+    name: str, video: _Video, frames: Mapping[int, Path], findings: Findings
+) -> Iterator[ParsedPicture]:
+    for number, picture in sorted(frames.items()):
+        boxes = [_box(each, number) for each in video.objects if number in each.boxes]
+        unplaced = any(_is_in_view(each, number, video.fps) for each in video.objects if number not in each.boxes)
+        if unplaced:
+            findings.add("no_boxes_for_frame", picture.name)
+        yield ParsedPicture(picture, tuple(boxes), None, name, is_ignored=unplaced)
 
 
 def _field(line: str) -> tuple[str, str]:
@@ -96,38 +109,43 @@ def _parsed(path: Path, findings: Findings) -> _Video:
         if key == "object":
             video.objects.append(_Object(value))
         elif key in ("fps", "frequency"):
-            video.fps = numbers[0] if numbers else 0.0
-        elif line.strip() and not (key and _told(video, key, value, numbers)):
+            video.fps = next(iter(numbers), 0.0)
+        elif line.strip() and not (key and _add_field(video, key, value, numbers)):
             findings.add("malformed_labels", f"{path.name}, line {number}")
     video.objects = [each for each in video.objects if each.name]
     return video
 
 
-def _told(video: _Video, key: str, value: str, numbers: list[float]) -> bool:
-    """Add one field to the last object, or to a new one where the last has it already; whether it was understood."""
+def _add_field(video: _Video, key: str, value: str, numbers: list[float]) -> bool:
+    """Add one field to the last object, or to a new one where the last has its type; whether it was understood."""
     if key == "type" and (not video.objects or "type" in video.objects[-1].keys):
         video.objects.append(_Object())
     if not video.objects:
         return key not in _KNOWN and key != "box"  # what comes before the first object is about the video
     last = video.objects[-1]
     last.keys.add(key)
+    return _set_field(last, key, value, numbers)
+
+
+def _set_field(each: _Object, key: str, value: str, numbers: list[float]) -> bool:
+    """Set what a field gives of an object; whether it was understood."""
     if key == "type":
-        last.name = value or last.name
+        each.name = value or each.name
     elif key == "appearance":
         if len(numbers) != 2 or numbers[1] < numbers[0]:
             return False
-        last.from_s, last.until_s = numbers
+        each.from_s, each.until_s = numbers
     elif key == "box":
         if len(numbers) != 5:
             return False
-        last.boxes[int(numbers[0])] = tuple(numbers[1:])
+        each.boxes[int(numbers[0])] = tuple(numbers[1:])
     return True
 
 
 def _demand_times(path: Path, video: _Video) -> None:
     if not video.fps > 0 and any(each.from_s > -inf for each in video.objects):
         raise InputError(
-            f"{path} says at which second objects are in view but not how many frames make a second; add a line such "
+            f"{path} states at which second objects are in view but not how many frames make a second; add a line such "
             "as 'Fps: 25' before the first object"
         )
 

@@ -2,9 +2,10 @@
 
 import re
 from pathlib import Path
+from typing import TypeAlias
 
 from sorvolo.errors import InputError
-from sorvolo.store.datasets.pairing import frames_by_video, labels_of_pictures, no_frames, pictures_around
+from sorvolo.store.datasets.pairing import frames_by_video, no_frames, paired, pictures_around
 from sorvolo.store.datasets.parsed import Findings, ParsedBox, ParsedPicture, ParsedSet
 from sorvolo.store.datasets.picture_files import files_below
 from sorvolo.store.datasets.text_files import is_label_file, read_text
@@ -20,6 +21,8 @@ _IGNORED = {0, len(NAMES) - 1}
 _DET, _VID = 8, 10  # numbers a line
 _LINE = re.compile(r"\s*-?\d+\s*(,\s*-?\d+\s*){7}(,\s*-?\d+\s*,\s*-?\d+\s*)?,?\s*")
 
+_RowsByFile: TypeAlias = dict[Path, list[list[int]]]
+
 
 def read_visdrone(place: Path, findings: Findings) -> ParsedSet:
     """A folder with `annotations/` and `images/` (DET) or `sequences/` (VID), or one text file beside its pictures.
@@ -31,28 +34,10 @@ def read_visdrone(place: Path, findings: Findings) -> ParsedSet:
     files = [place] if place.is_file() else [path for path in files_below(place, ".txt") if is_label_file(path)]
     rows = {path: _rows(path, findings) for path in files}
     rows = {path: found for path, found in rows.items() if found or not read_text(path).strip()}
-    lengths = {len(row) for found in rows.values() for row in found}
-    if len(lengths) != 1:
-        raise InputError(
-            f"{place}: " + ("no line is a VisDrone label (8 or 10 whole numbers with commas)" if not lengths else
-                            "lines of 8 and of 10 numbers; read pictures (DET) and videos (VID) one by one")
-        )
+    length = _numbers_a_line(place, rows)
     pictures = pictures_around(place, FORM)
-    if lengths == {_VID}:
-        return ParsedSet(FORM, _video_frames(place, rows, pictures, findings), NAMES)
-    label_of = labels_of_pictures(pictures, rows)
-    for path in sorted(set(rows) - set(label_of.values())):
-        findings.add("labels_without_picture", path.name)
-    if not label_of:
-        raise InputError(f"{place}: none of its {len(rows)} {FORM} files has a picture of the same name")
-    result = []
-    for path in pictures:
-        if path not in label_of:
-            findings.add("pictures_without_labels", path.name)
-        found = rows[label_of[path]] if path in label_of else []
-        sequence = re.fullmatch(r"(\d{7})_\d+_d_\d+", path.stem)  # the video it was taken from comes first
-        result.append(ParsedPicture(path, tuple(map(_box, found)), None, sequence[1] if sequence else ""))
-    return ParsedSet(FORM, tuple(result), NAMES)
+    read = _video_frames if length == _VID else _separate_pictures
+    return ParsedSet(FORM, read(place, rows, pictures, findings), NAMES)
 
 
 def looks_like_visdrone(line: str) -> bool:
@@ -70,14 +55,36 @@ def _rows(path: Path, findings: Findings) -> list[list[int]]:
     return rows
 
 
+def _numbers_a_line(place: Path, rows: _RowsByFile) -> int:
+    """8 (DET) or 10 (VID). Raises InputError for no line, and for lines of both lengths."""
+    lengths = {len(row) for found in rows.values() for row in found}
+    if not lengths:
+        raise InputError(f"{place}: no line is a VisDrone label (8 or 10 whole numbers with commas)")
+    if len(lengths) > 1:
+        raise InputError(f"{place}: lines of 8 and of 10 numbers; read pictures (DET) and videos (VID) one by one")
+    return lengths.pop()
+
+
 def _box(row: list[int]) -> ParsedBox:
     left, top, width, height, score, category = row[-_DET:-2]
     name = NAMES[category] if 0 <= category < len(NAMES) else str(category)
     return ParsedBox(name, left, top, left + width, top + height, score == 0 or category in _IGNORED)
 
 
+def _separate_pictures(
+    place: Path, rows: _RowsByFile, pictures: list[Path], findings: Findings
+) -> tuple[ParsedPicture, ...]:
+    label_of = paired(pictures, rows, place, FORM, findings)
+    result = []
+    for path in pictures:
+        found = rows[label_of[path]] if path in label_of else []
+        sequence = re.fullmatch(r"(\d{7})_\d+_d_\d+", path.stem)  # the video it was taken from comes first
+        result.append(ParsedPicture(path, tuple(map(_box, found)), None, sequence[1] if sequence else ""))
+    return tuple(result)
+
+
 def _video_frames(
-    place: Path, rows: dict[Path, list[list[int]]], pictures: list[Path], findings: Findings
+    place: Path, rows: _RowsByFile, pictures: list[Path], findings: Findings
 ) -> tuple[ParsedPicture, ...]:
     frames = frames_by_video(pictures, [path.stem for path in rows])
     if not any(frames.values()):

@@ -9,7 +9,7 @@ from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
 from sorvolo.errors import InputError
-from sorvolo.store.datasets.pairing import labels_of_pictures, pictures_around
+from sorvolo.store.datasets.pairing import paired, pictures_around
 from sorvolo.store.datasets.parsed import Findings, ParsedBox, ParsedPicture, ParsedSet
 from sorvolo.store.datasets.picture_files import files_below
 from sorvolo.store.datasets.text_files import read_text
@@ -24,6 +24,29 @@ def read_voc(place: Path, findings: Findings) -> ParsedSet:
     1; a set with a box that starts at 0 counts edges from 0 instead, and is read so throughout. Raises InputError when
     no XML file is of this form.
     """
+    labelled = _annotations(place, findings)
+    pictures = pictures_around(place, FORM)
+    if not place.is_dir():
+        pictures = [path for path in pictures if path.stem == place.stem]
+    label_of = paired(pictures, labelled, place, FORM, findings)
+    from_zero = any(min(box.left, box.top) < 0 for each in labelled.values() for box in each.boxes)
+    if from_zero:
+        findings.add("counted_from_zero", str(place), len(labelled))
+    result = []
+    for path in pictures:
+        found = labelled[label_of[path]] if path in label_of else ParsedPicture(path, ())
+        boxes = _counted_from_zero(found.boxes) if from_zero else found.boxes
+        result.append(replace(found, path=path, boxes=boxes))
+    return ParsedSet(FORM, tuple(result))
+
+
+def looks_like_voc(path: Path) -> bool:
+    """Whether an XML file begins as an annotation."""
+    return "<annotation" in read_text(path)[:2000]
+
+
+def _annotations(place: Path, findings: Findings) -> dict[Path, ParsedPicture]:
+    """Every XML file of this form. Raises InputError when there is none."""
     files = [place] if place.is_file() else files_below(place, ".xml")
     labelled: dict[Path, ParsedPicture] = {}
     for path in files:
@@ -34,34 +57,12 @@ def read_voc(place: Path, findings: Findings) -> ParsedSet:
             labelled[path] = picture
     if not labelled:
         raise InputError(f"{place}: none of its {len(files)} XML files is a {FORM} annotation")
-    if not place.is_dir():
-        pictures = [path for path in pictures_around(place, FORM) if path.stem == place.stem]
-    else:
-        pictures = pictures_around(place, FORM)
-    label_of = labels_of_pictures(pictures, labelled)
-    for path in sorted(set(labelled) - set(label_of.values())):
-        findings.add("labels_without_picture", path.name)
-    if not label_of:
-        raise InputError(f"{place}: none of its {len(labelled)} {FORM} files has a picture of the same name")
-    for path in pictures:
-        if path not in label_of:
-            findings.add("pictures_without_labels", path.name)
-    from_zero = any(min(box.left, box.top) < 0 for each in labelled.values() for box in each.boxes)
-    if from_zero:
-        findings.add("counted_from_zero", str(place), len(labelled))
-    result = []
-    for path in pictures:
-        found = labelled[label_of[path]] if path in label_of else ParsedPicture(path, ())
-        boxes = tuple(
-            box._replace(left=box.left + 1, top=box.top + 1) if from_zero else box for box in found.boxes
-        )
-        result.append(replace(found, path=path, boxes=boxes))
-    return ParsedSet(FORM, tuple(result))
+    return labelled
 
 
-def looks_like_voc(path: Path) -> bool:
-    """Whether an XML file begins as an annotation."""
-    return "<annotation" in read_text(path)[:2000]
+def _counted_from_zero(boxes: tuple[ParsedBox, ...]) -> tuple[ParsedBox, ...]:
+    """Boxes that were read as counted from 1, as they are when edges are counted from 0."""
+    return tuple(box._replace(left=box.left + 1, top=box.top + 1) for box in boxes)
 
 
 def _parsed(path: Path, findings: Findings) -> ParsedPicture | None:
@@ -73,16 +74,22 @@ def _parsed(path: Path, findings: Findings) -> ParsedPicture | None:
         return None
     boxes = []
     for each in root.iterfind("object"):
-        left, top, right, bottom = (
-            _number(each, f"bndbox/{name}") for name in ("xmin", "ymin", "xmax", "ymax")
-        )
-        name = (each.findtext("name") or "").strip()
-        if not name or not all(isfinite(edge) for edge in (left, top, right, bottom)):
+        box = _box(each)
+        if box is None:
             findings.add("malformed_labels", path.name)
-            continue
-        boxes.append(ParsedBox(name, left - 1, top - 1, right, bottom, _number(each, "difficult") == 1))
+        else:
+            boxes.append(box)
     size = _number(root, "size/width"), _number(root, "size/height")
     return ParsedPicture(path, tuple(boxes), size if size[0] > 0 and size[1] > 0 else None)
+
+
+def _box(element: Any) -> ParsedBox | None:
+    """The box of an `object` element; None without a name or with an edge that is no number."""
+    left, top, right, bottom = (_number(element, f"bndbox/{name}") for name in ("xmin", "ymin", "xmax", "ymax"))
+    name = (element.findtext("name") or "").strip()
+    if not name or not all(isfinite(edge) for edge in (left, top, right, bottom)):
+        return None
+    return ParsedBox(name, left - 1, top - 1, right, bottom, _number(element, "difficult") == 1)
 
 
 def _number(element: Any, path: str) -> float:

@@ -1,7 +1,7 @@
 """YOLO: a text file for each picture, a line for each box: class number, then centre and size as shares."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from math import isfinite
 from pathlib import Path
 
@@ -29,26 +29,15 @@ def read_yolo(place: Path, findings: Findings) -> ParsedSet:
     labels = {path: found for path in pictures if (found := _label_file(path)) is not None}
     _demand_both(folder, pictures, labels)
     _count_lonely(folder, pictures, labels, findings)
-    result, far, total = [], 0, 0
+    result = []
     for path in pictures:
         boxes: list[ParsedBox] = []
         if path in labels:
             boxes = list(_boxes(labels[path], names, findings))
-            total += len(boxes)
-            far += sum(max(abs(edge) for edge in box[1:5]) > _FARTHEST_SHARE for box in boxes)
         else:
             findings.add("pictures_without_labels", path.name)
         result.append(ParsedPicture(path, tuple(boxes), SHARES))
-    if far > total / 2:
-        raise InputError(
-            f"{folder}: {far} of {total} boxes have numbers beyond 1, as pixels would; YOLO labels are shares of the "
-            "picture's width and height: centre x, centre y, width, height"
-        )
-    if not total and findings.counts.get("malformed_labels"):
-        raise InputError(
-            f"{folder}: no line of its label files is YOLO (class, centre x, centre y, width, height; first failure in "
-            f"{findings.first['malformed_labels']}); if it is another form, name it"
-        )
+    _demand_shares(folder, [box for each in result for box in each.boxes], findings)
     return ParsedSet(FORM, tuple(result), tuple(names))
 
 
@@ -56,25 +45,6 @@ def looks_like_yolo(line: str) -> bool:
     """Whether a line is a class number and at least four numbers with spaces between, none of them far beyond 1."""
     numbers = _numbers(line)
     return len(numbers) >= 5 and numbers[0] == int(numbers[0]) >= 0 and max(map(abs, numbers[1:5])) <= _FARTHEST_SHARE
-
-
-def _names(place: Path, folder: Path) -> list[str]:
-    if place.is_file() and place.suffix.lower() in (".yaml", ".yml"):
-        return names_in_yaml(read_text(place))
-    above = [folder]
-    while above[-1].name.lower() in _PARTS and above[-1] != above[-1].parent:
-        above.append(above[-1].parent)
-    for each in above:
-        candidates = [each / name for name in _NAME_FILES]
-        candidates += sorted(each.glob("*.names")) + sorted(each.glob("*.yaml")) + [each / "labels" / "classes.txt"]
-        for path in candidates:
-            if path.is_file():
-                text = read_text(path)
-                is_yaml = path.suffix.lower() in (".yaml", ".yml")
-                names = names_in_yaml(text) if is_yaml else [line.strip() for line in text.splitlines() if line.strip()]
-                if names:
-                    return names
-    return []
 
 
 def names_in_yaml(text: str) -> list[str]:
@@ -85,18 +55,50 @@ def names_in_yaml(text: str) -> list[str]:
     if not match:
         return []
     body = re.sub(r"(^|\s)#.*", "", match.group(1)).strip()
-    if body.startswith(("[", "{")):
-        items = [item.strip() for item in body.strip("[]{} \n").replace("\n", " ").split(",")]
-    else:
-        items = [line.strip().removeprefix("- ").strip() for line in body.splitlines()]
     named: dict[int, str] = {}
-    for index, item in enumerate(item for item in items if item):
+    for index, item in enumerate(_yaml_items(body)):
         numbered = re.fullmatch(r"['\"]?(\d{1,6})['\"]?\s*:\s*(.*)", item)
         number, name = (int(numbered[1]), numbered[2]) if numbered else (index, item)
         named[number] = name.strip().strip("'\"")
     if not named or max(named) > 100_000:
         return []
     return [named.get(number, str(number)) for number in range(max(named) + 1)]
+
+
+def _yaml_items(body: str) -> list[str]:
+    """The entries of a list or mapping, in brackets or one a line; empty ones are left out."""
+    if body.startswith(("[", "{")):
+        items = [item.strip() for item in body.strip("[]{} \n").replace("\n", " ").split(",")]
+    else:
+        items = [line.strip().removeprefix("- ").strip() for line in body.splitlines()]
+    return [item for item in items if item]
+
+
+def _names(place: Path, folder: Path) -> list[str]:
+    """The class names: of the data.yaml that was given, else of the first file of names that has any."""
+    if place.is_file() and _is_yaml(place):
+        return names_in_yaml(read_text(place))
+    return next((names for path in _name_files(folder) if (names := _names_in(path))), [])
+
+
+def _name_files(folder: Path) -> Iterator[Path]:
+    """Files that may list class names, in the folder and, where it is one part of a set, above it."""
+    above = [folder]
+    while above[-1].name.lower() in _PARTS and above[-1] != above[-1].parent:
+        above.append(above[-1].parent)
+    for each in above:
+        candidates = [each / name for name in _NAME_FILES]
+        candidates += sorted(each.glob("*.names")) + sorted(each.glob("*.yaml")) + [each / "labels" / "classes.txt"]
+        yield from (path for path in candidates if path.is_file())
+
+
+def _names_in(path: Path) -> list[str]:
+    text = read_text(path)
+    return names_in_yaml(text) if _is_yaml(path) else [line.strip() for line in text.splitlines() if line.strip()]
+
+
+def _is_yaml(path: Path) -> bool:
+    return path.suffix.lower() in (".yaml", ".yml")
 
 
 def _label_file(picture: Path) -> Path | None:
@@ -120,6 +122,20 @@ def _demand_both(folder: Path, pictures: list[Path], labels: dict[Path, Path]) -
         raise InputError(
             f"{folder}: none of its {len(pictures)} pictures has a label file of the same name, beside it or in a "
             f"folder labels/ beside images/ (such as labels/{pictures[0].stem}.txt)"
+        )
+
+
+def _demand_shares(folder: Path, boxes: Sequence[ParsedBox], findings: Findings) -> None:
+    far = sum(max(abs(edge) for edge in box[1:5]) > _FARTHEST_SHARE for box in boxes)
+    if far > len(boxes) / 2:
+        raise InputError(
+            f"{folder}: {far} of {len(boxes)} boxes have numbers beyond 1, as pixels would; YOLO labels are shares of "
+            "the picture's width and height: centre x, centre y, width, height"
+        )
+    if not boxes and findings.counts.get("malformed_labels"):
+        raise InputError(
+            f"{folder}: no line of its label files is YOLO (class, centre x, centre y, width, height; first failure in "
+            f"{findings.first['malformed_labels']}); if it is another form, name it"
         )
 
 
