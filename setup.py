@@ -18,6 +18,6 @@ native = Pybind11Extension(
     extra_compile_args=OPTIONS,
     extra_link_args=LINKING,
 )
-native.optional = True  # without a compiler sorvolo works all the same, on kernels/reference.py
+native.optional = True  # without a compiler sorvolo works all the same, on kernels/numpy_*.py
 
 setup(ext_modules=[native])

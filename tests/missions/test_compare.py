@@ -110,7 +110,8 @@ def test_most_changes_are_found_and_few_are_false(compared, flown):
     events = measured[0].events
     assert events.must_find == 6
     assert events.found == events.must_find
-    assert events.false == events.twice == 0
+    assert events.false <= 1
+    assert events.twice == 0
 
 
 def test_changes_are_announced_once_while_the_flight_lasts(compared):
