@@ -37,12 +37,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mosaic_methods import commit, machine
+from provenance import commit, machine
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.missions.compare.flights import compare_flights
-from sorvolo.missions.evaluate.frame_rows import FrameRow, map_frames, site_points
+from sorvolo.missions.evaluate.frame_rows import map_frames
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.simulation.flight import SimulatedFlight, simulate_flight
@@ -58,6 +58,7 @@ from sorvolo.simulation.settings import (
 )
 from sorvolo.store.exports.flight_files import write_camera, write_photo
 from sorvolo.store.site.archive import Archive
+from sorvolo.survey.frame_rows import FrameRow
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "real_dates.json"
@@ -217,7 +218,7 @@ def true_outline_m(flight: SimulatedFlight, index: int, frame: LocalFrame) -> np
 def moved_frame(points_m: np.ndarray, theirs: LocalFrame, ours: LocalFrame) -> np.ndarray:
     """(N, 2) ground points of one local frame in another."""
     latitude, longitude, _ = theirs.wgs84_from_site(np.column_stack([points_m, np.zeros(len(points_m))]))
-    return site_points(ours, np.column_stack([longitude, latitude]))
+    return ours.ground_from_lonlat(np.column_stack([longitude, latitude]))
 
 
 def map_error(
@@ -259,7 +260,7 @@ def found(
     true_from_map = np.linalg.inv(map_from_true)
     reported = []
     for feature in json.loads(events.read_text())["features"]:
-        ring_m = site_points(frame, np.array(feature["geometry"]["coordinates"][0])[:, :2])
+        ring_m = frame.ground_from_lonlat(np.array(feature["geometry"]["coordinates"][0])[:, :2])
         ring_m = moved_frame(apply_homography(true_from_map, ring_m), frame, LocalFrame(simulation_origin()))
         reported.append((feature["properties"], drawn(pixels(ring_m, size_px), size_px)))
     everywhere = np.any([mask for _, mask in reported], axis=0) if reported else np.zeros(drawn_shape(size_px), bool)
