@@ -37,7 +37,8 @@ class SearchSettings:
     near_px: float = 24.0  # pairs around the first fit that compete for the second
     band_px: float = 5.0  # band of the final fit: 1 m from 100 m, what maps differ by locally
     least_pairs: int = 20
-    least_ratio: float = 2.5  # times the pairs that chance leaves in the band; a wrong place leaves 0.3 to 2.0
+    first_ratio: float = 4.0  # times the pairs that chance leaves in the band; other ground leaves 0.3 to 2.8
+    least_ratio: float = 2.5  # the same once the flight is known to lie on this map
     least_surplus: float = 3.0  # beside a neighbour, whose place is known: standard deviations above chance
     neighbours: int = 3
     most_kept: int = 200  # frames remembered: 0.2 MB each
@@ -202,7 +203,9 @@ class MapSearch:
             near.image_px, near.ground_m, sought.camera, self._prior(sought, pose), start_px=20.0,
             band_px=settings.band_px,
         )
-        return None if fit is None else self._judged(fit, near, settings.least_ratio)
+        is_known = len(self._strong_off_m()) >= settings.least_strong
+        least_ratio = settings.least_ratio if is_known else settings.first_ratio
+        return None if fit is None else self._judged(fit, near, least_ratio)
 
     def _near_neighbours(self, sought: _Sought, features: Features, beside: _Pairs) -> Found | None:
         """The frame placed by what it shares with placed frames and with the map around there."""
