@@ -45,42 +45,50 @@ class ChangeMethod(StrEnum):
     ROBUST = "robust"
     THESIS = "thesis"
 
+LaterFlights = Annotated[
+    list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources of a later flight.")
+]
+ComparedSite = Annotated[Path, typer.Option(help="Folder of the map that an earlier flight made.")]
+MethodOption = Annotated[
+    ChangeMethod, typer.Option(help="robust: copes with light, shadows and wind. thesis: the baseline.")
+]
+ViewsPerSecond = Annotated[float, typer.Option(help="Frames of a video compared per second of flight.")]
+Votes = Annotated[int, typer.Option(help="Announce a change that so many views show ...")]
+Voters = Annotated[int, typer.Option(help="... of the last so many views of that ground.")]
+WritesMasks = Annotated[bool, typer.Option("--masks", help="Also write each frame's change mask and boxes.")]
+StepsFolder = Annotated[
+    Path | None, typer.Option(help="Folder for pictures of method thesis's eight steps (4-8 MB a view).")
+]
+ThesisValues = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="A value of Table 4.2 for method thesis, such as T_gray=light, W_a=8x8, eq3.21=printed or threads=4. "
+        "Can be repeated. See docs/thesis.md."
+    ),
+]
+UpdatesMap = Annotated[
+    bool, typer.Option("--update/--no-update", help="Update the map where the ground changed or is new.")
+]
+NamingModel = Annotated[str, typer.Option(help="Detector that names what changed: a model's name, a file, or none.")]
+
 
 def compare(
-    inputs: Annotated[
-        list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources of a later flight.")
-    ],
-    site: Annotated[Path, typer.Option(help="Folder of the map that an earlier flight made.")],
+    inputs: LaterFlights,
+    site: ComparedSite,
     telemetry: LiveTelemetry = None,
     camera: Camera = "",
     area: Area = None,
-    method: Annotated[
-        ChangeMethod, typer.Option(help="robust: copes with light, shadows and wind. thesis: the baseline.")
-    ] = ChangeMethod.ROBUST,
-    views_per_second: Annotated[
-        float, typer.Option(help="Frames of a video compared per second of flight.")
-    ] = 5.0,
-    votes: Annotated[int, typer.Option(help="Announce a change that so many views show ...")] = 3,
-    voters: Annotated[int, typer.Option(help="... of the last so many views of that ground.")] = 5,
+    method: MethodOption = ChangeMethod.ROBUST,
+    views_per_second: ViewsPerSecond = 5.0,
+    votes: Votes = 3,
+    voters: Voters = 5,
     offset: Offset = None,
     ground_elevation: GroundElevation = None,
-    masks: Annotated[bool, typer.Option("--masks", help="Also write each frame's change mask and boxes.")] = False,
-    steps: Annotated[
-        Path | None, typer.Option(help="Folder for pictures of method thesis's eight steps (4-8 MB a view).")
-    ] = None,
-    thesis: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="A value of Table 4.2 for method thesis, such as T_gray=light, W_a=8x8, eq3.21=printed or threads=4. "
-            "Can be repeated. See docs/thesis.md."
-        ),
-    ] = None,
-    update: Annotated[
-        bool, typer.Option("--update/--no-update", help="Update the map where the ground changed or is new.")
-    ] = True,
-    model: Annotated[
-        str, typer.Option(help="Detector that names what changed: a model's name, a file, or none.")
-    ] = "default",
+    masks: WritesMasks = False,
+    steps: StepsFolder = None,
+    thesis: ThesisValues = None,
+    update: UpdatesMap = True,
+    model: NamingModel = "default",
     give_up: GiveUp = 30.0,
     coordinates: PlaceFormatOption = PlaceFormat.LATLON,
     as_json: AsJson = False,

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,45 +12,56 @@ from rich.console import Console
 from rich.table import Table
 
 from sorvolo import __version__
-from sorvolo.cli.options import names
+from sorvolo.cli.options import GroupPattern, names
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.errors import SettingsError
 
 if TYPE_CHECKING:
-    from sorvolo.detection.intervals import Interval
+    from sorvolo.detection.intervals import Difference, Interval
     from sorvolo.detection.scores import SetComparison, SetScores
+    from sorvolo.missions.evaluate.detector import DetectorEvaluation, EvaluationSettings
+    from sorvolo.survey.labels import LabelledSet
+
+MeasuredModels = Annotated[
+    str, typer.Argument(help="A model's name or file, or detections.json; several seeds separated by commas.")
+]
+LabelledPictures = Annotated[list[Path], typer.Argument(help="Labelled pictures: folders or label files.")]
+ComparedModels = Annotated[
+    list[str] | None, typer.Option(help="Another model to compare on the same pictures. Can be repeated.")
+]
+LabelFormat = Annotated[str | None, typer.Option(help="Label format: coco, yolo, voc ...", show_default="recognised")]
+ClassNames = Annotated[str, typer.Option(help="Class names of the set as ours, such as 'Pedestrian=person,Van=car'.")]
+IgnoredClasses = Annotated[str, typer.Option(help="Class names whose boxes are ignored.")]
+UnlabelledClasses = Annotated[str, typer.Option(help="Our classes that may be there without a label.")]
+VideoPattern = Annotated[str, typer.Option(help="Regular expression: use only pictures of matching videos.")]
+HeldOutShare = Annotated[
+    float, typer.Option(help="Use only the share that `sorvolo train --val SHARE` with the same seed holds out.")
+]
+Tiles = Annotated[
+    str, typer.Option(help="Cut pictures into tiles: none, auto (by ground resolution), or pixels a side.")
+]
+ReportFolder = Annotated[Path | None, typer.Option(help="Folder for detector.html, detector.json, detections.json.")]
+BootstrapDraws = Annotated[int, typer.Option(min=20, help="Bootstrap draws for the confidence intervals.")]
+Seed = Annotated[int, typer.Option(help="Random seed of the bootstrap and of what is held out.")]
+AsJsonReport = Annotated[bool, typer.Option("--json", help="Print detector.json.")]
 
 
 def detector(
-    model: Annotated[
-        str, typer.Argument(help="A model's name or file, or detections.json; several seeds separated by commas.")
-    ],
-    data: Annotated[list[Path], typer.Argument(help="Labelled pictures: folders or label files.")],
-    compare: Annotated[
-        list[str] | None, typer.Option(help="Another model to compare on the same pictures. Can be repeated.")
-    ] = None,
-    form: Annotated[
-        str | None, typer.Option(help="Label format: coco, yolo, voc ...", show_default="recognised")
-    ] = None,
-    classes: Annotated[
-        str, typer.Option(help="Class names of the set as ours, such as 'Pedestrian=person,Van=car'.")
-    ] = "",
-    ignore: Annotated[str, typer.Option(help="Class names whose boxes are ignored.")] = "",
-    unlabelled: Annotated[str, typer.Option(help="Our classes that may be there without a label.")] = "",
-    group_pattern: Annotated[
-        str | None, typer.Option(help="Regular expression; its group is the video's name in a picture's path.")
-    ] = None,
-    videos: Annotated[str, typer.Option(help="Regular expression: use only pictures of matching videos.")] = "",
-    held_out: Annotated[
-        float, typer.Option(help="Use only the share that `sorvolo train --val SHARE` with the same seed holds out.")
-    ] = 0.0,
-    tiles: Annotated[
-        str, typer.Option(help="Cut pictures into tiles: none, auto (by ground resolution), or pixels a side.")
-    ] = "none",
-    out: Annotated[Path | None, typer.Option(help="Folder for detector.html, detector.json, detections.json.")] = None,
-    draws: Annotated[int, typer.Option(min=20, help="Bootstrap draws for the confidence intervals.")] = 1000,
-    seed: Annotated[int, typer.Option(help="Random seed of the bootstrap and of what is held out.")] = 1,
-    as_json: Annotated[bool, typer.Option("--json", help="Print detector.json.")] = False,
+    model: MeasuredModels,
+    data: LabelledPictures,
+    compare: ComparedModels = None,
+    form: LabelFormat = None,
+    classes: ClassNames = "",
+    ignore: IgnoredClasses = "",
+    unlabelled: UnlabelledClasses = "",
+    group_pattern: GroupPattern = None,
+    videos: VideoPattern = "",
+    held_out: HeldOutShare = 0.0,
+    tiles: Tiles = "none",
+    out: ReportFolder = None,
+    draws: BootstrapDraws = 1000,
+    seed: Seed = 1,
+    as_json: AsJsonReport = False,
 ) -> None:
     """Measure detectors on labelled pictures: COCO AP, the thesis's mAP, recall by size, confusions, worst errors.
 
@@ -60,9 +72,7 @@ def detector(
     Example: sorvolo evaluate detector a1.onnx,a2.onnx data --compare b1.onnx,b2.onnx --out side-by-side
     """
     from sorvolo.missions.evaluate.detector import (
-        PAGE,
         EvaluationSettings,
-        evaluate_detector,
         evaluation_numbers,
         known_classes,
         read_sets,
@@ -76,14 +86,8 @@ def detector(
         data, form=form, classes=_pairs(classes) or None, ignore=names(ignore), unlabelled=names(unlabelled),
         group_pattern=group_pattern, videos=videos, held_out=held_out, seed=seed, known=known_classes(arms),
     )
-    with ProgressReport(Console(stderr=True)) as progress:
-        measured = evaluate_detector(
-            arms, labelled, settings,
-            lambda step: progress.show(
-                f"{step.model} on {step.set_name}, picture", step.pictures_done, step.pictures_total
-            ),
-        )
-    notices = (*(note.text for each in labelled for note in each.notices), *measured.notices)
+    measured = _measured(arms, labelled, settings)
+    notices = _notices(labelled, measured)
     description = {
         "sorvolo": __version__, "data": ", ".join(map(str, data)), "arms": "; ".join(", ".join(arm) for arm in arms),
         "videos": videos or "all", "held_out": held_out or "all", "tiles": tiles, "draws": draws, "seed": seed,
@@ -93,7 +97,32 @@ def detector(
         write_evaluation(measured, out, description)
     if as_json:
         typer.echo(json.dumps(plain_json(evaluation_numbers(measured, description)), indent=1))
-        return
+    else:
+        _show_all(measured, notices, out)
+
+
+def _measured(
+    arms: list[list[str]], labelled: "Sequence[LabelledSet]", settings: "EvaluationSettings"
+) -> "DetectorEvaluation":
+    """The evaluation, with progress on stderr."""
+    from sorvolo.missions.evaluate.detector import evaluate_detector
+
+    with ProgressReport(Console(stderr=True)) as progress:
+        return evaluate_detector(
+            arms, labelled, settings,
+            lambda step: progress.show(
+                f"{step.model} on {step.set_name}, picture", step.pictures_done, step.pictures_total
+            ),
+        )
+
+
+def _notices(labelled: "Sequence[LabelledSet]", measured: "DetectorEvaluation") -> tuple[str, ...]:
+    return (*(note.text for each in labelled for note in each.notices), *measured.notices)
+
+
+def _show_all(measured: "DetectorEvaluation", notices: Sequence[str], out: Path | None) -> None:
+    from sorvolo.missions.evaluate.detector import PAGE
+
     console = Console()
     for notice in notices:
         console.print(f"note: {notice}", markup=False)
@@ -155,17 +184,21 @@ def _show_comparison(console: Console, each: "SetComparison") -> None:
         if not math.isfinite(value):
             continue
         cells = [_share(arm.mean[name]) for arm in each.arms]
-        for found in each.differences:
-            told = found[name]
-            bounds = f" ({100 * told.low:+.1f} to {100 * told.high:+.1f})" if math.isfinite(told.low) else ""
-            cells.append(f"{100 * told.value:+.1f}{bounds}")
+        cells += [_difference(found[name]) for found in each.differences]
         table.add_row(name, *cells)
     console.print(table)
 
 
-def _between(told: "Interval") -> str:
-    bounds = f"\n{100 * told.low:.1f}-{100 * told.high:.1f}" if math.isfinite(told.low) else ""
-    return _share(told.value) + bounds
+def _difference(found: "Difference") -> str:
+    """In percentage points, with the bounds where there are any."""
+    low, high = 100 * found.low, 100 * found.high
+    bounds = f" ({low:+.1f} to {high:+.1f})" if math.isfinite(low) else ""
+    return f"{100 * found.value:+.1f}{bounds}"
+
+
+def _between(interval: "Interval") -> str:
+    bounds = f"\n{100 * interval.low:.1f}-{100 * interval.high:.1f}" if math.isfinite(interval.low) else ""
+    return _share(interval.value) + bounds
 
 
 def _share(value: float) -> str:

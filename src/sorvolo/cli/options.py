@@ -12,6 +12,10 @@ Camera = Annotated[
     str, typer.Option(help="Camera: a calibration file, a drone's name such as 'Mavic 2 Pro', or aov=DEGREES.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
+AsJsonSteps = Annotated[bool, typer.Option("--json", help="Print one JSON object per step.")]
+GroupPattern = Annotated[
+    str | None, typer.Option(help="Regular expression; its group is the video's name in a picture's path.")
+]
 Area = Annotated[
     Path | None, typer.Option(help="Outline of the area: GeoJSON, KML, KMZ. Frames outside it are not used.")
 ]
@@ -34,7 +38,6 @@ class PlaceFormat(StrEnum):
     LATLON = "latlon"
     UTM = "utm"
     MGRS = "mgrs"
-
 
 PlaceFormatOption = Annotated[
     PlaceFormat, typer.Option("--coordinates", help="How places are written: latlon, utm or mgrs.")

@@ -33,40 +33,55 @@ class Facing(StrEnum):
     FRONT = "front"
     BOTTOM = "bottom"
 
+FocalLength = Annotated[float, typer.Option(help="Focal length, mm.", show_default="of --camera")]
+PixelSize = Annotated[float, typer.Option(help="Sensor pixel, um.", show_default="of --camera")]
+TaskOption = Annotated[
+    Purpose, typer.Option(help="detection: something is there. recognition: it is a person. identification: who.")
+]
+FacingOption = Annotated[
+    Facing, typer.Option(help="Side of a person that the camera sees: bottom is from straight above.")
+]
+CriticalDimension = Annotated[
+    float, typer.Option(help="Smallest side of another object to be made out, m.", show_default="a person's")
+]
+FlightHeight = Annotated[float, typer.Option(help="Flight height above ground, m.", show_default="as high as allowed")]
+HighestFlight = Annotated[float, typer.Option(help="Highest flight allowed, m: the law's in most countries.")]
+PeopleDetector = Annotated[str, typer.Option(help="Detector that must find people: a name, a file, or none.")]
+GroundSpeed = Annotated[float, typer.Option(help="Ground speed, m/s.")]
+ForwardOverlap = Annotated[float, typer.Option(help="Overlap of consecutive pictures, 0 to 0.95.")]
+SideOverlap = Annotated[float, typer.Option(help="Overlap of neighbouring strips, 0 to 0.95.")]
+StripBearing = Annotated[
+    float, typer.Option(help="Direction of the strips, deg from north.", show_default="along the area")
+]
+PictureSize = Annotated[str, typer.Option(help="Picture size, such as 1920x1080.")]
+AreaToCover = Annotated[Path | None, typer.Option(help="Area to cover: GeoJSON, KML, KMZ, or a list of corners.")]
+WaypointFiles = Annotated[
+    list[Path] | None,
+    typer.Option(help="File to write: .plan (QGroundControl), .kmz (DJI), .geojson or .kml. Can be repeated."),
+]
+DjiDrone = Annotated[
+    str, typer.Option(help="For a .kmz: fly (DJI Fly), m300, m350, m30, m30t, m3e, m3t, m3m, m3d, m3td.")
+]
+
 
 def plan(
     camera: Camera = "",
-    focal_mm: Annotated[float, typer.Option(help="Focal length, mm.", show_default="of --camera")] = math.nan,
-    pixel_um: Annotated[float, typer.Option(help="Sensor pixel, um.", show_default="of --camera")] = math.nan,
-    size: Annotated[str, typer.Option(help="Picture size, such as 1920x1080.")] = "",
-    task: Annotated[
-        Purpose, typer.Option(help="detection: something is there. recognition: it is a person. identification: who.")
-    ] = Purpose.RECOGNITION,
-    facing: Annotated[
-        Facing, typer.Option(help="Side of a person that the camera sees: bottom is from straight above.")
-    ] = Facing.BOTTOM,
-    critical_m: Annotated[
-        float, typer.Option(help="Smallest side of another object to be made out, m.", show_default="a person's")
-    ] = math.nan,
-    height: Annotated[
-        float, typer.Option(help="Flight height above ground, m.", show_default="as high as allowed")
-    ] = math.nan,
-    max_height: Annotated[float, typer.Option(help="Highest flight allowed, m: the law's in most countries.")] = 120.0,
-    model: Annotated[str, typer.Option(help="Detector that must find people: a name, a file, or none.")] = "default",
-    speed: Annotated[float, typer.Option(help="Ground speed, m/s.")] = 5.0,
-    overlap: Annotated[float, typer.Option(help="Overlap of consecutive pictures, 0 to 0.95.")] = 0.75,
-    side_overlap: Annotated[float, typer.Option(help="Overlap of neighbouring strips, 0 to 0.95.")] = 0.65,
-    bearing: Annotated[
-        float, typer.Option(help="Direction of the strips, deg from north.", show_default="along the area")
-    ] = math.nan,
-    area: Annotated[Path | None, typer.Option(help="Area to cover: GeoJSON, KML, KMZ, or a list of corners.")] = None,
-    out: Annotated[
-        list[Path] | None,
-        typer.Option(help="File to write: .plan (QGroundControl), .kmz (DJI), .geojson or .kml. Can be repeated."),
-    ] = None,
-    dji_drone: Annotated[
-        str, typer.Option(help="For a .kmz: fly (DJI Fly), m300, m350, m30, m30t, m3e, m3t, m3m, m3d, m3td.")
-    ] = "fly",
+    focal_mm: FocalLength = math.nan,
+    pixel_um: PixelSize = math.nan,
+    size: PictureSize = "",
+    task: TaskOption = Purpose.RECOGNITION,
+    facing: FacingOption = Facing.BOTTOM,
+    critical_m: CriticalDimension = math.nan,
+    height: FlightHeight = math.nan,
+    max_height: HighestFlight = 120.0,
+    model: PeopleDetector = "default",
+    speed: GroundSpeed = 5.0,
+    overlap: ForwardOverlap = 0.75,
+    side_overlap: SideOverlap = 0.65,
+    bearing: StripBearing = math.nan,
+    area: AreaToCover = None,
+    out: WaypointFiles = None,
+    dji_drone: DjiDrone = "fly",
     as_json: AsJson = False,
 ) -> None:
     """Find the flight height, speed and overlap for a task, and write waypoints over an area.

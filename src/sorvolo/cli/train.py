@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from sorvolo.cli.options import AsJsonSteps, GroupPattern, names
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.errors import SettingsError
 
@@ -43,48 +44,56 @@ class Schedule(StrEnum):
     JOINT = "joint"
     FOUR_STEPS = "four-steps"
 
+LabelledSets = Annotated[list[Path] | None, typer.Argument(help="Labelled sets: folders, or their label files.")]
+RunFolder = Annotated[Path, typer.Option(help="Folder for the model, the report and the checkpoints.")]
+PresetOption = Annotated[
+    Preset, typer.Option(help="fast: laptops. accurate: GPUs. thesis: ResNet-50 with the nine modules.")
+]
+RpnOption = Annotated[
+    Rpn | None, typer.Option(help="Proposal network.", show_default="extended-residual; thesis: extended")
+]
+ScheduleOption = Annotated[Schedule, typer.Option(help="joint: everything at once. four-steps: as the thesis does.")]
+CheckedOn = Annotated[str, typer.Option(help="A labelled set to check on, or the share of videos to hold out.")]
+StartingWeights = Annotated[
+    str, typer.Option(help="Start from ImageNet (auto, or a file), nothing (none), or a model: name or .onnx."),
+]
+StepCount = Annotated[int, typer.Option(help="Number of batches.")]
+BatchSize = Annotated[int, typer.Option(help="Samples per batch.")]
+SampleSide = Annotated[int, typer.Option(help="Side of the samples cut from the pictures, px.")]
+Seed = Annotated[int, typer.Option(help="Random seed.")]
+SyntheticShare = Annotated[float, typer.Option(help="Share of simulated samples, 0 to 1.")]
+Patience = Annotated[int, typer.Option(help="Stop after so many of the 20 checks without a better AP50; 0: never.")]
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue the run in --out.")]
+LabelFormat = Annotated[str | None, typer.Option(help="Label format.", show_default="recognised")]
+ClassNames = Annotated[str, typer.Option(help="Class names of the labels as ours: Pedestrian=person,Van=car.")]
+IgnoredClasses = Annotated[str, typer.Option(help="Class names whose boxes are ignored: Bicycle,DontCare.")]
+UnlabelledClasses = Annotated[str, typer.Option(help="Classes that may be in the pictures without a label: person.")]
+
 
 def train(
     context: typer.Context,
-    data: Annotated[list[Path] | None, typer.Argument(help="Labelled sets: folders, or their label files.")] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the model, the report and the checkpoints.")] = Path("model"),
-    preset: Annotated[
-        Preset, typer.Option(help="fast: laptops. accurate: GPUs. thesis: ResNet-50 with the nine modules.")
-    ] = Preset.FAST,
-    rpn: Annotated[
-        Rpn | None, typer.Option(help="Proposal network.", show_default="extended-residual; thesis: extended")
-    ] = None,
-    schedule: Annotated[
-        Schedule, typer.Option(help="joint: everything at once. four-steps: as the thesis does.")
-    ] = Schedule.JOINT,
-    val: Annotated[
-        str, typer.Option(help="A labelled set to check on, or the share of videos to hold out.")
-    ] = "0.15",
-    weights: Annotated[
-        str, typer.Option(help="Start from ImageNet (auto, or a file), nothing (none), or a model: name or .onnx."),
-    ] = "auto",
-    steps: Annotated[int, typer.Option(help="Number of batches.")] = 8000,
-    batch: Annotated[int, typer.Option(help="Samples per batch.")] = 4,
-    side: Annotated[int, typer.Option(help="Side of the samples cut from the pictures, px.")] = 416,
-    seed: Annotated[int, typer.Option(help="Random seed.")] = 1,
-    synthetic: Annotated[float, typer.Option(help="Share of simulated samples, 0 to 1.")] = 0.0,
-    patience: Annotated[
-        int, typer.Option(help="Stop after so many of the 20 checks without a better AP50; 0: never.")
-    ] = 8,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --out.")] = False,
-    form: Annotated[str | None, typer.Option(help="Label format.", show_default="recognised")] = None,
-    classes: Annotated[
-        str, typer.Option(help="Class names of the labels as ours: Pedestrian=person,Van=car.")
-    ] = "",
-    ignore: Annotated[str, typer.Option(help="Class names whose boxes are ignored: Bicycle,DontCare.")] = "",
-    unlabelled: Annotated[
-        str, typer.Option(help="Classes that may be in the pictures without a label: person.")
-    ] = "",
-    group_pattern: Annotated[
-        str | None, typer.Option(help="Regular expression; its group is the video's name in a picture's path.")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per step.")] = False,
+    data: LabelledSets = None,
+    out: RunFolder = Path("model"),
+    preset: PresetOption = Preset.FAST,
+    rpn: RpnOption = None,
+    schedule: ScheduleOption = Schedule.JOINT,
+    val: CheckedOn = "0.15",
+    weights: StartingWeights = "auto",
+    steps: StepCount = 8000,
+    batch: BatchSize = 4,
+    side: SampleSide = 416,
+    seed: Seed = 1,
+    synthetic: SyntheticShare = 0.0,
+    patience: Patience = 8,
+    device: Device = "auto",
+    resume: Resume = False,
+    form: LabelFormat = None,
+    classes: ClassNames = "",
+    ignore: IgnoredClasses = "",
+    unlabelled: UnlabelledClasses = "",
+    group_pattern: GroupPattern = None,
+    as_json: AsJsonSteps = False,
 ) -> None:
     """Train a detector on labelled pictures (COCO, YOLO, VOC, VisDrone, Okutama-Action, UMCD).
 
@@ -97,7 +106,6 @@ def train(
     Example: sorvolo train my-labels --out my-model --resume
     """
     from sorvolo.missions.train.settings import TrainSettings
-    from sorvolo.store.exports.plain import plain_json
 
     chosen = rpn or (Rpn.EXTENDED if preset == Preset.THESIS else Rpn.RESIDUAL)
     settings = TrainSettings(
@@ -110,16 +118,10 @@ def train(
         raise SettingsError(
             f"training needs packages that are not installed ({error.name}): pip install 'sorvolo[training]'"
         ) from error
-    options = DataOptions(val, form, _mapping(classes), _names(ignore), _names(unlabelled), group_pattern)
+    options = DataOptions(val, form, _mapping(classes), names(ignore), names(unlabelled), group_pattern)
     updates = train_detector(data or [], out, settings, options, device=device, resume=resume)
     with _stopped_between_steps() as stop:
-        if as_json:
-            for update in updates:
-                typer.echo(json.dumps(plain_json(asdict(update))))
-                if stop.is_there:
-                    break
-        else:
-            _show(updates, stop)
+        (_print_json if as_json else _show)(updates, stop)
         if stop.is_there:
             cast(Generator[Any], updates).close()  # leaves a checkpoint, once it has learnt at all
             if (out / CHECKPOINT).is_file():
@@ -127,6 +129,16 @@ def train(
             raise KeyboardInterrupt
     if not as_json:
         typer.echo(f"report: {out / 'training.html'}; sorvolo evaluate detector measures the model on other pictures")
+
+
+def _print_json(updates: "Iterator[TrainingUpdate]", stop: "_StopRequest") -> None:
+    """One JSON object per step."""
+    from sorvolo.store.exports.plain import plain_json
+
+    for update in updates:
+        typer.echo(json.dumps(plain_json(asdict(update))))
+        if stop.is_there:
+            return
 
 
 def _show(updates: "Iterator[TrainingUpdate]", stop: "_StopRequest") -> None:
@@ -197,13 +209,9 @@ def _stopped_between_steps() -> Iterator[_StopRequest]:
         signal.signal(signal.SIGINT, before)
 
 
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(each.strip() for each in text.split(",") if each.strip())
-
-
 def _mapping(text: str) -> dict[str, str] | None:
     """ "Van=car,person" as {"Van": "car", "person": "person"}; None of nothing."""
-    pairs = [each.partition("=") for each in _names(text)]
+    pairs = [each.partition("=") for each in names(text)]
     if not all(name.strip() and (target.strip() or not equals) for name, equals, target in pairs):
         raise SettingsError(f"--classes {text!r}: give names as THEIRS=OURS, separated by commas")
     return {name.strip(): target.strip() or name.strip() for name, _, target in pairs} or None

@@ -3,7 +3,7 @@
 import json
 import signal
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from enum import StrEnum
 from pathlib import Path
@@ -38,49 +38,65 @@ class Save(StrEnum):
     VIDEO = "video"
     PICTURES = "pictures"
 
+WatchSource = Annotated[str, typer.Argument(help="A video, a folder of photos, or a live stream's address.")]
+WatchTelemetry = Annotated[
+    str, typer.Option(help="The flight's log if not beside the video; for a live source, a receiver's address.")
+]
+Model = Annotated[str, typer.Option(help="Detector: a model's name (sorvolo models list), or a file.")]
+SearchedClasses = Annotated[
+    str, typer.Option(help="Classes to search for, such as person,car.", show_default="all but those on request")
+]
+ResultsFolder = Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="SOURCE-watch")]
+SaveOption = Annotated[Save, typer.Option(help="Keep the frames with the objects drawn in.")]
+Labels = Annotated[str, typer.Option(help="Write labels to correct and train with: coco, yolo or coco,yolo.")]
+Cot = Annotated[str, typer.Option(help="Send objects to a TAK server or team: udp://host:port or tcp://host:port.")]
+CotType = Annotated[
+    list[str] | None, typer.Option(help="Cursor on Target type of a class, such as person=a-f-G. Can be repeated.")
+]
+AlertCommand = Annotated[
+    str,
+    typer.Option(help="Program to run for each object; {id} {class} {score} {latitude} {longitude} {time} {crop}."),
+]
+AlertUrl = Annotated[str, typer.Option(help="Post each new object to this web address as JSON.")]
+EveryNth = Annotated[int | None, typer.Option(help="Search every N-th frame only.")]
+SearchRate = Annotated[
+    float | None,
+    typer.Option(help="Frames searched per second of flight.", show_default="10; live: as many as possible"),
+]
+Tiles = Annotated[
+    str, typer.Option(help="Cut large pictures into tiles: auto (by ground resolution), pixels a side, or none.")
+]
+LeastScore = Annotated[
+    float | None, typer.Option(help="Lowest score to report, 0 to 1.", show_default="each class's own")
+]
+WatchOffset = Annotated[
+    float | None, typer.Option(help="Telemetry time minus video time, s.", show_default="as their clocks say")
+]
+HeightModel = Annotated[
+    str, typer.Option(help="GeoTIFF of ground heights in the telemetry's reference.", show_default="level ground")
+]
+
 
 def watch_command(
-    source: Annotated[str, typer.Argument(help="A video, a folder of photos, or a live stream's address.")],
-    telemetry: Annotated[
-        str, typer.Option(help="The flight's log if not beside the video; for a live source, a receiver's address.")
-    ] = "",
+    source: WatchSource,
+    telemetry: WatchTelemetry = "",
     camera: Camera = "",
-    model: Annotated[str, typer.Option(help="Detector: a model's name (sorvolo models list), or a file.")] = "default",
-    classes: Annotated[
-        str, typer.Option(help="Classes to search for, such as person,car.", show_default="all but those on request")
-    ] = "",
-    out: Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="SOURCE-watch")] = None,
-    save: Annotated[Save, typer.Option(help="Keep the frames with the objects drawn in.")] = Save.NONE,
-    labels: Annotated[str, typer.Option(help="Write labels to correct and train with: coco, yolo or coco,yolo.")] = "",
-    cot: Annotated[
-        str, typer.Option(help="Send objects to a TAK server or team: udp://host:port or tcp://host:port.")
-    ] = "",
-    cot_type: Annotated[
-        list[str] | None, typer.Option(help="Cursor on Target type of a class, such as person=a-f-G. Can be repeated.")
-    ] = None,
-    alert_command: Annotated[
-        str,
-        typer.Option(help="Program to run for each object; {id} {class} {score} {latitude} {longitude} {time} {crop}."),
-    ] = "",
-    alert_url: Annotated[str, typer.Option(help="Post each new object to this web address as JSON.")] = "",
-    every: Annotated[int | None, typer.Option(help="Search every N-th frame only.")] = None,
-    fps: Annotated[
-        float | None,
-        typer.Option(help="Frames searched per second of flight.", show_default="10; live: as many as possible"),
-    ] = None,
-    tiles: Annotated[
-        str, typer.Option(help="Cut large pictures into tiles: auto (by ground resolution), pixels a side, or none.")
-    ] = "auto",
-    least_score: Annotated[
-        float | None, typer.Option(help="Lowest score to report, 0 to 1.", show_default="each class's own")
-    ] = None,
-    offset: Annotated[
-        float | None, typer.Option(help="Telemetry time minus video time, s.", show_default="as their clocks say")
-    ] = None,
+    model: Model = "default",
+    classes: SearchedClasses = "",
+    out: ResultsFolder = None,
+    save: SaveOption = Save.NONE,
+    labels: Labels = "",
+    cot: Cot = "",
+    cot_type: CotType = None,
+    alert_command: AlertCommand = "",
+    alert_url: AlertUrl = "",
+    every: EveryNth = None,
+    fps: SearchRate = None,
+    tiles: Tiles = "auto",
+    least_score: LeastScore = None,
+    offset: WatchOffset = None,
     ground_elevation: GroundElevation = None,
-    height_model: Annotated[
-        str, typer.Option(help="GeoTIFF of ground heights in the telemetry's reference.", show_default="level ground")
-    ] = "",
+    height_model: HeightModel = "",
     give_up: GiveUp = 30.0,
     coordinates: PlaceFormatOption = PlaceFormat.LATLON,
     as_json: AsJson = False,
@@ -95,7 +111,6 @@ def watch_command(
     Example: sorvolo watch rtsp://192.168.1.10/live --telemetry udp://:10110 --cot udp://239.2.3.1:6969
     """
     from sorvolo.capture.live.reconnect import LiveSettings
-    from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
     from sorvolo.missions.watch.flights import watch
     from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
     from sorvolo.store.exports.cursor_on_target import COT_TYPES
@@ -107,19 +122,13 @@ def watch_command(
         out, save.value, names(labels), cot, {**COT_TYPES, **_types(cot_type or [])}, alert_command=alert_command,
         alert_url=alert_url,
     )
-    if name := interpreted_placeholder(alert_command):
-        Console(stderr=True).print(f"[yellow]warning[/yellow]  {escape(interpreted_words(name))}", soft_wrap=True)
-    folders: dict[Path, None] = {}
+    _warn_of_interpreted(alert_command)
     stop = _Stop()
     watching = watch(
         source, settings, outputs, telemetry=telemetry or None, camera=camera or None,
         live=LiveSettings(give_up_s=give_up), until=stop.until,
     )
-    # closed after a stop: then what was found is written
-    with stop.on_signals(), closing(watching) as updates, suppress(KeyboardInterrupt):
-        for folder in _show_progress(updates, Console(stderr=True), coordinates, is_quiet=as_json):
-            stop.is_running = True
-            folders[folder] = None
+    folders = _folders_watched(watching, stop, coordinates, is_quiet=as_json)
     results = [_result(folder) for folder in folders]
     if as_json:
         typer.echo(json.dumps({"watches": results}, indent=1))
@@ -128,6 +137,14 @@ def watch_command(
             _show_result(result, Console(), coordinates)
     if not results:
         Console(stderr=True).print("stopped before the first frame was searched")
+
+
+def _warn_of_interpreted(alert_command: str) -> None:
+    """Print a warning where an alert's program would run a placeholder's text as code of its own."""
+    from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
+
+    if name := interpreted_placeholder(alert_command):
+        Console(stderr=True).print(f"[yellow]warning[/yellow]  {escape(interpreted_words(name))}", soft_wrap=True)
 
 
 class _Stop:
@@ -155,6 +172,19 @@ class _Stop:
         if self.until.is_set() or not self.is_running:
             raise KeyboardInterrupt
         self.until.set()
+
+
+def _folders_watched(
+    watching: "Generator[WatchUpdate]", stop: _Stop, form: PlaceFormat, *, is_quiet: bool
+) -> list[Path]:
+    """Watch until the source ends or a person stops it; the folders of the results, each once, in order."""
+    folders: dict[Path, None] = {}
+    # closed after a stop: then what was found is written
+    with stop.on_signals(), closing(watching) as updates, suppress(KeyboardInterrupt):
+        for folder in _show_progress(updates, Console(stderr=True), form, is_quiet=is_quiet):
+            stop.is_running = True
+            folders[folder] = None
+    return list(folders)
 
 
 def _show_progress(

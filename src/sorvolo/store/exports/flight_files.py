@@ -90,6 +90,9 @@ UMCD_COLUMNS = (
 )
 """The sixty columns of the thesis's Table 2.2, spelled as there."""
 
+_UMCD_IDLE_INSTRUMENTS = ("0.0", "0.0", "-9.81", *["0.0"] * 3, *["0"] * 4)  # acceleration, rotation, magnetometer
+_UMCD_IDLE_ERRORS = (*["0.0"] * 4, "9.81", "0.0")  # errors, size of the acceleration and of the rotation
+_UMCD_MOTORS = (*["5200"] * 4, *["38"] * 4)  # speed and load of the four motors
 _KNOTS_PER_M_S = 3600 / 1852
 _GPX = "http://www.topografix.com/GPX/1/1"
 _DJI = "http://www.dji.com/drone-dji/1.0/"
@@ -251,67 +254,45 @@ def _umcd(telemetry: Telemetry) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(UMCD_COLUMNS)
     times_s = _since_first_s(telemetry)
-    course = np.radians(telemetry["course_deg"])
     speed = telemetry["speed_m_s"]
     travelled_m = (
         np.concatenate([[0.0], np.cumsum(speed[1:] * np.diff(times_s))]) if len(times_s) else times_s
     )
     for i, time_s in enumerate(times_s):
-        yaw, pitch, roll = (telemetry[f"body_{axis}_deg"][i] for axis in ("yaw", "pitch", "roll"))
-        height_m, relative_m = telemetry["orthometric_height_m"][i], telemetry["height_above_takeoff_m"][i]
-        gimbal = [f"{telemetry[f'camera_{axis}_deg'][i]:.4f}" for axis in ("roll", "pitch", "yaw")]
-        writer.writerow(
-            [
-                round(time_s * 600),
-                f"{time_s:.3f}",
-                round(time_s * 1000),
-                f"{telemetry['longitude_deg'][i]:.10f}",
-                f"{telemetry['latitude_deg'][i]:.10f}",
-                14,
-                f"{height_m:.3f}",
-                f"{height_m:.3f}",
-                "0.0",
-                f"{relative_m:.3f}",
-                "0.0",
-                "0.0",
-                "-9.81",
-                "0.0",
-                "0.0",
-                "0.0",
-                "0",
-                "0",
-                "0",
-                "0",
-                f"{speed[i] * np.cos(course[i]):.3f}",
-                f"{speed[i] * np.sin(course[i]):.3f}",
-                "0.0",
-                f"{speed[i]:.3f}",
-                *(f"{q:.6f}" for q in _quaternion(yaw, pitch, roll)),
-                f"{roll:.3f}",
-                f"{pitch:.3f}",
-                f"{yaw:.3f}",
-                "0.0",
-                "0.0",
-                "0.0",
-                "0.0",
-                "9.81",
-                "0.0",
-                f"{travelled_m[i]:.2f}",
-                f"{travelled_m[i]:.2f}",
-                f"{telemetry['course_deg'][i]:.2f}",
-                "42.0",
-                "31.0",
-                "4480",
-                f"{4480 - time_s:.0f}",
-                "12",
-                f"{max(5.0, 98 - time_s / 12):.0f}",
-                *gimbal,
-                *gimbal,
-                *["5200"] * 4,
-                *["38"] * 4,
-            ]
-        )
+        row = {name: float(column[i]) for name, column in telemetry.columns.items()}
+        writer.writerow([
+            *_umcd_place(time_s, row), *_UMCD_IDLE_INSTRUMENTS, *_umcd_velocity(row), *_umcd_attitude(row),
+            *_UMCD_IDLE_ERRORS, *[f"{travelled_m[i]:.2f}"] * 2, f"{row['course_deg']:.2f}", *_umcd_battery(time_s),
+            *[f"{row[f'camera_{axis}_deg']:.4f}" for axis in ("roll", "pitch", "yaw")] * 2, *_UMCD_MOTORS,
+        ])
     return text.getvalue()
+
+
+def _umcd_place(time_s: float, row: Mapping[str, float]) -> list[Any]:
+    """Columns `Tick#` to `relativeHeight`: time since the first row, place, satellites, heights."""
+    height = f"{row['orthometric_height_m']:.3f}"
+    return [
+        round(time_s * 600), f"{time_s:.3f}", round(time_s * 1000), f"{row['longitude_deg']:.10f}",
+        f"{row['latitude_deg']:.10f}", 14, height, height, "0.0", f"{row['height_above_takeoff_m']:.3f}",
+    ]
+
+
+def _umcd_velocity(row: Mapping[str, float]) -> list[str]:
+    """Columns `velN(M/S)` to `vel(M/S)`."""
+    course_rad, speed_m_s = np.radians(row["course_deg"]), row["speed_m_s"]
+    north_m_s, east_m_s = speed_m_s * np.cos(course_rad), speed_m_s * np.sin(course_rad)
+    return [f"{north_m_s:.3f}", f"{east_m_s:.3f}", "0.0", f"{speed_m_s:.3f}"]
+
+
+def _umcd_attitude(row: Mapping[str, float]) -> list[str]:
+    """Columns `quatW` to `Yaw`."""
+    yaw, pitch, roll = (row[f"body_{axis}_deg"] for axis in ("yaw", "pitch", "roll"))
+    return [*(f"{q:.6f}" for q in _quaternion(yaw, pitch, roll)), *(f"{angle:.3f}" for angle in (roll, pitch, yaw))]
+
+
+def _umcd_battery(time_s: float) -> list[str]:
+    """Columns `IMUTemp(C)` to `batteryLifePercentage`: the charge falls with the flight's time."""
+    return ["42.0", "31.0", "4480", f"{4480 - time_s:.0f}", "12", f"{max(5.0, 98 - time_s / 12):.0f}"]
 
 
 def _quaternion(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float, float]:
