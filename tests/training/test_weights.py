@@ -101,7 +101,7 @@ def test_pickles_that_would_run_code_are_refused(tmp_path: Path, monkeypatch: py
     assert not (tmp_path / "never").exists()
 
 
-def test_wrong_layers_are_told(tmp_path: Path, lite0: dict[str, "torch.Tensor"]) -> None:
+def test_wrong_layers_are_named(tmp_path: Path, lite0: dict[str, "torch.Tensor"]) -> None:
     path = tmp_path / "net.pth"
     for change, words in (
         ({"_conv_stem.weight": torch.zeros(32, 1, 3, 3)}, r"_conv_stem\.weight has shape \(32, 1, 3, 3\)"),
@@ -115,6 +115,9 @@ def test_wrong_layers_are_told(tmp_path: Path, lite0: dict[str, "torch.Tensor"])
         read_weights(path)
     torch.save({"backbone.body": torch.zeros(3)}, path)
     with pytest.raises(InputError, match=r"of another network: its layers are backbone\.body"):
+        read_weights(path)
+    torch.save({"layer1.0.conv1.weight": torch.zeros(64, 64, 1, 1)}, path)
+    with pytest.raises(InputError, match=r"conv1\.weight is missing; it is no whole resnet50"):
         read_weights(path)
     torch.save([torch.zeros(3)], path)
     with pytest.raises(InputError, match="no state dict"):

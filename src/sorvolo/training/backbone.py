@@ -76,6 +76,17 @@ class _Block(nn.Module):
         return x + features if self._is_residual else x
 
 
+def _blocks(deep: bool) -> list[_Block]:
+    """The blocks up to stride 16, or to 32 if `deep`, behind a stem of 32 channels."""
+    blocks: list[_Block] = []
+    channels = 32
+    for repeats, kernel, stride, growth, out in _BLOCKS if deep else _BLOCKS[:5]:
+        for repeat in range(repeats):
+            blocks.append(_Block(channels, out, kernel, stride if repeat == 0 else 1, growth))
+            channels = out
+    return blocks
+
+
 class EfficientNetLite0(nn.Module):
     """Features of strides 4, 8 and 16 (24, 40 and 112 channels), of 32 too (320) if `deep`.
 
@@ -87,12 +98,7 @@ class EfficientNetLite0(nn.Module):
     def __init__(self, *, deep: bool = False, thaw_all: bool = False) -> None:
         super().__init__()
         self._conv_stem = SamePadded(3, 32, 3, 2)
-        blocks: list[_Block] = []
-        channels = 32
-        for repeats, kernel, stride, growth, out in _BLOCKS if deep else _BLOCKS[:5]:
-            for repeat in range(repeats):
-                blocks.append(_Block(channels, out, kernel, stride if repeat == 0 else 1, growth))
-                channels = out
+        blocks = _blocks(deep)
         self._blocks = nn.ModuleList(blocks)
         self._taps = (2, 4, 10, 15) if deep else (2, 4, 10)
         self.channels = (24, 40, 112, 320) if deep else (24, 40, 112)
@@ -103,8 +109,7 @@ class EfficientNetLite0(nn.Module):
                 nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
         if not thaw_all:
             for module in (self._conv_stem, blocks[0], *(each._depthwise_conv for each in blocks[1:_STRIDE_8])):
-                for weight in module.parameters():
-                    weight.requires_grad = False
+                module.requires_grad_(False)
 
     def forward(self, images: Tensor) -> list[Tensor]:
         """One tensor (N, channels, H / stride, W / stride) per stride."""

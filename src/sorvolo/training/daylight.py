@@ -72,7 +72,7 @@ class DaylightSettings:
 
 
 class Daylight(nn.Module):
-    """Two networks in one graph: NanoDet finds people, Faster R-CNN all classes, and NanoDet has a say in its scores.
+    """Two networks in one graph: NanoDet finds people, Faster R-CNN all classes, and its scores count NanoDet's.
 
     A candidate of the aerial network for a person is supported by NanoDet's own score for people there; one of a
     judged class is scored again by the judge, and the mean of both opinions counts.
@@ -110,11 +110,11 @@ class Daylight(nn.Module):
     def _scored(
         self, levels: Sequence[Tensor], outputs: Sequence[Tensor], boxes: Tensor, scores: Tensor, labels: Tensor
     ) -> Tensor:
-        """(R,) the aerial candidates' scores, those of people and of judged classes with NanoDet's say."""
+        """(R,) the aerial candidates' scores, those of people and of judged classes with NanoDet's share."""
         own = odds_from_scores(scores)
         answers = self.judge(self.judge.pooled(levels, boxes), boxes, scores, labels)
-        said = support(outputs, self.coco.head.strides, boxes, self.coco.coco_of_class[0][0])
-        person = _calibrated(own, self.aerial_person, said)
+        supporting = support(outputs, self.coco.head.strides, boxes, self.coco.coco_of_class[0][0])
+        person = _calibrated(own, self.aerial_person, supporting)
         out = torch.where(labels == self.settings.person, person, scores)
         for label, calibration in self.judged.items():
             out = torch.where(labels == label, _calibrated((own + answers[:, label]) / 2, calibration), out)
@@ -130,9 +130,9 @@ def support(outputs: Sequence[Tensor], strides: Sequence[int], boxes: Tensor, ro
     return torch.stack(best).amax(0)
 
 
-def _calibrated(opinion: Tensor, how: Calibration, said: Tensor | None = None) -> Tensor:
+def _calibrated(opinion: Tensor, how: Calibration, supporting: Tensor | None = None) -> Tensor:
     logits = how.slope * opinion + how.shift
-    return torch.sigmoid(logits if said is None else logits + how.support * said)
+    return torch.sigmoid(logits if supporting is None else logits + how.support * supporting)
 
 
 def odds_from_scores(scores: Tensor) -> Tensor:

@@ -8,8 +8,8 @@ _QUICK_KERNEL = 3
 
 
 class _Depthwise(torch.autograd.Function):
-    """What torch's own says. The weights' gradient is reckoned in float32, and with a stride the features' too: mostly
-    several times as fast as in bfloat16 (benchmarks/depthwise_speed.py)."""
+    """The same values as torch's own. The weights' gradient is computed in float32, and with a stride the features'
+    too: mostly several times as fast as in bfloat16 (benchmarks/depthwise_speed.py)."""
 
     @staticmethod
     def forward(ctx, features: Tensor, weight: Tensor, stride: int, padding: int) -> Tensor:  # type: ignore[no-untyped-def]

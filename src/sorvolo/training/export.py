@@ -1,4 +1,4 @@
-"""A trained model as one ONNX file that `detection` runs without torch, checked against what torch says."""
+"""A trained model as one ONNX file that `detection` runs without torch, checked against torch's answers."""
 
 import io
 import json
@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import onnx
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Anything, Floats, ImageRGB
+from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.training.faster_rcnn import FasterRCNN
 
 OPSET = 17
@@ -29,7 +30,7 @@ _Found = tuple[Floats, Floats, Floats]  # boxes, scores, labels
 class ExportCheck:
     """How far the exported graph is from torch: over the detections of all pictures, and how many found no partner.
 
-    `undecided` more are told by torch or not as a rounding has it, and say nothing of the graph.
+    `undecided` more depend on rounding in torch itself and are not compared.
     """
 
     box_px: float
@@ -47,7 +48,7 @@ class ExportCheck:
 def export_onnx(model: FasterRCNN, info: dict[str, Any], *, regions: int | None = None) -> bytes:
     """The model as an ONNX file's bytes, with `info` as its "sorvolo" metadata (docs/detector.md has the fields).
 
-    `regions`: how many the head looks at in a picture, None for as many as the model's own `Reach` says. The file
+    `regions`: how many the head looks at in a picture, None for as many as the model's own `Reach` has. The file
     finds no more objects than that. Raises SettingsError when `info` names no classes or `regions` is below 1.
     """
     if not info.get("classes"):
@@ -90,8 +91,8 @@ def check_export(model: FasterRCNN, exported: bytes, pictures: Sequence[ImageRGB
     import onnxruntime
 
     session = onnxruntime.InferenceSession(exported, providers=["CPUExecutionProvider"])
-    told = json.loads(session.get_modelmeta().custom_metadata_map["sorvolo"])
-    model = _reaching(model.eval(), told["regions"])
+    info = json.loads(session.get_modelmeta().custom_metadata_map["sorvolo"])
+    model = _reaching(model.eval(), info["regions"])
     worst_px, worst_score, alone, count, undecided = 0.0, 0.0, 0, 0, 0
     for picture in pictures:
         height, width = (side // model.stride * model.stride for side in picture.shape[:2])
@@ -99,7 +100,7 @@ def check_export(model: FasterRCNN, exported: bytes, pictures: Sequence[ImageRGB
         found, others = _seen(model, planes), _shaken(model, planes)
         other_boxes, other_scores, other_labels = session.run(None, {"image": planes})
         for box, score, label in zip(*found):
-            if not all(_tells(other, box, score, label) for other in others):
+            if not all(_holds(other, box, score, label) for other in others):
                 undecided += 1
                 continue
             count += 1
@@ -110,7 +111,7 @@ def check_export(model: FasterRCNN, exported: bytes, pictures: Sequence[ImageRGB
             off_px = np.abs(other_boxes[same] - box).max(1)
             # of a graph's many alike boxes the one whose score is nearest as well
             best = int(np.argmin(off_px + 100 * np.abs(other_scores[same] - score)))
-            # at the lowest score that is told a rounding decides
+            # at the lowest score that is reported a rounding decides
             if off_px[best] > 4 and score < model.reach.least_score + 1e-3:
                 continue
             worst_px = max(worst_px, float(off_px[best]))
@@ -118,14 +119,14 @@ def check_export(model: FasterRCNN, exported: bytes, pictures: Sequence[ImageRGB
     return ExportCheck(worst_px, worst_score, alone, count, undecided)
 
 
-def _seen(model: FasterRCNN, planes: Anything) -> _Found:
+def _seen(model: FasterRCNN, planes: NDArray[np.uint8]) -> _Found:
     with torch.no_grad():
         boxes, scores, labels = model(torch.from_numpy(planes))
     return boxes.numpy(), scores.numpy(), labels.numpy()
 
 
-def _shaken(model: FasterRCNN, planes: Anything) -> list[_Found]:
-    """What the model says when the scores of anchors and regions change by what a rounding may.
+def _shaken(model: FasterRCNN, planes: NDArray[np.uint8]) -> list[_Found]:
+    """The model's answers when the scores of anchors and regions change by what a rounding may.
 
     Where many are equal, as after a few steps of training, it is that which decides whose regions are looked at and
     whose boxes stay.
@@ -136,8 +137,8 @@ def _shaken(model: FasterRCNN, planes: Anything) -> list[_Found]:
         return scores + _ROUNDING * torch.randn(scores.shape, generator=random)
 
     hooks = [
-        model.proposals.register_forward_hook(lambda _, __, told: replace(told, scores=shaken(told.scores))),
-        model.head.register_forward_hook(lambda _, __, told: (shaken(told[0]), told[1])),
+        model.proposals.register_forward_hook(lambda _, __, out: replace(out, scores=shaken(out.scores))),
+        model.head.register_forward_hook(lambda _, __, out: (shaken(out[0]), out[1])),
     ]
     try:
         return [_seen(model, planes) for _ in range(_SHAKES)]
@@ -146,7 +147,7 @@ def _shaken(model: FasterRCNN, planes: Anything) -> list[_Found]:
             hook.remove()
 
 
-def _tells(found: _Found, box: Floats, score: float, label: int) -> bool:
+def _holds(found: _Found, box: Floats, score: float, label: int) -> bool:
     """Whether the same detection is there."""
     boxes, scores, labels = found
     near = (np.abs(boxes - box).max(1) <= _SAME_PX) & (np.abs(scores - score) <= _SAME_SCORE)

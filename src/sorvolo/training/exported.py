@@ -1,7 +1,7 @@
 """An exported model taken back into torch, to learn on: the way to tune the packaged model to one's own pictures."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -22,7 +22,7 @@ _OF_CLASSES = "head.scores"  # the one layer with a row for each class; the back
 
 @dataclass(frozen=True, eq=False)
 class ExportedModel:
-    """A model file of ours to learn on from, and what it says of itself; `origin` names it in words."""
+    """A model file of ours to learn on from, and what it states about itself; `origin` names it in words."""
 
     content: bytes
     classes: tuple[str, ...]
@@ -46,30 +46,16 @@ def load_exported(
     model with batch norms that do not learn (ResNet-50's of the presets `accurate` and `thesis`).
     """
     graph, known = _read(exported)
-    values = {each.name: each for each in graph.initializer}
-    values |= {  # an export keeps values that are the same once
-        node.output[0]: values[node.input[0]]
-        for node in graph.node if node.op_type == "Identity" and node.input[0] in values
-    }
     layers = {name: each for name, each in model.named_modules() if isinstance(each, nn.Conv2d | nn.Linear)}
     norms = _norms_after(model)
-    loaded: dict[str, list[Tensor]] = {}
-    is_part = any(node.name.startswith(_AERIAL) for node in graph.node)
-    for node in graph.node:
-        own = [values[name] for name in node.input[1:] if name in values]
-        if node.op_type in _WEIGHTED and own and (not is_part or node.name.startswith(_AERIAL)):
-            inner = node.name.removeprefix(_AERIAL.rstrip("/")) if is_part else node.name
-            name = _module_of(inner, list(layers)) or node.name
-            loaded[name] = [torch.from_numpy(numpy_helper.to_array(each).copy()) for each in own]
+    loaded = _loaded(graph, list(layers))
     if foreign := [name for name in loaded if name not in layers]:
         raise _unfitting(f"the network has no layer {foreign[0]}, as the file has")
     for name, layer in layers.items():
         found = loaded.get(name, [])
         if name == _OF_CLASSES and classes is not None and len(found) == 2:
             found = _rows_of(layer, found, known, classes)
-        if len(found) != 2 or found[0].shape != layer.weight.shape:
-            shape = " x ".join(map(str, found[0].shape)) if found else "nothing"
-            raise _unfitting(f"its layer {name} should be {' x '.join(map(str, layer.weight.shape))}, and is {shape}")
+        _demand_fitting(name, layer, found)
         _fill(name, layer, norms.get(name), *found)
     _settle(model, list(norms.values()), pictures)
 
@@ -82,6 +68,41 @@ def _read(exported: bytes) -> tuple[Any, tuple[str, ...]]:
         return file.graph, tuple(map(str, json.loads(about)["classes"]))
     except (DecodeError, StopIteration, ValueError, LookupError, TypeError) as error:
         raise InputError("the model file is damaged, or none that `sorvolo train` wrote; give one of those") from error
+
+
+def _loaded(graph: Any, names: Sequence[str]) -> dict[str, list[Tensor]]:
+    """The weight and bias of each of the file's layers, by which of the network's `names` it is; of a file of two
+    networks those of the aerial one. A layer that the network does not have comes under its own name."""
+    values = _values(graph)
+    part = _AERIAL if any(node.name.startswith(_AERIAL) for node in graph.node) else ""
+    loaded: dict[str, list[Tensor]] = {}
+    for node in (each for each in graph.node if each.op_type in _WEIGHTED and each.name.startswith(part)):
+        if own := _tensors(node, values):
+            name = _module_of(node.name.removeprefix(part.rstrip("/")), names) or node.name
+            loaded[name] = own
+    return loaded
+
+
+def _tensors(node: Any, values: Mapping[str, Any]) -> list[Tensor]:
+    """The constants among a node's inputs, the features left out."""
+    own = [values[name] for name in node.input[1:] if name in values]
+    return [torch.from_numpy(numpy_helper.to_array(each).copy()) for each in own]
+
+
+def _values(graph: Any) -> dict[str, Any]:
+    """The graph's constants by every name that they go by: an export keeps values that are the same once."""
+    values = {each.name: each for each in graph.initializer}
+    return values | {
+        node.output[0]: values[node.input[0]]
+        for node in graph.node if node.op_type == "Identity" and node.input[0] in values
+    }
+
+
+def _demand_fitting(name: str, layer: nn.Conv2d | nn.Linear, found: Sequence[Tensor]) -> None:
+    """Raise InputError unless `found` is a weight of the layer's shape, and a bias."""
+    if len(found) != 2 or found[0].shape != layer.weight.shape:
+        shape = " x ".join(map(str, found[0].shape)) if found else "nothing"
+        raise _unfitting(f"its layer {name} should be {' x '.join(map(str, layer.weight.shape))}, and is {shape}")
 
 
 def _unfitting(reason: str) -> InputError:

@@ -12,7 +12,7 @@ from sorvolo.training.proposals import ProposalNetwork, Proposed, propose
 
 @dataclass(frozen=True)
 class Reach:
-    """How many regions are looked at, and what is told in the end."""
+    """How many regions are looked at, and what is reported in the end."""
 
     before: int = 800  # anchors kept by their score before suppression
     regions: int = 300  # regions that the head looks at
@@ -55,6 +55,6 @@ class FasterRCNN(nn.Module):
         shares = scores.softmax(1)[:, :-1].T
         kept = suppress(boxes, shares.contiguous(), reach.most, reach.suppress_iou, reach.least_score)
         labels, rows = kept[:, 0], kept[:, 1]
-        told = shares.T[rows, labels]
-        best, order = torch.topk(told, at_most(reach.most, told))
+        found = shares.T[rows, labels]
+        best, order = torch.topk(found, at_most(reach.most, found))
         return boxes[rows][order], best, labels[order]

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sorvolo.geometry.arrays import Anything
+from sorvolo.geometry.arrays import Numbers
 
 _MEAN_RGB = (123.68, 116.779, 103.939)  # Keras' "caffe" input: BGR 0 to 255 minus these
 _EPSILON = 1e-5  # of our batch norms
@@ -16,7 +16,7 @@ _BRANCHES = {"branch2a": ("conv1", "bn1"), "branch2b": ("conv2", "bn2"), "branch
 _SHORT = ("downsample.0", "downsample.1")
 
 
-def resnet50_from_keras(layers: Mapping[str, Anything], places: Mapping[str, Mapping[str, Any]]) -> dict[str, Tensor]:
+def resnet50_from_keras(layers: Mapping[str, Numbers], places: Mapping[str, Mapping[str, Any]]) -> dict[str, Tensor]:
     """The state dict of `resnet.ResNet50(original=True)` from Keras' arrays ("res2a_branch2a/kernel", ...).
 
     `places` gives each layer's settings, of which the batch norms' epsilon is used: it is folded into their variance,
@@ -46,5 +46,5 @@ def resnet50_from_keras(layers: Mapping[str, Anything], places: Mapping[str, Map
     return out
 
 
-def _tensor(values: Anything) -> Tensor:
+def _tensor(values: Numbers) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, np.float32).copy())

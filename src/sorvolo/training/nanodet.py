@@ -14,7 +14,7 @@ from sorvolo.training.tfjs_graph import TfjsGraph
 
 COCO_CLASSES = 80
 BINS = 11
-"""A box's side lies 0 to 10 strides from its cell's centre; a distribution over so many bins says where."""
+"""A box's side lies 0 to 10 strides from its cell's centre; a distribution over so many bins gives the place."""
 
 _MEAN_BGR, _STD_BGR = (103.53, 116.28, 123.675), (57.375, 57.12, 58.395)
 _SLOPE = 0.1
@@ -119,7 +119,7 @@ class CocoDetector(nn.Module):
         return self.found(self.head(self.backbone(images)), (images.shape[2], images.shape[3]))
 
     def found(self, outputs: Sequence[Tensor], size_px: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
-        """What `forward` gives, from what the head says of a picture of this (height, width)."""
+        """What `forward` gives, from the head's outputs for a picture of this (height, width)."""
         scores, bins, places = cells(outputs, self.head.strides, self.head.classes)
         own = torch.stack([scores[0][:, rows].amax(1) for rows in self.coco_of_class]).sigmoid()
         boxes = clipped(boxes_from_bins(bins[0], places), *size_px)

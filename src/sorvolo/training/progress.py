@@ -50,7 +50,7 @@ class LossRow:
 
 @dataclass(frozen=True)
 class Check:
-    """What the validation pictures said after `step`: COCO's AP50 and AP, AP50 of each class; NaN if unknown."""
+    """Accuracy on the validation pictures after `step`: COCO's AP50 and AP, AP50 of each class; NaN if unknown."""
 
     step: int
     ap50: float

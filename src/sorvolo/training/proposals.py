@@ -28,7 +28,7 @@ class AnchorSettings:
 
 @dataclass(frozen=True)
 class Proposed:
-    """What the proposal network says of every anchor of a batch: `scores` (N, K) before the sigmoid, `offsets`
+    """The proposal network's answer for every anchor of a batch: `scores` (N, K) before the sigmoid, `offsets`
     (N, K, 4), `anchors` (K, 4) px."""
 
     scores: Tensor

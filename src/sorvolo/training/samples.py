@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, Matrix3, TimesNs
+from sorvolo.geometry.arrays import Floats, ImageRGB, Labels, Matrix3
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.training.sprites import paste_small_objects
 
@@ -47,7 +48,7 @@ class Sample:
 
     image: ImageRGB
     boxes: Floats
-    labels: TimesNs
+    labels: Labels
     ignored: Floats
     known: Floats
 
@@ -152,7 +153,7 @@ def _weathered(image: ImageRGB, how: Augmentation, rng: np.random.Generator, *, 
         if rng.random() < how.grey:
             x[:] = x.mean(2, keepdims=True)
     if how.tone and rng.random() < how.tone:
-        x = np.asarray(_toned(x, rng), np.float32)
+        x = _toned(x, rng)
     x = (x - x.mean()) * rng.uniform(0.6, 1.35) + x.mean() + rng.uniform(-35, 35)
     if rng.random() < how.haze:
         share = rng.uniform(0.1, 0.5)
@@ -172,9 +173,9 @@ def _weathered(image: ImageRGB, how: Augmentation, rng: np.random.Generator, *, 
     return np.clip(x, 0, 255).astype(np.uint8)
 
 
-def _toned(x: Anything, rng: np.random.Generator) -> Anything:
+def _toned(x: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
     """(H, W, 3) 0 to 255 through a power of the grey values, brighter here and darker there by up to a quarter."""
     curved = 255 * (np.clip(x, 0, 255) / 255) ** np.exp(rng.uniform(-0.7, 0.7))
     coarse = rng.normal(0, rng.uniform(0, 25), (3, 3)).astype(np.float32)
     uneven = cv2.resize(coarse, x.shape[1::-1], interpolation=cv2.INTER_CUBIC)
-    return curved + uneven[:, :, None]
+    return np.asarray(curved + uneven[:, :, None], np.float32)

@@ -40,7 +40,7 @@ def device_of(wanted: str) -> str:
 def without_denormals() -> Iterator[None]:
     """What is almost nothing counts as nothing meanwhile: weights that decay so far cost a hundred times as much.
 
-    The processor is told so, hence the whole thread, whatever it calculates.
+    This sets the processor, hence the whole thread, whatever it calculates.
     """
     torch.set_flush_denormal(True)
     try:

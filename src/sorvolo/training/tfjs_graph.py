@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Anything
+from sorvolo.geometry.arrays import Numbers
 
 _MOST_BYTES = 1 << 28  # of a graph's weights; the one that we read has 7.6 MB
 _STORED = {"float16": "<f2", "float32": "<f4", "int32": "<i4", "bool": "?"}
@@ -31,7 +31,7 @@ class TfjsGraph:
     """Nodes by name and the values of the constants among them; `outputs` are the names that the signature gives."""
 
     nodes: Mapping[str, Node]
-    constants: Mapping[str, Anything]
+    constants: Mapping[str, Numbers]
     outputs: tuple[str, ...]
     origin: str
 
@@ -44,7 +44,7 @@ def read_graph(path: Path) -> TfjsGraph:
     try:
         described = json.loads(path.read_text())
         nodes = {each["name"]: _node(each) for each in described["modelTopology"]["node"]}
-        constants: dict[str, Anything] = {}
+        constants: dict[str, Numbers] = {}
         for group in described["weightsManifest"]:
             data = b"".join(_shard(path, each) for each in group["paths"])
             constants.update(_weights(group["weights"], data))
@@ -59,14 +59,14 @@ def read_graph(path: Path) -> TfjsGraph:
         ) from error
 
 
-def run_graph(graph: TfjsGraph, feed: Mapping[str, Anything], wanted: Sequence[str]) -> dict[str, Anything]:
+def run_graph(graph: TfjsGraph, feed: Mapping[str, Numbers], wanted: Sequence[str]) -> dict[str, Numbers]:
     """The values of the nodes `wanted` when the placeholders have the values of `feed`, computed in NumPy.
 
     Follows TensorFlow's definitions node by node; slow. Raises InputError for an operation that is not known here.
     """
-    values: dict[str, list[Anything]] = {name: [np.asarray(each)] for name, each in feed.items()}
+    values: dict[str, list[Numbers]] = {name: [each] for name, each in feed.items()}
 
-    def value(reference: str) -> Anything:
+    def value(reference: str) -> Numbers:
         name, _, output = reference.partition(":")
         return values[name][int(output or 0)]
 
@@ -95,9 +95,9 @@ def _shard(path: Path, name: str) -> bytes:
     return shard.read_bytes()
 
 
-def _weights(entries: Sequence[Mapping[str, Any]], data: bytes) -> dict[str, Anything]:
+def _weights(entries: Sequence[Mapping[str, Any]], data: bytes) -> dict[str, Numbers]:
     """Float weights come as float32, whatever they were stored as."""
-    out: dict[str, Anything] = {}
+    out: dict[str, Numbers] = {}
     start = 0
     for entry in entries:
         quantised = entry.get("quantization", {})
@@ -141,9 +141,9 @@ def _numbers(node: Node, key: str) -> list[int]:
     return [int(each) for each in node.attributes[key]["list"]["i"]]
 
 
-def _windows(x: Anything, height: int, width: int, strides: Sequence[int]) -> Anything:
+def _windows(x: Numbers, height: int, width: int, strides: Sequence[int]) -> Numbers:
     """(N, H', W', C, height, width) views of (N, H, W, C)."""
-    views = np.lib.stride_tricks.sliding_window_view(x, (height, width), (1, 2))
+    views: Any = np.lib.stride_tricks.sliding_window_view(x, (height, width), (1, 2))
     return views[:, :: strides[1], :: strides[2]]
 
 
@@ -154,23 +154,24 @@ def _valid_nhwc(node: Node, strides_key: str = "strides") -> list[int]:
     return _numbers(node, strides_key)
 
 
-def _convolved(node: Node, inputs: Sequence[Anything]) -> Anything:
+def _convolved(node: Node, inputs: Sequence[Numbers]) -> Numbers:
     x, kernel = inputs  # kernel (height, width, in, out)
     views = _windows(x, kernel.shape[0], kernel.shape[1], _valid_nhwc(node))
     return np.tensordot(views, kernel, ((4, 5, 3), (0, 1, 2)))
 
 
-def _pooled(node: Node, inputs: Sequence[Anything]) -> Anything:
+def _pooled(node: Node, inputs: Sequence[Numbers]) -> Numbers:
     side = _numbers(node, "ksize")
     return _windows(inputs[0], side[1], side[2], _valid_nhwc(node)).max((-2, -1))
 
 
-def _padded(_: Node, inputs: Sequence[Anything]) -> Anything:
+def _padded(_: Node, inputs: Sequence[Numbers]) -> Numbers:
     filling = float(inputs[2]) if len(inputs) > 2 else 0.0
-    return np.pad(inputs[0], inputs[1], constant_values=filling)
+    padded: Any = np.pad(inputs[0], inputs[1].tolist(), constant_values=filling)
+    return padded
 
 
-def _resized(node: Node, inputs: Sequence[Anything]) -> Anything:
+def _resized(node: Node, inputs: Sequence[Numbers]) -> Numbers:
     """Bilinear with half-pixel centres, as TensorFlow's ResizeBilinear."""
     if not node.attributes["half_pixel_centers"]["b"] or node.attributes["align_corners"]["b"]:
         raise InputError(f"{node.name}: only half-pixel centres are known here")
@@ -185,18 +186,19 @@ def _resized(node: Node, inputs: Sequence[Anything]) -> Anything:
     return out
 
 
-def _split(_: Node, inputs: Sequence[Anything]) -> list[Anything]:
-    return list(np.split(inputs[0], np.cumsum(inputs[1])[:-1], int(inputs[2])))
+def _split(_: Node, inputs: Sequence[Numbers]) -> list[Numbers]:
+    parts: list[Any] = np.split(inputs[0], np.cumsum(inputs[1])[:-1], int(inputs[2]))
+    return parts
 
 
-def _sparse_to_dense(_: Node, inputs: Sequence[Anything]) -> Anything:
+def _sparse_to_dense(_: Node, inputs: Sequence[Numbers]) -> Numbers:
     places, shape, values, filling = inputs
     out = np.full(shape, filling)
     out[tuple(np.reshape(places, (-1, len(out.shape))).T)] = values
     return out
 
 
-_OPERATIONS: Mapping[str, Callable[[Node, Sequence[Anything]], Any]] = {
+_OPERATIONS: Mapping[str, Callable[[Node, Sequence[Numbers]], Any]] = {
     "Add": lambda _, x: x[0] + x[1],
     "AddV2": lambda _, x: x[0] + x[1],
     "ConcatV2": lambda _, x: np.concatenate(x[:-1], int(x[-1])),

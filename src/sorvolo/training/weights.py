@@ -203,16 +203,23 @@ def _from_layers(content: Any, name: str) -> ImageNetWeights:
         _check(layers, "lite0", name)
         return ImageNetWeights("lite0", layers, False, name)
     if "layer1.0.conv1.weight" in layers:
-        std = torch.tensor(IMAGENET_STD) * 255
         original = "mean" in layers  # our own form, as saved from `resnet50_from_keras`
-        if not original:
-            layers["mean"] = torch.tensor(IMAGENET_MEAN) * 255
-            if layers["conv1.weight"].ndim == 4 and layers["conv1.weight"].shape[1] == 3:
-                layers["conv1.weight"] = layers["conv1.weight"].float() / std[None, :, None, None]
+        layers = layers if original else _taking_bytes(layers)
         _check(layers, "resnet50", name)
         return ImageNetWeights("resnet50", layers, original, name)
     some = ", ".join(sorted(layers)[:3])
     raise InputError(f"{name} is of another network: its layers are {some or 'none'}...; needed lite0 or ResNet-50")
+
+
+def _taking_bytes(layers: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Torchvision's ResNet-50 for pictures of 0 to 255: the mean is kept apart, the deviation goes into the first
+    convolution."""
+    out = {**layers, "mean": torch.tensor(IMAGENET_MEAN) * 255}
+    first = out.get("conv1.weight")
+    if first is not None and first.ndim == 4 and first.shape[1] == 3:
+        std = torch.tensor(IMAGENET_STD) * 255
+        out["conv1.weight"] = first.float() / std[None, :, None, None]
+    return out
 
 
 def _check(layers: Mapping[str, Tensor], net: Net, name: str) -> None:
