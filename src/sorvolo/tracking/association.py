@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from sorvolo.geometry.arrays import Anything, Floats, PointsM
+from sorvolo.geometry.arrays import Floats, PointsM, Rows
 from sorvolo.tracking.motion import Motions
 
 _GATE = 11.8  # squared distance in sigmas, two axes: 3 in 1000 of one object's sightings lie beyond
@@ -20,8 +20,8 @@ _MOST_VOTES = 24
 class Pairs:
     """Rows of tracks and of sightings that belong together, (M,) each, in order of the tracks."""
 
-    tracks: Anything
-    sightings: Anything
+    tracks: Rows
+    sightings: Rows
 
     def __len__(self) -> int:
         return len(self.tracks)
@@ -57,7 +57,7 @@ def size_likelihoods(track_sides_m: Floats, seen_sides_m: Floats) -> Floats:
 
 
 def looks_likelihoods(track_looks: Floats, seen_looks: Floats) -> Floats:
-    """(tracks, sightings) how well appearance vectors fit, (tracks, D) and (sightings, D), at best 0; NaN says nothing.
+    """(tracks, sightings) how well appearance vectors fit, (tracks, D) and (sightings, D), at best 0; NaN: unknown.
 
     Vectors are histograms or embeddings of any scale; their angle counts.
     """
@@ -67,7 +67,7 @@ def looks_likelihoods(track_looks: Floats, seen_looks: Floats) -> Floats:
     return np.nan_to_num(_LOOKS_WEIGHT * (a @ b.T - 1.0))
 
 
-def class_likelihoods(shares: Floats, labels: Anything) -> Floats:
+def class_likelihoods(shares: Floats, labels: Rows) -> Floats:
     """(tracks, sightings) log of how likely each sighting's class is, by the tracks' shares (tracks, classes)."""
     return np.log(0.03 + 0.97 * shares[:, labels])
 

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, Floats, PointsM
+from sorvolo.geometry.arrays import Floats, PointsM, Rows
 
 FORGETS_S = 60.0
 """How long a GPS error lasts."""
 
-_FIRST_JITTER = 0.4  # of the shared sigma: what changes from frame to frame, until the frames say it
+_FIRST_JITTER = 0.4  # of the shared sigma: what changes from frame to frame, until the frames show it
 _LEAST_JITTER = 0.03
 _LEARNS = 0.05
 _MOST_ROWS = 300  # places kept with what they share; those not seen for longest keep their own sigma only
@@ -26,7 +26,7 @@ _TINY = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class FittedShift:
-    """What M matched objects say: of each, what its others predict it beside its place, (M, 2), with variance (M,).
+    """What M matched objects show: of each, what its others predict it beside its place, (M, 2), with variance (M,).
 
     `jump_m` (2,) is the frame's own part of the shift, gone with it. The rest is what the filter's next state is made
     of: the objects' `rows` in it (M,), its `crosses` (rows, M) with what was seen, `gains` (rows, M), and the inverse
@@ -35,7 +35,7 @@ class FittedShift:
 
     of_others_m: PointsM
     of_others_m2: Floats
-    rows: Anything
+    rows: Rows
     gains: Floats
     crosses: Floats
     gaps_m: Floats
@@ -116,7 +116,7 @@ class CommonShift:
         return float(self._covariance[0, 0])
 
     def fit(self, ids: Sequence[int], gaps_m: PointsM, variances_m2: Floats) -> FittedShift:
-        """What matched tracks say of each other: (M, 2) seen less known places and shift, each erring alone by (M,)."""
+        """What matched tracks show of each other: (M, 2) seen less known places and shift, variances (M,) of each."""
         for number in ids:
             if number not in self._rows:
                 self._append(number, np.zeros(len(self._covariance)), self._frozen.pop(number, 0.0))
@@ -143,7 +143,7 @@ class CommonShift:
         return lines @ fitted.solved, np.maximum(before + self.jitter_m2 - gained, 0.0)
 
     def settle(self, fitted: FittedShift, ids: Sequence[int], movers: Sequence[int]) -> dict[int, Floats]:
-        """Take a fit over; how far places of tracks move by it, (2,) each, of those fitted by what the others say.
+        """Take a fit over; how far places of tracks move by it, (2,) each, of those fitted by what the others show.
 
         Places of `movers` hold no map: they are new in every frame.
         """

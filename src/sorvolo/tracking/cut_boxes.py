@@ -32,7 +32,7 @@ def beyond_edges(
 ) -> tuple[Floats, Floats]:
     """How far beside its box an object's middle may lie that the picture's edge cuts: (N, 2) m, with (N, 2, 2) m2.
 
-    `cut` as `cut_edges` tells it; `axes` (N, 2, 2) are the directions on the ground, a row each, in which the box's
+    `cut` as `cut_edges` gives it; `axes` (N, 2, 2) are the directions on the ground, a row each, in which the box's
     width and height grow, and `sides_m` (N, 2) how long they are there. Without this, what comes into view seems to be
     dragged along by the picture's edge.
     """

@@ -45,7 +45,7 @@ class Followed:
     place_m: PointsM = field(init=False)
     rough: tuple[float, ...] = field(init=False)
     _clearest: float = 0.0
-    _told: Track | None = None
+    _reported: Track | None = None
 
     def __post_init__(self) -> None:
         self.go_on(self.motion, self.motion_ns)
@@ -74,7 +74,7 @@ class Followed:
 
     def record(self, sighting: Sighting, looks: Floats | None) -> None:
         """Remember a sighting; its motion has been corrected with it."""
-        self._told = None
+        self._reported = None
         self.views += 1
         self.score_sum += sighting.score
         self.vote(sighting.label, sighting.score)
@@ -89,7 +89,7 @@ class Followed:
         self._extend_path(sighting.time_ns)
 
     def join(self, other: "Followed") -> None:
-        """Take in another track of the same object; the one seen last says where it is."""
+        """Take in another track of the same object; the one seen last gives its place."""
         if other.motion_ns >= self.motion_ns and other.last_ns >= self.last_ns:
             self.go_on(other.motion, other.motion_ns)
         later = other.first_ns > self.last_ns
@@ -104,12 +104,8 @@ class Followed:
         self.confirmed |= other.confirmed
         self.ended &= other.ended
         self.is_out &= other.is_out
-        for counts, others in ((self.together, other.together), (self.apart, other.apart)):
-            for neighbour, count in others.items():
-                counts[neighbour] = counts.get(neighbour, 0) + count
-            for own in (self.id, other.id):
-                counts.pop(own, None)
-        self._told = None
+        self._join_counts(other)
+        self._reported = None
         if other._clearest > self._clearest:
             self.best, self._clearest = other.best, other._clearest
         self.first_ns, self.last_ns = min(self.first_ns, other.first_ns), max(self.last_ns, other.last_ns)
@@ -129,19 +125,28 @@ class Followed:
     def track(self, shared_m2: float) -> Track:
         """As it is known now; its place in the map has an error of `shared_m2` per axis beside its own."""
         place_m = self.place_m
-        told = self._told
-        if told is not None and told.confirmed == self.confirmed and _is_near(told.position_m, place_m, shared_m2):
-            return told
+        reported = self._reported
+        if reported is not None and reported.confirmed == self.confirmed and _is_near(
+            reported.position_m, place_m, shared_m2
+        ):
+            return reported
         total = sum(self.scores.values())
         path_m, path_ns = (np.array(self.path_m), self.path_ns) if self.moves else (place_m[None], [self.last_ns])
-        self._told = Track(
+        self._reported = Track(
             self.id, self.label, self.score_sum / self.views, self.confirmed, self.moves, self.first_ns, self.last_ns,
             self.views, self.passes, place_m, self.motion.place_covariances_m2[0] + shared_m2 * np.eye(2),
             self.motion.means[0, MOVES, 2:] if self.moves else np.zeros(2), self.sides_m, self.best,
             path_m.reshape(-1, 2), np.array(path_ns),
             {label: score / total for label, score in sorted(self.scores.items())},
         )
-        return self._told
+        return self._reported
+
+    def _join_counts(self, other: "Followed") -> None:
+        for counts, others in ((self.together, other.together), (self.apart, other.apart)):
+            for neighbour, count in others.items():
+                counts[neighbour] = counts.get(neighbour, 0) + count
+            for own in (self.id, other.id):
+                counts.pop(own, None)
 
     def _extend_path(self, time_ns: int) -> None:
         self.path_m.append(self.place_m)
@@ -156,7 +161,7 @@ def _clearness(sighting: Sighting) -> float:
     return float(sighting.score * max((right - left) * (bottom - top), 1.0) ** 0.25)
 
 
-def _is_near(told_m: PointsM, place_m: PointsM, shared_m2: float) -> bool:
-    """Whether a place has moved by so little that nobody needs to be told."""
-    east, north = told_m[0] - place_m[0], told_m[1] - place_m[1]
+def _is_near(reported_m: PointsM, place_m: PointsM, shared_m2: float) -> bool:
+    """Whether a place has moved by too little to be reported anew."""
+    east, north = reported_m[0] - place_m[0], reported_m[1] - place_m[1]
     return bool(east * east + north * north < 0.01 * shared_m2 + 1e-4)

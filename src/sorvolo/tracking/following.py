@@ -86,11 +86,7 @@ class GroundFollower:
 
     def take(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> Taken:
         """Place a frame's detections, seen from `prior`, on the ground and give them to their tracks."""
-        if self._heading is not None:
-            prior = self._heading.take(frame, time_ns, found, prior)
-        else:
-            site_from_read = rotation_from_vector(np.array([0.0, 0.0, np.radians(self._compass.clockwise_deg)]))
-            prior = replace(prior, rotation=site_from_read @ prior.rotation)
+        prior = self._with_heading(frame, time_ns, found, prior)
         sightings, unlocated = locate(
             found, frame.index, frame.name, time_ns, self._camera.camera, prior, focal_sigma=self._camera.focal_sigma,
             ground_height_m=self._ground or 0.0, settings=LocateSettings() if self._ground is None else _OVER_MODEL,
@@ -118,6 +114,13 @@ class GroundFollower:
     def path_m(self) -> PointsM:
         """(N, 2) where the camera was, in site metres."""
         return np.array(self._path).reshape(-1, 2)
+
+    def _with_heading(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> CameraPrior:
+        """The prior with its heading from the pictures, or with its compass corrected by what stands."""
+        if self._heading is not None:
+            return self._heading.take(frame, time_ns, found, prior)
+        site_from_read = rotation_from_vector(np.array([0.0, 0.0, np.radians(self._compass.clockwise_deg)]))
+        return replace(prior, rotation=site_from_read @ prior.rotation)
 
     def _below_m(self, prior: CameraPrior) -> float:
         """The ground's height below the camera; 0 where it is not known."""

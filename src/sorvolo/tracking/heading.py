@@ -27,7 +27,7 @@ class Heading:
 class HeadingFromMotion:
     """A downward camera's heading from its own pictures and the fixes; `add` and `lose` change it.
 
-    `ImageMotion` lays each picture into the first one, which tells how the camera turned and moved since, all but the
+    `ImageMotion` lays each picture into the first one, which shows how the camera turned and moved since, all but the
     direction in which it began; the least-squares turn of that way onto the fixes of the last seconds is this direction
     (Procrustes in the plane, as complex numbers: real part right or east, imaginary part up or north).
     """
@@ -37,7 +37,7 @@ class HeadingFromMotion:
         self._points: deque[tuple[float, complex, complex]] = deque()
 
     def add(self, time_s: float, outline_px: PointsPx, place_m: Floats) -> Heading:
-        """Take in one picture and tell its heading.
+        """Take in one picture and return its heading.
 
         `outline_px` (4, 2) are its corners, from the top-left one clockwise, in the first picture's pixels; `place_m`
         (2,) the fix, east and north.
@@ -76,7 +76,7 @@ class CompassError:
     Places laid with a heading that is wrong by an angle are turned about the camera; as it flies on, all that stands
     seems to move sideways, by this angle times its way. A tracker takes that for the frames' common shift, of which it
     follows a part: so the shift's way is held against the camera's and what they agree on is taken off bit by bit, less
-    and less: on the way back over a map that was begun with the wrong heading the shift says nothing of the compass.
+    and less: on the way back over a map that was begun with the wrong heading the shift shows nothing of the compass.
     """
 
     def __init__(self) -> None:
@@ -97,7 +97,7 @@ class CompassError:
             return self.clockwise_deg
         self._points.popleft()
         way_m2 = float(way_m @ way_m)
-        # against the fixes' own wander a short way says little
+        # against the fixes' own wander a short way shows little
         seen_rad = float(way_m[0] * slip_m[1] - way_m[1] * slip_m[0]) / (way_m2 + _LEAST_WAY_M**2)
         frame_s = time_s - self._points[-2][0] if len(self._points) > 1 else 0.0
         gain = _GAIN_PER_S * min(frame_s, 1.0) * float(np.exp(-self._learnt_s / _LEARNS_S))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, BoxesPx, Floats, Mask, PointsM, PointsPx
+from sorvolo.geometry.arrays import BoxesPx, Floats, Mask, PointsM, PointsPx
 from sorvolo.geometry.homography import pose_from_homography
 from sorvolo.geometry.level_ground import ground_from_pixels
 from sorvolo.geometry.pose import Pose
@@ -57,43 +57,10 @@ def lay_on_ground(seen: Detections, frame: PlacedFrame, *, has_metres: bool = Tr
     pose = pose_of(frame)
     if pose is None or not len(seen):
         return [None] * len(seen)
-    heights_m = np.array([usual_height_m(name) if has_metres else 0.0 for name in seen.names])
-    boxes = np.asarray(seen.boxes_px, np.float64)
-    cut = cut_edges(boxes, frame.camera.width_px, frame.camera.height_px, TOO_SHORT_CUT_PX)
-    result: list[LaidSighting | None] = []
-    for k, name in enumerate(seen.names):
-        up_m = heights_m[k] / 2
-        around_m = ground_from_pixels(frame.camera, pose, _cross(boxes[k:k + 1]), up_m)
-        place_m = around_m[0]
-        reach_m = pose.translation_m[2] - up_m
-        if not np.isfinite(around_m).all() or reach_m <= 0:
-            result.append(None)
-            continue
-        lean = (pose.translation_m[:2] - place_m) / reach_m
-        if float(np.hypot(*lean)) > _FARTHEST:
-            result.append(None)
-            continue
-        spans_m = np.array([around_m[2] - around_m[1], around_m[4] - around_m[3]])
-        sides_m = np.hypot(*spans_m.T)
-        if has_metres and impossible_size((name,), sides_m[None], cut[k:k + 1])[0]:
-            result.append(None)
-            continue
-        m_per_px = float(np.sqrt(np.prod(sides_m) / max(np.prod(boxes[k, 2:] - boxes[k, :2]), 1e-6)))
-        axes = spans_m / np.maximum(sides_m, 1e-9)[:, None]
-        outward_m, beyond_m2 = (each[0] for each in beyond_edges(
-            (name,), cut[k:k + 1], axes[None], sides_m[None], has_metres=has_metres
-        ))
-        beyond_m2 = beyond_m2 + _ASIDE**2 * np.trace(beyond_m2) * np.eye(2)
-        own_sigma_m = _own_sigma_m(sides_m, m_per_px, frame)
-        usual_sigma_m = 0.15 * heights_m[k] * lean
-        sighting = Sighting(
-            frame.index, frame.name, frame.time_ns, name, float(seen.scores[k]), seen.boxes_px[k],
-            place_m + outward_m, own_sigma_m**2 * np.eye(2) + np.outer(usual_sigma_m, usual_sigma_m) + beyond_m2,
-            np.sort(sides_m)[::-1],
-        )
-        own_sigma_m = float(np.hypot(own_sigma_m, np.sqrt(np.trace(beyond_m2) / 2)))
-        result.append(LaidSighting(sighting, up_m, lean, own_sigma_m, axes, sides_m, beyond_m2))
-    return result
+    cut = cut_edges(
+        np.asarray(seen.boxes_px, np.float64), frame.camera.width_px, frame.camera.height_px, TOO_SHORT_CUT_PX
+    )
+    return [_laid(seen, k, cut[k:k + 1], frame, pose, has_metres=has_metres) for k in range(len(seen))]
 
 
 def shows(frame: PlacedFrame, places_m: PointsM, up_m: Floats, reach_m: Floats) -> Mask:
@@ -109,11 +76,10 @@ def shows(frame: PlacedFrame, places_m: PointsM, up_m: Floats, reach_m: Floats) 
     x = camera.fx_px * rays[:, 0] / np.where(in_front, rays[:, 2], 1.0) + camera.cx_px
     y = camera.fy_px * rays[:, 1] / np.where(in_front, rays[:, 2], 1.0) + camera.cy_px
     margin_px = reach_m * camera.fx_px / np.where(in_front, rays[:, 2], 1.0) + 2.0
-    inside: Anything = (
+    return np.asarray(
         in_front & (x >= margin_px) & (y >= margin_px)
-        & (x <= camera.width_px - 1 - margin_px) & (y <= camera.height_px - 1 - margin_px)
+        & (x <= camera.width_px - 1 - margin_px) & (y <= camera.height_px - 1 - margin_px), bool
     )
-    return inside
 
 
 def pose_of(frame: PlacedFrame) -> Pose | None:
@@ -126,6 +92,42 @@ def pose_of(frame: PlacedFrame) -> Pose | None:
 def usual_height_m(name: str) -> float:
     """How high a class's members usually are; of classes that are not ours a guess between a thing and a person."""
     return TYPICAL_SIZE_M[name][2] if name in TYPICAL_SIZE_M else 1.0
+
+
+def _laid(
+    seen: Detections, k: int, cut: Mask, frame: PlacedFrame, pose: Pose, *, has_metres: bool
+) -> LaidSighting | None:
+    """Detection `k` on the ground, None where it has no place; `cut` (1, 4) are the edges that cut it."""
+    name = seen.names[k]
+    box_px = np.asarray(seen.boxes_px, np.float64)[k:k + 1]
+    height_m = usual_height_m(name) if has_metres else 0.0
+    up_m = height_m / 2
+    around_m = ground_from_pixels(frame.camera, pose, _cross(box_px), up_m)
+    place_m = around_m[0]
+    reach_m = pose.translation_m[2] - up_m
+    if not np.isfinite(around_m).all() or reach_m <= 0:
+        return None
+    lean = (pose.translation_m[:2] - place_m) / reach_m
+    spans_m = np.array([around_m[2] - around_m[1], around_m[4] - around_m[3]])
+    sides_m = np.hypot(*spans_m.T)
+    is_impossible = has_metres and bool(impossible_size((name,), sides_m[None], cut)[0])
+    if float(np.hypot(*lean)) > _FARTHEST or is_impossible:
+        return None
+    m_per_px = float(np.sqrt(np.prod(sides_m) / max(np.prod(box_px[0, 2:] - box_px[0, :2]), 1e-6)))
+    axes = spans_m / np.maximum(sides_m, 1e-9)[:, None]
+    outward_m, beyond_m2 = (each[0] for each in beyond_edges(
+        (name,), cut, axes[None], sides_m[None], has_metres=has_metres
+    ))
+    beyond_m2 = beyond_m2 + _ASIDE**2 * np.trace(beyond_m2) * np.eye(2)
+    own_sigma_m = _own_sigma_m(sides_m, m_per_px, frame)
+    usual_sigma_m = 0.15 * height_m * lean
+    sighting = Sighting(
+        frame.index, frame.name, frame.time_ns, name, float(seen.scores[k]), seen.boxes_px[k],
+        place_m + outward_m, own_sigma_m**2 * np.eye(2) + np.outer(usual_sigma_m, usual_sigma_m) + beyond_m2,
+        np.sort(sides_m)[::-1],
+    )
+    own_sigma_m = float(np.hypot(own_sigma_m, np.sqrt(np.trace(beyond_m2) / 2)))
+    return LaidSighting(sighting, up_m, lean, own_sigma_m, axes, sides_m, beyond_m2)
 
 
 def _own_sigma_m(sides_m: Floats, m_per_px: float, frame: PlacedFrame) -> float:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, PointsM, PointsPx
@@ -56,72 +57,124 @@ def locate(
     about the point below the camera: its radius is then the sigma.
     """
     settings = settings or LocateSettings()
-    sightings: list[Sighting | None] = [None] * len(found)
-    unlocated: Counter[str] = Counter()
     if not len(found):
-        return sightings, unlocated
+        return [], Counter()
     if (why_not := _unplaced(prior)) is not None:
-        return sightings, Counter({why_not: len(found)})
+        return [None] * len(found), Counter({why_not: len(found)})
     boxes = found.boxes_px.astype(np.float64)
     sides_px = boxes[:, 2:] - boxes[:, :2]
     rays, slopes = _rays_with_slopes(camera, (boxes[:, :2] + boxes[:, 2:]) / 2 - 0.5)
-    rays_site = rays @ prior.rotation.T
-    heights = np.array([TYPICAL_SIZE_M[name][2] if name in TYPICAL_SIZE_M else _OTHER_HEIGHT_M for name in found.names])
-    reach, plane_m = _reach(rays_site, prior.position_m, heights / 2, ground_height_m)
-    known = np.isfinite(plane_m)
-    downward = rays_site[:, 2] < 0
-    meets = downward & known & (reach > 0)
-    reach = np.where(meets, reach, 1.0)
-    places_m = prior.position_m[:2] + reach[:, None] * rays_site[:, :2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        away = np.where(meets[:, None], rays_site[:, :2] / rays_site[:, 2:], 0.0)
-    # a small step of the ray's end in space, seen along the ray on the plane
-    onto = np.concatenate([np.broadcast_to(np.eye(2), (len(found), 2, 2)), -away[:, :, None]], axis=2)
-    shared, own = np.zeros((len(found), 2, 2)), np.zeros((len(found), 2, 2))
-    shared += onto @ np.diag(prior.position_sigma_m**2) @ onto.transpose(0, 2, 1)
-    along = reach[:, None, None] * onto @ prior.rotation
-    shared += _attitude_part(along, rays, prior.attitude_sigma_deg, reach[:, None] * rays_site[:, :2])
-    focal = along[:, :, :2] @ rays[:, :2, None] * focal_sigma
-    shared += focal @ focal.transpose(0, 2, 1)
-    shared += (settings.ground_sigma_m**2) * away[:, :, None] @ away[:, None, :]
+    heights_m = np.array([
+        TYPICAL_SIZE_M[name][2] if name in TYPICAL_SIZE_M else _OTHER_HEIGHT_M for name in found.names
+    ])
+    ends = _ray_ends(rays, prior, heights_m, ground_height_m)
+    along = ends.along(prior)
+    shared = _shared_covariances(ends, along, rays, prior, focal_sigma, settings)
     per_px = along @ slopes  # (N, 2, 2) metres on the ground per pixel
-    sigma_px = np.maximum(settings.box_sigma_share * sides_px, settings.least_box_sigma_px)
-    own += per_px @ (sigma_px[:, :, None] ** 2 * np.eye(2)) @ per_px.transpose(0, 2, 1)
-    own += ((settings.height_sigma_share * heights / 2) ** 2)[:, None, None] * away[:, :, None] @ away[:, None, :]
+    own = _own_covariances(ends, per_px, sides_px, heights_m, settings)
     slopes_m = np.linalg.norm(per_px, axis=1)
     sizes_m = slopes_m * sides_px
     axes = per_px.transpose(0, 2, 1) / np.maximum(slopes_m, 1e-9)[:, :, None]
     cut = cut_edges(boxes, camera.width_px, camera.height_px)
-    short = impossible_size(
+    is_impossible = impossible_size(
         found.names, sizes_m, cut_edges(boxes, camera.width_px, camera.height_px, TOO_SHORT_CUT_PX),
-        _scale_sigma(prior, reach * -rays_site[:, 2], focal_sigma, settings),
+        _scale_sigma(prior, ends.reach * -ends.rays_site[:, 2], focal_sigma, settings),
     )
     outward_m, beyond_m2 = beyond_edges(found.names, cut, axes, sizes_m)
-    places_m, own = places_m + outward_m, own + beyond_m2
+    places_m, covariances = ends.places_m + outward_m, shared + (own + beyond_m2)
     sizes_m = np.sort(sizes_m, axis=1)[:, ::-1]
-    covariances = shared + own
-    sigmas = np.sqrt(np.trace(covariances, axis1=1, axis2=2) / 2)
     shared_sigmas = np.sqrt(np.trace(shared, axis1=1, axis2=2) / 2)
-    distances = np.linalg.norm(places_m - prior.position_m[:2], axis=1)
-    for row, label in enumerate(found.names):
-        if not downward[row]:
-            unlocated["at or above the horizon"] += 1
-        elif not known[row]:
-            unlocated["the height model says nothing of the ground there"] += 1
-        elif not meets[row]:
-            unlocated["by the telemetry the camera is not above the ground"] += 1
-        elif distances[row] > settings.farthest_m:
-            unlocated[f"farther than {settings.farthest_m:g} m"] += 1
-        elif not sigmas[row] <= settings.most_sigma_m:
-            unlocated[f"the place is known no better than {settings.most_sigma_m:g} m"] += 1
-        elif short[row]:
-            unlocated[IMPOSSIBLE_SIZE] += 1
-        else:
-            sightings[row] = Sighting(
-                frame_index, frame_name, time_ns, label, float(found.scores[row]), found.boxes_px[row], places_m[row],
-                covariances[row], sizes_m[row], float(shared_sigmas[row]),
-            )
-    return sightings, unlocated
+    reasons = _reasons(ends, places_m - prior.position_m[:2], covariances, is_impossible, settings)
+    sightings = [
+        None if reason else Sighting(
+            frame_index, frame_name, time_ns, label, float(found.scores[row]), found.boxes_px[row], places_m[row],
+            covariances[row], sizes_m[row], float(shared_sigmas[row]),
+        )
+        for row, (label, reason) in enumerate(zip(found.names, reasons))
+    ]
+    return sightings, Counter(reason for reason in reasons if reason)
+
+
+@dataclass(frozen=True, eq=False)
+class _RayEnds:
+    """Where N rays meet the planes of their objects.
+
+    `rays_site` (N, 3) in site axes, `reach` (N,) their lengths to the plane (1 where they do not meet it), `places_m`
+    (N, 2), `away` (N, 2) how far the place moves with each metre that the plane lies lower. `is_downward`, `is_known`
+    (the plane's height) and `meets` are (N,).
+    """
+
+    rays_site: PointsM
+    reach: Floats
+    places_m: PointsM
+    away: Floats
+    is_downward: NDArray[np.bool_]
+    is_known: NDArray[np.bool_]
+    meets: NDArray[np.bool_]
+
+    @property
+    def onto(self) -> Floats:
+        """(N, 2, 3) a small step of the ray's end in space, seen along the ray on the plane."""
+        flat = np.broadcast_to(np.eye(2), (len(self.reach), 2, 2))
+        return np.concatenate([flat, -self.away[:, :, None]], axis=2)
+
+    def along(self, prior: CameraPrior) -> Floats:
+        """(N, 2, 3) how the place moves with a change of the ray in the camera's axes."""
+        return np.asarray(self.reach[:, None, None] * self.onto @ prior.rotation, np.float64)
+
+
+def _ray_ends(
+    rays: PointsM, prior: CameraPrior, heights_m: Floats, ground_height_m: float | GroundHeight
+) -> _RayEnds:
+    rays_site = rays @ prior.rotation.T
+    reach, plane_m = _reach(rays_site, prior.position_m, heights_m / 2, ground_height_m)
+    is_known, is_downward = np.isfinite(plane_m), rays_site[:, 2] < 0
+    meets = is_downward & is_known & (reach > 0)
+    reach = np.where(meets, reach, 1.0)
+    places_m = prior.position_m[:2] + reach[:, None] * rays_site[:, :2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away = np.where(meets[:, None], rays_site[:, :2] / rays_site[:, 2:], 0.0)
+    return _RayEnds(rays_site, reach, places_m, away, is_downward, is_known, meets)
+
+
+def _shared_covariances(
+    ends: _RayEnds, along: Floats, rays: PointsM, prior: CameraPrior, focal_sigma: float, settings: LocateSettings
+) -> Floats:
+    """(N, 2, 2) of the places, by errors that all boxes of the frame share: of camera, focal length and ground."""
+    shared = ends.onto @ np.diag(prior.position_sigma_m**2) @ ends.onto.transpose(0, 2, 1)
+    shared += _attitude_part(along, rays, prior.attitude_sigma_deg, ends.reach[:, None] * ends.rays_site[:, :2])
+    focal = along[:, :, :2] @ rays[:, :2, None] * focal_sigma
+    shared += focal @ focal.transpose(0, 2, 1)
+    shared += (settings.ground_sigma_m**2) * ends.away[:, :, None] @ ends.away[:, None, :]
+    return np.asarray(shared, np.float64)
+
+
+def _own_covariances(
+    ends: _RayEnds, per_px: Floats, sides_px: Floats, heights_m: Floats, settings: LocateSettings
+) -> Floats:
+    """(N, 2, 2) of the places, by errors of each alone: of the box's middle and the object's height."""
+    sigma_px = np.maximum(settings.box_sigma_share * sides_px, settings.least_box_sigma_px)
+    own = per_px @ (sigma_px[:, :, None] ** 2 * np.eye(2)) @ per_px.transpose(0, 2, 1)
+    up_sigma_m = settings.height_sigma_share * heights_m / 2
+    own += (up_sigma_m**2)[:, None, None] * ends.away[:, :, None] @ ends.away[:, None, :]
+    return np.asarray(own, np.float64)
+
+
+def _reasons(
+    ends: _RayEnds, from_camera_m: PointsM, covariances: Floats, is_impossible: NDArray[np.bool_],
+    settings: LocateSettings,
+) -> list[str]:
+    """Why each has no place, in words; empty for those that have one."""
+    sigmas = np.sqrt(np.trace(covariances, axis1=1, axis2=2) / 2)
+    checks = (
+        (~ends.is_downward, "at or above the horizon"),
+        (~ends.is_known, "the height model does not cover the ground there"),
+        (~ends.meets, "by the telemetry the camera is not above the ground"),
+        (np.linalg.norm(from_camera_m, axis=1) > settings.farthest_m, f"farther than {settings.farthest_m:g} m"),
+        (~(sigmas <= settings.most_sigma_m), f"the place is known no better than {settings.most_sigma_m:g} m"),
+        (is_impossible, IMPOSSIBLE_SIZE),
+    )
+    return [next((words for fails, words in checks if fails[row]), "") for row in range(len(sigmas))]
 
 
 def _unplaced(prior: CameraPrior) -> str | None:

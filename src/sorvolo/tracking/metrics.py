@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from sorvolo.geometry.arrays import Floats, Matrix3, frozen
@@ -102,16 +103,11 @@ def match_objects(
         return ObjectMatch((), (), tuple(found))
     every = [(one, other) for one in found for other in true]
     apart_m = np.hypot(*_offsets_m(every, middle_ns, map_from_truth).T).reshape(len(found), len(true))
-    differs = np.array([[one.label != other.label for other in true] for one in found])
+    differs = np.array([one.label != other.label for one, other in every]).reshape(apart_m.shape)
     cost = np.where(apart_m <= _REACH_M, apart_m + _OTHER_CLASS_M * differs, _APART)
     rows, columns = linear_sum_assignment(cost)
     pairs = tuple((found[row], true[column]) for row, column in zip(rows, columns) if cost[row, column] < _APART)
-    taken = {id(one) for one, _ in pairs}
-    near = {id(one) for one, others in zip(found, apart_m <= _REACH_M) if others.any()}
-    left = [each for each in found if id(each) not in taken]
-    return ObjectMatch(
-        pairs, tuple(each for each in left if id(each) in near), tuple(each for each in left if id(each) not in near)
-    )
+    return ObjectMatch(pairs, *_unpaired(found, pairs, (apart_m <= _REACH_M).any(axis=1)))
 
 
 def score_objects(
@@ -147,6 +143,15 @@ def frames_over(outline_m: Floats, map_from_truth: Matrix3, outlines_m: Floats) 
     return sum(
         cv2.pointPolygonTest((each - place_m).astype(np.float32), (0.0, 0.0), False) > 0 for each in outlines_m
     )
+
+
+def _unpaired(
+    found: Sequence[JudgedObject], pairs: Sequence[tuple[JudgedObject, JudgedObject]], is_near: NDArray[np.bool_]
+) -> tuple[tuple[JudgedObject, ...], tuple[JudgedObject, ...]]:
+    """Found ones without a pair: those beside a true one, by `is_near` (found,), and those beside nothing."""
+    taken = {id(one) for one, _ in pairs}
+    left = [(each, near) for each, near in zip(found, is_near) if id(each) not in taken]
+    return tuple(each for each, near in left if near), tuple(each for each, near in left if not near)
 
 
 def _within_two_sigma(

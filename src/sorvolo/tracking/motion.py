@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, Floats, PointsM
+from sorvolo.geometry.arrays import Floats, PointsM, Rows
 
 STANDS, MOVES = 0, 1
 _LEAST_WEIGHT = 1e-4
@@ -46,12 +46,12 @@ class Motions:
     def __len__(self) -> int:
         return len(self.means)
 
-    def only(self, rows: Anything | slice) -> "Motions":
+    def only(self, rows: Rows | slice) -> "Motions":
         """Some of the objects."""
         return Motions(self.means[rows], self.covariances[rows], self.weights[rows], self.habits[rows])
 
     @property
-    def likelier(self) -> Anything:
+    def likelier(self) -> Rows:
         """(N,) the likelier model of each."""
         return np.argmax(self.weights, axis=1)
 

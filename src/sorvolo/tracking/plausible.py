@@ -8,7 +8,7 @@ from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.survey.objects import TYPICAL_SIZE_M
 
 TOO_SHORT_CUT_PX = 3.0
-"""Pieces of cars at the picture's edge end up to so far from it: nearer, their length says nothing."""
+"""Pieces of cars at the picture's edge end up to so far from it: nearer, their length means nothing."""
 
 _LEAST_LENGTH = 0.4  # of a class's usual length: what is shorter is none, however sure the detector is
 _MOST_WIDTH = 2.5  # times a class's largest dimension: what is wider is none; trucks are as wide as cars are long

@@ -1,6 +1,6 @@
 """What stands on a finished map: the sightings of all its frames fused, so that each object is there once.
 
-Tracking follows objects through time with what telemetry says of each frame. Here all frames have their final places,
+Tracking follows objects through time with the telemetry of each frame. Here all frames have their final places,
 which fit each other far better than telemetry does, so sightings are put together by place alone, whatever the order in
 which the drone came by; only what moves is followed through time (`walking`).
 """
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.box_overlap import iou_matrix, nesting_matrix
 from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.survey.objects import TYPICAL_SIZE_M
@@ -28,7 +28,7 @@ _SAME_BOX = 0.55  # overlap of two boxes of one frame from which they show one o
 _SHARED_FRAMES = 0.25  # of the fewer views: what is seen twice in more frames than these is two objects
 _LEAST_SHARE = 0.3  # of the frames that show its place: what fewer saw does not stand there
 _LEAST_CUT_SHARE = 0.7  # of both, where those that saw it all cut it and the others would show it whole
-_SURE = 0.8  # score from which one sighting alone is told, where no more than two frames show the place
+_SURE = 0.8  # score from which one sighting alone is reported, where no more than two frames show the place
 _TOP = 0.85  # of a body's height: tops are narrower than feet
 _HEIGHT_SIGMA = 0.3  # of a class's usual height
 _TURNS = np.radians(np.arange(0.0, 180.0, 5.0))
@@ -74,7 +74,7 @@ def fuse(laid: Sequence[LaidSighting], frames: Sequence[PlacedFrame]) -> Fused:
     """The objects that the sightings of these frames show, each once, the surest first.
 
     What too few of the frames saw that show its place is dropped, unless several such sightings lie on the way of
-    something that walks or drives: that is told once, as moving.
+    something that walks or drives: that is reported once, as moving.
     """
     if not laid:
         return Fused((), 0)
@@ -121,7 +121,7 @@ def fitted_size_m(laid: Sequence[LaidSighting], label: str, height_m: float) -> 
     """(2,) the longer and the shorter side of a box on the ground that has the sightings' sides.
 
     A body of length l, width w, turned by a, spans |l cos a| + |w sin a| along an axis, and its height times the lean
-    along it. Classes that Sorvolo knows are held near their usual sides; of others the sides' medians are told.
+    along it. Classes that Sorvolo knows are held near their usual sides; of others the sides' medians are taken.
     """
     whole = [each for each in laid if not each.is_cut] or list(laid)
     sides_m = np.array([each.sides_m for each in whole])
@@ -193,18 +193,11 @@ class _Gathering:
 
 def _gathered(laid: Sequence[LaidSighting]) -> list[_Gathering]:
     """Sightings frame by frame, each to the nearest object so far, no two of a frame to the same."""
-    by_frame: dict[int, list[int]] = defaultdict(list)
-    for k, each in enumerate(laid):
-        by_frame[each.sighting.frame_index].append(k)
     objects: list[_Gathering] = []
     places_m = np.zeros((0, 2))
-    for index in sorted(by_frame, key=lambda frame: laid[by_frame[frame][0]].sighting.time_ns):
-        inside = by_frame[index]
+    for inside in _by_frame(laid):
         new = [_begin([inside[k] for k in group], laid) for group in without_twins([laid[k] for k in inside])]
-        costs = np.full((len(new), len(objects)), _GATE)
-        for row, begun in enumerate(new):
-            for column in np.flatnonzero(np.hypot(*(places_m - begun.place_m).T) < _reach_m(begun, laid)):
-                costs[row, column] = min(_GATE, _distance(begun, objects[column]))
+        costs = _costs(new, objects, places_m, laid)
         matched = {row: column for row, column in zip(*linear_sum_assignment(costs)) if costs[row, column] < _GATE}
         for row, begun in enumerate(new):
             if row in matched:
@@ -213,6 +206,25 @@ def _gathered(laid: Sequence[LaidSighting]) -> list[_Gathering]:
                 objects.append(begun)
         places_m = np.array([each.place_m for each in objects])
     return objects
+
+
+def _costs(
+    new: Sequence[_Gathering], objects: Sequence[_Gathering], places_m: PointsM, laid: Sequence[LaidSighting]
+) -> Floats:
+    """(new, objects) squared distances in sigmas, at most the gate; `places_m` (objects, 2) are the objects' places."""
+    costs = np.full((len(new), len(objects)), _GATE)
+    for row, begun in enumerate(new):
+        for column in np.flatnonzero(np.hypot(*(places_m - begun.place_m).T) < _reach_m(begun, laid)):
+            costs[row, column] = min(_GATE, _distance(begun, objects[int(column)]))
+    return costs
+
+
+def _by_frame(laid: Sequence[LaidSighting]) -> list[list[int]]:
+    """The sightings of each frame, in order of time."""
+    by_frame: dict[int, list[int]] = defaultdict(list)
+    for k, each in enumerate(laid):
+        by_frame[each.sighting.frame_index].append(k)
+    return sorted(by_frame.values(), key=lambda inside: laid[inside[0]].sighting.time_ns)
 
 
 def _begin(members: list[int], laid: Sequence[LaidSighting]) -> _Gathering:
@@ -284,9 +296,7 @@ def _possible_views(
     showing it, wherever it lies beyond the others' edges.
     """
     firsts = [[laid[k] for k in group] for group in groups]
-    places_m = np.array([np.median([each.sighting.position_m for each in group], axis=0) for group in firsts])
-    up_m = np.array([np.median([each.middle_up_m for each in group]) for group in firsts])
-    reach_m = np.array([np.median([each.sighting.size_m[0] for each in group]) for group in firsts]) / 2
+    places_m, up_m, reach_m = _usual_bodies(firsts)
     open_m = np.array([_open_m(group) for group in firsts])
     usual_m = np.array([usual_length_m(group[0].sighting.label) for group in firsts])
     reach_m = np.where(open_m > 0, np.maximum(reach_m, usual_m / 2) + 2 * open_m, reach_m)
@@ -295,6 +305,14 @@ def _possible_views(
         counts += shows(frame, places_m, up_m, reach_m).astype(int)
     seen = [len(_frames_of(group, laid)) for group in groups]
     return [int(n + views) if is_open else max(int(n), views) for n, views, is_open in zip(counts, seen, open_m > 0)]
+
+
+def _usual_bodies(groups: Sequence[Sequence[LaidSighting]]) -> tuple[PointsM, Floats, Floats]:
+    """The medians of each group's places (N, 2), heights of their middles (N,) and half lengths (N,)."""
+    places_m = np.array([np.median([each.sighting.position_m for each in group], axis=0) for group in groups])
+    up_m = np.array([np.median([each.middle_up_m for each in group]) for group in groups])
+    reach_m = np.array([np.median([each.sighting.size_m[0] for each in group]) for group in groups]) / 2
+    return places_m, up_m, reach_m
 
 
 def _open_m(group: Sequence[LaidSighting]) -> float:
@@ -325,12 +343,28 @@ def _named(members: Sequence[int], laid: Sequence[LaidSighting]) -> tuple[str, f
 
 
 def _standing(members: Sequence[int], laid: Sequence[LaidSighting], possible: int) -> Standing:
-    """Place and height together by least squares: what was seen from several sides tells how high its middle lies."""
+    """One object that stands, from all its sightings."""
     label, score, shares = _named(members, laid)
     chosen = [laid[k] for k in members]
     whole = [each for each in chosen if not each.is_cut] or chosen
     has_metres = any(each.middle_up_m for each in chosen)
     usual_up_m = usual_height_m(label) / 2 if has_metres else 0.0
+    answer, covariance = _place_and_rise(whole, usual_up_m)
+    height_m = 2 * max(usual_up_m + float(answer[2]), 0.0)
+    size_m = fitted_size_m(chosen, label, height_m) if has_metres else _median_sides(chosen)
+    if all(each.is_cut for each in whole):  # no frame shows it whole: how long it is nobody saw
+        size_m = np.full(2, np.nan)
+    return Standing(
+        tuple(members), _best(members, laid, label), label, score, shares, answer[:2],
+        float(np.sqrt(np.trace(covariance) / 2)), size_m, possible,
+    )
+
+
+def _place_and_rise(whole: Sequence[LaidSighting], usual_up_m: float) -> tuple[Floats, Floats]:
+    """(3,) place and how far its middle lies above the usual height, by least squares, and the place's covariance.
+
+    What was seen from several sides shows how high its middle lies.
+    """
     rows, right = [], []
     for each in whole:
         place_m = each.sighting.position_m + each.lean * (usual_up_m - each.middle_up_m)
@@ -341,15 +375,7 @@ def _standing(members: Sequence[int], laid: Sequence[LaidSighting], possible: in
     right.append(np.zeros(1))
     normal = (matrix := np.concatenate(rows)).T @ matrix
     answer = np.asarray(np.linalg.solve(normal, matrix.T @ np.concatenate(right)), np.float64)
-    covariance = np.linalg.inv(normal)[:2, :2] + min((each.beyond_m2 for each in whole), key=np.trace)
-    height_m = 2 * max(usual_up_m + float(answer[2]), 0.0)
-    size_m = fitted_size_m(chosen, label, height_m) if has_metres else _median_sides(chosen)
-    if all(each.is_cut for each in whole):  # no frame shows it whole: how long it is nobody saw
-        size_m = np.full(2, np.nan)
-    return Standing(
-        tuple(members), _best(members, laid, label), label, score, shares, answer[:2],
-        float(np.sqrt(np.trace(covariance) / 2)), size_m, possible,
-    )
+    return answer, np.linalg.inv(normal)[:2, :2] + min((each.beyond_m2 for each in whole), key=np.trace)
 
 
 def _moving(members: Sequence[int], walk: Walk, laid: Sequence[LaidSighting]) -> Standing:

@@ -4,9 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sorvolo.errors import GeometryError, SettingsError
-from sorvolo.geometry.arrays import Anything, Floats, PointsM
+from sorvolo.geometry.arrays import Floats, Labels, PointsM, Rows
 from sorvolo.survey.objects import Sighting, Track
 from sorvolo.tracking.association import (
     Pairs,
@@ -24,7 +25,7 @@ from sorvolo.tracking.motion import MOVES, Motions, begun, corrected, habits_of,
 
 _LEAST_OWN_SHARE = 0.02  # of a sighting's whole variance that is its own
 _UNEVEN = 0.1  # of the shared sigma: turns and tilts do not shift a whole frame evenly
-_USUAL_STEP_S = 0.2  # sightings and gaps closer in time than this say less each
+_USUAL_STEP_S = 0.2  # sightings and gaps closer in time than this count less each
 _FORGOTTEN_S = 120.0  # tentative tracks out of view
 _SURE = 6.0  # evidence beyond this does not count: what leaves must be noticed
 _PENALTY_OF_ENDED = -1.5
@@ -104,37 +105,22 @@ class Tracker:
         """Take in one frame's sightings; a frame dated before the last one counts as taken with it.
 
         `footprint_m` (4, 2) is the ground that the frame shows, corners in turn: what should be there and is not seen
-        loses confidence; None when that is unknown. `appearance` (sightings, D) are vectors whose angle tells objects
-        apart, rows of NaN for those without. Raises GeometryError for one of another length.
+        loses confidence; None when that is unknown. `appearance` (sightings, D) are vectors whose angle separates
+        objects, rows of NaN for those without. Raises GeometryError for one of another length.
         """
         if appearance is not None and len(appearance) != len(sightings):
             raise GeometryError(f"{len(sightings)} sightings but {len(appearance)} appearance vectors")
-        time_ns = time_ns if self._time_ns is None else max(time_ns, self._time_ns)
-        elapsed_s = 0.0 if self._time_ns is None else (time_ns - self._time_ns) / 1e9
-        self._time_ns = time_ns
         seen = _Seen(sightings, appearance)
-        self._classes += sorted(set(seen.labels) - set(self._classes))
-        if len(sightings):
-            self._shared_m = float(np.median([each.shared_sigma_m for each in sightings]))
-        if len(sightings) or self._followed:
-            self._shift.move_on(elapsed_s, self._shared_m)
+        time_ns, elapsed_s = self._move_on(seen, time_ns)
         near = self._near(seen, time_ns, footprint_m)
         motions = _stacked(near, time_ns)
         pairs, motions = self._matched(near, motions, seen)
         ids = np.zeros(len(sightings), np.int64)
-        new: list[int] = []
-        for row, column in zip(pairs.tracks, pairs.sightings):
-            followed = near[row]
-            followed.go_on(motions.only(slice(row, row + 1)), time_ns)
-            if self._record(followed, seen, int(column), min(1.0, (time_ns - followed.last_ns) / 1e9 / _USUAL_STEP_S)):
-                new.append(followed.id)
-            ids[column] = followed.id
+        new = self._prolong(near, motions, pairs, seen, time_ns, ids)
         unmatched = np.setdiff1d(np.arange(len(near)), pairs.tracks)
         begun_now = self._begin(seen, ids)
         missing, ended = self._missed(near, motions, unmatched, time_ns, elapsed_s, footprint_m)
-        for row, stronger in seen.doubles.items():
-            if ids[stronger]:
-                ids[row] = ids[stronger]
+        seen.write_ids_of_doubles(ids)
         now = [near[row] for row in pairs.tracks] + begun_now
         merged = self._join(now, missing)
         ids = np.array([merged.get(each, each) for each in ids.tolist()], np.int64)
@@ -156,6 +142,31 @@ class Tracker:
         """All confirmed tracks; tentative ones are given up."""
         self._keep([each for each in self._followed if each.confirmed])
         return self.tracks()
+
+    def _move_on(self, seen: "_Seen", time_ns: int) -> tuple[int, float]:
+        """Bring classes, clock and shift to a new frame; the time that it counts as, and the seconds since the last."""
+        time_ns = time_ns if self._time_ns is None else max(time_ns, self._time_ns)
+        elapsed_s = 0.0 if self._time_ns is None else (time_ns - self._time_ns) / 1e9
+        self._time_ns = time_ns
+        self._classes += sorted(set(seen.labels) - set(self._classes))
+        if len(seen.sightings):
+            self._shared_m = float(np.median([each.shared_sigma_m for each in seen.sightings]))
+        if len(seen.sightings) or self._followed:
+            self._shift.move_on(elapsed_s, self._shared_m)
+        return time_ns, elapsed_s
+
+    def _prolong(
+        self, near: list[Followed], motions: Motions, pairs: Pairs, seen: "_Seen", time_ns: int, ids: Labels
+    ) -> list[int]:
+        """Give matched tracks their sightings, and the sightings the tracks' ids; the ids confirmed by it."""
+        new: list[int] = []
+        for row, column in zip(pairs.tracks, pairs.sightings):
+            followed = near[row]
+            followed.go_on(motions.only(slice(row, row + 1)), time_ns)
+            if self._record(followed, seen, int(column), min(1.0, (time_ns - followed.last_ns) / 1e9 / _USUAL_STEP_S)):
+                new.append(followed.id)
+            ids[column] = followed.id
+        return new
 
     def _near(self, seen: "_Seen", time_ns: int, footprint_m: PointsM | None) -> list[Followed]:
         """The tracks that the frame may show."""
@@ -180,54 +191,49 @@ class Tracker:
         none = Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64))
         if not near or not len(seen.places_m):
             return none, motions
-        unseen = np.log(self._settings.new_per_m2 * self._settings.unit_m**2)
-        fits = self._fits(near, seen)
-        fits[:, list(seen.doubles)] = -np.inf
-        sure = seen.scores >= self._settings.sure_score
-        shift, ids = self._shift, [each.id for each in near]
-        places_m = seen.places_m - shift.mean_m
+        ids = [each.id for each in near]
+        odds = _PairOdds(
+            motions, seen.places_m - self._shift.mean_m, seen.own_m2, self._fits(near, seen),
+            float(np.log(self._settings.new_per_m2 * self._settings.unit_m**2)),
+            seen.scores >= self._settings.sure_score,
+        )
+        pairs = self._paired(odds, ids)
+        if not len(pairs):
+            return none, motions
+        return pairs, self._corrected(odds, ids, pairs)
 
-        def gains(offsets_m: PointsM, offsets_m2: Floats) -> Floats:
-            return place_likelihoods(motions, places_m, seen.own_m2, offsets_m, offsets_m2) + fits - unseen
-
-        def assign(gain: Floats) -> Pairs:
-            first = assigned(np.where(sure, gain, -1.0))
-            gain = gain.copy()
-            gain[first.tracks], gain[:, first.sightings], gain[:, sure] = -1.0, -1.0, -1.0
-            return first.joined(assigned(gain))
-
-        def vote(shares: Floats, left_m2: Floats, slow_m2: float, gain: Floats, reluctance: float) -> PointsM:
-            return voted_shift(
-                motions, places_m, seen.own_m2, shares, left_m2, slow_m2, fits, gain, float(unseen), reluctance
-            )
-
-        none_m, even = np.zeros((len(near), 2)), np.ones(len(near))
-        own_m2 = np.trace(seen.own_m2, axis1=1, axis2=2) / 2
+    def _paired(self, odds: "_PairOdds", ids: list[int]) -> Pairs:
+        """The likeliest pairs, while the frame's shift is found from their pattern."""
+        shift, own_m2 = self._shift, odds.mean_own_m2
         shares, loose_m2 = shift.predict(ids)
-        gain = gains(none_m, loose_m2 + shift.jitter_m2)
-        pairs = assign(gain)
-        jump_m2 = self._shared_m**2
-        if int(sure.sum()) - len(pairs) >= max(2, _PUZZLED * sure.sum()):
-            wide = gains(none_m, loose_m2 + shift.jitter_m2 + jump_m2)
-            if vote(even, loose_m2 + shift.jitter_m2, jump_m2, wide, _JUMP_RELUCTANCE).any():
+        none_m = np.zeros((len(ids), 2))
+        gain = odds.gains(none_m, loose_m2 + shift.jitter_m2)
+        pairs = odds.assign(gain)
+        if int(odds.sure.sum()) - len(pairs) >= max(2, _PUZZLED * odds.sure.sum()):
+            jump_m2 = self._shared_m**2
+            wide = odds.gains(none_m, loose_m2 + shift.jitter_m2 + jump_m2)
+            if odds.vote(np.ones(len(ids)), loose_m2 + shift.jitter_m2, jump_m2, wide, _JUMP_RELUCTANCE).any():
                 shift.loosen(jump_m2)
                 shares, loose_m2 = shift.predict(ids)
                 gain = wide
         if (loose_m2 > np.median(own_m2)).any():
             left_m2 = np.maximum(loose_m2 - shares**2 * shift.slow_m2, 0.0) + shift.jitter_m2
-            error_m = vote(shares, left_m2, shift.slow_m2, gain, 0.0)
+            error_m = odds.vote(shares, left_m2, shift.slow_m2, gain, 0.0)
             settled_m2 = shares**2 * min(float(np.median(own_m2)), shift.slow_m2)
-            gain = gains(shares[:, None] * error_m, left_m2 + settled_m2)
-            pairs = assign(gain)
+            gain = odds.gains(shares[:, None] * error_m, left_m2 + settled_m2)
+            pairs = odds.assign(gain)
         if len(pairs) > 1:
-            fitted = shift.fit(*self._told(near, motions, places_m, own_m2, pairs))
-            pairs = assign(gains(*shift.offsets(fitted, ids)))
-        if not len(pairs):
-            return none, motions
-        matched, gaps_m, variances_m2 = self._told(near, motions, places_m, own_m2, pairs)
-        fitted = shift.fit(matched, gaps_m, variances_m2)
+            fitted = shift.fit(*self._misses(odds, ids, pairs))
+            pairs = odds.assign(odds.gains(*shift.offsets(fitted, ids)))
+        return pairs
+
+    def _corrected(self, odds: "_PairOdds", ids: list[int], pairs: Pairs) -> Motions:
+        """The tracks' motions with their sightings taken in, the map's places and shift settled by them."""
+        motions = odds.motions
+        matched, gaps_m, variances_m2 = self._misses(odds, ids, pairs)
+        fitted = self._shift.fit(matched, gaps_m, variances_m2)
         movers = [number for number, row in zip(matched, pairs.tracks) if motions.weights[row, MOVES] > 0.5]
-        steps_m = shift.settle(fitted, matched, movers)
+        steps_m = self._shift.settle(fitted, matched, movers)
         by_id = {each: row for row, each in enumerate(ids)}
         means, covariances, weights = motions.means.copy(), motions.covariances.copy(), motions.weights.copy()
         for followed in self._followed:
@@ -238,23 +244,21 @@ class Tracker:
         before = replace(motions, means=means).only(pairs.tracks)
         better = corrected(
             before, before.places_m + fitted.of_others_m,
-            seen.own_m2[pairs.sightings] + fitted.of_others_m2[:, None, None] * np.eye(2),
+            odds.own_m2[pairs.sightings] + fitted.of_others_m2[:, None, None] * np.eye(2),
         )
         means[pairs.tracks], covariances[pairs.tracks] = better.means, better.covariances
         weights[pairs.tracks] = better.weights
-        return pairs, replace(motions, means=means, covariances=covariances, weights=weights)
+        return replace(motions, means=means, covariances=covariances, weights=weights)
 
-    def _told(
-        self, near: list[Followed], motions: Motions, places_m: PointsM, own_m2: Floats, pairs: Pairs
-    ) -> tuple[list[int], PointsM, Floats]:
-        """What pairs tell of the shift: ids, seen less known places (M, 2), and how little that is to be trusted."""
-        matched = motions.only(pairs.tracks)
+    def _misses(self, odds: "_PairOdds", ids: list[int], pairs: Pairs) -> tuple[list[int], PointsM, Floats]:
+        """How far pairs miss each other: ids, seen less known places (M, 2), and their variances (M,)."""
+        matched = odds.motions.only(pairs.tracks)
         known_m2 = np.trace(matched.place_covariances_m2, axis1=1, axis2=2) / 2
         # a mover knows no place of its own that could hold the map
         restless_m2 = matched.weights[:, MOVES] * self._shared_m**2
         return (
-            [near[row].id for row in pairs.tracks], places_m[pairs.sightings] - matched.places_m,
-            own_m2[pairs.sightings] + known_m2 + restless_m2,
+            [ids[row] for row in pairs.tracks], odds.places_m[pairs.sightings] - matched.places_m,
+            odds.mean_own_m2[pairs.sightings] + known_m2 + restless_m2,
         )
 
     def _fits(self, near: list[Followed], seen: "_Seen") -> Floats:
@@ -268,6 +272,7 @@ class Tracker:
             unknown = np.full(seen.looks.shape[1], np.nan)
             known = np.array([unknown if each.looks is None else each.looks for each in near])
             fits += looks_likelihoods(known, seen.looks)
+        fits[:, list(seen.doubles)] = -np.inf
         return fits
 
     def _record(self, followed: Followed, seen: "_Seen", column: int, weight: float) -> bool:
@@ -290,7 +295,7 @@ class Tracker:
         followed.confirmed = True
         return True
 
-    def _begin(self, seen: "_Seen", ids: Anything) -> list[Followed]:
+    def _begin(self, seen: "_Seen", ids: Labels) -> list[Followed]:
         """Tracks for sure sightings that are none of those known; writes their ids."""
         fresh = [
             row for row in range(len(ids))
@@ -317,61 +322,59 @@ class Tracker:
         return started
 
     def _missed(
-        self, near: list[Followed], motions: Motions, rows: Anything, time_ns: int, elapsed_s: float,
+        self, near: list[Followed], motions: Motions, rows: Rows, time_ns: int, elapsed_s: float,
         footprint_m: PointsM | None,
     ) -> tuple[list[Followed], list[int]]:
         """Tracks whose places the frame shows without them, and the ids of the confirmed that end with it.
 
-        Near the picture's edge that says nothing of whether they are there, only of which neighbours are seen instead.
+        Near the picture's edge that is no sign that they are gone, only that neighbours are seen instead.
         """
         missing, ended = [], []
-        if len(rows):
-            sigmas = np.sqrt(np.trace(motions.place_covariances_m2[rows], axis1=1, axis2=2) / 2)
-            places_m = motions.places_m[rows] + self._shift.mean_m + self._shift.jump_m
-            if footprint_m is None:
-                depth_m = np.array([0.0 if time_ns - near[row].last_ns < 2e9 else -np.inf for row in rows])
-            else:
-                depth_m = inward_m(footprint_m, places_m)
-            sides_m = np.array([near[row].sides_m[0] for row in rows])
-            for row, depth, sigma, side in zip(rows, depth_m, sigmas, sides_m):
-                followed = near[row]
-                if depth < 0:
-                    followed.is_out = True
-                    continue
-                missing.append(followed)
-                if depth > 2 * sigma + side / 2 or footprint_m is None:
-                    followed.evidence -= self._settings.missed * min(1.0, max(elapsed_s, 0.02) / _USUAL_STEP_S)
-                    if followed.confirmed and not followed.ended and followed.evidence < 0:
-                        followed.ended = True
-                        ended.append(followed.id)
-        near_ids = {each.id for each in near}
+        sigmas = np.sqrt(np.trace(motions.place_covariances_m2[rows], axis1=1, axis2=2) / 2)
+        depths_m = self._depths_m([near[row] for row in rows], motions.only(rows), time_ns, footprint_m)
+        for row, depth, sigma in zip(rows, depths_m, sigmas):
+            followed = near[row]
+            if depth < 0:
+                followed.is_out = True
+                continue
+            missing.append(followed)
+            if depth > 2 * sigma + followed.sides_m[0] / 2 or footprint_m is None:
+                followed.evidence -= self._settings.missed * min(1.0, max(elapsed_s, 0.02) / _USUAL_STEP_S)
+                if followed.confirmed and not followed.ended and followed.evidence < 0:
+                    followed.ended = True
+                    ended.append(followed.id)
+        self._forget({each.id for each in near}, time_ns)
+        return missing, ended
+
+    def _depths_m(
+        self, followed: list[Followed], motions: Motions, time_ns: int, footprint_m: PointsM | None
+    ) -> Floats:
+        """(N,) how far within the frame tracks should lie, negative outside; by their last sighting without a frame."""
+        if footprint_m is None:
+            return np.array([0.0 if time_ns - each.last_ns < 2e9 else -np.inf for each in followed])
+        if not followed:
+            return np.zeros(0)
+        return inward_m(footprint_m, motions.places_m + self._shift.mean_m + self._shift.jump_m)
+
+    def _forget(self, near_ids: set[int], time_ns: int) -> None:
+        """Note which tracks are out of view, and give up tentative ones that are doubtful or long unseen."""
         for followed in self._followed:
             followed.is_out |= followed.id not in near_ids and followed.last_ns < time_ns
         self._keep([
             each for each in self._followed
             if each.confirmed or (each.evidence >= 0 and time_ns - each.last_ns < _FORGOTTEN_S * 1e9)
         ])
-        return missing, ended
 
     def _join(self, now: list[Followed], missing: list[Followed]) -> dict[int, int]:
         """Merge tracks that turn out to be one object; the earlier id stays."""
         reach_m = self._settings.neighbour_m / self._settings.unit_m
-        for first, second in neighbours(now, now, reach_m):
-            if first.id < second.id:
-                first.together[second.id] = first.together.get(second.id, 0) + 1
-                second.together[first.id] = second.together.get(first.id, 0) + 1
-        for first, second in neighbours(now, missing, reach_m):
-            first.apart[second.id] = first.apart.get(second.id, 0) + 1
-            second.apart[first.id] = second.apart.get(first.id, 0) + 1
+        _count_meetings(now, missing, reach_m)
         merged: dict[int, int] = {}
         by_id = {each.id: each for each in self._followed}
         for followed in now:
             if followed.id in merged or followed.id not in by_id:
                 continue
-            other = double_of(followed, by_id, reach_m)
-            if other is None and followed.moves and followed.views <= _FIRST_VIEWS:
-                density = self._settings.new_per_m2 * self._settings.unit_m**2
-                other = earlier_mover(followed, self._followed, density)
+            other = self._same_object(followed, by_id)
             if other is not None:
                 kept, gone = (other, followed) if other.id < followed.id else (followed, other)
                 kept.join(gone)
@@ -381,10 +384,58 @@ class Tracker:
             self._keep([each for each in self._followed if each.id not in merged])
         return merged
 
+    def _same_object(self, followed: Followed, by_id: Mapping[int, Followed]) -> Followed | None:
+        """Another track of the same object, if there is one."""
+        other = double_of(followed, by_id, self._settings.neighbour_m / self._settings.unit_m)
+        if other is None and followed.moves and followed.views <= _FIRST_VIEWS:
+            density = self._settings.new_per_m2 * self._settings.unit_m**2
+            other = earlier_mover(followed, self._followed, density)
+        return other
+
     def _keep(self, kept: list[Followed]) -> None:
         ids = {each.id for each in kept}
         self._shift.drop([each.id for each in self._followed if each.id not in ids])
         self._followed = kept
+
+
+@dataclass(frozen=True, eq=False)
+class _PairOdds:
+    """What speaks for each pair of a near track and a sighting, as logs.
+
+    `places_m` (sightings, 2) are without the shift's mean, `own_m2` (sightings, 2, 2) what each errs for itself, `fits`
+    (tracks, sightings) what beside place speaks for a pair, `unseen` the log density of new objects, `sure`
+    (sightings,) which may begin a track.
+    """
+
+    motions: Motions
+    places_m: PointsM
+    own_m2: Floats
+    fits: Floats
+    unseen: float
+    sure: NDArray[np.bool_]
+
+    @property
+    def mean_own_m2(self) -> Floats:
+        """(sightings,) what each errs for itself, per axis."""
+        return np.asarray(np.trace(self.own_m2, axis1=1, axis2=2) / 2, np.float64)
+
+    def gains(self, offsets_m: PointsM, offsets_m2: Floats) -> Floats:
+        """(tracks, sightings) how much likelier pairs are than new objects, tracks off by so much, (N, 2) and (N,)."""
+        near = place_likelihoods(self.motions, self.places_m, self.own_m2, offsets_m, offsets_m2)
+        return near + self.fits - self.unseen
+
+    def assign(self, gain: Floats) -> Pairs:
+        """The best pairs, sure sightings first."""
+        first = assigned(np.where(self.sure, gain, -1.0))
+        gain = gain.copy()
+        gain[first.tracks], gain[:, first.sightings], gain[:, self.sure] = -1.0, -1.0, -1.0
+        return first.joined(assigned(gain))
+
+    def vote(self, shares: Floats, left_m2: Floats, slow_m2: float, gain: Floats, reluctance: float) -> PointsM:
+        """The shift that most pairs agree in (`voted_shift`)."""
+        return voted_shift(
+            self.motions, self.places_m, self.own_m2, shares, left_m2, slow_m2, self.fits, gain, self.unseen, reluctance
+        )
 
 
 class _Seen:
@@ -405,6 +456,23 @@ class _Seen:
         if self.looks is None or not np.isfinite(self.looks[row]).all():
             return None
         return self.looks[row]
+
+    def write_ids_of_doubles(self, ids: Labels) -> None:
+        """Give each double the id of the stronger sighting, where that has one."""
+        for row, stronger in self.doubles.items():
+            if ids[stronger]:
+                ids[row] = ids[stronger]
+
+
+def _count_meetings(now: list[Followed], missing: list[Followed], reach_m: float) -> None:
+    """Count for each track which neighbours the frame shows together with it, and which without it."""
+    for first, second in neighbours(now, now, reach_m):
+        if first.id < second.id:
+            first.together[second.id] = first.together.get(second.id, 0) + 1
+            second.together[first.id] = second.together.get(first.id, 0) + 1
+    for first, second in neighbours(now, missing, reach_m):
+        first.apart[second.id] = first.apart.get(second.id, 0) + 1
+        second.apart[first.id] = second.apart.get(first.id, 0) + 1
 
 
 def _own_covariances(sightings: Sequence[Sighting]) -> Floats:

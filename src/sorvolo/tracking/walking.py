@@ -71,17 +71,7 @@ def _followed(
     speed_m_s = float(np.hypot(*(two.position_m - one.position_m))) / gap_s
     if not _LEAST_M_S <= speed_m_s <= fastest_m_s:
         return None
-    members = [first, second]
-    for k in order[np.searchsorted(times_s[order], times_s[second], side="right"):]:
-        after_s = float(times_s[k] - times_s[members[-1]])
-        if after_s > _LONGEST_GAP_S:
-            break
-        if after_s <= 0 or laid[k].sighting.label != one.label:
-            continue
-        expected_m, _, spread = _line(members, laid, times_s, float(times_s[k]))
-        sigma_m = np.hypot(np.hypot(spread, _sigma_m(laid[k])), 0.5 * _WOBBLE_M_S2 * after_s**2)
-        if np.hypot(*(laid[k].sighting.position_m - expected_m)) < _MOST_OFF * sigma_m:
-            members.append(int(k))
+    members = _prolonged([first, second], laid, times_s, order)
     if len(members) < _LEAST_VIEWS:
         is_sure = all(laid[k].sighting.score >= _SURE and not laid[k].is_cut for k in members)
         return (members, 0.0) if is_sure else None
@@ -90,6 +80,22 @@ def _followed(
     if off > _MOST_OFF or not _LEAST_M_S <= np.hypot(*velocity_m_s) <= fastest_m_s:
         return None
     return members, off
+
+
+def _prolonged(way: list[int], laid: Sequence[LaidSighting], times_s: Floats, order: TimesNs) -> list[int]:
+    """A way with the later sightings of its class that lie on it."""
+    members, label = list(way), laid[way[0]].sighting.label
+    for k in order[np.searchsorted(times_s[order], times_s[way[-1]], side="right"):]:
+        after_s = float(times_s[k] - times_s[members[-1]])
+        if after_s > _LONGEST_GAP_S:
+            break
+        if after_s <= 0 or laid[k].sighting.label != label:
+            continue
+        expected_m, _, spread = _line(members, laid, times_s, float(times_s[k]))
+        sigma_m = np.hypot(np.hypot(spread, _sigma_m(laid[k])), 0.5 * _WOBBLE_M_S2 * after_s**2)
+        if np.hypot(*(laid[k].sighting.position_m - expected_m)) < _MOST_OFF * sigma_m:
+            members.append(int(k))
+    return members
 
 
 def _joined(found: list[list[int]], laid: Sequence[LaidSighting], times_s: Floats) -> list[list[int]]:
@@ -123,7 +129,7 @@ def _line(
     members: Sequence[int], laid: Sequence[LaidSighting], times_s: Floats, at_s: float
 ) -> tuple[Floats, Floats, float]:
     """Even motion through the last sightings: the place at a time, the velocity, and the place's sigma per axis."""
-    last = members[-4:]  # people turn: what is long ago tells little of where they go
+    last = members[-4:]  # people turn: what is long ago shows little of where they go
     since_s = times_s[last] - at_s
     places_m = np.array([laid[k].sighting.position_m for k in last])
     weights = 1.0 / np.array([_sigma_m(laid[k]) for k in last])
