@@ -259,7 +259,7 @@ def _show_changes(features: Sequence[Any], console: Console, form: PlaceFormat, 
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     place_name = place_heading(is_local, form)
     for name in ("id", "kind", f"length {unit}", place_name, f"accuracy {unit}", "views", "score"):
-        table.add_column(name, no_wrap=name in ("id", place_name), overflow="fold")
+        table.add_column(name, no_wrap=name in ("id", "kind", place_name), overflow="fold")
     for feature in features[:_MOST_ROWS]:
         each = feature["properties"]
         x, y = _middle(feature["geometry"]["coordinates"][0])

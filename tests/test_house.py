@@ -1,0 +1,74 @@
+"""The house as ARCHITECTURE.md draws it: every file named once, and functions that a reader holds in one look."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "src" / "sorvolo"
+LONGEST_LINES = 60
+COMPLEX_ABOVE = 10
+COMPLEX_SHARE = 0.03
+
+
+def _files() -> set[str]:
+    return {
+        path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*")
+        if path.suffix in (".py", ".cpp", ".hpp") and not (path.name == "__init__.py" and path.parent != PACKAGE)
+    }
+
+
+def _drawn() -> list[str]:
+    """The files of ARCHITECTURE.md's tree, by the folder under which they stand."""
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    tree = text[text.index("    src/sorvolo/\n"):]
+    tree = tree[:re.search(r"^\S", tree, re.MULTILINE).start()]  # type: ignore[union-attr]
+    folders: list[tuple[int, str]] = []
+    found = []
+    for line in tree.splitlines()[1:]:
+        if not (entry := re.match(r"^( {6,14})([\w./-]+)(?: |$)", line)):
+            continue
+        indent, name = len(entry[1]), entry[2]
+        folders = [each for each in folders if each[0] < indent]
+        if name.endswith("/"):
+            folders.append((indent, name))
+        elif "." in name:
+            found.append("".join(each[1] for each in folders) + name)
+    return found
+
+
+def test_every_file_stands_in_the_tree_and_every_line_of_the_tree_is_a_file() -> None:
+    drawn = _drawn()
+    assert len(drawn) == len(set(drawn))
+    assert set(drawn) == _files()
+
+
+def _functions(path: Path) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield node
+
+
+def test_no_function_is_longer_than_a_look() -> None:
+    too_long = [
+        f"{path.relative_to(PACKAGE)}: {each.name} has {each.end_lineno - each.lineno + 1} lines"
+        for path in PACKAGE.rglob("*.py") for each in _functions(path)
+        if each.end_lineno is not None and each.end_lineno - each.lineno + 1 > LONGEST_LINES
+    ]
+    assert not too_long
+
+
+def test_few_functions_are_complex() -> None:
+    """Cyclomatic complexity by radon, which counts conditions and comprehensions."""
+    complexity = pytest.importorskip("radon.complexity")
+    every, complex_ones = 0, []
+    for path in PACKAGE.rglob("*.py"):
+        for block in complexity.cc_visit(path.read_text()):
+            for each in (*getattr(block, "methods", ()), *([] if hasattr(block, "methods") else [block])):
+                every += 1
+                if each.complexity > COMPLEX_ABOVE:
+                    complex_ones.append(f"{path.relative_to(PACKAGE)}: {each.name} {each.complexity}")
+    assert len(complex_ones) <= COMPLEX_SHARE * every, "\n".join(sorted(complex_ones))
