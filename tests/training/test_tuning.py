@@ -62,10 +62,10 @@ def test_new_classes_are_learnt_from_the_beginning_and_told(
     command = ["train", str(data), "--out", str(out), "--weights", "default", "--steps", "1", *_BRIEFLY]
     assert main([*command, "--classes", "car,boat"]) == 0
     told = " ".join(capsys.readouterr().out.split())
-    assert "note the model default knows nothing of boat: learnt from the beginning" in told
+    assert "note the model default does not know boat: learnt from the beginning" in told
     assert "note the model default knows person, small object, which nothing here labels" in told
     notices = json.loads((out / "training.json").read_text())["notices"]
-    assert any("knows nothing of boat" in each for each in notices)
+    assert any("does not know boat" in each for each in notices)
     assert Detector.load(out / "model.onnx").classes == ("car", "boat")
 
 

@@ -60,8 +60,8 @@ class EvaluationProgress:
 class DetectorEvaluation:
     """One model's scores on each set, and, with rivals, all of them side by side; of several seeds the first is scored.
 
-    `found` are the first model's detections; `worst` each set's worst mistakes with their pictures; `notices` say what
-    was left out, and what the models had to say.
+    `found` are the first model's detections; `worst` each set's worst mistakes with their pictures; `notices` name what
+    was left out, and what the models report about the pictures.
     """
 
     found: FoundSets

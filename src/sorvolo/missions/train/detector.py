@@ -19,7 +19,7 @@ from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.train.checks import check_model, check_of
 from sorvolo.missions.train.sets import DataOptions, TrainingSets, read_labels, simulate_samples, training_sets
 from sorvolo.missions.train.settings import TrainSettings
-from sorvolo.missions.train.start import load_start, told_of_classes
+from sorvolo.missions.train.start import class_notices, load_start
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
 from sorvolo.store.exports.plain import json_bytes, plain_json
 from sorvolo.store.pages.training import training_page
@@ -57,7 +57,7 @@ _EXPORT_PICTURES, _EXPORT_PX = 4, 1280  # by which the model file is compared wi
 
 @dataclass(frozen=True)
 class TrainingUpdate:
-    """Where a run stands. Before its first step `step` is 0 and `words` says what is done."""
+    """Where a run stands. Before its first step `step` is 0 and `words` names what is being done."""
 
     step: int
     steps: int
@@ -66,7 +66,7 @@ class TrainingUpdate:
     steps_per_s: float = float("nan")
     left_s: float = float("nan")
     check: Check | None = None  # the one made just now
-    notices: tuple[str, ...] = ()  # what is to be known, each told once
+    notices: tuple[str, ...] = ()  # what is to be known, each reported once
 
 
 @dataclass(eq=False)
@@ -80,7 +80,7 @@ class _Run:
     reader: "_Reader"
     device: str
     start: ImageNetWeights | ExportedModel | None
-    notices: tuple[str, ...]  # told before the first step
+    notices: tuple[str, ...]  # reported before the first step
     history: History = field(default_factory=History)
 
     @property
@@ -121,10 +121,10 @@ def _train(
         for words in simulate_samples(out / SIMULATED, samples, settings.seed):
             yield TrainingUpdate(0, steps, words)
     sets = training_sets(labels, synthetic=settings.synthetic, simulated=out / SIMULATED)
-    told = sets.notices
+    notices = sets.notices
     if isinstance(start, ExportedModel):
-        told += tuple(told_of_classes(start, sets.classes))
-    yield TrainingUpdate(0, steps, f"preparing the network ({settings.preset})", notices=told)
+        notices += tuple(class_notices(start, sets.classes))
+    yield TrainingUpdate(0, steps, f"preparing the network ({settings.preset})", notices=notices)
     reader = _Reader(sets)
     with without_denormals():
         with closing(_batches(sets, reader, settings)) as first:
@@ -132,15 +132,15 @@ def _train(
                 settings.preset, sets.classes, settings.rpn, settings.schedule, start, first, steps=steps,
                 batch=settings.batch, seed=settings.seed, device=device,
             )
-        run = _Run(out, settings, sets, learner, reader, device, start, told)
+        run = _Run(out, settings, sets, learner, reader, device, start, notices)
         if resume:
             checkpoint = read_checkpoint((out / CHECKPOINT).read_bytes(), str(out / CHECKPOINT))
             restore(run.learner, checkpoint, run.identity)
             run.history = checkpoint.history
         yield from _learn(run)
         yield TrainingUpdate(run.learner.step, steps, "measuring and writing the model")
-        check, told = _finish(run)
-    yield TrainingUpdate(run.learner.step, steps, f"{out / MODEL} is ready", check=check, notices=told)
+        check, closing_notices = _finish(run)
+    yield TrainingUpdate(run.learner.step, steps, f"{out / MODEL} is ready", check=check, notices=closing_notices)
 
 
 @contextmanager
@@ -259,8 +259,8 @@ def _look(run: _Run, model: FasterRCNN, most: int) -> Checked:
 
 
 def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
-    """The best weights as a model file, checked against torch, with the report; its last check, and what is new to
-    say."""
+    """The best weights as a model file, checked against torch, with the report; its last check, and notices that
+    are new."""
     model, classes, best = run.learner.average, run.sets.classes, run.history.best
     if best is not None:
         load_weights_bytes(model, (run.out / BEST).read_bytes(), str(run.out / BEST))
@@ -280,14 +280,14 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     agreement = check_export(model.cpu(), exported, _some_pictures(run))
     atomic_write_bytes(run.out / MODEL, exported)
     check = check_of(checked, run.learner.step if best is None else best.step) if run.sets.held_out else None
-    told = _closing_notices(run, agreement, check)
-    report = _report(run, info, agreement, len(exported), check, told) | {
+    notices = _closing_notices(run, agreement, check)
+    report = _report(run, info, agreement, len(exported), check, notices) | {
         "reported": {name: asdict(each) for name, each in thresholds.items()},
         "found_px": found_sizes_px(checked, scores, classes),
     }
     atomic_write_bytes(run.out / REPORT, json_bytes(report))
     atomic_write_bytes(run.out / PAGE, training_page(plain_json(report)).encode())
-    return check, told
+    return check, notices
 
 
 def _descent(run: _Run, learnt: str) -> dict[str, str]:
@@ -295,9 +295,9 @@ def _descent(run: _Run, learnt: str) -> dict[str, str]:
     licence = "as the data that it was trained on"
     if not isinstance(run.start, ExportedModel):
         return {"licence": licence, "trained_on": learnt}
-    before = run.start.trained_on or "what is not said"
+    before = run.start.trained_on or "not stated"
     return {
-        "licence": f"{licence}; {run.start.origin} before: {run.start.licence or 'not said'}",
+        "licence": f"{licence}; {run.start.origin} before: {run.start.licence or 'not stated'}",
         "trained_on": f"{learnt}; {run.start.origin} before: {before}",
     }
 
@@ -322,7 +322,7 @@ def _closing_notices(run: _Run, agreement: ExportCheck, check: Check | None) -> 
     if check is not None and check.ap50 < _FINDS_NOTHING_AP50:
         notices.append(
             f"the model finds next to nothing: its AP50 on the held-out pictures is {check.ap50:.3f}; train longer "
-            "(--steps), begin with --weights auto or a model, or look whether the labels fit the pictures"
+            "(--steps), begin with --weights auto or a model, or check whether the labels fit the pictures"
         )
     if run.reader.damaged:
         count, (path, reason) = len(run.reader.damaged), next(iter(run.reader.damaged.items()))

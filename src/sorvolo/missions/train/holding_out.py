@@ -8,7 +8,7 @@ _BLOCKS, _GAP = 10, 10  # into which a set of too few videos is cut; frames left
 
 
 def hold_out(labelled: LabelledSet, share: float, seed: int) -> tuple[LabelledSet, LabelledSet, list[str]]:
-    """What is learnt from, what is held out, and what is to be said of it; whole videos wherever there are enough.
+    """What is learnt from, what is held out, and notices about that; whole videos wherever there are enough.
 
     Both `sorvolo train --val SHARE` and `sorvolo evaluate detector --held-out SHARE` take it from here. Raises
     SettingsError for a share outside 0 to below 1.
@@ -24,7 +24,7 @@ def hold_out(labelled: LabelledSet, share: float, seed: int) -> tuple[LabelledSe
         if share / 3 <= len(parts["held out"]) / len(labelled) <= min(3 * share, (1 + share) / 2):
             return parts["learnt"], parts["held out"], []
     except InputError:
-        pass  # too few videos: told below
+        pass  # too few videos: blocks of frames are held out below
     block = max(1, len(labelled) // _BLOCKS)
     try:
         parts = split_by_blocks(labelled, shares, block, min(_GAP, block // 2), seed)
@@ -34,5 +34,5 @@ def hold_out(labelled: LabelledSet, share: float, seed: int) -> tuple[LabelledSe
         f"{labelled.name} has too few videos to hold whole ones out: blocks of about {block} neighbouring frames were "
         "instead; frames of one video look alike, so the score will be too good"
     )
-    told = [notice.text for each in parts.values() for notice in each.notices]
-    return parts["learnt"], parts["held out"], [text, *(f"{labelled.name}: {each}" for each in told)]
+    remarks = [f"{labelled.name}: {notice.text}" for each in parts.values() for notice in each.notices]
+    return parts["learnt"], parts["held out"], [text, *remarks]

@@ -20,7 +20,7 @@ from sorvolo.survey.splits import shared_groups, shuffled
 from sorvolo.training.samples import Share
 
 _SMALL = CLASSES[2]
-_LOOKED_AT = 40  # pictures of a set by which it is told whether it is thermal
+_LOOKED_AT = 40  # pictures of a set that decide whether it is thermal
 _SUBSTANTIAL = 0.1  # share of the samples from which on a light is learnt
 _SYNTHETIC_PICTURES = (4, 1200)  # made at least and at most
 _SYNTHETIC_THERMAL = 0.2
@@ -112,21 +112,26 @@ def read_labels(places: Sequence[Path], options: DataOptions, *, synthetic: floa
     read = _read([*places, *checked], options)
     whole, apart = list(read[:len(places)]), list(read[len(places):])
     notices = [f"{each.name}: {notice.text}" for each in read for notice in each.notices]
-    if share is None:
-        learnt, held_out = whole, apart
-        notices += [notice.text for each in whole for notice in shared_groups(each, held_out[0])]
-    else:
-        parts = [hold_out(each, share, seed) for each in whole]
-        learnt, held_out = [each[0] for each in parts], [each[1] for each in parts if len(each[1])]
-        notices += [text for each in parts for text in each[2]]
-    return ReadLabels(tuple(learnt), tuple(held_out), tuple(notices))
+    if share is not None:
+        return _divided(whole, share, seed, notices)
+    notices += [notice.text for each in whole for notice in shared_groups(each, apart[0])]
+    return ReadLabels(tuple(whole), tuple(apart), tuple(notices))
+
+
+def _divided(whole: Sequence[LabelledSet], share: float, seed: int, notices: Sequence[str]) -> ReadLabels:
+    """The sets with a share of each held out; `notices` and what is to be known of that."""
+    parts = [hold_out(each, share, seed) for each in whole]
+    return ReadLabels(
+        tuple(learnt for learnt, _, _ in parts), tuple(held_out for _, held_out, _ in parts if len(held_out)),
+        (*notices, *(text for _, _, texts in parts for text in texts)),
+    )
 
 
 def training_sets(read: ReadLabels, *, synthetic: float, simulated: Path) -> TrainingSets:
     """What is learnt from and checked on; `simulated` is the folder of `simulate_samples`, from which `synthetic` of
     all samples come, with small objects composed onto the ground of the sets that have none.
 
-    A class that a set knows nothing of is unlabelled there. Raises InputError where no set holds an object to learn.
+    A class that a set does not name is unlabelled there. Raises InputError where no set holds an object to learn.
     """
     notices = list(read.notices)
     shares = [share for each in read.learnt for share in _by_light(each)]
@@ -136,19 +141,29 @@ def training_sets(read: ReadLabels, *, synthetic: float, simulated: Path) -> Tra
     classes = _in_order(name for each in shares for name in each.labelled.classes)
     shares = [replace(each, labelled=_honest(each.labelled, classes)) for each in shares]
     if synthetic > 0:
-        shares = [replace(each, pastes=_SMALL) if _SMALL in each.labelled.unlabelled else each for each in shares]
-    if not any(len(picture.labels) for each in shares for picture in each.labelled.pictures):
-        remarks = "; ".join(notices) or "all their label files are empty"
-        raise InputError(f"none of the pictures to learn from has a labelled object that can be used ({remarks}); "
-                         "check the labels, their class names and what is held out with --val")
+        shares = [_with_small_objects(each) for each in shares]
+    _demand_objects(shares, notices)
     notices += _short_classes(shares, classes)
     return TrainingSets(
         tuple(shares), tuple(_honest(each, classes) for each in read.held_out), classes, tuple(notices)
     )
 
 
+def _with_small_objects(share: Share) -> Share:
+    """The share with small objects composed onto its ground, where it labels none."""
+    return replace(share, pastes=_SMALL) if _SMALL in share.labelled.unlabelled else share
+
+
+def _demand_objects(shares: Sequence[Share], notices: Sequence[str]) -> None:
+    """Raise InputError where no picture has an object to learn, with what was remarked of the sets."""
+    if not any(len(picture.labels) for each in shares for picture in each.labelled.pictures):
+        remarks = "; ".join(notices) or "all their label files are empty"
+        raise InputError(f"none of the pictures to learn from has a labelled object that can be used ({remarks}); "
+                         "check the labels, their class names and what is held out with --val")
+
+
 def simulate_samples(folder: Path, samples: int, seed: int) -> Iterator[str]:
-    """Make pictures for so many simulated samples, telling how far it is; a folder that has them already is kept."""
+    """Make pictures for so many simulated samples, and report how far it is; a folder that has them already is kept."""
     low, high = _SYNTHETIC_PICTURES
     if not (folder / PICTURES_MARK).is_file():
         settings = PictureSettings(
@@ -187,8 +202,7 @@ def _honest(labelled: LabelledSet, classes: Sequence[str]) -> LabelledSet:
 def _by_light(labelled: LabelledSet) -> list[Share]:
     """The set as one share, thermal or not by some of its pictures; as two where these are of both kinds."""
     rows = shuffled(len(labelled))[:_LOOKED_AT]  # not evenly: lights may take turns
-    told = [_is_thermal(labelled.pictures[row]) for row in rows]
-    known = [each for each in told if each is not None]
+    known = [each for row in rows if (each := _is_thermal(labelled.pictures[row])) is not None]
     ratio = sum(known) / max(1, len(known))
     if not _SUBSTANTIAL <= ratio <= 1 - _SUBSTANTIAL:
         return [Share(labelled, float(len(labelled)), thermal=ratio > 0.5)]

@@ -62,16 +62,16 @@ def fetch_weights(net: Net) -> Path:
     return place
 
 
-def told_of_classes(start: ExportedModel, classes: Sequence[str]) -> list[str]:
+def class_notices(start: ExportedModel, classes: Sequence[str]) -> list[str]:
     """What becomes of the model's classes in a training of `classes`, where they are not the same."""
     new = [name for name in classes if name not in start.classes]
     left = [name for name in start.classes if name not in classes]
-    told = []
+    notices = []
     if new:
-        told.append(f"{start.origin} knows nothing of {', '.join(new)}: learnt from the beginning")
+        notices.append(f"{start.origin} does not know {', '.join(new)}: learnt from the beginning")
     if left:
-        told.append(f"{start.origin} knows {', '.join(left)}, which nothing here labels: the new model will not")
-    return told
+        notices.append(f"{start.origin} knows {', '.join(left)}, which nothing here labels: the new model will not")
+    return notices
 
 
 def _model(choice: str, preset: Preset) -> ExportedModel:

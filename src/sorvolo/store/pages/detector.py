@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from sorvolo.geometry.arrays import Anything, ImageRGB
+from sorvolo.geometry.arrays import ImageRGB, ImageRGBA
 from sorvolo.store.pages.plots import Axes, Label, Line, Scale, colour_class, line_plot
 from sorvolo.store.pages.render import cell, render
 from sorvolo.store.pages.words import known, picture_uri
@@ -194,8 +194,8 @@ def _mistake_words(mistake: Any) -> str:
     return f"{mistake.label}, {mistake.score:.2f}{beside}"
 
 
-def _opaque(rgb: ImageRGB) -> Anything:
-    return np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
+def _opaque(rgb: ImageRGB) -> ImageRGBA:
+    return np.asarray(np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)]), np.uint8)
 
 
 def _range(low: float, high: float, unit: str) -> str:
