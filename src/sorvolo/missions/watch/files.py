@@ -116,7 +116,7 @@ class WatchFiles:
         self._forgotten += [name for each in track_ids if (name := self.crop_names.pop(each, None)) is not None]
 
     def clear(self) -> None:
-        """Remove the crops that were forgotten; not earlier, for whom an alert told may still be looking at them."""
+        """Remove the crops that were forgotten; not earlier: who received an alert may still be looking at them."""
         for name in self._forgotten:
             (self.folder / name).unlink(missing_ok=True)
 
@@ -162,7 +162,7 @@ class WatchFiles:
             started_s = time.monotonic()
             try:
                 self._write(seen)
-            except Exception as error:  # told by the next `add`, or by `close`
+            except Exception as error:  # raised by the next `add`, or by `close`
                 self._error = error
             self.seconds += time.monotonic() - started_s
 

@@ -38,9 +38,9 @@ def watch(
 
     `source`, `telemetry` and `camera` are those of `map_flights`; a folder of several videos is watched one after
     another, each into a folder of its own. `detector` is one that is loaded already; else `settings.model` is. Every
-    wanted frame of a recorded flight is searched; of a live one, read as `live` says, the newest, so that latency stays
-    bounded, and the others are counted. Objects are placed on the ground where telemetry allows it, else followed in
-    the picture.
+    wanted frame of a recorded flight is searched; of a live one, read with the settings `live`, the newest, so that
+    latency stays bounded, and the others are counted. Objects are placed on the ground where telemetry allows it, else
+    followed in the picture.
 
     Set `until`, close the generator, or press Ctrl-C, to end early: all that was found until then is written. Raises
     InputError, SettingsError or StoreError with what to do.
@@ -49,10 +49,7 @@ def watch(
     if outputs.cot:
         check_host(cot_place(outputs.cot))
     finder = Detector.load(settings.model) if detector is None else detector
-    if unknown := sorted(set(settings.classes) - set(finder.classes)):
-        raise SettingsError(f"the model knows no {unknown[0]!r}; it knows {', '.join(finder.classes)}")
-    if unknown := sorted(set(outputs.cot_types) - {*finder.classes, *COT_TYPES}):
-        raise SettingsError(f"--cot-type {unknown[0]}: no such class; the model knows {', '.join(finder.classes)}")
+    _demand_known_classes(finder, settings, outputs)
     sources = open_sources([source], telemetry, camera, live=live, until=until)
     with ExitStack() as stack:
         for each in sources:
@@ -68,6 +65,13 @@ def watch(
                 each, finder, settings, replace(outputs, folder=folder), folder, until,
                 telemetry_named=telemetry is not None,
             )
+
+
+def _demand_known_classes(detector: Detects, settings: WatchSettings, outputs: WatchOutputs) -> None:
+    if unknown := sorted(set(settings.classes) - set(detector.classes)):
+        raise SettingsError(f"the model knows no {unknown[0]!r}; it knows {', '.join(detector.classes)}")
+    if unknown := sorted(set(outputs.cot_types) - {*detector.classes, *COT_TYPES}):
+        raise SettingsError(f"--cot-type {unknown[0]}: no such class; the model knows {', '.join(detector.classes)}")
 
 
 def _watch_one(
@@ -89,18 +93,7 @@ def _watch_one(
     with WatchRun(setup, places, detector, settings, outputs, folder) as run:
         ended = _STOPPED
         try:
-            asked = _Asked(_wanted(source, settings))
-            with closing(_arrivals(source, asked)) as arrivals:
-                for arrived_s, each in arrivals:
-                    if isinstance(each, Frame):
-                        yield run.add(each, arrived_s)
-                    else:
-                        run.lose(each)
-                    if until.is_set():
-                        break
-            ended = _STOPPED if until.is_set() else "the source ended"
-            if ended != _STOPPED and not isinstance(source, LiveSource):
-                run.log.read = asked.frames  # also those after the last one that was searched
+            ended = yield from _search(run, source, settings, until)
         except KeyboardInterrupt:
             pass  # the usual way to end a live watch: what was found is written below
         except Exception as error:
@@ -112,6 +105,26 @@ def _watch_one(
         if not run.log.detected and ended != _STOPPED:
             reason = next(iter(run.log.lost), "the source holds none")
             raise InputError(f"no frame of {source.name} could be searched: {reason}; `sorvolo inspect` tells more")
+
+
+def _search(
+    run: WatchRun, source: Source, settings: WatchSettings, until: threading.Event
+) -> Generator[WatchUpdate, None, str]:
+    """Search the wanted frames, yielding an update for each; why it ended, in words."""
+    asked = _Asked(_wanted(source, settings))
+    with closing(_arrivals(source, asked)) as arrivals:
+        for arrived_s, each in arrivals:
+            if isinstance(each, Frame):
+                yield run.add(each, arrived_s)
+            else:
+                run.lose(each)
+            if until.is_set():
+                break
+    if until.is_set():
+        return _STOPPED
+    if not isinstance(source, LiveSource):
+        run.log.read = asked.frames  # also those after the last one that was searched
+    return "the source ended"
 
 
 class _Asked:
@@ -178,7 +191,7 @@ def read_ahead(frames: Iterator[Frame | LostFrame], most: int) -> Generator[Fram
 
 
 def _wanted(source: Source, settings: WatchSettings) -> Callable[[int, int], bool]:
-    """Which frames are searched: all photos, every so manieth frame, or so many a second of flight.
+    """Which frames are searched: all photos, every N-th frame, or a number a second of flight.
 
     Of a live source all may be: those that nobody has time for give way to newer ones.
     """

@@ -45,7 +45,7 @@ class Places(Protocol):
         """How frames were placed, and what could not be."""
 
     def path_m(self) -> Floats:
-        """(N, 2) where the camera was, in site metres; none where nothing says so."""
+        """(N, 2) where the camera was, in site metres; none where it is not known."""
 
 
 def places_of(setup: FlightSetup, least_score: float, ground: GroundHeight | None = None) -> Places:

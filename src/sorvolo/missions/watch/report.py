@@ -1,4 +1,4 @@
-"""What a watch's report says: counted and timed while it runs, told at the end."""
+"""A watch's report: counted and timed while it runs, written at the end."""
 
 import platform
 import resource
@@ -20,7 +20,7 @@ from sorvolo.store.exports.plain import utc_text
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.objects import Detections, Track
 
-# what sources say of frames that cannot be used either, told with the reasons
+# notices of sources about frames that cannot be used: left out where the reasons are reported
 _OF_LOST_FRAMES = ("unreadable_photo", "corrupt_photo", "duplicate_photo", "other_size", "other_shape")
 
 
@@ -78,7 +78,6 @@ def build_watch_report(
     source, camera = setup.source, setup.source.camera
     total = sum(log.found.values())
     seconds = log.seconds
-    height = setup.track.height_words if setup.track else "none"
     return {
         "sorvolo": sorvolo.__version__,
         "flight": source.name,
@@ -102,12 +101,7 @@ def build_watch_report(
             "origin": camera.origin, "width_px": camera.camera.width_px, "height_px": camera.camera.height_px,
             "focal_px": camera.camera.fx_px, "focal_sigma_relative": camera.focal_sigma,
         },
-        "telemetry": {
-            "format": source.telemetry.format, "samples": len(source.telemetry),
-            "tie": setup.clock.tie if setup.clock else "none",
-            "height": height if on_ground else height.split(",")[0],  # what follows says how a map finds it
-            "attitude": setup.track.attitude if setup.track else "none",
-        },
+        "telemetry": _telemetry(setup, on_ground),
         "latency_s": {
             "median": statistics.median(log.latency_s) if log.latency_s else None,
             "max": max(log.latency_s, default=None),
@@ -125,8 +119,18 @@ def build_watch_report(
     }
 
 
+def _telemetry(setup: FlightSetup, on_ground: bool) -> dict[str, Any]:
+    telemetry = setup.source.telemetry
+    height = setup.track.height_words if setup.track else "none"
+    return {
+        "format": telemetry.format, "samples": len(telemetry), "tie": setup.clock.tie if setup.clock else "none",
+        "height": height if on_ground else height.split(",")[0],  # the rest is how a map finds it
+        "attitude": setup.track.attitude if setup.track else "none",
+    }
+
+
 def source_notices(source: Source, log: WatchLog) -> tuple[Notice, ...]:
-    """What the source, its telemetry and its unusable frames have to tell."""
+    """The notices of the source and its telemetry, and one about unusable frames."""
     lost = sum(log.lost.values())
     reasons = "; ".join(f"{count} x {reason}" for reason, count in log.lost.most_common(5))
     unusable = (Notice("lost_frames", lost, f"{lost} frames could not be used: {reasons}"),) if lost else ()

@@ -24,6 +24,7 @@ from sorvolo.store.pages.watch import watch_page
 from sorvolo.survey.flight import Frame, LostFrame, Site
 from sorvolo.survey.objects import Detections, Sighting, Track
 from sorvolo.survey.wording import counted_list
+from sorvolo.tracking.following import Taken
 
 _LAST_ALERTS_S, _LAST_EVENTS_S = 35.0, 5.0  # how long the end waits for what is still on its way
 
@@ -100,20 +101,15 @@ class WatchRun:
         log.searched(time_ns, found, placed)
         confirmed = [track for track in self._places.tracks() if track.confirmed]
         counts = count_by_class(confirmed)
+        seen_ids = set(taken.track_ids)
+        seen = [track for track in confirmed if track.id in seen_ids]
+        new = [track for track in confirmed if track.id in taken.new_ids]
         with log.stage("hand over"):
             self._files.add(SeenFrame(
                 frame, time_ns, found, taken.sightings, taken.track_ids, frozenset(each.id for each in confirmed),
                 f"frame {frame.name}, counted so far: {counted_list(counts)}", taken.segment,
             ))
-            seen_ids = set(taken.track_ids)
-            seen = [track for track in confirmed if track.id in seen_ids]
-            for track in seen:
-                self._files.crop_of(track)
-            new = [track for track in confirmed if track.id in taken.new_ids]
-            self._files.forget(taken.merged)
-            self._notifier.report(new, seen, self._files.crop_names, taken.segment)
-            self._notifier.withdraw(taken.merged)
-            self._files.show(confirmed)
+            self._hand_over(taken, confirmed, seen, new)
         latency_s = time.monotonic() - arrived_s
         log.latency_s.append(latency_s)
         source = self._setup.source
@@ -122,6 +118,17 @@ class WatchRun:
             latency_s, log.read, log.detected, source.frame_count, log.seconds, self._folder,
             self._places.site, taken.segment,
         )
+
+    def _hand_over(
+        self, taken: Taken, confirmed: Sequence[Track], seen: Sequence[Track], new: Sequence[Track]
+    ) -> None:
+        """Crops, reports and withdrawals of one frame, and the files that show all tracks so far."""
+        for track in seen:
+            self._files.crop_of(track)
+        self._files.forget(taken.merged)
+        self._notifier.report(new, seen, self._files.crop_names, taken.segment)
+        self._notifier.withdraw(taken.merged)
+        self._files.show(confirmed)
 
     def finish(self, *, ended: str, skipped: int) -> None:
         """The last word on every track, the files for other programs, and the report."""
@@ -160,15 +167,20 @@ class WatchRun:
         warnings = []
         if name := interpreted_placeholder(self._outputs.alert_command):
             warnings.append(interpreted_words(name))
+        return warnings if self._places.site.is_local else warnings + self._place_warnings(tracks)
+
+    def _place_warnings(self, tracks: Sequence[Track]) -> list[str]:
+        """What makes places on the ground few or inaccurate."""
+        warnings = []
         total = sum(self.log.found.values()) - self._places.set_aside
-        if not self._places.site.is_local and total and self.log.placed < 0.5 * total:
+        if total and self.log.placed < 0.5 * total:
             warnings.append(
                 f"{total - self.log.placed} of {total} detections have no place on the ground and are in no track; "
                 "the notices say why"
             )
-        if not self._places.site.is_local and self._setup.source.camera.focal_sigma > 0.1:
+        if self._setup.source.camera.focal_sigma > 0.1:
             warnings.append(f"camera: {self._setup.source.camera.origin}; until then places are some percent off")
-        far = [track for track in tracks if track.sigma_m > 10] if not self._places.site.is_local else []
+        far = [track for track in tracks if track.sigma_m > 10]
         if far:
             warnings.append(
                 f"{len(far)} of {len(tracks)} objects are placed to more than 10 m only; telemetry with the camera's "

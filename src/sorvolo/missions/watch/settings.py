@@ -1,4 +1,4 @@
-"""What a person may choose for a watch: what is looked for in which frames, and who is told."""
+"""What a person may choose for a watch: what is searched for in which frames, and who is notified."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -25,9 +25,9 @@ class WatchSettings:
     classes: tuple[str, ...] = ()  # empty: all that the model knows
     least_score: float | None = None  # of a detection; None: each class's own, as its model has it
     tiles: Literal["auto"] | int | None = "auto"  # large pictures cut: by the ground's sampling distance, px, not
-    every: int | None = None  # every so manieth frame; None: by time
+    every: int | None = None  # search every N-th frame; None: by time
     frames_per_second: float | None = None  # of flight; None: 10, and of a live stream as many as there is time for
-    offset_s: float | None = None  # telemetry time = video time + this; None: as their clocks say
+    offset_s: float | None = None  # telemetry time = video time + this; None: by their clocks
     ground_elevation_m: float | None = None  # of the ground, in the telemetry's own height reference
     height_model: str = ""  # a GeoTIFF of the ground's heights, in the same reference; empty: the ground is level
 
@@ -36,27 +36,30 @@ class WatchSettings:
             raise SettingsError(f"the least score must lie in 0 to 1, got {self.least_score}")
         if isinstance(self.tiles, int) and not 64 <= self.tiles <= 16_384:
             raise SettingsError(f"tiles must be 64 to 16384 px wide, got {self.tiles}")
+        self._check_frames()
+        if self.height_model and self.ground_elevation_m is not None:
+            raise SettingsError("give a height model or the ground's elevation, not both")
+        check_offset(self.offset_s)
+
+    def _check_frames(self) -> None:
         if self.every is not None and self.frames_per_second is not None:
             raise SettingsError("give every N-th frame (--every) or so many frames a second (--fps), not both")
         if self.every is not None and self.every < 1:
             raise SettingsError(f"every N-th frame: N must be 1 or more, got {self.every}")
         if self.frames_per_second is not None and not 0.001 <= self.frames_per_second <= 1000:
             raise SettingsError(f"frames a second must lie in 0.001 to 1000, got {self.frames_per_second}")
-        if self.height_model and self.ground_elevation_m is not None:
-            raise SettingsError("give a height model or the ground's elevation, not both")
-        check_offset(self.offset_s)
 
 
 @dataclass(frozen=True)
 class WatchOutputs:
-    """What a watch leaves behind and whom it tells while it runs."""
+    """The files that a watch leaves, and whom it notifies while it runs."""
 
     folder: Path | None = None  # None: `<source>-watch` where the command runs
     save: Literal["none", "video", "pictures"] = "none"  # frames with what was found drawn in
     labels: tuple[str, ...] = ()  # of "coco", "yolo": what was found, as labels to correct and train with
     cot: str = ""  # udp://host:port or tcp://host:port
     cot_types: Mapping[str, str] = field(default_factory=lambda: COT_TYPES)  # Cursor on Target's type of each class
-    cot_every_s: float = 3.0  # of one track, once it was told of
+    cot_every_s: float = 3.0  # of one track, once it was reported
     cot_stale_s: float = 300.0
     alert_command: str = ""
     alert_url: str = ""

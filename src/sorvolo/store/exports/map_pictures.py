@@ -55,24 +55,30 @@ def pictures(
     columns, rows = np.array(indexes).T
     left, top = int(columns.min()), int(rows.min())
     width, height = int(columns.max()) - left + 1, int(rows.max()) - top + 1
-    step = 1
-    while tile_px % (2 * step) == 0 and max(width, height) * tile_px > step * max_px:
-        step *= 2
+    step = _thinning(max(width, height), tile_px, max_px)
     small_px = tile_px // step
     canvases = [np.zeros((height * small_px, width * small_px, 4), np.uint8) for _ in maps]
     seen = np.zeros((height * small_px, width * small_px), bool)
     for canvas, tiles in zip(canvases, maps):
+        known = alike if canvas is not canvases[0] else ()
         for column, row in sorted(tiles):
             y, x = (row - top) * small_px, (column - left) * small_px
             part = np.s_[y:y + small_px, x:x + small_px]
-            if canvas is not canvases[0] and (column, row) in alike:
-                canvas[part] = canvases[0][part]
-            else:
-                canvas[part] = shrink(tiles[column, row], small_px, small_px)
+            canvas[part] = (
+                canvases[0][part] if (column, row) in known else shrink(tiles[column, row], small_px, small_px)
+            )
         seen |= canvas[..., 3] > 0
     (y0, y1), (x0, x1) = (np.flatnonzero(seen.any(axis=axis))[[0, -1]] + [0, 1] for axis in (1, 0))
     corner_px = (left * tile_px + int(x0) * step - 0.5, top * tile_px + int(y0) * step - 0.5)
     return [Picture(np.ascontiguousarray(canvas[y0:y1, x0:x1]), corner_px, step) for canvas in canvases]
+
+
+def _thinning(tiles: int, tile_px: int, max_px: int) -> int:
+    """By how much tiles are made smaller, a power of two that divides a tile, so that `tiles` in a row fit `max_px`."""
+    step = 1
+    while tile_px % (2 * step) == 0 and tiles * tile_px > step * max_px:
+        step *= 2
+    return step
 
 
 def write_preview(tiles: Mapping[TileIndex, ImageRGBA], path: Path, max_px: int = PREVIEW_PX) -> None:

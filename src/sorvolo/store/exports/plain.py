@@ -19,18 +19,20 @@ _NO_PLACE = (
 
 
 def plain_json(value: Any) -> Any:
-    """The value as JSON can say it: records as objects, arrays as lists, NaN and infinities as null.
+    """The value as JSON can hold it: records as objects, arrays as lists, NaN and infinities as null.
 
     Raises TypeError for what has no such form.
     """
-    if value is None or isinstance(value, bool | str):
+    if value is None or isinstance(value, bool | str | int):
         return value.value if isinstance(value, Enum) else value
     if isinstance(value, np.generic | np.ndarray):
         return plain_json(value.tolist())
-    if isinstance(value, int):
-        return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
+    return _plain_members(value)
+
+
+def _plain_members(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(key): plain_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
@@ -89,7 +91,7 @@ def utc_text(time_ns: int) -> str:
 
 
 def time_words(time_ns: int) -> str:
-    """UTC to the second for people; the time into the flight where no clock told the date."""
+    """UTC to the second for people; the time into the flight where no clock knew the date."""
     if 0 <= time_ns < _DAY_NS:
         return f"{time_ns // 60_000_000_000}:{time_ns // 1_000_000_000 % 60:02d} into the flight"
     return utc_text(time_ns)[:19].replace("T", " ")

@@ -63,9 +63,9 @@ def changes_page(
     text is escaped.
     """
     most_bytes = int(_CROPS_BYTES / max(2 * len(changes), 1))
-    is_shown = before is not None and after is not None and after.rgba.size > 0
+    shown = (before, after) if before is not None and after is not None and after.rgba.size > 0 else None
     listed = [
-        _listed(each, site, crops.get(each.id, (None, None)), most_bytes, after if is_shown else None)
+        _listed(each, site, crops.get(each.id, (None, None)), most_bytes, shown[1] if shown else None)
         for each in changes
     ]
     is_reviewed = any(each.verdict is not None for each in changes)
@@ -76,15 +76,18 @@ def changes_page(
         headline=_headline(report, changes), summary=" ".join(_summary(report, changes)),
         warning_lines=_warnings(report), is_many=len(changes) > _MANY, legend=_legend(changes),
         before_words=before_words, after_words=after_words,
-        map=_map(before, after) if before is not None and after is not None and is_shown else None,
+        map=_map(*shown) if shown else None,
         changes=listed, is_reviewed=is_reviewed, has_metres=not site.is_local,
         systems=() if site.is_local else tuple(SYSTEMS.items()),
         columns=_columns(listed, is_reviewed), files=_files(site),
         view_rows=_view_rows(report), not_announced=_not_announced(report),
-        reasons=[(count, why) for why, count in (at(report, "comparison", "reasons") or {}).items()],
-        unknown_share=None if unknown is None else f"{unknown:.1%}", how=_how(report),
+        reasons=_reasons(report), unknown_share=None if unknown is None else f"{unknown:.1%}", how=_how(report),
     )
     return str(page)
+
+
+def _reasons(report: Mapping[str, Any]) -> list[tuple[Any, Any]]:
+    return [(count, why) for why, count in (at(report, "comparison", "reasons") or {}).items()]
 
 
 @dataclass(frozen=True)
@@ -146,12 +149,16 @@ def _headline(report: Mapping[str, Any], changes: Sequence[StoredChange]) -> str
     kinds: Counter[ChangeKind] = Counter(each.kind for each in changes if each.kind is not ChangeKind.MOVING)
     moving = sum(each.kind is ChangeKind.MOVING for each in changes)
     also = f"; also {plural(moving, 'moving object')}" if moving else ""
-    total = sum(kinds.values())
     is_dark = at(report, "comparison", "most_missed") is True
+    return _found_words(kinds, ground, also, is_dark=is_dark)
+
+
+def _found_words(kinds: Mapping[ChangeKind, int], ground: str, also: str, *, is_dark: bool) -> str:
+    total = sum(kinds.values())
     if not total:
         none = f"no change was found{ground}{also}."
         return f"Too dark: most changes would be missed, and {none}" if is_dark else f"N{none[1:]}"
-    named = ", ".join(f"{kinds[kind]} {kind.value}" for kind in ChangeKind if kinds[kind])
+    named = ", ".join(f"{kinds[kind]} {kind.value}" for kind in ChangeKind if kinds.get(kind))
     dark = "; it was too dark to find most others" if is_dark else ""
     return f"{plural(total, 'change')}{ground}: {named}{also}{dark}."
 
@@ -171,21 +178,18 @@ def _summary(report: Mapping[str, Any], changes: Sequence[StoredChange]) -> list
     grown_m2, extending = (number_at(report, "comparison", "extension", key) for key in ("area_m2", "frames"))
     if grown_m2 and extending:
         sentences.append(f"The map grew by {area_words(grown_m2)}, shown by {plural(extending, 'frame')}.")
+    return sentences + _reviewed_words(changes)
+
+
+def _reviewed_words(changes: Sequence[StoredChange]) -> list[str]:
+    """One sentence, or none where nothing was reviewed."""
     reviewed = Counter(each.verdict for each in changes if each.verdict is not None)
-    if reviewed:
-        counts = " and ".join(f"{reviewed[verdict]} {verdict.value}" for verdict in Verdict if reviewed[verdict])
-        sentences.append(f"Reviewed by a person: {counts}.")
-    return sentences
+    counts = " and ".join(f"{reviewed[verdict]} {verdict.value}" for verdict in Verdict if reviewed[verdict])
+    return [f"Reviewed by a person: {counts}."] if reviewed else []
 
 
 def _warnings(report: Mapping[str, Any]) -> list[str]:
-    warnings = [str(each) for each in at(report, "warnings") or []]
-    views = at(report, "comparison", "views") or {}
-    total = sum(views.values())
-    for status in (ViewStatus.NOT_ALIGNED, ViewStatus.ALL_CHANGED):
-        count = views.get(status.value, 0)
-        if total and count > 0.1 * total:
-            warnings.append(f"{count} of {total} views: {status.value}; each {_VIEW_WORDS[status]}.")
+    warnings = [str(each) for each in at(report, "warnings") or []] + _view_warnings(report)
     unknown = number_at(report, "comparison", "unknown_share")
     if unknown is not None and unknown > _UNKNOWN_SHARE:
         warnings.append(f"{unknown:.0%} of the ground under the views was unknown: its changes are not in the list.")
@@ -195,6 +199,17 @@ def _warnings(report: Mapping[str, Any]) -> list[str]:
     if at(report, "comparison", "map_updated") is False:
         warnings.append("The map was not updated: both halves of the picture show the map before.")
     return warnings
+
+
+def _view_warnings(report: Mapping[str, Any]) -> list[str]:
+    """Reasons for which more than a tenth of the views could not be compared."""
+    views = at(report, "comparison", "views") or {}
+    total = sum(views.values())
+    counts = {status: views.get(status.value, 0) for status in (ViewStatus.NOT_ALIGNED, ViewStatus.ALL_CHANGED)}
+    return [
+        f"{count} of {total} views: {status.value}; each {_VIEW_WORDS[status]}."
+        for status, count in counts.items() if total and count > 0.1 * total
+    ]
 
 
 def _map(before: Picture, after: Picture) -> dict[str, Any]:

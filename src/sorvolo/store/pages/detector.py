@@ -126,14 +126,7 @@ def _curves(scores: Any) -> dict[str, Any] | None:
         return None
     x = Scale(0, 1, _MARGIN_PX, _SIDE_PX - 12)
     y = Scale(0, 1, _SIDE_PX - _MARGIN_PX, 12)
-    ticks = (0.0, 0.25, 0.5, 0.75, 1.0)
-    labels = [Label(x(tick), y(0) + 16, f"{tick:g}") for tick in ticks]
-    labels += [Label(x(0) - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
-    labels += [Label(x(1), _SIDE_PX - 8, "recall", "end"), Label(6, _SIDE_PX - 8, "precision upwards", "start")]
-    frame = Axes(
-        x(0), x(1), 12, y(0), tuple(("grid", y(tick)) for tick in ticks), tuple(("grid", x(tick)) for tick in ticks),
-        tuple(labels),
-    )
+    frame = _unit_axes(x, y)
     lines = []
     for place, row in enumerate(shown):
         at = (row.reported.recall, row.reported.precision)
@@ -142,6 +135,18 @@ def _curves(scores: Any) -> dict[str, Any] | None:
         lines.append(Line(colour_class(place), points, dots, "reported", 4.5))
     keys = [(colour_class(place), row.label) for place, row in enumerate(shown)]
     return {"drawing": line_plot("Precision over recall", lines, frame, _SIDE_PX, _SIDE_PX), "legend": keys}
+
+
+def _unit_axes(x: Scale, y: Scale) -> Axes:
+    """Recall to the right and precision upwards, both 0 to 1."""
+    ticks = (0.0, 0.25, 0.5, 0.75, 1.0)
+    labels = [Label(x(tick), y(0) + 16, f"{tick:g}") for tick in ticks]
+    labels += [Label(x(0) - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
+    labels += [Label(x(1), _SIDE_PX - 8, "recall", "end"), Label(6, _SIDE_PX - 8, "precision upwards", "start")]
+    return Axes(
+        x(0), x(1), 12, y(0), tuple(("grid", y(tick)) for tick in ticks), tuple(("grid", x(tick)) for tick in ticks),
+        tuple(labels),
+    )
 
 
 def _sizes(scores: Any) -> list[tuple[str, list[list[Any]]]]:

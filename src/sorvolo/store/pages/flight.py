@@ -254,18 +254,24 @@ def _clock_offset(report: Mapping[str, Any]) -> str:
 
 def _stages(report: Mapping[str, Any]) -> list[dict[str, Any]]:
     """What each stage took, and the rest."""
-    wall, cpu = at(report, "seconds") or {}, at(report, "cpu_s") or {}
-    stages = {name: finite_or_none(value) or 0.0 for name, value in wall.items() if name != "total"}
-    rest = (finite_or_none(wall.get("total")) or 0.0) - sum(stages.values())
-    rows = [(_STAGE_WORDS.get(name, name), value, finite_or_none(cpu.get(name))) for name, value in stages.items()]
-    if rest > 0:
-        rows.append(("reading frames, and the rest", rest, None))
+    rows = _stage_rows(report)
     longest = max([value for _, value, _ in rows] + [1e-9])
     return [
         {"name": name, "share": value / longest, "time": seconds_words(value),
          "cpu": "" if cpu_s is None else seconds_words(cpu_s)}
         for name, value, cpu_s in rows
     ]
+
+
+def _stage_rows(report: Mapping[str, Any]) -> list[tuple[str, float, float | None]]:
+    """Name, seconds, and seconds of processor time where known, of each stage and of the rest."""
+    wall, cpu = at(report, "seconds") or {}, at(report, "cpu_s") or {}
+    stages = {name: finite_or_none(value) or 0.0 for name, value in wall.items() if name != "total"}
+    rest = (finite_or_none(wall.get("total")) or 0.0) - sum(stages.values())
+    rows = [(_STAGE_WORDS.get(name, name), value, finite_or_none(cpu.get(name))) for name, value in stages.items()]
+    if rest > 0:
+        rows.append(("reading frames, and the rest", rest, None))
+    return rows
 
 
 def _effort(report: Mapping[str, Any]) -> str:

@@ -90,8 +90,7 @@ def _settings(report: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _plot(title: str, lines: _Lines, high: float | None = None) -> dict[str, Any] | None:
     """Lines over steps and their key; None unless two points of one are known."""
-    certain = {name: [point for point in line if _is_known(point[1])] for name, line in lines.items()}
-    certain = {name: line for name, line in certain.items() if len(line) > 1}
+    certain = _certain(lines)
     if not certain:
         return None
     last = max(line[-1][0] for line in certain.values())
@@ -104,6 +103,12 @@ def _plot(title: str, lines: _Lines, high: float | None = None) -> dict[str, Any
     ]
     keys = [(colour_class(place), name) for place, name in enumerate(certain)]
     return {"drawing": line_plot(title, drawn, _axes(x, y), _WIDE_PX, _LOW_PX), "legend": keys}
+
+
+def _certain(lines: _Lines) -> dict[str, list[tuple[float, float]]]:
+    """The known points of each line; lines of fewer than two are left out."""
+    known = {name: [point for point in line if _is_known(point[1])] for name, line in lines.items()}
+    return {name: line for name, line in known.items() if len(line) > 1}
 
 
 def _axes(x: Scale, y: Scale) -> Axes:

@@ -47,24 +47,30 @@ def watch_page(
     nothing places. All text is escaped.
     """
     counts = Counter(str(each["class"]) for each in tracks)
-    looked_for = at(report, "settings", "classes") or at(report, "model", "classes") or ["objects"]
     shown = _crops(tracks, crops)
     is_local = not report.get("georeferenced")
-    versions = ", ".join(f"{name} {value}" for name, value in (report.get("versions") or {}).items())
     page = render(
         "watch.html", title=f"{report.get('flight')} - watch", flight=known(report.get("flight")),
         first=_when(report.get("first_frame")), last=_when(report.get("last_frame")),
         counts=count_words(dict(counts.most_common())), frames=known(at(report, "frames", "detected")),
-        looked_for=", ".join(map(str, looked_for)), warning_lines=report.get("warnings") or [],
+        looked_for=_searched_for(report), warning_lines=report.get("warnings") or [],
         maps=_maps(report, tracks, drone_m), rows=_rows(tracks, is_local=is_local),
         systems=() if is_local else tuple(SYSTEMS.items()),
         files=_LOCAL_FILES if is_local else _FILES,
         crops=shown, without_crop=len(tracks) - len(shown), course=_course(report),
         notices=[str(each["text"]) for each in report.get("notices") or []],
         model=[(str(name), known(_plain(value))) for name, value in (report.get("model") or {}).items()],
-        versions=join_words(f"Sorvolo {known(report.get('sorvolo'))},", versions),
+        versions=join_words(f"Sorvolo {known(report.get('sorvolo'))},", _versions(report)),
     )
     return str(page)
+
+
+def _searched_for(report: Mapping[str, Any]) -> str:
+    return ", ".join(map(str, at(report, "settings", "classes") or at(report, "model", "classes") or ["objects"]))
+
+
+def _versions(report: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in (report.get("versions") or {}).items())
 
 
 @dataclass(frozen=True)

@@ -282,7 +282,8 @@ def _naming_faults(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _raster(source: rasterio.DatasetReader, path: Path, max_px: int) -> Raster:
+def _demand_readable(source: rasterio.DatasetReader, path: Path) -> None:
+    """Raises InputError where it is no north-up map of 8-bit bands and square pixels in metres."""
     transform = source.transform
     if source.count == 2 or set(source.dtypes) != {"uint8"}:
         raise InputError(
@@ -293,6 +294,11 @@ def _raster(source: rasterio.DatasetReader, path: Path, max_px: int) -> Raster:
         raise InputError(f"{path} is not a north-up map with square pixels; warp it with gdalwarp first")
     if source.crs is not None and not source.crs.is_projected:
         raise InputError(f"{path} is in degrees ({source.crs}); warp it to a CRS in metres, as its UTM zone")
+
+
+def _raster(source: rasterio.DatasetReader, path: Path, max_px: int) -> Raster:
+    _demand_readable(source, path)
+    transform = source.transform
     step = -(-max(source.width, source.height) // max_px)
     width, height = source.width // step, source.height // step
     if not width or not height:

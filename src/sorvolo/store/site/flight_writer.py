@@ -74,7 +74,7 @@ class FlightWriter:
             self._files.catalogue.fold_log()
             forget_unfinished(self._files)
         except StoreError:
-            # if the disk is still full, the next opening does it, and the first error is the one to tell
+            # if the disk is still full, the next opening does it, and the first error is the one to report
             if error is None:
                 raise
 
@@ -152,11 +152,7 @@ class FlightWriter:
         """
         if crs is not None:
             parse_crs(crs, self._files.site_grid().grid)
-        keyframes = [
-            self._keyframe(frame, image_paths[frame.index])
-            for frame in placed
-            if frame.index in image_paths and frame.status is not Status.REJECTED
-        ]
+        keyframes = self._keyframes(placed, image_paths)
         site = self._files.site()
         found = change_records.stored_changes(self._flight_id, changes or ())
         texts = {
@@ -165,8 +161,7 @@ class FlightWriter:
             "report.json": json_bytes(report),
             "report.html": report_html.encode(),
         }
-        times_ns = [int(frame.time_ns) for frame in placed]
-        flown_ns = (min(times_ns), max(times_ns)) if times_ns else None
+        flown_ns = _flown_ns(placed)
         frames = {status.value: sum(frame.status is status for frame in placed) for status in Status}
         self.flush()
         self._stage(changes or (), search)
@@ -224,6 +219,14 @@ class FlightWriter:
     def _image_path(self, index: int) -> str:
         return self._files.image_name(self._flight_id, self._run_id, index)
 
+    def _keyframes(self, placed: Sequence[PlacedFrame], image_paths: Mapping[int, str]) -> list[StoredKeyframe]:
+        """The frames with a saved picture that the map did not reject."""
+        return [
+            self._keyframe(frame, image_paths[frame.index])
+            for frame in placed
+            if frame.index in image_paths and frame.status is not Status.REJECTED
+        ]
+
     def _keyframe(self, frame: PlacedFrame, image_path: str) -> StoredKeyframe:
         if image_path not in self._sizes:
             raise StoreError(f"the image {image_path} of frame {frame.name} was never saved; save it first")
@@ -238,3 +241,9 @@ class FlightWriter:
             frame.site_from_camera, np.asarray(frame.gains), frame.sigma_m, frame.residual_px,
             np.asarray(frame.vignette),
         )
+
+
+def _flown_ns(placed: Sequence[PlacedFrame]) -> tuple[int, int] | None:
+    """Times of the first and the last frame, ns; None without frames."""
+    times_ns = [int(frame.time_ns) for frame in placed]
+    return (min(times_ns), max(times_ns)) if times_ns else None

@@ -22,12 +22,12 @@ from sorvolo.store.site.files import STAGED, SiteFiles
 def repair(files: SiteFiles) -> None:
     """Write the derived files that a killed process still owed, and those of the map that were deleted.
 
-    Raises StoreError on a full disk; what the catalogue says stays true.
+    Raises StoreError on a full disk; what the catalogue holds stays true.
     """
     with files.catalogue.reading() as connection:
         owed = records.owed_files(connection)
         shown = records.derived_version(connection)
-    newest = next((each for each in reversed(files.versions()) if each.complete), None)
+    newest = _newest(files)
     for each in owed:
         _write_flight_files(files, each)
     if owed or not site_objects_are_there(files):
@@ -38,6 +38,10 @@ def repair(files: SiteFiles) -> None:
         write_map_files(files, newest)
     with files.catalogue.changing() as connection:
         records.mark_written(connection, [each.run_id for each in owed], newest.id)
+
+
+def _newest(files: SiteFiles) -> VersionEntry | None:
+    return next((each for each in reversed(files.versions()) if each.complete), None)
 
 
 def forget_unfinished(files: SiteFiles) -> None:
