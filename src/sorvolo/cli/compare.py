@@ -203,7 +203,7 @@ def _class_words(before: str | None, after: str | None) -> str:
 
 
 def _result(folder: Path, announced: Sequence[str]) -> dict[str, Any]:
-    """What a flight's files say, and which changes were announced on the way and withdrawn in the end."""
+    """A flight's report and changes, and which changes were announced on the way and withdrawn in the end."""
     from sorvolo.store.exports.plain import features_path
 
     report = read_json(folder / "report.json")

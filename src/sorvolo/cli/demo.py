@@ -93,8 +93,8 @@ def _is_simulated(folder: Path, settings: "SimulationSettings") -> bool:
     from sorvolo.store.exports.plain import plain_json
 
     try:
-        told = json.loads((folder / MARK).read_text(encoding="utf-8"))
-        same = told["settings"] == plain_json(asdict(settings)) and told["versions"]["sorvolo"] == __version__
+        mark = json.loads((folder / MARK).read_text(encoding="utf-8"))
+        same = mark["settings"] == plain_json(asdict(settings)) and mark["versions"]["sorvolo"] == __version__
     except (OSError, ValueError, KeyError, TypeError):
         return False
     return bool(same) and (folder / _FLIGHT).is_file()

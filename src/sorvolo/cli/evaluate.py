@@ -15,6 +15,7 @@ from sorvolo.survey.wording import counted
 if TYPE_CHECKING:
     from sorvolo.change.metrics import EventScores
     from sorvolo.missions.evaluate.changes import FlightChanges
+    from sorvolo.missions.evaluate.mask_folders import MaskScores
     from sorvolo.missions.evaluate.mosaic import MosaicEvaluation
     from sorvolo.mosaic.map_quality import Spread
     from sorvolo.tracking.metrics import FlightObjects
@@ -130,19 +131,7 @@ def _show_objects(console: Console, measured: "FlightObjects") -> None:
 def show_changes(console: Console, measured: "FlightChanges") -> None:
     """The tables of one flight's changes."""
     if measured.masks is not None:
-        masks = measured.masks
-        table = Table("per", "pixel", "frame")
-        both = masks.pixels, masks.frames
-        for name in ("tp", "fp", "fn", "tn", "unknown"):
-            table.add_row(name.upper() if len(name) < 3 else name, *(f"{getattr(each, name):,}" for each in both))
-        for name in ("precision", "recall", "accuracy", "f1"):
-            table.add_row("F1" if name == "f1" else name, *(_share(getattr(each, name), 2) for each in both))
-        console.print(table)
-        console.print(
-            f"{measured.flight}: {counted(masks.compared, 'mask')} compared; without truth: {masks.only_found}; true "
-            f"masks without a found one: {masks.only_true}; a frame is positive from "
-            f"{counted(masks.least_px, 'changed pixel')} on", highlight=False,
-        )
+        _show_masks(console, measured.flight, measured.masks)
     if measured.events is not None:
         _show_events(console, measured.flight, measured.events, measured.map_shift_m)
     if measured.classes is not None:
@@ -153,6 +142,21 @@ def show_changes(console: Console, measured: "FlightChanges") -> None:
         )
     for remark in measured.remarks:
         console.print(f"{measured.flight}: {remark}")
+
+
+def _show_masks(console: Console, flight: str, masks: "MaskScores") -> None:
+    table = Table("per", "pixel", "frame")
+    both = masks.pixels, masks.frames
+    for name in ("tp", "fp", "fn", "tn", "unknown"):
+        table.add_row(name.upper() if len(name) < 3 else name, *(f"{getattr(each, name):,}" for each in both))
+    for name in ("precision", "recall", "accuracy", "f1"):
+        table.add_row("F1" if name == "f1" else name, *(_share(getattr(each, name), 2) for each in both))
+    console.print(table)
+    console.print(
+        f"{flight}: {counted(masks.compared, 'mask')} compared; without truth: {masks.only_found}; true "
+        f"masks without a found one: {masks.only_true}; a frame is positive from "
+        f"{counted(masks.least_px, 'changed pixel')} on", highlight=False,
+    )
 
 
 def _show_events(console: Console, flight: str, scores: "EventScores", map_shift_m: float) -> None:

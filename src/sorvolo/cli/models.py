@@ -1,7 +1,7 @@
 """`sorvolo models`: the detection models that are installed, and others by their hash."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -59,7 +59,7 @@ def list_models(
     if table.rows:
         console.print(table)
     for row in rows:
-        if "error" in row:  # below the table: no column is wide enough to say why
+        if "error" in row:  # below the table: no column is wide enough for the reason
             typer.echo(f"{row['name']} cannot be used: {row['error']}")
     if not rows:
         typer.echo(f"no models are installed; put your own into {models_folder()}")
@@ -152,17 +152,23 @@ def verify(
     if sha256 and not model:
         raise typer.BadParameter("name the model that has this hash", param_hint="--sha256")
     wanted = parse_sha256(sha256) if sha256 else ""
-    bad = 0
-    for each in chosen:
-        words, is_bad = _verdict(each, wanted)
-        bad += is_bad
-        typer.echo(f"{each.name}: {words}")
+    all_good = _verify_each(chosen, wanted)
     if not chosen:
         typer.echo("no models are installed")
     if not model:
         _show_hidden()
-    if bad:
+    if not all_good:
         raise typer.Exit(1)
+
+
+def _verify_each(models: Sequence["InstalledModel"], sha256: str) -> bool:
+    """Print the verdict on each model; whether all are good."""
+    all_good = True
+    for each in models:
+        words, is_bad = _verdict(each, sha256)
+        all_good = all_good and not is_bad
+        typer.echo(f"{each.name}: {words}")
+    return all_good
 
 
 @models_app.command()
@@ -225,9 +231,9 @@ def _measured(sets: Any) -> Table | None:
     return table if table.rows else None
 
 
-def _interval(told: Any) -> str:
+def _interval(share: Any) -> str:
     """ "62.2 (42.3-77.3)" of a share with its interval, "-" where it is not known."""
-    numbers = [told.get(key) for key in ("value", "low", "high")] if isinstance(told, Mapping) else [told]
+    numbers = [share.get(key) for key in ("value", "low", "high")] if isinstance(share, Mapping) else [share]
     known = [f"{100 * each:.1f}" for each in numbers if isinstance(each, int | float)]
     return f"{known[0]} ({known[1]}-{known[2]})" if len(known) == 3 else known[0] if known else "-"
 
@@ -246,13 +252,13 @@ def _facts(info: "ModelInfo") -> dict[str, Any]:
     return {key: dict(value) if isinstance(value, Mapping) else value for key, value in vars(info).items()}
 
 
-def _light(told: Mapping[str, Any]) -> str:
+def _light(facts: Mapping[str, Any]) -> str:
     """The light that a model knows, in words."""
-    if not told["thermal"]:
+    if not facts["thermal"]:
         return "day"
-    if not told["daylight"]:
+    if not facts["daylight"]:
         return "thermal"
-    return f"day; thermal by {told['thermal_by']}" if told["thermal_by"] else "day and thermal"
+    return f"day; thermal by {facts['thermal_by']}" if facts["thermal_by"] else "day and thermal"
 
 
 def _verdict(model: "InstalledModel", sha256: str) -> tuple[str, bool]:

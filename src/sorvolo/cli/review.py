@@ -48,12 +48,7 @@ def review(
     from sorvolo.missions.site.review import list_changes, review_changes
     from sorvolo.survey.findings import Verdict
 
-    if confirm and reject:
-        raise SettingsError("--confirm and --reject contradict each other; give one of them")
-    if ids and not (confirm or reject):
-        raise SettingsError("changes were named, but no verdict: give --confirm or --reject")
-    if not ids and (confirm or reject or note):
-        raise SettingsError("which changes? give the ids that `sorvolo review SITE` lists")
+    _demand_whole_verdict(ids, confirm, reject, note)
     if ids:
         verdict = Verdict.CONFIRMED if confirm else Verdict.REJECTED
         changes = review_changes(site, ids, verdict, note, flight=flight)
@@ -65,6 +60,16 @@ def review(
         typer.echo(json.dumps({"site": str(site), "changes": rows}, indent=1))
     else:
         _show(changes, place_of, coordinates, Console())
+
+
+def _demand_whole_verdict(ids: list[str] | None, confirm: bool, reject: bool, note: str) -> None:
+    """Raises SettingsError where changes are named without one verdict, or a verdict without changes."""
+    if confirm and reject:
+        raise SettingsError("--confirm and --reject contradict each other; give one of them")
+    if ids and not (confirm or reject):
+        raise SettingsError("changes were named, but no verdict: give --confirm or --reject")
+    if not ids and (confirm or reject or note):
+        raise SettingsError("which changes? give the ids that `sorvolo review SITE` lists")
 
 
 def _show(changes: Sequence["StoredChange"], site: "Site", form: PlaceFormat, console: Console) -> None:

@@ -181,6 +181,11 @@ def _telemetry_findings(source: Source, frames: FrameFacts, facts: TelemetryFact
                 "give --offset if you know it; else it is estimated from the motion",
             )]
         return []
+    return _cover_findings(source, frames, facts)
+
+
+def _cover_findings(source: Source, frames: FrameFacts, facts: TelemetryFacts) -> list[Finding]:
+    """Whether the telemetry is of the same time as the frames."""
     share = facts.covered_s / frames.duration_s
     beyond_s = float(source.telemetry.video_time_ns.max(initial=0)) / _SECOND_NS - frames.duration_s
     if source.kind == "video" and beyond_s > max(5.0, 0.2 * frames.duration_s):
@@ -256,6 +261,11 @@ def _flight_findings(
             Level.WARNING, f"the height changes by {flight.height_spread_m:.0f} m during the flight",
             "if the drone kept its height, its altitude is wrong and is given little weight",
         ))
+    return found + _overlap_findings(kind, frames, flight)
+
+
+def _overlap_findings(kind: str, frames: FrameFacts, flight: FlightFacts) -> list[Finding]:
+    found = []
     if flight.forward_overlap < 0.6:
         level = Level.PROBLEM if flight.forward_overlap < 0.3 else Level.WARNING
         found.append(Finding(

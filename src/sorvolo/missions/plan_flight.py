@@ -83,7 +83,7 @@ class FlightAnswers:
     """The plan's numbers. `maximum_heights_m` and `required_px_per_m` are by task name, by resolution alone.
 
     `height_bounds_m` are the heights that task, detector (if one must see) and ceiling allow, by `Bound`; `bounded_by`
-    says which of them `height_m` is.
+    names the one that `height_m` is.
     """
 
     camera: CameraModel

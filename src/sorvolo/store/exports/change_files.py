@@ -19,7 +19,7 @@ from sorvolo.survey.findings import Change, Verdict
 from sorvolo.survey.flight import Site
 
 CHANGED, UNCHANGED, UNKNOWN = 255, 0, 128
-"""What a pixel of a view's mask says."""
+"""The meaning of a pixel in a view's mask."""
 
 BOXES_FILE = "boxes.json"
 _PICTURE_ENDINGS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".dng", ".bmp"}

@@ -32,7 +32,7 @@ def cot_event(
 
     `uid` is the same for the same object in every event. `now_ns` is the UTC time of sending, and `stale_s` later the
     event is stale. `ce` is one sigma of the place along its worst direction, as the schema has it; `hae` is the
-    ground's height above the ellipsoid where the site knows it. Speed and course are told of what moves. The site must
+    ground's height above the ellipsoid where the site knows it. Speed and course are sent of what moves. The site must
     be geo-referenced.
     """
     longitude, latitude = (float(each[0]) for each in longitude_latitude(track.position_m[None], site))

@@ -20,7 +20,7 @@ from sorvolo.survey.flight import Frame, Site
 from sorvolo.survey.objects import Sighting, Track
 
 MARK = "watch.json"
-"""The file that says that a folder is a watch's, and of which source."""
+"""The file that marks a folder as a watch's, with its source."""
 
 LINES, DETECTIONS, TRACKS, CROPS = "detections.jsonl", "detections.geojson", "tracks.geojson", "objects"
 TRACKS_KML, TRACKS_GPX = "tracks.kml", "tracks.gpx"
@@ -128,7 +128,7 @@ def write_detections_geojson(folder: Path, site: Site) -> int:
 
 
 def track_properties(track: Track, site: Site) -> dict[str, Any]:
-    """What is told of a track: its properties in tracks.geojson, the body of an alert."""
+    """What is reported of a track: its properties in tracks.geojson, the body of an alert."""
     east, north = track.velocity_m_s
     return {
         "id": track.id, "class": track.label, "score": rounded(track.score, 4),
@@ -198,7 +198,7 @@ def write_crop(folder: Path, track_id: int, crop: ImageRGB) -> str:
 
 
 def _mark_of(folder: Path) -> dict[str, Any] | None:
-    """What the folder's mark says; None where it has none of ours."""
+    """What the folder's mark holds; None where it has none of ours."""
     try:
         mark = json.loads((folder / MARK).read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -23,7 +23,7 @@ _LABEL_COLOUR, _FOUND_COLOUR = (40, 220, 90), (255, 150, 30)
 @dataclass(frozen=True, eq=False)
 class FoundSet:
     """What a model found in one set: its pictures' file names, one Detections a picture, and from which score on each
-    class is told there; a model may have other thresholds for thermal frames."""
+    class is reported there; a model may have other thresholds for thermal frames."""
 
     files: tuple[str, ...]
     detections: tuple[Detections, ...]
@@ -34,7 +34,7 @@ class FoundSet:
 class FoundSets:
     """What one model found, by the sets' names.
 
-    `seconds_per_picture` is NaN where it was not measured; `notices` are what the detector had to say.
+    `seconds_per_picture` is NaN where it was not measured; `notices` are the detector's own notices.
     """
 
     name: str

@@ -136,10 +136,10 @@ def video_writer(
 
 
 def write_photo(path: Path, frame: Frame, camera: Camera, row: Mapping[str, float]) -> None:
-    """Write a JPEG with what telemetry's row says of it in EXIF GPS and DJI's XMP; an empty row writes
+    """Write a JPEG with telemetry's row in EXIF GPS and DJI's XMP; an empty row writes
     neither.
 
-    EXIF tells the focal length as a length and as its 35 mm equivalent, rounded as cameras do. Raises
+    EXIF holds the focal length as a length and as its 35 mm equivalent, rounded as cameras do. Raises
     StoreError as `video_writer`.
     """
     moment = _moment(frame.time_ns)

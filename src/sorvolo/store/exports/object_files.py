@@ -1,4 +1,4 @@
-"""The files that say what stands on the map: objects.geojson of a flight and of the site, and the crops."""
+"""The files of what stands on the map: objects.geojson of a flight and of the site, and the crops."""
 
 from collections.abc import Iterable
 from typing import Any

@@ -162,7 +162,7 @@ class Archive:
             return change_records.load_changes(connection, flight_id)
 
     def reviews(self) -> list[StoredReview]:
-        """Everything that was said of changes, in the order of saying, also of those that were replaced since."""
+        """All reviews of changes, oldest first, also of changes that were replaced since."""
         with self._files.catalogue.reading() as connection:
             return change_records.load_reviews(connection)
 
@@ -193,7 +193,7 @@ class Archive:
     def review(self, change_ids: str | Iterable[str], verdict: Verdict, note: str = "") -> None:
         """Say of one change, or of several, that it is real or not; the flights' change files follow.
 
-        A later word replaces an earlier one. Raises InputError, and says nothing, when an id is unknown.
+        A later review replaces an earlier one. Raises InputError, and stores nothing, when an id is unknown.
         """
         self._require_writable()
         wanted = {change_ids} if isinstance(change_ids, str) else set(change_ids)

@@ -1,4 +1,4 @@
-"""Changes and what people said of them, in the catalogue."""
+"""Changes and people's reviews of them, in the catalogue."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -32,7 +32,7 @@ class StoredChange:
     """A change of a flight's complete run, and the verdict on it, if any.
 
     The fields are those of `survey.findings.Change`; `number` counts within the flight. The crops are
-    `<id>-before.png` and `<id>-after.png` in the flight's folder `changes`, on the ground as `crop` says.
+    `<id>-before.png` and `<id>-after.png` in the flight's folder `changes`, on the ground as `crop` places them.
     """
 
     id: str
@@ -63,7 +63,7 @@ class StoredChange:
 
 @dataclass(frozen=True, eq=False)
 class StoredReview:
-    """What a person said of a change, with the kind and outline that the change had when it was said."""
+    """A person's review of a change, with the kind and outline that the change had then."""
 
     change_id: str
     flight_id: str
@@ -143,12 +143,12 @@ def load_changes(connection: Connection, flight_id: str | None = None) -> list[S
     )
     if flight_id is not None:
         query = query.where(schema.flights.c.id == flight_id)
-    said = {review.change_id: review for review in load_reviews(connection)}
-    return [_change_of(row, said.get(row.id)) for row in connection.execute(query)]
+    reviews = {review.change_id: review for review in load_reviews(connection)}
+    return [_change_of(row, reviews.get(row.id)) for row in connection.execute(query)]
 
 
 def load_reviews(connection: Connection) -> list[StoredReview]:
-    """Everything that was said, in the order of saying."""
+    """All reviews, oldest first."""
     if _is_older(connection):
         return []
     rows = connection.execute(select(schema.reviews).order_by(schema.reviews.c.at_utc, schema.reviews.c.change_id))
