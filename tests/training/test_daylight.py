@@ -136,3 +136,24 @@ def test_its_onnx_file_says_what_torch_says_and_can_be_learnt_on_from(tmp_path: 
         if key in aerial.state_dict():
             np.testing.assert_allclose(again.state_dict()[key], aerial.state_dict()[key], rtol=1e-4)
     assert torch.equal(again.head.scores.weight, aerial.head.scores.weight)
+
+
+class _AerialByDay(_Aerial):
+    """Finds nothing in a black picture, as the real one now and then."""
+
+    def forward(self, images):
+        boxes, scores, labels = super().forward(images)
+        own = torch.nonzero(images.to(torch.float32).amax() > 0 * scores)[:, 0]
+        return boxes[own], scores[own], labels[own]
+
+
+def test_its_onnx_file_bears_a_picture_without_any_aerial_candidate(tmp_path: Path) -> None:
+    torch.manual_seed(3)
+    coco = CocoDetector(NanoDetBackbone(), NanoDetHead(), ((0,),))
+    model = Daylight(_AerialByDay(), coco, Judge(3), {1: Calibration()}, Calibration()).eval()
+    path = tmp_path / "toy.onnx"
+    path.write_bytes(onnx_from_module(model, INFO))
+    session = Session(path, "cpu", 1)
+    by_day, by_night = (session.see(np.full((64, 96, 3), value, np.uint8)) for value in (200, 0))
+    assert {1, 2} <= set(by_day.labels.tolist())
+    assert set(by_night.labels.tolist()) <= {0}
