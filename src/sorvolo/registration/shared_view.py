@@ -12,7 +12,7 @@ from sorvolo.registration.robust import fit_homography
 _SIDE_PX = 640  # pictures are made so small: the answer needs no sub-pixel match
 _LEAST_INLIERS = 12
 _THRESHOLD_PX = 3.0
-_POINTS = 24  # a side of the grid that is counted
+_POINTS = 48  # cells a side of the grid that is counted
 
 
 def shared_view(first: ImageRGB, second: ImageRGB) -> float:
@@ -25,7 +25,8 @@ def shared_view(first: ImageRGB, second: ImageRGB) -> float:
     if fit is None or fit[1].sum() < _LEAST_INLIERS:
         return 0.0
     height, width = small_first.shape
-    columns, rows = np.meshgrid(np.linspace(0, width - 1, _POINTS), np.linspace(0, height - 1, _POINTS))
+    middles = (np.arange(_POINTS) + 0.5) / _POINTS  # of cells: points on the rim itself fall out by a hair
+    columns, rows = np.meshgrid(width * middles - 0.5, height * middles - 0.5)
     there = apply_homography(fit[0], np.column_stack([columns.ravel(), rows.ravel()]))
     height, width = small_second.shape
     inside = (there >= 0).all(axis=1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
