@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, ImageRGBA, PointsM
+from sorvolo.geometry.arrays import Floats, ImageRGB, ImageRGBA, PointsM
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 from sorvolo.survey.map_objects import MapObject
 from sorvolo.survey.objects import Detections, Sighting
@@ -116,7 +116,7 @@ def _middle(outline_m: PointsM) -> Floats:
     return np.asarray((outline_m.min(axis=0) + outline_m.max(axis=0)) / 2, np.float64)
 
 
-def _common_share(one: Anything, other: Anything) -> float:
+def _common_share(one: Floats, other: Floats) -> float:
     """What two boxes have in common, as a share of the smaller one."""
     low, high = np.maximum(one[:2], other[:2]), np.minimum(one[2:], other[2:])
     areas = np.prod(one[2:] - one[:2]), np.prod(other[2:] - other[:2])

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, ImageRGB, ImageRGBA, Mask, Matrix3, PointsM, Vector3
+from sorvolo.geometry.arrays import ImageBGR, ImageRGB, ImageRGBA, Mask, Matrix3, PointsM, Vector3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, pose_from_homography
 from sorvolo.geometry.pose import Pose
@@ -40,7 +40,7 @@ class EarlierPictures:
 
     def seen_from(
         self, site_from_image: Matrix3, camera_m: Vector3, width_px: int, height_px: int, most: int
-    ) -> Iterator[tuple[Anything, Mask]]:
+    ) -> Iterator[tuple[ImageBGR, Mask]]:
         """The `most` pictures taken nearest to `camera_m`, one from each side along the way, in an image's pixels:
         BGR (`height_px`, `width_px`, 3), and where they see."""
         for index in self._nearest(camera_m, most):
@@ -50,14 +50,15 @@ class EarlierPictures:
             centre = image_from_picture @ np.array([keyframe.camera.cx_px, keyframe.camera.cy_px, 1.0])
             scale = _scale(image_from_picture, (keyframe.camera.cx_px, keyframe.camera.cy_px))
             while scale < 0.6:  # a mere interpolation would skip pixels
-                picture = _known_inside(cv2.pyrDown(picture))
+                picture = _known_inside(np.asarray(cv2.pyrDown(picture), np.uint8))
                 image_from_picture = image_from_picture @ np.array([[2.0, 0, 0.0], [0, 2.0, 0.0], [0, 0, 1.0]])
                 scale *= 2
             if centre[2] == 0:
                 continue
             size = width_px, height_px
-            seen: Anything = cv2.warpPerspective(picture, image_from_picture, size, flags=cv2.INTER_LINEAR)
-            yield cv2.cvtColor(seen, cv2.COLOR_RGBA2BGR), np.asarray(cv2.extractChannel(seen, 3) == 255)
+            seen = cv2.warpPerspective(picture, image_from_picture, size, flags=cv2.INTER_LINEAR)
+            bgr = np.asarray(cv2.cvtColor(seen, cv2.COLOR_RGBA2BGR), np.uint8)
+            yield bgr, np.asarray(cv2.extractChannel(seen, 3) == 255)
 
     def _nearest(self, camera_m: Vector3, most: int) -> list[int]:
         """The nearest picture and then the nearest ones that lie on the other sides of the camera."""
@@ -82,10 +83,10 @@ def with_known_pixels(rgb: ImageRGB) -> ImageRGBA:
 
     In four bands OpenCV resamples it, and where it is known, in less time than in three and one.
     """
-    return _known_inside(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA))
+    return _known_inside(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), np.uint8))
 
 
-def _known_inside(rgba: Anything) -> ImageRGBA:
+def _known_inside(rgba: ImageRGBA) -> ImageRGBA:
     """The picture (h, w, 4) with alpha 0 at its edge and 255 elsewhere; it is written over."""
     edge = max(2, round(_EDGE * rgba.shape[1]))
     rgba[..., 3] = 0

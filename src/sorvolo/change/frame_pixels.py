@@ -2,8 +2,9 @@
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 
-from sorvolo.geometry.arrays import Anything, Boxes, ImageGray, Mask, Matrix3, PointsM, Vector3
+from sorvolo.geometry.arrays import Boxes, ImageGray, Mask, Matrix3, PointsM, Vector3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, pose_from_homography
 from sorvolo.geometry.level_ground import footprint
@@ -21,7 +22,7 @@ class FramePixels:
 
     def __init__(self, full: Camera, small: Camera) -> None:
         self.full, self.small = full, small
-        self._maps: tuple[Anything, Anything] | None = None
+        self._maps: tuple[MatLike, MatLike] | None = None
         sx, sy = small.width_px / full.width_px, small.height_px / full.height_px
         self.small_from_full: Matrix3 = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
         """(3, 3) from undistorted pixels of the full size."""
@@ -49,9 +50,9 @@ class FramePixels:
             small = apply_homography(self.small_from_full, ideal).astype(np.float32).reshape(*x.shape, 2)
             self._maps = cv2.convertMaps(small[..., 0], small[..., 1], cv2.CV_16SC2, nninterpolation=True)
         x_map, y_map = self._maps
-        changed: Anything = cv2.remap(view.changed, x_map, y_map, cv2.INTER_NEAREST)
-        valid: Anything = cv2.remap(view.valid.view(np.uint8), x_map, y_map, cv2.INTER_NEAREST)
-        return changed, valid > 0
+        changed = np.asarray(cv2.remap(view.changed, x_map, y_map, cv2.INTER_NEAREST), np.uint8)
+        valid = cv2.remap(view.valid.view(np.uint8), x_map, y_map, cv2.INTER_NEAREST)
+        return changed, np.asarray(valid > 0)
 
     def boxes(self, view: ComparedView) -> Boxes:
         """The view's boxes in the frame's own pixels."""

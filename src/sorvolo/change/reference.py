@@ -7,7 +7,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, ImageGray, ImageRGB, ImageRGBA, Mask, Matrix3, PointsPx
+from sorvolo.geometry.arrays import ImageGray, ImageRGB, ImageRGBA, Mask, Matrix3, PointsPx
 from sorvolo.geometry.grid import Grid, TileIndex
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.registration.features import FeatureSettings, gray_from_rgb, normalise_contrast, orb_features
@@ -175,7 +175,7 @@ class ReferenceMap:
         for (dx, dy), child in children.items():
             if child is not None:
                 large[dy * side:(dy + 1) * side, dx * side:(dx + 1) * side] = child
-        small: Anything = cv2.resize(large, (side, side), interpolation=cv2.INTER_AREA)
+        small = np.asarray(cv2.resize(large, (side, side), interpolation=cv2.INTER_AREA), np.uint8)
         small[small[..., 3] < 255] = 0  # half-known pixels are darkened by the unknown half
         return small
 
@@ -194,7 +194,7 @@ class ReferenceMap:
         found = orb_features(normalised(cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB), known), _FEATURES)  # type: ignore[arg-type]
         near = np.rint(found.points_px).astype(int).clip(0, side - 1)
         inner = ((found.points_px >= _APRON_PX - 0.5) & (found.points_px < side - _APRON_PX - 0.5)).all(axis=1)
-        safe: Anything = cv2.erode(known.view(np.uint8), np.ones((31, 31), np.uint8))  # no corners of the map's rim
+        safe = cv2.erode(known.view(np.uint8), np.ones((31, 31), np.uint8))  # no corners of the map's rim
         keep = inner & (safe[near[:, 1], near[:, 0]] > 0)
         grid_px = apply_homography(np.linalg.inv(_level_from_grid(level)), found.points_px[keep] + [x, y])
         return Features(found.kind, grid_px, found.descriptors[keep])

@@ -16,7 +16,7 @@ from sorvolo.change.pair.robust import RobustSettings, compare_robust
 from sorvolo.change.pair.thesis import compare_thesis
 from sorvolo.change.pair.thesis_options import ThesisOptions
 from sorvolo.change.reference import ReferenceMap
-from sorvolo.geometry.arrays import Anything, ImageRGB, Mask, Matrix3
+from sorvolo.geometry.arrays import ImageBGR, ImageRGB, Mask, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.registration.lens import Undistorter
@@ -56,7 +56,7 @@ class OneSided:
     aligned: Aligned
     image: ImageRGB
     reference: ImageRGB
-    query: Anything
+    query: ImageBGR
     valid: Mask
     found: Difference
     settings: RobustSettings | None
@@ -199,7 +199,7 @@ class ViewMaker:
             earlier.append((Difference(found.mask, found.boxes, found.scores), sees))
         return believed((compared.found, compared.valid), earlier)
 
-    def _difference(self, reference: Anything, query: Anything, valid: Mask) -> Difference:
+    def _difference(self, reference: ImageBGR, query: ImageBGR, valid: Mask) -> Difference:
         """What differs from the map; the flight's tuning learns of it."""
         settings = self._settings_now()
         if self._tuning is None or settings is None:
@@ -214,6 +214,6 @@ class ViewMaker:
         return None if self._tuning is None else replace(self._tuning.settings(), least_score=LEAST_SURENESS)
 
 
-def as_bgr(image: ImageRGB) -> Anything:
+def as_bgr(image: ImageRGB) -> ImageBGR:
     """The picture with its channels in OpenCV's order."""
-    return cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2BGR), np.uint8)

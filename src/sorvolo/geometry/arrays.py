@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 Floats: TypeAlias = NDArray[np.float64]
 """Any float64 array; the docstring gives its shape."""
 
+Floats32: TypeAlias = NDArray[np.float32]
+"""Any float32 array; the docstring gives its shape."""
+
 PointsPx: TypeAlias = NDArray[np.float64]
 """(N, 2) image or grid points, x right then y down, px; (0, 0) is the centre of the top-left pixel."""
 
@@ -25,6 +28,9 @@ ImageRGB: TypeAlias = NDArray[np.uint8]
 
 ImageRGBA: TypeAlias = NDArray[np.uint8]
 """(height, width, 4) uint8, red green blue alpha (0 = nothing known, 255 = seen)."""
+
+ImageBGR: TypeAlias = NDArray[np.uint8]
+"""(height, width, 3) uint8, blue green red: OpenCV's own order, for what goes straight into it."""
 
 ImageGray: TypeAlias = NDArray[np.uint8]
 """(height, width) uint8."""
@@ -56,9 +62,6 @@ Labels: TypeAlias = NDArray[np.int64]
 
 Counts: TypeAlias = NDArray[np.int64]
 """Whole numbers that count something; the docstring gives their shape."""
-
-Anything: TypeAlias = NDArray[Any]
-"""An array of any type."""
 
 
 def floats(values: Any) -> Floats:

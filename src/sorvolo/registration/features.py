@@ -6,8 +6,9 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 
-from sorvolo.geometry.arrays import Anything, ImageGray, ImageRGB, PointsPx
+from sorvolo.geometry.arrays import Descriptors, ImageGray, ImageRGB, PointsPx
 from sorvolo.survey.mosaic import Features
 
 _TEXTURE_SIDE_PX = 960
@@ -114,8 +115,10 @@ def sharpness(gray: ImageGray) -> float:
     return float(fine.std() / (coarse.std() + 0.05))
 
 
-def _features(kind: str, keypoints: Sequence[cv2.KeyPoint], descriptors: Anything | None, scale: float) -> Features:
+def _features(kind: str, keypoints: Sequence[cv2.KeyPoint], descriptors: MatLike | None, scale: float) -> Features:
     if descriptors is None or len(keypoints) == 0:
         return Features(kind, np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
     points = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64)
-    return Features(kind, (points + 0.5) / scale - 0.5, descriptors)
+    as_bytes = kind == "orb"
+    packed: Descriptors = np.asarray(descriptors, np.uint8) if as_bytes else np.asarray(descriptors, np.float32)
+    return Features(kind, (points + 0.5) / scale - 0.5, packed)

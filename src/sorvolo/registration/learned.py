@@ -9,7 +9,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Anything, ImageGray, Matrix3, PointsPx
+from sorvolo.geometry.arrays import Floats32, ImageGray, Matrix3, PointsPx
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.mosaic import Features
 
@@ -67,7 +67,7 @@ def match_learned(
     return np.column_stack([rows[mutual], nearest[mutual]]).astype(np.int64)
 
 
-def _sampled(planes: Anything, points_px: PointsPx) -> Anything:
+def _sampled(planes: Floats32, points_px: PointsPx) -> Floats32:
     """(N, C) values of `planes` (C, rows, columns), one a cell, between cells by distance, at image points (N, 2)."""
     _, rows, columns = planes.shape
     at = np.clip((points_px + 0.5) / _CELL_PX - 0.5, 0, [columns - 1, rows - 1])

@@ -2,8 +2,9 @@
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 
-from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, Mask, PointsPx
+from sorvolo.geometry.arrays import Floats, ImageRGB, Mask, PointsPx
 from sorvolo.geometry.camera import Camera
 
 _VISIBLE_PX = 0.5
@@ -24,7 +25,7 @@ class Undistorter:
         self._size = camera.width_px, camera.height_px
         self._averages = camera.is_distorted and 1.0 < taken.width_px / camera.width_px < _AVERAGED
         self._mapped_size = (taken.width_px, taken.height_px) if self._averages else self._size
-        self._maps: tuple[Anything, Anything] | None = None
+        self._maps: tuple[MatLike, MatLike] | None = None
         if self._averages:
             x, y = cv2.initUndistortRectifyMap(
                 taken.matrix, taken.distortion, None, camera.matrix, self._size, cv2.CV_32FC1

@@ -7,9 +7,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Anything, Floats, ImageGray, Matrix3, PointsPx
+from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Matrix3, PointsPx
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.registration.features import FeatureSettings, corners, sift_features
 from sorvolo.registration.matching import match
@@ -179,9 +180,9 @@ def _correlate(new: ImageGray, old: ImageGray, predicted: Matrix3, search_px: fl
     return shift @ predicted
 
 
-def _band_pass(gray: Anything) -> Anything:
+def _band_pass(gray: MatLike) -> Floats32:
     image = gray.astype(np.float32)
-    return cv2.GaussianBlur(image, (0, 0), 1.0) - cv2.GaussianBlur(image, (0, 0), 8.0)
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0) - cv2.GaussianBlur(image, (0, 0), 8.0), np.float32)
 
 
 def refine(
@@ -198,7 +199,9 @@ def refine(
         return "the overlap is too small"
     size = (new.gray.shape[1], new.gray.shape[0])
     overlaid = old.gray.shape == new.gray.shape and np.array_equal(new_from_old, np.eye(3))
-    warped = old.gray if overlaid else cv2.warpPerspective(old.gray, new_from_old, size, flags=cv2.INTER_LINEAR)
+    warped = old.gray
+    if not overlaid:
+        warped = np.asarray(cv2.warpPerspective(old.gray, new_from_old, size, flags=cv2.INTER_LINEAR), np.uint8)
     start = points.astype(np.float32).reshape(-1, 1, 2)
     window = (settings.refine_window_px, settings.refine_window_px)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
@@ -227,22 +230,23 @@ def refine(
     return Link(new.id, old.id, new_px[chosen], old_px[chosen], homography, max(sigma_px, 0.05))
 
 
-def _correlation(new: ImageGray, warped: Anything, at_new: Anything, at_warped: Anything) -> Anything:
+def _correlation(new: ImageGray, warped: ImageGray, at_new: Floats32, at_warped: Floats32) -> Floats32:
     """(N,) normalised cross-correlation of 15 px patches around paired points."""
     offsets = np.arange(-7, 8, dtype=np.float32)
     dy, dx = np.meshgrid(offsets, offsets, indexing="ij")
 
-    def patches(image: Anything, at: Anything) -> Anything:
+    def patches(image: ImageGray, at: Floats32) -> Floats32:
         x = (at[:, :1] + dx.ravel()).astype(np.float32)
         y = (at[:, 1:] + dy.ravel()).astype(np.float32)
-        values = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
+        remapped = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        values = np.asarray(remapped, np.float32)
         values -= values.mean(axis=1, keepdims=True)
         return values / (np.linalg.norm(values, axis=1, keepdims=True) + 1.0)
 
     return (patches(new, at_new) * patches(warped, at_warped)).sum(axis=1)
 
 
-def _spread(points: PointsPx, miss: Floats, usable: Anything, count: int) -> NDArray[np.intp]:
+def _spread(points: PointsPx, miss: Floats, usable: Mask, count: int) -> NDArray[np.intp]:
     """Indices of at most `count` usable points, taken in turn from the cells of a 6 x 6 grid over the points."""
     indices = np.flatnonzero(usable)
     if len(indices) <= count:

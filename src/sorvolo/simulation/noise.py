@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from sorvolo.geometry.arrays import Anything, Floats
+from sorvolo.geometry.arrays import Floats
 
 FieldF32 = NDArray[np.float32]
 """(height, width) float32."""
@@ -58,7 +58,7 @@ class SmoothSeries:
 
     spline: CubicSpline
 
-    def __call__(self, time_s: Anything | float) -> Floats:
+    def __call__(self, time_s: Floats | float) -> Floats:
         """The number at these times, in their shape."""
         return np.asarray(self.spline(time_s), dtype=np.float64)
 

@@ -11,15 +11,16 @@ from typing import TypeVar, cast
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Anything, Floats, ImageRGBA, Matrix3, PointsM, PointsPx, Vector3
+from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA, Matrix3, PointsM, PointsPx, Vector3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
 
 _Scalar = TypeVar("_Scalar", np.uint8, np.float32)
 # x and y are in one map; an empty array here instead of None makes OpenCV 5 sample garbage
-_NO_SECOND_MAP = cast(Anything, None)
+_NO_SECOND_MAP = cast(Floats32, None)
 
 RaysF32 = NDArray[np.float32]
 """(height, width, 2) float32: x and y of every pixel's ray with z = 1."""
@@ -175,10 +176,9 @@ def _sample(view: View, patch: Patch, window: Window) -> ImageRGBA | None:
     return remapped(patch.texture, where.reshape(*rays.shape), cv2.BORDER_CONSTANT)
 
 
-def remapped(picture: NDArray[_Scalar], where: Anything, border: int) -> NDArray[_Scalar]:
+def remapped(picture: NDArray[_Scalar], where: MatLike, border: int) -> NDArray[_Scalar]:
     """The picture at `where`, (height, width, 2) float32 x and y, linear; a constant border is zero."""
-    coordinates = np.asarray(where, np.float32)
-    sampled = cv2.remap(picture, coordinates, _NO_SECOND_MAP, cv2.INTER_LINEAR, borderMode=border)
+    sampled = cv2.remap(picture, where, _NO_SECOND_MAP, cv2.INTER_LINEAR, borderMode=border)
     return np.asarray(sampled, picture.dtype)
 
 

@@ -5,9 +5,10 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 
 from sorvolo.errors import StoreError
-from sorvolo.geometry.arrays import Anything, ImageRGB, ImageRGBA, frozen
+from sorvolo.geometry.arrays import Floats32, ImageRGB, ImageRGBA, frozen
 
 MOST_KEYFRAME_PX = 160_000_000
 """Of a stored keyframe: the largest cameras that fly have 150 million pixels."""
@@ -55,7 +56,7 @@ def rgba_from_png(data: bytes, name: str, most_px: int = MOST_TILE_PX) -> ImageR
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA), dtype=np.uint8)
 
 
-def _decoded(data: bytes, size_of: Callable[[bytes], int], flags: int, name: str, most_px: int) -> Anything | None:
+def _decoded(data: bytes, size_of: Callable[[bytes], int], flags: int, name: str, most_px: int) -> MatLike | None:
     """The picture as OpenCV gives it; None for bytes of another form. The size in its header is looked at first."""
     pixels = size_of(data)
     if pixels > most_px:
@@ -94,7 +95,7 @@ def shrink(rgba: ImageRGBA, width: int, height: int) -> ImageRGBA:
     return unweighted(cv2.resize(weighted(rgba), size, interpolation=cv2.INTER_AREA))
 
 
-def weighted(rgba: ImageRGBA) -> Anything:
+def weighted(rgba: ImageRGBA) -> Floats32:
     """Float colours times alpha (and alpha as it is): in this form neighbouring pixels may be averaged."""
     alpha = rgba[..., 3]
     is_partly_seen = (alpha != 0) & (alpha != 255)
@@ -105,7 +106,7 @@ def weighted(rgba: ImageRGBA) -> Anything:
     return result
 
 
-def unweighted(image: Anything) -> ImageRGBA:
+def unweighted(image: MatLike) -> ImageRGBA:
     """The inverse of `weighted`, rounded."""
     alpha = image[..., 3:]
     colours = image[..., :3] * 255 / np.maximum(alpha, 1e-3)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Anything, Floats, ImageGray, Mask, Matrix3, PointsM
+from sorvolo.geometry.arrays import Floats, ImageGray, Mask, Matrix3, PointsM
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import ComparedView
 
@@ -168,8 +168,8 @@ def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask) -> LaidVie
     cell_from_small = np.linalg.inv(window.site_from_cell(cell_m)) @ view.site_from_image @ image_from_small
     size = window.shape[::-1]
 
-    def laid(image: ImageGray, how: int) -> Anything:
-        return cv2.warpPerspective(image, cell_from_small, size, flags=how)
+    def laid(image: ImageGray, how: int) -> ImageGray:
+        return np.asarray(cv2.warpPerspective(image, cell_from_small, size, flags=how), np.uint8)
 
     seen = laid(valid, cv2.INTER_LINEAR) >= 250
     _clear_behind(seen, cell_from_small)

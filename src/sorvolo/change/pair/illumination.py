@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.change.pair.moved_shadows import STEPS, moved_shades
-from sorvolo.geometry.arrays import Anything, Floats, Mask
+from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.kernels import detail_products, relight, slopes
 
 Bgr = NDArray[np.uint8]
@@ -109,7 +109,7 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     return Light(exponents, offsets, np.exp2(octaves).astype(np.float32), unevenness, cells, factors)
 
 
-def light_around(light: Light, things: Anything) -> Light:
+def light_around(light: Light, things: NDArray[np.uint8]) -> Light:
     """The light where it is known what hides the ground: `things` (h, w) uint8, 255 or 0, of the pictures' size.
 
     All other ground near is trusted, plain ground too. The same `light` where that makes no difference near a thing.
@@ -140,9 +140,10 @@ def _curves_and_gains(light: Light, width: int) -> tuple[NDArray[np.int32], NDAr
     levels = np.log2(np.arange(256) + BLACK_LEVEL)
     curves = 2.0 ** (light.exponents[:, None] * levels + light.offsets[:, None])
     table = np.clip(np.rint(curves * CURVE_ONE), 0, 16383).astype(np.int32)
-    grid: Anything = light.gains
+    grid = light.gains
     if light.shades is not None:
-        grid = cv2.multiply(light.shades, cv2.resize(grid, light.shades.shape[1::-1], interpolation=cv2.INTER_LINEAR))
+        gains = cv2.resize(grid, light.shades.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+        grid = np.asarray(cv2.multiply(light.shades, gains), np.float32)
     steps = np.clip(np.rint(grid * GAIN_ONE), 0, 65535).astype(np.float32)
     return table, np.asarray(cv2.resize(steps, (width, len(steps)), interpolation=cv2.INTER_LINEAR), np.float32)
 
@@ -151,11 +152,12 @@ def _shades(
     reference: Bgr, query: Bgr, exponents: Floats, offsets: Floats, known: Mask | None
 ) -> NDArray[np.float32] | None:
     """Octaves (h, w, 3) by which shadows that moved changed the ground of two pictures (h, w, 3); None if nowhere."""
-    levels = np.log2(np.arange(256)[:, None] + BLACK_LEVEL)
-    before, after = (
-        cv2.LUT(image, np.clip(np.rint((each - np.log2(BLACK_LEVEL)) * 2 * STEPS), 0, 255).astype(np.uint8)[None])
-        for image, each in ((reference, exponents * levels + offsets), (query, np.repeat(levels, 3, axis=1)))
+    levels, black = np.log2(np.arange(256)[:, None] + BLACK_LEVEL), np.log2(BLACK_LEVEL)
+    tables = (
+        np.clip(np.rint((each - black) * 2 * STEPS), 0, 255).astype(np.uint8)[None]
+        for each in (exponents * levels + offsets, np.repeat(levels, 3, axis=1))
     )
+    before, after = (np.asarray(cv2.LUT(*each), np.uint8) for each in zip((reference, query), tables))
     return moved_shades(before, after, _surely(known, (reference.shape[1], reference.shape[0])))
 
 

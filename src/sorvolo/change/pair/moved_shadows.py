@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 from numpy.typing import NDArray
 
 from sorvolo.change.pair.regions import Image
@@ -74,9 +75,9 @@ class _Pieces:
     `middle` (h, w) is how much brighter the ground became.
     """
 
-    def __init__(self, mask: Image, middle: Image) -> None:
+    def __init__(self, mask: MatLike, middle: MatLike) -> None:
         window = np.ones((LEAST_WIDTH, LEAST_WIDTH), np.uint8)
-        self._opened: Image = cv2.morphologyEx(mask, cv2.MORPH_OPEN, window)
+        self._opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, window)
         self.count, self.labels = 1, self._opened
         if cv2.countNonZero(self._opened) == 0:
             return
@@ -155,21 +156,21 @@ class _Pieces:
         return np.asarray(np.bincount(self._own, values, self.count) / self._number)
 
 
-def _places(image: Image) -> NDArray[np.int64]:
+def _places(image: MatLike) -> NDArray[np.int64]:
     """Where an image is not 0, counted row by row."""
     return np.flatnonzero(image != 0)
 
 
-def _steps(image: Image, places: NDArray[np.int64]) -> Floats:
+def _steps(image: MatLike, places: NDArray[np.int64]) -> Floats:
     return np.asarray(image.ravel()[places].astype(np.float64) - ALIKE)
 
 
 def _details(logarithm: Image) -> Image:
     gray = cv2.cvtColor(logarithm, cv2.COLOR_BGR2GRAY)
-    return cv2.addWeighted(gray, 1, cv2.blur(gray, (FINEST, FINEST)), -1, ALIKE)
+    return np.asarray(cv2.addWeighted(gray, 1, cv2.blur(gray, (FINEST, FINEST)), -1, ALIKE), np.uint8)
 
 
-def _octaves(shaded: Image, weak: Image, apart: Image) -> NDArray[np.float32]:
+def _octaves(shaded: MatLike, weak: MatLike, apart: MatLike) -> NDArray[np.float32]:
     """(h, w, 3) how deep the shadow is where `shaded`, smooth; about its rim the part of it that all colours show.
 
     Its rim is as wide as what near it is `weak`, dimmed a little. What stands in it leaves holes: they are as deep.

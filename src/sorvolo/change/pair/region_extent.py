@@ -10,7 +10,7 @@ import numpy as np
 
 from sorvolo.change.pair.illumination import Light, light_around, relit_parts
 from sorvolo.change.pair.regions import Image, Regions, RegionSettings
-from sorvolo.geometry.arrays import Anything, Mask
+from sorvolo.geometry.arrays import Mask
 from sorvolo.kernels import darker_alike, differences, held_parts
 
 REACH_PX = 20  # around a region and half of its length more: the ground that is looked at
@@ -136,11 +136,11 @@ def grown(regions: Regions, region: int, came: bool, views: Views) -> Piece | No
     bare = strength * ~shade
     limit = max(LEAST_LIMIT, LIMIT_OF_TOP * top, QUIET_FACTOR * _quantile(bare, quiet, QUIET_QUANTILE))
     while limit < HIGHEST * top:
-        over: Anything = cv2.threshold(bare, floor(limit), 255, cv2.THRESH_BINARY)[1]
-        above: Anything = cv2.morphologyEx(over, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        over = cv2.threshold(bare, floor(limit), 255, cv2.THRESH_BINARY)[1]
+        above = np.asarray(cv2.morphologyEx(over, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), np.uint8)
         thing = held_parts(above | surely, surely)
         if _is_thing(thing, bare, limit):
-            largest_near: Anything = cv2.dilate(strength, np.ones((BLUR_PX, BLUR_PX), np.uint8))
+            largest_near = cv2.dilate(strength, np.ones((BLUR_PX, BLUR_PX), np.uint8))
             is_sharp = strength > cv2.LUT(largest_near, _BLURRED)
             return Piece(window, (thing > 0) & (is_sharp | (surely > 0)))
         limit *= STEP
@@ -203,6 +203,6 @@ def _shade(views: Views, window: Window, came: bool) -> Mask:
 
 def _quantile(values: Image, where: Mask, share: float) -> int:
     """A quantile of uint8 values (h, w) somewhere, in one pixel at least, without the care that np.quantile takes."""
-    counts: Anything = cv2.calcHist([values], [0], where.view(np.uint8), [256], [0, 256])
+    counts = np.asarray(cv2.calcHist([values], [0], where.view(np.uint8), [256], [0, 256]))
     sums = counts.ravel().astype(np.int64).cumsum()
     return int(np.searchsorted(sums, share * sums[-1]))

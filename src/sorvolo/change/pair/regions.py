@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.change.pair.scratch import Scratch
-from sorvolo.geometry.arrays import Anything, Floats, Mask
+from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.kernels import core_regions, differences, match_regions, measure_regions, rim_balance, tint
 
 RING_PX = 4
@@ -35,7 +35,7 @@ FEATURES = (
 )
 
 _LOG = np.clip(np.rint(np.log2((np.arange(256) + 8) / 8) * 50), 0, 255).astype(np.uint8)
-Image = Anything
+Image = NDArray[np.uint8]
 """uint8, (h, w) or (h, w, 3)."""
 
 
@@ -92,7 +92,7 @@ def find_regions(
     # a large thing's inside is no clutter: only what is small among the differences raises the thresholds around it
     window = np.ones((SPECK_PX, SPECK_PX), np.uint8)
     cv2.subtract(difference, cv2.morphologyEx(difference, cv2.MORPH_OPEN, window, dst=spare), dst=specks)
-    some: Anything = cv2.calcHist([np.ascontiguousarray(specks[::4, ::4])], [0], None, [256], [0, 256])
+    some = np.asarray(cv2.calcHist([np.ascontiguousarray(specks[::4, ::4])], [0], None, [256], [0, 256]))
     counts = some.ravel().cumsum(dtype=np.float64)
     noise = float(np.searchsorted(counts, 0.95 * counts[-1]))
     cv2.blur(difference, (3, 3), dst=smooth)

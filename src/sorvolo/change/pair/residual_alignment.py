@@ -6,9 +6,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Anything, Mask, Matrix3
+from sorvolo.geometry.arrays import Mask, Matrix3
 from sorvolo.kernels import fit_moves, flow_on_grid
 
 LARGEST_PX = 6.0  # at the pictures' corners, in their own pixels; a larger one has lost its way
@@ -58,7 +59,7 @@ def settle(reference: NDArray[np.uint8], query: NDArray[np.uint8], known: Mask |
     return Settling(matrix, moved_px, rest_px)
 
 
-def _details(gray: Anything) -> NDArray[np.uint8]:
+def _details(gray: MatLike) -> NDArray[np.uint8]:
     """What is finer than clouds, in logarithms: light falls out of it."""
     logarithm = cv2.LUT(gray, _LOG)
     return np.asarray(cv2.addWeighted(logarithm, 2, cv2.blur(logarithm, (15, 15)), -2, 128), np.uint8)

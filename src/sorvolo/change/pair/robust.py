@@ -15,7 +15,7 @@ from sorvolo.change.pair.regions import FEATURES, Regions, RegionSettings, find_
 from sorvolo.change.pair.residual_alignment import Settling, settle
 from sorvolo.change.pair.scratch import Scratch, scratch_of_thread
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Anything, Boxes, Floats, ImageGray, Mask
+from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
 from sorvolo.kernels import looked_up
 
 LEAST_SIDE_PX = 32
@@ -166,7 +166,8 @@ def _result(
     if not sure.any():
         nothing = np.zeros(size[::-1], np.uint8), np.zeros((0, 4), np.int64), np.zeros(0)
         return RobustResult(*nothing, light, settling, regions.noise, known)
-    count, parts = cv2.connectedComponents(regions.weak, connectivity=8)
+    count, labelled = cv2.connectedComponents(regions.weak, connectivity=8)
+    parts = np.asarray(labelled, np.int32)
     went = _went(regions, parts)
     grows = sure & (scores >= LEAST_GROWN)
     pieces: dict[int, Piece] = {}
@@ -181,10 +182,12 @@ def _result(
     if settling.moved_px < SAME_PLACE_PX or not (sure & went).any():
         half_mask = _filled(sure, regions, pieces, parts, count, scratch)
     else:  # what disappeared is seen in the reference: it keeps the reference's pixels
-        gone: Anything = _filled(sure & went, regions, pieces, parts, count, scratch)
-        gone = cv2.warpPerspective(gone, settling.reference_from_query, half, flags=cv2.INTER_LINEAR)
+        gone = _filled(sure & went, regions, pieces, parts, count, scratch)
+        gone = np.asarray(
+            cv2.warpPerspective(gone, settling.reference_from_query, half, flags=cv2.INTER_LINEAR), np.uint8
+        )
         stays = sure & ~went
-        half_mask = np.asarray(gone, np.uint8)
+        half_mask = gone
         if stays.any():
             half_mask = np.asarray(cv2.max(_filled(stays, regions, pieces, parts, count, scratch), gone), np.uint8)
         middle = boxes_px[:, :2] + boxes_px[:, 2:] / 2
@@ -198,7 +201,7 @@ def _result(
     return RobustResult(mask, boxes, scores[sure], light, settling, regions.noise, known)
 
 
-def _around(box: Anything, piece: Piece | None) -> tuple[int, int, int, int]:
+def _around(box: NDArray[np.int32], piece: Piece | None) -> tuple[int, int, int, int]:
     """x, y, width, height of what holds a region's box and what it has grown to."""
     x, y, wide, high = (int(each) for each in box)
     if piece is None:
@@ -221,7 +224,7 @@ def _enlarged(half_mask: ImageGray, size: tuple[int, int]) -> ImageGray:
     return mask
 
 
-def _went(regions: Regions, parts: Anything) -> Mask:
+def _went(regions: Regions, parts: NDArray[np.int32]) -> Mask:
     """Which regions (N,) are things that the reference shows; what touches is one thing."""
     part = np.zeros(len(regions.boxes), np.int64)
     for region, (x, y, wide, high) in enumerate(regions.boxes):
@@ -232,7 +235,7 @@ def _went(regions: Regions, parts: Anything) -> Mask:
 
 
 def _filled(
-    chosen: Mask, regions: Regions, pieces: Mapping[int, Piece], parts: Anything, count: int,
+    chosen: Mask, regions: Regions, pieces: Mapping[int, Piece], parts: NDArray[np.int32], count: int,
     scratch: Scratch,
 ) -> ImageGray:
     """The things of the `chosen` (N,) regions: their `pieces`, and where there is none the region with what weakly
@@ -266,7 +269,8 @@ def _filled(
         around[piece.window][piece.mask] = 255
     x, y, wide, high = cv2.boundingRect(around)
     things = np.s_[max(0, y - CLOSES_PX) : y + high + CLOSES_PX, max(0, x - CLOSES_PX) : x + wide + CLOSES_PX]
-    closed: Anything = cv2.morphologyEx(around[things], cv2.MORPH_CLOSE, np.ones((CLOSES_PX, CLOSES_PX), np.uint8))
+    window = np.ones((CLOSES_PX, CLOSES_PX), np.uint8)
+    closed = np.asarray(cv2.morphologyEx(around[things], cv2.MORPH_CLOSE, window), np.uint8)
     outlines, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     for outline in outlines:
         hull = cv2.convexHull(outline)
@@ -279,7 +283,7 @@ def _filled(
     return outlined
 
 
-def _outlined(thing: ImageGray, strength: Anything) -> ImageGray:
+def _outlined(thing: ImageGray, strength: ImageGray) -> ImageGray:
     """Things (h, w) 0 or 255 whose rim is drawn anew where the difference falls below a part of its height nearby."""
     near = np.ones((RIM_WIDTH_PX, RIM_WIDTH_PX), np.uint8)
     height = np.maximum(cv2.dilate(cv2.min(thing, strength), near), 1).astype(np.float32)

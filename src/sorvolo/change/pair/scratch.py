@@ -3,8 +3,7 @@
 import threading
 
 import numpy as np
-
-from sorvolo.geometry.arrays import Anything
+from numpy.typing import NDArray
 
 MOST_KEPT_PX = 1 << 20  # of a picture: what is larger is given back
 
@@ -18,19 +17,19 @@ class Scratch:
 
     def __init__(self) -> None:
         self._size: tuple[int, int] = (0, 0)
-        self._kept: dict[tuple[str, tuple[int, ...]], Anything] = {}
+        self._kept: dict[tuple[str, tuple[int, ...]], NDArray[np.uint8]] = {}
 
     def take(
         self, name: str, size: tuple[int, int], bands: tuple[int, ...] = (), margin_px: int = 0
-    ) -> Anything:
+    ) -> NDArray[np.uint8]:
         """The uint8 array `name` for pictures of `size` (h, w), grown by a margin; with `bands` (h, w, ...)."""
         return self._taken(name, size, (size[0] + 2 * margin_px, size[1] + 2 * margin_px, *bands))
 
-    def stack(self, name: str, size: tuple[int, int], planes: int) -> Anything:
+    def stack(self, name: str, size: tuple[int, int], planes: int) -> NDArray[np.uint8]:
         """The uint8 array `name` of shape (planes, h, w), holding anything."""
         return self._taken(name, size, (planes, *size))
 
-    def _taken(self, name: str, size: tuple[int, int], shape: tuple[int, ...]) -> Anything:
+    def _taken(self, name: str, size: tuple[int, int], shape: tuple[int, ...]) -> NDArray[np.uint8]:
         if size[0] * size[1] > MOST_KEPT_PX:
             return np.empty(shape, np.uint8)
         if size != self._size:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sorvolo.change.shape.kinds import kind_of, median_ratio
 from sorvolo.change.shape.outlines import measures, outline_of
-from sorvolo.geometry.arrays import Anything, ImageRGB, Mask
+from sorvolo.geometry.arrays import Floats32, ImageRGB, Mask
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 
 _DARK = 1.08  # of the light before: what is no brighter and of the same colour is a shadow or its rim, or dark itself
@@ -61,7 +61,7 @@ def is_mostly_shade(change: Change) -> bool:
 def thing_of(changed: Mask, shadow: Mask) -> Mask:
     """The part of the change that is the thing, not its shadow; `changed` itself where hardly anything would stay."""
     lit = changed & ~shadow
-    opened: Anything = cv2.morphologyEx(lit.view(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    opened = cv2.morphologyEx(lit.view(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     if np.count_nonzero(opened) < max(_LEAST_PX, _LEAST_SHARE * np.count_nonzero(changed)):
         return changed
     _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
@@ -107,7 +107,7 @@ def _groups(patch: Patch, changed: Mask, light: "_OneLight") -> list[tuple[Mask,
     return [(each, kind_of(replace(patch, changed=each))) for each in found]
 
 
-def _group_of_pieces(patch: Patch, pieces: Sequence[Mask], distances_m: Sequence[Anything]) -> list[int]:
+def _group_of_pieces(patch: Patch, pieces: Sequence[Mask], distances_m: Sequence[Floats32]) -> list[int]:
     """The group of each piece: those near each other are one, unless one came and the other left."""
     kinds = [kind_of(replace(patch, changed=each)) for each in pieces]
     group = list(range(len(pieces)))
@@ -139,19 +139,19 @@ def _things_of_group(
 
 def _lit_things(bare: Mask, m_per_px: float) -> list[Mask]:
     """The solid things, the largest first, in the part of a change that is no shadow."""
-    lit: Anything = cv2.morphologyEx(bare.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    lit = cv2.morphologyEx(bare.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     labels = _joined(np.asarray(lit > 0), m_per_px)
     areas_m2 = np.bincount(labels[lit > 0]) * m_per_px**2
     large = [(labels == each) & (lit > 0) for each in np.argsort(-areas_m2) if areas_m2[each] >= _LEAST_THING_M2]
     return [each for each in large if np.count_nonzero(each) >= _SOLID * np.count_nonzero(_hull(each))]
 
 
-def _distance(mask: Mask) -> Anything:
+def _distance(mask: Mask) -> Floats32:
     """(h, w) how far each pixel lies from a mask, pixels."""
-    return cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 5)
+    return np.asarray(cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 5), np.float32)
 
 
-def _hull(mask: Anything) -> Mask:
+def _hull(mask: Mask | NDArray[np.uint8]) -> Mask:
     hull = np.zeros(mask.shape, np.uint8)
     cv2.fillConvexPoly(hull, cv2.convexHull(cv2.findNonZero(mask.view(np.uint8))), (1,))
     return hull.view(bool)
@@ -214,7 +214,7 @@ class _OneLight:
         return came, left
 
     @cached_property
-    def _dark(self) -> tuple[tuple[Mask, Anything], tuple[Mask, Anything]]:
+    def _dark(self) -> tuple[tuple[Mask, Floats32], tuple[Mask, Floats32]]:
         return _darkest(self._after / self._before), _darkest(self._before / self._after)
 
     def _whole(self, mask: Mask) -> Mask:
@@ -223,8 +223,8 @@ class _OneLight:
         return whole
 
 
-def _darkest(ratio: Anything) -> tuple[Mask, Anything]:
+def _darkest(ratio: Floats32) -> tuple[Mask, Floats32]:
     """Where (h, w) pictures of a ratio (h, w, 3) have a shadow, and the ratio of the colour it takes least of."""
     red, green, blue = cv2.split(ratio)
     most, least = cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue)
-    return np.asarray((most < _DARK) & (most - least < _ALIKE)), most
+    return np.asarray((most < _DARK) & (most - least < _ALIKE)), np.asarray(most, np.float32)

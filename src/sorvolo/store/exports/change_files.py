@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, Boxes, Floats, ImageGray, Mask, PointsM
+from sorvolo.geometry.arrays import Boxes, Floats, ImageBGR, ImageGray, Mask, PointsM
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.placemarks import Placemark
@@ -71,7 +71,7 @@ def write_view_masks(folder: Path, name: str, changed: ImageGray, valid: Mask) -
     return path
 
 
-def write_pictures(folder: Path, pictures: Mapping[str, Anything]) -> None:
+def write_pictures(folder: Path, pictures: Mapping[str, ImageBGR | ImageGray]) -> None:
     """Write pictures, BGR or gray uint8, as `<name>.png` into the folder, which is made; StoreError on a full disk."""
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)

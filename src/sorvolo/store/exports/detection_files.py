@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 from sorvolo.errors import StoreError
-from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, TimesNs
+from sorvolo.geometry.arrays import Floats, ImageRGB, TimesNs
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes, remove_leftovers, writing
 from sorvolo.store.exports.placemarks import Placemark
 from sorvolo.store.exports.places import longitude_latitude
@@ -177,7 +177,7 @@ def track_placemarks(tracks: Iterable[Track], site: Site) -> list[Placemark]:
     return placemarks
 
 
-def crop_around(image: ImageRGB, box_px: Anything | Sequence[float], *, margin: float = 0.6) -> ImageRGB:
+def crop_around(image: ImageRGB, box_px: Iterable[float], *, margin: float = 0.6) -> ImageRGB:
     """The part of the picture around a box (BoxesPx), wider by `margin` of its longer side, at least 24 px a side."""
     left, top, right, bottom = (float(edge) for edge in box_px)
     reach_px = max((0.5 + margin) * max(right - left, bottom - top), 12.0)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Anything, BoxesPx, Floats
+from sorvolo.geometry.arrays import BoxesPx, Floats, Labels
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.plain import json_bytes
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
@@ -82,7 +82,7 @@ def write_yolo(folder: Path, labelled: LabelledSet) -> int:
     return sum(len(picture.ignored_px) for picture in labelled.pictures)
 
 
-def yolo_text(boxes_px: BoxesPx, labels: Anything, width_px: int, height_px: int) -> str:
+def yolo_text(boxes_px: BoxesPx, labels: Labels, width_px: int, height_px: int) -> str:
     """A line for each box, (N, 4): class number, centre x and y, width and height as shares of the picture's."""
     edges = np.asarray(boxes_px, np.float64).reshape(-1, 4) / np.array([width_px, height_px] * 2)
     centres, sides = (edges[:, :2] + edges[:, 2:]) / 2, edges[:, 2:] - edges[:, :2]
@@ -118,7 +118,7 @@ def _image_row(picture: LabelledPicture, image_id: int, folder: Path) -> dict[st
     return row | ({"m_per_px": round(picture.m_per_px, 6)} if isfinite(picture.m_per_px) else {})
 
 
-def _annotation(box_px: Anything, label: int, image_id: int, is_crowd: int) -> dict[str, Any]:
+def _annotation(box_px: Iterable[float], label: int, image_id: int, is_crowd: int) -> dict[str, Any]:
     left, top, right, bottom = (float(edge) for edge in box_px)
     width, height = right - left, bottom - top
     return {

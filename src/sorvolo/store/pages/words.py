@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, ImageRGBA
+from sorvolo.geometry.arrays import ImageBGR, ImageRGBA
 from sorvolo.store.images import shrink
 
 _MOST_PICTURE_BYTES = 1_450_000  # base64 makes four bytes of three: below 2 MB in the page
@@ -90,7 +90,7 @@ def picture_uri(picture: ImageRGBA, most_bytes: int = _MOST_PICTURE_BYTES) -> st
     small = picture
     while True:
         alpha = small[..., 3:].astype(np.float32) / 255
-        flat: Anything = np.round(small[..., 2::-1] * alpha + _BACKGROUND * (1 - alpha)).astype(np.uint8)
+        flat: ImageBGR = np.round(small[..., 2::-1] * alpha + _BACKGROUND * (1 - alpha)).astype(np.uint8)
         for quality in (88, 75):
             _, data = cv2.imencode(".jpg", flat, [cv2.IMWRITE_JPEG_QUALITY, quality])
             if len(data) <= most_bytes or max(small.shape[:2]) <= 32:

@@ -14,6 +14,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 import rasterio
 import rasterio.shutil
+from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import RasterioError
@@ -22,7 +23,7 @@ from rasterio.warp import calculate_default_transform, reproject
 from rasterio.windows import Window
 
 from sorvolo.errors import InputError, SettingsError, StoreError
-from sorvolo.geometry.arrays import Anything, ImageRGBA
+from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
 from sorvolo.store.atomic import atomic_path, scratch_folder, writing
 from sorvolo.store.images import shrink
@@ -248,7 +249,7 @@ def _verify(path: Path, source: rasterio.DatasetReader, *, is_jpeg: bool) -> Non
                 raise StoreError(_differs(path))
 
 
-def _is_close(read: Anything, wanted: ImageRGBA) -> bool:
+def _is_close(read: NDArray[np.uint8], wanted: NDArray[np.uint8]) -> bool:
     """Whether a block's colours, (3, H, W), are those wanted, (4, H, W), up to JPEG's loss."""
     seen = wanted[3] > 0
     differences = np.abs(read[:, seen].astype(np.int16) - wanted[:3, seen])
