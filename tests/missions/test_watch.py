@@ -144,7 +144,11 @@ def test_without_telemetry_objects_are_counted_in_the_picture(
     truth = _seen_objects(flown)
     # without GPS the way back is another way, on which objects count again; a false alarm may count as well
     assert len(truth) <= report["objects"]["total"] <= 2 * len(truth) + 1 and updates
-    tracks = _read(tmp_path / "watch" / "tracks.geojson")
+    folder = tmp_path / "watch"
+    assert not [*folder.glob("*.geojson"), *folder.glob("*.kml"), *folder.glob("*.gpx")]
+    assert _read(folder / "detections.json")["crs"] is None
+    assert "No GeoJSON, KML or GPX is written" in (folder / "report.html").read_text()
+    tracks = _read(folder / "tracks.json")
     assert tracks["crs"] is None and "x_px" in tracks["features"][0]["properties"]
 
 
@@ -162,7 +166,7 @@ def test_after_a_cut_places_and_objects_begin_anew(flown: Path, detector: TruthD
     updates = list(watch(tmp_path / "photos", outputs=WatchOutputs(folder=tmp_path / "watch"), detector=finder))
     first, last = updates[0].segment, updates[-1].segment
     assert first == 1 and last > 1
-    tracks = [each["properties"] for each in _read(tmp_path / "watch" / "tracks.geojson")["features"]]
+    tracks = [each["properties"] for each in _read(tmp_path / "watch" / "tracks.json")["features"]]
     assert {first, last} <= {each["segment"] for each in tracks}
     assert len({each["id"] for each in tracks}) == len(tracks)
     height, width = pictures[0].shape[:2]

@@ -23,9 +23,9 @@ from sorvolo.store.exports.detection_files import (
     crop_around,
     detection_row,
     track_placemarks,
-    tracks_geojson,
+    tracks_collection,
     write_crop,
-    write_detections_geojson,
+    write_detections,
 )
 from sorvolo.survey.flight import Frame, Site
 from sorvolo.survey.objects import Sighting, Track
@@ -91,7 +91,7 @@ def test_lines_become_points(tmp_path: Path) -> None:
         "longitude": rows[0]["longitude"], "east_m": 100.0, "north_m": 200.0, "sigma_m": 1.581, "size_m": [1.0, 0.5],
     }
     assert "latitude" not in rows[1] and rows[1]["track"] is None
-    assert write_detections_geojson(tmp_path, _SITE) == 2
+    assert write_detections(tmp_path, _SITE) == 2
     collection = json.loads((tmp_path / "detections.geojson").read_text())
     assert "crs" not in collection
     first, second = collection["features"]
@@ -106,14 +106,15 @@ def test_lines_become_points(tmp_path: Path) -> None:
 def test_nothing_found_is_an_empty_collection(tmp_path: Path) -> None:
     with DetectionLines(tmp_path):
         pass
-    assert write_detections_geojson(tmp_path, _LOCAL) == 0
-    collection = json.loads((tmp_path / "detections.geojson").read_text())
+    assert write_detections(tmp_path, _LOCAL) == 0
+    collection = json.loads((tmp_path / "detections.json").read_text())
     assert collection["features"] == [] and collection["crs"] is None
+    assert not (tmp_path / "detections.geojson").exists()
 
 
 def test_tracks_carry_path_and_crop(tmp_path: Path) -> None:
     moving = _track(id=8, moving=True, velocity_m_s=np.array([0.0, 1.4]))
-    collection = tracks_geojson([_track(), moving], _SITE, {7: "objects/7.jpg"})
+    collection = tracks_collection([_track(), moving], _SITE, {7: "objects/7.jpg"})
     first, second = collection["features"]
     told = first["properties"]
     assert (told["id"], told["class"], told["views"], told["passes"], told["crop"]) == (
@@ -124,14 +125,15 @@ def test_tracks_carry_path_and_crop(tmp_path: Path) -> None:
     assert told["first_seen"] == "2026-05-28T20:26:40.000000Z"
     assert len(told["path"]["coordinates"]) == len(told["path"]["times"]) == 2
     assert told["path"]["coordinates"][1] == first["geometry"]["coordinates"]
-    local = tracks_geojson([_track()], _LOCAL, {})
+    local = tracks_collection([_track()], _LOCAL, {})
     assert local["crs"] is None and local["features"][0]["geometry"]["coordinates"] == [100.0, 200.0]
+    assert "type" not in local and "pixels of the first picture" in local["note"]  # no map shows it by mistake
 
 
 def test_tracks_are_placemarks_where_they_were_last() -> None:
     track = _track()
     (mark,) = track_placemarks([track], _SITE)
-    (feature,) = tracks_geojson([track], _SITE, {})["features"]
+    (feature,) = tracks_collection([track], _SITE, {})["features"]
     assert (mark.longitude_deg, mark.latitude_deg) == pytest.approx(feature["geometry"]["coordinates"], abs=1e-8)
     assert mark.name == f"{track.label} {track.id}" and "position accuracy" in mark.description
 

@@ -214,7 +214,9 @@ def _words_of(track: "Track", site: "Site", form: PlaceFormat) -> str:
 
 
 def _result(folder: Path) -> dict[str, Any]:
-    tracks = read_json(folder / "tracks.geojson")
+    from sorvolo.store.exports.plain import features_path
+
+    tracks = read_json(features_path(folder, "tracks"))
     return {"folder": str(folder), **read_json(folder / "report.json"), "tracks": tracks}
 
 
@@ -236,7 +238,11 @@ def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat)
     show_notices_and_warnings(result, console)
     folder = Path(result["folder"])
     show_path("report", folder / "report.html", console)
-    show_path("GeoJSON", folder / "tracks.geojson", console)
+    if result["georeferenced"]:
+        show_path("GeoJSON", folder / "tracks.geojson", console)
+    else:
+        show_path("list", folder / "tracks.json", console)
+        console.print(f"  {result['tracks']['note']}", style="dim", highlight=False)
 
 
 def _show_tracks(tracks: Sequence[Any], console: Console, form: PlaceFormat, *, on_ground: bool) -> None:
@@ -253,7 +259,8 @@ def _show_tracks(tracks: Sequence[Any], console: Console, form: PlaceFormat, *, 
         )
     console.print(table)
     if len(tracks) > _MOST_ROWS:
-        console.print(f"and {len(tracks) - _MOST_ROWS:,} more in tracks.geojson")
+        name = "tracks.geojson" if on_ground else "tracks.json"
+        console.print(f"and {len(tracks) - _MOST_ROWS:,} more in {name}")
     console.print(_COLUMNS_EXPLAINED, style="dim", highlight=False)
 
 

@@ -26,12 +26,12 @@ from sorvolo.store.exports.detection_files import (
     crop_around,
     detection_row,
     track_placemarks,
-    tracks_geojson,
+    tracks_collection,
     write_crop,
 )
 from sorvolo.store.exports.label_files import picture_of_detections, write_coco, write_yolo
 from sorvolo.store.exports.placemarks import gpx_bytes, kml_bytes
-from sorvolo.store.exports.plain import geojson_bytes
+from sorvolo.store.exports.plain import features_name, geojson_bytes
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.flight import Frame, Site
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
@@ -70,7 +70,7 @@ class WatchFiles:
         self.crop_names: dict[int, str] = {}
         self._segments: dict[int, int] = {}  # by track
         self._forgotten: list[str] = []
-        self._told_s = time.monotonic()
+        self._shown_s = time.monotonic()
         self._labelled: list[tuple[LabelledPicture, Floats]] = []
         self._classes: tuple[str, ...] = ()
         self._label_due_ns = -1
@@ -121,23 +121,24 @@ class WatchFiles:
             (self.folder / name).unlink(missing_ok=True)
 
     def show(self, tracks: Iterable[Track]) -> None:
-        """Bring `tracks.geojson` up to date, unless that was done within the last seconds."""
-        if time.monotonic() - self._told_s >= _TRACKS_EVERY_S:
-            self._told_s = time.monotonic()
+        """Bring the list of tracks up to date, unless that was done within the last seconds."""
+        if time.monotonic() - self._shown_s >= _TRACKS_EVERY_S:
+            self._shown_s = time.monotonic()
             self.write_tracks(tracks)
 
     def write_tracks(self, tracks: Iterable[Track]) -> list[dict[str, Any]]:
-        """Replace `tracks.geojson`, .kml and .gpx: readers see the old one or the new one.
+        """Replace `tracks.geojson`, .kml and .gpx, for a local site `tracks.json`: readers see the old or the new one.
 
         Returns each track's properties there.
         """
         tracks = list(tracks)
-        collection = tracks_geojson(tracks, self._site, self.crop_names)
+        collection = tracks_collection(tracks, self._site, self.crop_names)
         rows = [each["properties"] for each in collection["features"]]
         if self._site.is_local:
             for row in rows:
                 row["segment"] = self._segments[row["id"]]
-        atomic_write_bytes(self.folder / TRACKS, geojson_bytes(collection), durable=False)
+        name = features_name(TRACKS, is_local=self._site.is_local)
+        atomic_write_bytes(self.folder / name, geojson_bytes(collection), durable=False)
         if not self._site.is_local:
             placemarks = track_placemarks(tracks, self._site)
             atomic_write_bytes(self.folder / TRACKS_KML, kml_bytes("tracks", placemarks), durable=False)

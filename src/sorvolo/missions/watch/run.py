@@ -18,7 +18,7 @@ from sorvolo.missions.watch.places import Places
 from sorvolo.missions.watch.report import WatchLog, build_watch_report, count_by_class, source_notices
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.store.atomic import atomic_write_bytes
-from sorvolo.store.exports.detection_files import write_detections_geojson
+from sorvolo.store.exports.detection_files import write_detections
 from sorvolo.store.exports.plain import json_bytes
 from sorvolo.store.pages.watch import watch_page
 from sorvolo.survey.flight import Frame, LostFrame, Site
@@ -141,7 +141,7 @@ class WatchRun:
             self._notifier.close(_LAST_ALERTS_S, _LAST_EVENTS_S)
             self._files.clear()
             site, crop_names = self._places.site, self._files.crop_names
-            write_detections_geojson(self._folder, site)
+            write_detections(self._folder, site)
             rows = self._files.write_tracks(tracks)
         notices = (
             *self._places.notices(), *self._detector.notices, *source_notices(self._setup.source, self.log),

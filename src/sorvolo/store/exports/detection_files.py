@@ -14,7 +14,16 @@ from sorvolo.geometry.arrays import Floats, ImageRGB, TimesNs
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes, remove_leftovers, writing
 from sorvolo.store.exports.placemarks import Placemark
 from sorvolo.store.exports.places import longitude_latitude
-from sorvolo.store.exports.plain import json_bytes, plain_json, rounded, time_words, utc_text
+from sorvolo.store.exports.plain import (
+    NO_PLACE_FILES,
+    feature_collection,
+    features_name,
+    json_bytes,
+    plain_json,
+    rounded,
+    time_words,
+    utc_text,
+)
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.flight import Frame, Site
 from sorvolo.survey.objects import Sighting, Track
@@ -22,15 +31,22 @@ from sorvolo.survey.objects import Sighting, Track
 MARK = "watch.json"
 """The file that marks a folder as a watch's, with its source."""
 
-LINES, DETECTIONS, TRACKS, CROPS = "detections.jsonl", "detections.geojson", "tracks.geojson", "objects"
+LINES, CROPS = "detections.jsonl", "objects"
+DETECTIONS, TRACKS = "detections", "tracks"
+"""Collections: .geojson, or .json where nothing places the flight (`features_path`)."""
 TRACKS_KML, TRACKS_GPX = "tracks.kml", "tracks.gpx"
 ANNOTATED_VIDEO, ANNOTATED_PICTURES, LABELS = "annotated.mp4", "annotated", "labels"
 
 _OURS = (
-    LINES, DETECTIONS, TRACKS, TRACKS_KML, TRACKS_GPX, CROPS, ANNOTATED_VIDEO, ANNOTATED_PICTURES, LABELS,
+    LINES, *(features_name(name, is_local=is_local) for name in (DETECTIONS, TRACKS) for is_local in (False, True)),
+    TRACKS_KML, TRACKS_GPX, CROPS, ANNOTATED_VIDEO, ANNOTATED_PICTURES, LABELS,
     "report.json", "report.html",
 )
 _MADE_BY = "sorvolo watch"
+_OF_FIRST_PICTURE = (
+    "Nothing places the flight on Earth: coordinates are pixels of the first picture of each segment, x to the right "
+    "and y down. " + NO_PLACE_FILES
+)
 
 
 def claim_folder(folder: Path, source: str, fingerprint: str, *, replaces: bool = True) -> None:
@@ -102,25 +118,25 @@ def detection_row(
     return row
 
 
-def write_detections_geojson(folder: Path, site: Site) -> int:
-    """Make `detections.geojson` of the lines written so far; how many there are.
+def write_detections(folder: Path, site: Site) -> int:
+    """Make `detections.geojson` of the lines written so far, for a local site `detections.json`; how many there are.
 
     One point for each detection, without geometry where it has no place on the ground. For a local site coordinates
     are pixels of the first frame and "crs" is null.
     """
-    head: dict[str, Any] = {"type": "FeatureCollection", "name": "detections"}
-    if site.is_local:
-        head["crs"] = None
+    head = _collection(DETECTIONS, [], site)
+    del head["features"]
+    kind = {} if site.is_local else {"type": "Feature"}
     count = 0
     with (
         (folder / LINES).open(encoding="utf-8") as lines,
-        atomic_path(folder / DETECTIONS) as path,
+        atomic_path(folder / features_name(DETECTIONS, is_local=site.is_local)) as path,
         path.open("w", encoding="utf-8") as file,
     ):
-        file.write(json.dumps(head)[:-1] + ', "features": [\n')
+        file.write(json.dumps(head, ensure_ascii=False)[:-1] + ', "features": [\n')
         for line in lines:
             row = json.loads(line)
-            feature = {"type": "Feature", "geometry": _point(row), "properties": row}
+            feature = {**kind, "geometry": _point(row), "properties": row}
             file.write((",\n" if count else "") + json.dumps(feature, ensure_ascii=False))
             count += 1
         file.write("\n]}\n")
@@ -128,7 +144,7 @@ def write_detections_geojson(folder: Path, site: Site) -> int:
 
 
 def track_properties(track: Track, site: Site) -> dict[str, Any]:
-    """What is reported of a track: its properties in tracks.geojson, the body of an alert."""
+    """What is reported of a track: its properties in the list of tracks, the body of an alert."""
     east, north = track.velocity_m_s
     return {
         "id": track.id, "class": track.label, "score": rounded(track.score, 4),
@@ -142,15 +158,12 @@ def track_properties(track: Track, site: Site) -> dict[str, Any]:
     }
 
 
-def tracks_geojson(tracks: Iterable[Track], site: Site, crops: Mapping[int, str]) -> dict[str, Any]:
+def tracks_collection(tracks: Iterable[Track], site: Site, crops: Mapping[int, str]) -> dict[str, Any]:
     """Confirmed tracks as a GeoJSON FeatureCollection: a point each, its path as a property (docs/formats.md).
 
-    `crops` are the crops' file names by track. For a local site coordinates are pixels of the first frame and "crs"
-    is null.
+    `crops` are the crops' file names by track. For a local site it is plain JSON: coordinates are pixels of the first
+    frame and "crs" is null.
     """
-    collection: dict[str, Any] = {"type": "FeatureCollection", "name": "tracks"}
-    if site.is_local:
-        collection["crs"] = None
     features = []
     for track in tracks:
         properties = track_properties(track, site)
@@ -158,8 +171,7 @@ def tracks_geojson(tracks: Iterable[Track], site: Site, crops: Mapping[int, str]
             "type": "Feature", "id": track.id, "geometry": _point(properties),
             "properties": {**properties, "crop": crops.get(track.id), "path": _path(track.path_m, track.path_ns, site)},
         })
-    collection["features"] = features
-    return collection
+    return _collection(TRACKS, features, site)
 
 
 def track_placemarks(tracks: Iterable[Track], site: Site) -> list[Placemark]:
@@ -204,6 +216,10 @@ def _mark_of(folder: Path) -> dict[str, Any] | None:
     except (OSError, ValueError):
         return None
     return mark if isinstance(mark, dict) and mark.get("made_by") == _MADE_BY else None
+
+
+def _collection(name: str, features: Sequence[Mapping[str, Any]], site: Site) -> dict[str, Any]:
+    return feature_collection(name, features, is_local=site.is_local, note=_OF_FIRST_PICTURE)
 
 
 def _place(position_m: Floats, site: Site) -> dict[str, Any]:

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 _DAY_NS = 86_400_000_000_000
-_NO_PLACE = (
+NO_PLACE_FILES = "No GeoJSON, KML or GPX is written, since these hold places on Earth."
+_OF_OWN_MAP = (
     "The flight has no GPS: coordinates are pixels of its own map, x to the right and y up, without metres and north. "
-    "No GeoJSON, KML or GPX is written, since these hold places on Earth."
+    + NO_PLACE_FILES
 )
 
 
@@ -61,15 +62,17 @@ def geojson_bytes(collection: Mapping[str, Any]) -> bytes:
     return (opening + ', "features": [\n' + ",\n".join(features) + "\n]}\n").encode()
 
 
-def feature_collection(name: str, features: Sequence[Mapping[str, Any]], *, is_local: bool) -> dict[str, Any]:
+def feature_collection(
+    name: str, features: Sequence[Mapping[str, Any]], *, is_local: bool, note: str = _OF_OWN_MAP
+) -> dict[str, Any]:
     """Features with a geometry as a GeoJSON FeatureCollection; of a local site as plain JSON, which no map would open.
 
-    A local site has no place on Earth: its coordinates are pixels of its own map, x east and y north.
+    A local site has no place on Earth: its coordinates are pixels, of its own map where `note` states nothing else.
     """
     if not is_local:
         return {"type": "FeatureCollection", "name": name, "features": list(features)}
     plain = [{key: value for key, value in each.items() if key != "type"} for each in features]
-    return {"name": name, "crs": None, "note": _NO_PLACE, "features": plain}
+    return {"name": name, "crs": None, "note": note, "features": plain}
 
 
 def features_name(name: str, *, is_local: bool) -> str:

@@ -13,6 +13,7 @@ from markupsafe import Markup
 
 from sorvolo.geometry.arrays import Floats
 from sorvolo.store.exports.places import SYSTEMS, degrees_words
+from sorvolo.store.exports.plain import NO_PLACE_FILES
 from sorvolo.store.pages.plots import round_length
 from sorvolo.store.pages.render import render
 from sorvolo.store.pages.words import (
@@ -33,7 +34,7 @@ _ROWS = 3  # so many lines a label may lie from its dot
 _CROPS_BYTES = 8_000_000  # of all crops in the page together
 _COLOURS = 6
 _FILES = "tracks.geojson, tracks.kml (Google Earth), tracks.gpx (GPS receivers)"
-_LOCAL_FILES = "tracks.geojson (coordinates in pixels)"
+_LOCAL_FILES = "tracks.json, coordinates in pixels of the first picture. " + NO_PLACE_FILES
 _Box = tuple[float, float, float, float]  # left, top, right, bottom
 _Track = Mapping[str, Any]
 
@@ -41,7 +42,7 @@ _Track = Mapping[str, Any]
 def watch_page(
     report: Mapping[str, Any], tracks: Sequence[_Track], crops: Mapping[int, bytes], drone_m: Floats
 ) -> str:
-    """report.html of one watch: `report` as in report.json, `tracks` the properties of tracks.geojson.
+    """report.html of one watch: `report` as in report.json, `tracks` the properties of the list of tracks.
 
     `crops` are JPEG files by track, and `drone_m` (N, 2) the camera's places in site metres, none for a flight that
     nothing places. All text is escaped.
