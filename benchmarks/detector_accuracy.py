@@ -154,24 +154,24 @@ def figures(scores) -> dict[str, object]:
 def people_by_centre(
     labelled: LabelledSet, found: FoundSet, classes: tuple[str, ...]
 ) -> dict[str, float | int] | None:
-    """How many people are found if a told box's centre within the label is enough, for sets with loose boxes.
+    """How many people are found if a reported box's centre within the label is enough, for sets with loose boxes.
 
     At the model's own threshold; None where no person is labelled. `found` and `right` are shares of the labels and of
-    the told boxes; boxes whose centre lies in a region to ignore are left out.
+    the reported boxes; boxes whose centre lies in a region to ignore are left out.
     """
-    own, told = labelled.classes.index("person"), classes.index("person")
+    own, person = labelled.classes.index("person"), classes.index("person")
     labels = hits = boxes = right = 0
     for picture, seen in zip(labelled.pictures, found.detections):
         people = picture.boxes_px[picture.labels == own]
-        is_told = (seen.labels == told) & (seen.scores >= found.thresholds["person"])
-        centres = (seen.boxes_px[is_told][:, :2] + seen.boxes_px[is_told][:, 2:]) / 2
+        is_reported = (seen.labels == person) & (seen.scores >= found.thresholds["person"])
+        centres = (seen.boxes_px[is_reported][:, :2] + seen.boxes_px[is_reported][:, 2:]) / 2
         inside, ignored = _holds(people, centres), _holds(picture.ignored_px, centres)
         labels, hits = labels + len(people), hits + int(inside.any(axis=1).sum())
         counts = inside.any(axis=0) | ~ignored.any(axis=0)
         boxes, right = boxes + int(counts.sum()), right + int(inside.any(axis=0).sum())
     if not labels:
         return None
-    return {"labels": labels, "told": boxes, "found": hits / labels, "right": right / max(boxes, 1)}
+    return {"labels": labels, "reported": boxes, "found": hits / labels, "right": right / max(boxes, 1)}
 
 
 def _holds(boxes_px: np.ndarray, points_px: np.ndarray) -> np.ndarray:

@@ -62,8 +62,8 @@ def main() -> None:
     looks |= {f"eager {name}": eager(untrained(name), options.threads) for name in options.eager}
     providers = {Path(name).name: each.provider for name, each in detectors.items()}
     for spec in options.untrained:
-        own, told = exported(spec, options.provider, options.threads, frames)
-        looks, providers = looks | own, providers | told
+        own, where = exported(spec, options.provider, options.threads, frames)
+        looks, providers = looks | own, providers | where
     runs = {}
     load = [os.getloadavg()[0]]
     for size in options.sizes:
@@ -109,14 +109,14 @@ def timed(looks: dict[str, Callable], pictures: list[np.ndarray], warm: int) -> 
             started, spent = time.perf_counter(), time.process_time()
             look(picture)
             seconds[name].append((time.perf_counter() - started, time.process_time() - spent))
-    told = {}
+    measured = {}
     for name, each in seconds.items():
         (low, middle, high), processor = np.percentile(1e3 * np.array(each[warm:]), (5, 50, 95), axis=0).T
-        told[name] = {
+        measured[name] = {
             "median_ms": round(float(middle), 1), "p5_ms": round(float(low), 1), "p95_ms": round(float(high), 1),
             "frames_per_second": round(1e3 / float(middle), 1),
         } | {f"processor_{key}_ms": round(float(value), 1) for key, value in zip(("p5", "median", "p95"), processor)}
-    return told
+    return measured
 
 
 def with_decoding(detector: Detector, video: Path) -> dict[str, float]:
@@ -164,7 +164,7 @@ def exported(
 ) -> tuple[dict[str, Callable], dict[str, str]]:
     """An untrained network as a file of float32, one of int8, and in eager PyTorch, all on one thread and on `threads`.
 
-    Told with where the files run.
+    With where the files run.
     """
     import torch
 

@@ -1,7 +1,7 @@
 """The packaged model in eight bits, and what that costs: python benchmarks/pack_int8_model.py DATA (after packing).
 
 Calibrated on pictures of the training sets, compared with the float32 model on held-out pictures; the card says by how
-much each class's AP differs. Its remark tells where more than half a point is lost.
+much each class's AP differs. Its remark states where more than half a point is lost.
 """
 
 import argparse
@@ -69,7 +69,7 @@ def main() -> None:
     }
     print("lost", lost, flush=True)
     (wishes.home / "default-int8.onnx").write_bytes(found.model)
-    told = "; ".join(f"{100 * value:.1f} points of {name}" for name, value in lost.items()) or "half a point at most"
+    points = [f"{100 * value:.1f} points of {name}" for name, value in lost.items()] or ["half a point at most"]
     float_card = json.loads((wishes.home / "default.json").read_text())
     card = {
         "name": "default-int8", "of": "default", "precision": "int8", **{key: float_card[key] for key in _KEPT},
@@ -77,7 +77,7 @@ def main() -> None:
         "bytes": len(found.model), "convolutions": f"{found.convolutions} of {found.of}",
         "calibrated_on": "pictures of the training sets: HIT-UAV, aerial cars, TinyPerson, simulated",
         "against_float32": against,
-        "remark": f"about twice as quick on CPUs with eight-bit instructions; loses {told}",
+        "remark": f"about twice as quick on CPUs with eight-bit instructions; loses {'; '.join(points)}",
     }
     (wishes.home / "default-int8.json").write_text(json.dumps(card, indent=1) + "\n")
 

@@ -148,11 +148,11 @@ def theirs(report: Path, photo: Path, run: dict[str, Any]) -> dict[str, Sequence
     """pyOrthomosaic's picture centres, from the affine maps of its report (pixels of the full photo to UTM metres)."""
     from PIL import Image
 
-    said = json.loads(report.read_text()) if report.exists() else {"images_used": 0, "cameras": {}}
-    run["used"] = said["images_used"]
+    record = json.loads(report.read_text()) if report.exists() else {"images_used": 0, "cameras": {}}
+    run["used"] = record["images_used"]
     with Image.open(photo) as picture:
         middle = np.array([(picture.width - 1) / 2, (picture.height - 1) / 2, 1.0])
-    return {name: (np.array(each["affine"]) @ middle).tolist() for name, each in said["cameras"].items()}
+    return {name: (np.array(each["affine"]) @ middle).tolist() for name, each in record["cameras"].items()}
 
 
 def colmap_centres(peer_bin: Path, folder: Path, place: Path, runs: dict[str, Any]) -> dict[str, Sequence[float]]:
@@ -161,9 +161,9 @@ def colmap_centres(peer_bin: Path, folder: Path, place: Path, runs: dict[str, An
     runs["colmap"] = measured([peer_bin / "python", "-c", _COLMAP, found, folder])
     if not found.exists():
         return {}
-    said = json.loads(found.read_text())
-    runs["colmap"]["used"] = len(said["cameras"])
-    points = np.array(said["points"])
+    record = json.loads(found.read_text())
+    runs["colmap"]["used"] = len(record["cameras"])
+    points = np.array(record["points"])
     middle = np.median(points, axis=0)
     near = points[np.linalg.norm(points - middle, axis=1) < 5 * np.median(np.linalg.norm(points - middle, axis=1))]
     for _ in range(5):  # trees stand on one side of the ground only: the plane is fitted to what lies close to it
@@ -172,7 +172,7 @@ def colmap_centres(peer_bin: Path, folder: Path, place: Path, runs: dict[str, An
         off = np.abs((near - middle) @ axes[2])
         near = near[off <= 2 * np.median(off) + 1e-12]
     result = {}
-    for name, each in said["cameras"].items():
+    for name, each in record["cameras"].items():
         centre, axis = np.array(each["centre"]) - middle, np.array(each["axis"])
         hit = centre - axis * (centre @ axes[2]) / (axis @ axes[2])
         result[name] = [float(hit @ axes[0]), float(hit @ axes[1])]

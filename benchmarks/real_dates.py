@@ -113,12 +113,12 @@ def main() -> None:
 
 def append(output: Path, run: dict[str, Any]) -> None:
     """Add a run to the results, with its date, commit and machine."""
-    said = json.loads(output.read_text()) if output.is_file() else {
+    record = json.loads(output.read_text()) if output.is_file() else {
         "benchmark": "real_dates", "held_out": HELD_OUT, "development": DEVELOPMENT, "right_m": RIGHT_M, "runs": [],
     }
     stamp = {"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M}", "commit": commit(), "machine": machine()}
-    said["runs"].append(stamp | run)
-    output.write_text(json.dumps(said, indent=1) + "\n")
+    record["runs"].append(stamp | run)
+    output.write_text(json.dumps(record, indent=1) + "\n")
 
 
 def score(pair: Pair, attitude: str, truth: dict[str, Any], options: argparse.Namespace) -> dict[str, Any]:
@@ -279,7 +279,7 @@ def found(
                 for overlap, size in zip(overlaps, sizes)
             )
     quiet = np.any([drawn(np.array(ring, float), size_px) for ring in truth["unchanged"].values()], axis=0)
-    false = [said["id"] for said, mask in reported if (mask & quiet).sum() >= _FALSE_SHARE * max(1, mask.sum())]
+    false = [record["id"] for record, mask in reported if (mask & quiet).sum() >= _FALSE_SHARE * max(1, mask.sum())]
     by_kind = {
         kind: f"{sum(hits[name] for name in names)} of {len(names)}"
         for kind in ("appeared", "disappeared", "replaced", "area")

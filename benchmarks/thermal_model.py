@@ -31,7 +31,7 @@ from sorvolo.training.presets import fast
 from train_default_model import reader
 
 RESULTS = Path(__file__).parent / "results" / "thermal_model.json"
-TOLD = dict.fromkeys(CLASSES, 0.5)
+THRESHOLDS = dict.fromkeys(CLASSES, 0.5)
 
 
 def main() -> None:
@@ -44,7 +44,7 @@ def main() -> None:
     wishes = parser.parse_args()
     model = fast(CLASSES)
     model.load_state_dict(torch.load(wishes.weights, weights_only=True))
-    info = {"name": "thermal", "classes": list(CLASSES), "thermal": True, "thresholds": TOLD, "best_px": BEST_PX}
+    info = {"name": "thermal", "classes": list(CLASSES), "thermal": True, "thresholds": THRESHOLDS, "best_px": BEST_PX}
     sets: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "thermal.onnx"
@@ -86,13 +86,13 @@ def compared(labelled: LabelledSet, detectors: dict[str, Detector]) -> dict[str,
             detector.detect(read(each.path), tiles="auto", m_per_px=each.m_per_px, least_score=0.02)
             for each in labelled.pictures
         )
-        arms.append(Arm(name, CLASSES, (found,), (TOLD,)))
-    told = compare_arms(labelled, arms)
-    of_class = [f"{kind} {label}" for label in told.labels if told.labels[label] for kind in ("AP50", "AP")]
+        arms.append(Arm(name, CLASSES, (found,), (THRESHOLDS,)))
+    compared = compare_arms(labelled, arms)
+    of_class = [f"{kind} {label}" for label in compared.labels if compared.labels[label] for kind in ("AP50", "AP")]
     return {
-        "pictures": told.pictures, "groups": told.groups, "labels": told.labels,
-        **{arm.name: {key: arm.mean[key] for key in of_class} for arm in told.arms},
-        "difference": {key: asdict(told.differences[0][key]) for key in of_class},
+        "pictures": compared.pictures, "groups": compared.groups, "labels": compared.labels,
+        **{arm.name: {key: arm.mean[key] for key in of_class} for arm in compared.arms},
+        "difference": {key: asdict(compared.differences[0][key]) for key in of_class},
     }
 
 

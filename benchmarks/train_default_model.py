@@ -152,7 +152,7 @@ def _made(simulated: Path) -> LabelledSet:
 
 
 def _from(labelled: LabelledSet, fits: Callable[[float], bool]) -> LabelledSet:
-    """HIT-UAV's frames taken at angles below the horizon that `fits`; their names tell them, night_height_angle_."""
+    """HIT-UAV's frames taken at angles below the horizon that `fits`; their names give them, night_height_angle_."""
     return labelled.only([each for each in labelled.pictures if fits(float(Path(each.path).stem.split("_")[2]))])
 
 

@@ -171,13 +171,13 @@ def seen(model: Daylight, planes: torch.Tensor, truth: Truth) -> Look:
     people, people_scores, _ = model.coco.found(outputs, (planes.shape[2], planes.shape[3]))
     right, known = truth.of(boxes.numpy())
     is_person, is_known = truth.of(people.numpy())
-    told = is_known[:, PERSON] & (people_scores.numpy() >= LEAST_SCORE)
+    reported = is_known[:, PERSON] & (people_scores.numpy() >= LEAST_SCORE)
     place = truth.labelled.name
     return Look(
         place, Path(truth.picture.path).stem if place in BARE else truth.picture.group,
         model.judge.pooled(levels, boxes).half().numpy(), boxes.numpy(), scores.numpy(), labels.numpy(),
         support(outputs, model.coco.head.strides, boxes, 0).numpy(), right, known,
-        np.stack([people_scores.numpy()[told], is_person[told, PERSON]], 1),
+        np.stack([people_scores.numpy()[reported], is_person[reported, PERSON]], 1),
     )
 
 

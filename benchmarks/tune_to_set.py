@@ -69,9 +69,9 @@ def main() -> None:
         found += [looked(model, reader()(each.path), wishes.look, wishes.tiles) for each in measured]
         learnt_from += len(learnt)
     held_out = LabelledSet(wishes.name, CLASSES, tuple(pictures), unlabelled)
-    told = dict.fromkeys(CLASSES, 0.5)
-    scores = score_set(held_out, found, CLASSES, told)
-    centres = people_by_centre(held_out, FoundSet((), tuple(found), told), CLASSES)
+    thresholds = dict.fromkeys(CLASSES, 0.5)
+    scores = score_set(held_out, found, CLASSES, thresholds)
+    centres = people_by_centre(held_out, FoundSet((), tuple(found), thresholds), CLASSES)
     document = {
         "benchmark": "tune_to_set", "set": wishes.name, "machine": machine(), "commit": commit(), "seed": wishes.seed,
         "steps": wishes.steps, "scale": wishes.scale, "look": wishes.look, "tiles": wishes.tiles,

@@ -62,7 +62,7 @@ def packet_of(index: int) -> bytes:
 
 
 class Sender(threading.Thread):
-    """Sends frames in real time until told to stop or `count` are sent; `open_url` may wait for a listener."""
+    """Sends frames in real time until asked to stop or `count` are sent; `open_url` may wait for a listener."""
 
     def __init__(
         self, url: str, *, count: int = 10_000, size: tuple[int, int] = (160, 96), klv: bool = False, first: int = 0,
@@ -96,9 +96,9 @@ class Sender(threading.Thread):
                 if self._stopped.wait(max(0.0, began_s + step / self._rate / self._speed - time.monotonic())):
                     break
                 if data is not None:
-                    told = av.Packet(self._klv_of(index))
-                    told.stream, told.time_base, told.pts, told.dts = data, Fraction(1, self._rate), step, step
-                    output.mux(told)
+                    packet = av.Packet(self._klv_of(index))
+                    packet.stream, packet.time_base, packet.pts, packet.dts = data, Fraction(1, self._rate), step, step
+                    output.mux(packet)
                 frame = av.VideoFrame.from_ndarray(self._image(index), format="rgb24")
                 frame.pts, frame.time_base = step, Fraction(1, self._rate)
                 output.mux(stream.encode(frame))

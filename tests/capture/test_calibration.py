@@ -127,7 +127,7 @@ def test_the_datasets_order_is_seen_from_the_numbers(read):
     assert "can only be k3" in model.origin
 
 
-def test_an_order_that_numbers_do_not_tell_is_opencvs_and_says_so(read):
+def test_an_order_that_numbers_do_not_show_is_opencvs_and_is_named(read):
     model = read(xml(distortion="-0.2 0.1 0.001 -0.002 0.003"))
     np.testing.assert_allclose(model.camera.distortion, [-0.2, 0.1, 0.001, -0.002, 0.003])
     assert "assumed" in model.origin
@@ -366,7 +366,7 @@ def test_a_real_phantom_3_photo_is_recognised():
     ("M3M", 5280, 3956, 12.29, "Mavic 3E"), ("M3M", 2592, 1944, 4.34, "Mavic 3M multispectral"),
     ("ZH20T", 640, 512, 13.5, "Zenmuse H20T thermal"), ("M4T", 8064, 6048, 6.72, "Matrice 4T"),
 ])
-def test_a_drones_cameras_are_told_apart(model, width_px, height_px, focal_mm, name):
+def test_a_drones_cameras_are_distinguished(model, width_px, height_px, focal_mm, name):
     found = guess_camera(width_px, height_px, make="DJI", model=model, focal_length_mm=focal_mm)
     assert found.origin.startswith(f"preset {name}:")
 

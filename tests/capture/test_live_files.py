@@ -78,11 +78,11 @@ def _crc32_mpeg(data: bytes) -> int:
 
 def test_synchronous_metadata(tmp_path: Path) -> None:
     """ST 1402: an access unit header before each set, in a stream of type 0x15."""
-    def told(index: int) -> bytes:
+    def klv_of(index: int) -> bytes:
         packet = packet_of(index)
         return b"\0" + bytes([index]) + b"\xdf" + len(packet).to_bytes(2, "big") + packet
 
-    plain = write_ts(tmp_path / "plain.ts", klv=True, klv_of=told)
+    plain = write_ts(tmp_path / "plain.ts", klv=True, klv_of=klv_of)
     (tmp_path / "film.ts").write_bytes(as_synchronous(plain.read_bytes()))
     assert (tmp_path / "film.ts").read_bytes() != plain.read_bytes()
     for film in (plain, tmp_path / "film.ts"):
@@ -92,13 +92,13 @@ def test_synchronous_metadata(tmp_path: Path) -> None:
 
 
 def test_metadata_with_damage_and_without_time(tmp_path: Path) -> None:
-    def told(index: int) -> bytes:
+    def klv_of(index: int) -> bytes:
         packet = bytearray(packet_of(index))
         if index % 5 == 1:
             packet[-1] ^= 1
         return encode(0, {"sensor_latitude_deg": 1.0}) if index % 5 == 2 else bytes(packet)
 
-    (source,) = open_sources([write_ts(tmp_path / "film.ts", klv=True, klv_of=told)])
+    (source,) = open_sources([write_ts(tmp_path / "film.ts", klv=True, klv_of=klv_of)])
     counts = {notice.code: notice.count for notice in source.telemetry.notices}
     assert len(source.telemetry) == 18 and counts["bad_checksum"] == 6 and counts["no_time"] == 6
 

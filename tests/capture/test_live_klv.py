@@ -163,19 +163,19 @@ def test_the_cameras_angles_are_composed_as_by_hand(
 
 
 def test_columns() -> None:
-    told = one(encode(_TIME_NS, {
+    decoded = one(encode(_TIME_NS, {
         "platform_heading_deg": 90.0, "platform_pitch_full_deg": 40.0, "platform_pitch_deg": nan,
         "platform_roll_deg": 0.0, "sensor_relative_azimuth_deg": 0.0, "sensor_relative_elevation_deg": -90.0,
         "sensor_latitude_deg": 46.5, "sensor_longitude_deg": 11.3, "sensor_true_altitude_m": 160.0,
         "sensor_ellipsoid_height_m": 212.0, "sensor_ellipsoid_height_extended_m": 210.0,
         "frame_center_elevation_m": 100.0,
     }))
-    columns = columns_of(told)
+    columns = columns_of(decoded)
     assert columns["orthometric_height_m"] == pytest.approx(160, abs=0.2)
     assert columns["ellipsoidal_height_m"] == pytest.approx(210, abs=0.02)  # the finer tag wins
     assert columns["camera_pitch_deg"] == pytest.approx(-50, abs=1e-3)
     assert columns["body_pitch_deg"] == pytest.approx(40, abs=1e-3)
-    assert ground_elevation_m(told) == pytest.approx(100, abs=0.2)
+    assert ground_elevation_m(decoded) == pytest.approx(100, abs=0.2)
     bare = columns_of(one(encode(_TIME_NS, {"platform_heading_deg": 90.0, "sensor_latitude_deg": 46.5})))
     assert set(bare) == {"latitude_deg", "body_yaw_deg"}
 

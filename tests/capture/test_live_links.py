@@ -35,13 +35,13 @@ def sentences(utc_ns: int, seconds: float = 0.0) -> bytes:
         f"GNGGA,{clock},46{minutes:010.7f},N,01118.0000000,E,1,12,0.8,160.0,M,48.0,M,,",
         f"GNRMC,{clock},A,46{minutes:010.7f},N,01118.0000000,E,9.719,0.00,{moment:%d%m%y},,,A",
     )
-    told = b""
+    lines = b""
     for body in both:
         total = 0
         for letter in body.encode():
             total ^= letter
-        told += f"${body}*{total:02X}\r\n".encode()
-    return told
+        lines += f"${body}*{total:02X}\r\n".encode()
+    return lines
 
 
 @contextmanager
@@ -104,7 +104,7 @@ def test_udp() -> None:
         silent_from_s = time.monotonic()
         while not link.outages.silent_s and time.monotonic() < silent_from_s + 5:
             time.sleep(0.02)
-        assert link.outages.silent_s > 0  # noticed, and told when it is over
+        assert link.outages.silent_s > 0  # noticed, and reported when it is over
         count = len(ear.epochs)
         with speaking(lambda data: sender.sendto(data, ("127.0.0.1", port))):
             assert ear.wait(count + 3)
@@ -166,7 +166,7 @@ def test_links_that_cannot_be(address: str, words: str) -> None:
 
 
 @pytest.mark.parametrize("has_metadata", [False, True])
-def test_a_receiver_beside_a_stream_tells_where_each_frame_was_taken(has_metadata: bool) -> None:
+def test_a_receiver_beside_a_stream_gives_where_each_frame_was_taken(has_metadata: bool) -> None:
     """The pictures' clock is this computer's or, with metadata, another: both are tied by when things come."""
     video, gps = free_port(), free_port()
     with (

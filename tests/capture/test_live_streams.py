@@ -191,7 +191,7 @@ def test_frames_of_another_size_are_fitted_and_of_another_shape_lost() -> None:
     assert counts["size_changed"] == len(by_sender[1]) and counts["other_shape"] == len(by_sender[2])
 
 
-def test_a_flight_ends_when_it_is_told_to() -> None:
+def test_a_flight_ends_when_it_is_stopped() -> None:
     port, until = free_port(), threading.Event()
     with sending(udp_url(port)), opened_sources([f"udp://:{port}"], live=ALL, until=until) as (source,):
         frames = source.frames(every_frame)
@@ -229,10 +229,10 @@ def test_a_server_that_refuses_is_an_error_at_once() -> None:
     server = RtspServer(password=True)
     server.start()
     began_s = time.monotonic()
-    with pytest.raises(InputError, match=r"401.*check the address, the name and the password") as told:
+    with pytest.raises(InputError, match=r"401.*check the address, the name and the password") as refused:
         open_live(server.address.replace("//", "//me:secret@"))
     server.close()
-    assert time.monotonic() - began_s < 10 and "secret" not in str(told.value)
+    assert time.monotonic() - began_s < 10 and "secret" not in str(refused.value)
 
 
 @pytest.mark.parametrize(("here", "there", "container"), [

@@ -374,7 +374,7 @@ def test_a_flight_is_sorted_by_time_then_by_name(tmp_path: Path) -> None:
     assert source.kind == "photos" and source.frame_count == 4 and math.isnan(source.frame_rate_hz)
 
 
-def test_an_unknown_zone_is_told_and_no_time_too(tmp_path: Path) -> None:
+def test_an_unknown_zone_is_reported_and_no_time_too(tmp_path: Path) -> None:
     (tmp_path / "local").mkdir()
     for index in range(3):
         write_photo(tmp_path / "local" / f"{index}.jpg", local=f"2021:06:01 12:00:0{index}", seed=index)

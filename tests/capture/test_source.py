@@ -164,7 +164,7 @@ def test_a_site_folder_is_no_flight(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["log.srt", "log.csv", "log.mp4"])
-def test_telemetry_given_as_input_is_told_where_it_belongs(tmp_path: Path, name: str) -> None:
+def test_telemetry_given_as_input_is_refused_with_where_it_belongs(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text(SRT)
     with pytest.raises(InputError, match=r"a telemetry file, no video or photo; .* --telemetry"):
         open_sources([tmp_path / name])

@@ -28,7 +28,7 @@ SECOND_NS = 1_000_000_000
 
 
 def row(index: int) -> dict[str, float]:
-    said = {
+    reported = {
         "Tick#": 1000 + 60 * index, "offsetTime": 12.5 + 0.1 * index, "flightTime(msec)": 5000 + 100 * index,
         "Longitude": 12.4964 + 1e-6 * index, "Latitude": 41.9028 + 2e-6 * index, "gpsAltitude(meters)": 85.5,
         "baroAlt(meters)": 90.25 + index, "vpsHeight(M)": 9.0, "relativeHeight": 10.5, "velN(M/S)": 3.0,
@@ -36,7 +36,7 @@ def row(index: int) -> dict[str, float]:
         "quatX": 0.0, "quatY": 0.0, "quatZ": 0.0, "Gimbal:roll": 0.5, "Gimbal:pitch": -90.0,
         "Gimbal:yaw": 31.0, "Gimbal:Xroll": 99.0, "Gimbal:Yyaw": 99.0, "directionOfTravel": 7.0,
     }
-    return {name: said.get(name, 1.0) for name in COLUMNS}
+    return {name: reported.get(name, 1.0) for name in COLUMNS}
 
 
 def table(columns=COLUMNS, count: int = 20, delimiter: str = ",", newline: str = "\n", changes=()) -> str:
@@ -312,9 +312,9 @@ def test_broken_rows_are_counted():
     lines[9] = '"' + lines[9]  # a stray quote
     lines[12] = ""
     telemetry = flight_table.read(("\n".join(lines) + "\n").encode(), "a.csv")
-    said = codes(telemetry)
-    assert said["unreadable_line"] == 1
-    assert said["short_row"] == 2
+    reported = codes(telemetry)
+    assert reported["unreadable_line"] == 1
+    assert reported["short_row"] == 2
     assert len(telemetry) == 27
 
 

@@ -1,4 +1,4 @@
-"""Changes collected over views of a world whose things are known: each told once, ghosts and noise not at all."""
+"""Changes collected over views of a world whose things are known: each reported once, ghosts and noise not at all."""
 
 from dataclasses import replace
 
@@ -25,11 +25,11 @@ def centre(change: Change) -> np.ndarray:
     return (change.outline_m.min(axis=0) + change.outline_m.max(axis=0)) / 2
 
 
-def test_what_came_and_what_left_is_told_once_with_its_place_size_and_time():
+def test_what_came_and_what_left_is_announced_once_with_its_place_size_and_time():
     came, left = Thing(0, 0), Thing(3, 2, (1.4, 0.8), colour=(40, 40, 200), on_map=True, in_flight=False)
     stays = Thing(-2, -2, on_map=True)
-    evidence, told = collect(flight([came, left, stays]))
-    assert [each.id for _, each in told] == ["f-1", "f-2"]
+    evidence, reported = collect(flight([came, left, stays]))
+    assert [each.id for _, each in reported] == ["f-1", "f-2"]
     final = evidence.conclude()
     assert [each.kind for each in final] == [ChangeKind.APPEARED, ChangeKind.DISAPPEARED]
     for change, thing in zip(final, (came, left)):
@@ -43,10 +43,10 @@ def test_what_came_and_what_left_is_told_once_with_its_place_size_and_time():
     assert evidence.conclude() is not None and len(evidence.conclude()) == 2  # again: the same
 
 
-def test_it_is_told_within_a_second_of_being_in_view_whatever_the_frame_rate():
+def test_it_is_announced_within_a_second_of_being_in_view_whatever_the_frame_rate():
     for fps in (5.0, 30.0):
-        _, told = collect(flight([Thing(2, 0)], fps=fps))
-        (index, change), = told
+        _, reported = collect(flight([Thing(2, 0)], fps=fps))
+        (index, change), = reported
         whole_in_view_s = (2 + 0.5 + 8 - 8) / 3  # the view reaches 8 m ahead of a drone that starts at -8 m
         assert index / fps < whole_in_view_s + 1.0
         assert change.announced_ns == START_NS + round(index / fps * 1e9)
@@ -89,8 +89,8 @@ def test_the_patch_shows_both_dates_north_up():
 def test_things_apart_stay_two_and_pieces_that_nearly_touch_are_one():
     evidence, _ = collect(flight([Thing(0, 0), Thing(2.0, 0)]))
     assert len(evidence.conclude()) == 2
-    evidence, told = collect(flight([Thing(0, 0), Thing(1.2, 0)]))
-    assert len(told) == 1
+    evidence, reported = collect(flight([Thing(0, 0), Thing(1.2, 0)]))
+    assert len(reported) == 1
     (change,) = evidence.conclude()
     assert change.length_m == pytest.approx(2.2, abs=0.2)
 
@@ -101,8 +101,8 @@ def test_changes_that_grow_together_keep_the_older_id():
     last_m = float(views[-1].camera_m[0])
     more = [view_of(14 + i, 2.8 + i / 5, (last_m + 0.6 * (i + 1), 0, CAMERA_HEIGHT_M), [left, right, bridge])
             for i in range(12)]
-    evidence, told = collect(views + more)
-    assert [each.id for _, each in told] == ["f-1", "f-2"]
+    evidence, reported = collect(views + more)
+    assert [each.id for _, each in reported] == ["f-1", "f-2"]
     assert [each.id for each in evidence.changes()] == ["f-1"]
 
 
@@ -136,28 +136,28 @@ def test_noise_that_does_not_come_back_at_its_place_is_nothing():
     for view in flight([]):
         things = [Thing(*rng.uniform([-12, -4], [8, 4]), (0.4, 0.4)) for _ in range(3)]
         views.append(view_of(view.index, view.index / 5, view.camera_m, things))
-    evidence, told = collect(views)
-    assert told == []
+    evidence, reported = collect(views)
+    assert reported == []
     assert [each for each in evidence.conclude() if each.kind != ChangeKind.MOVING] == []
 
 
 def test_the_moving_ghost_of_something_tall_is_no_event():
     # stands on both dates: the map shows it from one side, each view from another; only its foot stays in place
     pole = Thing(0, 0, (0.3, 0.3), height_m=5, on_map=True)
-    evidence, told = collect(flight([pole], map_eye_m=(0.5, 0.3, CAMERA_HEIGHT_M)))
+    evidence, reported = collect(flight([pole], map_eye_m=(0.5, 0.3, CAMERA_HEIGHT_M)))
     # near its foot both its ends are seen: the map's and the flight's
-    assert [each.kind for _, each in told] == [ChangeKind.APPEARED, ChangeKind.DISAPPEARED]
-    assert all(np.abs(centre(each)).max() < 1.1 for _, each in told)
+    assert [each.kind for _, each in reported] == [ChangeKind.APPEARED, ChangeKind.DISAPPEARED]
+    assert all(np.abs(centre(each)).max() < 1.1 for _, each in reported)
     final = evidence.conclude()
     assert [each.kind for each in final] == [ChangeKind.APPEARED, ChangeKind.DISAPPEARED]
     assert all(np.abs(centre(each)).max() < 0.5 for each in final)
 
 
-def test_a_drone_that_hovers_tells_a_ghost_only_with_half_the_score_and_takes_it_back_when_it_flies_on():
+def test_a_drone_that_hovers_announces_a_ghost_only_with_half_the_score_and_withdraws_it_when_it_flies_on():
     pole = Thing(0, -1, (0.5, 0.5), height_m=4, on_map=True)
     hover = [view_of(i, i / 5, (-5, 0, CAMERA_HEIGHT_M), [pole]) for i in range(10)]
-    evidence, told = collect(hover)
-    assert told and all(each.score <= 0.5 for _, each in told)
+    evidence, reported = collect(hover)
+    assert reported and all(each.score <= 0.5 for _, each in reported)
     ghosts = len(evidence.changes())
     for i in range(10, 40):
         camera_m = (-5 + 0.5 * (i - 10), 0, CAMERA_HEIGHT_M)
@@ -181,8 +181,8 @@ def test_the_same_views_give_the_same_changes():
 
 
 def test_views_with_gaps_between_them_still_add_up():
-    evidence, told = collect(flight([Thing(0, 0)], fps=1.0))
-    assert len(told) == 1
+    evidence, reported = collect(flight([Thing(0, 0)], fps=1.0))
+    assert len(reported) == 1
     assert len(evidence.conclude()) == 1
 
 
@@ -200,39 +200,39 @@ def test_a_hole_does_not_wipe_out_what_was_seen():
     views = list(flight([Thing(0, 0)]))
     blind = [view_of(v.index, v.index / 5, v.camera_m, [Thing(0, 0)], hole_m=(-3, -3, 3, 3)) for v in views]
     mixed = [blind[i] if i % 2 else views[i] for i in range(len(views))]
-    evidence, told = collect(mixed)
-    assert len(told) == 1
+    evidence, reported = collect(mixed)
+    assert len(reported) == 1
     assert evidence.conclude()[0].score > 0.7
 
 
 def test_snow_is_one_event_in_bounded_time_and_memory():
-    evidence, told = collect(flight([Thing(0, 0)], all_changed=True))
-    assert len(told) == 1
+    evidence, reported = collect(flight([Thing(0, 0)], all_changed=True))
+    assert len(reported) == 1
     (change,) = evidence.conclude()
     assert change.area_m2 > 150
     assert max(change.patch.changed.shape) <= 512
 
 
-def test_photos_tell_what_most_of_the_few_that_saw_it_show():
+def test_photos_announce_what_most_of_the_few_that_saw_it_show():
     thing = Thing(0, 0)
     photos = [view_of(i, 2.0 * i, (-3 + 6 * i, 0, CAMERA_HEIGHT_M), [thing]) for i in range(2)]
-    evidence, told = collect(photos)
-    assert told == []
+    evidence, reported = collect(photos)
+    assert reported == []
     (change,) = evidence.conclude()
     assert change.views == 2 and change.announced_ns == -1
     assert change.kind == ChangeKind.APPEARED
 
 
-def test_photos_tell_a_standing_thing_with_the_third_that_shows_it_and_are_as_sure_as_views_of_a_video():
+def test_photos_announce_a_standing_thing_with_the_third_that_shows_it_and_are_as_sure_as_views_of_a_video():
     thing = Thing(0, 0)
     photos = [view_of(i, 1.4 * i, (-4 + 4 * i, 0, CAMERA_HEIGHT_M), [thing]) for i in range(3)]
-    _, told = collect(photos)
-    assert [index for index, _ in told] == [2]
+    _, reported = collect(photos)
+    assert [index for index, _ in reported] == [2]
     two = collect(photos[:2])[0].conclude()
     assert len(two) == 1 and two[0].score > 0.6
 
 
-def test_two_photos_tell_all_of_many_things():
+def test_two_photos_announce_all_of_many_things():
     things = [Thing(east, north, (0.6, 0.6)) for east in (-4, -2, 0, 2, 4) for north in (-2, 0, 2)]
     photos = [view_of(i, 1.4 * i, (-1 + 2 * i, 0, CAMERA_HEIGHT_M), things) for i in range(2)]
     assert len(collect(photos)[0].conclude()) == len(things)
@@ -247,17 +247,17 @@ def test_a_single_view_is_believed_only_if_very_sure_and_at_half_the_score():
     thing = Thing(0, 0)
     sure = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [thing], score=0.95)
     unsure = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [thing], score=0.7)
-    evidence, told = collect([sure], AnnounceSettings(least_score=0.24), single_view_score=0.9)
-    assert told == []
+    evidence, reported = collect([sure], AnnounceSettings(least_score=0.24), single_view_score=0.9)
+    assert reported == []
     (change,) = evidence.conclude()
     assert change.views == 1 and change.score < 0.4
     assert collect([unsure], AnnounceSettings(least_score=0.24), single_view_score=0.9)[0].conclude() == ()
     assert collect([sure])[0].conclude() == ()  # unless asked for, a single view is not believed at all
 
 
-def test_low_scores_are_kept_but_not_told():
-    evidence, told = collect(flight([Thing(0, 0)], score=0.1))
-    assert told == [] and evidence.conclude() == ()
+def test_low_scores_are_kept_but_not_announced():
+    evidence, reported = collect(flight([Thing(0, 0)], score=0.1))
+    assert reported == [] and evidence.conclude() == ()
 
 
 @pytest.mark.parametrize(("side_m", "score", "is_told"), [(2.0, 0.45, False), (2.0, 0.7, True), (1.0, 0.45, True)])
@@ -282,8 +282,8 @@ def test_what_became_of_the_candidates_is_counted():
 def test_something_seen_for_a_while_only_is_taken_back():
     thing = Thing(-4, 0)
     views = [view_of(i, i / 5, (-6 + 0.2 * i, 0, CAMERA_HEIGHT_M), [thing] if i < 6 else []) for i in range(30)]
-    evidence, told = collect(views)
-    assert len(told) == 1
+    evidence, reported = collect(views)
+    assert len(reported) == 1
     assert evidence.conclude() == ()
 
 
@@ -297,9 +297,9 @@ def test_every_well_seen_thing_is_found_once_and_nothing_else(seed):
               on_map=bool(flip), in_flight=not flip)
         for spot, flip in zip(spots, rng.integers(0, 2, 6)) if rng.random() < 0.7
     ]
-    evidence, told = collect(flight(things, seconds=6))
+    evidence, reported = collect(flight(things, seconds=6))
     final = evidence.conclude()
-    assert len(final) == len(things) == len({each.id for _, each in told})
+    assert len(final) == len(things) == len({each.id for _, each in reported})
     for thing in things:
         distances = [float(np.hypot(*(centre(each) - [thing.east_m, thing.north_m]))) for each in final]
         assert min(distances) < 0.3
@@ -324,5 +324,5 @@ def test_a_least_score_beyond_one_is_refused():
 def test_a_view_without_any_known_ground_is_harmless():
     view = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [])
     blind = replace(view, valid=np.zeros_like(view.valid), changed=np.zeros_like(view.changed))
-    evidence, told = collect([blind])
-    assert told == [] and evidence.conclude() == ()
+    evidence, reported = collect([blind])
+    assert reported == [] and evidence.conclude() == ()

@@ -1,4 +1,4 @@
-"""Came, left or replaced: told from pictures of both dates on textured ground, in any light."""
+"""Came, left or replaced: reported from pictures of both dates on textured ground, in any light."""
 
 import cv2
 import numpy as np
@@ -43,7 +43,7 @@ def patch(seed, before, after, light=1.0):
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 1000), st.sampled_from([(190, 60, 50), (60, 60, 160), (150, 150, 150)]), st.floats(0.6, 1.3))
-def test_a_thing_that_stands_out_is_told_by_the_date_that_has_it(seed, colour, light):
+def test_a_thing_that_stands_out_is_announced_by_the_date_that_has_it(seed, colour, light):
     assert kind_of(patch(seed, None, colour, light)) == ChangeKind.APPEARED
     assert kind_of(patch(seed, colour, None, light)) == ChangeKind.DISAPPEARED
 

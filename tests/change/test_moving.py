@@ -1,4 +1,4 @@
-"""People and cars that move while they are seen: told once as moving, never as changes of the ground."""
+"""People and cars that move while they are seen: reported once as moving, never as changes of the ground."""
 
 
 import numpy as np
@@ -15,8 +15,8 @@ from sorvolo.survey.findings import ChangeKind
 
 def events(views):
     evidence = EvidenceMap(M_PER_PX, EvidenceSettings(), "f")
-    told = [change for view in views for change in evidence.add(view)]
-    return told, evidence.conclude()
+    announced = [change for view in views for change in evidence.add(view)]
+    return announced, evidence.conclude()
 
 
 def point(time_s, place_m, camera_m):
@@ -34,10 +34,10 @@ def point(time_s, place_m, camera_m):
     ids=["walker", "car ahead", "walker across"],
 )
 def test_what_moves_is_one_event_of_its_own_kind(thing, velocity):
-    told, final = events(flight([thing]))
-    assert [each.kind for each in told] == [ChangeKind.MOVING]
+    announced, final = events(flight([thing]))
+    assert [each.kind for each in announced] == [ChangeKind.MOVING]
     (change,) = final
-    assert change.kind == ChangeKind.MOVING and change.id == told[0].id
+    assert change.kind == ChangeKind.MOVING and change.id == announced[0].id
     assert np.abs(change.velocity_m_s - velocity).max() < 0.2
     assert change.views >= 5 and change.announced_ns > 0
     way = thing.outline_m((change.last_seen_ns - flight_start_ns()) * 1e-9).mean(axis=0)
@@ -59,7 +59,7 @@ def test_what_stays_where_somebody_walks_by_is_kept():
     assert sorted(each.kind for each in final) == [ChangeKind.APPEARED, ChangeKind.MOVING]
 
 
-def test_a_fast_thing_that_cannot_be_told_from_a_ghost_is_at_least_no_change_of_the_ground():
+def test_a_fast_thing_that_looks_like_a_ghost_is_at_least_no_change_of_the_ground():
     _, final = events(flight([Thing(6, 2, (4.5, 1.8), velocity_m_s=(-5, 0))]))
     assert final == ()
 
@@ -81,16 +81,16 @@ def test_a_walker_lost_for_a_while_is_the_same_one():
     views = [
         view_of(i, i / 5, (-4 + 0.5 * i / 5, 0, CAMERA_HEIGHT_M), [] if 9 <= i < 24 else [thing]) for i in range(34)
     ]
-    told, final = events(views)
-    assert len(told) == 1
+    announced, final = events(views)
+    assert len(announced) == 1
     assert [each.kind for each in final] == [ChangeKind.MOVING]
 
 
 def test_a_walker_seen_now_with_the_shadow_and_now_without_is_one():
     things = [Thing(-3, -2, (side, side), velocity_m_s=(0.9, 0.8)) for side in (0.9, 0.5)]
     views = [view_of(i, i / 5, (-4 + 0.5 * i / 5, 0, CAMERA_HEIGHT_M), [things[i % 2]]) for i in range(24)]
-    told, final = events(views)
-    assert len(told) == len(final) == 1 and final[0].kind == ChangeKind.MOVING
+    announced, final = events(views)
+    assert len(announced) == len(final) == 1 and final[0].kind == ChangeKind.MOVING
 
 
 def test_two_who_walk_side_by_side_are_two():
@@ -152,7 +152,7 @@ def test_settings_are_checked():
 
 
 @pytest.mark.parametrize("north_m", [-3.5, -3])
-def test_a_walker_seen_from_aside_is_told_where_the_feet_are(north_m):
+def test_a_walker_seen_from_aside_is_placed_where_the_feet_are(north_m):
     thing = Thing(-2, north_m, (0.5, 0.5), height_m=1.7, velocity_m_s=(1.2, 0.1))
     _, (change,) = events(flight([thing], seconds=4))
     assert change.kind == ChangeKind.MOVING

@@ -98,9 +98,9 @@ def test_a_cell_remembers_the_last_views_that_saw_it(history):
     shape = window.shape
     for flag, seen in history:
         evidence = grid.record(laid_of(np.full(shape, flag), np.full(shape, seen), window), True)
-    told = [flag for flag, seen in history if seen]
-    assert (evidence.votes == sum(told[-5:])).all()
-    assert (evidence.changed == sum(told)).all()
+    announced = [flag for flag, seen in history if seen]
+    assert (evidence.votes == sum(announced[-5:])).all()
+    assert (evidence.changed == sum(announced)).all()
 
 
 def test_ground_where_nothing_changes_costs_no_memory_and_the_oldest_goes_first():

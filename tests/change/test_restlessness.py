@@ -79,12 +79,12 @@ def photos_among(ghosts: int, photos: int = 3, **how: object) -> EvidenceMap:
     return evidence
 
 
-def test_three_photos_that_agree_tell_on_calm_ground_and_not_where_much_else_differs_in_each():
+def test_three_photos_that_agree_announce_on_calm_ground_and_not_where_much_else_differs_in_each():
     calm, restless = (photos_among(ghosts).conclude() for ghosts in (0, 130))
     assert len(calm) == 1 and calm[0].score > 0.4
     assert [each for each in restless if np.hypot(*each.outline_m.mean(axis=0)) < 0.5] == []
 
 
-def test_what_all_of_many_views_show_surely_is_told_on_restless_ground():
-    told = photos_among(130, photos=10, score=0.99).conclude()
-    assert any(np.hypot(*each.outline_m.mean(axis=0)) < 0.5 for each in told)
+def test_what_all_of_many_views_show_surely_is_announced_on_restless_ground():
+    announced = photos_among(130, photos=10, score=0.99).conclude()
+    assert any(np.hypot(*each.outline_m.mean(axis=0)) < 0.5 for each in announced)

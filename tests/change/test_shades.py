@@ -1,4 +1,4 @@
-"""Ground that another shadow falls on is the same ground; what is new on it is told all the same."""
+"""Ground that another shadow falls on is the same ground; what is new on it is reported nevertheless."""
 
 import cv2
 import numpy as np

@@ -48,12 +48,12 @@ def test_who_does_not_see_the_place_is_not_asked():
     assert len(believed((says((30, 0.9)), ALL), [(says(), ALL)]).boxes) == 0
 
 
-def test_what_lies_a_few_pixels_beside_is_the_same_and_told_once():
+def test_what_lies_a_few_pixels_beside_is_the_same_and_announced_once():
     found = believed((says((30, 0.9)), ALL), [(says((34, 0.9)), ALL), (says((28, 0.8)), ALL)])
     assert found.boxes.tolist() == [[30, 20, 10, 10]]
 
 
-def test_neighbours_whose_boxes_overlap_are_both_told():
+def test_neighbours_whose_boxes_overlap_are_both_reported():
     mask = np.zeros(SHAPE, np.uint8)
     mask[20:40, 20:34] = mask[10:30, 34:40] = 255
     both = Difference(mask, np.array([[20, 20, 20, 20], [34, 10, 6, 20]]), np.array([0.9, 0.8]))

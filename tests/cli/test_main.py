@@ -39,7 +39,7 @@ sorvolo.cli.main.main = main
 """
 
 
-def test_module_tells_its_code_wherever_ctrl_c_strikes(tmp_path: Path) -> None:
+def test_module_returns_its_code_wherever_ctrl_c_strikes(tmp_path: Path) -> None:
     (tmp_path / "sitecustomize.py").write_text(_STRUCK)
     command, environment = [sys.executable, "-m", "sorvolo"], {**os.environ, "PYTHONPATH": str(tmp_path)}
     assert subprocess.run(command, env=environment, timeout=60, check=False).returncode == 130
@@ -84,8 +84,8 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
 )
 def test_wrong_usage_is_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(arguments) == 2
-    told = capsys.readouterr()
-    assert told.out == "" and "Usage" in told.err
+    printed = capsys.readouterr()
+    assert printed.out == "" and "Usage" in printed.err
 
 
 @pytest.mark.parametrize("arguments", [
@@ -99,10 +99,10 @@ def test_an_error_is_one_line_on_stderr(
     names = {"gone": tmp_path / "gone.mp4", "made": tmp_path / "made", "file": tmp_path / "file"}
     names["file"].touch()
     assert cli.main([each.format(**names) for each in arguments]) == 1
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err.startswith("error: ") and any(str(path) in told.err for path in names.values())
-    assert told.err.count("\n") == 1 and "Traceback" not in told.err
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("error: ") and any(str(path) in printed.err for path in names.values())
+    assert printed.err.count("\n") == 1 and "Traceback" not in printed.err
 
 
 def test_nothing_is_left_of_a_map_that_could_not_begin(
@@ -161,48 +161,48 @@ class TestFailures:
     def _fail(cls) -> None:
         raise cls.error
 
-    def _told(
+    def _printed(
         self, error: BaseException, capsys: pytest.CaptureFixture[str], *options: str
     ) -> tuple[int, str]:
         type(self).error = error
         code = cli.main([*options, "fail"])
-        told = capsys.readouterr()
-        assert told.out == ""
-        return code, told.err
+        printed = capsys.readouterr()
+        assert printed.out == ""
+        return code, printed.err
 
     def test_ours(self, capsys: pytest.CaptureFixture[str]) -> None:
-        assert self._told(InputError("no\nsuch  thing"), capsys) == (1, "error: no such thing\n")
+        assert self._printed(InputError("no\nsuch  thing"), capsys) == (1, "error: no such thing\n")
 
     def test_full_disk(self, capsys: pytest.CaptureFixture[str]) -> None:
-        code, told = self._told(OSError(errno.ENOSPC, "No space left", "/full/tile.png"), capsys)
-        assert code == 1 and "disk is full" in told and "/full/tile.png" in told and told.count("\n") == 1
+        code, printed = self._printed(OSError(errno.ENOSPC, "No space left", "/full/tile.png"), capsys)
+        assert code == 1 and "disk is full" in printed and "/full/tile.png" in printed and printed.count("\n") == 1
 
     def test_forbidden(self, capsys: pytest.CaptureFixture[str]) -> None:
-        code, told = self._told(PermissionError(errno.EACCES, "Permission denied", "/locked"), capsys)
-        assert code == 1 and told.startswith("error: /locked: Permission denied")
+        code, printed = self._printed(PermissionError(errno.EACCES, "Permission denied", "/locked"), capsys)
+        assert code == 1 and printed.startswith("error: /locked: Permission denied")
 
     def test_out_of_memory(self, capsys: pytest.CaptureFixture[str]) -> None:
-        code, told = self._told(MemoryError(), capsys)
-        assert code == 1 and "memory" in told and "bug" not in told
+        code, printed = self._printed(MemoryError(), capsys)
+        assert code == 1 and "memory" in printed and "bug" not in printed
 
     def test_bug(self, capsys: pytest.CaptureFixture[str]) -> None:
-        code, told = self._told(KeyError("oops"), capsys)
-        assert code == 1 and "bug" in told and "KeyError" in told and "--debug" in told
-        assert told.count("\n") == 1
+        code, printed = self._printed(KeyError("oops"), capsys)
+        assert code == 1 and "bug" in printed and "KeyError" in printed and "--debug" in printed
+        assert printed.count("\n") == 1
 
     def test_debug_shows_where(self, capsys: pytest.CaptureFixture[str]) -> None:
-        code, told = self._told(KeyError("oops"), capsys, "--debug")
-        assert code == 1 and "Traceback" in told and "_fail" in told
+        code, printed = self._printed(KeyError("oops"), capsys, "--debug")
+        assert code == 1 and "Traceback" in printed and "_fail" in printed
 
     def test_debug_by_environment(
         self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
         monkeypatch.setenv("SORVOLO_DEBUG", "1")
-        assert "Traceback" in self._told(InputError("x"), capsys)[1]
+        assert "Traceback" in self._printed(InputError("x"), capsys)[1]
 
     def test_stopped(self, capsys: pytest.CaptureFixture[str]) -> None:
-        code, told = self._told(KeyboardInterrupt(), capsys)
-        assert code == 130 and told == "stopped; unfinished work was discarded, everything before it is unchanged\n"
+        code, printed = self._printed(KeyboardInterrupt(), capsys)
+        assert code == 130 and printed == "stopped; unfinished work was discarded, everything before it is unchanged\n"
 
 
 def test_import_is_quick_and_lazy() -> None:

@@ -48,9 +48,9 @@ def _arguments(simulated: Path, site: Path) -> list[str]:
 def test_json_then_words(simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     site = tmp_path / "site"
     assert cli.main([*_arguments(simulated, site), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert Path(told["preview_png"]).is_file() and Path(told["mosaic_tif"]).is_file()
-    (report,) = told["flights"]
+    printed = json.loads(capsys.readouterr().out)
+    assert Path(printed["preview_png"]).is_file() and Path(printed["mosaic_tif"]).is_file()
+    (report,) = printed["flights"]
     assert report["flight"] == "flight1" and "track" not in report
     assert report["frames"]["selected"] == sum(report["frames"][status.value] for status in Status) > 2
 

@@ -66,10 +66,10 @@ def _arguments(video: Path, model: Path, out: Path) -> list[str]:
 def test_json_then_words(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     video, out = _fly(tmp_path / "flight", 30), tmp_path / "out"
     assert cli.main([*_arguments(video, model, out), "--json", "--classes", "small object"]) == 0
-    (told,) = json.loads(capsys.readouterr().out)["watches"]
-    assert told["objects"] == {"total": 2, "by_class": {"small object": 2}} and told["georeferenced"]
-    assert told["folder"] == str(out)
-    for (left, top, right, bottom), feature in zip(_BOXES, told["tracks"]["features"]):
+    (printed,) = json.loads(capsys.readouterr().out)["watches"]
+    assert printed["objects"] == {"total": 2, "by_class": {"small object": 2}} and printed["georeferenced"]
+    assert printed["folder"] == str(out)
+    for (left, top, right, bottom), feature in zip(_BOXES, printed["tracks"]["features"]):
         east_m = ((left + right - 1) / 2 - _CAMERA.cx_px) * _M_PER_PX
         north_m = (_CAMERA.cy_px - (top + bottom - 1) / 2) * _M_PER_PX
         longitude, latitude = feature["geometry"]["coordinates"]
@@ -79,7 +79,7 @@ def test_json_then_words(model: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert cli.main([*_arguments(video, model, out), "--every", "2"]) == 0
     words = capsys.readouterr().out
     assert "2 small objects" in words and "15 of 30 frames searched" in words
-    first = told["tracks"]["features"][0]["properties"]
+    first = printed["tracks"]["features"][0]["properties"]
     assert f"{first['latitude']:.5f}" in words and str(out / "report.html") in words.replace("\n", "")
 
 
@@ -100,7 +100,7 @@ def test_nothing_found_is_no_error(model: Path, tmp_path: Path, capsys: pytest.C
         (["--alert-command", "no-such-program"], "no program"), (["--alert-url", "ftp://x"], "web address"),
     ],
 )
-def test_wrong_wishes_are_told_before_anything_is_written(
+def test_wrong_wishes_are_reported_before_anything_is_written(
     model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], extra: list[str], words: str
 ) -> None:
     video = _fly(tmp_path / "flight", 3)
@@ -138,9 +138,9 @@ def test_a_stop_ends_well_with_everything_written(
         while not (lines.exists() and lines.stat().st_size > 3000) and time.monotonic() < deadline:
             time.sleep(0.01)
         os.kill(running.pid, signal_number)
-        told, err = running.communicate(timeout=60)
+        printed, err = running.communicate(timeout=60)
     assert running.returncode == 0, err
-    (watch,) = json.loads(told)["watches"]
+    (watch,) = json.loads(printed)["watches"]
     assert watch["ended"] == "stopped on demand"
     assert 0 < watch["frames"]["detected"] < 1500
     assert watch["objects"]["total"] >= 1

@@ -218,10 +218,10 @@ def test_intervals_hold_the_value_shrink_with_data_and_repeat():
             labelled, found = random_set(seed, pictures=3 * count, groups=count)
             matches, numbers, _ = match_pictures(labelled, found, CLASSES)
             tables = group_tables(matches, group_index(labelled), HALF)
-            told = intervals(tables, draws=200)["AP"]
-            assert told.value == pytest.approx(numbers.ap, abs=1e-9) and told.low < told.value < told.high
-            assert intervals(tables, draws=200)["AP"] == told
-            seen_widths.append(told.high - told.low)
+            stated = intervals(tables, draws=200)["AP"]
+            assert stated.value == pytest.approx(numbers.ap, abs=1e-9) and stated.low < stated.value < stated.high
+            assert intervals(tables, draws=200)["AP"] == stated
+            seen_widths.append(stated.high - stated.low)
     assert np.mean(widths[64]) < 0.6 * np.mean(widths[8])
     assert np.array_equal(draw_groups(5, 3, 7), draw_groups(5, 3, 7))
     assert (draw_groups(5, 3, 7).sum(axis=1) == 5).all()

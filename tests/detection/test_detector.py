@@ -98,8 +98,8 @@ def test_several_pictures_of_different_sizes(detector: Detector, picture: np.nda
 
 def test_each_class_has_its_own_threshold(detector: Detector) -> None:
     picture = draw((120, 200), _BOXES, labels=[0, 1, 2], scores=[130, 130, 130])
-    told = detector.detect(picture)
-    assert told.names == ["person", "car"], "0.51 lies above the thresholds of people and cars, below small objects'"
+    found = detector.detect(picture)
+    assert found.names == ["person", "car"], "0.51 lies above the thresholds of people and cars, below small objects'"
     assert len(detector.detect(picture, least_score=0.5)) == 3
     assert len(detector.detect(picture, least_score=0.52)) == 0
     assert detector.detect(picture, classes=["car"]).names == ["car"]
@@ -175,8 +175,8 @@ class TestThermalFramesAndDaylightModels:
 
     def test_without_one_it_is_said(self, picture: np.ndarray, tmp_path: Path) -> None:
         classes = ["boat", "buoy", "raft"]  # none that the packaged model knows
-        told = {"thresholds": dict.fromkeys(classes, 0.3), "best_px": {each: [4, 300] for each in classes}}
-        model = rectangle_model(tmp_path / "sea.onnx", name="sea", thermal=False, classes=classes, **told)
+        stated = {"thresholds": dict.fromkeys(classes, 0.3), "best_px": {each: [4, 300] for each in classes}}
+        model = rectangle_model(tmp_path / "sea.onnx", name="sea", thermal=False, classes=classes, **stated)
         sea = Detector.load(model, provider="cpu", threads=1)
         for polarity in (picture[:, :, 0], 255 - picture[:, :, 0]):
             sea.detect(polarity)

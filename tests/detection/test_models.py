@@ -90,7 +90,7 @@ def test_names_and_paths(folder: Path, model: Path) -> None:
         Detector.load("day")
 
 
-def test_an_own_model_that_a_packaged_name_hides_is_told(
+def test_an_own_model_that_a_packaged_name_hides_is_reported(
     folder: Path, model: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder.mkdir(parents=True, exist_ok=True)
@@ -98,8 +98,8 @@ def test_an_own_model_that_a_packaged_name_hides_is_told(
     assert find_model("thermal") != folder / "thermal.onnx"
     for command in ("list", "verify"):
         assert cli.main(["models", command]) == 0
-        told = " ".join(capsys.readouterr().out.split())
-        assert "is not used: 'thermal' is the name of a packaged model" in told
+        printed = " ".join(capsys.readouterr().out.split())
+        assert "is not used: 'thermal' is the name of a packaged model" in printed
 
 
 def test_where_own_models_lie(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -214,13 +214,13 @@ def test_a_card_s_measurements_are_a_table(folder: Path, model: Path, capsys: py
     }
     (folder / "coast.json").write_text(json.dumps(card))
     assert cli.main(["models", "show", "coast"]) == 0
-    told = capsys.readouterr().out
-    assert "{" not in told and "AP50 %" in told
-    row = next(line.split() for line in told.splitlines() if "sea side" in line)
+    printed = capsys.readouterr().out
+    assert "{" not in printed and "AP50 %" in printed
+    row = next(line.split() for line in printed.splitlines() if "sea side" in line)
     assert row == ["sea", "side", "person", "1387", "62.2", "(40.0-77.0)", "26.4"]
 
 
-def test_what_is_no_model_is_told_as_what_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_model_is_reported_as_what_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("clip.mp4").write_bytes(b"")
     for name in ("clip.mp4", "./clip.mp4"):
@@ -244,16 +244,16 @@ def test_verify_finds_changed_damaged_and_unknown_files(
     assert cli.main(["models", "verify", str(path), "--sha256", "0" * 64]) == 1
     capsys.readouterr()
     assert cli.main(["models", "verify", str(path), "--sha256", _hash(path)[:12]]) == 1
-    told = capsys.readouterr()
-    assert "64 hexadecimal digits" in told.err and "CHANGED" not in told.out
+    printed = capsys.readouterr()
+    assert "64 hexadecimal digits" in printed.err and "CHANGED" not in printed.out
     path.with_suffix(".json").unlink()
     capsys.readouterr()
     assert cli.main(["models", "verify", "coast"]) == 0
     assert _hash(path) in capsys.readouterr().out
     (folder / "broken.onnx").write_bytes(b"nothing")
     assert cli.main(["models", "verify", "broken"]) == 1
-    told = capsys.readouterr().out
-    assert "copy or fetch it again" in told and "models verify" not in told
+    printed = capsys.readouterr().out
+    assert "copy or fetch it again" in printed and "models verify" not in printed
     (folder / "broken.json").write_text("{")
     assert cli.main(["models", "verify", "broken"]) == 1
     assert cli.main(["models", "list"]) == 0, "a broken file of another model stops nothing"

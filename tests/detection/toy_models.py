@@ -108,11 +108,11 @@ rectangles (uint8[1, 3, {height}, {width}] image) => (float[K, 4] boxes, float[K
 """
 
 
-def rectangle_model(path: Path, *, fixed: tuple[int, int] | None = None, **told: Any) -> Path:
-    """Write a model that finds rectangles brighter than 120 in red; `told` changes its metadata."""
+def rectangle_model(path: Path, *, fixed: tuple[int, int] | None = None, **changed: Any) -> Path:
+    """Write a model that finds rectangles brighter than 120 in red; `changed` changes its metadata."""
     height, width = fixed or ("H", "W")
     model = onnx.parser.parse_model(_RECTANGLES.format(height=height, width=width))
-    return write_model(model, path, METADATA | told)
+    return write_model(model, path, METADATA | changed)
 
 
 def write_model(model: Any, path: Path, metadata: dict[str, Any] | None) -> Path:

@@ -65,7 +65,7 @@ def test_a_command_gets_words_and_json(tmp_path: Path) -> None:
     assert body == _ALERT
 
 
-def test_what_a_command_does_wrong_is_told(tmp_path: Path) -> None:
+def test_what_a_command_does_wrong_is_reported(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="code 3: no such number"):
         alert_command(_script(tmp_path, "import sys\nprint('no such number', file=sys.stderr); sys.exit(3)"))(_ALERT)
     began_s = time.monotonic()
@@ -102,9 +102,9 @@ def test_an_outbox_goes_on_after_failures(server: str) -> None:
     outbox.put(_ALERT)
     outbox.put(_ALERT)
     outbox.close(10)
-    (told,) = outbox.notices()
-    assert (told.code, told.count, outbox.sent, len(_Receiver.got)) == ("alert_url_failed", 2, 0, 2)
-    assert "500" in told.text
+    (reported,) = outbox.notices()
+    assert (reported.code, reported.count, outbox.sent, len(_Receiver.got)) == ("alert_url_failed", 2, 0, 2)
+    assert "500" in reported.text
 
 
 @pytest.fixture
@@ -178,11 +178,11 @@ def test_a_slow_receiver_holds_nothing_up() -> None:
     outbox.close(0.1)
     assert time.monotonic() - began_s < 2
     gate.set()
-    (told,) = outbox.notices()
-    assert told.code == "slow_dropped" and 1190 <= told.count <= 1200
+    (reported,) = outbox.notices()
+    assert reported.code == "slow_dropped" and 1190 <= reported.count <= 1200
 
 
-def test_a_track_is_told_at_once_then_at_its_pace() -> None:
+def test_a_track_is_reported_at_once_then_at_its_pace() -> None:
     now_s = 100.0
     pace = Pace(3.0, lambda: now_s)
     assert pace.allows(1) and pace.allows(2) and not pace.allows(1)

@@ -28,9 +28,9 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     """The one line that a command, which must fail with code 1, says on stderr."""
     capsys.readouterr()
     assert cli.main(["map", "--model", "none", *map(str, arguments)]) == 1
-    told = capsys.readouterr().err.splitlines()
-    assert len(told) == 1 and told[0].startswith("error: ") and "bug" not in told[0], told
-    return told[0]
+    printed = capsys.readouterr().err.splitlines()
+    assert len(printed) == 1 and printed[0].startswith("error: ") and "bug" not in printed[0], printed
+    return printed[0]
 
 
 def mapped(site: Path, *arguments: str | Path, code: int = 0) -> dict[str, Any]:
@@ -195,7 +195,7 @@ def test_telemetry_of_another_path_at_the_same_time(film: Path, filmed: Path, tm
     assert report["frames"]["vision"] == report["frames"]["selected"]
 
 
-def test_a_height_of_zero_is_told_and_not_used(film: Path, filmed: Path, tmp_path: Path) -> None:
+def test_a_height_of_zero_is_reported_and_not_used(film: Path, filmed: Path, tmp_path: Path) -> None:
     rows = [line.split(",") for line in (filmed / "flight1" / "flight1.csv").read_text().splitlines()]
     zeroed = [k for k, name in enumerate(rows[0]) if "alt" in name.lower() or "height" in name.lower()]
     for row in rows[1:]:
@@ -475,8 +475,8 @@ def test_a_stop_by_the_keyboard_leaves_no_traceback(photos: Path, photographed: 
         while process.poll() is None and not any(site.glob("flights/*/keyframes/*/*")):
             time.sleep(0.005)
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=60)
-    assert process.returncode == 130 and "Traceback" not in told and "stopped" in told
+        _, printed = process.communicate(timeout=60)
+    assert process.returncode == 130 and "Traceback" not in printed and "stopped" in printed
     with Archive.open(site, write=False) as archive:
         assert not archive.flights() and not archive.tiles() and not archive.has_site
 
@@ -490,8 +490,8 @@ def test_a_stop_by_the_keyboard_keeps_the_flights_before(photos: Path, photograp
         while process.poll() is None and not any(site.glob("flights/second/keyframes/*/*")):
             time.sleep(0.005)
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=60)
-    assert process.returncode == 130 and "Traceback" not in told and "stopped" in told
+        _, printed = process.communicate(timeout=60)
+    assert process.returncode == 130 and "Traceback" not in printed and "stopped" in printed
     assert (site / "mosaic.tif").is_file() and not (site / "flights" / "second").exists()
     with Archive.open(site, write=False) as archive:
         assert [flight.id for flight in archive.flights()] == ["photos"] and len(archive.keyframes()) == 12

@@ -123,7 +123,7 @@ def test_changes_are_announced_once_while_the_flight_lasts(compared):
     assert any(update.announced for update in updates[:-1])
 
 
-def test_the_files_tell_what_was_found(compared):
+def test_the_files_hold_what_was_found(compared):
     site, updates = compared
     folder = site / "flights" / "flight2"
     for each in features(site):
@@ -135,9 +135,9 @@ def test_the_files_tell_what_was_found(compared):
             assert cv2.imdecode(
                 np.frombuffer((folder / "changes" / f"{own['id']}-{side}.png").read_bytes(), np.uint8), cv2.IMREAD_COLOR
             ) is not None
-    told = report(site)["comparison"]
-    assert told["views"]["compared"] == len(updates)
-    assert told["compared_area_m2"] > 200
+    printed = report(site)["comparison"]
+    assert printed["views"]["compared"] == len(updates)
+    assert printed["compared_area_m2"] > 200
     settings = asdict(CompareSettings(model="none", writes_masks=True))
     assert report(site)["settings"] == json.loads(json.dumps(settings))
     assert "changes.html" in {path.name for path in folder.iterdir()}
@@ -215,11 +215,11 @@ def test_a_view_that_fails_beside_the_rest_is_reported_and_leaves_the_site_as_it
         return compare_with_map(self, posed)
 
     monkeypatch.setattr(ViewMaker, "compare_with_map", fails)
-    before, told = files(site), []
+    before, printed = files(site), []
     with pytest.raises(StoreError, match="a tile is damaged"):
         for each in compare_flights([flown / "flight2"], site, _COMPARE, camera=flown / "camera.xml"):
-            told.append(each.frame_name)
-    assert len(told) == 5 and told == sorted(told), "those before it are told, in order"
+            printed.append(each.frame_name)
+    assert len(printed) == 5 and printed == sorted(printed), "those before it are printed, in order"
     after = files(site)
     assert {name for name in after if "flight2" in name} == set()
     assert all(after[name] == content for name, content in before.items() if name.endswith((".tif", ".geojson")))
@@ -242,12 +242,12 @@ def test_the_pictures_of_changes_are_no_finer_than_the_views(flown, compared, tm
     assert rows(fine) == pytest.approx(rows(compared[0]), rel=0.2), "twice as many were there to be drawn"
 
 
-@pytest.mark.parametrize("waiting, told_at", [
+@pytest.mark.parametrize("waiting, announced_at", [
     ([False] * 5, [0, 1, 2, 3, 4]),  # each before the next frame is asked for
     ([True] * 5, [2, 3, 4, 5, 5]),  # three at work at once; the rest when no frame comes any more
     ([True, True, False, False, False], [2, 2, 2, 3, 4]),
 ])
-def test_a_live_view_is_told_at_once_unless_the_next_one_waits_already(waiting, told_at):
+def test_a_live_view_is_reported_at_once_unless_the_next_one_waits_already(waiting, announced_at):
     asked = []
 
     def frames():
@@ -261,7 +261,7 @@ def test_a_live_view_is_told_at_once_unless_the_next_one_waits_already(waiting, 
     begun = _begun(frames(), setup, lambda posed: True, run, lambda: 2 * waiting[asked[-1]])
     found = [(each, asked[-1]) for each in begun]
     assert [each for each, _ in found] == [0, 1, 2, 3, 4]
-    assert [last for _, last in found] == told_at
+    assert [last for _, last in found] == announced_at
 
 
 def test_a_rejected_change_does_not_come_back_with_the_next_flight(flown, site, tmp_path):
@@ -305,10 +305,10 @@ def test_a_guessed_camera_becomes_the_one_that_mapping_found(flown, tmp_path):
     found = report(site, "flight1")["camera"]
     for _ in compare_flights([flown / "flight2"], site, replace(_COMPARE, updates_map=False)):
         pass
-    told = report(site)["camera"]
-    assert told["focal_px"] == pytest.approx(found["focal_found_px"]) != found["focal_px"]
-    assert "as flight flight1 of this site found it" in told["origin"] and found["origin"] in told["origin"]
-    assert told["focal_sigma_relative"] < found["focal_sigma_relative"]
+    printed = report(site)["camera"]
+    assert printed["focal_px"] == pytest.approx(found["focal_found_px"]) != found["focal_px"]
+    assert "as flight flight1 of this site found it" in printed["origin"] and found["origin"] in printed["origin"]
+    assert printed["focal_sigma_relative"] < found["focal_sigma_relative"]
     assert report(site)["comparison"]["residual_px"]["median"] < 1.4  # 1.8 with the guess
     with Archive.open(site, write=False) as archive:
         calibrated = camera_from_option(str(flown / "camera.xml"), 640, 360)
@@ -317,7 +317,7 @@ def test_a_guessed_camera_becomes_the_one_that_mapping_found(flown, tmp_path):
         assert known_camera(other, archive) == other
 
 
-def test_a_guessed_camera_is_told_of_one_that_was_given_for_pictures_of_its_size(site):
+def test_a_guessed_camera_names_one_that_was_given_for_pictures_of_its_size(site):
     with Archive.open(site, write=False) as archive:
         guess = known_camera(guess_camera(640, 360), archive)
         assert guess.camera.fx_px == guess_camera(640, 360).camera.fx_px, "another camera may have the same size"
@@ -456,27 +456,28 @@ def test_ground_beside_the_map_extends_it(flown, tmp_path):
             for version, tiles in (("before", before), ("after", after))}
     assert area["after"] > 1.3 * area["before"]
     assert features(tmp_path / "site")
-    told = report(tmp_path / "site")
-    extension = told["comparison"]["extension"]
+    printed = report(tmp_path / "site")
+    extension = printed["comparison"]["extension"]
     with Archive.open(tmp_path / "site", write=False) as archive:
         grown_m2 = (area["after"] - area["before"]) * archive.site().m_per_px ** 2
     assert extension["frames"] > 2 and extension["shown_as_well"] > 0
     assert extension["area_m2"] == pytest.approx(grown_m2, rel=1e-6)
-    assert not any("have no place" in warning for warning in told["warnings"])
-    assert told["frames"]["rejected"] == told["comparison"]["views"]["not-aligned"], "who extends the map does not fail"
+    assert not any("have no place" in warning for warning in printed["warnings"])
+    views = printed["comparison"]["views"]
+    assert printed["frames"]["rejected"] == views["not-aligned"], "who extends the map does not fail"
     page = (tmp_path / "site" / "flights" / "flight2" / "changes.html").read_text()
     assert f"shown by {extension['frames']} frames" in page
 
 
-def test_the_command_tells_the_changes_as_json(flown, site, capsys):
+def test_the_command_prints_the_changes_as_json(flown, site, capsys):
     camera = str(flown / "camera.xml")
     flight = str(flown / "flight2")
     options = ["--camera", camera, "--json", "--model", "none"]
     assert main(["compare", flight, "--site", str(site), *options]) == 0
-    told = json.loads(capsys.readouterr().out)["flights"][0]
-    assert told["flight"] == "flight2"
-    assert len(told["changes"]["features"]) == sum(told["comparison"]["changes"].values()) > 0
-    assert not set(told["withdrawn"]) & {each["properties"]["id"] for each in told["changes"]["features"]}
+    printed = json.loads(capsys.readouterr().out)["flights"][0]
+    assert printed["flight"] == "flight2"
+    assert len(printed["changes"]["features"]) == sum(printed["comparison"]["changes"].values()) > 0
+    assert not set(printed["withdrawn"]) & {each["properties"]["id"] for each in printed["changes"]["features"]}
 
 
 def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(compared, flown, site):
@@ -498,8 +499,8 @@ def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(com
     assert not list(site.glob("flights/flight2/staged"))
 
 
-@pytest.mark.parametrize(("brightness", "told"), [(0.3, "dark or of the ground's colour"), (0.06, "means little")])
-def test_a_flight_in_the_dark_is_told_to_show_less_and_paints_no_black_ground(site, tmp_path, brightness, told):
+@pytest.mark.parametrize(("brightness", "printed"), [(0.3, "dark or of the ground's colour"), (0.06, "means little")])
+def test_a_flight_in_the_dark_is_reported_to_show_less_and_paints_no_black_ground(site, tmp_path, brightness, printed):
     weather = replace(_PAIR.later.weather, brightness=brightness)
     dark = replace(_PAIR, later=replace(_PAIR.later, weather=weather))
     for _ in simulate_site(tmp_path / "dark", dark):
@@ -507,8 +508,8 @@ def test_a_flight_in_the_dark_is_told_to_show_less_and_paints_no_black_ground(si
     shutil.copytree(site, tmp_path / "thesis")
     compare(tmp_path / "dark", site)
     (warning,) = (each for each in report(site)["warnings"] if "times as bright as the map" in each)
-    assert told in warning
-    is_night = told == "means little"
+    assert printed in warning
+    is_night = printed == "means little"
     assert report(site)["comparison"]["most_missed"] == is_night
     assert ("too dark" in (site / "flights" / "flight2" / "changes.html").read_text().lower()) == is_night
     assert has_grown(site) != is_night

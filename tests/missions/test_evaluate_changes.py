@@ -132,14 +132,14 @@ def test_late_needs_to_know_when(site, simulated):
     for delay_s, late in ((0.9, 0), (1.1, len(third_ns)), (None, None)):
         def say(events, delay_s=delay_s):
             for each in events:
-                told_ns = third_ns.get(each["properties"]["id"])
-                said = None if told_ns is None or delay_s is None else utc_text(told_ns + round(delay_s * 1e9))
-                each["properties"]["announced"] = said
+                at_ns = third_ns.get(each["properties"]["id"])
+                given = None if at_ns is None or delay_s is None else utc_text(at_ns + round(delay_s * 1e9))
+                each["properties"]["announced"] = given
 
         edit(site, say)
-        (said,) = evaluate_changes(site, simulated)
-        assert said.events.judged_late == len(third_ns)
-        assert said.events.late == late or (late is None and said.events.late > 0)  # told only after the last frame
+        (given,) = evaluate_changes(site, simulated)
+        assert given.events.judged_late == len(third_ns)
+        assert given.events.late == late or (late is None and given.events.late > 0)  # only after the last frame
 
 
 def test_a_clock_without_a_date_is_understood(site, simulated):
@@ -151,16 +151,16 @@ def test_a_clock_without_a_date_is_understood(site, simulated):
     for row in rows:
         row["properties"]["time"] = utc_text(time_ns_of(row["properties"]["time"]) - start_ns)
     write(path, rows)
-    told = {pair.found.id: int(pair.true.clear_ns[2]) - start_ns + 700_000_000 for pair in measured.match.pairs}
+    stated = {pair.found.id: int(pair.true.clear_ns[2]) - start_ns + 700_000_000 for pair in measured.match.pairs}
 
     def say(events):
         for each in events:
-            told_ns = told.get(each["properties"]["id"])
-            each["properties"]["announced"] = None if told_ns is None else utc_text(told_ns)
+            at_ns = stated.get(each["properties"]["id"])
+            each["properties"]["announced"] = None if at_ns is None else utc_text(at_ns)
 
     edit(site, say)
-    (said,) = evaluate_changes(site, simulated)
-    assert [pair.delay_s for pair in said.match.pairs] == pytest.approx([0.7] * len(told), abs=1e-3)
+    (given,) = evaluate_changes(site, simulated)
+    assert [pair.delay_s for pair in given.match.pairs] == pytest.approx([0.7] * len(stated), abs=1e-3)
 
 
 def test_only_what_lies_on_compared_ground_must_be_found(site, simulated):

@@ -165,11 +165,11 @@ def test_arms_of_several_seeds_side_by_side(many, tmp_path):
     standard = [random_arm(tmp_path, "standard", many, 0.5, seed) for seed in (1, 2, 3)]
     extended = [random_arm(tmp_path, "extended", many, 0.8, seed) for seed in (1, 2, 3)]
     evaluation = evaluate_detector([standard, extended], [many], QUICK)
-    (told,) = evaluation.comparisons
-    assert [arm.seeds for arm in told.arms] == [3, 3] and told.groups == 12
-    assert told.arms[0].lowest["AP50"] < told.arms[0].mean["AP50"] < told.arms[0].highest["AP50"]
-    better = told.differences[0]["AP50"]
-    assert better.value == pytest.approx(told.arms[1].mean["AP50"] - told.arms[0].mean["AP50"])
+    (printed,) = evaluation.comparisons
+    assert [arm.seeds for arm in printed.arms] == [3, 3] and printed.groups == 12
+    assert printed.arms[0].lowest["AP50"] < printed.arms[0].mean["AP50"] < printed.arms[0].highest["AP50"]
+    better = printed.differences[0]["AP50"]
+    assert better.value == pytest.approx(printed.arms[1].mean["AP50"] - printed.arms[0].mean["AP50"])
     assert better.is_clear and 0.1 < better.low < better.value < better.high
     write_evaluation(evaluation, tmp_path / "out", {})
     page = (tmp_path / "out" / PAGE).read_text()
@@ -219,19 +219,19 @@ def coco(labelled, tmp_path_factory):
     return folder
 
 
-def test_the_command_reads_labels_tells_numbers_and_writes_the_report(toy, coco, tmp_path, capsys):
-    told = ["--classes", "Walker=person,Truck=car", "--unlabelled", "small object", "--draws", "20"]
-    assert main(["evaluate", "detector", str(toy), str(coco), *told, "--out", str(tmp_path / "out"), "--json"]) == 0
+def test_the_command_reads_labels_prints_numbers_and_writes_the_report(toy, coco, tmp_path, capsys):
+    printed = ["--classes", "Walker=person,Truck=car", "--unlabelled", "small object", "--draws", "20"]
+    assert main(["evaluate", "detector", str(toy), str(coco), *printed, "--out", str(tmp_path / "out"), "--json"]) == 0
     numbers = json.loads(capsys.readouterr().out)
     assert numbers["sets"][0]["confusion"] == [[2, 1, 0], [0, 1, 1], [1, 0, 0]]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted([PAGE, NUMBERS, FOUND])
     found = str(tmp_path / "out" / FOUND)
-    assert main(["evaluate", "detector", str(toy), str(coco), *told, "--compare", found]) == 0
+    assert main(["evaluate", "detector", str(toy), str(coco), *printed, "--compare", found]) == 0
     shown = capsys.readouterr().out
     assert "side by side" in shown and "thesis_map" in shown
     assert main(["evaluate", "detector", str(toy), str(coco), "--classes", "Walker"]) == 1
     assert "pairs look like" in capsys.readouterr().err
-    assert main(["evaluate", "detector", "no-such-model", str(coco), *told]) == 1
+    assert main(["evaluate", "detector", "no-such-model", str(coco), *printed]) == 1
 
 
 def test_a_damaged_picture_is_left_out_for_all_models_and_named(toy, coco, tmp_path, capsys):
@@ -247,8 +247,8 @@ def test_a_damaged_picture_is_left_out_for_all_models_and_named(toy, coco, tmp_p
     capsys.readouterr()
     earlier = str(tmp_path / "whole" / FOUND)
     assert main([*command, "--compare", earlier, "--out", str(tmp_path / "cut")]) == 0
-    told = capsys.readouterr().out.replace("\n", "")
-    assert f"note: 1 pictures cannot be read and were left out: {folder / '1.png'}" in told
+    printed = capsys.readouterr().out.replace("\n", "")
+    assert f"note: 1 pictures cannot be read and were left out: {folder / '1.png'}" in printed
     numbers = json.loads((tmp_path / "cut" / NUMBERS).read_text())
     assert numbers["sets"][0]["pictures"] == 3 and "1 pictures cannot be read" in numbers["notices"]
     assert numbers["comparisons"][0]["arms"][0]["mean"] == numbers["comparisons"][0]["arms"][1]["mean"]
@@ -262,7 +262,7 @@ def test_a_damaged_picture_is_left_out_for_all_models_and_named(toy, coco, tmp_p
     assert "none of the 4 pictures of coco can be read" in " ".join(capsys.readouterr().err.split())
 
 
-def test_names_that_nothing_has_are_told(toy, coco, capsys):
+def test_names_that_nothing_has_are_reported(toy, coco, capsys):
     command = ["evaluate", "detector", str(toy), str(coco), "--classes", "Walker=person,Truck=car"]
     assert main([*command, "--ignore", "Lory"]) == 1
     assert "ignore: 'Lory' is no name in the labels; there are: Walker, Truck" in capsys.readouterr().err
@@ -270,7 +270,7 @@ def test_names_that_nothing_has_are_told(toy, coco, capsys):
     assert "unlabelled: 'Car' is no class; there are: person, car, small object" in capsys.readouterr().err
 
 
-def test_what_was_left_out_on_reading_is_told_of_chosen_pictures_too(coco):
+def test_what_was_left_out_on_reading_is_reported_of_chosen_pictures_too(coco):
     names = {"Walker": "person"}
     (whole,), (some,) = (read_sets([coco], classes=names, videos=videos) for videos in ("", "coco|.*"))
     assert whole.notices and [each.text for each in some.notices] == [each.text for each in whole.notices]

@@ -136,7 +136,7 @@ def test_a_height_of_zero_and_thin_overlap(tmp_path: Path) -> None:
     assert "neighbouring strips overlap by 0 %" in texts(low, Level.WARNING)
 
 
-def test_water_is_told_from_ground(tmp_path: Path) -> None:
+def test_water_is_distinguished_from_ground(tmp_path: Path) -> None:
     found = one(lawnmower(tmp_path / "water", texture=0))
     assert "hardly any texture" in texts(found, Level.WARNING)
 

@@ -43,21 +43,21 @@ class FilmedFlight:
         self.images = [each.image for each in source.frames(lambda *_: True) if isinstance(each, Frame)]
         self.seconds = self.telemetry.video_time_ns / 1e9
         self.level = level = site_from_gimbal_rotation(0.0, 0.0, 0.0)
-        told = self.telemetry
-        self.ground_m = float(np.median(told["orthometric_height_m"] - told["height_above_takeoff_m"]))
-        self.headings = told["body_yaw_deg"] % 360
+        printed = self.telemetry
+        self.ground_m = float(np.median(printed["orthometric_height_m"] - printed["height_above_takeoff_m"]))
+        self.headings = printed["body_yaw_deg"] % 360
         self.relative = [
             gimbal_angles_from_rotation(
                 level @ site_from_gimbal_rotation(heading, 0.0, 0.0).T @ site_from_gimbal_rotation(*angles)
             )
             for heading, *angles in zip(
-                self.headings, told["camera_yaw_deg"], told["camera_pitch_deg"], told["camera_roll_deg"]
+                self.headings, printed["camera_yaw_deg"], printed["camera_pitch_deg"], printed["camera_roll_deg"]
             )
         ]
 
 
 class Drone:
-    """It stands and sends until it is told to fly, then flies and sends until it has landed; then `landed` is set."""
+    """It stands and sends until it may fly, then flies and sends until it has landed; then `landed` is set."""
 
     def __init__(self, flight: FilmedFlight, *, metadata: bool, speed: float = 2.0, count: int = 10_000) -> None:
         self._flight, self._metadata, self._speed = flight, metadata, speed
@@ -99,14 +99,14 @@ class Drone:
             raise OSError("landed")  # ends the sender
         return self._flight.images[frame]
 
-    def _told(self, index: int) -> bytes:
+    def _printed(self, index: int) -> bytes:
         """ST 0601: the aircraft level, the sensor turned against it as the gimbal is against north and horizon."""
         flight = self._flight
-        told, at_s = flight.telemetry, self._frame(index) / flight.rate
+        printed, at_s = flight.telemetry, self._frame(index) / flight.rate
         nearest = int(np.argmin(np.abs(flight.seconds - at_s)))
         azimuth, elevation, roll = flight.relative[nearest]
         latitude, longitude, height_m = (
-            float(np.interp(at_s, flight.seconds, told[name]))
+            float(np.interp(at_s, flight.seconds, printed[name]))
             for name in ("latitude_deg", "longitude_deg", "orthometric_height_m")
         )
         return encode(_CLOCK_NS + index * 10**9 // flight.rate, {
@@ -197,14 +197,14 @@ def test_a_later_flight_is_compared_live(flight: FilmedFlight, mapped_live: tupl
 def test_a_receiver_beside_a_stream_places_the_map(flight: FilmedFlight, tmp_path: Path) -> None:
     """Neither says more than it must: pictures without times, positions without the camera's angles."""
     site, drone, gps = tmp_path / "site", Drone(flight, metadata=False, speed=1.0, count=42), free_port()
-    told = flight.telemetry
+    printed = flight.telemetry
     is_over = threading.Event()
 
     def speak() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             while not is_over.wait(0.2):
                 at_s = 0.0 if drone.took_off_s is None else time.monotonic() - drone.took_off_s
-                place = [float(np.interp(at_s, flight.seconds, told[name])) for name in (
+                place = [float(np.interp(at_s, flight.seconds, printed[name])) for name in (
                     "latitude_deg", "longitude_deg", "orthometric_height_m",
                 )]
                 sender.sendto(gga(*place), ("127.0.0.1", gps))
@@ -248,6 +248,6 @@ def test_a_stream_is_inspected(flight: FilmedFlight) -> None:
 def test_a_source_that_is_not_there_leaves_no_site(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["map", "follow:/no/such.ts", "--site", str(tmp_path / "site"), "--model", "none"]) == 1
     assert cli.main(["map", str(tmp_path / "nowhere.mp4"), "--site", str(tmp_path / "site"), "--model", "none"]) == 1
-    told = capsys.readouterr().err
-    assert "no such file or folder: /no/such.ts" in told and "no such file or folder: " in told
+    printed = capsys.readouterr().err
+    assert "no such file or folder: /no/such.ts" in printed and "no such file or folder: " in printed
     assert not (tmp_path / "site").exists()

@@ -36,7 +36,7 @@ from sorvolo.survey.objects import Detections, Sighting, no_detections
 
 
 class Knowing(TruthDetector):
-    """The truth's detector; what it was not told of, such as a picture made from frames, shows nothing."""
+    """The truth's detector; what it does not know, such as a picture made from frames, shows nothing."""
 
     def detect(
         self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
@@ -101,11 +101,11 @@ def test_map_finds_each_object_once(simulated: Path, mapped: Path) -> None:
 
 def test_report_crops_and_site_file(mapped: Path) -> None:
     """The report tells what was found and shows it; the crops are pictures; both files hold the same objects."""
-    told = report_of(mapped, "flight1")["objects"]
+    reported = report_of(mapped, "flight1")["objects"]
     own = json.loads((mapped / "flights/flight1/objects.geojson").read_text())["features"]
-    assert told["count"] == len(own) == sum(told["classes"].values()) == len(told["list"])
-    assert told["model"] == "truth"
-    assert told["frames"] > 3
+    assert reported["count"] == len(own) == sum(reported["classes"].values()) == len(reported["list"])
+    assert reported["model"] == "truth"
+    assert reported["frames"] > 3
     for each in own:
         assert (mapped / "flights/flight1" / each["properties"]["crop"]).read_bytes().startswith(b"\xff\xd8")
     page = (mapped / "flights/flight1/report.html").read_text()
@@ -146,7 +146,7 @@ def test_without_a_model(simulated: Path, tmp_path: Path) -> None:
 
 
 def test_a_model_that_is_not_there(simulated: Path, tmp_path: Path) -> None:
-    """A name that is not installed is told before anything is mapped; "none" is no error."""
+    """A name that is not installed is reported before anything is mapped; "none" is no error."""
     assert open_detector("none") is None
     with pytest.raises(InputError, match="no model 'nosuch'"):
         next(map_flights([simulated / "flight1/flight1.mp4"], tmp_path / "site", MapSettings(model="nosuch")))
@@ -200,8 +200,8 @@ def test_sightings_on_the_way_of_what_moves() -> None:
     assert seen_at(change, [sighting("person", 4.0, 26.0, 7.0)]) == ""
     assert seen_at(change, [sighting("car", 10.0, 20.0, 3.0)]) == ""
     still = change_at(ChangeKind.APPEARED)
-    told = [sighting("car", 10.0, 20.0, 3.0, 0.9), *(sighting("person", 10.2, 20.0, s, 0.5) for s in (4.0, 5.0))]
-    assert seen_at(still, told) == "person"
+    reported = [sighting("car", 10.0, 20.0, 3.0, 0.9), *(sighting("person", 10.2, 20.0, s, 0.5) for s in (4.0, 5.0))]
+    assert seen_at(still, reported) == "person"
 
 
 class Sees(Knowing):
@@ -254,6 +254,6 @@ def test_a_class_that_is_reported_on_request_alone_is_not_looked_for(simulated: 
     knowing.info = replace(knowing.info, on_request=("small object",))
     for _ in map_flights([simulated / "flight1/flight1.mp4"], tmp_path / "site", detector=knowing):
         pass
-    told = report_of(tmp_path / "site", "flight1")["objects"]
-    assert told["looked_for"] == ["person", "car"]
-    assert set(told["classes"]) == {"person", "car"} and told["count"] > 0
+    reported = report_of(tmp_path / "site", "flight1")["objects"]
+    assert reported["looked_for"] == ["person", "car"]
+    assert set(reported["classes"]) == {"person", "car"} and reported["count"] > 0

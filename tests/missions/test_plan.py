@@ -113,7 +113,7 @@ def test_a_preset_plans_with_its_full_photo():
 @pytest.mark.parametrize(("option", "focal_mm", "pixel_um"), [
     ("", math.nan, math.nan), ("", 4.0, math.nan), ("Mavic 2 Pro", 4.0, 2.0), ("", 0.0, 2.0), ("", 4.0, -2.0),
 ])
-def test_a_camera_that_is_not_told_is_asked_for(option, focal_mm, pixel_um):
+def test_a_camera_that_is_not_given_is_asked_for(option, focal_mm, pixel_um):
     with pytest.raises(SettingsError):
         camera_to_plan_with(option, focal_mm, pixel_um, None)
 
@@ -275,7 +275,7 @@ def test_the_command_covers_an_area(tmp_path, field_file):
     assert out.exists()
 
 
-def test_the_table_tells_when_the_height_is_too_great(field_file):
+def test_the_table_marks_heights_that_are_too_great(field_file):
     wanted = ("--task", "identification", "--height", 200, "--max-height", 200)
     result = run("--camera", "FC300S", *wanted, "--area", field_file)
     assert result.exit_code == 0, result.output

@@ -42,8 +42,8 @@ def test_changes_are_listed_by_flight_and_number(site: Path) -> None:
 
 
 def test_verdicts_are_kept_and_changed(site: Path) -> None:
-    said = review_changes(site, ["b-1", "c-2"], Verdict.REJECTED, "leaves")
-    assert [(each.id, each.verdict, each.note) for each in said] == [
+    printed = review_changes(site, ["b-1", "c-2"], Verdict.REJECTED, "leaves")
+    assert [(each.id, each.verdict, each.note) for each in printed] == [
         ("b-1", Verdict.REJECTED, "leaves"), ("c-2", Verdict.REJECTED, "leaves"),
     ]
     review_changes(site, ["2"], Verdict.CONFIRMED, flight="c")
@@ -110,8 +110,8 @@ def test_the_command_lists_and_says(
     assert main(["review", str(site), "b-2", "--reject", "--note", "[bold]grass"]) == 0
     assert "rejected: [bold]grass" in capsys.readouterr().out
     assert main(["review", str(site), "1", "--flight", "c", "--confirm", "--json"]) == 0
-    (said,) = json.loads(capsys.readouterr().out)["changes"]
-    assert (said["id"], said["review"], said["east_m"]) == ("c-1", "confirmed", 5.0)
+    (printed,) = json.loads(capsys.readouterr().out)["changes"]
+    assert (printed["id"], printed["review"], printed["east_m"]) == ("c-1", "confirmed", 5.0)
     assert main(["review", str(site)]) == 0
     listed = capsys.readouterr().out
     assert all(name in listed for name in ("b-1", "b-2", "c-1", "c-2"))

@@ -1,4 +1,4 @@
-"""Mode 2 on small simulated flights with a truth-fed detector: what is found, where, what is written, who is told."""
+"""Mode 2 on small simulated flights with a truth-fed detector: what is found, placed, written, and sent."""
 
 import json
 import socket
@@ -95,8 +95,8 @@ def _metres(degrees: np.ndarray, latitude_deg: float) -> np.ndarray:
 def test_each_object_once_at_its_place(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
     folder = tmp_path / "watch"
     updates = _watch(flown, folder, detector)
-    told = [track.id for update in updates for track in update.new]
-    assert len(told) == len(set(told))
+    reported = [track.id for update in updates for track in update.new]
+    assert len(reported) == len(set(reported))
     truth = _seen_objects(flown)
     tracks = _read(folder / "tracks.geojson")["features"]
     assert len(truth) >= 4
@@ -214,7 +214,7 @@ def test_heights_without_a_ground_are_said_and_can_be_helped(
 def test_a_height_model_places_what_its_heights_alone_cannot(
     flown: Path, detector: TruthDetector, tmp_path: Path
 ) -> None:
-    """Level ground told by a model is level ground told by a number; both together are not taken."""
+    """Level ground given as a model is level ground given as a number; both together are not taken."""
     log = flown / "flight1" / "other" / "flight1.nmea"
     ground_m = 83.3 - 48.3
     model = tmp_path / "ground.tif"
@@ -241,13 +241,13 @@ def test_a_height_model_places_what_its_heights_alone_cannot(
         replace(few, height_model=str(model), ground_elevation_m=3.0)
 
 
-def test_those_who_want_it_are_told(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
+def test_those_who_want_it_are_alerted(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
     script = tmp_path / "hook.py"
     script.write_text(
         "import json, sys\n"
-        "told = json.load(sys.stdin)\n"
-        "open(sys.argv[1], 'a').write(json.dumps([sys.argv[2:], told]) + '\\n')\n"
-        "sys.exit(0 if open(told['crop'], 'rb').read(2) == b'\\xff\\xd8' else 1)\n"
+        "reported = json.load(sys.stdin)\n"
+        "open(sys.argv[1], 'a').write(json.dumps([sys.argv[2:], reported]) + '\\n')\n"
+        "sys.exit(0 if open(reported['crop'], 'rb').read(2) == b'\\xff\\xd8' else 1)\n"
     )
     out = tmp_path / "told.jsonl"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
@@ -264,16 +264,16 @@ def test_those_who_want_it_are_told(flown: Path, detector: TruthDetector, tmp_pa
                 events.append(fromstring(receiver.recv(10_000)))
             except TimeoutError:
                 break
-    told = [json.loads(line) for line in out.read_text().splitlines()]
+    reported = [json.loads(line) for line in out.read_text().splitlines()]
     tracks = _read(tmp_path / "watch" / "tracks.geojson")["features"]
-    assert {each["properties"]["id"] for each in tracks} <= {body["id"] for _, body in told}
-    assert all(words == [str(body["id"]), body["class"]] for words, body in told)
-    assert len({body["id"] for _, body in told}) == len(told)
+    assert {each["properties"]["id"] for each in tracks} <= {body["id"] for _, body in reported}
+    assert all(words == [str(body["id"]), body["class"]] for words, body in reported)
+    assert len({body["id"] for _, body in reported}) == len(reported)
     uids = [event.get("uid", "") for event in events]
     assert {uid.rsplit(".", 1)[1] for uid in uids} >= {str(each["properties"]["id"]) for each in tracks}
     assert len(uids) <= 4 * len(set(uids))  # at its pace, not with each frame
     notices = {each["code"]: each for each in _read(tmp_path / "watch" / "report.json")["notices"]}
-    assert notices["alert_url_failed"]["count"] == len(told)
+    assert notices["alert_url_failed"]["count"] == len(reported)
     assert "alert_command_failed" not in notices
 
 
@@ -341,7 +341,7 @@ def test_a_source_without_a_picture_is_an_error(detector: TruthDetector, tmp_pat
         list(watch(tmp_path / "gone.mp4", detector=detector))
 
 
-def test_a_photo_that_cannot_be_read_is_told_of_once(
+def test_a_photo_that_cannot_be_read_is_reported_once(
     photographs: Path, detector: TruthDetector, tmp_path: Path
 ) -> None:
     (photographs / "IMG_1.jpg").write_bytes(b"no picture")

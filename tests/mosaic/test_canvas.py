@@ -239,7 +239,7 @@ def test_shrinking_does_not_alias():
     assert abs(small.mean() - 127.5) < 5
 
 
-def test_covers_tells_the_painted_share(scene):
+def test_covers_gives_the_painted_share(scene):
     frames, images = scene
     canvas = Canvas(Grid((0.0, 0.0), 0.05), {}, images.__getitem__)
     assert canvas.covers(frames[0].outline_px) == 0.0

@@ -58,7 +58,7 @@ def flown(seed: int, per_strip: int = 6) -> list[Pose]:
     return poses
 
 
-def told(pose: Pose, rng: np.random.Generator, shift_m: tuple[float, float, float] = (0, 0, 0)) -> CameraPrior:
+def measured(pose: Pose, rng: np.random.Generator, shift_m: tuple[float, float, float] = (0, 0, 0)) -> CameraPrior:
     """GPS of 1 m, a compass of 2 deg, no tilt."""
     forward = pose.rotation @ np.array([0.0, -1.0, 0.0])
     yaw = np.degrees(np.arctan2(forward[0], forward[1])) + rng.normal(0, 2)
@@ -66,7 +66,7 @@ def told(pose: Pose, rng: np.random.Generator, shift_m: tuple[float, float, floa
     return CameraPrior(place, np.ones(3), site_from_gimbal_rotation(yaw, -90, 0), np.array([3.0, 3.0, 4.0]))
 
 
-def untold(first: Pose | None = None) -> CameraPrior:
+def unmeasured(first: Pose | None = None) -> CameraPrior:
     """Without telemetry: the first frame defines the frame."""
     if first is not None:
         return CameraPrior(first.translation_m, np.full(3, 0.02), first.rotation, np.array([4.0, 4.0, 0.1]))
@@ -86,7 +86,7 @@ def test_a_flight_is_placed_by_vision(has_gps):
     poses, rng = flown(1), np.random.default_rng(1)
     mapper = PlanarMapper(PoseGraphSettings(altitude_offset_sigma_m=1.0 if has_gps else 0.0))
     for k, pose in enumerate(poses):
-        prior = told(pose, rng) if has_gps else untold(pose if k == 0 else None)
+        prior = measured(pose, rng) if has_gps else unmeasured(pose if k == 0 else None)
         outcome = mapper.add(k, CAMERA, seen(pose, seed=k), prior)
         assert (outcome.status, outcome.reason) == (Status.VISION, "")
         assert k in outcome.moved
@@ -107,7 +107,7 @@ def test_a_featureless_frame_stands_by_its_gps_and_the_next_ones_are_found_again
         image = seen(pose, seed=k)
         if k == 3:
             image = np.clip(90 + np.random.default_rng(9).normal(0, 1.5, image.shape), 0, 255).astype(np.uint8)
-        mapper.add(k, CAMERA, image, told(pose, rng))
+        mapper.add(k, CAMERA, image, measured(pose, rng))
     mapper.settle()
     status, reason = mapper.ending(3)
     assert status is Status.GPS_ONLY
@@ -125,7 +125,7 @@ def test_without_gps_a_frame_of_another_place_is_rejected_and_the_flight_goes_on
     outcomes = []
     for k, pose in enumerate(poses):
         image = seen(pose, ELSEWHERE if k == 3 else SCENE, seed=k)
-        outcomes.append(mapper.add(k, CAMERA, image, untold(poses[0] if k == 0 else None)))
+        outcomes.append(mapper.add(k, CAMERA, image, unmeasured(poses[0] if k == 0 else None)))
     assert [each.status for each in outcomes] == [
         Status.VISION, Status.VISION, Status.VISION, Status.REJECTED, Status.VISION, Status.VISION
     ]
@@ -144,7 +144,7 @@ def test_keyframes_of_a_known_map_tie_the_next_flight():
     mapper = PlanarMapper(PoseGraphSettings(gps_offset_sigma_m=5.0), known=known)
     for k, pose in enumerate(second[:6]):
         # this day's GPS is two metres off the first one's
-        outcome = mapper.add(100 + k, CAMERA, seen(pose, seed=50 + k), told(pose, rng, (2.0, -1.5, 0.0)))
+        outcome = mapper.add(100 + k, CAMERA, seen(pose, seed=50 + k), measured(pose, rng, (2.0, -1.5, 0.0)))
         assert outcome.status is Status.VISION
         assert all(each >= 100 for each in outcome.moved)
     mapper.settle()
@@ -160,7 +160,7 @@ def test_a_flight_that_starts_with_water_is_placed():
     mapper = PlanarMapper(PoseGraphSettings())
     for k, pose in enumerate(poses):
         image = np.full((300, 400, 3), 90, np.uint8) if k == 0 else seen(pose, seed=k)
-        mapper.add(k, CAMERA, image, told(pose, rng))
+        mapper.add(k, CAMERA, image, measured(pose, rng))
     mapper.settle()
     assert [mapper.ending(k)[0] for k in range(5)] == [Status.GPS_ONLY] + 4 * [Status.VISION]
 
@@ -169,7 +169,7 @@ def test_a_camera_turned_in_its_mount_does_no_harm():
     poses, rng = flown(7, per_strip=3), np.random.default_rng(7)
     mapper = PlanarMapper(PoseGraphSettings())
     for k, pose in enumerate(poses):
-        prior = told(pose, rng)
+        prior = measured(pose, rng)
         half_turn = CameraPrior(
             prior.position_m, prior.position_sigma_m, prior.rotation @ np.diag([-1.0, -1.0, 1.0]),
             prior.attitude_sigma_deg,
@@ -185,6 +185,6 @@ def test_large_pictures_are_registered_small_and_residuals_are_of_the_full_size(
     mapper = PlanarMapper(PoseGraphSettings())
     for k, pose in enumerate(poses):
         image = cv2.resize(seen(pose, seed=k), (1600, 1200), interpolation=cv2.INTER_CUBIC)
-        assert mapper.add(k, camera, image, told(pose, rng)).status is Status.VISION
+        assert mapper.add(k, camera, image, measured(pose, rng)).status is Status.VISION
     small = mapper.residuals_px(camera.resized(400, 300))
     assert all(value == pytest.approx(4 * small[k]) for k, value in mapper.residuals_px(camera).items())

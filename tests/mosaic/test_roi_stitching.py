@@ -169,7 +169,7 @@ def test_georeference_finds_the_similarity_and_turns_y_up(scale, turn_deg, east,
     assert np.linalg.det(found[:2, :2]) < 0
 
 
-def test_georeference_takes_every_fix_unless_told_otherwise():
+def test_georeference_takes_every_fix_unless_set_otherwise():
     barycentres = np.random.default_rng(2).uniform(0, 2000, (20, 2))
     true = pose(10, 20, 30, 0.05) @ np.diag([1.0, -1.0, 1.0])
     fixes = apply_homography(true, barycentres)

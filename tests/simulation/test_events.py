@@ -100,10 +100,10 @@ def test_features_are_plain_json_and_repeat_exactly(later):
     kinds = {feature["properties"]["kind"] for feature in features}
     assert kinds <= {"appeared", "disappeared", "replaced", "moving"}
     for feature in features:
-        said = feature["properties"]
-        assert bool(said["class_before"]) == (said["kind"] in ("disappeared", "replaced"))
-        assert bool(said["class_after"]) == (said["kind"] != "disappeared")
-        assert bool(said["path"]) == (said["kind"] == "moving" and bool(said["clear_views"]))
+        reported = feature["properties"]
+        assert bool(reported["class_before"]) == (reported["kind"] in ("disappeared", "replaced"))
+        assert bool(reported["class_after"]) == (reported["kind"] != "disappeared")
+        assert bool(reported["path"]) == (reported["kind"] == "moving" and bool(reported["clear_views"]))
 
 
 def test_a_later_flight_may_have_its_own_camera_height_and_heading(tmp_path):

@@ -91,11 +91,11 @@ def test_the_geojson_says_what_is_promised_in_wgs84(folder: Path) -> None:
         "id", "kind", "score", "first_seen", "last_seen", "views", "area_m2", "length_m", "sigma_m", "class_before",
         "class_after", "number", "east_m", "north_m", "velocity_m_s", "review",
     }
-    said = feature["properties"]
-    assert (said["id"], said["kind"], said["score"], said["number"]) == ("b-3", "appeared", 0.875, 3)
-    assert said["review"] is said["class_after"] is said["velocity_m_s"] is None
-    seen = datetime.fromisoformat(said["first_seen"])
-    assert abs(seen.timestamp() - SEEN_NS / 1e9) < 1e-6 and said["first_seen"].endswith("Z")
+    reported = feature["properties"]
+    assert (reported["id"], reported["kind"], reported["score"], reported["number"]) == ("b-3", "appeared", 0.875, 3)
+    assert reported["review"] is reported["class_after"] is reported["velocity_m_s"] is None
+    seen = datetime.fromisoformat(reported["first_seen"])
+    assert abs(seen.timestamp() - SEEN_NS / 1e9) < 1e-6 and reported["first_seen"].endswith("Z")
     ring = np.array(feature["geometry"]["coordinates"][0])
     assert np.array_equal(ring[0], ring[-1]) and signed_area(ring[:-1]) > 0
     # every corner lies where the outline does, to a tenth of a millimetre
@@ -245,11 +245,11 @@ def test_a_verdict_reaches_the_files_and_outlives_the_run(folder: Path) -> None:
     page = (folder / "flights/b/changes.html").read_text()
     assert "1 confirmed and 1 rejected" in page and "Schatten &lt;&amp;&gt;" in page
     with Archive.open(folder, write=True) as archive:
-        said = {review.change_id: review for review in archive.reviews()}
-        assert {each: said[each].verdict.value for each in said} == {"b-1": "confirmed", "b-2": "rejected"}
-        assert said["b-2"].note == "Schatten <&>" and said["b-2"].kind is ChangeKind.APPEARED
-        assert np.array_equal(said["b-2"].outline_m, fake_change(2, east_m=-8).outline_m)
-        assert np.allclose(said["b-2"].centre_m, [-8, -4])
+        reported = {review.change_id: review for review in archive.reviews()}
+        assert {each: reported[each].verdict.value for each in reported} == {"b-1": "confirmed", "b-2": "rejected"}
+        assert reported["b-2"].note == "Schatten <&>" and reported["b-2"].kind is ChangeKind.APPEARED
+        assert np.array_equal(reported["b-2"].outline_m, fake_change(2, east_m=-8).outline_m)
+        assert np.allclose(reported["b-2"].centre_m, [-8, -4])
         # the same number on other ground was not reviewed; the same ground was
         compare(archive, "b", [fake_change(1, east_m=60), fake_change(2, east_m=-8.2)])
         assert [each.verdict for each in archive.changes()] == [None, Verdict.REJECTED]

@@ -33,8 +33,8 @@ def page_of(changes: list[Change], report: dict[str, Any] | None = None, **chang
 def page_of_stored(stored: list[StoredChange], changes: list[Change], report: dict[str, Any] | None = None) -> str:
     picture = Picture(fake_picture(300, 200), (-150.5, -100.5), 1)
     crops = {each.id: (each.patch.before, each.patch.after) for each in changes}
-    said = fake_report(5) | {"flight": "b", "comparison": fake_comparison()} if report is None else report
-    return changes_page(said, stored, picture, picture, SITE, crops)
+    reported = fake_report(5) | {"flight": "b", "comparison": fake_comparison()} if report is None else report
+    return changes_page(reported, stored, picture, picture, SITE, crops)
 
 
 @pytest.mark.parametrize("count", [0, 1, 12, 150])

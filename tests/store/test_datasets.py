@@ -170,7 +170,7 @@ def test_coco_names_that_lead_out_of_the_set_are_refused(tmp_path, name):
 
 
 @pytest.mark.parametrize(("share", "how"), [(0.35, "breaks off"), (0.8, "breaks off"), (1.0, "is damaged")])
-def test_coco_that_breaks_off_is_told_with_file_and_place(tmp_path, share, how):
+def test_coco_that_breaks_off_is_reported_with_file_and_place(tmp_path, share, how):
     put.put_picture(tmp_path / "a.jpg")
     path = put.put_coco(tmp_path / "cut.json", ["a.jpg"], [(0, 1, 1, 2, 3, 4, 0)] * 9)
     text = path.read_text()
@@ -472,7 +472,7 @@ def test_the_wrong_form_names_the_right_one(tmp_path):
     ("train/0001.jpg", "set"), ("google_P000_aZk5uQM_jpg.rf.12ab.jpg", "google_P000_aZk5uQM"),
     ("baidu_timg-17-.jpg", "baidu_timg"), ("site5 (12).jpg", "site5"),
 ])
-def test_a_picture_s_video_is_told_from_its_name(tmp_path, path, group):
+def test_a_picture_s_video_is_recognised_by_its_name(tmp_path, path, group):
     place = tmp_path / "set"
     put.put_picture(place / path)
     assert group_of(place / path, place) == group

@@ -116,15 +116,15 @@ def test_tracks_carry_path_and_crop(tmp_path: Path) -> None:
     moving = _track(id=8, moving=True, velocity_m_s=np.array([0.0, 1.4]))
     collection = tracks_collection([_track(), moving], _SITE, {7: "objects/7.jpg"})
     first, second = collection["features"]
-    told = first["properties"]
-    assert (told["id"], told["class"], told["views"], told["passes"], told["crop"]) == (
+    reported = first["properties"]
+    assert (reported["id"], reported["class"], reported["views"], reported["passes"], reported["crop"]) == (
         7, "person", 5, 2, "objects/7.jpg",
     )
-    assert told["velocity_m_s"] is None and second["properties"]["velocity_m_s"] == [0.0, 1.4]
+    assert reported["velocity_m_s"] is None and second["properties"]["velocity_m_s"] == [0.0, 1.4]
     assert second["properties"]["crop"] is None
-    assert told["first_seen"] == "2026-05-28T20:26:40.000000Z"
-    assert len(told["path"]["coordinates"]) == len(told["path"]["times"]) == 2
-    assert told["path"]["coordinates"][1] == first["geometry"]["coordinates"]
+    assert reported["first_seen"] == "2026-05-28T20:26:40.000000Z"
+    assert len(reported["path"]["coordinates"]) == len(reported["path"]["times"]) == 2
+    assert reported["path"]["coordinates"][1] == first["geometry"]["coordinates"]
     local = tracks_collection([_track()], _LOCAL, {})
     assert local["crs"] is None and local["features"][0]["geometry"]["coordinates"] == [100.0, 200.0]
     assert "type" not in local and "pixels of the first picture" in local["note"]  # no map shows it by mistake

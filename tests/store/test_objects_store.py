@@ -139,12 +139,12 @@ def test_section_of_the_report() -> None:
     """Text is escaped; without a model it says why nothing was looked for; old reports have no section."""
     row = {"id": "a-o1", "class": "<i>", "score": 0.8, "east_m": 1.0, "north_m": 2.0, "sigma_m": None, "views": 3}
     placed = {**row, "id": "a-o2", "sigma_m": 0.534}
-    told = {"model": "fast", "classes": {"<i>": 1}, "list": [row, placed]}
-    page = objects_section({"objects": told}, {"a-o1": CROP})
+    reported = {"model": "fast", "classes": {"<i>": 1}, "list": [row, placed]}
+    page = objects_section({"objects": reported}, {"a-o1": CROP})
     assert "<i>" not in page
     assert "1 &lt;i&gt;" in page
     assert page.count(">+1.0, +2.0<") == 2 and ">0.5 m<" in page
-    placed_page = objects_section({"objects": told}, {}, SITE)
+    placed_page = objects_section({"objects": reported}, {}, SITE)
     assert ">46.500018, 13.250013<" in placed_page and ">33T UM" in placed_page and ">UTM<" in placed_page
     assert "data:image/jpeg;base64," in page
     assert "no model was wanted" in objects_section({"objects": {"model": None, "why_not": "no model was wanted"}}, {})

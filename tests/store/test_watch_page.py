@@ -76,7 +76,7 @@ def test_a_flight_that_nothing_places_is_drawn_in_pixels() -> None:
     assert "40, of which none with a place on the ground" in text
 
 
-def test_what_no_clock_dated_is_told_from_the_start() -> None:
+def test_what_no_clock_dated_is_timed_from_the_start() -> None:
     report = {"flight": "f", "first_frame": "1970-01-01T00:00:00Z", "last_frame": "1970-01-01T00:00:14.000000Z"}
     track = _track(1, first_seen="1970-01-01T00:00:03Z", last_seen="1970-01-01T00:00:09.5Z", x_px=1.0, y_px=2.0)
     page = watch_page(report, [track], {}, np.zeros((0, 2)))

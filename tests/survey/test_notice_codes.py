@@ -1,4 +1,4 @@
-"""The codes of notices are promised to be stable: each is told in the documentation."""
+"""The codes of notices are promised to be stable: each is reported in the documentation."""
 
 import re
 from pathlib import Path
@@ -11,9 +11,9 @@ _DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 def _codes() -> set[str]:
     source = "\n".join(path.read_text() for path in Path(sorvolo.__file__).parent.rglob("*.py"))
-    told = set(re.findall(r'\b[Nn]otice\(\s*"(\w+)"', source)) | set(re.findall(r'\.notices\("(\w+)"\)', source))
+    reported = set(re.findall(r'\b[Nn]otice\(\s*"(\w+)"', source)) | set(re.findall(r'\.notices\("(\w+)"\)', source))
     outboxes = re.findall(r'Outbox\([^\n]*code="(\w+)"', source)
-    return told | {f"{name}_{end}" for name in outboxes for end in ("failed", "dropped")} | set(FINDINGS)
+    return reported | {f"{name}_{end}" for name in outboxes for end in ("failed", "dropped")} | set(FINDINGS)
 
 
 def test_every_code_is_documented() -> None:

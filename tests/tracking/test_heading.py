@@ -11,14 +11,14 @@ _M_PER_PX = 0.05
 def _fly(
     headings_deg: np.ndarray, way_m: np.ndarray, *, gps_m: float = 0.0, wobble_px: float = 0.0, seed: int = 1
 ) -> list[Heading]:
-    """What is told along a way (N, 2) of a camera with these headings, ten frames a second."""
+    """What is reported along a way (N, 2) of a camera with these headings, ten frames a second."""
     rng = np.random.default_rng(seed)
     drift_m = gps_m * np.cumsum(rng.normal(0, 1, way_m.shape), axis=0) / np.sqrt(len(way_m))
-    finder, told = HeadingFromMotion(), []
+    finder, reported = HeadingFromMotion(), []
     for number, place_m in enumerate(way_m):
         outline_px = _outline(headings_deg[number], place_m, headings_deg[0], way_m[0])
-        told.append(finder.add(number / 10, outline_px + rng.normal(0, wobble_px, 2), place_m + drift_m[number]))
-    return told
+        reported.append(finder.add(number / 10, outline_px + rng.normal(0, wobble_px, 2), place_m + drift_m[number]))
+    return reported
 
 
 def _outline(heading_deg: float, place_m: np.ndarray, first_deg: float, first_m: np.ndarray) -> np.ndarray:
@@ -42,19 +42,19 @@ def _apart_deg(one: float, other: float) -> float:
 @pytest.mark.parametrize("heading_deg", [0.0, 37.0, 90.0, 181.0, 359.0])
 def test_a_straight_way_in_any_direction(heading_deg: float) -> None:
     way_m = np.outer(np.arange(60) * 0.5, [0.6, -0.8])  # the camera need not look where it flies
-    told = _fly(np.full(60, heading_deg), way_m)
-    assert told[3].sigma_deg == np.inf  # two metres are no way yet
-    assert _apart_deg(told[-1].heading_deg, heading_deg) < 0.01 and told[-1].sigma_deg == 4.0
+    reported = _fly(np.full(60, heading_deg), way_m)
+    assert reported[3].sigma_deg == np.inf  # two metres are no way yet
+    assert _apart_deg(reported[-1].heading_deg, heading_deg) < 0.01 and reported[-1].sigma_deg == 4.0
 
 
 def test_turns_are_followed() -> None:
     headings_deg = np.concatenate([np.full(80, 90.0), np.linspace(90, 270, 40), np.full(40, 270.0)])
     steps = np.column_stack([np.sin(np.radians(headings_deg)), np.cos(np.radians(headings_deg))]) * 0.6
-    told = _fly(headings_deg, np.cumsum(steps, axis=0))
-    assert all(_apart_deg(each.heading_deg, true) < 0.1 for each, true in zip(told[40:], headings_deg[40:]))
+    reported = _fly(headings_deg, np.cumsum(steps, axis=0))
+    assert all(_apart_deg(each.heading_deg, true) < 0.1 for each, true in zip(reported[40:], headings_deg[40:]))
 
 
-def test_noise_is_within_what_is_told() -> None:
+def test_noise_is_within_the_stated_sigma() -> None:
     misses = []
     for seed in range(40):
         headings_deg = 45 + np.cumsum(np.random.default_rng(seed).normal(0, 1, 150))
@@ -64,9 +64,9 @@ def test_noise_is_within_what_is_told() -> None:
     assert np.mean(np.array(misses) < 2) >= 0.9
 
 
-def test_hovering_tells_nothing_and_a_cut_begins_anew() -> None:
-    told = _fly(np.full(100, 10.0), np.zeros((100, 2)), gps_m=1.0, wobble_px=5.0)
-    assert all(each.sigma_deg == np.inf for each in told)
+def test_hovering_gives_nothing_and_a_cut_begins_anew() -> None:
+    reported = _fly(np.full(100, 10.0), np.zeros((100, 2)), gps_m=1.0, wobble_px=5.0)
+    assert all(each.sigma_deg == np.inf for each in reported)
     finder = HeadingFromMotion()
     for number in range(60):
         place_m = np.array([0.0, 0.5 * number])

@@ -128,7 +128,7 @@ def test_what_one_strip_only_cuts_is_no_second_object(yaw_deg: float) -> None:
 
 
 def test_what_every_frame_cuts_has_no_size_and_a_place_that_says_so() -> None:
-    """A car beyond the rim of all that was flown: told once, its place within the stated sigma, its length unknown."""
+    """A car beyond the rim of what was flown: reported once, its place within the stated sigma, its length unknown."""
     frames = survey()
     fused = fuse(sightings(frames, [("car", 16.0, -18.0, 90.0, (0.0, 0.0))], misses=0.0, least_shown=0.2), frames)
     (car,) = fused.objects
@@ -176,7 +176,7 @@ def test_what_few_frames_saw_is_left_out() -> None:
 
 
 def test_a_walker_is_one_and_moves() -> None:
-    """1.3 m/s along the strip: seen at many places, told once, with its velocity and where it was last."""
+    """1.3 m/s along the strip: seen at many places, reported once, with its velocity and where it was last."""
     frames = survey()[:10]
     fused = fuse(sightings(frames, [("person", 8.0, 2.0, 0.0, (1.3, -0.3))], misses=0.0), frames)
     (walker,) = fused.objects

@@ -189,7 +189,7 @@ def test_low_scores_prolong_and_do_not_begin():
     assert tracker.update([sighting(2, [0.0, 0.0], score=0.2)], time_ns=int(4e8)).track_ids == (1,)
 
 
-def test_appearance_tells_who_came_back():
+def test_appearance_shows_who_came_back():
     looks = np.eye(4)
     tracker = Tracker()
     for frame in range(6):

@@ -147,7 +147,7 @@ class _AerialByDay(_Aerial):
         return boxes[own], scores[own], labels[own]
 
 
-def test_its_onnx_file_bears_a_picture_without_any_aerial_candidate(tmp_path: Path) -> None:
+def test_its_onnx_file_takes_a_picture_without_any_aerial_candidate(tmp_path: Path) -> None:
     torch.manual_seed(3)
     coco = CocoDetector(NanoDetBackbone(), NanoDetHead(), ((0,),))
     model = Daylight(_AerialByDay(), coco, Judge(3), {1: Calibration()}, Calibration()).eval()

@@ -1,4 +1,4 @@
-"""An exported model goes back into torch and sees the same; what does not fit is told."""
+"""An exported model goes back into torch and sees the same; what does not fit is reported."""
 
 import json
 from pathlib import Path
@@ -52,8 +52,8 @@ def _model(rpn: Stem = "extended-residual", classes: tuple[str, ...] = _CLASSES)
 
 
 def _export(model: FasterRCNN, classes: tuple[str, ...] = _CLASSES) -> bytes:
-    told = {"thresholds": dict.fromkeys(classes, 0.5), "best_px": dict.fromkeys(classes, (8, 90))}
-    return export_onnx(model, {"name": "own", "classes": list(classes), "preset": "fast", **told})
+    reported = {"thresholds": dict.fromkeys(classes, 0.5), "best_px": dict.fromkeys(classes, (8, 90))}
+    return export_onnx(model, {"name": "own", "classes": list(classes), "preset": "fast", **reported})
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def exported() -> bytes:
     return _export(_model())
 
 
-def _told(exported: bytes, picture: ImageRGB) -> list[np.ndarray]:
+def _printed(exported: bytes, picture: ImageRGB) -> list[np.ndarray]:
     session = onnxruntime.InferenceSession(exported, providers=["CPUExecutionProvider"])
     return session.run(None, {"image": np.ascontiguousarray(picture.transpose(2, 0, 1))[None]})
 
@@ -74,7 +74,7 @@ def test_a_model_that_went_through_its_file_sees_the_same(exported: bytes) -> No
     assert check.is_good and check.detections > 20, check
     again = _export(back)
     for picture in _pictures(3):
-        for found, wanted in zip(_told(again, picture), _told(exported, picture)):
+        for found, wanted in zip(_printed(again, picture), _printed(exported, picture)):
             np.testing.assert_allclose(found, wanted, atol=2e-2)
 
 
@@ -123,7 +123,7 @@ def test_classes_of_the_same_name_keep_their_rows_and_others_start_anew(exported
         load_exported(fast(("car",)), exported, _batch())
 
 
-def test_another_proposal_network_is_told(exported: bytes) -> None:
+def test_another_proposal_network_is_reported(exported: bytes) -> None:
     for rpn in ("standard", "extended"):
         torch.manual_seed(6)
         with pytest.raises(InputError, match=r"does not fit the network: .*proposals.stems.*same preset, --rpn"):
@@ -133,12 +133,12 @@ def test_another_proposal_network_is_told(exported: bytes) -> None:
 
 
 @pytest.mark.parametrize("preset", [accurate, thesis])
-def test_another_preset_is_told(exported: bytes, preset) -> None:  # type: ignore[no-untyped-def]
+def test_another_preset_is_reported(exported: bytes, preset) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(InputError, match="does not fit the network"):
         load_exported(preset(_CLASSES), exported, _batch())
 
 
-def test_norms_that_do_not_learn_are_told() -> None:
+def test_norms_that_do_not_learn_are_reported() -> None:
     torch.manual_seed(5)
     model = _model()
     model.backbone = ResNet50(deep=True)
@@ -165,7 +165,7 @@ def _load_layers_of(model: FasterRCNN) -> None:
     load_exported(model, file.SerializeToString(), _batch())
 
 
-def test_a_model_in_eight_bits_is_told(tmp_path: Path) -> None:
+def test_a_model_in_eight_bits_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "whole.onnx"
     path.write_bytes(_export(_model()))
     small = quantise(path, _pictures(8)).model
@@ -174,6 +174,6 @@ def test_a_model_in_eight_bits_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"no model", b"\x08\x07"])
-def test_what_is_no_model_of_ours_is_told(data: bytes) -> None:
+def test_what_is_no_model_of_ours_is_reported(data: bytes) -> None:
     with pytest.raises(InputError, match="damaged, or none that `sorvolo train` wrote"):
         load_exported(fast(_CLASSES), data, _batch())

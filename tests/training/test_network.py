@@ -150,7 +150,7 @@ def test_another_network_s_file_is_no_export_of_this_one(trained):
     assert not check.is_good and check.box_px > 0.5, check
 
 
-def test_an_export_looks_at_as_many_regions_as_it_is_told(trained):
+def test_an_export_looks_at_as_many_regions_as_its_settings_give(trained):
     model = trained[0].average
     pictures = [each.image for each in squares(4, 4)]
     whole, few = (

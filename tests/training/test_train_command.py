@@ -1,4 +1,4 @@
-"""`sorvolo train`: a tiny network learns, is stopped, goes on, and is written; bad input is told."""
+"""`sorvolo train`: a tiny network learns, is stopped, goes on, and is written; bad input is reported."""
 
 import json
 import os
@@ -111,11 +111,11 @@ def test_ctrl_c_waits_for_the_step_and_leaves_a_checkpoint(
     options = ["--weights", "none", "--steps", "100000", "--batch", "1", "--side", "64", "--val", "0", "--json"]
     assert main(["train", str(data), "--out", str(tmp_path / "out"), *options]) == 130
     alarm.join()
-    told = capsys.readouterr()
-    assert "stopping after this step" in told.err
-    assert "stopped; the same command with --resume continues the run" in told.err
-    assert "discarded" not in told.err
-    last = json.loads(told.out.splitlines()[-1])["step"]
+    printed = capsys.readouterr()
+    assert "stopping after this step" in printed.err
+    assert "stopped; the same command with --resume continues the run" in printed.err
+    assert "discarded" not in printed.err
+    last = json.loads(printed.out.splitlines()[-1])["step"]
     content = (tmp_path / "out" / "checkpoint.pt").read_bytes()
     assert read_checkpoint(content, "checkpoint").state["step"] == last
 
@@ -145,7 +145,7 @@ def test_other_labels_are_other_data(tmp_path: Path) -> None:
         list(_train(place, tmp_path / "out", _settings(), resume=True))
 
 
-def test_damaged_pictures_are_passed_over_and_told(tmp_path: Path) -> None:
+def test_damaged_pictures_are_passed_over_and_reported(tmp_path: Path) -> None:
     place = labelled_squares(tmp_path / "squares", 2, 3)
     path = place / "images" / "flight0_0001.png"
     path.write_bytes(path.read_bytes()[:2000])
@@ -169,18 +169,18 @@ def test_whole_videos_are_held_out(data: Path) -> None:
     assert len(learnt) == 3 and len(held) == 1 and not learnt & held
 
 
-def test_what_was_remarked_is_told_on_the_terminal_too(
+def test_what_was_remarked_is_reported_on_the_terminal_too(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = labelled_squares(tmp_path / "other", 2, 2, names=("car", "boat"))
     options = ["--weights", "none", "--rpn", "standard", "--steps", "1", "--batch", "1", "--side", "64"]
     command = ["train", str(data), "--val", str(other), "--out", str(tmp_path / "out"), *options]
     assert main(command) == 0
-    told = " ".join(capsys.readouterr().out.split())
-    assert "note other: 4 boxes of classes that stand for none of ours left out: boat (4)" in told
-    assert "lie in both" in told and "flight0" in told
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "note other: 4 boxes of classes that stand for none of ours left out: boat (4)" in printed
+    assert "lie in both" in printed and "flight0" in printed
     notices = json.loads((tmp_path / "out" / "training.json").read_text())["notices"]
-    assert all(" ".join(each.split()) in told for each in notices)
+    assert all(" ".join(each.split()) in printed for each in notices)
 
 
 def _greyed(place: Path, count: int) -> Path:
@@ -250,7 +250,7 @@ def test_labels_are_checked_before_anything_is_simulated(data: Path, tmp_path: P
     assert not (tmp_path / "out" / "simulated").exists()
 
 
-def test_bad_input_is_told(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_reported(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def words(*arguments: str) -> str:
         assert main(["train", *arguments, "--out", str(tmp_path / "new" / "out")]) == 1
         assert not (tmp_path / "new").exists()
@@ -270,8 +270,8 @@ def test_bad_input_is_told(data: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert "THEIRS=OURS" in words(place, "--classes", "=car")
     assert "ignore: 'Bicycle' is no name in the labels; there are: car" in words(place, "--ignore", "Bicycle")
     assert "unlabelled: 'persn' is no class; there are: person, car" in words(place, "--unlabelled", "persn")
-    assert "none of its class names" in (told := words(place, "--classes", "Boat=boat"))
-    assert "such as --classes " in told and "=person" in told
+    assert "none of its class names" in (printed := words(place, "--classes", "Boat=boat"))
+    assert "such as --classes " in printed and "=person" in printed
     if not torch.cuda.is_available():
         assert "sees no GPU; use --device cpu" in words(place, "--device", "cuda")
 

@@ -1,4 +1,4 @@
-"""`sorvolo train --weights MODEL`: a model is tuned to other pictures; what does not fit is told."""
+"""`sorvolo train --weights MODEL`: a model is tuned to other pictures; what does not fit is reported."""
 
 import json
 from pathlib import Path
@@ -54,16 +54,16 @@ def test_a_tuned_run_goes_on_from_its_own_model_only(learnt: Path, data: Path, t
     assert main([*command, "--weights", "none", "--resume"]) == 1
 
 
-def test_new_classes_are_learnt_from_the_beginning_and_told(
+def test_new_classes_are_learnt_from_the_beginning_and_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = labelled_squares(tmp_path / "both", 2, 3, names=("car", "boat"))
     out = tmp_path / "out"
     command = ["train", str(data), "--out", str(out), "--weights", "default", "--steps", "1", *_BRIEFLY]
     assert main([*command, "--classes", "car,boat"]) == 0
-    told = " ".join(capsys.readouterr().out.split())
-    assert "note the model default does not know boat: learnt from the beginning" in told
-    assert "note the model default knows person, small object, which nothing here labels" in told
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "note the model default does not know boat: learnt from the beginning" in printed
+    assert "note the model default knows person, small object, which nothing here labels" in printed
     notices = json.loads((out / "training.json").read_text())["notices"]
     assert any("does not know boat" in each for each in notices)
     assert Detector.load(out / "model.onnx").classes == ("car", "boat")
@@ -75,7 +75,7 @@ def test_the_four_steps_begin_from_a_model_too(learnt: Path, data: Path, tmp_pat
     assert json.loads((tmp_path / "out" / "training.json").read_text())["export"]["good"]
 
 
-def test_models_that_do_not_fit_are_told(
+def test_models_that_do_not_fit_are_reported(
     learnt: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def words(*arguments: str) -> str:
@@ -97,12 +97,12 @@ def test_models_that_do_not_fit_are_told(
     assert "cannot be learnt on from: a model file of the preset accurate lacks" in words(
         "--weights", accurate, "--preset", "accurate"
     )
-    assert "does not fit the network" in (told := words("--weights", str(learnt), "--rpn", "standard"))
-    assert "same preset, --rpn" in told
+    assert "does not fit the network" in (printed := words("--weights", str(learnt), "--rpn", "standard"))
+    assert "same preset, --rpn" in printed
     assert "is in int8 and cannot be learnt on from; give the float32 model" in words("--weights", "default-int8")
     assert "there is no model file" in words("--weights", "gone.onnx")
-    assert "no weights at nobody" in (told := words("--weights", "nobody"))
-    assert "or a model to tune: a .onnx file, or a name that `sorvolo models list` shows" in told
+    assert "no weights at nobody" in (printed := words("--weights", "nobody"))
+    assert "or a model to tune: a .onnx file, or a name that `sorvolo models list` shows" in printed
     (tmp_path / "junk.onnx").write_bytes(b"junk")
     assert "damaged or no ONNX file" in words("--weights", str(tmp_path / "junk.onnx"))
     assert find_model("default-int8").is_file()

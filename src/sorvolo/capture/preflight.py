@@ -53,7 +53,7 @@ class FrameFacts:
 
 @dataclass(frozen=True)
 class TelemetryFacts:
-    """The telemetry. `tie` says how it belongs to the frames, `covered_s` how long both run, NaN unknown."""
+    """The telemetry. `tie` states how it belongs to the frames, `covered_s` how long both run, NaN if unknown."""
 
     format: str
     samples: int
@@ -68,7 +68,7 @@ class TelemetryFacts:
 
 @dataclass(frozen=True)
 class FlightFacts:
-    """The flight, as far as telemetry and camera tell; NaN where they do not.
+    """The flight, as far as telemetry and camera give it; NaN elsewhere.
 
     `height_reference` says above what `height_m` is. `forward_overlap` is that of consecutive photos;
     `frame_interval_s` the longest time between two frames that keeps 70 % overlap (eqs 3.16-3.17).
@@ -89,7 +89,7 @@ class FlightFacts:
 
 
 def frame_facts(source: Source, glimpses: Sequence[Frame]) -> FrameFacts:
-    """What a source's header and a few of its frames, spread over the flight, tell of its pictures."""
+    """What a source's header and a few of its frames, spread over the flight, show of its pictures."""
     camera = source.camera.camera
     seen = [sharpness_and_texture(frame.image) for frame in glimpses]
     sharp, texture = np.median(seen, axis=0).tolist() if seen else (math.nan, math.nan)
@@ -170,7 +170,7 @@ def _tie(source: Source, frames: FrameFacts) -> tuple[str, float]:
 
 
 def while_filming(source: Source, frames: FrameFacts) -> Telemetry:
-    """The telemetry between the first and the last frame; all of it where that cannot be told."""
+    """The telemetry between the first and the last frame; all of it where that is unknown."""
     telemetry = source.telemetry
     duration_ns = round(frames.duration_s * _SECOND_NS) if frames.duration_s > 0 else 0
     since_start_ns = telemetry.video_time_ns
@@ -190,7 +190,7 @@ def common_ns(telemetry: Telemetry, start_ns: int, duration_s: float) -> int:
 
 
 def flight_facts(telemetry: Telemetry, camera: Camera, frames: FrameFacts) -> FlightFacts:
-    """How the drone flew while it filmed, as far as telemetry and camera tell."""
+    """How the drone flew while it filmed, as far as telemetry and camera give it."""
     placed = np.isfinite(telemetry["latitude_deg"])
     points_m = _track_m(telemetry["latitude_deg"][placed], telemetry["longitude_deg"][placed])
     times_s = (telemetry.time_ns[placed] - telemetry.time_ns[placed][:1]) / _SECOND_NS
@@ -236,9 +236,9 @@ def _height(telemetry: Telemetry) -> tuple[float, float, str]:
 
 
 def _speed(telemetry: Telemetry, points_m: PointsM, times_s: Floats) -> float:
-    """Median speed while moving; from positions where telemetry does not tell it."""
-    told = telemetry["speed_m_s"]
-    speeds = told[np.isfinite(told)] if np.isfinite(told).any() else speeds_m_s(points_m, times_s)
+    """Median speed while moving; from positions where telemetry lacks it."""
+    logged = telemetry["speed_m_s"]
+    speeds = logged[np.isfinite(logged)] if np.isfinite(logged).any() else speeds_m_s(points_m, times_s)
     moving = speeds[speeds > _MOVING_M_S]
     return float(np.median(moving)) if len(moving) else (0.0 if len(speeds) else math.nan)
 

@@ -127,7 +127,7 @@ Integers64 region_boxes(const Bytes &mask) {
             above.swap(here);
         }
         const std::int32_t count = static_cast<std::int32_t>(labels.parent.size());
-        for (std::int32_t label = count - 1; label >= 0; --label) {  // parents are smaller: children are told first
+        for (std::int32_t label = count - 1; label >= 0; --label) {  // parents are smaller: children come first
             const std::int32_t parent = labels.parent[label];
             if (parent == label) continue;
             std::int64_t *into = labels.boxes.data() + 4 * static_cast<std::size_t>(parent);

@@ -181,7 +181,7 @@ struct Margined {
 };
 
 // Hands each 8-connected part of `left`, whose pixels are 1 or 0, to `take`, in order of first pixels; clears it.
-// Pixels are told by where they lie in `left.pixels`.
+// Pixels are identified by where they lie in `left.pixels`.
 template <typename Take>
 void collect_parts(Margined &left, Take take) {
     const std::ptrdiff_t size = static_cast<std::ptrdiff_t>(left.pixels.size()), stride = left.stride;

@@ -253,7 +253,7 @@ def _flight_findings(
     elif math.isnan(flight.height_m):
         found.append(Finding(
             Level.WARNING, f"height above ground {flight.height_reference}",
-            "ground resolution and overlap cannot be told before mapping",
+            "ground resolution and overlap are unknown before mapping",
         ))
     usual_m = flight.height_m if flight.height_m > 0 else 60.0
     if flight.height_spread_m > max(10.0, 0.4 * usual_m):

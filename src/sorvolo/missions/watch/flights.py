@@ -104,7 +104,7 @@ def _watch_one(
                 run.finish(ended=ended, skipped=source.skipped if isinstance(source, LiveSource) else 0)
         if not run.log.detected and ended != _STOPPED:
             reason = next(iter(run.log.lost), "the source holds none")
-            raise InputError(f"no frame of {source.name} could be searched: {reason}; `sorvolo inspect` tells more")
+            raise InputError(f"no frame of {source.name} could be searched: {reason}; see `sorvolo inspect`")
 
 
 def _search(
