@@ -111,3 +111,16 @@ def test_bad_settings_and_shapes_are_refused():
         ExposureSettings(largest_gain=0.5)
     with pytest.raises(GeometryError):
         ColourPairs(np.zeros((2, 3)), np.zeros((3, 3)), np.zeros(2), np.zeros(2))
+
+
+def test_links_of_few_and_of_many_points_count_by_their_points():
+    """Frame 1 meets 0 in 2 points and 2 in 60: the padding of the short link weighs nothing."""
+    rng = np.random.default_rng(8)
+    ground, radius2 = rng.uniform(50, 150, (60, 3)), rng.uniform(0, 1, 60)
+    few = ColourPairs(ground[:2], ground[:2] * 0.8, radius2[:2], radius2[:2])
+    many = ColourPairs(ground, ground * 0.8, radius2, radius2)
+    found = solve_exposure({(0, 1): few, (1, 2): many})
+    alone = solve_exposure({(1, 2): many})
+    assert found.gains[2] / found.gains[1] == pytest.approx(np.full(3, 1 / 0.8), rel=0.01)
+    assert alone.gains[2] / alone.gains[1] == pytest.approx(np.full(3, 1 / 0.8), rel=0.01)
+    assert (found.gains[0] < found.gains[1]).all()

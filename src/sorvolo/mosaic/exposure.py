@@ -11,9 +11,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.sparse import csc_array, diags_array
+from scipy.sparse.linalg import splu
 
 from sorvolo.errors import GeometryError, SettingsError
-from sorvolo.geometry.arrays import Floats, ImageRGB, PointsPx, Rows, frozen
+from sorvolo.geometry.arrays import Floats, ImageRGB, Mask, PointsPx, Rows, frozen
 
 _SHRINK = 4
 _ITERATIONS = 8
@@ -152,11 +154,16 @@ class _Unknowns:
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """Colour pairs as equations: unknowns' columns (n, 6) and factors (n, 6), log-colour differences (n, 3)."""
+    """Colour pairs as equations, those of a link beside each other, L links of up to P pairs.
+
+    `columns` (L, 6) of their unknowns, `factors` (L, P, 6), log-colour `difference` (L, P, 3); `exists` (L, P) is
+    False where a link has fewer pairs.
+    """
 
     columns: Rows
     factors: Floats
     difference: Floats
+    exists: Mask
 
 
 def _unknowns(ids: Sequence[int], camera_of: Mapping[int, int]) -> _Unknowns:
@@ -169,25 +176,29 @@ def _equations(
     pairs: Mapping[tuple[int, int], ColourPairs], unknowns: _Unknowns, settings: ExposureSettings
 ) -> _Equations:
     """The equations of all links, at least one of which has pairs."""
-    links = [_link_equations(each, pairs[each], unknowns, settings) for each in sorted(pairs) if len(pairs[each])]
-    return _Equations(
-        np.concatenate([each.columns for each in links]), np.concatenate([each.factors for each in links]),
-        np.concatenate([each.difference for each in links]),
-    )
+    links = [each for each in sorted(pairs) if len(pairs[each])]
+    chosen = [pairs[each] for each in links]
+    counts = np.array([len(each) for each in chosen])
+    slots = np.arange(min(settings.points_per_link, counts.max()))
+    exists = slots < np.minimum(counts, settings.points_per_link)[:, None]
+    evenly = slots * (counts[:, None] - 1) // max(1, settings.points_per_link - 1)
+    within = np.where(counts[:, None] > settings.points_per_link, evenly, np.where(exists, slots, 0))
+    rows = within + (np.cumsum(counts) - counts)[:, None]  # (L, P) of all pairs in a row
+    radius2_a = np.concatenate([each.radius2_a for each in chosen])[rows]
+    radius2_b = np.concatenate([each.radius2_b for each in chosen])[rows]
+    colours_a = np.concatenate([each.colours_a for each in chosen])[rows]
+    colours_b = np.concatenate([each.colours_b for each in chosen])[rows]
+    one = np.ones_like(radius2_a)
+    factors = np.stack([one, -one, -radius2_a, -(radius2_a**2), radius2_b, radius2_b**2], axis=-1)
+    difference = np.log(np.maximum(colours_a, 1.0)) - np.log(np.maximum(colours_b, 1.0))
+    return _Equations(np.array([_columns_of(each, unknowns) for each in links]), factors, difference, exists)
 
 
-def _link_equations(
-    link: tuple[int, int], pairs: ColourPairs, unknowns: _Unknowns, settings: ExposureSettings
-) -> _Equations:
-    pick = np.linspace(0, len(pairs) - 1, min(len(pairs), settings.points_per_link)).astype(int)
+def _columns_of(link: tuple[int, int], unknowns: _Unknowns) -> list[int]:
+    """The columns of a link's six unknowns: two gains, two vignettes of two."""
     a, b = link
     lens_a, lens_b = unknowns.lens_of[a], unknowns.lens_of[b]
-    row = [unknowns.column[a], unknowns.column[b], lens_a, lens_a + 1, lens_b, lens_b + 1]
-    ra, rb = pairs.radius2_a[pick], pairs.radius2_b[pick]
-    one = np.ones(len(pick))
-    factors = np.column_stack([one, -one, -ra, -(ra**2), rb, rb**2])
-    colours_a, colours_b = np.maximum(pairs.colours_a[pick], 1.0), np.maximum(pairs.colours_b[pick], 1.0)
-    return _Equations(np.tile(row, (len(pick), 1)), factors, np.log(colours_a) - np.log(colours_b))
+    return [unknowns.column[a], unknowns.column[b], lens_a, lens_a + 1, lens_b, lens_b + 1]
 
 
 def _robust_solution(
@@ -198,33 +209,40 @@ def _robust_solution(
     prior = np.repeat([settings.gain_sigma**-2, settings.vignette_sigma**-2], [frames, 2 * len(unknowns.lens)])
     solution, typical = np.zeros((len(prior), 3)), 0.0
     for _ in range(_ITERATIONS):
-        fitted = np.einsum("nk,nkc->nc", equations.factors, solution[equations.columns])
-        length = np.linalg.norm(equations.difference + fitted, axis=1) / np.sqrt(3)
-        typical = float(np.median(length))
+        fitted = equations.factors @ solution[equations.columns]  # (L, P, 3)
+        length = np.linalg.norm(equations.difference + fitted, axis=-1) / np.sqrt(3)
+        typical = float(np.median(length[equations.exists]))
         spread = max(settings.colour_sigma, _SIGMA_FROM_MEDIAN * typical)
-        weight = 1 / (1 + (length / spread) ** 2) / spread**2
+        weight = equations.exists / (1 + (length / spread) ** 2) / spread**2
         solution = _solve(equations, weight, prior, frames)
     return solution, typical * _SIGMA_FROM_MEDIAN
 
 
 def _solve(equations: _Equations, weight: Floats, prior: Floats, frames: int) -> Floats:
-    """(U, 3) unknowns from weighted normal equations; the vignette is one for all channels."""
-    columns, factors, difference = equations.columns, equations.factors, equations.difference
-    unknowns = len(prior)
-    normal = np.zeros((unknowns, unknowns))
-    np.add.at(
-        normal, (columns[:, :, None], columns[:, None, :]),
-        factors[:, :, None] * factors[:, None, :] * weight[:, None, None],
-    )
-    normal[np.diag_indices(unknowns)] += prior
-    right = np.zeros((unknowns, 3))
-    np.add.at(right, columns, -factors[:, :, None] * (weight[:, None] * difference)[:, None, :])
+    """(U, 3) unknowns from weighted normal equations; the vignette is one for all channels.
+
+    Frames share equations only with the frames that they overlap: the matrix is sparse, and so is its solution's cost.
+    """
+    columns, count = equations.columns, len(prior)
+    weighted = np.swapaxes(equations.factors * weight[..., None], 1, 2)  # (L, 6, P)
+    blocks, sides = weighted @ equations.factors, -(weighted @ equations.difference)
+    rows, others = np.broadcast_arrays(columns[:, :, None], columns[:, None, :])
+    normal = csc_array((blocks.ravel(), (rows.ravel(), others.ravel())), shape=(count, count)) + diags_array(prior)
+    right = np.zeros((count, 3))
+    np.add.at(right, columns, sides)
     # gains per channel eliminated for the vignette of their mean, then put back with that vignette
-    mean = np.linalg.solve(normal, right.mean(axis=1))
+    normal = normal.tocsc()
+    mean = _solved(normal, right.mean(axis=1))
     lens = mean[frames:]
     known = (normal[:frames, frames:] @ lens)[:, None]
-    gains = np.linalg.solve(normal[:frames, :frames], right[:frames] - known)
+    gains = _solved(normal[:frames, :frames], right[:frames] - known)
     return np.vstack([gains, np.tile(lens[:, None], (1, 3))])
+
+
+def _solved(normal: csc_array, right: Floats) -> Floats:
+    """The solution of symmetric, positive definite equations."""
+    factors = splu(normal, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
+    return np.asarray(factors.solve(right))
 
 
 def _sample(image: ImageRGB, points_px: PointsPx) -> Floats:
