@@ -31,8 +31,9 @@ import cv2
 import numpy as np
 
 from change_events import flight as flight_path
-from change_real import halves
 from provenance import commit, machine
+from real_strips import FLIGHTS as FLIGHTS_OF_PHOTOS
+from real_strips import photos_of
 from sorvolo.change import views
 from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
 from sorvolo.change.metrics import FoundEvent, match_events, score_events
@@ -57,8 +58,8 @@ FLIGHTS = (
 )
 """Preset and length of a strip, m: short, for each rule is one more run over all of them."""
 
-REAL = (("caliterra", 0), ("brighton_beach", 0))
-"""Flights of real photos and which half of them is the map."""
+REAL = (("caliterra", 3), ("brighton_beach", 0))
+"""Flights of real photos, and which of their pairs of strips: one is mapped, the other compared."""
 
 
 def main() -> None:
@@ -171,13 +172,17 @@ def record_all(cache: Path, real: Path | None, presets: Sequence[str] | None, se
         print(folder.name, "mapped", round(time.process_time() - started), "s", flush=True)
         record(folder, flight_path(simulation, 2), site, camera, simulation)
         print(folder.name, "recorded", round(time.process_time() - started), "s", flush=True)
-    for name, parity in REAL if real is not None else ():
+    for name, number in REAL if real is not None else ():
         folder = cache / f"real-{name}"
         if (folder / "recorded.pickle").is_file():
             continue
         started = time.process_time()
-        mapped, later = halves(real / name, folder, parity)
-        list(map_flights([mapped], folder / "site", MapSettings(model="none")))
+        earlier, later = (folder / part for part in ("earlier", "later"))
+        for strip, photos in zip(FLIGHTS_OF_PHOTOS[name].pairs[number], (earlier, later)):
+            photos.mkdir(parents=True, exist_ok=True)
+            for path in photos_of(real / name, FLIGHTS_OF_PHOTOS[name].strips[strip]):
+                (photos / path.name).symlink_to(path.resolve())
+        list(map_flights([earlier], folder / "site", MapSettings(model="none")))
         record(folder, later, folder / "site", None, None)
         print(folder.name, "recorded", round(time.process_time() - started), "s", flush=True)
 

@@ -4,9 +4,9 @@ python benchmarks/change_events.py [SEED...] [--presets compare compare-photos] 
 python benchmarks/change_events.py --speed        (a 1080p video at 30 frames a second instead)
 
 For each seed and preset two flights are simulated, the first is mapped, the second compared by each method on a copy
-of that map, each run in a process of its own whose processor time and peak memory are measured. Without
-seeds, new ones are drawn from the commit's hash (provenance.py); 301 and 302 were scored about twenty times and serve
-development now. Figures are pooled over seeds; the range over seeds is beside them.
+of that map, each run in a process of its own whose processor time and peak memory are measured. Without seeds, new ones
+are drawn from the commit's hash, never the same twice (provenance.py); 301 and 302 were scored about twenty times and
+serve development now. Figures are pooled over seeds; the range over seeds is beside them.
 Everything is written to results/change_events.json (--speed: change_speed_video.json).
 """
 
@@ -48,7 +48,8 @@ def main() -> None:
     """Run the benchmark, or one comparison in the child process."""
     layout = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
-    parser.add_argument("seeds", type=int, nargs="*", help="else two drawn from the commit's hash")
+    parser.add_argument("seeds", type=int, nargs="*", help="else new ones, drawn from the commit's hash")
+    parser.add_argument("--count", type=int, default=2, help="how many seeds to draw")
     parser.add_argument("--presets", nargs="+", default=PRESETS)
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     parser.add_argument("--no-masks", action="store_true", help="leave frames and pixels out")
@@ -62,7 +63,7 @@ def main() -> None:
     if options.run:
         run_method(options.run[0], options.run[1] == "masks", Path(options.run[2]), Path(options.run[3]))
         return
-    options.seeds = seeds_or_drawn("change_events", options.seeds, 2)
+    options.seeds = seeds_or_drawn("change_events", options.seeds, options.count)
     presets = ["compare"] if options.speed else options.presets
     masks = not (options.no_masks or options.speed)
     options.scoring = note_scoring(f"change_events, seeds {' '.join(map(str, options.seeds))}")

@@ -46,6 +46,7 @@ def main() -> None:
     options = parser.parse_args()
     options.seeds = seeds_or_drawn("change_methods", options.seeds, 2)
     scoring = note_scoring(f"change_methods, {options.split} grounds")
+    note_scoring(f"change_methods, seeds {' '.join(map(str, options.seeds))}")
     places = grounds(options.data, options.split)
     sources = sorted({each.source for each in places})
     if sources == ["procedural"]:

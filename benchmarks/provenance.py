@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
@@ -57,18 +58,34 @@ def drawn_seeds(benchmark: str, count: int, hash_of_commit: str | None = None) -
     ]
 
 
+def fresh_seeds(
+    benchmark: str, count: int, hash_of_commit: str | None = None, ledger: Path = SCORED
+) -> list[int]:
+    """As `drawn_seeds`, but never one that the ledger has: a commit that is measured again gets others."""
+    scored = {
+        int(seed) for held_out in _known(ledger) if held_out.startswith(f"{benchmark}, seeds ")
+        for seed in re.findall(r"\d+", held_out.removeprefix(benchmark))
+    }
+    drawn = drawn_seeds(benchmark, count + len(scored), hash_of_commit)
+    return [seed for seed in drawn if seed not in scored][:count]
+
+
 def seeds_or_drawn(benchmark: str, seeds: Sequence[int], count: int) -> list[int]:
-    """The seeds given, else `count` drawn ones."""
-    return list(seeds) or drawn_seeds(benchmark, count)
+    """The seeds given, else `count` fresh ones."""
+    return list(seeds) or fresh_seeds(benchmark, count)
 
 
 def note_scoring(held_out: str, ledger: Path = SCORED) -> dict[str, str | int]:
     """Count one more scoring of a held-out set; what a result file holds of it: `held_out` and `times_scored`."""
-    known = json.loads(ledger.read_text(encoding="utf-8")) if ledger.is_file() else {}
+    known = _known(ledger)
     known[held_out] = known.get(held_out, 0) + 1
     ledger.parent.mkdir(exist_ok=True)
     ledger.write_text(json.dumps(dict(sorted(known.items())), indent=1) + "\n", encoding="utf-8")
     return {"held_out": held_out, "times_scored": known[held_out]}
+
+
+def _known(ledger: Path) -> dict[str, int]:
+    return json.loads(ledger.read_text(encoding="utf-8")) if ledger.is_file() else {}
 
 
 def _git(repository: Path, *words: str) -> str:
