@@ -32,6 +32,7 @@ import time
 from collections import Counter, deque
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -276,8 +277,9 @@ def ground_colour(path: Path, place_m: Floats, whole: WholeMap, reach_m: float) 
     return np.asarray(mean)
 
 
+@lru_cache(maxsize=10)
 def read(path: Path) -> np.ndarray:
-    """A photo, RGB uint8."""
+    """A photo, RGB uint8; a strip's stay in memory."""
     with Image.open(path) as image:
         return np.asarray(image.convert("RGB"))
 
@@ -355,26 +357,28 @@ def matched(
         shaded = own.union(Polygon(thing.shadow_outline_m).buffer(0)).convex_hull
         touching = {number for number, each in enumerate(events) if each["outline"].intersects(shaded.buffer(0.3))}
         explained |= touching
-        hits = [event["kind"] for event in (events[number] for number in sorted(touching))
-                if event["outline"].intersects(own) and event["outline"].area <= _MOST_TIMES * max(shaded.area, 0.2)]
         place = apply_homography(site_from_whole, thing.place_m[None])
         planted.append({
             "kind": thing.cutout.kind, "label": thing.cutout.label, "when": fate,
             "contrast": "low" if thing.is_low else "high", "compared": bool(ground.holds(place)[0]),
-            "found": bool(hits), "times": len(hits), "named_right": fate in hits,
             "place_m": [round(float(value), 1) for value in thing.place_m],
+            **fared([events[number] for number in sorted(touching)], own, shaded.area, fate),
         })
     rest = [each for number, each in enumerate(events) if number not in explained]
     return planted, [{key: value for key, value in each.items() if key != "outline"} for each in rest]
 
 
+def fared(touching: list[dict[str, Any]], own: Polygon, shaded_m2: float, fate: str) -> dict[str, Any]:
+    """Whether events touch a thing and are not far larger, how many do, and whether one names what became of it."""
+    most_m2 = _MOST_TIMES * max(shaded_m2, 0.2)
+    hits = [each["kind"] for each in touching if each["outline"].intersects(own) and each["outline"].area <= most_m2]
+    return {"found": bool(hits), "times": len(hits), "named_right": fate in hits}
+
+
 def pooled(pairs: list[dict[str, Any]]) -> dict[str, Any]:
     """False events a hectare, outside and within crowns, and what was found by kind, fate and contrast."""
     good = [pair for pair in pairs if "failure" not in pair]
-    ends = Counter(
-        "moved" if event["moved"] else "in_crowns" if event["in_crown"] else "outside"
-        for pair in good for event in pair["events"]
-    )
+    ends = Counter(place_of(event) for pair in good for event in pair["events"])
     outside_m2, crowns_m2 = (sum(pair[key] for pair in good) for key in ("outside_m2", "crowns_m2"))
     return {
         "pairs": len(pairs), "failed": len(pairs) - len(good), "hectares_outside_crowns": round(outside_m2 / 1e4, 3),
@@ -382,6 +386,11 @@ def pooled(pairs: list[dict[str, Any]]) -> dict[str, Any]:
         "hectares_in_crowns": round(crowns_m2 / 1e4, 3), "false_in_crowns": ends["in_crowns"], "moved": ends["moved"],
         **found_words([each for pair in good for each in pair["things"] if each["compared"]]),
     }
+
+
+def place_of(event: dict[str, Any]) -> str:
+    """Where an event that lies on no thing is counted."""
+    return "moved" if event["moved"] else "in_crowns" if event["in_crown"] else "outside"
 
 
 def found_words(things: list[dict[str, Any]]) -> dict[str, Any]:
