@@ -364,8 +364,12 @@ def matched(
             "place_m": [round(float(value), 1) for value in thing.place_m],
             **fared([events[number] for number in sorted(touching)], own, shaded.area, fate),
         })
-    rest = [each for number, each in enumerate(events) if number not in explained]
-    return planted, [{key: value for key, value in each.items() if key != "outline"} for each in rest]
+    return planted, [listed(each) for number, each in enumerate(events) if number not in explained]
+
+
+def listed(event: dict[str, Any]) -> dict[str, Any]:
+    """An event as the results list it."""
+    return {key: value for key, value in event.items() if key != "outline"}
 
 
 def fared(touching: list[dict[str, Any]], own: Polygon, shaded_m2: float, fate: str) -> dict[str, Any]:
