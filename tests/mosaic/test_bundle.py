@@ -8,7 +8,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, rotation_from_vector
-from sorvolo.mosaic.bundle import SHARED, Nodes, Pairs, _normal_equations, linearise, rotation_vector, solve, whiten
+from sorvolo.mosaic.bundle import (
+    NO_GROUND,
+    SHARED,
+    Ground,
+    Nodes,
+    Pairs,
+    _normal_equations,
+    _Problem,
+    linearise,
+    rotation_vector,
+    solve,
+    whiten,
+)
 
 FOCAL_PX = 600.0
 HELD = np.zeros(len(SHARED))
@@ -122,9 +134,22 @@ def test_whitening_is_loose_along_the_parallax_and_tight_across_it():
     assert np.allclose(loose, 1 / np.hypot(0.3, 0.5 * np.linalg.norm(line.parallax, axis=-1)))
 
 
+def known_ground(nodes: Nodes, sigma_m: float = 0.05) -> Ground:
+    """Two points below each camera, some metres high, as it really sees them."""
+    rng = np.random.default_rng(30)
+    node = np.repeat(np.arange(len(nodes.centres_m)), 2)
+    below_m = nodes.centres_m[node, :2] + rng.uniform(-4, 4, (len(node), 2))
+    place_m = np.column_stack([below_m, rng.uniform(-2, 2, len(node))])
+    local = np.einsum("mji,mj->mi", nodes.rotations[node], place_m - nodes.centres_m[node])
+    focal_px, sigma_px = np.full(len(node), FOCAL_PX), np.full(len(node), 0.5)
+    return Ground(node, local[:, :2] / local[:, 2:], place_m, focal_px, sigma_px, np.full(len(node), sigma_m))
+
+
+@pytest.mark.parametrize("has_ground", [False, True], ids=["links", "known ground"])
 @pytest.mark.parametrize("attitude_sigma_rad", [1e6, 0.05])
-def test_the_gradient_is_that_of_the_cost(attitude_sigma_rad):
+def test_the_gradient_is_that_of_the_cost(attitude_sigma_rad, has_ground):
     nodes, pairs = staged(7, count=4, pairs_per_link=8)
+    ground = known_ground(nodes, sigma_m=0.0) if has_ground else NO_GROUND  # px of a place's sigma hang on the camera
     turned = rotation_from_vector(np.random.default_rng(8).normal(0, 2e-3, (4, 3)))
     nodes = replace(
         disturbed(nodes, 9, metres=0.02, radians=1e-3), prior_rotations=turned @ nodes.rotations,
@@ -136,9 +161,10 @@ def test_the_gradient_is_that_of_the_cost(attitude_sigma_rad):
 
     def cost(at: int, step: np.ndarray) -> float:
         changed = moved(nodes, at, step[:6]) if at < 4 else nodes
-        return _normal_equations(changed, pairs, shared + (step if at == 4 else 0.0), sigma, free, 3.0)[0]
+        return _normal_equations(problem, changed, shared + (step if at == 4 else 0.0), free)[0]
 
-    _, normal, gradient, position = _normal_equations(nodes, pairs, shared, sigma, free, 3.0)
+    problem = _Problem(pairs, ground, sigma, 3.0)
+    _, normal, gradient, position = _normal_equations(problem, nodes, shared, free)
     expected = []
     for at, length in ((1, 6), (2, 6), (3, 6), (4, 8)):
         for axis in range(length):
@@ -177,6 +203,14 @@ def test_a_perfect_problem_is_solved_exactly(seed):
     assert np.abs(solution.nodes.centres_m - nodes.centres_m).max() < 1e-6
     assert solution.cost < 1e-8
     assert np.allclose(solution.nodes.rotations @ solution.nodes.rotations.transpose(0, 2, 1), np.eye(3), atol=1e-12)
+
+
+def test_known_ground_brings_a_map_without_fixes_to_its_place():
+    nodes, pairs = staged(21, count=6)
+    free = replace(nodes, prior_sigma_m=np.full((6, 3), 1e6))
+    away = replace(disturbed(free, 22, 0.1, 0.005), centres_m=nodes.centres_m + np.array([3.0, -2.0, 1.0]))
+    solution = solve(away, pairs, HELD, HELD, np.ones(6, bool), 40, ground=known_ground(nodes))
+    assert np.abs(solution.nodes.centres_m - nodes.centres_m).max() < 1e-4
 
 
 def test_the_focal_length_is_found_where_heights_are_known():

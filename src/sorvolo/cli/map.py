@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.options import Area, AsJson, Camera, GiveUp, GroundElevation, LiveTelemetry, Offset
+from sorvolo.cli.options import Area, AsJson, Camera, GiveUp, GroundElevation, LiveTelemetry, Offset, names
 from sorvolo.cli.progress import show_progress
 from sorvolo.cli.shown import newest_version, read_json, show_notices_and_warnings, show_path
 from sorvolo.survey.wording import counted, counted_list
@@ -59,6 +59,13 @@ def map_command(
     crs: Annotated[
         str, typer.Option(help="Coordinate system of mosaic.tif, such as EPSG:25832. Without it: the UTM zone.")
     ] = "",
+    gcp: Annotated[
+        Path | None, typer.Option(help="Ground control points: a gcp_list.txt, as OpenDroneMap reads it.")
+    ] = None,
+    gcp_accuracy: Annotated[float, typer.Option(help="Accuracy of the control points, m (1 sigma).")] = 0.05,
+    check: Annotated[
+        str, typer.Option(help="Control points held back to measure the map: labels with commas; CP* for a prefix.")
+    ] = "",
     transform: Annotated[Transform, typer.Option(help="What --method thesis fits.")] = Transform.SIMILARITY,
     model: Annotated[
         str, typer.Option(help="Detector for people, cars and small objects: a model's name, a file, or none.")
@@ -75,6 +82,8 @@ def map_command(
 
     Example: sorvolo map photos/ --site field --camera phantom.xml --area field.geojson
 
+    Example: sorvolo map photos/ --site field --gcp gcp_list.txt --check CP*
+
     Example: sorvolo map rtsp://192.168.1.10/live --telemetry serial:/dev/ttyUSB0 --site field
     """
     from sorvolo.capture.live.reconnect import LiveSettings
@@ -82,10 +91,11 @@ def map_command(
 
     settings = MapSettings(
         method.value, gsd, overlap, offset, ground_elevation, crs or None, transform.value, model=model,
+        control_sigma_m=gcp_accuracy, checks=names(check),
     )
     reports = map_and_read_reports(
         inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area,
-        live=LiveSettings(keeps_all=True, give_up_s=give_up),
+        live=LiveSettings(keeps_all=True, give_up_s=give_up), control=gcp,
     )
     if as_json:
         plain = [{key: value for key, value in each.items() if key != "track"} for each in reports]
@@ -100,7 +110,7 @@ def map_command(
 def map_and_read_reports(
     inputs: Sequence[Path | str], site: Path, settings: "MapSettings", *, telemetry: Path | str | None = None,
     camera: str | None = None, area: Path | None = None,
-    live: "LiveSettings | None" = None,
+    live: "LiveSettings | None" = None, control: Path | None = None,
 ) -> list[dict[str, Any]]:
     """Map with progress on stderr; the reports of the mapped flights, in order."""
     from sorvolo.capture.live.reconnect import LiveSettings
@@ -111,7 +121,7 @@ def map_and_read_reports(
     with ended_by_signal(inputs) as until:
         mapping = map_flights(
             inputs, site, settings, telemetry=telemetry, camera=camera, area=area,
-            live=live or LiveSettings(keeps_all=True), until=until,
+            live=live or LiveSettings(keeps_all=True), until=until, control=control,
         )
         # closed even when the bar is stopped: then the site is as it was
         with closing(mapping) as updates:
@@ -187,16 +197,35 @@ def _quality_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         rows += [
             ("distance to GPS", _with_unit("{:.2f} m (median)", report["gps_residual_m"]["median"])),
             ("position accuracy", _with_unit(
-                "{:.2f} m (1 sigma, including the error shared by all GPS fixes)", report["sigma_m"]
+                f"{{:.2f}} m (1 sigma, including the error shared by all {_placed_by(report)})", report["sigma_m"]
             )),
         ]
     return [
         *rows,
+        *_control_rows(report.get("control")),
         ("map", _size(report)),
         ("objects found", _objects(report.get("objects") or {})),
         ("clock offset", _clock_offset(report["time_offset"])),
         ("took", f"{report['seconds']['total']:.1f} s, memory at most {report['peak_memory_mb']:,.0f} MB"),
     ]
+
+
+def _placed_by(report: Mapping[str, Any]) -> str:
+    return "control points" if report.get("control") else "GPS fixes"
+
+
+def _control_rows(control: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """How well the map fits its control points, those left out by name."""
+    if control is None:
+        return []
+    words = {"control": "control points", "check": "check points"}
+    rows = []
+    for role, name in words.items():
+        count = sum(each["role"] == role for each in control["points"])
+        rms_m = control[f"{role}_rms_m"]
+        rows.append((name, f"{count}, {rms_m:.3f} m off (root mean square)" if rms_m is not None else ""))
+    left_out = ", ".join(escape(each) for each in control["excluded"])
+    return [*rows, ("[red]left out[/red]", f"{left_out}: contradict the other control points" if left_out else "")]
 
 
 def _size(report: Mapping[str, Any]) -> str:

@@ -5,9 +5,8 @@ projected into the new one; the miss in pixels is the residual. Residuals are in
 the whole map would gain by shrinking to a point.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +27,6 @@ turn of the camera, about its own axes, against the attitude that telemetry stat
 
 
 _STEPS_AS_ONE = 4  # of the whole map at once, before its cameras move one by one
-
-_Scatter: TypeAlias = Callable[[Rows, Rows, Floats], None]  # rows, columns (n,); blocks (n, h, w)
-_Gather: TypeAlias = Callable[[Rows, Floats], None]  # rows (n,); blocks (n, h)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +58,35 @@ class Pairs:
     def of(self, chosen: NDArray[np.bool_]) -> "Pairs":
         """The pairs of some links only."""
         return Pairs(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """Image points whose place in the site is known, M of them: marks of control points, matches with a base map."""
+
+    node: Rows  # (M,) node index
+    ideal: Floats  # (M, 2) in focal lengths from the optical centre
+    place_m: Floats  # (M, 3)
+    focal_px: Floats  # (M,)
+    sigma_px: Floats  # (M,) of the mark
+    sigma_m: Floats  # (M,) of the place
+
+
+NO_GROUND = Ground(np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True, eq=False)
+class GroundRows:
+    """Misses (M, 2) in px, derivatives by the camera (M, 2, 6) and by focal length and distortion (M, 2, 2).
+
+    `sigma_px` (M,) holds the mark's and the place's errors together; `seen` (M,) is False behind the camera.
+    """
+
+    residual_px: Floats
+    by_camera: Floats
+    by_shared: Floats
+    sigma_px: Floats
+    seen: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +150,25 @@ def linearise(nodes: Nodes, pairs: Pairs, shared: Floats) -> Linearised:
     return Linearised(residual, by_old, by_new, by_shared, parallax, seen)
 
 
+def linearise_ground(nodes: Nodes, ground: Ground, shared: Floats) -> GroundRows:
+    """Project known places into their cameras."""
+    log_focal, radial = shared[0], shared[1]
+    rotation, offset = nodes.rotations[ground.node], ground.place_m - nodes.centres_m[ground.node]
+    local = np.einsum("mji,mj->mi", rotation, offset)
+    seen = local[:, 2] > 1e-3
+    depth = np.where(seen, local[:, 2], 1e-3)[:, None]
+    image = local[:, :2] / depth
+    focal_px = ground.focal_px[:, None] * np.exp(log_focal)
+    r2 = (ground.ideal**2).sum(-1, keepdims=True)
+    residual = focal_px * image - ground.focal_px[:, None] * ground.ideal * (1 + radial * r2)
+    across = rotation.transpose(0, 2, 1)
+    by_place = (focal_px / depth)[..., None] * (across[:, :2] - image[..., None] * across[:, 2:])
+    by_camera = np.concatenate([_times_cross(by_place, offset), -by_place], axis=-1)
+    by_shared = np.stack([focal_px * image, -ground.focal_px[:, None] * ground.ideal * r2], axis=-1)
+    sigma_px = np.hypot(ground.sigma_px, ground.sigma_m * focal_px[:, 0] / depth[:, 0])
+    return GroundRows(residual, by_camera, by_shared, sigma_px, seen)
+
+
 def whiten(line: Linearised, pairs: Pairs) -> Floats:
     """(L, K, 2, 2) matrices that turn residuals into sigmas: loose along the parallax, tight across it.
 
@@ -152,20 +196,21 @@ class Solution:
 
 def solve(
     nodes: Nodes, pairs: Pairs, shared: Floats, shared_sigma: Floats, free: NDArray[np.bool_], iterations: int,
-    robust_sigmas: float = 3.0,
+    robust_sigmas: float = 3.0, ground: Ground = NO_GROUND,
 ) -> Solution:
     """Levenberg-Marquardt with a Cauchy loss over the free nodes, (N,) bool, and the shared unknowns.
 
     `shared_sigma` (8,) is each shared unknown's prior sigma about 0; 0 holds it at its present value.
     """
     damping = 1e-6
+    problem = _Problem(pairs, ground, shared_sigma, robust_sigmas)
     if iterations and free.sum() > 2 and np.array_equal(free, nodes.own):
-        nodes, shared = _moved_as_one(nodes, pairs, shared, shared_sigma, robust_sigmas)
-    cost, normal, gradient, position = _normal_equations(nodes, pairs, shared, shared_sigma, free, robust_sigmas)
+        nodes, shared = _moved_as_one(problem, nodes, shared)
+    cost, normal, gradient, position = _normal_equations(problem, nodes, shared, free)
     for _ in range(iterations):
         step = _damped_step(normal, gradient, damping)
         moved, moved_shared = _advance(nodes, shared, step, position)
-        trial = _normal_equations(moved, pairs, moved_shared, shared_sigma, free, robust_sigmas)
+        trial = _normal_equations(problem, moved, moved_shared, free)
         if trial[0] > cost * (1 + 1e-9) or not np.isfinite(trial[0]):
             damping = max(damping * 30, 1e-4)
             if damping > 1e3:
@@ -180,22 +225,30 @@ def solve(
     return Solution(nodes, shared, cost, normal, position)
 
 
-def _moved_as_one(
-    nodes: Nodes, pairs: Pairs, shared: Floats, shared_sigma: Floats, robust_sigmas: float
-) -> tuple[Nodes, Floats]:
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What stays the same during a solve."""
+
+    pairs: Pairs
+    ground: Ground
+    shared_sigma: Floats  # (8,)
+    robust_sigmas: float
+
+
+def _moved_as_one(problem: _Problem, nodes: Nodes, shared: Floats) -> tuple[Nodes, Floats]:
     """All own cameras shifted, turned about the vertical and scaled as one, and the shared unknowns, to the least cost.
 
     Links hardly notice such a motion, so telemetry alone decides it. Camera by camera it is a long way: straight steps
     along a turn stretch the map, and Levenberg-Marquardt allows only short ones. Here the turn is exact.
     """
-    state = _normal_equations(nodes, pairs, shared, shared_sigma, nodes.own, robust_sigmas)
+    state = _normal_equations(problem, nodes, shared, nodes.own)
     for _ in range(_STEPS_AS_ONE):
         cost, normal, gradient, _ = state
         middle_m = nodes.centres_m[nodes.own].mean(axis=0) * [1, 1, 0]
         basis = _common_motions(nodes.centres_m[nodes.own] - middle_m)
         step = np.linalg.lstsq(basis.T @ (normal @ basis), basis.T @ gradient, rcond=None)[0]
         trial_nodes, trial_shared = _move_as_one(nodes, middle_m, step[:4]), shared + step[4:]
-        trial = _normal_equations(trial_nodes, pairs, trial_shared, shared_sigma, nodes.own, robust_sigmas)
+        trial = _normal_equations(problem, trial_nodes, trial_shared, nodes.own)
         if not trial[0] < cost * (1 - 1e-4):
             break
         nodes, shared, state = trial_nodes, trial_shared, trial
@@ -227,78 +280,115 @@ def _move_as_one(nodes: Nodes, middle_m: Floats, step: Floats) -> Nodes:
     return replace(nodes, rotations=rotations, centres_m=centres_m)
 
 
-def _normal_equations(
-    nodes: Nodes, pairs: Pairs, shared: Floats, shared_sigma: Floats, free: NDArray[np.bool_], robust_sigmas: float
-) -> tuple[float, csc_matrix, Floats, Rows]:
-    position = np.full(len(free), -1)
-    position[free] = np.arange(int(free.sum()))
-    count = 6 * int(free.sum())
-    size = count + len(SHARED)
-    gradient = np.zeros(size)
-    rows, columns, values = [], [], []
-    cost = 0.0
+class _Assembly:
+    """The normal equations while terms are added: blocks of the matrix, the gradient, the cost."""
 
-    def scatter(row_start: Rows, column_start: Rows, blocks: Floats) -> None:
+    def __init__(self, cameras: int) -> None:
+        self.shared_at = 6 * cameras
+        self.cost = 0.0
+        self.gradient = np.zeros(self.shared_at + len(SHARED))
+        self._rows: list[Rows] = []
+        self._columns: list[Rows] = []
+        self._values: list[Floats] = []
+
+    def scatter(self, row_start: Rows, column_start: Rows, blocks: Floats) -> None:
+        """Add blocks (n, h, w) at rows and columns (n,); those at a negative place belong to held unknowns."""
         keep = (row_start >= 0) & (column_start >= 0)
         height, width = blocks.shape[1:]
         r = row_start[keep, None, None] + np.arange(height)[None, :, None]
         c = column_start[keep, None, None] + np.arange(width)[None, None, :]
-        rows.append(np.broadcast_to(r, (len(r), height, width)).ravel())
-        columns.append(np.broadcast_to(c, (len(c), height, width)).ravel())
-        values.append(blocks[keep].ravel())
+        self._rows.append(np.broadcast_to(r, (len(r), height, width)).ravel())
+        self._columns.append(np.broadcast_to(c, (len(c), height, width)).ravel())
+        self._values.append(blocks[keep].ravel())
 
-    def gather(start: Rows, blocks: Floats) -> None:
+    def gather(self, start: Rows, blocks: Floats) -> None:
+        """Add blocks (n, h) to the gradient at rows (n,)."""
         keep = start >= 0
-        np.add.at(gradient, start[keep, None] + np.arange(blocks.shape[1]), blocks[keep])
+        np.add.at(self.gradient, start[keep, None] + np.arange(blocks.shape[1]), blocks[keep])
 
-    if len(pairs.old):
-        line = linearise(nodes, pairs, shared)
-        white = whiten(line, pairs)
-        residual = np.einsum("lkij,lkj->lki", white, line.residual_px)
-        weight = pairs.weight * line.seen
-        squared = (residual**2).sum(-1) / robust_sigmas**2
-        cost += float((weight * np.log1p(squared)).sum()) * robust_sigmas**2
-        root = np.sqrt(weight / (1 + squared))[..., None]
-        residual = (residual * root).reshape(len(pairs.old), -1)
-        jacobian = np.concatenate([line.by_old, line.by_new, line.by_shared], axis=-1)
-        jacobian = (white @ jacobian * root[..., None]).reshape(len(pairs.old), residual.shape[1], -1)
+    def add(self, jacobian: Floats, residual: Floats, places: Sequence[tuple[Rows, slice]]) -> None:
+        """Add whitened, weighted rows: `jacobian` (n, r, w), `residual` (n, r); `places` says where columns belong."""
         information = jacobian.transpose(0, 2, 1) @ jacobian
-        pull = -np.einsum("lri,lr->li", jacobian, residual)
-        old_at, new_at = _start(position[pairs.old]), _start(position[pairs.new])
-        shared_at = np.full(len(old_at), count)
-        places = ((old_at, slice(0, 6)), (new_at, slice(6, 12)), (shared_at, slice(12, 14)))
+        pull = -np.einsum("nri,nr->ni", jacobian, residual)
         for start_a, a in places:
-            gather(start_a, pull[:, a])
+            self.gather(start_a, pull[:, a])
             for start_b, b in places:
-                scatter(start_a, start_b, information[:, a, b])
+                self.scatter(start_a, start_b, information[:, a, b])
 
-    cost += _add_priors(nodes, shared, position, count, scatter, gather, robust_sigmas)
+    def matrix(self) -> csc_matrix:
+        """The information matrix so far."""
+        size = len(self.gradient)
+        places = np.concatenate(self._rows), np.concatenate(self._columns)
+        return coo_matrix((np.concatenate(self._values), places), shape=(size, size)).tocsc()
 
+
+def _normal_equations(
+    problem: _Problem, nodes: Nodes, shared: Floats, free: NDArray[np.bool_]
+) -> tuple[float, csc_matrix, Floats, Rows]:
+    position = np.full(len(free), -1)
+    position[free] = np.arange(int(free.sum()))
+    into = _Assembly(int(free.sum()))
+    if len(problem.pairs.old):
+        _add_links(into, nodes, problem.pairs, shared, position, problem.robust_sigmas)
+    if len(problem.ground.node):
+        _add_ground(into, nodes, problem.ground, shared, position, problem.robust_sigmas)
+    _add_telemetry(into, nodes, shared, position, problem.robust_sigmas)
+    _add_shared_priors(into, shared, problem.shared_sigma)
+    return into.cost, into.matrix(), into.gradient, position
+
+
+def _add_links(
+    into: _Assembly, nodes: Nodes, pairs: Pairs, shared: Floats, position: Rows, robust: float
+) -> None:
+    line = linearise(nodes, pairs, shared)
+    white = whiten(line, pairs)
+    residual = np.einsum("lkij,lkj->lki", white, line.residual_px)
+    weight = pairs.weight * line.seen
+    squared = (residual**2).sum(-1) / robust**2
+    into.cost += float((weight * np.log1p(squared)).sum()) * robust**2
+    root = np.sqrt(weight / (1 + squared))[..., None]
+    residual = (residual * root).reshape(len(pairs.old), -1)
+    jacobian = np.concatenate([line.by_old, line.by_new, line.by_shared], axis=-1)
+    jacobian = (white @ jacobian * root[..., None]).reshape(len(pairs.old), residual.shape[1], -1)
+    old_at, new_at = _start(position[pairs.old]), _start(position[pairs.new])
+    shared_at = np.full(len(old_at), into.shared_at)
+    into.add(jacobian, residual, ((old_at, slice(0, 6)), (new_at, slice(6, 12)), (shared_at, slice(12, 14))))
+
+
+def _add_ground(
+    into: _Assembly, nodes: Nodes, ground: Ground, shared: Floats, position: Rows, robust: float
+) -> None:
+    rows = linearise_ground(nodes, ground, shared)
+    residual = rows.residual_px / rows.sigma_px[:, None]
+    squared = (residual**2).sum(-1) / robust**2
+    into.cost += float((rows.seen * np.log1p(squared)).sum()) * robust**2
+    root = np.sqrt(rows.seen / (1 + squared))[:, None]
+    jacobian = np.concatenate([rows.by_camera, rows.by_shared], axis=-1) / rows.sigma_px[:, None, None]
+    camera_at = _start(position[ground.node])
+    shared_at = np.full(len(camera_at), into.shared_at)
+    into.add(jacobian * root[..., None], residual * root, ((camera_at, slice(0, 6)), (shared_at, slice(6, 8))))
+
+
+def _add_shared_priors(into: _Assembly, shared: Floats, shared_sigma: Floats) -> None:
     held = shared_sigma <= 0
     prior = np.where(held, 1e12, 1 / np.maximum(shared_sigma, 1e-12) ** 2)
-    at = np.array([count])
-    scatter(at, at, np.diag(prior)[None])
-    gradient[count:] -= np.where(held, 0.0, prior * shared)
-    gradient[count:][held] = 0.0
-    cost += float(np.where(held, 0.0, prior * shared**2).sum())
-    normal = coo_matrix(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(size, size)
-    ).tocsc()
-    return cost, normal, gradient, position
+    at = np.array([into.shared_at])
+    into.scatter(at, at, np.diag(prior)[None])
+    into.gradient[into.shared_at:] -= np.where(held, 0.0, prior * shared)
+    into.gradient[into.shared_at:][held] = 0.0
+    into.cost += float(np.where(held, 0.0, prior * shared**2).sum())
 
 
-def _add_priors(
-    nodes: Nodes, shared: Floats, position: Rows, count: int, scatter: _Scatter, gather: _Gather, robust: float
-) -> float:
+def _add_telemetry(into: _Assembly, nodes: Nodes, shared: Floats, position: Rows, robust: float) -> None:
     index = np.flatnonzero(position >= 0)
     start = 6 * position[index]
-    shared_start = np.full(len(index), count)
+    shared_start = np.full(len(index), into.shared_at)
     # place: GPS belongs to the camera, up to the offsets that the flight shares
     root = 1 / nodes.prior_sigma_m[index]
     miss = nodes.centres_m[index] + shared[[3, 4, 2]] - nodes.prior_centres_m[index]
     white = miss * root
     squared = np.column_stack([(white[:, :2] ** 2).sum(1), (white[:, :2] ** 2).sum(1), white[:, 2] ** 2]) / robust**2
-    cost = float((np.log1p(squared[:, 1]) + np.log1p(squared[:, 2])).sum()) * robust**2
+    into.cost += float((np.log1p(squared[:, 1]) + np.log1p(squared[:, 2])).sum()) * robust**2
     information = root**2 / (1 + squared)
     blocks = np.zeros((len(index), 6, 6))
     blocks[:, [3, 4, 5], [3, 4, 5]] = information
@@ -307,7 +397,7 @@ def _add_priors(
     own = np.zeros((len(index), 8, 8))
     own[:, [3, 4, 2], [3, 4, 2]] = information
     pull = -information * miss
-    gather(start, np.concatenate([np.zeros_like(pull), pull], axis=1))
+    into.gather(start, np.concatenate([np.zeros_like(pull), pull], axis=1))
     shared_pull = np.zeros((len(index), 8))
     shared_pull[:, [3, 4, 2]] = pull
     # attitude, about the camera's own axes
@@ -316,20 +406,19 @@ def _add_priors(
     error = rotation_vector(relative) - shared[5:]
     root = 1 / nodes.prior_sigma_rad[index]
     squared = (error * root) ** 2 / robust**2
-    cost += float(np.log1p(squared).sum()) * robust**2
+    into.cost += float(np.log1p(squared).sum()) * robust**2
     information = root**2 / (1 + squared)
     blocks[:, :3, :3] = (rotation * information[:, None, :]) @ rotation.transpose(0, 2, 1)
     turn_pull = -np.einsum("nij,nj->ni", rotation, information * error)
-    gather(start, np.concatenate([turn_pull, np.zeros_like(turn_pull)], axis=1))
+    into.gather(start, np.concatenate([turn_pull, np.zeros_like(turn_pull)], axis=1))
     coupling[:, :3, 5:] = -rotation * information[:, None, :]
     own[:, [5, 6, 7], [5, 6, 7]] = information
     shared_pull[:, 5:] = information * error
-    gather(shared_start, shared_pull)
-    scatter(start, shared_start, coupling)
-    scatter(shared_start, start, coupling.transpose(0, 2, 1))
-    scatter(shared_start, shared_start, own)
-    scatter(start, start, blocks)
-    return cost
+    into.gather(shared_start, shared_pull)
+    into.scatter(start, shared_start, coupling)
+    into.scatter(shared_start, start, coupling.transpose(0, 2, 1))
+    into.scatter(shared_start, shared_start, own)
+    into.scatter(start, start, blocks)
 
 
 def _damped_step(normal: csc_matrix, gradient: Floats, damping: float) -> Floats:

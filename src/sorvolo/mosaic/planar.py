@@ -12,6 +12,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
 from sorvolo.mosaic.exposure import ColourPairs, Exposure, solve_exposure, tie_colours
+from sorvolo.mosaic.ground_ties import GroundTies
 from sorvolo.mosaic.pose_graph import GraphReport, PoseGraph, PoseGraphSettings, pose_from_link
 from sorvolo.registration.features import gray_from_rgb, normalise_contrast, orb_features
 from sorvolo.registration.link import Effort, LinkCache, LinkPrediction, LinkSettings, link
@@ -122,6 +123,18 @@ class PlanarMapper:
     def retime(self, priors: Mapping[int, CameraPrior]) -> frozenset[int]:
         """Take the telemetry of another clock offset; the keyframes that moved."""
         return self._graph.retime({each: prior for each, prior in priors.items() if each in self._graph})
+
+    def tie_to_ground(self, ties: GroundTies, *, is_datum: bool) -> frozenset[int]:
+        """See `PoseGraph.tie_to_ground`; the keyframes that moved."""
+        return self._graph.tie_to_ground(ties, is_datum=is_datum)
+
+    def ground_places_m(self, ties: GroundTies) -> PointsM:
+        """See `PoseGraph.ground_places_m`."""
+        return self._graph.ground_places_m(ties)
+
+    def registration_scale(self, keyframe_id: int, full: Camera) -> float:
+        """Pixels at which a keyframe was registered in one of its full size."""
+        return self._keyframes[keyframe_id].camera.width_px / full.width_px
 
     def pose(self, keyframe_id: int) -> Pose:
         """site_from_camera as it stands."""

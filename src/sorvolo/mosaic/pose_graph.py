@@ -1,20 +1,36 @@
 """The pose graph: keyframes come in one at a time with their links, and the ones that moved come out."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
-from sorvolo.geometry.arrays import Floats, PointsM, Rows
+from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Rows
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.homography import fit_similarity, pose_from_homography, site_from_image_homography
+from sorvolo.geometry.homography import (
+    apply_homography,
+    fit_similarity,
+    pose_from_homography,
+    site_from_image_homography,
+)
 from sorvolo.geometry.level_ground import footprint
-from sorvolo.geometry.pose import Pose
-from sorvolo.mosaic.bundle import SHARED, Nodes, Solution, linearise, rotation_vector, solve
+from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
+from sorvolo.mosaic.bundle import (
+    NO_GROUND,
+    SHARED,
+    Ground,
+    Nodes,
+    Solution,
+    linearise,
+    linearise_ground,
+    rotation_vector,
+    solve,
+)
 from sorvolo.mosaic.graph_rows import LinkRows, NodeRows
+from sorvolo.mosaic.ground_ties import GroundTies, similarity_of_most
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
 
@@ -116,6 +132,7 @@ class PoseGraph:
         self._solved_at = 0
         self._trust = _Trust()
         self._as_reported = np.zeros(len(SHARED), bool)
+        self._ground = NO_GROUND
 
     def __contains__(self, keyframe_id: int) -> bool:
         return keyframe_id in self._ids
@@ -209,6 +226,31 @@ class PoseGraph:
             self._rows.set_prior(self._ids[keyframe_id], prior)
         return self.conclude()
 
+    def tie_to_ground(self, ties: GroundTies, *, is_datum: bool) -> frozenset[int]:
+        """Take these ties to known ground in place of earlier ones, bring the map there, and solve it anew.
+
+        `is_datum`: nothing but them knows where the map lies; of telemetry only that cameras look down stays.
+        """
+        node = np.array([self._ids[each] for each in ties.keyframe_ids], int)
+        focal_px = np.array([self._nodes[at].camera.fx_px for at in node])
+        self._ground = Ground(
+            node, ties.ideal, ties.place_m, focal_px, np.maximum(ties.sigma_px, self._settings.sigma_px), ties.sigma_m
+        )
+        self._align()
+        if is_datum:
+            self._forget_places()
+        return self.conclude()
+
+    def ground_places_m(self, ties: GroundTies) -> PointsM:
+        """(M, 2) where the map has the tied points: their rays cut at the height of their known places."""
+        node = np.array([self._ids[each] for each in ties.keyframe_ids], int)
+        ideal = ties.ideal * (1 + self.radial * (ties.ideal**2).sum(1, keepdims=True)) / self.focal_scale
+        rays = np.column_stack([ideal, np.ones(len(ideal))])
+        turned = np.einsum("mij,mj->mi", self._rows.rotations[node], rays)
+        centres_m = self._rows.centres_m[node]
+        reach = (ties.place_m[:, 2] - centres_m[:, 2]) / np.minimum(turned[:, 2], -1e-3)
+        return centres_m[:, :2] + reach[:, None] * turned[:, :2]
+
     def conclude(self) -> frozenset[int]:
         """The flight is over: settle with every offset free, judge which are real, and settle again."""
         self._as_reported[:] = False
@@ -274,8 +316,11 @@ class PoseGraph:
         """What all fixes of the flight err in common, per axis, m; 0 without fixes.
 
         A receiver's errors repeat for minutes, so a map made from a hundred fixes is hardly better placed than one
-        fix: seven tenths of a fix's sigma, or of the scatter that the pictures found if that is larger.
+        fix: seven tenths of a fix's sigma, or of the scatter that the pictures found if that is larger. Of known ground
+        it is that of the mean of all places.
         """
+        if len(self._ground.node):
+            return float(1 / np.sqrt((self._ground.sigma_m**-2.0).sum()))
         stated_m = self._rows.stated_sigma_m[self._own(), 0]
         stated_m = stated_m[np.isfinite(stated_m)]
         fixes = self._own().any() and len(stated_m) >= 2
@@ -315,11 +360,21 @@ class PoseGraph:
         if len(pairs.old):
             pairs = pairs.of(free[pairs.old] | free[pairs.new])
         sigma = self._shared_sigma() if shared else np.zeros(len(SHARED))
-        solution = solve(self._state(), pairs, self._shared, sigma, free, iterations)
+        solution = solve(self._state(), pairs, self._shared, sigma, free, iterations, ground=self._weighed_ground())
         if iterations:
             self._rows.rotations[:], self._rows.centres_m[:] = solution.nodes.rotations, solution.nodes.centres_m
             self._shared = solution.shared
         return solution
+
+    def _weighed_ground(self) -> Ground:
+        """The ties to known ground, their sigmas as large as most of them miss by now: else none would pull."""
+        ground = self._ground
+        if not len(ground.node):
+            return ground
+        rows = linearise_ground(self._state(), ground, self._shared)
+        miss = np.linalg.norm(rows.residual_px, axis=1) / rows.sigma_px
+        factor = float(np.clip(np.median(miss[rows.seen]), 1.0, 1e4)) if rows.seen.any() else 1.0
+        return replace(ground, sigma_px=ground.sigma_px * factor, sigma_m=ground.sigma_m * factor)
 
     def _shared_sigma(self) -> Floats:
         """(8,) prior sigma of each shared unknown; those taken as reported are held close to zero."""
@@ -362,7 +417,14 @@ class PoseGraph:
         return grown >= max(4, len(self._nodes) // 6)
 
     def _align(self) -> None:
-        """Bring the whole map to its GPS fixes by a similarity where it is far off: the solve only bends a little."""
+        """Bring the whole map to known ground, else to its GPS fixes, by a similarity where it is far off: the solve
+        only bends a little."""
+        if not len(self._ground.node):
+            self._align_to_fixes()
+        elif self._own().all():
+            self._align_to_ground()
+
+    def _align_to_fixes(self) -> None:
         own = self._own()
         sigma = self._rows.stated_sigma_m[:, :2].max(axis=1)
         usable = own & np.isfinite(sigma)
@@ -385,6 +447,38 @@ class PoseGraph:
         turn = float(np.arctan2(change[1, 0], change[0, 0]))
         if abs(np.log(scale)) < max(3 * uncertainty, 0.02) and abs(turn) < max(3 * uncertainty, 0.03):
             return
+        self._move_all(change)
+
+    def _align_to_ground(self) -> None:
+        """Bring the whole map to known ground by a similarity of where it has the tied points, wild ones left out."""
+        names = np.array(self._names)[self._ground.node]
+        ties = GroundTies(names, self._ground.ideal, self._ground.place_m, self._ground.sigma_px, self._ground.sigma_m)
+        places_m = self.ground_places_m(ties)
+        known = np.isfinite(places_m).all(axis=1)
+        change = similarity_of_most(ties.place_m[known, :2], places_m[known])
+        if change is None:
+            return
+        before = np.median(np.linalg.norm(places_m[known] - ties.place_m[known, :2], axis=1))
+        moved = apply_homography(change, places_m[known])
+        after = np.median(np.linalg.norm(moved - ties.place_m[known, :2], axis=1))
+        if before > 3 * after:  # else the solve, which knows more than a similarity, has it
+            self._move_all(change)
+
+    def _forget_places(self) -> None:
+        """Take the flight's own frame out of its telemetry: looking down, with the heading that the map has."""
+        forward = -self._rows.rotations[:, :2, 1]
+        for at in np.flatnonzero(self._own()).tolist():
+            yaw_deg = float(np.degrees(np.arctan2(forward[at, 0], forward[at, 1])))
+            sigma_deg = np.array([*np.degrees(self._rows.stated_sigma_rad[at, :2]), np.inf])
+            down = site_from_gimbal_rotation(yaw_deg, -90.0, 0.0)
+            self._rows.set_prior(
+                at, CameraPrior(self._rows.centres_m[at].copy(), np.full(3, np.inf), down, sigma_deg)
+            )
+
+    def _move_all(self, change: Matrix3) -> None:
+        """Shift, turn and scale the whole map by a similarity of the ground."""
+        scale = float(np.hypot(change[0, 0], change[1, 0]))
+        turn = float(np.arctan2(change[1, 0], change[0, 0]))
         matrix = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]])
         centres_m = self._rows.centres_m
         self._rows.rotations[:] = matrix @ self._rows.rotations

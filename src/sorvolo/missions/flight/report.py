@@ -20,7 +20,9 @@ from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.flight.warnings import flight_warnings
 from sorvolo.mosaic.flight_figures import FlightFigures, flight_figures, shown_m2, track_row
 from sorvolo.mosaic.pose_graph import GraphReport
+from sorvolo.store.exports.control_files import control_summary
 from sorvolo.store.exports.plain import utc_text
+from sorvolo.survey.control import ControlReport
 from sorvolo.survey.flight import CameraModel, Notice, Site
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
@@ -38,6 +40,7 @@ class FlightResult:
     graph: GraphReport | None = None
     colour_spread: float = float("nan")
     makes_map: bool = True  # else it was compared with one
+    control: ControlReport | None = None
 
 
 def build_report(
@@ -64,6 +67,7 @@ def build_report(
         "telemetry": _telemetry(setup),
         "time_offset": _offset(settings, log, result.offset),
         **_figures(figures),
+        "control": control_summary(result.control) if result.control else None,
         "relief_m": graph.relief_m if graph else None,
         "altitude_offset_m": graph.altitude_offset_m if graph else None,
         "links": {"kept": graph.links, "dropped_as_false": graph.links_dropped} if graph else None,

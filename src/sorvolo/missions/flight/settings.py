@@ -29,8 +29,14 @@ class MapSettings:
     transform: Literal["similarity", "homography"] = "similarity"  # of method thesis (its Figure 3.12)
     live_s: float = 3.0  # how often the growing map is made visible
     model: str = "default"  # that looks for objects: an installed one's name, a file, or "none"
+    control_sigma_m: float = 0.05  # of the control points' places, horizontal
+    checks: tuple[str, ...] = ()  # control points held back to measure the map; "NAME*" for all that begin so
 
     def __post_init__(self) -> None:
+        if not 1e-4 <= self.control_sigma_m <= 100:
+            raise SettingsError(
+                f"the control points' accuracy (--gcp-accuracy) must lie in 0.0001 to 100 m, got {self.control_sigma_m}"
+            )
         if self.method not in ("planar", "thesis"):
             raise SettingsError(f"method must be planar or thesis, got {self.method!r}")
         if self.m_per_px is not None and not 1e-4 <= self.m_per_px <= 100:

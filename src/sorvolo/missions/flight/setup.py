@@ -1,7 +1,7 @@
 """Before the first frame: clocks tied, telemetry in the site frame, the site itself, what can be known beforehand."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sorvolo.capture.flight_telemetry import FlightTelemetry, TelemetryWishes, distance_m, duration_s, local_prior
@@ -10,6 +10,7 @@ from sorvolo.capture.sync import DATED_NS, Clock, Track, site_origin
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame, utm_epsg
+from sorvolo.missions.flight.control import FlightControl
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.mosaic.selection import FramePlan, live_plan, untimed_plan, video_plan
 from sorvolo.store.site.archive import Archive
@@ -30,6 +31,12 @@ class FlightSetup:
     site: Site | None
     notices: tuple[Notice, ...]
     telemetry: FlightTelemetry | None = None
+    control: FlightControl | None = None
+
+    @property
+    def is_placed_late(self) -> bool:
+        """Whether the flight has no GPS, and finds its place on Earth, its scale and north once all of it is seen."""
+        return self.control is not None and self.control.is_datum
 
     @property
     def track(self) -> Track | None:
@@ -78,12 +85,13 @@ class FlightSetup:
 
 def prepare(
     source: Source, settings: MapSettings, site: Site | None, *, telemetry_named: bool, finds_itself: bool = False,
-    ground_m: PointsM | None = None,
+    ground_m: PointsM | None = None, control: FlightControl | None = None,
 ) -> FlightSetup:
     """Tie clocks, lay the flight into the site frame and foresee its keyframes.
 
     `ground_m` (N, 2) are places all over the ground that the site shows, see `known_ground_m`. `finds_itself`: the
-    flight's frames are looked for in the site's map, so that they need no GPS. Raises InputError when the flight is of
+    flight's frames are looked for in the site's map, so that they need no GPS. `control` are its control points, which
+    place a flight without GPS. Raises InputError when the flight is of
     another place than the site, or the telemetry of another flight.
     """
     if isinstance(source, LiveSource):
@@ -91,13 +99,47 @@ def prepare(
     if finds_itself and site is not None and (site.is_local or not source.telemetry.has_fixes):
         return _found_by_pictures(source, site)
     if not source.telemetry.has_fixes:
-        return _without_gps(source, settings, site, telemetry_named)
+        return _without_gps(source, settings, site, telemetry_named, control)
     if site is not None and site.is_local:
         raise InputError(
             f"the site {site.name} has no geo-reference, but the flight {source.name} has GPS: map it into a new site "
             "folder"
         )
-    return _with_gps(source, settings, site, telemetry_named, ground_m)
+    setup = _with_gps(source, settings, site, telemetry_named, ground_m)
+    return setup if control is None else _with_control(setup, control)
+
+
+def _with_control(setup: FlightSetup, control: FlightControl) -> FlightSetup:
+    """A flight with GPS and control points that lie on it."""
+    assert setup.track is not None
+    track, frame = setup.track, setup.frame
+    control.check_place(lambda each: distance_m(track, frame.ground_from_lonlat(
+        [(point.longitude_deg, point.latitude_deg) for point in each.points]
+    )))
+    return replace(setup, control=control, notices=(*setup.notices, *control.notices))
+
+
+def _by_control(source: Source, settings: MapSettings, site: Site | None, control: FlightControl) -> FlightSetup:
+    """A first flight that has no GPS and is placed by its control points."""
+    if site is not None:
+        raise InputError(
+            f"the flight {source.name} has no GPS, and control points alone cannot join it to a map that exists: map "
+            "it into a site folder of its own"
+        )
+    if settings.offset_s is not None:
+        raise SettingsError("--offset was given, but the flight has no telemetry with fixes")
+    name = control.file.path.name
+    notice = Notice("no_telemetry", 1, f"no GPS: control points alone give the map its place, scale and north ({name})")
+    plan = _untimed(source)
+    return FlightSetup(
+        source, LocalFrame(control.control.middle), plan, None, (notice, *control.notices), control=control
+    )
+
+
+def _untimed(source: Source) -> FramePlan:
+    is_video = source.kind == "video"
+    expected = max(2, round(duration_s(source))) if is_video else source.frame_count
+    return untimed_plan(is_video=is_video, expected=expected)
 
 
 def _found_by_pictures(source: Source, site: Site) -> FlightSetup:
@@ -108,8 +150,12 @@ def _found_by_pictures(source: Source, site: Site) -> FlightSetup:
     return FlightSetup(source, site.frame, plan, site, (notice,))
 
 
-def _without_gps(source: Source, settings: MapSettings, site: Site | None, telemetry_named: bool) -> FlightSetup:
-    """A first flight in a frame of its own."""
+def _without_gps(
+    source: Source, settings: MapSettings, site: Site | None, telemetry_named: bool, control: FlightControl | None
+) -> FlightSetup:
+    """A first flight in a frame of its own, or in that of its control points."""
+    if control is not None:
+        return _by_control(source, settings, site, control)
     if site is not None and not site.is_local:
         raise InputError(
             f"the site is geo-referenced, but the flight {source.name} has no GPS: give --telemetry, or map it "
@@ -125,11 +171,8 @@ def _without_gps(source: Source, settings: MapSettings, site: Site | None, telem
     lack = "telemetry without a single fix" if len(source.telemetry) else "no telemetry"
     lack += " in time" if isinstance(source, LiveSource) and telemetry_named else ""
     text = f"{lack}: the map is in a local frame of its own, without metres and north"
-    is_video = source.kind == "video"
-    expected = max(2, round(duration_s(source))) if is_video else source.frame_count
     return FlightSetup(
-        source, LocalFrame(Geodetic(0.0, 0.0)), untimed_plan(is_video=is_video, expected=expected), site,
-        (Notice("no_telemetry", 1, text),),
+        source, LocalFrame(Geodetic(0.0, 0.0)), _untimed(source), site, (Notice("no_telemetry", 1, text),)
     )
 
 
@@ -180,6 +223,9 @@ def new_site(setup: FlightSetup, name: str, m_per_px: float, ground_up_m: float)
 
     `ground_up_m` is the ground's height where telemetry's own zero is (0 where it takes the ground for that).
     """
+    if setup.is_placed_late:
+        place = setup.frame.origin
+        return Site(name, place, f"EPSG:{utm_epsg(place.latitude_deg, place.longitude_deg)}", m_per_px)
     if setup.telemetry is None:
         return Site(name, Geodetic(0.0, 0.0), "", m_per_px, is_local=True)
     ground_m, reference = setup.telemetry.ground_height(ground_up_m)

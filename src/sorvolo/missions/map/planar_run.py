@@ -21,9 +21,12 @@ from sorvolo.mosaic.placing import map_m_per_px, sees_horizon
 from sorvolo.mosaic.planar import PlanarMapper
 from sorvolo.mosaic.pose_graph import PoseGraphSettings
 from sorvolo.registration.lens import Undistorter, refined_camera
+from sorvolo.store.exports.control_files import control_documents
 from sorvolo.store.exports.map_pictures import picture
+from sorvolo.store.images import image_from_jpeg, jpeg_from_image
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
+from sorvolo.survey.control import ControlReport
 from sorvolo.survey.flight import Notice, PosedFrame
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
@@ -46,13 +49,16 @@ class PlanarRun(FlightRun):
         self._known = KnownKeyframes.of(archive, setup.source.name)
         offset_sigma_m = None if setup.track is None else setup.track.altitude_offset_sigma_m
         self._mapper = PlanarMapper(
-            PoseGraphSettings.of_flight(model.focal_sigma, offset_sigma_m, joins_map=self._known.count > 0),
+            PoseGraphSettings.of_flight(
+                model.focal_sigma, offset_sigma_m, joins_map=self._known.count > 0 or setup.control is not None
+            ),
             known=self._known.for_graph(),
         )
         self._frames: dict[int, PosedFrame] = {}
-        self._held: dict[int, ImageRGB] = {}
+        self._held: dict[int, ImageRGB | bytes] = {}  # JPEG where all of the flight waits for its place
         self._painter: FlightPainter | None = None
         self._offset: OffsetEstimate | None = None
+        self._control: ControlReport | None = None
 
     @property
     def images(self) -> Mapping[int, str]:
@@ -100,6 +106,7 @@ class PlanarRun(FlightRun):
             with self._log.stage(Stage.REGISTER):
                 self._mapper.settle()
                 self._offset = self._find_offset()
+                self._tie_to_ground()
             self._started_painter().finish()
         return self._placed()
 
@@ -114,7 +121,7 @@ class PlanarRun(FlightRun):
             shown = picture(writer.tiles, 1600).rgba
         result = FlightResult(
             placed, self._refined(self._setup.source.camera.camera), self._offset, self._mapper.report(),
-            self._exposure.spread,
+            self._exposure.spread, control=self._control,
         )
         report = build_report(
             self._setup, self._settings, self._log, result, self._archive.site(), writer.tiles,
@@ -122,7 +129,10 @@ class PlanarRun(FlightRun):
         )
         report["objects"] = self._search_summary(search)
         page = report_page(report, shown, crops_of(search), self._archive.site())
-        writer.commit(placed, self.images, report, page, crs=self._settings.crs, search=search)
+        documents = {} if self._control is None else control_documents(self._control)
+        writer.commit(
+            placed, self.images, report, page, crs=self._settings.crs, search=search, documents=documents
+        )
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
@@ -136,6 +146,9 @@ class PlanarRun(FlightRun):
     def _keep(self, keyframe_id: int, image: ImageRGB) -> None:
         if self._painter is not None:
             self._painter.save(keyframe_id, image)
+            return
+        if self._setup.is_placed_late:
+            self._held[keyframe_id] = jpeg_from_image(image)
             return
         self._held[keyframe_id] = image
         telemetry = self._setup.telemetry
@@ -151,20 +164,28 @@ class PlanarRun(FlightRun):
                 writer, self._archive, self._mapper, self._lens, self._known, self._native_m_per_px(), self._log,
                 self._settings.live_s,
             )
-            for keyframe_id, image in self._held.items():
+            for keyframe_id, held in self._held.items():
+                image = image_from_jpeg(held, "") if isinstance(held, bytes) else held
                 self._painter.save(keyframe_id, image)
             self._painter.mark(self._frames.keys())
             self._held.clear()
         return self._painter
 
     def _native_m_per_px(self) -> float:
-        if self._setup.track is None:
+        if self._setup.track is None and not self._setup.is_placed_late:
             return _LOCAL_M_PER_PX
         heights = [float(self._mapper.pose(each).translation_m[2]) for each in self._mapper.placed()]
         return map_m_per_px(heights, self._refined(self._lens.camera).fx_px)
 
     def _refined(self, camera: Camera) -> Camera:
         return refined_camera(camera, self._mapper.focal_scale, self._mapper.radial)
+
+    def _tie_to_ground(self) -> None:
+        """Bring the map to its control points, where it has any."""
+        control = self._setup.control
+        if control is not None:
+            keyframe_of = {self._frames[each].frame.name: each for each in self._mapper.placed()}
+            self._control = control.tie(self._mapper, keyframe_of, self._setup.frame)
 
     def _find_offset(self) -> OffsetEstimate | None:
         """The clock offset that motion shows, applied when it is well seen and none was given."""

@@ -35,6 +35,10 @@ _STATUS_WORDS = {
     Status.GPS_ONLY: ("GPS only", "matches no neighbour; placed by telemetry alone, so its edges may be metres off"),
     Status.REJECTED: ("not placed", "has no place in the map; see the reasons"),
 }
+_ROLE_WORDS = {
+    "control": "ties the map", "check": "check point", "excluded": "left out: contradicts the others",
+    "unseen": "in no frame that has a place",
+}
 _STAGE_WORDS = {
     "undistort": "removing the lens's distortion",
     "register": "matching frames",
@@ -61,7 +65,7 @@ def report_page(
         site=known(report.get("site")), inputs=_inputs(report), headline=_headline(report), summary=_summary(report),
         is_comparison=bool(report.get("comparison")), warning_lines=at(report, "warnings") or [],
         picture=_picture(report, picture), figures=_key_figures(report),
-        objects=objects_section(report, object_crops, site), statuses=_statuses(report),
+        control=_control(report), objects=objects_section(report, object_crops, site), statuses=_statuses(report),
         reasons=[(count, reason) for reason, count in (at(report, "frames", "reasons") or {}).items()],
         plots=_plots(report), camera_rows=_camera_and_telemetry(report),
         notices=[(known(each.get("count")), known(each.get("text")), known(each.get("code")))
@@ -114,8 +118,9 @@ def _summary(report: Mapping[str, Any]) -> str:
     sigma_m, gps_m = number_at(report, "sigma_m"), number_at(report, "gps_residual_m", "median")
     sentences = []
     if sigma_m is not None:
+        sources = "control points" if report.get("control") else "GPS fixes"
         sentences.append(
-            f"Position accuracy {length_words(sigma_m)} (1 sigma, including the error shared by all GPS fixes)."
+            f"Position accuracy {length_words(sigma_m)} (1 sigma, including the error shared by all {sources})."
         )
     if gps_m is not None:
         sentences.append(f"The cameras are {length_words(gps_m)} from their GPS fixes (median).")
@@ -174,6 +179,30 @@ def _metric_figures(report: Mapping[str, Any]) -> list[tuple[str, str | None, st
         ("flight height", with_unit("{:.1f} m", number_at(report, "height_above_ground_m")),
          "above the ground, median"),
     ]
+
+
+def _control(report: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The table of control points, and its sentences."""
+    control = at(report, "control")
+    if not control:
+        return None
+    sentences = [
+        f"{name} points: {number:.3f} m (root mean square)"
+        for name, key in (("Control", "control_rms_m"), ("Check", "check_rms_m"))
+        if (number := number_at(report, "control", key)) is not None
+    ]
+    rows = [
+        (known(each.get("label")), _ROLE_WORDS.get(str(each.get("role")), known(each.get("role"))),
+         each.get("marks"), *(_signed_m(each.get(name)) for name in ("east_m", "north_m")),
+         with_unit("{:.3f}", finite_or_none(each.get("distance_m"))) or "")
+        for each in control.get("points") or []
+    ]
+    source = f"From {known(control.get('file'))}, {known(control.get('crs'))}"
+    return {"words": ". ".join([source, *sentences]) + ".", "rows": rows}
+
+
+def _signed_m(value: Any) -> str:
+    return with_unit("{:+.3f}", finite_or_none(value)) or ""
 
 
 def _statuses(report: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -1,0 +1,265 @@
+"""Control point files in OpenDroneMap's form (gcp_list.txt): a CRS, then `x y z px py image [label]` a line."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import isfinite, nan
+from pathlib import Path
+
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError
+
+from sorvolo.capture.photos import PhotoSource
+from sorvolo.capture.small_files import read_small_file, text_of
+from sorvolo.capture.source import Source
+from sorvolo.capture.telemetry.cleaning import notice
+from sorvolo.errors import InputError
+from sorvolo.geometry.camera import Camera
+from sorvolo.survey.control import ControlMark, ControlPoint, GroundControl
+from sorvolo.survey.flight import Notice
+
+LEAST_POINTS = 3
+"""Fewer cannot show that one of them is wrong."""
+
+_KIND, _NEEDED = "control point file", "a CRS in the first line, then x y z px py image a line"
+_MOST_BYTES = 10_000_000
+_PROJ_KEYS = frozenset({
+    "proj", "zone", "south", "ellps", "datum", "units", "to_meter", "no_defs", "type", "lat_0", "lon_0", "lat_1",
+    "lat_2", "lat_ts", "k", "k_0", "x_0", "y_0", "a", "b", "rf", "towgs84", "axis", "gamma", "alpha", "lonc",
+})
+"""Of a proj string: those of map projections. Grids and pipelines would read files."""
+
+
+@dataclass(frozen=True)
+class _Line:
+    number: int
+    x: float
+    y: float
+    z: float
+    x_px: float
+    y_px: float
+    image: str
+    label: str
+
+
+@dataclass(frozen=True)
+class ControlFile:
+    """A control point file as it was read; `control` takes it at its word."""
+
+    path: Path
+    crs_words: str
+    lines: tuple[_Line, ...]
+
+    @property
+    def control(self) -> GroundControl:
+        """Points and marks. Raises InputError for places that the CRS does not have."""
+        return self._control(self.crs_words, swaps_xy=False, swaps_px=False)
+
+    def other_readings(self) -> Iterator[tuple[str, GroundControl]]:
+        """Other ways to read the file, each with the mistake it stands for: to name that where the file is wrong."""
+        for words, crs_words, swaps_xy, swaps_px in self._mistakes():
+            try:
+                yield words, self._control(crs_words, swaps_xy=swaps_xy, swaps_px=swaps_px)
+            except InputError:
+                continue
+
+    def _mistakes(self) -> Iterator[tuple[str, str, bool, bool]]:
+        yield "x and y are exchanged (easting or longitude comes first)", self.crs_words, True, False
+        yield "px and py are exchanged (the column comes before the row)", self.crs_words, False, True
+        yield "x and y are exchanged, and px and py as well", self.crs_words, True, True
+        utm = _utm_zone(_parsed_crs(self.crs_words, self.path))
+        for zone in range(1, 61) if utm else ():
+            for side in "NS":
+                if (zone, side) != utm:
+                    yield f"the CRS is UTM zone {zone}{side}", f"WGS84 UTM {zone}{side}", False, False
+
+    def _control(self, crs_words: str, *, swaps_xy: bool, swaps_px: bool) -> GroundControl:
+        crs = _parsed_crs(crs_words, self.path)
+        to_m = _height_unit_m(crs)
+        transformer = Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+        points: dict[str, ControlPoint] = {}
+        marks = []
+        for line in self.lines:
+            x, y = (line.y, line.x) if swaps_xy else (line.x, line.y)
+            if line.label not in points:
+                longitude_deg, latitude_deg = transformer.transform(x, y)
+                if not (abs(latitude_deg) <= 90 and abs(longitude_deg) <= 360):
+                    raise InputError(
+                        f"{self.path}, line {line.number}: {line.x:g} {line.y:g} is no place in {crs_words} "
+                        f"({crs.name}); give x (easting, longitude) before y, in the CRS of the first line"
+                    )
+                points[line.label] = ControlPoint(line.label, latitude_deg, longitude_deg, line.z * to_m)
+            x_px, y_px = (line.y_px, line.x_px) if swaps_px else (line.x_px, line.y_px)
+            marks.append(ControlMark(line.label, line.image, x_px, y_px))
+        return GroundControl(self.path.name, f"{crs_words} ({crs.name})", tuple(points.values()), tuple(marks))
+
+
+def read_control_points(path: Path) -> ControlFile:
+    """Read a gcp_list.txt: the first line a CRS (EPSG:code, "WGS84 UTM 32N", WGS84, or a proj string), the others are
+    `x y z px py image [label]`; further columns, blank lines and those that begin with # are left out.
+
+    Lines without a label belong together where their coordinates are the same. Raises InputError for what cannot be
+    read, naming the line.
+    """
+    text = text_of(path, read_small_file(path, _KIND, _MOST_BYTES), _KIND, _NEEDED)
+    numbered = [
+        (number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip() and not line.strip().startswith("#")
+    ]
+    if not numbered:
+        raise InputError(f"{path}: nothing but comments; {_NEEDED} is needed")
+    crs_words = numbered[0][1]
+    _parsed_crs(crs_words, path)
+    lines = _labelled([_line(path, number, line) for number, line in numbered[1:]])
+    if not lines:
+        raise InputError(f"{path}: no control point after its first line; {_NEEDED} is needed")
+    _check_labels(path, lines)
+    return ControlFile(path, crs_words, tuple(lines))
+
+
+def marks_in_frames(control: GroundControl, source: Source) -> tuple[GroundControl, tuple[Notice, ...]]:
+    """The control with its marks in the pixels of the flight's frames, those of other pictures left out and counted.
+
+    Names match without regard to case and ending. Raises InputError where a mark lies beside its picture, and where
+    fewer than three points are marked in pictures of this flight.
+    """
+    sizes = _original_sizes(source)
+    kept, elsewhere = [], set()
+    for mark in control.marks:
+        frame = _matching(mark.frame, sizes)
+        if frame is None:
+            elsewhere.add(mark.frame)
+            continue
+        kept.append(_scaled(control, replace(mark, frame=frame), sizes[frame], source.camera.camera))
+    if not kept:
+        raise InputError(
+            f"{control.name}: none of its pictures ({', '.join(sorted(elsewhere)[:3])} ...) is one of this flight's "
+            f"({', '.join(source.inputs[:3])} ...); give the marks of these photos"
+        )
+    marked = {each.label for each in kept}
+    if len(marked) < LEAST_POINTS:
+        raise InputError(
+            f"{control.name}: {len(marked)} control points are marked in pictures of {source.name}, at least "
+            f"{LEAST_POINTS} are needed, well apart; mark more of them"
+        )
+    words = "pictures of the control point file that are not this flight's: {}"
+    notices = notice("control_elsewhere", len(elsewhere), words)
+    points = tuple(each for each in control.points if each.label in marked)
+    return replace(control, points=points, marks=tuple(kept)), tuple(notices)
+
+
+def _original_sizes(source: Source) -> dict[str, tuple[int, int]]:
+    """Each frame's name with the size, width and height, in whose pixels a person marks it."""
+    if isinstance(source, PhotoSource):
+        return {
+            photo.path.name: photo.metadata.shown_size_px for photo in source.album.photos if photo.metadata.width_px
+        }
+    camera = source.camera.camera
+    return {str(number): (camera.width_px, camera.height_px) for number in range(source.frame_count)}
+
+
+def _matching(name: str, sizes: Mapping[str, tuple[int, int]]) -> str | None:
+    if name in sizes:
+        return name
+    stem = Path(name).stem.casefold()
+    return next((each for each in sizes if Path(each).stem.casefold() == stem), None)
+
+
+def _scaled(control: GroundControl, mark: ControlMark, size_px: tuple[int, int], camera: Camera) -> ControlMark:
+    """A mark of a picture of this size in the frames' pixels; raises InputError for one beside the picture."""
+    width_px, height_px = size_px
+    if not (-1 <= mark.x_px <= width_px and -1 <= mark.y_px <= height_px):
+        swapped = mark.x_px <= height_px and mark.y_px <= width_px
+        hint = "are px and py exchanged?" if swapped else "give pixels of the photo as it was taken"
+        raise InputError(
+            f"{control.name}: {mark.label} is marked at {mark.x_px:g}, {mark.y_px:g} in {mark.frame}, which has "
+            f"{width_px} x {height_px} pixels; {hint}"
+        )
+    across, down = camera.width_px / width_px, camera.height_px / height_px
+    return replace(mark, x_px=(mark.x_px + 0.5) * across - 0.5, y_px=(mark.y_px + 0.5) * down - 0.5)
+
+
+def _line(path: Path, number: int, text: str) -> _Line:
+    fields = text.split()
+    if len(fields) < 6:
+        raise InputError(
+            f"{path}, line {number}: {len(fields)} columns, {text[:60]!r}; x y z px py image was needed"
+        )
+    numbers = [_number(each) for each in fields[:5]]
+    wrong = [fields[at] for at in (0, 1, 3, 4) if not isfinite(numbers[at])]  # a height may be missing: NaN
+    if wrong:
+        raise InputError(f"{path}, line {number}: {wrong[0]!r} is no number; x y z px py image was needed")
+    x, y, z, x_px, y_px = numbers
+    image = fields[5].replace("\\", "/").rpartition("/")[2]
+    return _Line(number, x, y, z, x_px, y_px, image, fields[6] if len(fields) > 6 else "")
+
+
+def _labelled(lines: Sequence[_Line]) -> list[_Line]:
+    """The lines, those without a label named "point N" by their coordinates."""
+    names: dict[tuple[float, float], str] = {}
+    return [
+        line if line.label else replace(line, label=names.setdefault((line.x, line.y), f"point {len(names) + 1}"))
+        for line in lines
+    ]
+
+
+def _check_labels(path: Path, lines: Sequence[_Line]) -> None:
+    first: dict[str, _Line] = {}
+    marked: set[tuple[str, str]] = set()
+    for line in lines:
+        known = first.setdefault(line.label, line)
+        if (known.x, known.y) != (line.x, line.y):
+            raise InputError(
+                f"{path}: {line.label} has other coordinates in line {line.number} than in line {known.number}; give "
+                "each point one place"
+            )
+        if (line.label, line.image) in marked:
+            raise InputError(f"{path}, line {line.number}: {line.label} is marked twice in {line.image}; keep one mark")
+        marked.add((line.label, line.image))
+
+
+def _parsed_crs(words: str, path: Path) -> CRS:
+    """The CRS of the first line. Raises InputError for all but the forms that need no file and no network."""
+    words = _as_epsg(words)
+    if words.startswith("+"):
+        keys = {part.lstrip("+").partition("=")[0] for part in words.split()}
+        if strange := keys - _PROJ_KEYS:
+            raise InputError(f"{path}: +{sorted(strange)[0]} in its first line is not read; give the CRS as EPSG:code")
+    elif not re.fullmatch(r"EPSG:[1-9][0-9]{0,8}", words, re.IGNORECASE):
+        raise InputError(
+            f"{path}: {words[:60]!r} in its first line is no CRS; give EPSG:32632, WGS84 UTM 32N, WGS84, or a proj "
+            "string"
+        )
+    try:
+        crs = CRS.from_user_input(words)
+    except CRSError as error:
+        raise InputError(f"{path}: unknown CRS {words[:60]!r} in its first line; give one as EPSG:32632") from error
+    if not (crs.is_projected or crs.is_geographic):
+        raise InputError(f"{path}: {words} ({crs.name}) is no CRS of a map; give a projected one as EPSG:32632")
+    return crs
+
+
+def _as_epsg(words: str) -> str:
+    """ "WGS84 UTM 32N" and "WGS84" as EPSG codes; other words as they are."""
+    utm = re.fullmatch(r"WGS ?84[ ,/]+UTM(?: zone)? ?(\d{1,2}) ?([NS])", words, re.IGNORECASE)
+    if utm and 1 <= int(utm[1]) <= 60:
+        return f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}"
+    return "EPSG:4326" if re.fullmatch(r"WGS ?84", words, re.IGNORECASE) else words
+
+
+def _utm_zone(crs: CRS) -> tuple[int, str] | None:
+    zone = re.fullmatch(r"(\d+)([NS])", crs.utm_zone or "")
+    return (int(zone[1]), zone[2]) if zone else None
+
+
+def _height_unit_m(crs: CRS) -> float:
+    """Metres in a unit of the points' heights: that of their other coordinates, where those are lengths."""
+    return float(crs.axis_info[0].unit_conversion_factor) if crs.is_projected and crs.axis_info else 1.0
+
+
+def _number(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        return nan
+    return value if isfinite(value) else nan

@@ -1,0 +1,211 @@
+"""A map tied to control points: what they are held against, which of them cannot be right, and how well it fits."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Rows
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.geodesy import LocalFrame
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.mosaic.ground_ties import GroundTies, similarity_of_most
+from sorvolo.mosaic.planar import PlanarMapper
+from sorvolo.survey.control import ControlReport, ControlResidual, ControlRole, GroundControl
+
+LEAST_CONTROL = 3
+
+
+@dataclass(frozen=True)
+class ControlSettings:
+    """How control points are weighed, and when one of them is taken for wrong."""
+
+    sigma_m: float = 0.05  # of the survey, horizontal
+    mark_px: float = 1.0  # with which a person marks, px of the frame
+    checks: tuple[str, ...] = ()  # labels held back; one that ends in * stands for all that begin so
+    excluded_sigmas: float = 5.0  # beyond which a point may be wrong ...
+    excluded_times: float = 4.0  # ... if it also misses so many times as much as the others
+    most_misfit: float = 0.12  # of the points' spread: more, and the points are not those in the pictures
+    most_off_gps_m: float = 60.0  # no receiver errs so far: the points' CRS is another
+    most_scale: float = 1.3  # between GPS and the points
+
+    def holds_back(self, label: str) -> bool:
+        """Whether this point measures the map in place of tying it."""
+        return any(
+            label.startswith(each[:-1]) if each.endswith("*") else label == each for each in self.checks
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Points with marks in placed frames: `point` (M,) is the index of each mark's point in `labels`."""
+
+    labels: tuple[str, ...]
+    point: Rows
+    ties: GroundTies
+
+    def of(self, chosen: set[str]) -> GroundTies:
+        """The ties of some of the points."""
+        return self.ties.of(np.array([self.labels[k] in chosen for k in self.point], bool))
+
+    def misses(self, places_m: PointsM) -> tuple[PointsM, Floats]:
+        """Mean miss of each point's marks, (P, 2) m, and how far they scatter, (P,)."""
+        off_m = places_m - self.ties.place_m[:, :2]
+        mean = np.array([off_m[self.point == k].mean(axis=0) for k in range(len(self.labels))])
+        scatter = np.sqrt(((off_m - mean[self.point]) ** 2).sum(axis=1))
+        return mean, np.array([np.sqrt((scatter[self.point == k] ** 2).mean()) for k in range(len(self.labels))])
+
+
+@dataclass(frozen=True, eq=False)
+class ControlProblem:
+    """A flight's control: marks in the frames' own pixels, the keyframe that shows each frame, the camera as
+    calibrated, and other readings of the file to name a mistake by."""
+
+    control: GroundControl
+    keyframe_of: Mapping[str, int]
+    camera: Camera
+    frame: LocalFrame
+    is_datum: bool  # nothing else knows where the flight was
+    other_readings: Callable[[], Iterable[tuple[str, GroundControl]]] = field(default=lambda: ())
+
+
+def tie_control(mapper: PlanarMapper, problem: ControlProblem, settings: ControlSettings) -> ControlReport:
+    """Tie the map to its control points, points that contradict the others excluded one by one.
+
+    Raises InputError where too few are seen, and where they do not fit the pictures at all.
+    """
+    seen = _seen(mapper, problem, problem.control, settings)
+    used = {label for label in seen.labels if not settings.holds_back(label)}
+    if len(used) < LEAST_CONTROL:
+        raise InputError(
+            f"{problem.control.name}: {len(used)} control points are marked in frames that have a place and are not "
+            f"held back, at least {LEAST_CONTROL} are needed; mark more points, in more photos"
+        )
+    _check_fit(mapper, problem, seen, used, settings)
+    excluded: set[str] = set()
+    while True:
+        mapper.tie_to_ground(seen.of(used), is_datum=problem.is_datum)
+        misses, scatter = seen.misses(mapper.ground_places_m(seen.ties))
+        expected_m = _expected_m(mapper, seen, problem, settings)
+        wrong = _wrong_point(seen, misses, used, expected_m, settings)
+        if wrong is None or len(used) == LEAST_CONTROL:
+            break
+        used.remove(wrong)
+        excluded.add(wrong)
+    rows = {label: (misses[k], scatter[k], int((seen.point == k).sum())) for k, label in enumerate(seen.labels)}
+    return ControlReport(problem.control.name, problem.control.crs, settings.sigma_m, tuple(
+        _residual(problem.control, number, rows, used, excluded) for number in range(len(problem.control.points))
+    ))
+
+
+def _residual(
+    control: GroundControl, number: int, rows: Mapping[str, tuple[Floats, float, int]], used: set[str],
+    excluded: set[str],
+) -> ControlResidual:
+    point = control.points[number]
+    if point.label not in rows:
+        return ControlResidual(point, ControlRole.UNSEEN, 0, np.nan, np.nan, np.nan)
+    miss, scatter, marks = rows[point.label]
+    role = ControlRole.CONTROL if point.label in used else (
+        ControlRole.EXCLUDED if point.label in excluded else ControlRole.CHECK
+    )
+    return ControlResidual(point, role, marks, float(miss[0]), float(miss[1]), float(scatter))
+
+
+def _seen(
+    mapper: PlanarMapper, problem: ControlProblem, control: GroundControl, settings: ControlSettings
+) -> _Seen:
+    marks = [each for each in control.marks if each.frame in problem.keyframe_of]
+    marked = {each.label for each in marks}
+    labels = tuple(each.label for each in control.points if each.label in marked)
+    frame = LocalFrame(control.middle) if problem.is_datum else problem.frame
+    place_of = dict(zip((each.label for each in control.points), _places_m(control, frame), strict=True))
+    keyframes = np.array([problem.keyframe_of[each.frame] for each in marks], int)
+    pixels = np.array([(each.x_px, each.y_px) for each in marks]).reshape(-1, 2)
+    point = np.array([labels.index(each.label) for each in marks], int)
+    count = np.bincount(point, minlength=len(labels))[point]
+    scale = [mapper.registration_scale(each, problem.camera) for each in keyframes.tolist()]
+    ties = GroundTies(
+        keyframes, problem.camera.rays_from_pixels(pixels)[:, :2],
+        np.array([place_of[each.label] for each in marks]).reshape(-1, 3), settings.mark_px * np.array(scale),
+        settings.sigma_m * np.sqrt(count),  # marks of one point share its error
+    )
+    return _Seen(labels, point, ties)
+
+
+def _places_m(control: GroundControl, frame: LocalFrame) -> PointsM:
+    """(P, 3) in the site; the points' median height is taken for the ground's, points without one lie there."""
+    latitude, longitude, height = (
+        np.array([getattr(each, name) for each in control.points])
+        for name in ("latitude_deg", "longitude_deg", "height_m")
+    )
+    level = np.full(len(latitude), frame.origin.height_m)
+    known = np.isfinite(height)
+    up_m = np.where(known, height - (np.median(height[known]) if known.any() else 0.0), 0.0)
+    return np.column_stack([frame.site_from_wgs84(latitude, longitude, level)[:, :2], up_m])
+
+
+def _expected_m(mapper: PlanarMapper, seen: _Seen, problem: ControlProblem, settings: ControlSettings) -> float:
+    """How far a point that is right may miss, one sigma: its survey's error and that of its marks."""
+    heights_m = [mapper.pose(each).translation_m[2] for each in seen.ties.keyframe_ids.tolist()]
+    return float(np.hypot(settings.sigma_m, settings.mark_px * np.median(heights_m) / problem.camera.fx_px))
+
+
+def _wrong_point(
+    seen: _Seen, misses: PointsM, used: set[str], expected_m: float, settings: ControlSettings
+) -> str | None:
+    """The used point that misses most, where it misses more than surveying, marking and the others allow."""
+    miss_m = {label: float(np.linalg.norm(misses[k])) for k, label in enumerate(seen.labels) if label in used}
+    worst = max(miss_m, key=lambda label: miss_m[label])
+    usual_m = float(np.median([value for label, value in miss_m.items() if label != worst]))
+    limit_m = max(settings.excluded_sigmas * expected_m, settings.excluded_times * usual_m)
+    return worst if miss_m[worst] > limit_m else None
+
+
+def _check_fit(
+    mapper: PlanarMapper, problem: ControlProblem, seen: _Seen, used: set[str], settings: ControlSettings
+) -> None:
+    """Raise InputError where the points as they are read cannot be those in the pictures."""
+    found = _disagreement(mapper, seen, used, problem, settings)
+    if not found:
+        return
+    for words, control in problem.other_readings():
+        other = _seen(mapper, problem, control, settings)
+        if len(used & set(other.labels)) == len(used) and not _disagreement(mapper, other, used, problem, settings):
+            raise InputError(f"{problem.control.name}: {found}; they fit if {words}: correct the file")
+    raise InputError(
+        f"{problem.control.name}: {found}; check the CRS in its first line, the order of x and y, and the marks"
+    )
+
+
+def _disagreement(
+    mapper: PlanarMapper, seen: _Seen, used: set[str], problem: ControlProblem, settings: ControlSettings
+) -> str:
+    """In words, how the points cannot be those in the pictures; "" where they can."""
+    ties = seen.of(used)
+    places_m = mapper.ground_places_m(ties)
+    order = np.array([label for label in np.array(seen.labels)[seen.point] if label in used])
+    a, b = (
+        np.array([each[order == label].mean(axis=0) for label in sorted(used)])
+        for each in (ties.place_m[:, :2], places_m)
+    )
+    spread_m = float(np.linalg.norm(a.std(axis=0)))
+    change = similarity_of_most(a, b) if spread_m > 0 and np.isfinite(b).all() else None
+    if change is None:
+        return "the control points all lie in one place"
+    miss_m = np.sort(np.linalg.norm(apply_homography(change, b) - a, axis=1))[(len(a) + 1) // 2]
+    if miss_m > settings.most_misfit * spread_m:
+        return f"the control points miss those marked by {miss_m:.1f} m on ground {2 * spread_m:.0f} m wide"
+    return "" if problem.is_datum else _against_gps(a, b, change, spread_m, settings)
+
+
+def _against_gps(a: PointsM, b: PointsM, change: Matrix3, spread_m: float, settings: ControlSettings) -> str:
+    """How surveyed places `a` cannot be those that a map by GPS has at `b`, (P, 2) each; "" where they can."""
+    off_m = float(np.median(np.linalg.norm(a - b, axis=1)))
+    scale = float(np.hypot(change[0, 0], change[1, 0]))
+    if off_m > settings.most_off_gps_m + 0.25 * spread_m:
+        return f"the control points lie {off_m:.0f} m from where GPS has what is marked"
+    if not 1 / settings.most_scale < scale < settings.most_scale:
+        return f"the control points are {scale:.2f} times as far apart as GPS has what is marked"
+    return ""

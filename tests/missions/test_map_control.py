@@ -1,0 +1,207 @@
+"""`sorvolo map --gcp`: simulated photos tied to control points, with and without GPS, and files that are wrong."""
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from pyproj import Transformer
+
+from sorvolo.capture.calibration import camera_from_option
+from sorvolo.cli import main as cli
+from sorvolo.geometry.geodesy import Geodetic, LocalFrame
+from sorvolo.geometry.pose import Pose
+
+_UTM = "EPSG:32633"
+_GPS_IFD = 0x8825
+
+
+@dataclass(frozen=True)
+class Mark:
+    label: str
+    place_m: np.ndarray  # (3,) in the site
+    x_px: float
+    y_px: float
+    photo: str
+
+
+@dataclass(frozen=True)
+class Surveyed:
+    """Photos and marks of points on their ground, exact to a tenth of a pixel."""
+
+    photos: Path
+    camera: Path
+    frame: LocalFrame
+    marks: tuple[Mark, ...]
+    frames: dict[str, Any]
+
+    def write(self, path: Path, crs: str = _UTM, change: Callable[[Mark], Mark] = lambda each: each) -> Path:
+        transformer = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+        lines = [crs]
+        for mark in map(change, self.marks):
+            latitude, longitude, height = (float(each[0]) for each in self.frame.wgs84_from_site(mark.place_m[None]))
+            x, y = transformer.transform(longitude, latitude)
+            lines.append(f"{x:.9f} {y:.9f} {height:.3f} {mark.x_px:.2f} {mark.y_px:.2f} {mark.photo} {mark.label}")
+        path.write_text("\n".join(lines) + "\n")
+        return path
+
+
+@pytest.fixture(scope="module")
+def surveyed(photographed: Path) -> Surveyed:
+    truth = json.loads((photographed / "truth" / "frames.geojson").read_text())
+    frame = LocalFrame(Geodetic(**truth["site"]))
+    photos = photographed / "flight1" / "photos"
+    with Image.open(next(photos.iterdir())) as first:
+        width_px, height_px = first.size
+    camera = camera_from_option(str(photographed / "camera.xml"), width_px, height_px).camera
+    rng = np.random.default_rng(4)
+    marks = []
+    places = [(x, y) for x in (-14.0, -4.0, 6.0, 16.0) for y in (-7.0, 6.0)]
+    for number, (x, y) in enumerate(places):
+        place_m = np.array([x, y, 0.0])
+        for each in truth["features"]:
+            known = each["properties"]
+            pixel = camera.pixels_from_points(_pose(known, frame).inverse().apply(place_m[None]))[0]
+            if (pixel > 5).all() and (pixel < [width_px - 5, height_px - 5]).all():
+                pixel = pixel + rng.normal(0, 0.1, 2)
+                marks.append(Mark(f"{'CP' if number in (2, 5) else 'G'}{number}", place_m, *pixel, known["frame"]))
+    assert len({each.label for each in marks}) >= 7
+    return Surveyed(photos, photographed / "camera.xml", frame, tuple(marks), truth)
+
+
+def _pose(known: dict[str, Any], frame: LocalFrame) -> Pose:
+    place = frame.site_from_wgs84(
+        *(np.array([known[name]]) for name in ("camera_latitude_deg", "camera_longitude_deg", "camera_height_m"))
+    )[0]
+    return Pose(np.array(known["rotation"]).reshape(3, 3), place)
+
+
+@pytest.fixture(scope="module")
+def blind(surveyed: Surveyed, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same photos without GPS and attitude."""
+    folder = tmp_path_factory.mktemp("blind") / "photos"
+    folder.mkdir()
+    for path in surveyed.photos.glob("*.jpg"):
+        with Image.open(path) as picture:
+            exif = picture.getexif()
+            if _GPS_IFD in exif:
+                del exif[_GPS_IFD]
+            picture.save(folder / path.name, "JPEG", exif=exif, quality=95)
+    return folder
+
+
+def run(site: Path, photos: Path, surveyed: Surveyed, gcp: Path, *more: str) -> int:
+    return cli.main([
+        "map", str(photos), "--site", str(site), "--model", "none", "--camera", str(surveyed.camera), "--gcp", str(gcp),
+        *more,
+    ])
+
+
+def control_of(site: Path) -> dict[str, Any]:
+    return json.loads(next(site.glob("flights/*/report.json")).read_text())["control"]
+
+
+def absolute_m(site: Path, surveyed: Surveyed) -> float:
+    found = json.loads(next(site.glob("flights/*/frames.geojson")).read_text())
+    true = {each["properties"]["frame"]: each for each in surveyed.frames["features"]}
+    misses = []
+    for each in found["features"]:
+        pair = [np.array(one["geometry"]["coordinates"][0])[:4] for one in (each, true[each["properties"]["frame"]])]
+        a, b = (surveyed.frame.ground_from_lonlat(ring) for ring in pair)
+        misses.append(a - b)
+    return float(np.sqrt((np.concatenate(misses) ** 2).sum(axis=1).mean()))
+
+
+def test_control_alone_places_photos_without_gps(surveyed: Surveyed, blind: Path, tmp_path: Path) -> None:
+    gcp = surveyed.write(tmp_path / "gcp_list.txt")
+    assert run(tmp_path / "site", blind, surveyed, gcp, "--check", "CP*") == 0
+    control = control_of(tmp_path / "site")
+    roles = {each["label"]: each["role"] for each in control["points"]}
+    assert all(role == ("check" if label.startswith("CP") else "control") for label, role in roles.items())
+    assert control["check_rms_m"] < 0.05 and control["control_rms_m"] < 0.05
+    assert absolute_m(tmp_path / "site", surveyed) < 0.1
+    report = json.loads(next((tmp_path / "site").glob("flights/*/report.json")).read_text())
+    assert report["georeferenced"] and report["headline"]["quality"] == "map"
+    listed = json.loads(next((tmp_path / "site").glob("flights/*/control.geojson")).read_text())
+    assert {each["properties"]["label"] for each in listed["features"]} == set(roles)
+    assert "CP2" in next((tmp_path / "site").glob("flights/*/report.html")).read_text()
+
+
+def test_control_outweighs_fixes_that_lie_beside(surveyed: Surveyed, tmp_path: Path) -> None:
+    def shifted(mark: Mark) -> Mark:
+        return Mark(mark.label, mark.place_m + np.array([7.0, -4.0, 0.0]), mark.x_px, mark.y_px, mark.photo)
+
+    gcp = surveyed.write(tmp_path / "gcp_list.txt", change=shifted)
+    assert run(tmp_path / "site", surveyed.photos, surveyed, gcp, "--check", "CP2,CP5") == 0
+    control = control_of(tmp_path / "site")
+    assert control["check_rms_m"] < 0.05 and not control["excluded"]
+    assert absolute_m(tmp_path / "site", surveyed) == pytest.approx(np.hypot(7, 4), abs=0.1)
+
+
+@pytest.mark.parametrize("has_gps", [True, False], ids=["GPS", "no GPS"])
+def test_a_point_that_contradicts_the_others_is_named_and_left_out(
+    surveyed: Surveyed, blind: Path, tmp_path: Path, has_gps: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def wrong(mark: Mark) -> Mark:
+        off = np.array([3.0, 0.0, 0.0]) * (mark.label == "G3")
+        return Mark(mark.label, mark.place_m + off, mark.x_px, mark.y_px, mark.photo)
+
+    gcp = surveyed.write(tmp_path / "gcp_list.txt", change=wrong)
+    assert run(tmp_path / "site", surveyed.photos if has_gps else blind, surveyed, gcp) == 0
+    control = control_of(tmp_path / "site")
+    assert control["excluded"] == ["G3"]
+    (row,) = (each for each in control["points"] if each["label"] == "G3")
+    assert row["east_m"] == pytest.approx(-3.0, abs=0.15) and row["north_m"] == pytest.approx(0.0, abs=0.15)
+    assert control["control_rms_m"] < 0.05 and "G3" in capsys.readouterr().out
+
+
+def exchanged(text: str, first: int, second: int) -> str:
+    """The lines with two columns exchanged."""
+    head, *rows = text.splitlines()
+    cells = [row.split() for row in rows]
+    for row in cells:
+        row[first], row[second] = row[second], row[first]
+    return "\n".join([head, *(" ".join(row) for row in cells)])
+
+
+@pytest.mark.parametrize("has_gps", [True, False], ids=["GPS", "no GPS"])
+@pytest.mark.parametrize("crs, change, words", [
+    ("EPSG:4326", lambda text: exchanged(text, 0, 1), "x and y are exchanged"),
+    (_UTM, lambda text: exchanged(text, 0, 1), "x and y are exchanged"),
+    (_UTM, lambda text: text.replace(_UTM, "EPSG:32632"), "UTM zone 33N"),
+    (_UTM, lambda text: "\n".join(re.findall(".*(?:33|G0|G1)$", text, re.M)), "2 control points are marked"),
+    (_UTM, lambda text: text.replace(".jpg", "_of_another_day.jpg"), "none of its pictures"),
+    (_UTM, lambda text: text.replace(_UTM, "Gauss"), "no CRS"),
+    (_UTM, lambda text: text.replace(_UTM, "+proj=pipeline +nadgrids=@/etc/passwd"), "nadgrids"),
+    (_UTM, lambda text: text.replace(" G0", " G0\nhalf a line"), "columns"),
+    (_UTM, lambda text: exchanged(text, 3, 4), "px and py"),
+])
+def test_a_wrong_file_ends_in_one_clear_error(
+    surveyed: Surveyed, blind: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], has_gps: bool, crs: str,
+    change: Callable[[str], str], words: str,
+) -> None:
+    if words == "UTM zone 33N" and not has_gps:
+        pytest.skip("nothing shows a wrong zone where there is no GPS")
+    gcp = surveyed.write(tmp_path / "gcp_list.txt", crs)
+    gcp.write_text(change(gcp.read_text()))
+    assert run(tmp_path / "site", surveyed.photos if has_gps else blind, surveyed, gcp) == 1
+    error = capsys.readouterr().err
+    assert words in error and error.count("error:") == 1
+    assert not (tmp_path / "site" / "mosaic.tif").exists()
+
+
+@pytest.mark.parametrize("more, words", [
+    (["--check", "X9"], "no such control point"), (["--check", "G*,CP2"], "at least 3"),
+    (["--method", "thesis"], "method planar only"), (["--gcp-accuracy", "0"], "--gcp-accuracy"),
+])
+def test_options_that_cannot_be_are_refused(
+    surveyed: Surveyed, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], words: str
+) -> None:
+    gcp = surveyed.write(tmp_path / "gcp_list.txt")
+    assert run(tmp_path / "site", surveyed.photos, surveyed, gcp, *more) == 1
+    assert words in capsys.readouterr().err
