@@ -41,6 +41,15 @@ class Transform(StrEnum):
     HOMOGRAPHY = "homography"
 
 
+ControlPoints = Annotated[
+    Path | None, typer.Option(help="Ground control points: a gcp_list.txt, as OpenDroneMap reads it.")
+]
+ControlAccuracy = Annotated[float, typer.Option(help="Accuracy of the control points, m (1 sigma).")]
+CheckPoints = Annotated[
+    str, typer.Option(help="Control points held back to measure the map: labels with commas; CP* for a prefix.")
+]
+
+
 def map_command(
     inputs: Annotated[list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources.")],
     site: Annotated[Path, typer.Option(help="Folder of the map; an existing map is extended.")],
@@ -59,13 +68,9 @@ def map_command(
     crs: Annotated[
         str, typer.Option(help="Coordinate system of mosaic.tif, such as EPSG:25832. Without it: the UTM zone.")
     ] = "",
-    gcp: Annotated[
-        Path | None, typer.Option(help="Ground control points: a gcp_list.txt, as OpenDroneMap reads it.")
-    ] = None,
-    gcp_accuracy: Annotated[float, typer.Option(help="Accuracy of the control points, m (1 sigma).")] = 0.05,
-    check: Annotated[
-        str, typer.Option(help="Control points held back to measure the map: labels with commas; CP* for a prefix.")
-    ] = "",
+    gcp: ControlPoints = None,
+    gcp_accuracy: ControlAccuracy = 0.05,
+    check: CheckPoints = "",
     transform: Annotated[Transform, typer.Option(help="What --method thesis fits.")] = Transform.SIMILARITY,
     model: Annotated[
         str, typer.Option(help="Detector for people, cars and small objects: a model's name, a file, or none.")

@@ -1,6 +1,6 @@
 """A map tied to control points: what they are held against, which of them cannot be right, and how well it fits."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +12,7 @@ from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.mosaic.ground_ties import GroundTies, similarity_of_most
 from sorvolo.mosaic.planar import PlanarMapper
-from sorvolo.survey.control import ControlReport, ControlResidual, ControlRole, GroundControl
+from sorvolo.survey.control import ControlMark, ControlReport, ControlResidual, ControlRole, GroundControl
 
 LEAST_CONTROL = 3
 
@@ -121,9 +121,7 @@ def _seen(
     labels = tuple(each.label for each in control.points if each.label in marked)
     frame = LocalFrame(control.middle) if problem.is_datum else problem.frame
     place_of = dict(zip((each.label for each in control.points), _places_m(control, frame), strict=True))
-    keyframes = np.array([problem.keyframe_of[each.frame] for each in marks], int)
-    pixels = np.array([(each.x_px, each.y_px) for each in marks]).reshape(-1, 2)
-    point = np.array([labels.index(each.label) for each in marks], int)
+    keyframes, pixels, point = _columns(marks, problem.keyframe_of, labels)
     count = np.bincount(point, minlength=len(labels))[point]
     scale = [mapper.registration_scale(each, problem.camera) for each in keyframes.tolist()]
     ties = GroundTies(
@@ -132,6 +130,15 @@ def _seen(
         settings.sigma_m * np.sqrt(count),  # marks of one point share its error
     )
     return _Seen(labels, point, ties)
+
+
+def _columns(
+    marks: Sequence[ControlMark], keyframe_of: Mapping[str, int], labels: Sequence[str]
+) -> tuple[Rows, Floats, Rows]:
+    """Keyframe, pixel and point of each mark."""
+    rows = [(keyframe_of[each.frame], labels.index(each.label)) for each in marks]
+    keyframes, points = np.array(rows, int).reshape(-1, 2).T
+    return keyframes, np.array([(each.x_px, each.y_px) for each in marks]).reshape(-1, 2), points
 
 
 def _places_m(control: GroundControl, frame: LocalFrame) -> PointsM:
