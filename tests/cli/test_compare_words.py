@@ -8,13 +8,22 @@ from rich.console import Console
 
 from sorvolo.cli.compare import show_results
 from sorvolo.cli.options import PlaceFormat
+from sorvolo.missions.compare.report import comparison_headline
+
+COVERED = {
+    "headline": {"quality": "compared", "text": "1 change in 100 m2; 20 m2 could not be compared"},
+    "coverage": {
+        "compared_m2": 100.0, "not_compared_m2": 20.0, "gaps_m2": {"leaning": 19.5, "dark": 0.5}, "smallest_m": 0.3,
+        "faint_m": None, "large_found": 0.9, "is_enough": True,
+    },
+}
 
 
 def test_withdrawn_changes_are_named(tmp_path: Path) -> None:
     result = {
         "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [],
         "changes": {"features": []},
-        "comparison": {"views": {"compared": 7}, "compared_area_m2": 100.0, "reasons": {}},
+        "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
         "withdrawn": ["b-4", "b-7"],
     }
     console = Console(record=True, width=120, file=StringIO())
@@ -27,7 +36,7 @@ def test_withdrawn_changes_are_named(tmp_path: Path) -> None:
 def test_notices_and_the_report_are_shown_as_by_map(tmp_path: Path) -> None:
     result = {
         "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "changes": {"features": []}, "withdrawn": [],
-        "comparison": {"views": {"compared": 7}, "compared_area_m2": 100.0, "reasons": {}},
+        "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
         "notices": [{"code": "no_date", "count": 1, "text": "the table has no date"}], "warnings": ["look here"],
     }
     console = Console(record=True, width=300, file=StringIO())
@@ -38,7 +47,7 @@ def test_notices_and_the_report_are_shown_as_by_map(tmp_path: Path) -> None:
 
 
 def test_how_much_the_map_grew_is_shown(tmp_path: Path) -> None:
-    comparison = {"views": {"compared": 7, "outside": 5}, "compared_area_m2": 100.0, "reasons": {}}
+    comparison = {"views": {"compared": 7, "outside": 5}, "reasons": {}, **COVERED}
     result = {
         "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [],
         "changes": {"features": []},
@@ -50,8 +59,8 @@ def test_how_much_the_map_grew_is_shown(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("georeference", "shown", "not_shown"), [
-    ({}, ["1 change found", "length m", "latitude, longitude", "41.250000, 12.500000", "100 m2"], ["units"]),
-    ({"crs": None}, ["length units", "east, north", "12.5, 41.2", "100 square units"], ["latitude", " m2"]),
+    ({}, ["1 change in 100 m2", "length m", "latitude, longitude", "41.250000, 12.500000", "20 m2"], ["units"]),
+    ({"crs": None}, ["length units", "east, north", "12.5, 41.2", "20 square units"], ["latitude", "0.3 m"]),
 ])
 def test_a_map_without_metres_is_not_shown_in_metres(
     tmp_path: Path, georeference: dict, shown: list[str], not_shown: list[str]
@@ -67,7 +76,7 @@ def test_a_map_without_metres_is_not_shown_in_metres(
     result = {
         "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [], "withdrawn": [],
         "changes": {"features": [change]} | georeference,
-        "comparison": {"views": {"compared": 7}, "compared_area_m2": 100.0, "reasons": {}},
+        "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
     }
     console = Console(record=True, width=120, file=StringIO())
     show_results([result], tmp_path, console)
@@ -86,8 +95,36 @@ def test_places_are_written_as_asked_for(tmp_path: Path, form: str, place: str) 
     result = {
         "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [], "withdrawn": [],
         "changes": {"features": [change]},
-        "comparison": {"views": {"compared": 7}, "compared_area_m2": 100.0, "reasons": {}},
+        "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
     }
     console = Console(record=True, width=120, file=StringIO())
     show_results([result], tmp_path, console, PlaceFormat(form))
     assert place in console.export_text()
+
+
+def test_what_was_not_compared_and_how_small_a_thing_is_found_are_shown(tmp_path: Path) -> None:
+    result = {
+        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [], "withdrawn": [],
+        "changes": {"features": []}, "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
+    }
+    console = Console(record=True, width=200, file=StringIO())
+    show_results([result], tmp_path, console)
+    text = console.export_text()
+    assert "Flight b: 1 change in 100 m2; 20 m2 could not be compared" in text
+    assert "not compared: 20 m2, crowns or walls lean there" in text and "too dark" not in text
+    assert "plain ones from 0.3 m on are found, faint ones of no size" in text
+
+
+@pytest.mark.parametrize(("changes", "compared_m2", "missing_m2", "is_enough", "text"), [
+    (0, 21_300.0, 4_100.0, True, "0 changes in 2.1 ha; 0.4 ha could not be compared"),
+    (1, 340.0, 0.0, True, "1 change in 340 m2; 0 m2 could not be compared"),
+    (0, 4_000.0, 21_000.0, False,
+     "not to be relied on, most of the ground could not be compared: 0 changes in 0.4 ha; 2.1 ha could not be "
+     "compared"),
+])
+def test_the_headline_never_speaks_of_ground_that_was_not_compared(
+    changes: int, compared_m2: float, missing_m2: float, is_enough: bool, text: str
+) -> None:
+    coverage = {"compared_m2": compared_m2, "not_compared_m2": missing_m2, "is_enough": is_enough}
+    headline = comparison_headline(changes, coverage, is_local=False)
+    assert headline == {"quality": "compared" if is_enough else "doubtful", "text": text}

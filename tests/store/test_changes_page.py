@@ -1,5 +1,6 @@
 """The page of changes: whole, self-contained, escaped, and honest about what was not compared."""
 
+import json
 import re
 from dataclasses import replace
 from importlib.resources import files
@@ -16,9 +17,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.store.exports.coverage_files import coverage_geojson
 from sorvolo.store.exports.map_pictures import Picture
 from sorvolo.store.pages.changes import changes_page
 from sorvolo.store.site.change_records import StoredChange, stored_changes
+from sorvolo.survey.coverage import CoveredGround, Gap
 from sorvolo.survey.findings import Change, ChangeKind, Verdict
 
 KINDS = list(ChangeKind)
@@ -122,6 +125,44 @@ def test_the_headline_counts_and_does_not_count_what_moves() -> None:
 def test_what_was_not_compared_is_said(changed: dict[str, Any], words: str) -> None:
     report = fake_report(5) | {"warnings": [], "comparison": fake_comparison(**changed)}
     assert words in "".join(checked(page_of([], report)).text)
+
+
+SQUARE = np.array([[-8.0, -8.0], [-2.0, -8.0], [-2.0, -2.0], [-8.0, -2.0]])
+COVERED = [
+    CoveredGround(((SQUARE, SQUARE[::-1] / 2 - 2.5),), 30.0, None, "", 0.3, np.nan),
+    CoveredGround(((SQUARE + 9.0,),), 36.0, Gap.REJECTED, "no single plane <fits>", np.nan, np.nan),
+    CoveredGround(((SQUARE * [-1.0, 1.0],),), 12.0, Gap.DARK, "", np.nan, np.nan),
+]
+
+
+def test_the_ground_that_was_not_compared_lies_on_the_map_and_in_a_table() -> None:
+    comparison = fake_comparison(coverage={"compared_m2": 21_300.0, "not_compared_m2": 4_100.0})
+    picture = Picture(fake_picture(300, 200), (-150.5, -100.5), 1)
+    features = json.loads(json.dumps(coverage_geojson(COVERED, SITE)))["features"]
+    page = changes_page(
+        fake_report(5) | {"flight": "b", "comparison": comparison}, [], picture, picture, SITE, {}, coverage=features
+    )
+    checker = checked(page)
+    text = " ".join("".join(checker.text).split())
+    assert "No change was found in 2.13 ha; 4 100 m² could not be compared." in text
+    assert "its views could not be compared: no single plane <fits>" in text
+    assert "black shadow or night on one of the dates" in text
+    assert "0.30 m" in text and "not known" in text
+    assert page.count('<path class="gaps"') == 2 and page.count('<path class="sizes"') == 1
+    assert 'id="show-gaps"' in page and 'id="show-sizes"' in page
+    path = re.search(r'<path class="gaps" d="M([^Z]+)Z', page)
+    assert path is not None
+    drawn = np.array([[float(number) for number in pair.split()] for pair in path.group(1).split("L")])
+    grid = SiteGrid.at(SITE.origin, SITE.m_per_px, SITE.crs)
+    corners = grid.grid_from_site(SQUARE + 9.0) + np.array([150.5, 100.5])
+    assert np.linalg.norm(drawn[:, None] - corners[None], axis=-1).min(axis=1).max() < 0.1
+
+
+@pytest.mark.parametrize("broken", [[None], [{}], ["x"], [{"properties": {"gap": "unheard-of", "area_m2": "x"}}]])
+def test_a_broken_coverage_file_takes_no_page_away(broken: list[Any]) -> None:
+    picture = Picture(fake_picture(300, 200), (-150.5, -100.5), 1)
+    report = fake_report(5) | {"flight": "b", "comparison": fake_comparison()}
+    checked(changes_page(report, [], picture, picture, SITE, {}, coverage=broken))
 
 
 def test_nothing_to_look_at_first_when_all_is_well() -> None:

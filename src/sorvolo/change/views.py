@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 
 from sorvolo.change.alignment import Aligned, Aligner
+from sorvolo.change.coverage.planting import Planted, Planting
 from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.frame_pixels import FramePixels, comparison_camera
-from sorvolo.change.pair.corroboration import LEAST_SURENESS, Difference, believed
+from sorvolo.change.pair.corroboration import LEAST_SURENESS, SURE, Difference, believed
 from sorvolo.change.pair.flight_tuning import FlightTuning
 from sorvolo.change.pair.robust import RobustSettings, compare_robust
 from sorvolo.change.pair.thesis import compare_thesis
@@ -34,7 +35,9 @@ _ALL_CHANGED = 0.5  # share of a view: more is snow, a flood or another place, n
 class ViewOutcome:
     """How one frame's comparison ended. `view` exists when it was compared, `site_from_image` (of the full undistorted
     frame) when it was aligned. `known` is the share of the frame that lies on known ground, `brightness` how many times
-    as bright as the map the flight is so far, NaN where that is not known."""
+    as bright as the map the flight is so far, NaN where that is not known. `doubted` (h, w) is what surely differs from
+    the map in a compared view and is contradicted by earlier pictures; `planted` what is found of things drawn in.
+    """
 
     status: ViewStatus
     reason: str
@@ -43,6 +46,8 @@ class ViewOutcome:
     site_from_image: Matrix3 | None = None
     view: ComparedView | None = None
     brightness: float = float("nan")
+    doubted: Mask | None = None
+    planted: tuple[Planted, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +102,7 @@ class ViewMaker:
         self._aligner = Aligner(reference, site_grid)
         self._thesis = thesis or ThesisOptions()
         self._tuning = FlightTuning() if thesis is None else None
+        self._planting = Planting()
 
     def compare_with_map(self, posed: PosedFrame) -> ViewOutcome | OneSided:
         """Align one frame and compare it with the map; a `ViewOutcome` if that ended it."""
@@ -136,10 +142,11 @@ class ViewMaker:
         if changed > _ALL_CHANGED:
             reason = f"{changed:.0%} of it looks changed: snow, a flood, night or another place?"
             return replace(outcome, status=ViewStatus.ALL_CHANGED, reason=reason)
-        return replace(outcome, view=ComparedView(
+        view = ComparedView(
             frame.index, frame.name, self._flight.utc_ns(frame.time_ns), aligned.site_from_image, aligned.camera_m,
             compared.image, compared.reference, valid, found.mask, found.boxes, found.scores, aligned.residual_px,
-        ))
+        )
+        return replace(outcome, view=view, doubted=_doubted(compared.found, found), planted=self._plant(view, compared))
 
     def placed(self, posed: PosedFrame, outcome: ViewOutcome, map_sigma_m: float) -> PlacedFrame:
         """The frame's record: placed by the map it fits, or rejected with the reason."""
@@ -199,6 +206,15 @@ class ViewMaker:
             earlier.append((Difference(found.mask, found.boxes, found.scores), sees))
         return believed((compared.found, compared.valid), earlier)
 
+    def _plant(self, view: ComparedView, compared: OneSided) -> tuple[Planted, ...]:
+        """What is found of things drawn into a view, if it is its turn; nothing by method thesis."""
+        if compared.settings is None:
+            return ()
+        settings, reference = replace(compared.settings, least_score=SURE), as_bgr(compared.reference)
+        return self._planting.plant(
+            view, lambda picture: compare_robust(reference, as_bgr(picture), compared.valid, settings).mask > 0
+        )
+
     def _difference(self, reference: ImageBGR, query: ImageBGR, valid: Mask) -> Difference:
         """What differs from the map; the flight's tuning learns of it."""
         settings = self._settings_now()
@@ -212,6 +228,14 @@ class ViewMaker:
     def _settings_now(self) -> RobustSettings | None:
         """Those of the robust method as the flight has set them so far; None for method thesis."""
         return None if self._tuning is None else replace(self._tuning.settings(), least_score=LEAST_SURENESS)
+
+
+def _doubted(found: Difference, kept: Difference) -> Mask:
+    """(h, w) what a view surely shows to differ from the map, less what was kept of it."""
+    sure = np.zeros(found.mask.shape, bool)
+    for x, y, w, h in found.boxes[found.scores >= SURE]:
+        sure[y : y + h, x : x + w] = True
+    return sure & (found.mask > 0) & (kept.mask == 0)
 
 
 def as_bgr(image: ImageRGB) -> ImageBGR:

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.map import ended_by_signal
+from sorvolo.cli.map import TO_CHECK, ended_by_signal
 from sorvolo.cli.options import (
     Area,
     AsJson,
@@ -28,7 +28,8 @@ from sorvolo.cli.options import (
 from sorvolo.cli.places import place_heading, place_words
 from sorvolo.cli.progress import ProgressReport, rate_words
 from sorvolo.cli.shown import newest_version, read_json, show_notices_and_warnings, show_path, site_of, unit_of
-from sorvolo.survey.wording import counted, plural
+from sorvolo.survey.coverage import GAP_WORDS, Gap
+from sorvolo.survey.wording import area_text, counted, plural
 
 if TYPE_CHECKING:
     from sorvolo.capture.live.reconnect import LiveSettings
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 
 _COLOURS = {"appeared": "green", "disappeared": "red", "replaced": "yellow", "moving": "cyan"}
 _MOST_ROWS, _MOST_REASONS = 40, 6
+_LEAST_SHOWN = 0.01  # of the compared ground: gaps smaller than that are in the report alone
 
 
 class ChangeMethod(StrEnum):
@@ -118,6 +120,8 @@ def compare(
         typer.echo(json.dumps({"site": str(site), "flights": results}, indent=1))
     else:
         show_results(results, site, Console(), coordinates)
+    if any(each["comparison"]["headline"]["quality"] != "compared" for each in results):
+        raise typer.Exit(TO_CHECK)
 
 
 def compare_and_read_results(
@@ -220,20 +224,19 @@ def _result(folder: Path, announced: Sequence[str]) -> dict[str, Any]:
 
 def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat) -> None:
     comparison, features = result["comparison"], result["changes"]["features"]
-    dark = " (it was too dark: most changes would be missed)" if comparison.get("most_missed") else ""
+    dark = " (too dark: most changes would be missed)" if comparison.get("most_missed") else ""
     console.print(
-        f"Flight {escape(result['flight'])}: {counted(len(features), 'change')} found{dark}", style="bold",
-        highlight=False,
+        f"Flight {escape(result['flight'])}: {comparison['headline']['text']}{dark}", style="bold", highlight=False
     )
     is_local = result["changes"].get("crs", "WGS84") is None  # no place on Earth, no metres
     if features:
         _show_changes(features, console, form, is_local=is_local)
     views = comparison["views"]
-    area = f"{comparison['compared_area_m2']:,.0f} {'square units' if is_local else 'm2'}"
     console.print(
-        f"{views['compared']:,} of {counted(sum(views.values()), 'view')} compared, {area}, "
-        f"in {result['seconds']:.1f} s; memory at most {result['peak_memory_mb']:,.0f} MB", highlight=False,
+        f"{views['compared']:,} of {counted(sum(views.values()), 'view')} compared in {result['seconds']:.1f} s; "
+        f"memory at most {result['peak_memory_mb']:,.0f} MB", highlight=False,
     )
+    _show_coverage(comparison["coverage"], console, is_local=is_local)
     extension = comparison.get("extension") or {}
     if extension.get("frames"):
         more = extension["shown_as_well"]
@@ -250,6 +253,26 @@ def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat)
     for reason, count in list(comparison["reasons"].items())[:_MOST_REASONS]:
         console.print(f"  {counted(count, 'view')}: {escape(reason)}", highlight=False)
     show_notices_and_warnings(result, console)
+
+
+def _show_coverage(coverage: Mapping[str, Any], console: Console, *, is_local: bool) -> None:
+    """What kept ground from being compared, and how small a thing would have been found on the rest."""
+    gaps = {name: area for name, area in coverage["gaps_m2"].items() if area >= _LEAST_SHOWN * coverage["compared_m2"]}
+    for name, area in gaps.items():
+        console.print(f"  not compared: {area_text(area, is_local=is_local)}, {GAP_WORDS[Gap(name)]}", highlight=False)
+    if not is_local:
+        console.print(f"things drawn into these views: {_size_words(coverage)}", highlight=False)
+
+
+def _size_words(coverage: Mapping[str, Any]) -> str:
+    """How small a thing is found in four of five pictures."""
+    plain, faint, large = coverage["smallest_m"], coverage["faint_m"], coverage["large_found"]
+    if large is None:
+        return "none, so that nobody knows how small a thing is found"
+    if plain is None:
+        return f"of the largest {large:.0%} are found; no size is found in four of five pictures"
+    faint_words = "faint ones of no size" if faint is None else f"faint ones from {faint:g} m"
+    return f"on half of the ground plain ones from {plain:g} m on are found, {faint_words}"
 
 
 def _show_changes(features: Sequence[Any], console: Console, form: PlaceFormat, *, is_local: bool) -> None:

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from sorvolo.missions.flight.settings import MapSettings
 
 _MOST_REASONS = 6
-_TO_CHECK = 3  # exit code of a flight that is mapped, but is no map, or one to check before use
+TO_CHECK = 3
+"""Exit code of a flight that was used, but whose result is to be checked before use."""
 
 
 class Method(StrEnum):
@@ -109,7 +110,7 @@ def map_command(
     else:
         show_reports(reports, site, Console())
     if any(each["headline"]["quality"] != "map" for each in reports):
-        raise typer.Exit(_TO_CHECK)
+        raise typer.Exit(TO_CHECK)
 
 
 def map_and_read_reports(

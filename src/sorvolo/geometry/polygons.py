@@ -139,3 +139,13 @@ def _polygon(rings: Sequence[PointsM]) -> Any:
 
 def _open(ring: Any) -> PointsM:
     return np.asarray(shapely.get_coordinates(ring)[:-1], dtype=np.float64)
+
+
+def union_of_boxes(boxes: Floats) -> list[list[PointsM]]:
+    """The polygons that boxes, (N, 4) west, south, east, north, cover together: each its outline, then its holes."""
+    joined = shapely.union_all(shapely.box(*np.asarray(boxes, float).T))
+    parts = shapely.get_parts(shapely.simplify(joined, 0.0))
+    return [
+        [np.asarray(ring.coords)[:-1] for ring in (part.exterior, *part.interiors)]
+        for part in parts if not part.is_empty
+    ]

@@ -27,3 +27,13 @@ def counted(count: int, noun: str) -> str:
 def counted_list(counts: Mapping[str, int], *, none: str = "nothing") -> str:
     """How many of each thing, in the mapping's order; `none` where all counts are 0."""
     return ", ".join(counted(count, name) for name, count in counts.items() if count) or none
+
+
+def area_text(area_m2: float, *, is_local: bool = False) -> str:
+    """Ground in square metres, hectares or square kilometres; in square units of a map without metres."""
+    if is_local:
+        return f"{area_m2:,.0f} square units"
+    if area_m2 < 1_000:
+        return f"{area_m2:,.0f} m2"
+    amount, unit = (area_m2 / 1e4, "ha") if area_m2 < 1e6 else (area_m2 / 1e6, "km2")
+    return f"{amount:.1f} {unit}" if amount < 10 else f"{amount:.0f} {unit}"

@@ -11,7 +11,10 @@ from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
 LEAST_SURENESS = 0.2
 """Score from which on a difference is handed to `believed`: an unsure one may confirm a sure one."""
 
-_SURE, _VERY_SURE = 0.5, 0.9  # scores of a difference that others confirm, and of one that nobody needs to
+SURE = 0.5
+"""Score of a difference that others confirm."""
+
+_VERY_SURE = 0.9  # score of one that nobody needs to confirm
 _NEAR_PX = 9  # what leans a little another way lies a few pixels beside
 _SHOWN, _SEEN = 0.3, 0.95  # shares of a difference that another picture shows, and must see to be asked
 _MAP = 0  # the first of the opinions
@@ -46,7 +49,7 @@ def believed(by_map: tuple[Difference, Mask], earlier: Sequence[tuple[Difference
     boxes, scores = [], []
     for own, opinion in enumerate(opinions):
         kept = mask > 0  # of others: two regions of one opinion are two things, though boxes overlap
-        for k in np.flatnonzero(opinion.difference.scores >= _SURE):
+        for k in np.flatnonzero(opinion.difference.scores >= SURE):
             x, y, w, h = opinion.difference.boxes[k]
             part = np.s_[y : y + h, x : x + w]
             shown = (opinion.difference.mask[part] > 0) & known[part]

@@ -1,15 +1,19 @@
 """What a comparison adds to a flight's report: views counted, changes counted, warnings."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sorvolo.change.compared_cells import ComparedCells
+from sorvolo.change.coverage.ground import CoverageSettings, GroundCoverage, coverage_summary
+from sorvolo.change.coverage.planting import recall_curve
 from sorvolo.change.views import ViewMaker, ViewOutcome
+from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.summary import median_of_known, percentile_of_known
 from sorvolo.missions.compare.extension import NIGHT
 from sorvolo.missions.flight.settings import CompareSettings
+from sorvolo.survey.coverage import CoveredGround, Gap
 from sorvolo.survey.findings import Change, ChangeKind, ViewStatus
+from sorvolo.survey.wording import area_text, plural
 
 _DARK = 0.4  # times the map's brightness: less hides things
 
@@ -18,7 +22,7 @@ class ViewCounts:
     """How a flight's frames ended and what ground they compared, as they come. Only `end` and `take` change it."""
 
     def __init__(self) -> None:
-        self.ground = ComparedCells()
+        self.ground = GroundCoverage()
         self._statuses: Counter[ViewStatus] = Counter()
         self._reasons: Counter[str] = Counter()
         self._residuals_px: list[float] = []
@@ -29,11 +33,17 @@ class ViewCounts:
         if reason:
             self._reasons[reason] += 1
 
-    def take(self, outcome: ViewOutcome) -> None:
-        """Count a frame's comparison."""
+    def take(self, outcome: ViewOutcome, outline_m: PointsM | None) -> None:
+        """Count a frame's comparison; `outline_m` (4, 2) is the ground under it, None where nobody knows."""
         self.end(outcome.status, outcome.reason)
         if outcome.site_from_image is not None:
             self._residuals_px.append(outcome.residual_px)
+        if outcome.view is not None:
+            is_dark = outcome.brightness < NIGHT
+            self.ground.compare(outcome.view, is_dark=is_dark, doubted=outcome.doubted, planted=outcome.planted)
+        else:
+            gap = Gap.NO_MAP if outcome.status is ViewStatus.OUTSIDE else Gap.REJECTED
+            self.ground.reject(outline_m, gap, outcome.reason.partition(":")[0])
 
     def __getitem__(self, status: ViewStatus) -> int:
         return self._statuses[status]
@@ -61,24 +71,40 @@ class ViewCounts:
 
 def comparison_summary(
     changes: Sequence[Change], suppressed: int, counts: ViewCounts, views: ViewMaker, settings: CompareSettings,
-    base_version: int,
+    base_version: int, ground: Sequence[CoveredGround], *, is_local: bool,
 ) -> dict[str, Any]:
     """The report's part on the comparison; specified in docs/formats.md. `suppressed` changes were not reported: a
     person rejected them on an earlier flight."""
     kinds = Counter(each.kind for each in changes)
+    coverage = coverage_summary(ground, counts.ground.unplaced, counts.ground.planted)
     return {
         "against_version": base_version,
         "method": settings.method,
         **counts.summary(),
         "changes": {kind.value: kinds[kind] for kind in ChangeKind},
         "suppressed": suppressed,
-        "compared_area_m2": counts.ground.area_m2,
+        "compared_area_m2": coverage["compared_m2"],
+        "headline": comparison_headline(len(changes), coverage, is_local=is_local),
+        "coverage": coverage | {"planted": recall_curve(counts.ground.planted, CoverageSettings().planting)},
         "unknown_share": counts.ground.unknown_share,
         "votes": settings.votes, "voters": settings.voters,
         "chosen": views.chosen(),
         "map_updated": settings.updates_map,
         "most_missed": views.brightness < NIGHT,
     }
+
+
+def comparison_headline(changes: int, coverage: Mapping[str, Any], *, is_local: bool) -> dict[str, str]:
+    """The first line of a comparison: its `quality`, "compared" or "doubtful", and its `text`.
+
+    It is doubtful when most of the ground under the views that the map shows could not be compared: then the number of
+    changes says nothing about the site. `coverage` is that of the report.
+    """
+    compared, missing = (area_text(coverage[name], is_local=is_local) for name in ("compared_m2", "not_compared_m2"))
+    found = f"{changes:,} {plural('change', changes)} in {compared}; {missing} could not be compared"
+    if coverage["is_enough"]:
+        return {"quality": "compared", "text": found}
+    return {"quality": "doubtful", "text": f"not to be relied on, most of the ground could not be compared: {found}"}
 
 
 def comparison_warnings(counts: ViewCounts, brightness: float) -> list[str]:

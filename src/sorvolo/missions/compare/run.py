@@ -28,10 +28,13 @@ from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.store.exports.change_files import write_pictures
+from sorvolo.store.exports.coverage_files import COVERAGE, coverage_geojson
 from sorvolo.store.exports.map_pictures import picture
+from sorvolo.store.exports.plain import features_name, geojson_bytes
 from sorvolo.store.images import ImageCache
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
+from sorvolo.survey.coverage import CoveredGround
 from sorvolo.survey.findings import Change, ComparedView, Verdict, ViewStatus
 from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
 from sorvolo.survey.mosaic import PlacedFrame, Status
@@ -123,7 +126,7 @@ class CompareRun:
         posed = pending.posed
         with self._log.stage(Stage.COMPARE):
             outcome = pending.outcome.result()
-        self._counts.take(outcome)
+        self._counts.take(outcome, self._views.pixels.ground_m(posed, outcome.site_from_image))
         self._placed[posed.frame.index] = self._views.placed(posed, outcome, self._map_sigma_m)
         with self._log.stage(Stage.DETECT):
             self._objects.search(posed, outcome, self._views)
@@ -155,10 +158,15 @@ class CompareRun:
             search, changes = self._objects.conclude(placed, changes)
         with self._log.stage(Stage.REPORT):
             shown = picture(self._writer.tiles, 800).rgba  # a day without change should cost little
-        report = self._report(changes, suppressed, shown_as_well, placed, notices, started_s)
+        ground = self._counts.ground.parts()
+        report = self._report(changes, suppressed, shown_as_well, placed, notices, started_s, ground)
         report["objects"] = self._objects.summary(search)
         page = report_page(report, shown, crops_of(search), self._archive.site())
-        self._writer.commit(placed, self._extension.images, report, page, changes=changes, search=search)
+        site = self._archive.site()
+        documents = {features_name(COVERAGE, is_local=site.is_local): geojson_bytes(coverage_geojson(ground, site))}
+        self._writer.commit(
+            placed, self._extension.images, report, page, changes=changes, search=search, documents=documents
+        )
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
@@ -174,7 +182,6 @@ class CompareRun:
         if announced:
             with self._log.stage(Stage.DETECT):
                 announced = self._objects.named(announced)
-        self._counts.ground.add(view)
         with self._log.stage(Stage.STORE):
             self._write_masks(view)
         return tuple(announced)
@@ -203,7 +210,7 @@ class CompareRun:
 
     def _report(
         self, changes: Sequence[Change], suppressed: int, shown_as_well: int, placed: Sequence[PlacedFrame],
-        notices: Sequence[Notice], started_s: float,
+        notices: Sequence[Notice], started_s: float, ground: Sequence[CoveredGround],
     ) -> dict[str, Any]:
         result = FlightResult(placed, self._setup.source.camera.camera, makes_map=False)
         report = build_report(
@@ -212,7 +219,8 @@ class CompareRun:
         )
         warnings = comparison_warnings(self._counts, self._views.brightness)
         comparison = comparison_summary(
-            changes, suppressed, self._counts, self._views, self._settings, self._base_version
+            changes, suppressed, self._counts, self._views, self._settings, self._base_version, ground,
+            is_local=self._archive.site().is_local,
         )
         comparison["candidates"] = None if self._evidence is None else self._evidence.outcomes()
         comparison["extension"] = {

@@ -17,6 +17,7 @@ from sorvolo.store.exports.map_pictures import Picture
 from sorvolo.store.exports.places import SYSTEMS, place_words
 from sorvolo.store.exports.plain import time_words
 from sorvolo.store.images import shrink
+from sorvolo.store.pages.coverage_layer import coverage_shapes, coverage_words, gap_rows, size_rows
 from sorvolo.store.pages.render import render
 from sorvolo.store.pages.words import area_words, at, known, length_words, number_at, picture_uri, plural, with_unit
 from sorvolo.store.site.change_records import StoredChange
@@ -53,14 +54,15 @@ def changes_page(
     site: Site,
     crops: Mapping[str, _Crops],
     *,
+    coverage: Sequence[Any] = (),
     before_words: str = "before",
     after_words: str = "after",
 ) -> str:
     """changes.html of one flight: `report` as in report.json with its "comparison" (docs/formats.md).
 
     `before` and `after` are the map's pictures on the same ground, None for a map without tiles; the words name their
-    dates. `crops` are the changes' pictures before and after by id. What the report does not hold is left out. All
-    text is escaped.
+    dates. `crops` are the changes' pictures before and after by id, `coverage` the features of coverage.geojson. What
+    the report does not hold is left out. All text is escaped.
     """
     most_bytes = int(_CROPS_BYTES / max(2 * len(changes), 1))
     shown = (before, after) if before is not None and after is not None and after.rgba.size > 0 else None
@@ -77,6 +79,8 @@ def changes_page(
         warning_lines=_warnings(report), is_many=len(changes) > _MANY, legend=_legend(changes),
         before_words=before_words, after_words=after_words,
         map=_map(*shown) if shown else None,
+        coverage=coverage_shapes(coverage, site, shown[1]) if shown and not site.is_local else (),
+        gap_rows=gap_rows(coverage), size_rows=() if site.is_local else size_rows(coverage),
         changes=listed, is_reviewed=is_reviewed, has_metres=not site.is_local,
         systems=() if site.is_local else tuple(SYSTEMS.items()),
         columns=_columns(listed, is_reviewed), files=_files(site),
@@ -145,7 +149,9 @@ def _headline(report: Mapping[str, Any], changes: Sequence[StoredChange]) -> str
     if views and not views.get(ViewStatus.COMPARED.value):
         return "No view could be compared with the map: this flight cannot show changes."
     area_m2 = number_at(report, "comparison", "compared_area_m2")
-    ground = f" on {area_words(area_m2)} of ground" if area_m2 is not None and report.get("georeferenced", True) else ""
+    ground = ""
+    if area_m2 is not None and report.get("georeferenced", True):
+        ground = coverage_words(at(report, "comparison") or {}) or f" on {area_words(area_m2)} of ground"
     kinds: Counter[ChangeKind] = Counter(each.kind for each in changes if each.kind is not ChangeKind.MOVING)
     moving = sum(each.kind is ChangeKind.MOVING for each in changes)
     also = f"; also {plural(moving, 'moving object')}" if moving else ""

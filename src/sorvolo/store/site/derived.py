@@ -91,7 +91,7 @@ def write_change_files(files: SiteFiles, flight_id: str, version: VersionEntry |
     before, after = _before_and_after(files, version, _PICTURE_PX if changes else _UNCHANGED_PX)
     made = {each.id: each for each in files.versions()}
     page = changes_page(
-        files.report(flight_id), changes, before, after, site, crops,
+        files.report(flight_id), changes, before, after, site, crops, coverage=files.coverage(flight_id),
         before_words=_words_of(made.get(version.parent_id)), after_words=_words_of(version),
     )
     atomic_write_bytes(folder / "changes.html", page.encode())

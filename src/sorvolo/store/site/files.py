@@ -3,7 +3,7 @@
 import fcntl
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -11,6 +11,8 @@ from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.store.atomic import TEMPORARY_PREFIX, writing
+from sorvolo.store.exports.coverage_files import COVERAGE
+from sorvolo.store.exports.plain import features_name
 from sorvolo.store.images import image_from_jpeg
 from sorvolo.store.nofollow import read_below, refuse_links
 from sorvolo.store.site import catalogue as records
@@ -123,12 +125,22 @@ class SiteFiles:
 
     def report(self, flight_id: str) -> Mapping[str, Any]:
         """A flight's report.json; empty when somebody took it away or broke it."""
+        return self._document(flight_id, "report.json")
+
+    def coverage(self, flight_id: str) -> Sequence[Any]:
+        """The features of a flight's coverage.geojson; none when it has none, or somebody broke it."""
+        name = features_name(COVERAGE, is_local=self.site().is_local)
+        features = self._document(flight_id, name).get("features")
+        return features if isinstance(features, list) else []
+
+    def _document(self, flight_id: str, document: str) -> Mapping[str, Any]:
+        """A JSON object in a flight's folder; empty when it is missing or broken."""
         try:
-            name = f"flights/{checked_name(flight_id, 'flight')}/report.json"
-            report = json.loads(read_below(self.folder, name, _MOST_REPORT_BYTES))
+            name = f"flights/{checked_name(flight_id, 'flight')}/{document}"
+            content = json.loads(read_below(self.folder, name, _MOST_REPORT_BYTES))
         except (OSError, ValueError, RecursionError):
             return {}
-        return report if isinstance(report, dict) else {}
+        return content if isinstance(content, dict) else {}
 
     def find_site(self) -> Site | None:
         """The site; None while there is none."""

@@ -1,0 +1,282 @@
+"""The ground under a flight's views: which of it was compared with the map, why the rest was not, what could be found.
+
+Ground is counted in square cells. A cell is compared when enough views compared it well; else the record names what
+kept them from it. What no view was over is not part of it.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.change.coverage.planting import Planted, PlantingSettings, Sensitivity, sensitivities, texture
+from sorvolo.change.evidence.cells import CellWindow, window_around
+from sorvolo.geometry.arrays import Floats, ImageRGB, Mask, PointsM
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.polygons import union_of_boxes
+from sorvolo.registration.features import sharpness
+from sorvolo.survey.coverage import CoveredGround, Gap
+from sorvolo.survey.findings import ComparedView
+
+_CHUNK = 64
+_MOST_REASONS = 250  # a byte holds which one
+_STEPS_M = (0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # sizes are written in these steps
+
+
+@dataclass(frozen=True)
+class CoverageSettings:
+    """When a view's ground counts as compared."""
+
+    cell_m: float = 1.0
+    least_views: int = 2  # as the evidence: what one view alone shows is not announced
+    black: float = 14.0  # mean grey level of ground in whose shadow nothing can be seen
+    least_sharpness: float = 0.5  # of the flight's usual one: a view with less is blurred
+    black_px: int = 15  # over how many pixels that mean is taken
+    planting: PlantingSettings = field(default_factory=PlantingSettings)
+
+
+class _Chunk:
+    def __init__(self) -> None:
+        self.clean = np.zeros((_CHUNK, _CHUNK), np.uint16)
+        self.gaps = {gap: np.zeros((_CHUNK, _CHUNK), np.uint16) for gap in _COUNTED}
+        self.rejected = np.zeros((_CHUNK, _CHUNK), np.uint8)  # which reason; 0 none
+        self.texture = np.zeros((_CHUNK, _CHUNK), np.float32)  # summed over the clean views
+        self.finest = np.full((_CHUNK, _CHUNK), np.inf, np.float32)  # m of a pixel
+
+
+_COUNTED = (Gap.NO_MAP, Gap.DARK, Gap.LEANING, Gap.BLURRED)
+_CLEAN = 255  # marks of a view's pixels: this, or 1 + the place in _COUNTED
+
+
+class GroundCoverage:
+    """The ground that a flight's views were over. `compare` and `reject` change it."""
+
+    def __init__(self, settings: CoverageSettings = CoverageSettings()) -> None:
+        self._settings = settings
+        self._chunks: dict[tuple[int, int], _Chunk] = {}
+        self._reasons: list[str] = []
+        self._sharpness: list[float] = []
+        self._unknown: list[float] = []
+        self._planted: list[Planted] = []
+        self.unplaced = 0  # views that nobody knows the ground of
+
+    def compare(
+        self, view: ComparedView, *, is_dark: bool = False, doubted: Mask | None = None,
+        planted: Sequence[Planted] = (),
+    ) -> None:
+        """Count a compared view. `doubted` (h, w) is what differs from the map and is contradicted by earlier pictures;
+        `is_dark` that the whole flight is; `planted` what was found of things drawn into it."""
+        self._planted.extend(planted)
+        self._unknown.append(1.0 - float(view.valid.mean()))
+        height, width = view.valid.shape
+        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+        window = window_around(apply_homography(view.site_from_image, corners), self._settings.cell_m)
+        cell_from_image = np.linalg.inv(window.site_from_cell(self._settings.cell_m)) @ view.site_from_image
+        size = window.shape[::-1]
+        marks = self._marks(view, is_dark=is_dark, doubted=doubted)
+        laid = cv2.warpPerspective(marks, cell_from_image, size, flags=cv2.INTER_NEAREST)
+        rough = texture(view)
+        image_from_rough = _resized(width / rough.shape[1], height / rough.shape[0])
+        rough_laid = cv2.warpPerspective(
+            rough, cell_from_image @ image_from_rough, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        for chunk, inside, part in self._pieces(window):
+            mine = laid[part]
+            is_clean = mine == _CLEAN
+            chunk.clean[inside] += is_clean
+            chunk.texture[inside] += np.where(is_clean, rough_laid[part], 0)
+            finest = chunk.finest[inside]
+            np.minimum(finest, view.m_per_px, out=finest, where=is_clean)
+            for place, gap in enumerate(_COUNTED, 1):
+                chunk.gaps[gap][inside] += mine == place
+
+    def reject(self, outline_m: PointsM | None, gap: Gap, why: str) -> None:
+        """Count a view that was not compared, with the ground (N, 2) under it as far as anyone knows."""
+        if outline_m is None or not np.isfinite(outline_m).all():
+            self.unplaced += 1
+            return
+        window = window_around(outline_m, self._settings.cell_m)
+        site_from_cell = window.site_from_cell(self._settings.cell_m)
+        under = np.zeros(window.shape, np.uint8)
+        cells = apply_homography(np.linalg.inv(site_from_cell), outline_m)
+        cv2.fillPoly(under, [np.rint(cells).astype(np.int32)], 1)
+        number = 0 if gap in _COUNTED else self._number_of(why)
+        for chunk, inside, part in self._pieces(window):
+            if gap in _COUNTED:
+                chunk.gaps[gap][inside] += under[part]
+            else:
+                chunk.rejected[inside][under[part] > 0] = number
+
+    @property
+    def unknown_share(self) -> float | None:
+        """The mean share of a view that lay on unknown ground; None before the first view."""
+        return float(np.mean(self._unknown)) if self._unknown else None
+
+    @property
+    def planted(self) -> Sequence[Planted]:
+        """Everything that was drawn into the views."""
+        return self._planted
+
+    def parts(self) -> list[CoveredGround]:
+        """The ground in parts that were treated alike, compared ones first, each as large as it is."""
+        plain, faint = sensitivities(self._planted, self._settings.planting)[:2]
+        runs: dict[tuple[int, int, int], list[tuple[float, float, float, float]]] = {}
+        cell_m = self._settings.cell_m
+        for (column, row), chunk in self._chunks.items():
+            labels = self._labels(chunk, plain, faint)
+            for label, x0, x1, y in _runs(labels):
+                west, north = (column * _CHUNK + x0) * cell_m, -(row * _CHUNK + y) * cell_m
+                east = (column * _CHUNK + x1) * cell_m
+                runs.setdefault(label, []).append((west, north - cell_m, east, north))
+        parts = [self._part(label, np.array(boxes)) for label, boxes in runs.items()]
+        return sorted(parts, key=lambda each: (each.gap is not None, str(each.gap), -each.area_m2))
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _part(self, label: tuple[int, int, int], boxes: Floats) -> CoveredGround:
+        kind, first, second = label
+        area_m2 = float(((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])).sum())
+        polygons = tuple(tuple(rings) for rings in union_of_boxes(boxes))
+        if kind == _CLEAN:
+            return CoveredGround(polygons, area_m2, None, "", _step_m(first), _step_m(second))
+        gap = list(Gap)[kind]
+        why = self._reasons[first - 1] if gap is Gap.REJECTED else ""
+        return CoveredGround(polygons, area_m2, gap, why, np.nan, np.nan)
+
+    def _labels(self, chunk: _Chunk, plain: Sensitivity, faint: Sensitivity) -> NDArray[np.int32]:
+        """(rows, columns, 3): the class, and of compared ground the steps of both sizes, of rejected the reason."""
+        classes = self._classes(chunk)
+        labels = np.zeros((*classes.shape, 3), np.int32)
+        labels[..., 0] = classes
+        labels[classes == list(Gap).index(Gap.REJECTED), 1] = chunk.rejected[
+            classes == list(Gap).index(Gap.REJECTED)
+        ]
+        clean = classes == _CLEAN
+        if clean.any() and self._planted:
+            rough = chunk.texture[clean] / chunk.clean[clean]
+            sizes_m = [each.smallest_px(rough) * chunk.finest[clean] for each in (plain, faint)]
+            labels[clean, 1], labels[clean, 2] = (_step_of(each) for each in sizes_m)
+            labels[clean, 0] = np.where(plain.is_blind(rough), list(Gap).index(Gap.INSENSITIVE), _CLEAN)
+            labels[labels[..., 0] == list(Gap).index(Gap.INSENSITIVE), 1:] = 0
+        return labels
+
+    def _classes(self, chunk: _Chunk) -> NDArray[np.int32]:
+        """(rows, columns): `_CLEAN`, the place of a gap among all, or -1 where no view was."""
+        names = list(Gap)
+        clean = chunk.clean.astype(np.int32)
+        hidden = np.stack([chunk.gaps[gap] for gap in (Gap.DARK, Gap.LEANING, Gap.BLURRED)]).astype(np.int32)
+        classes = np.full(clean.shape, -1, np.int32)
+        classes[chunk.rejected > 0] = names.index(Gap.REJECTED)
+        classes[chunk.gaps[Gap.NO_MAP] > 0] = names.index(Gap.NO_MAP)
+        classes[clean > 0] = names.index(Gap.ONE_VIEW)
+        most = np.array([names.index(gap) for gap in (Gap.DARK, Gap.LEANING, Gap.BLURRED)])[hidden.argmax(axis=0)]
+        classes = np.where(hidden.sum(axis=0) > 0, most, classes)
+        is_compared = (clean >= self._settings.least_views) & (clean >= hidden.sum(axis=0))
+        return np.where(is_compared, _CLEAN, classes)
+
+    def _marks(self, view: ComparedView, *, is_dark: bool, doubted: Mask | None) -> NDArray[np.uint8]:
+        """A view's pixels, (h, w): 255 compared, else 1 + the place of what kept it from that; 0 where it sees nothing.
+        """
+        def mark(gap: Gap) -> int:
+            return 1 + _COUNTED.index(gap)
+
+        marks = np.full(view.valid.shape, _CLEAN, np.uint8)
+        gray = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
+        is_black = np.minimum(*(_mean_grey(each, self._settings.black_px) for each in (view.image, view.reference)))
+        marks[is_black < self._settings.black] = mark(Gap.DARK)
+        if doubted is not None:
+            marks[doubted] = mark(Gap.LEANING)
+        self._sharpness.append(sharpness(np.asarray(gray, np.uint8)))
+        if self._sharpness[-1] < self._settings.least_sharpness * float(np.median(self._sharpness)):
+            marks[:] = mark(Gap.BLURRED)
+        if is_dark:
+            marks[:] = mark(Gap.DARK)
+        marks[~view.valid] = mark(Gap.NO_MAP)
+        return marks
+
+    def _number_of(self, why: str) -> int:
+        if why not in self._reasons and len(self._reasons) < _MOST_REASONS:
+            self._reasons.append(why)
+        return 1 + self._reasons.index(why) if why in self._reasons else _MOST_REASONS
+
+    def _pieces(self, window: CellWindow) -> Iterator[tuple[_Chunk, tuple[slice, slice], tuple[slice, slice]]]:
+        """Chunks, what of them lies in a window, and where that is in the window's raster."""
+        for row in range(window.y0 // _CHUNK, -(-window.y1 // _CHUNK)):
+            y0, y1 = max(window.y0, row * _CHUNK), min(window.y1, (row + 1) * _CHUNK)
+            for column in range(window.x0 // _CHUNK, -(-window.x1 // _CHUNK)):
+                x0, x1 = max(window.x0, column * _CHUNK), min(window.x1, (column + 1) * _CHUNK)
+                chunk = self._chunks.setdefault((column, row), _Chunk())
+                inside = np.s_[y0 - row * _CHUNK : y1 - row * _CHUNK, x0 - column * _CHUNK : x1 - column * _CHUNK]
+                yield chunk, inside, np.s_[y0 - window.y0 : y1 - window.y0, x0 - window.x0 : x1 - window.x0]
+
+
+def coverage_summary(
+    parts: Sequence[CoveredGround], unplaced: int, planted: Sequence[Planted] = ()
+) -> dict[str, Any]:
+    """The areas as a report has them; `smallest_m` is what is found on half of the compared ground, `faint_m` too.
+
+    `large_found` is the share found of plain things of the largest size that was drawn, None where none was.
+    """
+    compared = [each for each in parts if each.gap is None]
+    gaps_m2 = {
+        gap.value: sum(each.area_m2 for each in parts if each.gap is gap) for gap in Gap
+        if any(each.gap is gap for each in parts)
+    }
+    compared_m2, missing_m2 = sum(each.area_m2 for each in compared), sum(gaps_m2.values())
+    on_map_m2 = compared_m2 + missing_m2 - gaps_m2.get(Gap.NO_MAP.value, 0.0)
+    return {
+        "compared_m2": compared_m2, "not_compared_m2": missing_m2,
+        "gaps_m2": dict(sorted(gaps_m2.items(), key=lambda item: -item[1])), "views_without_a_place": unplaced,
+        "smallest_m": _middle([(each.smallest_m, each.area_m2) for each in compared]),
+        "faint_m": _middle([(each.faint_m, each.area_m2) for each in compared]),
+        "large_found": _large_found(planted),
+        "is_enough": compared_m2 >= 0.5 * on_map_m2 and compared_m2 > 0,
+    }
+
+
+def _large_found(planted: Sequence[Planted]) -> float | None:
+    """The share found of the largest and plainest things; None where nothing was planted."""
+    largest = max(((each.contrast, each.size_px) for each in planted), default=None)
+    found = [each.found for each in planted if (each.contrast, each.size_px) == largest]
+    return float(np.mean(found)) if found else None
+
+
+def _middle(sizes: Sequence[tuple[float, float]]) -> float | None:
+    """The size that half of the ground has or a smaller one; None where half of the ground has none."""
+    total, covered = sum(area for _, area in sizes), 0.0
+    for size_m, area in sorted(each for each in sizes if np.isfinite(each[0])):
+        covered += area
+        if 2 * covered >= total:
+            return size_m
+    return None
+
+
+def _step_of(sizes_m: Floats) -> NDArray[np.int32]:
+    """1 + the place of the next larger step; 0 where the size is not known or larger than all."""
+    place = np.searchsorted(_STEPS_M, np.nan_to_num(sizes_m, nan=np.inf))
+    return np.where(place < len(_STEPS_M), place + 1, 0).astype(np.int32)
+
+
+def _step_m(number: int) -> float:
+    return _STEPS_M[number - 1] if number else float("nan")
+
+
+def _runs(labels: NDArray[np.int32]) -> Iterator[tuple[tuple[int, int, int], int, int, int]]:
+    """The label, first column, last column + 1 and row of each run of cells that are alike; not where no view was."""
+    for y, row in enumerate(labels):
+        starts = np.flatnonzero(np.r_[True, (row[1:] != row[:-1]).any(axis=1)])
+        for start, end in zip(starts, np.r_[starts[1:], len(row)]):
+            if row[start, 0] >= 0:
+                kind, first, second = (int(each) for each in row[start])
+                yield (kind, first, second), int(start), int(end), y
+
+
+def _mean_grey(image: ImageRGB, side_px: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (side_px, side_px)), np.uint8)
+
+
+def _resized(x: float, y: float) -> Floats:
+    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])

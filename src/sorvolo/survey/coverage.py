@@ -1,0 +1,46 @@
+"""Which ground a comparison could speak about, and what kept it from the rest."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from sorvolo.geometry.arrays import PointsM
+
+
+class Gap(StrEnum):
+    """Why ground under a flight's views was not compared."""
+
+    NO_MAP = "no-map"  # the map does not show it
+    REJECTED = "view-rejected"  # its views were not aligned, or nearly all of them differs; `why` has the reason
+    DARK = "dark"  # too dark on either date
+    LEANING = "leaning"  # earlier pictures contradict the map there: crowns and walls that lean
+    BLURRED = "blurred"  # its views are blurred
+    ONE_VIEW = "one-view"  # one view alone shows it, which announces nothing
+    INSENSITIVE = "insensitive"  # things that were drawn there were not found
+
+
+GAP_WORDS = {
+    Gap.NO_MAP: "the map does not show it",
+    Gap.REJECTED: "its views could not be compared",
+    Gap.DARK: "black shadow or night on one of the dates",
+    Gap.LEANING: "crowns or walls lean there: earlier pictures contradict the map",
+    Gap.BLURRED: "its views are blurred",
+    Gap.ONE_VIEW: "one view alone shows it, which announces nothing",
+    Gap.INSENSITIVE: "things drawn into its views were not found",
+}
+"""Each reason in words."""
+
+
+@dataclass(frozen=True, eq=False)
+class CoveredGround:
+    """Ground that was treated alike: polygons (outline, then holes; (N, 2) site metres each).
+
+    `gap` is None where it was compared; then `smallest_m` and `faint_m` are the sizes from which a plain and a faint
+    thing are found, NaN where not known. `why` is the reason of a rejected view.
+    """
+
+    polygons: tuple[tuple[PointsM, ...], ...]
+    area_m2: float
+    gap: Gap | None
+    why: str
+    smallest_m: float
+    faint_m: float
