@@ -69,6 +69,48 @@ def read_area(path: Path) -> Area:
         raise InputError(f"{path}: {error}") from error
 
 
+def read_segments(path: Path) -> list[tuple[str, Area, float]]:
+    """The segments of a search in a GeoJSON file: name, area, and the probability that the missing is in it (POA).
+
+    Each feature is a polygon with the property `poa` or `POA`, a probability from 0 to 1, or `poa_percent`; `name` is
+    its name. Raises InputError for anything else, and for probabilities that add up to more than 1.
+    """
+    text = text_of(path, read_small_file(path, "file of segments", _MOST_BYTES), "file of segments", "GeoJSON polygons")
+    try:
+        features = json.loads(text)["features"]
+        segments = [_segment(path, number, each) for number, each in enumerate(features, start=1)]
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: broken GeoJSON: {error}") from error
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: no FeatureCollection of polygons with the property poa: {error}") from error
+    except GeometryError as error:
+        raise InputError(f"{path}: {error}") from error
+    if not segments or sum(poa for _, _, poa in segments) > 1.0 + 1e-6:
+        raise InputError(f"{path}: the probabilities (poa) of at least one segment must add up to 1 at most")
+    return segments
+
+
+def _segment(path: Path, number: int, feature: Any) -> tuple[str, Area, float]:
+    properties = feature["properties"] or {}
+    name = str(properties.get("name") or f"segment {number}")
+    shares = {"poa": 1.0, "POA": 1.0, "poa_percent": 0.01}
+    stated = [float(properties[key]) * share for key, share in shares.items() if properties.get(key) is not None]
+    if not stated or not 0 <= stated[0] <= 1:
+        raise InputError(f"{path}: {name} needs the property poa, the probability (0 to 1) that the missing is there")
+    polygons = _geojson_polygons(path, feature)
+    return name, Area(tuple(polygons), name), stated[0]
+
+
+def _geojson_polygons(path: Path, feature: Any) -> list[Rings]:
+    polygons: list[Rings] = []
+    for geometry in _geometries(feature):
+        if geometry["type"] == "Polygon":
+            polygons.append(_geojson_rings(path, geometry["coordinates"]))
+        elif geometry["type"] == "MultiPolygon":
+            polygons += [_geojson_rings(path, each) for each in geometry["coordinates"]]
+    return polygons
+
+
 def _kml_in_kmz(path: Path, raw: bytes) -> bytes:
     try:
         with zipfile.ZipFile(io.BytesIO(raw)) as archive:

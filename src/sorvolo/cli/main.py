@@ -24,6 +24,7 @@ from sorvolo.cli.map import map_command
 from sorvolo.cli.models import models_app
 from sorvolo.cli.plan import plan
 from sorvolo.cli.review import review
+from sorvolo.cli.search import search_command
 from sorvolo.cli.simulate import simulate
 from sorvolo.cli.train import train
 from sorvolo.cli.watch import watch_command
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
 _COMMANDS: dict[str, Callable[..., None]] = {
     "inspect": inspect, "plan": plan, "map": map_command, "compare": compare, "watch": watch_command,
-    "simulate": simulate, "train": train,
+    "search": search_command, "simulate": simulate, "train": train,
     "calibrate": calibrate, "demo": demo, "history": history, "review": review,
 }
 _FAILED, _STOPPED = 1, 130

@@ -133,6 +133,19 @@ def widened_line(line: PointsM, reach: float) -> list[list[PointsM]]:
     return polygons
 
 
+def swollen(polygons: Sequence[Sequence[PointsM]], reach: float) -> list[list[PointsM]]:
+    """The polygons of everything within `reach` of any of these; corners stay corners, what meets becomes one.
+
+    Gaps narrower than `reach` all over are filled.
+    """
+    widened = shapely.buffer(shapely.union_all([_polygon(rings) for rings in polygons]), reach, join_style="mitre")
+    found = []
+    for polygon in shapely.get_parts(shapely.simplify(widened, reach / 2)):
+        rings = [_open(ring) for ring in shapely.get_rings(polygon)]
+        found.append([rings[0], *(ring for ring in rings[1:] if narrowest_extent(ring)[0] > reach)])
+    return found
+
+
 def _polygon(rings: Sequence[PointsM]) -> Any:
     return shapely.polygons(shapely.linearrings(rings[0]), [shapely.linearrings(ring) for ring in rings[1:]] or None)
 

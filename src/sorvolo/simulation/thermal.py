@@ -13,9 +13,11 @@ from sorvolo.simulation.photographed import recompressed
 from sorvolo.simulation.view import Patch, cut_out
 from sorvolo.simulation.world import Day
 
-_GROUND = 90.0
+GROUND_LEVEL = 90.0
+"""The ground's level of warmth in the pictures that are rendered."""
+
 _UP_SIDES = np.zeros(3)
-# how much warmer than the ground, in grey levels of the span that `_GROUND` leaves; people always stand out
+# how much warmer than the ground, in grey levels of the span that `GROUND_LEVEL` leaves; people always stand out
 _WARMTH = {
     Label.PERSON: (35.0, 140.0), Label.CAR: (-45.0, 55.0), Label.SMALL: (-35.0, 40.0), Label.TREE: (-15.0, 25.0),
     Label.HOUSE: (-30.0, 45.0),
@@ -32,10 +34,10 @@ def warm_day(day: Day, bare: GroundRaster, rng: np.random.Generator) -> Day:
     raster = day.ground if has_sun else bare.resampled(day.ground.m_per_px[0])
     spread, turn = rng.uniform(0.1, 0.5), 1.0 if has_sun else rng.choice((-1.0, 1.0))
     grey = cv2.GaussianBlur(raster.rgb.mean(axis=2).astype(np.float32), (0, 0), 1.2)
-    warmth = _GROUND + np.float32(spread * turn) * (grey - grey.mean())
+    warmth = GROUND_LEVEL + np.float32(spread * turn) * (grey - grey.mean())
     warmth += np.float32(rng.uniform(2, 9)) * layer(rng, warmth.shape[:2], 4.0 / raster.m_per_px[0])
     ground = replace(raster, rgb=np.dstack([np.clip(warmth, 0, 255).astype(np.uint8)] * 3))
-    bodies = {thing.id: _warm_body(thing, day.bodies[thing.id], rng) for thing in day.things}
+    bodies = {thing.id: warm_body(thing, day.bodies[thing.id], rng) for thing in day.things}
     return replace(day, ground=ground, bodies=bodies)
 
 
@@ -54,7 +56,8 @@ def heat_picture(image: ImageRGB, rng: np.random.Generator) -> ImageRGB:
     return recompressed(np.dstack([np.round(255 * shown).astype(np.uint8)] * 3), rng)
 
 
-def _warm_body(thing: Thing, body: Body, rng: np.random.Generator) -> Body:
+def warm_body(thing: Thing, body: Body, rng: np.random.Generator) -> Body:
+    """The body with warmth for colour, in levels around `GROUND_LEVEL`: how warm it is drawn from its class's range."""
     low, high = _WARMTH[thing.label]
     warmth = float(rng.uniform(low, high))
     if thing.label.is_target and abs(warmth) < _LEAST_CONTRAST:
@@ -62,13 +65,14 @@ def _warm_body(thing: Thing, body: Body, rng: np.random.Generator) -> Body:
     detail = float(rng.uniform(0.3, 0.8) if thing.label is Label.TREE else rng.uniform(0.05, 0.25))
     mean = _mean_grey([part.texture for part in body.parts])
     parts: list[Part] = [
-        replace(part, texture=_warmed(part.texture, _GROUND + warmth, detail, mean)) for part in body.parts
+        replace(part, texture=_warmed(part.texture, GROUND_LEVEL + warmth, detail, mean)) for part in body.parts
     ]
     if thing.label is Label.PERSON and len(parts) > 2:  # feet and clothes are cooler than the head
-        parts[0] = replace(parts[0], texture=_warmed(body.parts[0].texture, _GROUND + 0.6 * warmth, detail, mean))
-        parts[-1] = replace(parts[-1], texture=_warmed(body.parts[-1].texture, _GROUND + 1.2 * warmth, detail, mean))
+        for index, share in ((0, 0.6), (-1, 1.2)):
+            texture = _warmed(body.parts[index].texture, GROUND_LEVEL + share * warmth, detail, mean)
+            parts[index] = replace(parts[index], texture=texture)
     if thing.label is Label.CAR and rng.uniform() < 0.65:
-        parts.insert(5, _engine(thing, _GROUND + float(rng.uniform(30, 140))))  # above the bonnet, below the cabin
+        parts.insert(5, _engine(thing, GROUND_LEVEL + float(rng.uniform(30, 140))))  # above the bonnet, below the cabin
     return Body(tuple(parts))
 
 

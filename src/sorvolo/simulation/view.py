@@ -75,8 +75,8 @@ class View:
         return bool(normal_m @ (self.eye_m[:3] - self.eye_m[3] * corner_m) > 0)
 
 
-def camera_view(camera: Camera, site_from_camera: Pose, rays: RaysF32) -> View:
-    """What a camera sees from this pose; `rays` is its `ray_grid`."""
+def camera_view(camera: Camera, site_from_camera: Pose, rays: RaysF32 | None) -> View:
+    """What a camera sees from this pose; `rays` is its `ray_grid`, or None without distortion."""
     camera_from_site = site_from_camera.inverse()
     matrix = np.column_stack([camera_from_site.rotation, camera_from_site.translation_m])
     return View(camera, matrix, np.append(site_from_camera.translation_m, 1.0), rays)

@@ -124,7 +124,7 @@ def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px:
     standing = [thing for thing in things if not thing.is_moving]
     ground = _with_shadows(ground, standing, bodies, light)
     shadows = {
-        thing.id: _own_shadow(thing, bodies[thing.id], light, m_per_px) for thing in things if thing.is_moving
+        thing.id: own_shadow(thing, bodies[thing.id], light, m_per_px) for thing in things if thing.is_moving
     }
     cloud_shade = 0.38 if weather.has_clouds else 0.0
     return Day(ground, things, bodies, shadows, light, gains, cloud_shade)
@@ -334,7 +334,7 @@ def _with_shadows(
     return replace(ground, rgb=rgb)
 
 
-def _own_shadow(thing: Thing, body: Body, light: Light, m_per_px: float) -> Patch:
+def own_shadow(thing: Thing, body: Body, light: Light, m_per_px: float) -> Patch:
     """The shadow of something that moves, as a dark patch on the ground around its place."""
     reach_m = thing.reach_m + thing.size_m[2] * float(np.hypot(*light.sun[:2]) / light.sun[2]) + 0.3
     side = max(8, int(np.ceil(2 * reach_m / m_per_px)))

@@ -1,0 +1,264 @@
+"""Whether `sorvolo search` states the right chances: python benchmarks/search_pod.py [--flights 24] [--seeds ...]
+
+Simulated searches over fresh ground, by day and with a thermal camera, with people and cars hidden in them. Each flight
+is measured as the command does it: plants of other seeds go into its frames, and each hidden thing gets the chance that
+the plants give its place. Then the untouched frames are searched, and what is reported by the rule of maps counts as
+found. Where the chance is 0.8, four of five should be found.
+
+Hidden people are of two renderings: drawn limb by limb, as the plants are (other bodies, clothes and poses), and the
+plain figures of simulated flights, which no plant is like. Poses of the frames are the true ones. What crowns hide by
+the measure's own judgement is counted apart.
+
+Writes results/search_pod.json.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from provenance import commit, machine, seeds_or_drawn
+from sorvolo.detection.detector import Detector
+from sorvolo.geometry.geodesy import utm_epsg
+from sorvolo.geometry.grid import SiteGrid
+from sorvolo.geometry.homography import site_from_image_homography
+from sorvolo.geometry.level_ground import footprint
+from sorvolo.missions.search.measure import MeasuredFlight, SearchFrame, measure_flight, reach_m
+from sorvolo.missions.search.settings import SearchSettings
+from sorvolo.search.cells import cell_side_m, cells_over
+from sorvolo.search.conditions import gather, look_at
+from sorvolo.search.recall import calibration
+from sorvolo.simulation.flight import SimulatedFlight, simulate_flight
+from sorvolo.simulation.frame_light import frame_light
+from sorvolo.simulation.objects import Thing
+from sorvolo.simulation.planted import new_plant
+from sorvolo.simulation.rendering import render, render_labels
+from sorvolo.simulation.settings import (
+    ImagingSettings,
+    MotionSettings,
+    OutputSettings,
+    PathSettings,
+    SceneSettings,
+    SimulationSettings,
+)
+from sorvolo.simulation.thermal import heat_picture, warm_day
+from sorvolo.simulation.world import build_day, is_free
+from sorvolo.survey.flight import Site
+from sorvolo.survey.mosaic import PlacedFrame, Status
+from sorvolo.tracking.laying import lay_on_ground
+from sorvolo.tracking.planted import reported_plants
+
+RESULTS = Path(__file__).parent / "results" / "search_pod.json"
+SUN_DEG = (215.0, 48.0)  # of every first day in the simulation
+PEOPLE, CARS = 28, 12  # hidden in a flight
+GROUNDS = ("countryside", "dirt", "urban", "sand")
+HEIGHTS_M = (18.0, 30.0, 45.0)
+
+
+def main() -> None:
+    """Fly, measure, search, count, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--flights", type=int, default=24)
+    parser.add_argument("--seeds", type=int, nargs="*", default=[])
+    parser.add_argument("--plants", type=int, default=60)
+    parser.add_argument("--minutes", type=float, default=1e9, help="Begin no flight after so many minutes.")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    wishes = parser.parse_args()
+    started = time.monotonic()
+    detector = Detector.load("default", provider="cpu", threads=1)
+    rows: list[dict] = []
+    seeds = seeds_or_drawn("search_pod", wishes.seeds, wishes.flights)
+    done = []
+    for number, seed in enumerate(seeds):
+        if time.monotonic() - started > 60 * wishes.minutes:
+            break
+        flight, images = flown(seed, number)
+        rows += searched(flight, images, detector, wishes.plants, number)
+        done.append(seed)
+        document = {
+            "benchmark": "search_pod", "machine": machine(), "commit": commit(), "date": time.strftime("%Y-%m-%d"),
+            "seeds": done, "plants": wishes.plants, "model": detector.info.name, "groups": summarised(rows),
+            "rows": rows,
+        }
+        wishes.results.write_text(json.dumps(document, indent=1) + "\n")
+        print(number, seed, {name: each["bins"] for name, each in summarised(rows).items()}, flush=True)
+
+
+def flown(seed: int, number: int) -> tuple[SimulatedFlight, list]:
+    """A flight of photos over hidden people and cars, and its pictures; every third is thermal, some are blurred."""
+    rng = np.random.default_rng([seed, 1])
+    height_m = float(HEIGHTS_M[int(rng.integers(len(HEIGHTS_M)))] * rng.uniform(0.85, 1.15))
+    is_thermal = number % 3 == 2
+    length_m = 2.2 * height_m
+    settings = SimulationSettings(
+        seed=seed, flights=1,
+        scene=SceneSettings(str(rng.choice(GROUNDS)), people=PEOPLE // 2, cars=CARS, small_objects=0),
+        path=PathSettings(height_m=height_m, speed_m_s=8, length_m=length_m, strips=2, strip_spacing_m=0.5 * height_m),
+        motion=MotionSettings(camera_pitch_deg=float(rng.choice([-90.0, -90.0, -65.0]))),
+        imaging=ImagingSettings(
+            640, 480, fps=6, distortion=(0.0,) * 5, exposure_s=float(rng.choice([1 / 1000, 1 / 1000, 1 / 60])),
+        ),
+        output=OutputSettings(photos=True, photo_overlap=0.55),
+    )
+    flight = simulate_flight(settings)
+    things = (*flight.day.things, *hidden_limb_by_limb(flight, rng))
+    world = replace(flight.world, days=(things,))
+    flight = replace(flight, world=world, day=build_day(world, settings, 1, settings.m_per_px))
+    return flight, [taken(flight, index, is_thermal) for index in range(len(flight))]
+
+
+def hidden_limb_by_limb(flight: SimulatedFlight, rng: np.random.Generator) -> Iterator[Thing]:
+    """People of the plants' kind, where there is room for them on the flown ground."""
+    outlines_m = np.concatenate([footprint(flight.camera, pose) for pose in flight.true_poses])
+    low, high = np.percentile(outlines_m, (15, 85), axis=0)
+    placed = list(flight.day.things)
+    for number in range(PEOPLE // 2):
+        for _ in range(50):
+            new = new_plant(5000 + number, "person", rng.uniform(low, high), int(rng.integers(2**31)))
+            if is_free(new, placed):
+                placed.append(new)
+                yield new
+                break
+
+
+def taken(flight: SimulatedFlight, index: int, is_thermal: bool) -> np.ndarray:
+    """A frame as recorded; by a thermal camera, the same noise in all frames of a flight."""
+    if not is_thermal:
+        return flight.frame(index).image
+    day = warm_day(flight.day, flight.world.ground, np.random.default_rng([flight.settings.seed, 2]))
+    picture = render(day, flight.view(index), flight.true_poses[index], float(flight.from_middle_s[index]))
+    return heat_picture(picture, np.random.default_rng([flight.settings.seed, 3]))
+
+
+def searched(
+    flight: SimulatedFlight, images: Sequence[np.ndarray], detector: Detector, plants: int, number: int
+) -> list[dict]:
+    """A row for each hidden thing that a frame shows: the chance it was given, and whether it was found."""
+    frames = [SearchFrame(placed(flight, index), lambda image=image: image) for index, image in enumerate(images)]
+    origin = flight.settings.scene.origin
+    crs = f"EPSG:{utm_epsg(origin.latitude_deg, origin.longitude_deg)}"
+    outlines_m = [each.placed.outline_m for each in frames]
+    cells = cells_over(outlines_m, SiteGrid.at(origin, cell_side_m(outlines_m), crs), None)
+    targets = [thing for thing in flight.day.things if thing.label.is_target]
+    settings = SearchSettings(plants=plants, classes=("person", "car"), sun_deg=SUN_DEG, seed=flight.settings.seed + 1)
+    *_, measured = measure_flight(
+        flight.name, frames, cells, Site("search", origin, crs, 0.02, height_reference="ellipsoidal"), detector,
+        settings, np.array([thing.place_m(0)[:2] for thing in targets]),
+    )
+    assert isinstance(measured, MeasuredFlight)
+    return rows_of(flight, frames, images, detector, measured, targets, number)
+
+
+def rows_of(
+    flight: SimulatedFlight, frames: Sequence[SearchFrame], images: Sequence[np.ndarray], detector: Detector,
+    measured: MeasuredFlight, targets: Sequence[Thing], number: int,
+) -> list[dict]:
+    """What was stated and what came true."""
+    laid, boxes = [], {}
+    for index, (each, image) in enumerate(zip(frames, images)):
+        m_per_px = float(flight.true_poses[index].translation_m[2]) / flight.camera.fx_px
+        found = detector.detect(image, tiles="auto", m_per_px=m_per_px, classes=("person", "car")).surest(60)
+        laid += [one for one in lay_on_ground(found, each.placed) if one is not None]
+        boxes[index] = boxes_px(flight, index, targets)
+    reported = reported_plants(laid, [each.placed for each in frames], boxes, [str(each.label) for each in targets])
+    looks = [
+        look_at(image, each.placed.camera, flight.true_poses[k], frame_light(image).blur_px)
+        for k, (each, image) in enumerate(zip(frames, images))
+    ]
+    rows = []
+    for label in measured.classes:
+        own = [(k, thing) for k, thing in enumerate(targets) if thing.label == label.label]
+        seen = gather(looks, np.array([thing.place_m(0)[:2] for _, thing in own]), reach_m(label.label))
+        if label.recall is None:
+            continue
+        chances = label.recall.of(seen.columns)
+        for row, (k, thing) in enumerate(own):
+            if seen.seen[row]:
+                rows.append({
+                    "flight": number, "class": label.label, "kind": thing.kind, "thermal": measured.is_thermal,
+                    "chance": round(float(chances.mean[row]), 4), "low": round(float(chances.low[row]), 4),
+                    "high": round(float(chances.high[row]), 4), "found": k in reported,
+                    "trees": bool(seen.under_trees[row]), "height_m": round(flight.path.height_m, 1),
+                })
+    return rows
+
+
+def boxes_px(flight: SimulatedFlight, index: int, targets: Sequence[Thing]) -> np.ndarray:
+    """(N, 4) what shows of each target; NaN for one that is out of sight or hidden."""
+    labels, _ = render_labels(
+        flight.day.things, flight.day.bodies, flight.view(index), flight.true_poses[index],
+        float(flight.from_middle_s[index]),
+    )
+    boxes = np.full((len(targets), 4), np.nan, np.float32)
+    for k, thing in enumerate(targets):
+        mask = (labels == thing.id).astype(np.uint8)
+        if mask.any():
+            x, y, width, height = cv2.boundingRect(mask)
+            boxes[k] = x, y, x + width, y + height
+    return boxes
+
+
+def placed(flight: SimulatedFlight, index: int) -> PlacedFrame:
+    """A frame on its true place."""
+    camera, pose = flight.camera, flight.true_poses[index]
+    return PlacedFrame(
+        flight.frame_name(index), index, int(flight.frame_times_ns[index]), Status.VISION, "", camera, pose,
+        site_from_image_homography(camera, pose), footprint(camera, pose), 0.5, 0.3,
+    )
+
+
+def summarised(rows: Sequence[dict]) -> dict:
+    """Stated and found by class, light and rendering, on open ground; and what trees hide."""
+    groups = {
+        "cars by day": lambda row: row["class"] == "car" and not row["thermal"],
+        "people by day, limb by limb": lambda row: row["class"] == "person" and not row["thermal"]
+        and row["kind"] != "person",
+        "people by day, plain figures": lambda row: row["kind"] == "person" and not row["thermal"],
+        "people, thermal, limb by limb": lambda row: row["class"] == "person" and row["thermal"]
+        and row["kind"] != "person",
+        "people, thermal, plain figures": lambda row: row["kind"] == "person" and row["thermal"],
+        "cars, thermal": lambda row: row["class"] == "car" and row["thermal"],
+        "all but plain figures": lambda row: row["kind"] != "person",
+    }
+    result = {}
+    for name, belongs in groups.items():
+        own = [row for row in rows if belongs(row) and not row["trees"]]
+        if not own:
+            continue
+        chances, found = np.array([row["chance"] for row in own]), np.array([row["found"] for row in own], bool)
+        flights = sorted({row["flight"] for row in own})
+        result[name] = {
+            "things": len(own), "stated": round(float(chances.mean()), 4), "found": round(float(found.mean()), 4),
+            "difference": round(float(found.mean() - chances.mean()), 4),
+            "difference_90": bootstrapped([[row for row in own if row["flight"] == flight] for flight in flights]),
+            "bins": [
+                [round(each.stated, 3), round(each.found, 3), each.count] for each in calibration(chances, found)
+            ],
+            "bins_whole": [asdict(each) for each in calibration(chances, found)],
+        }
+    hidden = [row for row in rows if row["trees"]]
+    if hidden:
+        result["under trees"] = {
+            "things": len(hidden), "stated": 0.0, "found": round(float(np.mean([row["found"] for row in hidden])), 4),
+            "bins": [],
+        }
+    return result
+
+
+def bootstrapped(groups: Sequence[Sequence[dict]]) -> list[float]:
+    """The 90 % interval of found less stated, over flights drawn with replacement."""
+    rng = np.random.default_rng(1)
+    means = []
+    for _ in range(1000):
+        drawn = [row for k in rng.integers(len(groups), size=len(groups)) for row in groups[k]]
+        means.append(np.mean([row["found"] - row["chance"] for row in drawn]))
+    return [round(float(each), 4) for each in np.percentile(means, (5, 95))]
+
+
+if __name__ == "__main__":
+    main()

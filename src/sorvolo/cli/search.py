@@ -1,0 +1,150 @@
+"""`sorvolo search`: what a flight's search would have found, measured, and where it could not see."""
+
+import json
+from collections.abc import Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from sorvolo.cli.options import AsJson, Camera, names
+from sorvolo.cli.progress import ProgressReport
+from sorvolo.cli.shown import show_notices_and_warnings, show_path
+from sorvolo.errors import SettingsError
+
+_HOLES = 3  # exit code of a search that could not see all of its area
+
+
+Inputs = Annotated[
+    list[str],
+    typer.Argument(help="The folder of a map; or flights (videos, folders of photos) to map into --site first."),
+]
+SiteFolder = Annotated[Path | None, typer.Option(help="Folder of the map that flights go into.")]
+Flights = Annotated[
+    list[str] | None, typer.Option(help="Flight to measure. Can be repeated. Without it: all of the map's.")
+]
+SearchedArea = Annotated[
+    Path | None, typer.Option(help="Area that was to be searched: GeoJSON, KML, KMZ. Without it: what was flown.")
+]
+Segments = Annotated[
+    Path | None, typer.Option(help="Segments as GeoJSON polygons with the property poa (probability of area).")
+]
+DetectorName = Annotated[str, typer.Option(help="Detector: a model's name or a file.")]
+PlantedClasses = Annotated[str, typer.Option(help="Classes, with commas.", show_default="those it usually reports")]
+Plants = Annotated[int, typer.Option(help="People, and cars, to plant: more take longer and are surer.")]
+Enough = Annotated[float, typer.Option(help="Ground with a lower probability is a hole.")]
+ThroughCrowns = Annotated[
+    float, typer.Option(help="Share of a body that crowns leave free: 0 counts ground under trees as not seen.")
+]
+Sun = Annotated[str, typer.Option(help="Azimuth,elevation of the sun, deg.", show_default="by time and place")]
+ReflyFiles = Annotated[
+    list[Path] | None,
+    typer.Option(help="Waypoints over the holes: .plan, .kmz (DJI), .geojson or .kml. Can be repeated."),
+]
+DjiDrone = Annotated[str, typer.Option(help="For a .kmz: fly (DJI Fly), m300, m350, m30, m3e ...")]
+ResultsFolder = Annotated[Path | None, typer.Option(help="Folder for results.", show_default="SITE-search")]
+Seed = Annotated[int, typer.Option(help="Other plants at other places.")]
+
+
+def search_command(
+    inputs: Inputs,
+    site: SiteFolder = None,
+    flight: Flights = None,
+    area: SearchedArea = None,
+    poa: Segments = None,
+    model: DetectorName = "default",
+    classes: PlantedClasses = "",
+    plants: Plants = 80,
+    enough: Enough = 0.5,
+    through_crowns: ThroughCrowns = 0.0,
+    sun: Sun = "",
+    refly: ReflyFiles = None,
+    dji_drone: DjiDrone = "fly",
+    out: ResultsFolder = None,
+    camera: Camera = "",
+    seed: Seed = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Measure what a search would have found: "had a person lain here, would we have seen them?"
+
+    People and cars are drawn into the flight's own frames, the detector searches them, and the share that a map would
+    report becomes a map of the probability of detection. Ends with exit code 3 where part of the area was not seen well
+    enough; the first line says why.
+
+    Example: sorvolo search field --area search-area.kml --refly holes.kml
+
+    Example: sorvolo search DJI_0042.MP4 --site field --poa segments.geojson
+    """
+    from sorvolo.missions.search.flights import SearchOutputs, search_site
+    from sorvolo.missions.search.settings import SearchSettings
+
+    settings = SearchSettings(plants, names(classes), model, enough, through_crowns, _sun(sun), seed)
+    folder = _mapped(inputs, site, camera, model)
+    outputs = SearchOutputs(
+        out or folder.with_name(f"{folder.resolve().name}-search"), area, poa, tuple(flight or ()),
+        tuple(refly or ()), dji_drone,
+    )
+    report: Mapping[str, Any] = {}
+    with ProgressReport(Console(stderr=True)) as progress, closing(search_site(folder, settings, outputs)) as measuring:
+        for each in measuring:
+            if isinstance(each, dict):
+                report = each
+            else:
+                words = f"{each.found} of {each.planted} found" if each.planted else ""
+                progress.show(f"searching planted pictures of {each.flight},", each.done, each.total, words)
+    if as_json:
+        typer.echo(json.dumps({"folder": str(outputs.folder), **report}, indent=1))
+    else:
+        _show(report, outputs.folder, outputs.refly, Console())
+    if not report["headline"]["complete"]:
+        raise typer.Exit(_HOLES)
+
+
+def _mapped(inputs: list[str], site: Path | None, camera: str, model: str) -> Path:
+    """The site's folder; where flights were given, they are mapped into it first."""
+    from sorvolo.cli.map import map_and_read_reports
+    from sorvolo.missions.flight.settings import MapSettings
+
+    if site is None:
+        if len(inputs) > 1 or not Path(inputs[0]).is_dir():
+            raise SettingsError("give the folder of a map, or flights and --site FOLDER to map them into")
+        return Path(inputs[0])
+    map_and_read_reports(list(inputs), site, MapSettings(model=model), camera=camera or None)
+    return site
+
+
+def _sun(text: str) -> tuple[float, float] | None:
+    if not text:
+        return None
+    try:
+        azimuth, elevation = (float(each) for each in text.split(","))
+    except ValueError as error:
+        raise SettingsError(f"--sun {text!r}: give azimuth,elevation in degrees, such as 215,48") from error
+    return azimuth, elevation
+
+
+def _show(report: Mapping[str, Any], folder: Path, refly: tuple[Path, ...], console: Console) -> None:
+    text = report["headline"]["text"]
+    console.print(escape(text[:1].upper() + text[1:]), style="bold", highlight=False, soft_wrap=True)
+    table = Table("class", "POD", "90 % interval", "area", "seen", "sweep width", "coverage")
+    for label, row in report["classes"].items():
+        width = "" if row["sweep_width_m"] is None else f"{row['sweep_width_m']:.1f} m"
+        table.add_row(
+            escape(label), f"{row['pod']:.2f}", f"{row['pod_low']:.2f} to {row['pod_high']:.2f}",
+            f"{row['area_m2']:,.0f} m2", f"{row['seen_m2']:,.0f} m2", width, f"{row['coverage']:.2f}",
+        )
+    console.print(table)
+    if report["segments"]:
+        segments = Table("segment", "POA", "POD", "POS", "left")
+        for each in report["segments"]:
+            segments.add_row(escape(each["name"]), *(f"{each[key]:.2f}" for key in ("poa", "pod", "pos", "left")))
+        console.print(segments)
+    show_notices_and_warnings(report, console)
+    for name, file in (("page", "search.html"), ("GeoTIFF", "pod.tif"), ("areas", "pod.geojson")):
+        show_path(name, folder / file, console)
+    for path in refly if report["refly"] else ():
+        show_path("re-fly", path, console)

@@ -1,0 +1,47 @@
+"""A site's flights as they are searched: their kept frames on their final places."""
+
+from collections.abc import Sequence
+
+from sorvolo.errors import InputError
+from sorvolo.geometry.homography import pose_from_homography
+from sorvolo.geometry.level_ground import footprint, is_on_ground
+from sorvolo.missions.search.measure import SearchFrame
+from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue import StoredKeyframe
+from sorvolo.survey.mosaic import PlacedFrame, Status
+
+
+def flights_to_search(archive: Archive, wanted: Sequence[str]) -> list[str]:
+    """The names of the site's mapped flights, or of those wanted. Raises InputError for one that the site has not."""
+    known = _mapped(archive)
+    if unknown := [name for name in wanted if name not in known]:
+        raise InputError(f"the site {archive.folder} has no flight {unknown[0]!r}; it has {', '.join(known) or 'none'}")
+    return [name for name in known if not wanted or name in wanted]
+
+
+def _mapped(archive: Archive) -> list[str]:
+    complete = {each.flight_id for each in archive.versions() if each.complete}
+    return [each.id for each in archive.flights() if each.id in complete]
+
+
+def search_frames(archive: Archive, flight_id: str) -> list[SearchFrame]:
+    """The frames of a flight that have a place. Raises InputError where none has."""
+    frames = [
+        SearchFrame(placed, lambda stored=stored: archive.image(stored))  # type: ignore[misc]
+        for stored in archive.keyframes(flight_id) if (placed := _placed(stored)) is not None
+    ]
+    if not frames:
+        raise InputError(f"no frame of the flight {flight_id} has a place on the ground; map it again")
+    return frames
+
+
+def _placed(stored: StoredKeyframe) -> PlacedFrame | None:
+    if stored.status is Status.REJECTED:
+        return None
+    pose = stored.site_from_camera or pose_from_homography(stored.site_from_image, stored.camera)
+    if pose is None or not is_on_ground(outline_m := footprint(stored.camera, pose)):
+        return None
+    return PlacedFrame(
+        stored.name, stored.index, stored.time_ns, stored.status, "", stored.camera, pose, stored.site_from_image,
+        outline_m, stored.residual_px, stored.sigma_m, stored.gains,
+    )

@@ -1,0 +1,194 @@
+"""One flight measured: plants into its own frames, the detector over them, and what a map would have reported."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+from sorvolo.capture.sync import DATED_NS
+from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Mask, Vector3
+from sorvolo.geometry.sun import direction_from_angles, sun_direction
+from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.search.settings import SearchSettings
+from sorvolo.search.cells import Cells
+from sorvolo.search.conditions import Conditions, FrameLook, gather, look_at
+from sorvolo.search.outcomes import Outcomes, any_of, every_label, found_rows
+from sorvolo.search.places import PlantPlace, plant_places, seeded
+from sorvolo.search.recall import Chances, Recall, fit_recall, map_chances
+from sorvolo.simulation.frame_light import FrameLight, frame_light
+from sorvolo.simulation.objects import Thing
+from sorvolo.simulation.planted import new_plant, plant
+from sorvolo.survey.flight import Site
+from sorvolo.survey.mosaic import PlacedFrame
+from sorvolo.survey.objects import TYPICAL_SIZE_M
+from sorvolo.tracking.laying import LaidSighting, lay_on_ground, pose_of
+from sorvolo.tracking.planted import reported_plants
+
+_KEEP_OFF_M = 4.0  # plants from what a map shows already
+_MOST_DETECTIONS = 60  # of one frame, as maps take them
+
+
+@dataclass(frozen=True, eq=False)
+class SearchFrame:
+    """A frame on its final place, and how to get its picture."""
+
+    placed: PlacedFrame
+    image: Callable[[], ImageRGB]
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredClass:
+    """What was measured of one class: its plants, the regression on them, the chances of all cells."""
+
+    label: str
+    seen: Conditions
+    outcomes: Outcomes
+    recall: Recall | None
+    chances: Chances
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredFlight:
+    """One flight as it was measured. `looked` counts pictures that the detector searched."""
+
+    name: str
+    frames: int
+    looked: int
+    rounds: int
+    seconds: float
+    has_shadows: bool
+    is_thermal: bool
+    blur_px: float
+    classes: tuple[MeasuredClass, ...]
+
+
+@dataclass(frozen=True)
+class SearchProgress:
+    """How far a measurement is: pictures searched, of so many."""
+
+    flight: str
+    done: int
+    total: int
+    found: int
+    planted: int
+
+
+def measure_flight(
+    name: str, frames: Sequence[SearchFrame], cells: Cells, site: Site, detector: Detects, settings: SearchSettings,
+    keep_off_m: Sequence[Floats],
+) -> Iterator[SearchProgress | MeasuredFlight]:
+    """Measure one flight over a site with metres; yields progress and, at last, what was measured.
+
+    `keep_off_m` are places, (2,) each, of what stands on the map already: no plant is put beside it.
+    """
+    started_s = time.monotonic()
+    wanted = settings.classes or every_label(detector.info.usual_classes)
+    lights, looks = _looks(frames)
+    seen = {label: gather(looks, cells.centres_m, reach_m(label)) for label in wanted}
+    usable = _usable(seen[wanted[0]], cells, settings)
+    rounds = plant_places(
+        cells, seen[wanted[0]], wanted, settings.plants, keep_off_m=keep_off_m, free_m=_KEEP_OFF_M,
+        rng=seeded(settings.seed), usable=usable,
+    )
+    sun = _sun(frames, site, settings)
+    gathered: list[tuple[PlantPlace, bool]] = []
+    number = looked = 0
+    for place_round in rounds:
+        things = [new_plant(number + k, each.label, each.place_m, settings.seed) for k, each in enumerate(place_round)]
+        number += len(things)
+        run = _Round(frames, lights, looks, things, sun, settings)
+        yield from run.search(name, detector, wanted, looked, len(rounds) * len(frames), gathered)
+        looked += run.looked
+        reported = run.reported()
+        gathered += [(place, k in reported) for k, place in enumerate(place_round)]
+    measured = tuple(_measured(label, seen[label], looks, gathered, settings) for label in wanted)
+    yield MeasuredFlight(
+        name, len(frames), looked, len(rounds), time.monotonic() - started_s, sun is not None,
+        any(each.is_thermal for each in lights), max((each.blur_px for each in lights), default=0.0), measured,
+    )
+
+
+def reach_m(label: str) -> float:
+    """Half the length of a class's usual member as it shows from above or aslant."""
+    return max(TYPICAL_SIZE_M[label][:2]) / 2 if label in TYPICAL_SIZE_M else 0.5
+
+
+class _Round:
+    """Plants that stand at once, in all frames that show them."""
+
+    def __init__(
+        self, frames: Sequence[SearchFrame], lights: Sequence[FrameLight], looks: Sequence[FrameLook],
+        things: Sequence[Thing], sun: Vector3 | None, settings: SearchSettings,
+    ) -> None:
+        self._frames, self._lights, self._things, self._sun, self._settings = frames, lights, things, sun, settings
+        under = gather(looks, [each.place_m(0)[:2] for each in things], 0.5).under_trees
+        self._shown = [settings.through_crowns if hidden else 1.0 for hidden in under]
+        self._laid: list[LaidSighting] = []
+        self._boxes_px: dict[int, BoxesPx] = {}
+        self.looked = 0
+
+    def search(
+        self, name: str, detector: Detects, wanted: Sequence[str], before: int, total: int,
+        gathered: Sequence[tuple[PlantPlace, bool]],
+    ) -> Iterator[SearchProgress]:
+        """Plant into one frame after the other and search it; those that show no plant are left out."""
+        for number, (each, light) in enumerate(zip(self._frames, self._lights)):
+            pose = pose_of(each.placed)
+            assert pose is not None  # frames without a place are none of these
+            planted = plant(
+                each.image(), each.placed.camera, pose, self._things, light, self._sun, self._shown,
+                self._settings.seed + number,
+            )
+            if any_of(planted.boxes_px):
+                found = detector.detect(
+                    planted.image, tiles="auto", m_per_px=float(pose.translation_m[2]) / each.placed.camera.fx_px,
+                    classes=wanted,
+                ).surest(_MOST_DETECTIONS)
+                self._boxes_px[each.placed.index] = planted.boxes_px
+                self._laid += [laid for laid in lay_on_ground(found, each.placed) if laid is not None]
+                self.looked += 1
+            hits = sum(hit for _, hit in gathered)
+            yield SearchProgress(name, before + self.looked, total, hits, len(gathered))
+
+    def reported(self) -> set[int]:
+        """Which of the plants a map of these frames would report."""
+        placed = [each.placed for each in self._frames]
+        return reported_plants(self._laid, placed, self._boxes_px, [str(each.label) for each in self._things])
+
+
+def _looks(frames: Sequence[SearchFrame]) -> tuple[list[FrameLight], list[FrameLook]]:
+    lights, looks = [], []
+    for each in frames:
+        image, pose = each.image(), pose_of(each.placed)
+        assert pose is not None
+        light = frame_light(image)
+        lights.append(light)
+        looks.append(look_at(image, each.placed.camera, pose, light.blur_px))
+    return lights, looks
+
+
+def _usable(seen: Conditions, cells: Cells, settings: SearchSettings) -> Mask:
+    """Where plants may stand: wanted ground that was seen, under trees only where some of them would show."""
+    usable = cells.wanted & seen.seen
+    return usable if settings.through_crowns > 0 else usable & ~seen.under_trees
+
+
+def _sun(frames: Sequence[SearchFrame], site: Site, settings: SearchSettings) -> Vector3 | None:
+    """The direction to the sun; None where no clock knows the date."""
+    if settings.sun_deg is not None:
+        return direction_from_angles(*settings.sun_deg)
+    time_ns = frames[len(frames) // 2].placed.time_ns
+    if time_ns <= DATED_NS:
+        return None
+    return sun_direction(time_ns, site.origin.latitude_deg, site.origin.longitude_deg)
+
+
+def _measured(
+    label: str, seen: Conditions, looks: Sequence[FrameLook], gathered: Sequence[tuple[PlantPlace, bool]],
+    settings: SearchSettings,
+) -> MeasuredClass:
+    places_m: list[Floats] = [place.place_m for place, _ in gathered if place.label == label]
+    hits = [hit for place, hit in gathered if place.label == label]
+    outcomes = found_rows(places_m, gather(looks, places_m, reach_m(label)), hits)
+    recall = fit_recall(outcomes.columns, outcomes.found) if len(outcomes) else None
+    hidden = seen.under_trees if settings.through_crowns == 0 else seen.under_trees & False
+    return MeasuredClass(label, seen, outcomes, recall, map_chances(recall, seen.columns, hidden))

@@ -1,0 +1,32 @@
+"""What a person may choose for measuring a search."""
+
+from dataclasses import dataclass
+
+from sorvolo.errors import SettingsError
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How the probability of detection is measured (`sorvolo search`).
+
+    `plants` of each class are planted in all; no `classes` means those that the model usually reports. Where less than
+    `enough` would have been found the ground is a hole. `through_crowns` is the share of a body that crowns are assumed
+    to leave free (0: nothing under trees is seen). `sun_deg` is its azimuth and elevation; None: by time and place.
+    """
+
+    plants: int = 80
+    classes: tuple[str, ...] = ()
+    model: str = "default"
+    enough: float = 0.5
+    through_crowns: float = 0.0
+    sun_deg: tuple[float, float] | None = None
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        if not 10 <= self.plants <= 5000:
+            raise SettingsError(f"--plants must lie in 10 to 5000, got {self.plants}: fewer measure nothing")
+        for name, value in (("--enough", self.enough), ("--through-crowns", self.through_crowns)):
+            if not 0 <= value <= 1:
+                raise SettingsError(f"{name} must lie in 0 to 1, got {value}")
+        if self.sun_deg is not None and not (0 <= self.sun_deg[0] <= 360 and -90 <= self.sun_deg[1] <= 90):
+            raise SettingsError(f"--sun: azimuth in 0 to 360 and elevation in -90 to 90 degrees, got {self.sun_deg}")

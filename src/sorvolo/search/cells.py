@@ -1,0 +1,106 @@
+"""The cells of ground for which a probability of detection is given: a coarse grid north up over what was flown."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_fill_holes
+
+from sorvolo.geometry.arrays import Mask, PointsM, frozen
+from sorvolo.geometry.grid import SiteGrid
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.polygons import points_inside
+
+_MOST_CELLS = 40_000
+_LEAST_CELL_M = 1.0
+_Number = TypeVar("_Number", np.uint8, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """`rows` x `columns` cells of the grid, the first at grid pixel (`left`, `top`); counted row by row.
+
+    A pixel of `site_grid` is a cell. `wanted` (rows * columns,) marks the cells within the area that is to be searched.
+    """
+
+    site_grid: SiteGrid
+    left: int
+    top: int
+    columns: int
+    rows: int
+    wanted: Mask
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "wanted", frozen(self.wanted, np.bool_))
+
+    def __len__(self) -> int:
+        return self.rows * self.columns
+
+    @property
+    def cell_m(self) -> float:
+        """The side of a cell."""
+        return self.site_grid.grid.m_per_px
+
+    @cached_property
+    def centres_m(self) -> PointsM:
+        """(N, 2) the cells' middles, site metres."""
+        return _centres_m(self.site_grid, self.left, self.top, self.columns, self.rows)
+
+    def as_grid(self, values: NDArray[_Number]) -> NDArray[_Number]:
+        """(N,) values laid out as (rows, columns), north up."""
+        return values.reshape(self.rows, self.columns)
+
+    def outer_corner_m(self) -> tuple[float, float]:
+        """Easting and northing of the grid's north-west corner, in the grid's own projection."""
+        corner = self.site_grid.grid.projected_from_grid(np.array([[self.left - 0.5, self.top - 0.5]]))[0]
+        return float(corner[0]), float(corner[1])
+
+
+def cell_side_m(outlines_m: Sequence[PointsM]) -> float:
+    """The side of cells so that not too many cover these outlines: 1, 2, 5, 10 ... metres."""
+    points = np.concatenate([np.asarray(each) for each in outlines_m])
+    wide_m = float(np.prod(np.maximum(np.ptp(points, axis=0), 1.0)))
+    least_m = max(_LEAST_CELL_M, (wide_m / _MOST_CELLS) ** 0.5)
+    power = 10.0 ** np.floor(np.log10(least_m))
+    return float(next(step * power for step in (1, 2, 5, 10) if step * power >= least_m - 1e-9))
+
+
+def cells_over(
+    outlines_m: Sequence[PointsM], site_grid: SiteGrid, area_m: Sequence[Sequence[PointsM]] | None
+) -> Cells:
+    """Cells over frames' outlines, (4, 2) site metres each, and over the area (polygons of rings) to be searched.
+
+    Without an area, what is wanted is what the frames show and the gaps that they enclose.
+    """
+    area_rings = [] if area_m is None else [ring for rings in area_m for ring in rings]
+    corners_px = site_grid.grid_from_site(np.concatenate([*map(np.asarray, outlines_m), *map(np.asarray, area_rings)]))
+    left, top = (int(each) for each in np.floor(corners_px.min(axis=0)))
+    right, bottom = (int(each) + 1 for each in np.ceil(corners_px.max(axis=0)))
+    columns, rows = right - left, bottom - top
+    centres_m = _centres_m(site_grid, left, top, columns, rows)
+    if area_m is None:
+        wanted = _with_enclosed(_inside_any([[each] for each in outlines_m], centres_m).reshape(rows, columns)).ravel()
+    else:
+        wanted = _inside_any(area_m, centres_m)
+    return Cells(site_grid, left, top, columns, rows, wanted)
+
+
+def _centres_m(site_grid: SiteGrid, left: int, top: int, columns: int, rows: int) -> PointsM:
+    x, y = np.meshgrid(np.arange(left, left + columns), np.arange(top, top + rows))
+    site_from_grid = np.linalg.inv(site_grid.grid_from_site_affine(np.zeros(2), 50.0))
+    return apply_homography(site_from_grid, np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
+
+
+def _inside_any(polygons: Sequence[Sequence[PointsM]], points: PointsM) -> Mask:
+    inside = np.zeros(len(points), bool)
+    for rings in polygons:
+        inside |= points_inside(rings, points)
+    return inside
+
+
+def _with_enclosed(seen: Mask) -> Mask:
+    """The mask with its holes filled: what no way of unseen cells joins with the outside."""
+    return np.asarray(binary_fill_holes(seen), bool)

@@ -1,0 +1,120 @@
+"""Ground where little would have been found, and why."""
+
+from collections.abc import Sequence
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.geometry.arrays import Floats, Mask
+from sorvolo.search.cells import Cells
+from sorvolo.search.conditions import CONDITIONS, Conditions
+from sorvolo.search.recall import Chances, Recall
+
+Holes = NDArray[np.uint8]
+"""(N,) numbers of REASONS, 0 for none."""
+
+POD_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+"""The classes of probability that polygons are drawn of."""
+
+_DARK = 45.0  # grey levels: below, people and ground are alike in most pictures
+_BLURRED_SHARE = 0.25  # of a body's longest side: blurred so far along, it is a smear
+_LEAST_PULL = 0.35  # of log odds: a smaller one is no reason
+
+
+class Reason(StrEnum):
+    """Why little would have been found."""
+
+    NONE = ""
+    NOT_SEEN = "not seen"
+    TREES = "under trees"
+    COARSE = "too coarse"
+    BLUR = "motion blur"
+    DARK = "dark"
+    TEXTURE = "rough ground"
+    FEW_VIEWS = "too few views"
+    SLANT = "seen aslant"
+    DETECTOR = "rarely found anywhere"
+
+    @property
+    def can_be_flown_again(self) -> bool:
+        """Whether another flight may see what this one did not."""
+        return self not in (Reason.NONE, Reason.TREES, Reason.DETECTOR)
+
+
+REASONS = tuple(Reason)
+"""The reasons by the numbers that `hole_reasons` gives."""
+
+_BY_CONDITION = {
+    "resolution": Reason.COARSE, "views": Reason.FEW_VIEWS, "single view": Reason.FEW_VIEWS, "blur": Reason.BLUR,
+    "texture": Reason.TEXTURE, "light": Reason.DARK, "slant": Reason.SLANT, "trees": Reason.TREES,
+}
+
+
+def hole_reasons(
+    cells: Cells, seen: Conditions, chances: Chances, recall: Recall | None, *, enough: float, needed_m_per_px: float,
+    length_m: float,
+) -> Holes:
+    """(N,) the number in REASONS of why each wanted cell has less than `enough` of a chance; 0 where it has it.
+
+    Pixels coarser than `needed_m_per_px`, blur over a quarter of `length_m` and darkness are reasons by themselves;
+    else it is the condition that lowers the fitted chance most, or the detector where none does by much.
+    """
+    numbers = np.zeros(len(cells), np.uint8)
+    poor = cells.wanted & ~(np.nan_to_num(chances.mean, nan=-1.0) >= enough)
+    blur_m = np.exp(seen.columns[:, CONDITIONS.index("blur")])
+    light = seen.columns[:, CONDITIONS.index("light")]
+    with np.errstate(invalid="ignore"):
+        rules: list[tuple[Reason, Mask]] = [
+            (Reason.NOT_SEEN, ~seen.seen), (Reason.TREES, seen.under_trees),
+            (Reason.COARSE, seen.m_per_px() > needed_m_per_px), (Reason.BLUR, blur_m > _BLURRED_SHARE * length_m),
+            (Reason.DARK, light < _DARK),
+        ]
+    worst = _worst_condition(seen.columns, recall)
+    for reason, holds in (*rules, *worst):
+        numbers[poor & holds & (numbers == 0)] = REASONS.index(reason)
+    return numbers
+
+
+def _worst_condition(columns: Floats, recall: Recall | None) -> list[tuple[Reason, Mask]]:
+    """The condition that lowers the chance of each cell most, by reasons; the detector where none does."""
+    everything = np.ones(len(columns), bool)
+    if recall is None:
+        return [(Reason.DETECTOR, everything)]
+    pulls = np.nan_to_num(recall.pulls(columns))
+    is_lowest = pulls.argmin(axis=1)
+    is_strong = pulls.min(axis=1) < -_LEAST_PULL
+    found = [(_BY_CONDITION[name], is_strong & (is_lowest == k)) for k, name in enumerate(CONDITIONS)]
+    return [*found, (Reason.DETECTOR, everything)]
+
+
+def reasons_together(
+    reasons: Sequence[Holes], flights: Sequence[Chances], total: Chances,
+    cells: Cells, enough: float,
+) -> Holes:
+    """(N,) the reasons of several flights: of each cell, the reason of the flight that had the best chance there."""
+    chances = np.array([np.nan_to_num(each.mean, nan=-1.0) for each in flights])
+    best = np.take_along_axis(np.array(reasons), chances.argmax(axis=0)[None], axis=0)[0]
+    poor = cells.wanted & ~(np.nan_to_num(total.mean, nan=-1.0) >= enough)
+    return np.where(poor, best, 0).astype(np.uint8)
+
+
+def hole_areas_m2(
+    numbers: Holes, cell_m: float
+) -> dict[str, float]:
+    """The area of the holes of each reason, the largest first."""
+    areas = {reason.value: float((numbers == k).sum()) * cell_m**2 for k, reason in enumerate(REASONS) if k}
+    return dict(sorted(((name, area) for name, area in areas.items() if area), key=lambda item: -item[1]))
+
+
+def flyable(numbers: Holes) -> Holes:
+    """(N,) 1 where another flight may see what these did not."""
+    again = [k for k, reason in enumerate(REASONS) if reason.can_be_flown_again]
+    return np.isin(numbers, again).astype(np.uint8)
+
+
+def pod_classes(chances: Chances, wanted: Mask) -> Holes:
+    """(N,) 1 for the lowest of POD_EDGES' classes, 2 for the next ...; 0 for what is not wanted or was not seen."""
+    known = wanted & np.isfinite(chances.mean)
+    numbers = np.clip(np.digitize(np.nan_to_num(chances.mean), POD_EDGES[1:-1]) + 1, 1, len(POD_EDGES) - 1)
+    return np.where(known, numbers, 0).astype(np.uint8)

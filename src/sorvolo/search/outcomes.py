@@ -1,0 +1,47 @@
+"""What became of the plants: where each stood, under which conditions, and whether it was reported."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sorvolo.geometry.arrays import BoxesPx, Floats, Mask, PointsM, frozen
+from sorvolo.search.conditions import Conditions
+from sorvolo.survey.objects import CLASSES
+
+
+@dataclass(frozen=True, eq=False)
+class Outcomes:
+    """N plants of a class: places (N, 2), conditions (N, K) as CONDITIONS, whether found (N,), and views (N,)."""
+
+    places_m: PointsM
+    columns: Floats
+    found: Mask
+    views: Floats
+
+    def __post_init__(self) -> None:
+        for name in ("places_m", "columns", "views"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+        object.__setattr__(self, "found", frozen(self.found, np.bool_))
+
+    def __len__(self) -> int:
+        return len(self.found)
+
+
+def found_rows(places_m: Sequence[Floats], seen: Conditions, hits: Sequence[bool]) -> Outcomes:
+    """The outcomes of plants that at least one frame shows whole."""
+    keep = seen.seen
+    return Outcomes(
+        np.reshape(places_m, (-1, 2))[keep], seen.columns[keep], np.array(hits, bool).reshape(-1)[keep],
+        seen.views[keep],
+    )
+
+
+def any_of(boxes_px: BoxesPx) -> bool:
+    """Whether any of the boxes (N, 4) is known."""
+    return bool(np.isfinite(boxes_px).any())
+
+
+def every_label(names: Sequence[str]) -> tuple[str, ...]:
+    """Those classes that can be planted, people first."""
+    return tuple(name for name in CLASSES if name in names)

@@ -1,0 +1,154 @@
+"""The probability of detection as a function of the conditions, learnt from plants: logistic regression with its
+uncertainty.
+
+Few plants lie in any one cell, so cells of like conditions lend each other theirs: the chance that a plant is found is
+a logistic function of the conditions, with weights held near zero (Gelman et al. 2008), and its uncertainty follows
+from the weights' own (Laplace's approximation).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from sorvolo.geometry.arrays import Floats, Mask, frozen
+
+_SLOPE_SIGMA, _CHANCE_SIGMA = 1.0, 2.5  # before any plant: of a weight for one standard deviation, of the log odds
+_FARTHEST = 2.5  # standard deviations: beyond what plants covered, nothing is extrapolated
+_DRAWS = 400
+_STEPS = 40
+_Z90 = 1.6449
+
+
+@dataclass(frozen=True, eq=False)
+class Recall:
+    """A fitted regression: `middle` and `spread` (K,) of the conditions, `weights` (K + 1,) with their covariance."""
+
+    middle: Floats
+    spread: Floats
+    weights: Floats
+    covariance: Floats
+    plants: int
+    found: int
+
+    def __post_init__(self) -> None:
+        for name in ("middle", "spread", "weights", "covariance"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    def of(self, columns: Floats) -> "Chances":
+        """The probability of detection under conditions (N, K); NaN where these are."""
+        rows = self._rows(columns)
+        known = np.isfinite(rows).all(axis=1)
+        rng = np.random.default_rng(1)
+        drawn = rng.multivariate_normal(self.weights, self.covariance, _DRAWS, method="cholesky")
+        mean, low, high = (np.full(len(rows), np.nan) for _ in range(3))
+        for part in np.array_split(np.flatnonzero(known), max(1, int(known.sum()) // 5000)):
+            chances = _logistic(rows[part] @ drawn.T)
+            mean[part] = chances.mean(axis=1)
+            low[part], high[part] = np.percentile(chances, (5, 95), axis=1)
+        return Chances(mean, low, high)
+
+    def pulls(self, columns: Floats) -> Floats:
+        """(N, K) by how much each condition lowers (below 0) or raises the log odds from the plants' usual ones."""
+        return self._rows(columns)[:, 1:] * self.weights[1:]
+
+    def _rows(self, columns: Floats) -> Floats:
+        scaled = np.clip((columns - self.middle) / self.spread, -_FARTHEST, _FARTHEST)
+        return np.column_stack([np.ones(len(scaled)), scaled])
+
+
+@dataclass(frozen=True, eq=False)
+class Chances:
+    """(N,) probabilities, and the bounds of the interval that holds the true one in nine of ten cases."""
+
+    mean: Floats
+    low: Floats
+    high: Floats
+
+    def __post_init__(self) -> None:
+        for name in ("mean", "low", "high"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+
+def fit_recall(columns: Floats, found: Mask) -> Recall:
+    """The regression of which plants were found, (N,), on the conditions of their places, (N, K); N at least 1."""
+    middle = columns.mean(axis=0)
+    spread = np.maximum(columns.std(axis=0), 0.05)
+    scaled = np.clip((columns - middle) / spread, -_FARTHEST, _FARTHEST)
+    rows = np.column_stack([np.ones(len(scaled)), scaled])
+    prior = np.diag([1 / _CHANCE_SIGMA**2] + [1 / _SLOPE_SIGMA**2] * columns.shape[1])
+    right = found.astype(np.float64)
+    weights = np.zeros(rows.shape[1])
+    for _ in range(_STEPS):
+        chances = _logistic(rows @ weights)
+        curvature = (rows * (chances * (1 - chances))[:, None]).T @ rows + prior
+        step = np.linalg.solve(curvature, rows.T @ (right - chances) - prior @ weights)
+        weights = weights + step * min(1.0, 2.0 / max(float(np.abs(step).max()), 1e-9))
+        if np.abs(step).max() < 1e-8:
+            break
+    chances = _logistic(rows @ weights)
+    curvature = (rows * (chances * (1 - chances))[:, None]).T @ rows + prior
+    return Recall(middle, spread, weights, np.linalg.inv(curvature), len(found), int(found.sum()))
+
+
+def map_chances(recall: Recall | None, columns: Floats, hidden: Mask) -> Chances:
+    """The chances of cells under conditions (N, K): 0 where crowns hide the ground, unknown without a regression."""
+    if recall is None:
+        nothing = np.full(len(columns), np.nan)
+        return Chances(nothing, nothing, nothing)
+    open_ground = recall.of(columns)
+    return Chances(*(np.where(hidden, 0.0, each) for each in (open_ground.mean, open_ground.low, open_ground.high)))
+
+
+def held_out_chances(columns: Floats, found: Mask, parts: int = 5) -> Floats:
+    """(N,) each plant's probability by a regression on the others: every `parts`-th is left out in turn."""
+    chances = np.full(len(found), np.nan)
+    for part in range(min(parts, len(found))):
+        out = np.arange(len(found)) % parts == part
+        if out.any() and not out.all():
+            chances[out] = fit_recall(columns[~out], found[~out]).of(columns[out]).mean
+    return chances
+
+
+@dataclass(frozen=True)
+class CalibrationBin:
+    """Of `count` cases that were given a chance from `low` to `high`: the mean chance, and what came true, with its
+    interval (Wilson, 90 %)."""
+
+    low: float
+    high: float
+    count: int
+    stated: float
+    found: float
+    found_low: float
+    found_high: float
+
+
+def calibration(
+    chances: Floats, found: Mask, edges: Sequence[float] = (0, 0.2, 0.4, 0.6, 0.8, 1)
+) -> list[CalibrationBin]:
+    """How often what was given a chance came true, by bins of the chance; empty bins are left out."""
+    rows = []
+    for low, high in pairwise(edges):
+        inside = (chances >= low) & ((chances < high) | ((high == edges[-1]) & (chances <= high)))
+        if inside.any():
+            bounds = wilson(int(found[inside].sum()), int(inside.sum()))
+            rows.append(CalibrationBin(
+                low, high, int(inside.sum()), float(chances[inside].mean()), float(found[inside].mean()), *bounds
+            ))
+    return rows
+
+
+def wilson(hits: int, total: int) -> tuple[float, float]:
+    """The 90 % interval of a share (Wilson 1927); 0 to 1 where nothing was tried."""
+    if total == 0:
+        return 0.0, 1.0
+    share, z2 = hits / total, _Z90**2
+    middle = (share + z2 / (2 * total)) / (1 + z2 / total)
+    half = _Z90 / (1 + z2 / total) * float(np.sqrt(share * (1 - share) / total + z2 / (4 * total**2)))
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def _logistic(odds: Floats) -> Floats:
+    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(odds, -35, 35))), np.float64)

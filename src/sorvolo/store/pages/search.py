@@ -1,0 +1,82 @@
+"""What a search would have found, as one page of HTML that needs no other file, no network and no script."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from sorvolo.geometry.arrays import ImageRGBA
+from sorvolo.store.pages.render import render
+from sorvolo.store.pages.words import area_words, at, known, number_at, picture_uri, seconds_words, with_unit
+
+
+def search_page(report: Mapping[str, Any], pictures: Mapping[str, ImageRGBA]) -> str:
+    """search.html of search.json's content; `pictures` are the maps of the classes' probabilities. Text is escaped."""
+    first = next(iter(report["classes"]))
+    page = render(
+        "search.html", title=f"{known(report['site'])} - what the search would have found", site=known(report["site"]),
+        headline=_sentence(known(at(report, "headline", "text"))), model=known(report["model"]),
+        notices=[*report["warnings"], *(known(at(each, "text")) for each in report["notices"])],
+        maps=[(label, picture_uri(picture)) for label, picture in pictures.items()],
+        figures=_figures(report["classes"][first]), holes=_holes(report["classes"]), segments=_segments(report),
+        refly=_refly(report.get("refly")), plants=_plants(report), calibration=_calibration(report),
+        cell=with_unit("{:g} m", report["cell_m"]),
+    )
+    return str(page)
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _figures(row: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    interval = f"90 % interval {row['pod_low']:.2f} to {row['pod_high']:.2f}; unseen ground counts as 0"
+    return [
+        ("probability of detection (POD)", f"{row['pod']:.2f}", interval),
+        ("area", area_words(row["area_m2"]), f"of it seen: {area_words(row['seen_m2'])}"),
+        ("effective sweep width", with_unit("{:.1f} m", row["sweep_width_m"]) or "unknown",
+         "ground times its probability, over the flown path"),
+        ("coverage", f"{row['coverage']:.2f}", f"a random search of that effort has POD {row['random_pod']:.2f}"),
+    ]
+
+
+def _holes(classes: Mapping[str, Any]) -> list[list[str]]:
+    return [
+        [label, reason, area_words(area_m2), f"{area_m2 / row['area_m2']:.0%}"]
+        for label, row in classes.items() for reason, area_m2 in row["holes_m2"].items()
+    ]
+
+
+def _segments(report: Mapping[str, Any]) -> list[list[str]]:
+    return [
+        [
+            known(each["name"]), *(f"{each[key]:.2f}" for key in ("poa", "pod", "pos", "left")),
+            area_words(each["area_m2"]),
+        ]
+        for each in report["segments"]
+    ]
+
+
+def _refly(refly: Mapping[str, Any] | None) -> str:
+    if refly is None:
+        return ""
+    written = ", ".join(refly["files"])
+    files = f" Files: {written}." if written else " --refly FILE.kml (or .plan, .kmz) writes it."
+    return (
+        f"Another flight over {refly['holes']} of the holes ({area_words(number_at(refly, 'area_m2'))}), "
+        f"{refly['height_m']:.0f} m high, takes {seconds_words(number_at(refly, 'duration_s'))}.{files}"
+    )
+
+
+def _plants(report: Mapping[str, Any]) -> list[list[str]]:
+    return [
+        [known(flight["name"]), label, str(row["planted"]), str(row["found"]),
+         "{:.2f} to {:.2f}".format(*row["interval"]), str(flight["frames"]), seconds_words(flight["seconds"])]
+        for flight in report["flights"] for label, row in flight["classes"].items()
+    ]
+
+
+def _calibration(report: Mapping[str, Any]) -> list[list[str]]:
+    return [
+        [known(flight["name"]), label, f"{each['stated']:.2f}", f"{each['found']:.2f}",
+         f"{each['found_low']:.2f} to {each['found_high']:.2f}", str(each["count"])]
+        for flight in report["flights"] for label, row in flight["classes"].items() for each in row["calibration"]
+    ]

@@ -1,0 +1,166 @@
+"""Searches through whole missions: a small flight mapped, things planted into its frames, what a map would report."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+
+from sorvolo.capture.areas import read_segments
+from sorvolo.cli.main import main
+from sorvolo.detection.contract import ModelInfo
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.search.flights import SearchOutputs, search_site
+from sorvolo.missions.search.settings import SearchSettings
+from sorvolo.store.site.archive import Archive
+from sorvolo.survey.objects import CLASSES, Detections
+
+
+class Comparing:
+    """Detects what a picture has that the site's own frames have not, or nothing at all."""
+
+    classes = CLASSES
+    provider = "comparison"
+    notices = ()
+    info = ModelInfo(
+        "comparing", CLASSES, dict.fromkeys(CLASSES, 0.3), dict.fromkeys(CLASSES, (4.0, 400.0)), version="1",
+        licence="CC0-1.0", trained_on="nothing",
+    )
+
+    def __init__(self, site: Path, *, sees: bool = True) -> None:
+        with Archive.open(site, write=False) as archive:
+            self._frames = [archive.image(each) for each in archive.keyframes()]
+        self._sees = sees
+
+    def thresholds_for(self, picture: ImageRGB) -> Mapping[str, float]:
+        """The same for all pictures."""
+        return self.info.thresholds
+
+    def detect(
+        self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
+        least_score: float | None = None, classes: Sequence[str] | None = None,
+    ) -> Detections:
+        """Boxes around what differs from the frame that is most like the picture; cars are the large ones."""
+        apart = [int(cv2.norm(each, image, cv2.NORM_L1)) for each in self._frames]
+        same = self._frames[int(np.argmin(apart))]
+        grey = np.abs(image.astype(np.int16) - same).max(axis=2)
+        mask = cv2.dilate((grey > 25).astype(np.uint8), np.ones((5, 5), np.uint8))
+        _, _, stats, _ = cv2.connectedComponentsWithStats(mask)
+        boxes = [row[:4] for row in stats[1:] if row[4] > 12] if self._sees else []
+        rows = np.array([[x, y, x + w, y + h] for x, y, w, h in boxes], np.float32).reshape(-1, 4)
+        large = (rows[:, 2:] - rows[:, :2]).max(axis=1, initial=0) * (m_per_px or 0) > 3.0
+        return Detections(rows, np.full(len(rows), 0.95), np.where(large, 1, 0), CLASSES)
+
+
+@pytest.fixture(scope="module")
+def site(photographed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The photos mapped."""
+    folder = tmp_path_factory.mktemp("search") / "site"
+    for _ in map_flights(
+        [photographed / "flight1" / "photos"], folder, MapSettings(model="none"), camera=photographed / "camera.xml"
+    ):
+        pass
+    return folder
+
+
+def _report(site: Path, folder: Path, detector: Any, settings: SearchSettings, **outputs: Any) -> dict[str, Any]:
+    *_, report = search_site(site, settings, SearchOutputs(folder, **outputs), detector)
+    assert isinstance(report, dict)
+    return report
+
+
+def test_a_detector_that_sees_all_gives_high_chances_and_the_files_agree(site: Path, tmp_path: Path) -> None:
+    settings = SearchSettings(plants=20, classes=("car",), sun_deg=(215, 48))
+    report = _report(site, tmp_path / "out", Comparing(site), settings)
+    row = report["classes"]["car"]
+    planted = report["flights"][0]["classes"]["car"]
+    assert planted["planted"] >= 8 and planted["found"] >= 0.75 * planted["planted"]
+    with rasterio.open(tmp_path / "out" / "pod.tif") as file:
+        assert file.descriptions == ("car: pod", "car: low", "car: high")
+        pod, low, high = file.read()
+        seen = np.isfinite(pod)
+        assert (low[seen] <= pod[seen] + 1e-6).all() and (pod[seen] <= high[seen] + 1e-6).all()
+        assert file.crs is not None and np.isnan(file.nodata)
+        assert seen.sum() * file.res[0] ** 2 >= row["seen_m2"] - 1
+    features = json.loads((tmp_path / "out" / "pod.geojson").read_text())["features"]
+    area_m2 = sum(each["properties"]["area_m2"] for each in features if each["properties"]["kind"] == "pod")
+    assert area_m2 == pytest.approx(row["seen_m2"], rel=0.02)
+    assert "probability of detection" in (tmp_path / "out" / "search.html").read_text()
+    assert report["headline"]["text"].startswith("probability of detection of a car")
+
+
+def test_a_blind_detector_finds_nothing_and_the_headline_says_so(site: Path, tmp_path: Path) -> None:
+    settings = SearchSettings(plants=12, classes=("car",), sun_deg=(215, 48))
+    report = _report(site, tmp_path / "out", Comparing(site, sees=False), settings)
+    assert report["flights"][0]["classes"]["car"]["found"] == 0
+    assert report["classes"]["car"]["pod"] < 0.25 and not report["headline"]["complete"]
+    assert sum(report["classes"]["car"]["holes_m2"].values()) == pytest.approx(report["classes"]["car"]["area_m2"])
+
+
+def test_ground_beyond_the_flight_is_a_hole_not_seen_and_is_flown_again(site: Path, tmp_path: Path) -> None:
+    with Archive.open(site, write=False) as archive:
+        origin = archive.site().origin
+    d_lat, d_lon = 25 / 111_000, 60 / 111_000 / np.cos(np.radians(origin.latitude_deg))
+    west, east = origin.longitude_deg - 0.4 * d_lon, origin.longitude_deg + 2 * d_lon
+    south, north = origin.latitude_deg - d_lat, origin.latitude_deg + d_lat
+    ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+    segments = tmp_path / "segments.geojson"
+    segments.write_text(json.dumps({"type": "FeatureCollection", "features": [{
+        "type": "Feature", "properties": {"name": "all", "poa": 0.9},
+        "geometry": {"type": "Polygon", "coordinates": [ring]},
+    }]}))
+    report = _report(
+        site, tmp_path / "out", Comparing(site), SearchSettings(plants=20, classes=("car",), sun_deg=(215, 48)),
+        area=segments, poa=segments, refly=(tmp_path / "holes.kml", tmp_path / "holes.plan"),
+    )
+    row = report["classes"]["car"]
+    assert row["area_m2"] == pytest.approx(2.4 * 60 * 50, rel=0.05)
+    assert row["holes_m2"]["not seen"] > 0.4 * row["area_m2"] and not report["headline"]["complete"]
+    assert "not seen" in report["headline"]["text"]
+    (whole,) = report["segments"]
+    assert whole["pod"] == pytest.approx(row["pod"], abs=0.03) and whole["pos"] == pytest.approx(0.9 * whole["pod"])
+    assert report["refly"]["area_m2"] > 0.4 * row["area_m2"]
+    assert (tmp_path / "holes.kml").stat().st_size > 300 and (tmp_path / "holes.plan").is_file()
+
+
+def test_a_map_without_metres_is_refused(tmp_path: Path, filmed: Path) -> None:
+    lonely = tmp_path / "video.mp4"
+    lonely.write_bytes((filmed / "flight1" / "flight1.mp4").read_bytes())
+    for _ in map_flights([lonely], tmp_path / "site", MapSettings(model="none"), camera=filmed / "camera.xml"):
+        pass
+    with pytest.raises(InputError, match="without GPS"):
+        list(search_site(tmp_path / "site", SearchSettings(), SearchOutputs(tmp_path / "out")))
+
+
+def test_the_command_refuses_what_it_cannot_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["search", str(tmp_path / "nothing")]) == 1
+    assert "--site" in capsys.readouterr().err
+    assert main(["search", str(tmp_path), "--plants", "2"]) == 1
+    assert "--plants" in capsys.readouterr().err
+    assert main(["search", str(tmp_path), "--sun", "south"]) == 1
+    assert "--sun" in capsys.readouterr().err
+
+
+def test_segments_need_probabilities_that_add_up(tmp_path: Path) -> None:
+    ring = [[12.6, 41.8], [12.61, 41.8], [12.61, 41.81], [12.6, 41.81], [12.6, 41.8]]
+    path = tmp_path / "segments.geojson"
+
+    def write(*properties: dict[str, Any]) -> None:
+        path.write_text(json.dumps({"type": "FeatureCollection", "features": [
+            {"type": "Feature", "properties": each, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+            for each in properties
+        ]}))
+
+    write({"poa_percent": 40}, {"name": "b", "POA": 0.5})
+    assert [(name, poa) for name, _, poa in read_segments(path)] == [("segment 1", 0.4), ("b", 0.5)]
+    for wrong in ([{"name": "x"}], [{"poa": 0.7}, {"poa": 0.7}], [{"poa": 3}], []):
+        write(*wrong)
+        with pytest.raises(InputError, match="poa"):
+            read_segments(path)
