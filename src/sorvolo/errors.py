@@ -19,3 +19,7 @@ class SettingsError(SorvoloError):
 
 class StoreError(SorvoloError):
     """The site folder cannot be read or written."""
+
+
+class SorvoloWarning(RuntimeWarning):
+    """What works, but worse than it could; commands print it as one line."""

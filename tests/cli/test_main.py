@@ -28,6 +28,19 @@ def test_module_is_the_command() -> None:
     assert (run.returncode, run.stdout, run.stderr) == (0, f"sorvolo {sorvolo.__version__}\n", "")
 
 
+def test_missing_kernels_are_one_line() -> None:
+    """Without a compiler the NumPy kernels are used: a person reads one warning, once, without Python's own words."""
+    program = (
+        "import sys; sys.modules['sorvolo.kernels._native'] = None\n"
+        "from sorvolo.cli.main import main\n"
+        "sys.exit(main(['compare', 'no-such-video.mp4', '--site', 'no-such-site']))"
+    )
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    first, *others = run.stderr.splitlines()
+    assert first.startswith("warning: the compiled kernels are missing") and "reinstall sorvolo" in first
+    assert run.returncode == 1 and len(others) == 1 and others[0].startswith("error: ")
+
+
 _STRUCK = """
 import sorvolo.cli.main
 def main():

@@ -229,8 +229,8 @@ def test_the_command_reads_labels_prints_numbers_and_writes_the_report(toy, coco
     assert main(["evaluate", "detector", str(toy), str(coco), *printed, "--compare", found]) == 0
     shown = capsys.readouterr().out
     assert "side by side" in shown and "thesis_map" in shown
-    assert main(["evaluate", "detector", str(toy), str(coco), "--classes", "Walker"]) == 1
-    assert "pairs look like" in capsys.readouterr().err
+    assert main(["evaluate", "detector", str(toy), str(coco), "--classes", "=person"]) == 1
+    assert "THEIRS=OURS" in capsys.readouterr().err
     assert main(["evaluate", "detector", "no-such-model", str(coco), *printed]) == 1
 
 

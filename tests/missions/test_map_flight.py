@@ -107,6 +107,20 @@ def test_a_video_that_looks_ahead_by_half_a_right_angle(oblique: Path, tmp_path:
     assert told_deg == pytest.approx(45, abs=10) and "angles" in warning
 
 
+def test_an_oblique_video_is_recognised_by_its_pictures_alone(oblique: Path, filmed: Path, tmp_path: Path) -> None:
+    """Without any telemetry the perspective between the pictures shows how far the camera looks from straight down."""
+    found = []
+    for name, flown in (("oblique", oblique), ("nadir", filmed)):
+        (tmp_path / name).mkdir()
+        shutil.copy(_film(flown), tmp_path / name)
+        site = tmp_path / f"{name} site"
+        run_map(site, tmp_path / name / "flight1.mp4", "--camera", flown / "camera.xml")
+        found.append([each for each in report_of(site, "flight1")["warnings"] if "straight down" in each])
+    ((warning,), none) = found
+    assert float(warning.split(" deg")[0].rpartition(" ")[2]) == pytest.approx(45, abs=10)
+    assert "there is no telemetry" in warning and not none
+
+
 def test_the_report_counts_every_second_up_to_itself(filmed: Path, tmp_path: Path) -> None:
     site = tmp_path / "site"
     run_map(site, _film(filmed), "--camera", filmed / "camera.xml")
@@ -260,10 +274,11 @@ def test_the_thesis_method(photographed: Path, tmp_path: Path, transform: str) -
     photos = _some_photos(photographed, tmp_path / "few", 0, 7)
     site = tmp_path / "site"
     run_map(
-        site, photos, "--camera", photographed / "camera.xml", "--method", "thesis", "--transform", transform
+        site, photos, "--camera", photographed / "camera.xml", "--method", "thesis", "--transform", transform,
+        "--thesis", "features=3000",
     )
     report = report_of(site, "few")
-    assert report["method"] == "thesis" and report["settings"]["transform"] == transform
+    assert report["method"] == "thesis" and report["settings"]["thesis"]["transform"] == transform
     assert report["frames"]["vision"] == 7
     assert corner_errors_m(site, "few", photographed / "truth")[1] < 1.0  # metres: its own ceiling
 

@@ -14,6 +14,7 @@ from sorvolo.mosaic.roi_stitching import (
     RoiStitchingSettings,
     Stitched,
     georeference,
+    stitching_settings,
 )
 
 WIDTH, HEIGHT = 320, 240
@@ -183,3 +184,16 @@ def test_georeference_needs_two_places():
         georeference(np.zeros((1, 2)), np.zeros((1, 2)))
     with pytest.raises(GeometryError):
         georeference(np.zeros((3, 2)), np.zeros((2, 2)))
+
+
+def test_values_are_written_by_name() -> None:
+    chosen = stitching_settings(["A-kaze=1e-4", "features = 900", "matching=ratio"], transform="homography")
+    assert chosen == RoiStitchingSettings(
+        akaze_threshold=1e-4, max_features=900, matching="ratio", transform="homography"
+    )
+    for written, words in (
+        ("T_gray=40", "features"), ("features=many", "a whole number"), ("matching=best", "cross-check or ratio"),
+        ("side=9", "256 to 8192"),
+    ):
+        with pytest.raises(SettingsError, match=words):
+            stitching_settings([written])

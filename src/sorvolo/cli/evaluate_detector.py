@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from sorvolo import __version__
-from sorvolo.cli.options import GroupPattern, names
+from sorvolo.cli.options import GroupPattern, class_names, names
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.errors import SettingsError
 
@@ -83,7 +83,7 @@ def detector(
     settings = EvaluationSettings(_tiles(tiles), draws, seed)
     arms = [list(names(each)) for each in (model, *(compare or ()))]
     labelled = read_sets(
-        data, form=form, classes=_pairs(classes) or None, ignore=names(ignore), unlabelled=names(unlabelled),
+        data, form=form, classes=class_names(classes), ignore=names(ignore), unlabelled=names(unlabelled),
         group_pattern=group_pattern, videos=videos, held_out=held_out, seed=seed, known=known_classes(arms),
     )
     measured = _measured(arms, labelled, settings)
@@ -132,13 +132,6 @@ def _show_all(measured: "DetectorEvaluation", notices: Sequence[str], out: Path 
         _show_comparison(console, side_by_side)
     if out is not None:
         console.print(f"the whole report: {out / PAGE}")
-
-
-def _pairs(text: str) -> dict[str, str]:
-    pairs = [name.partition("=") for name in names(text)]
-    if any(not (theirs.strip() and ours.strip()) for theirs, _, ours in pairs):
-        raise SettingsError(f"--classes {text!r}: pairs look like Pedestrian=person,Van=car")
-    return {theirs.strip(): ours.strip() for theirs, _, ours in pairs}
 
 
 def _tiles(text: str) -> Literal["auto"] | int | None:

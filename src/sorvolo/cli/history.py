@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.options import AsJson, PlaceFormat, PlaceFormatOption
+from sorvolo.cli.options import AsJson, Compression, PlaceFormat, PlaceFormatOption
 from sorvolo.cli.shown import site_of
 from sorvolo.errors import SettingsError
 
@@ -26,8 +26,8 @@ def history(
     ] = None,
     export: Annotated[Path | None, typer.Option(help="Write the map as it was: FILE.tif, .png or .kmz.")] = None,
     compress: Annotated[
-        str, typer.Option(help="Of a .tif: deflate (without loss) or jpeg (a fraction of the size).")
-    ] = "deflate",
+        Compression, typer.Option(help="Of a .tif: deflate (without loss) or jpeg (a fraction of the size).")
+    ] = Compression.DEFLATE,
     coordinates: PlaceFormatOption = PlaceFormat.LATLON,
     as_json: AsJson = False,
 ) -> None:
@@ -50,7 +50,7 @@ def history(
             _show(entries, Console())
             _show_place(site, coordinates, Console())
         return
-    version = export_version(site, at, export, compress=compress)
+    version = export_version(site, at, export, compress=compress.value)
     if as_json:
         entry = next(each for each in entries if each.version == version.id)
         typer.echo(json.dumps({"site": str(site), "file": str(export), "version": plain_json(entry)}, indent=1))

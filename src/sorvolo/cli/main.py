@@ -6,10 +6,11 @@ import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
@@ -28,7 +29,7 @@ from sorvolo.cli.search import search_command
 from sorvolo.cli.simulate import simulate
 from sorvolo.cli.train import train
 from sorvolo.cli.watch import watch_command
-from sorvolo.errors import SorvoloError
+from sorvolo.errors import SorvoloError, SorvoloWarning
 
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
@@ -61,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command. The exit code: 0 success, 1 an error (one line on stderr), 2 wrong usage, 130 stopped."""
     wishes = _Wishes(debug=os.environ.get("SORVOLO_DEBUG", "") not in ("", "0"))
     try:
-        with _interrupts_repeated():
+        with _interrupts_repeated(), _warnings_in_one_line():
             app(args=None if arguments is None else list(arguments), prog_name="sorvolo", obj=wishes)
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else _FAILED
@@ -100,6 +101,25 @@ def _interrupts_repeated() -> Iterator[None]:
         yield
     finally:
         sys.unraisablehook = before
+
+
+@contextmanager
+def _warnings_in_one_line() -> Iterator[None]:
+    """Our own warnings are for the person at the terminal, who needs no place in the program."""
+    with warnings.catch_warnings():
+        before = warnings.showwarning
+
+        def show(
+            message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if issubclass(category, SorvoloWarning):
+                _print_line(f"warning: {message}")
+            else:
+                before(message, category, filename, lineno, file, line)
+
+        warnings.showwarning = show
+        yield
 
 
 def _print_version(wanted: bool) -> None:

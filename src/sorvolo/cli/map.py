@@ -14,7 +14,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.options import Area, AsJson, Camera, GiveUp, GroundElevation, LiveTelemetry, Offset, names
+from sorvolo.cli.options import (
+    Area,
+    AsJson,
+    Camera,
+    Compression,
+    GiveUp,
+    GroundElevation,
+    LiveTelemetry,
+    Offset,
+    names,
+)
 from sorvolo.cli.progress import show_progress
 from sorvolo.cli.shown import newest_version, read_json, show_notices_and_warnings, show_path
 from sorvolo.survey.wording import counted, counted_list
@@ -49,6 +59,18 @@ ControlAccuracy = Annotated[float, typer.Option(help="Accuracy of the control po
 CheckPoints = Annotated[
     str, typer.Option(help="Control points held back to measure the map: labels with commas; CP* for a prefix.")
 ]
+MapCompression = Annotated[
+    Compression | None,
+    typer.Option(
+        help="Of mosaic.tif: deflate (without loss) or jpeg (a fraction of the size). Without it: as before, deflate "
+        "for a new map."
+    ),
+]
+TransformOption = Annotated[Transform, typer.Option(help="What --method thesis fits.")]
+StitchingValues = Annotated[
+    list[str] | None,
+    typer.Option(help="A value of method thesis, such as features=3000. Can be repeated. See docs/thesis.md."),
+]
 
 
 def map_command(
@@ -72,7 +94,9 @@ def map_command(
     gcp: ControlPoints = None,
     gcp_accuracy: ControlAccuracy = 0.05,
     check: CheckPoints = "",
-    transform: Annotated[Transform, typer.Option(help="What --method thesis fits.")] = Transform.SIMILARITY,
+    compress: MapCompression = None,
+    transform: TransformOption = Transform.SIMILARITY,
+    thesis: StitchingValues = None,
     model: Annotated[
         str, typer.Option(help="Detector for people, cars and small objects: a model's name, a file, or none.")
     ] = "default",
@@ -94,9 +118,11 @@ def map_command(
     """
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.flight.settings import MapSettings
+    from sorvolo.mosaic.roi_stitching import stitching_settings
 
     settings = MapSettings(
-        method.value, gsd, overlap, offset, ground_elevation, crs or None, transform.value, model=model,
+        method.value, gsd, overlap, offset, ground_elevation, crs or None, compress.value if compress else None,
+        model=model, thesis=stitching_settings(thesis or [], transform=transform.value),
         control_sigma_m=gcp_accuracy, checks=names(check),
     )
     reports = map_and_read_reports(
@@ -104,13 +130,17 @@ def map_command(
         live=LiveSettings(keeps_all=True, give_up_s=give_up), control=gcp,
     )
     if as_json:
-        plain = [{key: value for key, value in each.items() if key != "track"} for each in reports]
-        files = {path.name.replace(".", "_"): str(path) for path in _map_files(site).values()}
-        typer.echo(json.dumps({"site": str(site), **files, "flights": plain}, indent=1))
+        _print_json(reports, site)
     else:
         show_reports(reports, site, Console())
     if any(each["headline"]["quality"] != "map" for each in reports):
         raise typer.Exit(TO_CHECK)
+
+
+def _print_json(reports: Sequence[Mapping[str, Any]], site: Path) -> None:
+    plain = [{key: value for key, value in each.items() if key != "track"} for each in reports]
+    files = {path.name.replace(".", "_"): str(path) for path in _map_files(site).values()}
+    typer.echo(json.dumps({"site": str(site), **files, "flights": plain}, indent=1))
 
 
 def map_and_read_reports(

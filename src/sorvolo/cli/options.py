@@ -39,6 +39,13 @@ class PlaceFormat(StrEnum):
     UTM = "utm"
     MGRS = "mgrs"
 
+class Compression(StrEnum):
+    """How a GeoTIFF is compressed: the names of `store.rasters.geotiff.COMPRESSIONS`."""
+
+    DEFLATE = "deflate"
+    JPEG = "jpeg"
+
+
 PlaceFormatOption = Annotated[
     PlaceFormat, typer.Option("--coordinates", help="How places are written: latlon, utm or mgrs.")
 ]
@@ -57,3 +64,11 @@ def size_px(text: str) -> tuple[int, int] | None:
 def names(text: str) -> tuple[str, ...]:
     """The names in a list with commas."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def class_names(text: str) -> dict[str, str] | None:
+    """ "Van=car,person" as {"Van": "car", "person": "person"}; None of nothing. Raises SettingsError."""
+    pairs = [each.partition("=") for each in names(text)]
+    if not all(theirs.strip() and (ours.strip() or not equals) for theirs, equals, ours in pairs):
+        raise SettingsError(f"--classes {text!r}: give names as THEIRS=OURS, separated by commas")
+    return {theirs.strip(): ours.strip() or theirs.strip() for theirs, _, ours in pairs} or None

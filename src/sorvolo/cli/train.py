@@ -14,7 +14,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from sorvolo.cli.options import AsJsonSteps, GroupPattern, names
+from sorvolo.cli.options import AsJsonSteps, GroupPattern, class_names, names
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.errors import SettingsError
 
@@ -118,7 +118,7 @@ def train(
         raise SettingsError(
             f"training needs packages that are not installed ({error.name}): pip install 'sorvolo[training]'"
         ) from error
-    options = DataOptions(val, form, _mapping(classes), names(ignore), names(unlabelled), group_pattern)
+    options = DataOptions(val, form, class_names(classes), names(ignore), names(unlabelled), group_pattern)
     updates = train_detector(data or [], out, settings, options, device=device, resume=resume)
     with _stopped_between_steps() as stop:
         (_print_json if as_json else _show)(updates, stop)
@@ -207,11 +207,3 @@ def _stopped_between_steps() -> Iterator[_StopRequest]:
         yield stop
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def _mapping(text: str) -> dict[str, str] | None:
-    """ "Van=car,person" as {"Van": "car", "person": "person"}; None of nothing."""
-    pairs = [each.partition("=") for each in names(text)]
-    if not all(name.strip() and (target.strip() or not equals) for name, equals, target in pairs):
-        raise SettingsError(f"--classes {text!r}: give names as THEIRS=OURS, separated by commas")
-    return {name.strip(): target.strip() or name.strip() for name, _, target in pairs} or None

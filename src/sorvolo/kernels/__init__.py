@@ -12,6 +12,7 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
+from sorvolo.errors import SorvoloWarning
 from sorvolo.kernels import numpy_light, numpy_robust, numpy_thesis
 
 _native: ModuleType | None
@@ -20,9 +21,9 @@ try:
 except ImportError:
     _native = None
     warnings.warn(
-        "sorvolo's compiled kernels are missing, change detection will be some 100 times slower; "
-        "install a C++17 compiler and reinstall sorvolo",
-        RuntimeWarning,
+        "the compiled kernels are missing, so change detection will be some 100 times slower; install a C++17 compiler "
+        "and reinstall sorvolo",
+        SorvoloWarning,
         stacklevel=2,
     )
 

@@ -5,6 +5,7 @@ similarity by RANSAC, gain compensation and multi-band blending into one growing
 never moved again.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -28,6 +29,7 @@ from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.geometry.polygons import polygon_area
 from sorvolo.mosaic.blending import fill_invalid
 from sorvolo.registration.features import gray_from_rgb
+from sorvolo.survey.named_values import named_values, positive_number, whole_number
 
 _CHUNK_PX = 1024
 
@@ -39,6 +41,7 @@ MosaicOffset: TypeAlias = tuple[int, int]
 class RoiStitchingSettings:
     """The choices of section 3.1.1, and those that it leaves open."""
 
+    side_px: int = 1024  # longest side of a picture: the thesis stitches at half HD (section 4.1.2)
     akaze_threshold: float = 8e-5  # OpenCV's 1e-3 finds next to nothing on low-contrast ground
     max_features: int = 6000  # the strongest, in frame and region each: matching costs their product
     matching: Literal["cross-check", "ratio"] = "cross-check"  # both read "only identical patterns match"
@@ -51,15 +54,40 @@ class RoiStitchingSettings:
     largest_px: int = 300_000_000  # of the whole picture: beyond, a frame was surely misplaced
 
     def __post_init__(self) -> None:
-        if min(self.akaze_threshold, self.ransac_px) <= 0 or not 0 < self.ratio <= 1:
-            raise SettingsError("thesis method: akaze_threshold, ransac_px must be positive, ratio in (0, 1]")
-        if self.max_features < 1:
-            raise SettingsError(f"thesis method: max_features must be at least 1, got {self.max_features}")
-        if self.roi_frames < 1 or self.min_inliers < 4 or not 1 <= self.bands <= 10:
-            raise SettingsError("thesis method: roi_frames at least 1, min_inliers at least 4, bands 1 to 10")
-        choices = ("cross-check", "ratio"), ("similarity", "homography")
-        if self.matching not in choices[0] or self.transform not in choices[1]:
-            raise SettingsError(f"thesis method: unknown choice {self.matching!r} or {self.transform!r}")
+        for name, fits, needed in (
+            ("side_px", 256 <= self.side_px <= 8192, "256 to 8192"),
+            ("akaze_threshold", self.akaze_threshold > 0, "a positive number"),
+            ("max_features", self.max_features >= 1, "at least 1"),
+            ("matching", self.matching in ("cross-check", "ratio"), "cross-check or ratio"),
+            ("ratio", 0 < self.ratio <= 1, "more than 0, at most 1"),
+            ("transform", self.transform in ("similarity", "homography"), "similarity or homography"),
+            ("ransac_px", self.ransac_px > 0, "a positive number"),
+            ("min_inliers", self.min_inliers >= 4, "at least 4"),
+            ("roi_frames", self.roi_frames >= 1, "at least 1"),
+            ("bands", 1 <= self.bands <= 10, "1 to 10"),
+        ):
+            if not fits:
+                raise SettingsError(f"method thesis: {name} is {getattr(self, name)!r}; give {needed}")
+
+
+NAMES: dict[str, tuple[str, Callable[[str], object]]] = {
+    "side": ("side_px", whole_number),
+    "A-KAZE": ("akaze_threshold", positive_number),
+    "features": ("max_features", whole_number),
+    "matching": ("matching", str),
+    "ratio": ("ratio", positive_number),
+    "RANSAC": ("ransac_px", positive_number),
+    "inliers": ("min_inliers", whole_number),
+    "region": ("roi_frames", positive_number),
+    "bands": ("bands", whole_number),
+}
+"""The settings as a person writes them: NAME=VALUE (docs/thesis.md)."""
+
+
+def stitching_settings(written: Sequence[str], *, transform: str = "similarity") -> RoiStitchingSettings:
+    """The settings, less those written otherwise, such as "features=3000". Raises SettingsError in words."""
+    chosen: dict[str, Any] = named_values(written, NAMES, "method thesis of sorvolo map")
+    return RoiStitchingSettings(transform=transform, **chosen)  # type: ignore[arg-type]  # checked there
 
 
 @dataclass(frozen=True, eq=False)

@@ -117,13 +117,12 @@ class Patch:
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
-    """One thing that happened to the ground, however many frames saw it.
+class ChangeFacts:
+    """What is known of a change, whether it was just found or is read from a site.
 
     `id` is the flight's name and a number, the same whenever the flight is compared again. `outline_m` (N, 2), N >= 3,
     is its outline on the ground in site metres, not closed. `length_m` is the longer side of the smallest rectangle
     around it. `sigma_m` is the one-sigma error of its place, per axis. `views` counts the frames that showed it.
-    `velocity_m_s` (2,) east, north: zero unless it moves. Classes are "" where nobody looked.
     """
 
     id: str
@@ -136,6 +135,15 @@ class Change:
     area_m2: float
     length_m: float
     sigma_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Change(ChangeFacts):
+    """One thing that happened to the ground, however many frames saw it, with its pictures.
+
+    `velocity_m_s` (2,) east, north: zero unless it moves. Classes are "" where nobody looked.
+    """
+
     patch: Patch
     velocity_m_s: Floats = field(default_factory=lambda: np.zeros(2))
     class_before: str = ""

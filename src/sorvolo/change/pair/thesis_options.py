@@ -7,6 +7,7 @@ from typing import Any
 
 from sorvolo.change.pair.thesis import ThesisSettings
 from sorvolo.errors import SettingsError
+from sorvolo.survey.named_values import named_values, whole_number
 
 LIGHT = "light"
 _MOST_THREADS = 256
@@ -30,22 +31,8 @@ def thesis_options(written: Sequence[str]) -> ThesisOptions:
 
     The names are those of `NAMES`, in any case. Raises SettingsError naming what was found and what is known.
     """
-    chosen: dict[str, Any] = {}
-    threads = 1
-    for each in written:
-        name, _, value = (part.strip() for part in each.partition("="))
-        known = {every.lower(): every for every in NAMES}
-        if not value or name.lower() not in known:
-            raise SettingsError(f"{each!r} is no setting of method thesis; write NAME=VALUE with {', '.join(NAMES)}")
-        field, read = NAMES[known[name.lower()]]
-        try:
-            number = read(value)
-        except ValueError as error:
-            raise SettingsError(f"{each!r} cannot be read; {known[name.lower()]} takes {error}") from error
-        if field == "threads":
-            threads = number
-        else:
-            chosen[field] = number
+    chosen: dict[str, Any] = named_values(written, NAMES, "method thesis")
+    threads = chosen.pop("threads", 1)
     return ThesisOptions(ThesisSettings(**chosen), threads)
 
 
@@ -54,12 +41,6 @@ def _window(written: str) -> tuple[int, int]:
     if not found:
         raise ValueError("width x height in px, such as 10x10")
     return int(found[1]), int(found[2])
-
-
-def _whole(written: str) -> int:
-    if not re.fullmatch(r"\d{1,6}", written):
-        raise ValueError("a whole number")
-    return int(written)
 
 
 def _level(written: str) -> int | None:
@@ -91,7 +72,7 @@ def _reading(written: str) -> bool:
     return written == "printed"
 
 
-NAMES: dict[str, tuple[str, Callable[[str], Any]]] = {
+NAMES: dict[str, tuple[str, Callable[[str], object]]] = {
     "W_a": ("averaging_px", _window),
     "W_l": ("pattern_px", _window),
     "T_gray": ("gray_threshold", _level),
@@ -101,6 +82,6 @@ NAMES: dict[str, tuple[str, Callable[[str], Any]]] = {
     "T_area": ("area_share", _share),
     "T_B": ("least_distance", _share),
     "eq3.21": ("isolation_as_printed", _reading),
-    "threads": ("threads", _whole),
+    "threads": ("threads", whole_number),
 }
 """The names of Table 4.2 (T_gray is section 3.2's T_diff), the reading of equation 3.21, and the threads."""

@@ -6,6 +6,7 @@ from typing import Literal
 from sorvolo.change.pair.thesis_options import ThesisOptions
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import check_map_crs
+from sorvolo.mosaic.roi_stitching import RoiStitchingSettings
 
 _MOST_OFFSET_S = 86_400 * 365
 
@@ -26,9 +27,10 @@ class MapSettings:
     offset_s: float | None = None  # telemetry time = video time + this; None: estimated from motion
     ground_elevation_m: float | None = None  # of the ground, in the telemetry's own height reference
     crs: str | None = None  # of mosaic.tif; None: the site's UTM zone
-    transform: Literal["similarity", "homography"] = "similarity"  # of method thesis (its Figure 3.12)
+    compress: Literal["deflate", "jpeg"] | None = None  # of mosaic.tif; None: as before, deflate for a new map
     live_s: float = 3.0  # how often the growing map is made visible
     model: str = "default"  # that looks for objects: an installed one's name, a file, or "none"
+    thesis: RoiStitchingSettings = field(default_factory=RoiStitchingSettings)  # of method thesis
     control_sigma_m: float = 0.05  # of the control points' places, horizontal
     checks: tuple[str, ...] = ()  # control points held back to measure the map; "NAME*" for all that begin so
 
@@ -37,8 +39,9 @@ class MapSettings:
             raise SettingsError(
                 f"the control points' accuracy (--gcp-accuracy) must lie in 0.0001 to 100 m, got {self.control_sigma_m}"
             )
-        if self.method not in ("planar", "thesis"):
-            raise SettingsError(f"method must be planar or thesis, got {self.method!r}")
+        self._check_method()
+        if self.compress not in (None, "deflate", "jpeg"):
+            raise SettingsError(f"the compression (--compress) must be deflate or jpeg, got {self.compress!r}")
         if self.m_per_px is not None and not 1e-4 <= self.m_per_px <= 100:
             raise SettingsError(f"the ground sampling distance (--gsd) must lie in 1e-4 to 100 m, got {self.m_per_px}")
         if not 0 < self.overlap < 1:
@@ -46,6 +49,12 @@ class MapSettings:
         if self.crs is not None:
             check_map_crs(self.crs)
         check_offset(self.offset_s)
+
+    def _check_method(self) -> None:
+        if self.method not in ("planar", "thesis"):
+            raise SettingsError(f"method must be planar or thesis, got {self.method!r}")
+        if self.method != "thesis" and self.thesis != RoiStitchingSettings():
+            raise SettingsError("--transform and --thesis belong to the thesis's method: give --method thesis as well")
 
 
 @dataclass(frozen=True)

@@ -55,9 +55,11 @@ def contradictions(placed: Sequence[PlacedFrame], figures: FlightFigures) -> lis
 
 def _camera_warnings(figures: FlightFigures, setup: FlightSetup) -> list[str]:
     warnings = []
-    if setup.track is not None and setup.track.attitude == "none" and figures.tilt_deg > OBLIQUE_DEG:
+    has_angles = setup.track is not None and setup.track.attitude != "none"
+    if not has_angles and figures.tilt_deg > OBLIQUE_DEG:  # measured from the pictures' perspective
+        lack = "there is no telemetry" if setup.track is None else "telemetry has no camera angles"
         warnings.append(
-            f"the camera looks {figures.tilt_deg:.0f} deg away from straight down and telemetry has no camera angles: "
+            f"the camera looks {figures.tilt_deg:.0f} deg away from straight down and {lack}: "
             "strips flown in opposite directions may not fit each other; give telemetry with the camera's angles"
         )
     if setup.source.camera.focal_sigma > _GUESSED:

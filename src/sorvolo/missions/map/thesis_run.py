@@ -12,7 +12,7 @@ from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.map.run import FlightRun
-from sorvolo.mosaic.roi_stitching import RoiStitcher, RoiStitchingSettings, Stitched
+from sorvolo.mosaic.roi_stitching import RoiStitcher, Stitched
 from sorvolo.mosaic.stitched_map import MIRROR_Y, StitchedPlaces, mosaic_m_per_px, paint_mosaic, site_from_mosaic
 from sorvolo.registration.lens import Undistorter
 from sorvolo.registration.sizes import at_size
@@ -21,8 +21,6 @@ from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Notice, PosedFrame
 from sorvolo.survey.mosaic import PlacedFrame, Status
-
-_SIDE_PX = 1024  # the thesis stitches at half HD (section 4.1.2): larger pictures are made as small
 
 
 class ThesisRun(FlightRun):
@@ -34,9 +32,9 @@ class ThesisRun(FlightRun):
         super().__init__(setup, archive, settings, finder=finder)
         self._lens = Undistorter(setup.source.camera.camera)
         full = self._lens.camera
-        scale = min(1.0, _SIDE_PX / max(full.width_px, full.height_px))
+        scale = min(1.0, settings.thesis.side_px / max(full.width_px, full.height_px))
         self._camera: Camera = full.resized(round(full.width_px * scale), round(full.height_px * scale))
-        self._stitcher = RoiStitcher(RoiStitchingSettings(transform=settings.transform))
+        self._stitcher = RoiStitcher(settings.thesis)
         self._frames: dict[int, PosedFrame] = {}
         self._stitched: dict[int, Stitched] = {}
         self._pictures: dict[int, ImageRGB] = {}

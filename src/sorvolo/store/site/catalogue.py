@@ -19,6 +19,7 @@ from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.geometry.pose import Pose
 from sorvolo.store.atomic import atomic_path
+from sorvolo.store.rasters.geotiff import COMPRESSIONS
 from sorvolo.store.site import schema
 from sorvolo.store.site.names import checked_crs, checked_image_path
 from sorvolo.store.site.schema import SCHEMA_VERSION
@@ -52,7 +53,8 @@ class FlightEntry:
 class VersionEntry:
     """One state of the map; versions share the tiles in which they agree.
 
-    `flown_ns` is the time of its flight's first frame, UTC; -1 where it was not stored.
+    `flown_ns` is the time of its flight's first frame, UTC; -1 where it was not stored. `compress` is how its GeoTIFF
+    is compressed: as its flight's settings state it, else as the version before.
     """
 
     id: int
@@ -64,6 +66,7 @@ class VersionEntry:
     export_crs: str
     run_id: int
     flown_ns: int = -1
+    compress: str = "deflate"
 
     @property
     def flown_utc(self) -> str:
@@ -246,7 +249,7 @@ def list_flights(connection: Connection) -> list[FlightEntry]:
 def list_versions(connection: Connection) -> list[VersionEntry]:
     """Every version, oldest first."""
     tiles = func.count(schema.version_tiles.c.sha256)
-    flown_ns = _flown_ns(connection)
+    flown_ns, compressions = _flown_ns(connection), _compressions(connection)
     rows = connection.execute(
         select(schema.versions, tiles.label("tiles"))
         .outerjoin(schema.version_tiles, schema.version_tiles.c.version_id == schema.versions.c.id)
@@ -257,9 +260,23 @@ def list_versions(connection: Connection) -> list[VersionEntry]:
         VersionEntry(
             row.id, row.parent_id, row.flight_id, row.created_utc, row.tiles, row.complete,
             checked_crs(row.export_crs), row.run_id, flown_ns.get(row.id, -1),
+            compressions[row.id],
         )
         for row in rows
     ]
+
+
+def _compressions(connection: Connection) -> dict[int, str]:
+    """How the versions' GeoTIFFs are compressed, by version; a version whose flight chose nothing is as its parent."""
+    wishes = {
+        row.id: row.settings.get("compress") if isinstance(row.settings, dict) else None
+        for row in connection.execute(select(schema.runs.c.id, schema.runs.c.settings))
+    }
+    found: dict[int, str] = {}
+    for row in connection.execute(select(schema.versions).order_by(schema.versions.c.id)):
+        wish = wishes.get(row.run_id)
+        found[row.id] = wish if wish in COMPRESSIONS else found.get(row.parent_id, COMPRESSIONS[0])
+    return found
 
 
 def _flown_ns(connection: Connection) -> dict[int, int]:

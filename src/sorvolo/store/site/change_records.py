@@ -13,7 +13,7 @@ from sorvolo.geometry.arrays import Floats, PointsM, frozen
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue import reading_rows, utc_now
 from sorvolo.store.site.names import checked_name, is_plain_name
-from sorvolo.survey.findings import Change, ChangeKind, Verdict
+from sorvolo.survey.findings import Change, ChangeFacts, ChangeKind, Verdict
 
 
 @dataclass(frozen=True)
@@ -28,25 +28,15 @@ class CropPlace:
 
 
 @dataclass(frozen=True, eq=False)
-class StoredChange:
+class StoredChange(ChangeFacts):
     """A change of a flight's complete run, and the verdict on it, if any.
 
     The fields are those of `survey.findings.Change`; `number` counts within the flight. The crops are
     `<id>-before.png` and `<id>-after.png` in the flight's folder `changes`, on the ground as `crop` places them.
     """
 
-    id: str
     flight_id: str
     number: int
-    kind: ChangeKind
-    score: float
-    outline_m: PointsM
-    first_seen_ns: int
-    last_seen_ns: int
-    views: int
-    area_m2: float
-    length_m: float
-    sigma_m: float
     velocity_m_s: Floats
     class_before: str
     class_after: str
@@ -205,8 +195,8 @@ def _stored(flight_id: str, number: int, change: Change) -> StoredChange:
     patch = change.patch
     height_px, width_px = patch.changed.shape
     return StoredChange(
-        change.id, flight_id, number, change.kind, change.score, change.outline_m, change.first_seen_ns,
-        change.last_seen_ns, change.views, change.area_m2, change.length_m, change.sigma_m, change.velocity_m_s,
+        change.id, change.kind, change.score, change.outline_m, change.first_seen_ns, change.last_seen_ns,
+        change.views, change.area_m2, change.length_m, change.sigma_m, flight_id, number, change.velocity_m_s,
         change.class_before, change.class_after, change.announced_ns,
         CropPlace(patch.west_m, patch.north_m, patch.m_per_px, width_px, height_px),
     )
@@ -237,10 +227,10 @@ def _change_of(row: Row[Any], review: StoredReview | None) -> StoredChange:
             raise ValueError("no outline, or a picture without a scale")
         is_reviewed = review is not None and outlines_meet(outline_m, review.outline_m)
         return StoredChange(
-            checked_name(row.id, "change"), row.flight_id, row.number, ChangeKind(row.kind), values["score"], outline_m,
+            checked_name(row.id, "change"), ChangeKind(row.kind), values["score"], outline_m,
             values["first_seen_ns"], values["last_seen_ns"], values["views"],
             _number(values["area_m2"]), _number(values["length_m"]), _number(values["sigma_m"]),
-            frozen(values["velocity_m_s"]), values["class_before"], values["class_after"],
+            row.flight_id, row.number, frozen(values["velocity_m_s"]), values["class_before"], values["class_after"],
             values["announced_ns"], CropPlace(west_m, north_m, m_per_px, width_px, height_px),
             review.verdict if review is not None and is_reviewed else None,
             review.note if review is not None and is_reviewed else "",

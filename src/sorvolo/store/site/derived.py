@@ -36,7 +36,8 @@ def write_map_files(files: SiteFiles, version: VersionEntry) -> None:
         return
     with ThreadPoolExecutor(1, thread_name_prefix="geotiff") as other:  # takes as long as all else together
         geotiff = other.submit(
-            write_cog, tiles, files.site_grid(), files.mosaic_path, crs=version.export_crs or None
+            write_cog, tiles, files.site_grid(), files.mosaic_path, crs=version.export_crs or None,
+            compress=version.compress,
         )
         write_preview(tiles, files.preview_path)
         if not files.site().is_local:

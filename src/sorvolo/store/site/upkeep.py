@@ -78,10 +78,10 @@ def _looks_like(files: SiteFiles, version: VersionEntry, shown: int) -> bool:
     """Whether the map's files, which show another version, would be the same for this one."""
     if version.id == shown:
         return True
-    crs = {each.id: each.export_crs for each in files.versions()}.get(shown)
+    written_as = {each.id: (each.export_crs, each.compress) for each in files.versions()}.get(shown)
     with files.catalogue.reading() as connection:
         same = records.tile_hashes(connection, version.id) == records.tile_hashes(connection, shown)
-    return same and crs == version.export_crs
+    return same and written_as == (version.export_crs, version.compress)
 
 
 def _write_flight_files(files: SiteFiles, owed: OwedFiles) -> None:
