@@ -52,6 +52,12 @@ class Transform(StrEnum):
     HOMOGRAPHY = "homography"
 
 
+Resolution = Annotated[
+    float | None, typer.Option(help="Ground resolution of a new map, m a pixel. Without it: the frames' own.")
+]
+CoordinateSystem = Annotated[
+    str, typer.Option(help="Coordinate system of mosaic.tif, such as EPSG:25832. Without it: the UTM zone.")
+]
 ControlPoints = Annotated[
     Path | None, typer.Option(help="Ground control points: a gcp_list.txt, as OpenDroneMap reads it.")
 ]
@@ -82,15 +88,11 @@ def map_command(
     method: Annotated[
         Method, typer.Option(help="planar: all frames fitted together. thesis: the baseline, frame by frame.")
     ] = Method.PLANAR,
-    gsd: Annotated[
-        float | None, typer.Option(help="Ground resolution of a new map, m a pixel. Without it: the frames' own.")
-    ] = None,
+    gsd: Resolution = None,
     overlap: Annotated[float, typer.Option(help="Overlap of the selected frames, 0 to 1.")] = 0.7,
     offset: Offset = None,
     ground_elevation: GroundElevation = None,
-    crs: Annotated[
-        str, typer.Option(help="Coordinate system of mosaic.tif, such as EPSG:25832. Without it: the UTM zone.")
-    ] = "",
+    crs: CoordinateSystem = "",
     gcp: ControlPoints = None,
     gcp_accuracy: ControlAccuracy = 0.05,
     check: CheckPoints = "",
