@@ -1,6 +1,7 @@
 """Camera files in every dialect, broken ones, presets, EXIF and the honest guess."""
 
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -282,6 +283,20 @@ def test_every_preset_is_a_camera_near_its_makers_angle_of_view():
         assert (25 if is_narrow else 40) < camera.angle_of_view_deg[0] < (60 if is_narrow else 100)
         for code in preset.codes:
             assert preset in find_presets(code)
+
+
+def test_every_preset_has_its_source_in_the_docs():
+    page = (Path(__file__).parents[2] / "docs" / "formats-in.md").read_text().partition("## Camera presets")[2]
+    words = " ".join(page.split())
+    assert not [each.name for each in CAMERA_PRESETS if each.name not in words]
+
+
+def test_skydios_cameras_are_as_skydio_calibrated_them():
+    assert guess_camera(4056, 3040, make="Skydio", model="2", focal_length_mm=3.7).camera.fx_px == pytest.approx(
+        2376.6, rel=0.002
+    )
+    narrow = guess_camera(4624, 3472, make="Skydio", model="VT300-Z_50", focal_length_mm=9.88)
+    assert narrow.camera.fx_px == pytest.approx(6334.2, rel=0.002) and "Skydio X10 narrow" in narrow.origin
 
 
 def test_a_second_camera_under_the_same_name_is_not_taken_for_the_preset():

@@ -1,8 +1,7 @@
-"""Cameras by model name: sensor, focal length and image size of common drones, as their makers state them.
+"""Cameras by model name: sensor, focal length and image size of common drones.
 
-Source of those sold since 2022: DJI's pages "Specs" (Mavic 3 Enterprise and Multispectral, Matrice 30, Matrice 4,
-Zenmuse H20, H30, L1 and L2, Air 3), which state the focal length or its 35 mm equivalent, the field of view and, of
-thermal cameras, the pixel's pitch of 12 um. Where a sensor's size is not stated it follows from those.
+docs/formats-in.md ("Camera presets") states for each where its figures come from and how far they agree with another
+source; `focal_sigma` covers the difference.
 """
 
 import re
@@ -56,10 +55,10 @@ CAMERA_PRESETS = (
     CameraPreset("Zenmuse H30", ("H30", "H30T"), 9.7, 7.3, 6.72, 8064, 6048, 0.04),
     CameraPreset("Air 3", (), 9.7, 7.3, 6.72, 8064, 6048, 0.04),
     CameraPreset("Air 3 tele", (), 9.7, 7.3, 19.6, 8064, 6048, 0.05),
-    CameraPreset("Zenmuse H20", ("ZH20", "ZH20T", "ZH20N"), 6.17, 4.63, 4.5, 4056, 3040, 0.03),
+    CameraPreset("Zenmuse H20", ("ZH20", "ZH20T", "ZH20N"), 6.17, 4.63, 4.5, 4056, 3040, 0.05),
     CameraPreset("Mini 3", ("FC3682",), 9.7, 7.3, 6.72, 4000, 3000, 0.04),
     CameraPreset("Mini 3 Pro", ("FC3582",), 9.7, 7.3, 6.72, 4032, 3024, 0.04),
-    CameraPreset("Mini 4 Pro", ("FC8482",), 9.7, 7.3, 6.72, 4032, 3024, 0.04),
+    CameraPreset("Mini 4 Pro", ("FC8482",), 9.7, 7.3, 6.72, 4032, 3024, 0.06),
     # 4/3 inch and larger
     CameraPreset("Mavic 3", ("L2D-20c",), 17.3, 13.0, 12.29, 5280, 3956, 0.03),
     CameraPreset("Mavic 3E", ("M3E", "M3M"), 17.3, 13.0, 12.29, 5280, 3956, 0.03),
@@ -70,6 +69,15 @@ CAMERA_PRESETS = (
     CameraPreset("Zenmuse X7", ("FC6540",), 23.5, 15.7, 24.0, 6016, 4008, changes_lens=True),
     CameraPreset("Zenmuse P1", ("ZenmuseP1",), 35.9, 24.0, 35.0, 8192, 5460, changes_lens=True),
     CameraPreset("senseFly Aeria X", ("AeriaX",), 23.5, 15.6, 18.5, 6000, 4000),
+    # Skydio's own calibrations: the sensor's size is that which makes its focal length in mm one in pixels
+    CameraPreset(
+        "Skydio 2", ("Skydio 2+", "Skydio X2", "Skydio X2 WIDE"), 6.315, 4.733, 3.7, 4056, 3040
+    ),
+    CameraPreset("Skydio X2 narrow", ("X2E", "X2D", "Skydio X2 NARROW"), 6.275, 4.718, 7.5, 4056, 3040),
+    CameraPreset("Skydio X10 wide", ("VT300-L_93", "V100-L_93"), 13.107, 9.83, 7.74, 8192, 6144, 0.03),
+    CameraPreset(
+        "Skydio X10 narrow", ("VT300-Z_50", "VT300-L_50", "V100-L_50"), 7.213, 5.44, 9.88, 9248, 6944
+    ),
     # lenses far from a pinhole: a calibration is worth much more than the preset
     CameraPreset("Parrot ANAFI", ("Anafi", "AnafiUSA", "AnafiThermal"), 5.985, 4.498, 4.0, 5344, 4016, 0.05),
     CameraPreset("GoPro HERO4", ("HERO4 Black", "HERO4 Silver"), 6.17, 4.63, 2.92, 4000, 3000, 0.1),
@@ -80,6 +88,7 @@ CAMERA_PRESETS = (
     CameraPreset("Matrice 30T thermal", ("M30T",), 7.68, 6.144, 9.1, 640, 512, 0.04),
     CameraPreset("Matrice 4T thermal", ("M4T", "M4TD"), 7.68, 6.144, 12.05, 640, 512, 0.05),
     CameraPreset("Zenmuse H20T thermal", ("ZH20T",), 7.68, 6.144, 13.5, 640, 512, 0.04),
+    CameraPreset("Skydio X10 thermal", ("VT300-Z_40", "VT300-L_40"), 7.68, 6.144, 13.6, 640, 512, 0.03),
     CameraPreset("Zenmuse H30T thermal", ("H30T",), 15.36, 12.288, 24.0, 1280, 1024, 0.04),
 )
 
