@@ -8,6 +8,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, fit_similarity, site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
+from sorvolo.mosaic.keyframes import Keyframes
 from sorvolo.mosaic.planar import KnownKeyframe, PlanarMapper
 from sorvolo.mosaic.pose_graph import PoseGraphSettings
 from sorvolo.survey.flight import CameraPrior
@@ -98,6 +99,30 @@ def test_a_flight_is_placed_by_vision(has_gps):
     assert max(mapper.residuals_px(CAMERA).values()) < 0.5
     assert np.isfinite(mapper.path_m()).all()
     assert len(mapper.exposure().gains) == 12
+
+
+def test_a_flight_with_next_to_no_memory_is_placed_as_with_plenty():
+    """Every keyframe comes from the shelf: the same places, gains and residuals to the last bit."""
+
+    class Shelf(dict):
+        def put(self, key, data):
+            self[key] = data
+
+        def get(self, key):
+            return self[key]
+
+    poses, shelf = flown(1, per_strip=4), Shelf()
+    plenty, little = PlanarMapper(PoseGraphSettings()), PlanarMapper(PoseGraphSettings(), keyframes=Keyframes(shelf, 1))
+    for mapper in (plenty, little):
+        rng = np.random.default_rng(1)
+        for k, pose in enumerate(poses):
+            mapper.add(k, CAMERA, seen(pose, seed=k), measured(pose, rng))
+        mapper.settle()
+    assert len(shelf) >= len(poses) - 1
+    for k in range(len(poses)):
+        assert (plenty.pose(k).translation_m == little.pose(k).translation_m).all()
+        assert (plenty.exposure().gains_of(k) == little.exposure().gains_of(k)).all()
+    assert plenty.residuals_px(CAMERA) == little.residuals_px(CAMERA)
 
 
 def test_a_featureless_frame_stands_by_its_gps_and_the_next_ones_are_found_again():

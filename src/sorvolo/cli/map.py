@@ -102,6 +102,10 @@ def map_command(
     model: Annotated[
         str, typer.Option(help="Detector for people, cars and small objects: a model's name, a file, or none.")
     ] = "default",
+    memory: Annotated[
+        float | None,
+        typer.Option(help="Memory for pictures that are needed again, MB. Without it: a quarter of the machine's."),
+    ] = None,
     give_up: GiveUp = 30.0,
     as_json: AsJson = False,
 ) -> None:
@@ -126,6 +130,7 @@ def map_command(
         method.value, gsd, overlap, offset, ground_elevation, crs or None, compress.value if compress else None,
         model=model, thesis=stitching_settings(thesis or [], transform=transform.value),
         control_sigma_m=gcp_accuracy, checks=names(check),
+        memory_mb=memory,
     )
     reports = map_and_read_reports(
         inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area,

@@ -59,6 +59,13 @@ class ColourPairs:
     def __len__(self) -> int:
         return len(self.colours_a)
 
+    def thinned(self, most: int) -> "ColourPairs":
+        """At most so many of them, taken evenly."""
+        if len(self) <= most:
+            return self
+        pick = np.linspace(0, len(self) - 1, most).astype(int)
+        return ColourPairs(self.colours_a[pick], self.colours_b[pick], self.radius2_a[pick], self.radius2_b[pick])
+
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
@@ -177,13 +184,11 @@ def _equations(
 ) -> _Equations:
     """The equations of all links, at least one of which has pairs."""
     links = [each for each in sorted(pairs) if len(pairs[each])]
-    chosen = [pairs[each] for each in links]
+    chosen = [pairs[each].thinned(settings.points_per_link) for each in links]
     counts = np.array([len(each) for each in chosen])
-    slots = np.arange(min(settings.points_per_link, counts.max()))
-    exists = slots < np.minimum(counts, settings.points_per_link)[:, None]
-    evenly = slots * (counts[:, None] - 1) // max(1, settings.points_per_link - 1)
-    within = np.where(counts[:, None] > settings.points_per_link, evenly, np.where(exists, slots, 0))
-    rows = within + (np.cumsum(counts) - counts)[:, None]  # (L, P) of all pairs in a row
+    slots = np.arange(counts.max())
+    exists = slots < counts[:, None]
+    rows = np.where(exists, slots, 0) + (np.cumsum(counts) - counts)[:, None]  # (L, P) of all pairs in a row
     radius2_a = np.concatenate([each.radius2_a for each in chosen])[rows]
     radius2_b = np.concatenate([each.radius2_b for each in chosen])[rows]
     colours_a = np.concatenate([each.colours_a for each in chosen])[rows]

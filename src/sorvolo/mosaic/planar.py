@@ -7,12 +7,13 @@ import cv2
 import numpy as np
 
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Matrix3, PointsM
+from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
-from sorvolo.mosaic.exposure import ColourPairs, Exposure, solve_exposure, tie_colours
+from sorvolo.mosaic.exposure import ColourPairs, Exposure, ExposureSettings, solve_exposure, tie_colours
 from sorvolo.mosaic.ground_ties import GroundTies
+from sorvolo.mosaic.keyframes import Keyframes
 from sorvolo.mosaic.pose_graph import GraphReport, PoseGraph, PoseGraphSettings, pose_from_link
 from sorvolo.registration.features import gray_from_rgb, normalise_contrast, orb_features
 from sorvolo.registration.link import Effort, LinkCache, LinkPrediction, LinkSettings, link
@@ -31,6 +32,7 @@ class PlanarSettings:
     least_overlap: float = 0.2  # of a view, for a spatial neighbour
     recovery: int = 30  # keyframes tried for a frame that is lost and has no GPS
     links: LinkSettings = field(default_factory=LinkSettings)
+    exposure: ExposureSettings = field(default_factory=ExposureSettings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,17 +88,16 @@ class PlanarMapper:
 
     def __init__(
         self, graph: PoseGraphSettings, settings: PlanarSettings = PlanarSettings(),
-        known: Sequence[KnownKeyframe] = (),
+        known: Sequence[KnownKeyframe] = (), keyframes: Keyframes | None = None,
     ) -> None:
         self._settings = settings
         self._graph = PoseGraph(graph)
         self._cache = LinkCache(settings.links.features)
-        self._keyframes: dict[int, Keyframe] = {}
+        self._keyframes = Keyframes() if keyframes is None else keyframes
         self._own: list[int] = []
         self._known = {each.id: each for each in known}
         self._known_centres_m = np.array([each.site_from_camera.translation_m for each in known]).reshape(-1, 3)
         self._colours: dict[tuple[int, int], ColourPairs] = {}
-        self._small: dict[int, ImageRGB] = {}
         self._failures: dict[int, str] = {}
 
     def add(self, keyframe_id: int, camera: Camera, image: ImageRGB, prior: CameraPrior) -> Outcome:
@@ -106,10 +107,9 @@ class PlanarMapper:
         if guess is None:
             self._failures[keyframe_id] = reason
             return Outcome(Status.REJECTED, reason, frozenset())
-        self._keyframes[keyframe_id] = keyframe
+        self._keyframes.add(keyframe, _thumbnail(image))
         moved = self._graph.add(keyframe_id, keyframe.camera, prior, links, guess)
         self._own.append(keyframe_id)
-        self._small[keyframe_id] = _thumbnail(image)
         for each in links:
             self._tie_colours(each)
         status = Status.VISION if links or len(self._own) == 1 else Status.GPS_ONLY
@@ -134,7 +134,7 @@ class PlanarMapper:
 
     def registration_scale(self, keyframe_id: int, full: Camera) -> float:
         """Pixels at which a keyframe was registered in one of its full size."""
-        return self._keyframes[keyframe_id].camera.width_px / full.width_px
+        return self._keyframes.camera(keyframe_id).width_px / full.width_px
 
     def pose(self, keyframe_id: int) -> Pose:
         """site_from_camera as it stands."""
@@ -175,7 +175,7 @@ class PlanarMapper:
     def residuals_px(self, full: Camera) -> dict[int, float]:
         """Median transfer residual of each keyframe, px of the full frame's size."""
         return {
-            each: value * full.width_px / self._keyframes[each].camera.width_px
+            each: value * full.width_px / self._keyframes.camera(each).width_px
             for each, value in self._graph.residuals_px().items() if each in self._keyframes
         }
 
@@ -201,7 +201,7 @@ class PlanarMapper:
 
     def exposure(self) -> Exposure:
         """Gains and vignette from the colours that linked keyframes share."""
-        return solve_exposure(self._colours)
+        return solve_exposure(self._colours, settings=self._settings.exposure)
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
@@ -365,17 +365,17 @@ class PlanarMapper:
                 np.full(3, np.inf),
             )
             image = known.image()
-            self._keyframes[other] = self._keyframe(other, known.camera, image, unknown)
-            self._graph.add_known(other, self._keyframes[other].camera, known.site_from_camera)
-            self._small[other] = _thumbnail(image)
-        return self._keyframes[other]
+            self._keyframes.add(self._keyframe(other, known.camera, image, unknown), _thumbnail(image))
+            self._graph.add_known(other, self._keyframes.camera(other), known.site_from_camera)
+        return self._keyframes.keyframe(other)
 
     def _tie_colours(self, each: Link) -> None:
-        new, old = self._keyframes[each.new_id], self._keyframes[each.old_id]
-        small_new, small_old = self._small[each.new_id], self._small[each.old_id]
-        self._colours[each.new_id, each.old_id] = tie_colours(
-            small_new, _scaled(each.new_px, new.gray, small_new), small_old, _scaled(each.old_px, old.gray, small_old)
+        small_new, small_old = self._keyframes.thumbnail(each.new_id), self._keyframes.thumbnail(each.old_id)
+        new, old = self._keyframes.camera(each.new_id), self._keyframes.camera(each.old_id)
+        pairs = tie_colours(
+            small_new, _scaled(each.new_px, new, small_new), small_old, _scaled(each.old_px, old, small_old)
         )
+        self._colours[each.new_id, each.old_id] = pairs.thinned(self._settings.exposure.points_per_link)
 
 
 def _thumbnail(image: ImageRGB) -> ImageRGB:
@@ -384,6 +384,6 @@ def _thumbnail(image: ImageRGB) -> ImageRGB:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
 
 
-def _scaled(points_px: Floats, gray: ImageGray, small: ImageRGB) -> Floats:
-    scale = np.array([small.shape[1] / gray.shape[1], small.shape[0] / gray.shape[0]])
+def _scaled(points_px: Floats, camera: Camera, small: ImageRGB) -> Floats:
+    scale = np.array([small.shape[1] / camera.width_px, small.shape[0] / camera.height_px])
     return (points_px + 0.5) * scale - 0.5

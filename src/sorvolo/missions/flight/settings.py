@@ -6,6 +6,7 @@ from typing import Literal
 from sorvolo.change.pair.thesis_options import ThesisOptions
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import check_map_crs
+from sorvolo.missions.flight.memory import memory_budget_bytes
 from sorvolo.mosaic.roi_stitching import RoiStitchingSettings
 
 _MOST_OFFSET_S = 86_400 * 365
@@ -33,8 +34,10 @@ class MapSettings:
     thesis: RoiStitchingSettings = field(default_factory=RoiStitchingSettings)  # of method thesis
     control_sigma_m: float = 0.05  # of the control points' places, horizontal
     checks: tuple[str, ...] = ()  # control points held back to measure the map; "NAME*" for all that begin so
+    memory_mb: float | None = None  # for what can be read again; None: a quarter of the machine's
 
     def __post_init__(self) -> None:
+        memory_budget_bytes(self.memory_mb)
         if not 1e-4 <= self.control_sigma_m <= 100:
             raise SettingsError(
                 f"the control points' accuracy (--gcp-accuracy) must lie in 0.0001 to 100 m, got {self.control_sigma_m}"

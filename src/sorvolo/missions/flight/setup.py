@@ -58,11 +58,11 @@ class FlightSetup:
         if self.telemetry is None:
             return local_prior(self.source.camera.camera, first=first)
         self.telemetry.renew(frame.time_ns)
-        return self.telemetry.track.prior(self.seconds(frame), smooth_s=self.plan.smooth_s)
+        return self.telemetry.track.prior(self.seconds(frame.time_ns), smooth_s=self.plan.smooth_s)
 
-    def seconds(self, frame: Frame) -> float:
-        """Seconds of the frame on the frames' clock."""
-        return (frame.time_ns - self.source.start_ns) / 1e9
+    def seconds(self, time_ns: int) -> float:
+        """Seconds of a frame's time on the frames' clock."""
+        return (time_ns - self.source.start_ns) / 1e9
 
     def utc_ns(self, time_ns: int) -> int:
         """A frame's UTC by telemetry's clock, where the source ties the two."""

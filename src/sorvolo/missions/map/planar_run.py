@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from types import TracebackType
 
 from sorvolo.capture.sync import OffsetEstimate
 from sorvolo.errors import InputError
@@ -10,6 +11,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.level_ground import footprint, is_on_ground
 from sorvolo.missions.flight.log import Ending, Stage, nothing_placed
 from sorvolo.missions.flight.map_objects import ObjectFinder, crops_of
+from sorvolo.missions.flight.memory import memory_budget_bytes
 from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
@@ -17,6 +19,7 @@ from sorvolo.missions.map.known_keyframes import KnownKeyframes
 from sorvolo.missions.map.painting import FlightPainter, site_from_image
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.mosaic.exposure import Exposure
+from sorvolo.mosaic.keyframes import Keyframes
 from sorvolo.mosaic.placing import map_m_per_px, sees_horizon
 from sorvolo.mosaic.planar import PlanarMapper
 from sorvolo.mosaic.pose_graph import PoseGraphSettings
@@ -26,6 +29,7 @@ from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.images import image_from_jpeg, jpeg_from_image
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
+from sorvolo.store.site.spill import SpillFile
 from sorvolo.survey.control import ControlReport
 from sorvolo.survey.flight import Notice, PosedFrame
 from sorvolo.survey.mosaic import PlacedFrame, Status
@@ -48,17 +52,25 @@ class PlanarRun(FlightRun):
         self._lens = Undistorter(model.camera)
         self._known = KnownKeyframes.of(archive, setup.source.name)
         offset_sigma_m = None if setup.track is None else setup.track.altitude_offset_sigma_m
+        self._spill = SpillFile(archive.folder)
         self._mapper = PlanarMapper(
             PoseGraphSettings.of_flight(
                 model.focal_sigma, offset_sigma_m, joins_map=self._known.count > 0 or setup.control is not None
             ),
             known=self._known.for_graph(),
+            keyframes=Keyframes(self._spill, memory_budget_bytes(settings.memory_mb) // 2),
         )
-        self._frames: dict[int, PosedFrame] = {}
+        self._times_ns: dict[int, int] = {}  # of the flight's keyframes that have a place
         self._held: dict[int, ImageRGB | bytes] = {}  # JPEG where all of the flight waits for its place
         self._painter: FlightPainter | None = None
         self._offset: OffsetEstimate | None = None
         self._control: ControlReport | None = None
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._spill.close()
+        super().__exit__(kind, error, trace)
 
     @property
     def images(self) -> Mapping[int, str]:
@@ -71,7 +83,7 @@ class PlanarRun(FlightRun):
         Raises InputError when a site has to be made and no frame has a place that gives its scale.
         """
         if not self._archive.has_site:
-            if not self._frames:
+            if not self._times_ns:
                 raise self._nothing_placed()
             self._make_site(self._settings.m_per_px or self._native_m_per_px(), self._mapper.altitude_offset_m)
         return self._begin_flight()
@@ -89,7 +101,7 @@ class PlanarRun(FlightRun):
         self._log.end(frame.index, frame.name, frame.time_ns, outcome.status, outcome.reason)
         if outcome.status is Status.REJECTED:
             return outcome.status, outcome.reason, 0
-        self._frames[keyframe_id] = posed
+        self._times_ns[keyframe_id] = frame.time_ns
         with self._log.stage(Stage.STORE):
             self._keep(keyframe_id, image)
         if self._painter is None:
@@ -102,7 +114,7 @@ class PlanarRun(FlightRun):
 
         Nothing is committed. Frames that came to nothing are rejected; without any other nothing is painted.
         """
-        if self._frames:
+        if self._times_ns:
             with self._log.stage(Stage.REGISTER):
                 self._mapper.settle()
                 self._offset = self._find_offset()
@@ -167,7 +179,7 @@ class PlanarRun(FlightRun):
             for keyframe_id, held in self._held.items():
                 image = image_from_jpeg(held, "") if isinstance(held, bytes) else held
                 self._painter.save(keyframe_id, image)
-            self._painter.mark(self._frames.keys())
+            self._painter.mark(self._times_ns.keys())
             self._held.clear()
         return self._painter
 
@@ -184,7 +196,8 @@ class PlanarRun(FlightRun):
         """Bring the map to its control points, where it has any."""
         control = self._setup.control
         if control is not None:
-            keyframe_of = {self._frames[each].frame.name: each for each in self._mapper.placed()}
+            endings = self._log.endings
+            keyframe_of = {endings[each - self._known.count].name: each for each in self._mapper.placed()}
             self._control = control.tie(self._mapper, keyframe_of, self._setup.frame)
 
     def _find_offset(self) -> OffsetEstimate | None:
@@ -196,7 +209,7 @@ class PlanarRun(FlightRun):
         applied_s = 0.0
         for _ in range(_OFFSET_ROUNDS):
             ids = self._mapper.placed()
-            seconds = [self._setup.seconds(self._frames[each].frame) for each in ids]
+            seconds = [self._setup.seconds(self._times_ns[each]) for each in ids]
             found = telemetry.offset_seen(seconds, self._mapper.path_m(), applied_s)
             estimate = found if estimate is None else estimate.refined(found, applied_s)
             if self._settings.offset_s is not None or not found.is_significant:
@@ -212,13 +225,13 @@ class PlanarRun(FlightRun):
         residuals: dict[int, float] = {}
         sigmas: dict[int, float] = {}
         gps: dict[int, Floats] = {}
-        if self._frames:
+        if self._times_ns:
             residuals = self._mapper.residuals_px(self._lens.camera)
             sigmas, gps = self._mapper.sigmas_m(), self._mapper.gps_residuals_m()
         result = []
         for ending in list(self._log.endings.values()):
             keyframe_id = self._known.count + ending.index
-            if keyframe_id not in self._frames:
+            if keyframe_id not in self._times_ns:
                 result.append(self._rejected(ending, ending.reason, camera))
                 continue
             pose = self._mapper.pose(keyframe_id)

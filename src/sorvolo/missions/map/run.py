@@ -7,12 +7,15 @@ from typing import Any, Self
 
 from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.map_objects import ObjectFinder, search_summary, why_not_searched
+from sorvolo.missions.flight.memory import memory_budget_bytes
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, new_site
 from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.survey.flight import Notice, PosedFrame
 from sorvolo.survey.map_objects import ObjectSearch
 from sorvolo.survey.mosaic import PlacedFrame, Status
+
+_MOST_CACHE_MB = 256  # of tiles, and of pictures: more is not used
 
 
 class FlightRun(ABC):
@@ -104,6 +107,7 @@ class FlightRun(ABC):
         if self._writer is None:
             source = self._setup.source
             settings: dict[str, Any] = {"method": self._settings.method, **vars(self._settings)}
-            self._writer = self._archive.begin_flight(source.name, source.fingerprint, settings)
+            cache_mb = min(_MOST_CACHE_MB, int(memory_budget_bytes(self._settings.memory_mb) / 1e6) // 8)
+            self._writer = self._archive.begin_flight(source.name, source.fingerprint, settings, cache_mb=cache_mb)
             self._began_writer = True
         return self._writer

@@ -1,0 +1,44 @@
+"""What a run cannot hold in memory, in one file beside the site's that nobody else sees and no kill leaves behind."""
+
+import tempfile
+from pathlib import Path
+from typing import BinaryIO
+
+from sorvolo.store.atomic import writing
+
+
+class SpillFile:
+    """Bytes by key, written once each, in a file without a name inside `folder`; made when first needed.
+
+    Raises StoreError when the disk is full.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._file: BinaryIO | None = None
+        self._places: dict[int, tuple[int, int]] = {}
+        self._end = 0
+
+    def put(self, key: int, data: bytes) -> None:
+        """Keep these bytes under a key that has none yet."""
+        with writing(self._folder):
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115 (lives as long as the run)
+            self._file.seek(self._end)
+            self._file.write(data)
+            self._file.flush()
+        self._places[key] = self._end, len(data)
+        self._end += len(data)
+
+    def get(self, key: int) -> bytes:
+        """The bytes kept under this key; raises KeyError where there are none."""
+        at, length = self._places[key]
+        assert self._file is not None
+        self._file.seek(at)
+        return self._file.read(length)
+
+    def close(self) -> None:
+        """Give the space back."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
