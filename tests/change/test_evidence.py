@@ -260,11 +260,11 @@ def test_low_scores_are_kept_but_not_announced():
     assert reported == [] and evidence.conclude() == ()
 
 
-@pytest.mark.parametrize(("side_m", "score", "is_told"), [(2.0, 0.45, False), (2.0, 0.7, True), (1.0, 0.45, True)])
-def test_what_is_large_must_be_surer_than_what_is_small(side_m, score, is_told):
+@pytest.mark.parametrize(("side_m", "score", "is_announced"), [(2.0, 0.45, False), (2.0, 0.7, True), (1.0, 0.45, True)])
+def test_what_is_large_must_be_surer_than_what_is_small(side_m, score, is_announced):
     """Walls that lean into view are large and unsure."""
     evidence, _ = collect(flight([Thing(0, 0, (side_m, side_m))], score=score))
-    assert len(evidence.conclude()) == is_told
+    assert len(evidence.conclude()) == is_announced
 
 
 def test_what_became_of_the_candidates_is_counted():

@@ -83,7 +83,7 @@ class Drone:
         flight = self._flight
         return sending(
             udp_url(self.port), size=flight.images[0].shape[1::-1], klv=self._metadata, image=self._image,
-            klv_of=self._told, rate=flight.rate, speed=self._speed,
+            klv_of=self._klv, rate=flight.rate, speed=self._speed,
         )
 
     def _frame(self, index: int) -> int:
@@ -99,7 +99,7 @@ class Drone:
             raise OSError("landed")  # ends the sender
         return self._flight.images[frame]
 
-    def _printed(self, index: int) -> bytes:
+    def _klv(self, index: int) -> bytes:
         """ST 0601: the aircraft level, the sensor turned against it as the gimbal is against north and horizon."""
         flight = self._flight
         printed, at_s = flight.telemetry, self._frame(index) / flight.rate
