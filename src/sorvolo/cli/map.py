@@ -77,6 +77,16 @@ StitchingValues = Annotated[
     list[str] | None,
     typer.Option(help="A value of method thesis, such as features=3000. Can be repeated. See docs/thesis.md."),
 ]
+HowRegistered = Annotated[
+    Method, typer.Option(help="planar: all frames fitted together. thesis: the baseline, frame by frame.")
+]
+Model = Annotated[
+    str, typer.Option(help="Detector for people, cars and small objects: a model's name, a file, or none.")
+]
+Memory = Annotated[
+    float | None,
+    typer.Option(help="Memory for pictures that are needed again, MB. Without it: a quarter of the machine's."),
+]
 
 
 def map_command(
@@ -85,9 +95,7 @@ def map_command(
     telemetry: LiveTelemetry = None,
     camera: Camera = "",
     area: Area = None,
-    method: Annotated[
-        Method, typer.Option(help="planar: all frames fitted together. thesis: the baseline, frame by frame.")
-    ] = Method.PLANAR,
+    method: HowRegistered = Method.PLANAR,
     gsd: Resolution = None,
     overlap: Annotated[float, typer.Option(help="Overlap of the selected frames, 0 to 1.")] = 0.7,
     offset: Offset = None,
@@ -99,13 +107,8 @@ def map_command(
     compress: MapCompression = None,
     transform: TransformOption = Transform.SIMILARITY,
     thesis: StitchingValues = None,
-    model: Annotated[
-        str, typer.Option(help="Detector for people, cars and small objects: a model's name, a file, or none.")
-    ] = "default",
-    memory: Annotated[
-        float | None,
-        typer.Option(help="Memory for pictures that are needed again, MB. Without it: a quarter of the machine's."),
-    ] = None,
+    model: Model = "default",
+    memory: Memory = None,
     give_up: GiveUp = 30.0,
     as_json: AsJson = False,
 ) -> None:
@@ -129,8 +132,7 @@ def map_command(
     settings = MapSettings(
         method.value, gsd, overlap, offset, ground_elevation, crs or None, compress.value if compress else None,
         model=model, thesis=stitching_settings(thesis or [], transform=transform.value),
-        control_sigma_m=gcp_accuracy, checks=names(check),
-        memory_mb=memory,
+        control_sigma_m=gcp_accuracy, checks=names(check), memory_mb=memory,
     )
     reports = map_and_read_reports(
         inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area,
