@@ -30,9 +30,10 @@ import json
 import shutil
 import time
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -183,8 +184,8 @@ def write_photos(
     strips = [photos_of(options.data / "flights" / name, FLIGHTS[name].strips[number]) for number in pair]
     things = []
     if seed is not None:
-        rng = np.random.default_rng([seed, *pair])
-        things = Planting(name, whole, strips, rng, options.data).things(options.things)
+        planting = Planting(name, whole, strips, np.random.default_rng([seed, *pair]), pool(options.data, seed))
+        things = planting.things(options.things)
     for part, shown, paths in zip(("earlier", "later"), FATES[::-1], strips):
         write_strip(folder / part, paths, [each for each, fate in things if fate == shown], whole)
     return things, [len(each) for each in strips]
@@ -194,7 +195,8 @@ class Planting:
     """Draws things for a pair of strips. Only `things` changes it: its random numbers go on."""
 
     def __init__(
-        self, name: str, whole: WholeMap, strips: list[list[Path]], rng: np.random.Generator, data: Path
+        self, name: str, whole: WholeMap, strips: list[list[Path]], rng: np.random.Generator,
+        sources: dict[str, list[Cutout]],
     ) -> None:
         self._flight, self._whole, self._rng = FLIGHTS[name], whole, rng
         self._photos = dict(zip(FATES, strips[::-1]))  # what appears is planted into the later strip
@@ -203,19 +205,18 @@ class Planting:
             for fate, paths in self._photos.items()
         }
         self._crowns = crowns_m(name, whole.frame)
-        self._data = data
+        self._sources = sources
         shadow_deg = self._flight.shadow_deg
         self._shadow_deg = float(rng.uniform(0, 360)) if shadow_deg is None else shadow_deg
         self._darkness = 0.15 if shadow_deg is None else 0.5
 
     def things(self, count: int) -> list[tuple[Planted, str]]:
         """Up to `count` things, each with its fate; kinds and fates by turns."""
-        sources = {kind: pool(self._data, kind, self._rng, self._flight.is_grey) for kind in KINDS}
         planted: list[tuple[Planted, str]] = []
         for number in range(count):
             kind, fate = list(KINDS)[number % len(KINDS)], FATES[number % 2]
             for _ in range(_TRIES):
-                thing = self._tried(sources[kind], fate, number // 3 % 4 == 2)
+                thing = self._tried(kind, fate, number // 3 % 4 == 2)
                 if thing is not None and all(
                     np.linalg.norm(each.place_m - thing.place_m) >= _APART_M for each, _ in planted
                 ):
@@ -225,9 +226,11 @@ class Planting:
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
-    def _tried(self, sources: list[Cutout], fate: str, is_low: bool) -> Planted | None:
+    def _tried(self, kind: str, fate: str, is_low: bool) -> Planted | None:
         """One thing somewhere; None where too few photos show the place, in a crown, or of the other contrast."""
-        cutout = sources[int(self._rng.integers(len(sources)))]
+        cutout = self._sources[kind][int(self._rng.integers(len(self._sources[kind])))]
+        if self._flight.is_grey:
+            cutout = replace(cutout, rgb=np.repeat(cutout.rgb.mean(axis=2, keepdims=True), 3, axis=2))
         place = drawn_place(self._shown[fate], self._rng)
         seen = [path for path, outline in zip(self._photos[fate], self._shown[fate]) if outline.contains(Point(place))]
         other = self._shown[FATES[1 - FATES.index(fate)]]
@@ -244,15 +247,11 @@ class Planting:
         return Planted(lit, place, turn, self._shadow_deg, 0.6 * cutout.height_m, self._darkness, is_low)
 
 
-def pool(data: Path, kind: str, rng: np.random.Generator, is_grey: bool, most: int = 24) -> list[Cutout]:
-    """Cut-outs of a kind."""
-    found = []
-    for each in cutouts(data, kind, rng):
-        grey = np.repeat(each.rgb.mean(axis=2, keepdims=True), 3, axis=2)
-        found.append(Cutout(each.kind, each.label, grey, each.alpha, each.length_m, each.height_m) if is_grey else each)
-        if len(found) == most:
-            break
-    return found
+@lru_cache(maxsize=1)
+def pool(data: Path, seed: int, most: int = 24) -> dict[str, list[Cutout]]:
+    """Cut-outs of each kind, the same for all pairs of strips."""
+    rng = np.random.default_rng([seed, 7])
+    return {kind: list(islice(cutouts(data, kind, rng), most)) for kind in KINDS}
 
 
 def drawn_place(outlines: list[Polygon], rng: np.random.Generator) -> Floats:
