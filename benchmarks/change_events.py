@@ -55,6 +55,7 @@ def main() -> None:
     parser.add_argument("--no-masks", action="store_true", help="leave frames and pixels out")
     parser.add_argument("--speed", action="store_true", help="time 1080p video at 30 frames a second, without masks")
     parser.add_argument("--length", type=float, help="length of a strip, m, for a shorter flight")
+    parser.add_argument("--fps", type=float, help="frames a second of the simulated videos; five of them are compared")
     parser.add_argument("--limit", type=float, default=1800.0, help="longest time of a run, s")
     parser.add_argument("--keep", type=Path, help="folder for simulations and sites, used again when run again")
     parser.add_argument("--output", type=Path)
@@ -72,7 +73,7 @@ def main() -> None:
         for seed in options.seeds:
             with tempfile.TemporaryDirectory() as scratch:
                 folder = (options.keep or Path(scratch)) / f"{name}-{seed}{'-1080p' if options.speed else ''}"
-                simulation, base = simulate(folder, name, seed, options.length, is_speed=options.speed)
+                simulation, base = simulate(folder, name, seed, options)
                 for method in options.methods:
                     print(f"{name}, seed {seed}: {method}", file=sys.stderr, flush=True)
                     site = folder / method
@@ -95,8 +96,8 @@ def save(runs: list[dict], presets: list[str], options: argparse.Namespace) -> N
     output = options.output or RESULTS / ("change_speed_video.json" if options.speed else "change_events.json")
     output.parent.mkdir(exist_ok=True)
     output.write_text(json.dumps({
-        "benchmark": "change_events", "presets": list(presets), "length_m": options.length, "seeds": options.seeds,
-        **options.scoring,
+        "benchmark": "change_events", "presets": list(presets), "length_m": options.length, "fps": options.fps,
+        "seeds": options.seeds, **options.scoring,
         "least_px": LEAST_PX, "machine": machine(), "commit": commit(),
         "summary": summarised(runs, presets, options.methods), "runs": runs,
     }, indent=1) + "\n")
@@ -113,13 +114,17 @@ def summarised(runs: list[dict], presets: list[str], methods: list[str]) -> dict
     }
 
 
-def simulate(folder: Path, name: str, seed: int, length_m: float | None, *, is_speed: bool) -> tuple[Path, Path]:
+def simulate(folder: Path, name: str, seed: int, options: argparse.Namespace) -> tuple[Path, Path]:
     """The two flights of a preset, and the map of the first; what is there already is kept."""
     simulation, base = folder / "simulation", folder / "base"
     settings = replace(preset(name), seed=seed)
-    if length_m is not None:
-        settings = replace(settings, path=replace(settings.path, length_m=length_m))
-    if is_speed:
+    if options.length is not None:
+        settings = replace(settings, path=replace(settings.path, length_m=options.length))
+    if options.fps is not None:  # the truth's steps as far apart in time as before
+        step = max(1, round(settings.output.truth_step * options.fps / settings.imaging.fps))
+        settings = replace(settings, imaging=replace(settings.imaging, fps=options.fps),
+                           output=replace(settings.output, truth_step=step))
+    if options.speed:
         imaging = ImagingSettings(1920, 1080, fps=30)
         settings = replace(settings, imaging=imaging, output=replace(settings.output, truth_step=1_000_000))
     if not simulation.is_dir():
