@@ -29,6 +29,7 @@ _KNOWN_ENOUGH = 0.1  # share of a frame on known ground: with less there is noth
 _WITNESSES = 2  # earlier pictures asked about a difference: one from each side
 _COARSER = 1.25  # times the map's pixels: views less coarse than that have its pixels
 _ALL_CHANGED = 0.5  # share of a view: more is snow, a flood or another place, not a list of changes
+_ALL_CHANGED_REASON = "more than half of it looks changed (water, snow, ploughing?)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,8 +141,7 @@ class ViewMaker:
         found = self._corroborated(compared)
         changed = np.count_nonzero(found.mask) / max(1, int(np.count_nonzero(valid)))
         if changed > _ALL_CHANGED:
-            reason = f"{changed:.0%} of it looks changed: snow, a flood, night or another place?"
-            return replace(outcome, status=ViewStatus.ALL_CHANGED, reason=reason)
+            return replace(outcome, status=ViewStatus.ALL_CHANGED, reason=_ALL_CHANGED_REASON)
         view = ComparedView(
             frame.index, frame.name, self._flight.utc_ns(frame.time_ns), aligned.site_from_image, aligned.camera_m,
             compared.image, compared.reference, valid, found.mask, found.boxes, found.scores, aligned.residual_px,

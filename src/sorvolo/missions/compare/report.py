@@ -132,7 +132,7 @@ def comparison_warnings(counts: ViewCounts, brightness: float) -> list[str]:
     all_changed = counts[ViewStatus.ALL_CHANGED]
     if all_changed > 0.1 * views:
         warnings.append(
-            f"{all_changed} of {views} views look changed all over (snow, a flood?) and were left out: "
-            "map the site anew"
+            f"{all_changed} of {views} views look changed all over (water, snow, ploughing?) and were left out: fly "
+            "again when that is gone, or map the site anew"
         )
     return warnings
