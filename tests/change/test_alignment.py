@@ -17,7 +17,7 @@ from sorvolo.survey.flight import CameraPrior
 M_PER_PX = 0.05
 TILE_PX = 256
 CAMERA = Camera.from_angle_of_view(640, 360, 62.0)
-NO_SEARCH = SearchSettings(least_pairs=10**6)
+NO_SEARCH = SearchSettings(least_pairs=10**6, weak_pairs=10**6)
 DOWN = np.diag([1.0, -1.0, -1.0])
 
 
@@ -261,3 +261,56 @@ def test_a_small_view_beside_a_large_one_shows_the_same_and_reads_no_tile(tiles)
         for shift in ((0, 0), (0, 1), (0, -1), (1, 0), (-1, 0))
     ]
     assert apart[0] < 0.5 * min(apart[1:])
+
+
+def test_a_map_that_differs_locally_is_met_by_a_local_fit(tiles):
+    """Waves of 0.2 m over ground that changed: the camera's fit alone leaves them."""
+    pose = Pose(turned(10.0, 1.0), np.array([3.0, -2.0, 30.0]))
+    found = aligner(tiles).align(photographed(pose, rebuilt(0.4)), CAMERA, prior_at(pose, (1.0, -0.5, 0.0)), 0)
+    assert isinstance(found, Aligned) and found.local is not None
+    assert found.local_m > 0.03
+    places = found.local.places_px(CAMERA.width_px, CAMERA.height_px)
+    seen = apply_homography(np.linalg.inv(site_from_ground()) @ found.site_from_image, places)
+    rng = np.random.default_rng(8)
+    rng.random((20, 20))
+    waves = [
+        cv2.resize(rng.normal(0, 3.0, (12, 12)).astype(np.float32), GROUND.shape[1::-1]) for _ in range(2)
+    ]
+    shown = np.linalg.inv(site_from_ground()) @ site_from_image_homography(CAMERA, pose)
+
+    def missed(by_px):
+        at = apply_homography(shown, places + by_px).astype(np.float32)
+        moved = [cv2.remap(each, at[:, None, 0], at[:, None, 1], cv2.INTER_LINEAR)[:, 0] for each in waves]
+        return float(np.median(np.linalg.norm(at + np.column_stack(moved) - seen, axis=1)))
+
+    assert missed(found.local.moved_px.reshape(-1, 2)) < 0.85 * missed(0.0)
+
+
+def test_a_frame_without_gps_is_placed_beside_one_that_was_on_rebuilt_ground(tiles):
+    along, ground = aligner(tiles), rebuilt(0.6)
+    placed = []
+    for number, east_m in enumerate((0.0, 3.0, 6.0)):
+        pose = Pose(turned(10.0, 1.0), np.array([east_m, -2.0, 30.0]))
+        prior = prior_at(pose, (1.0, -0.5, 0.0))
+        if number:
+            prior = CameraPrior(np.zeros(3), np.full(3, np.inf), DOWN, np.full(3, np.inf))
+        found = along.align(photographed(pose, ground), CAMERA, prior, number * 3 * 10**9)
+        assert isinstance(found, Aligned)
+        placed.append(error_px(found, pose) * 30 / CAMERA.fx_px)
+    assert max(placed) < 0.7  # m
+    alone = aligner(tiles).align(photographed(pose, ground), CAMERA, prior, 0)
+    assert isinstance(alone, NotAligned)
+
+
+def test_one_strip_that_is_not_found_does_not_lose_the_flight(tiles):
+    """Photos of other ground between two strips: those before and after are placed as if it had not been."""
+    along, ground = aligner(tiles), rebuilt(0.3)
+    other = textured(8 * TILE_PX, 31)
+    for number in range(14):
+        pose = Pose(turned(0.0), np.array([-6.0 + number, 0.0, 30.0]))
+        lost = 2 <= number < 12
+        found = along.align(
+            photographed(pose, other if lost else ground), CAMERA, prior_at(pose, (1.0, 1.0, 0.0)), number * 3 * 10**9
+        )
+        assert isinstance(found, NotAligned) == lost
+        assert lost or error_px(found, pose) * 30 / CAMERA.fx_px < 0.6

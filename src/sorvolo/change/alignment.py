@@ -1,12 +1,13 @@
 """A frame laid over the known map: by telemetry and the frames before, then by features, then to a part of a pixel."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
 
+from sorvolo.change.local_fit import LocalFit, fit_locally
 from sorvolo.change.map_search import MapSearch, SearchSettings
 from sorvolo.change.reference import ReferenceMap, normalised, resized
 from sorvolo.errors import GeometryError
@@ -15,6 +16,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import apply_homography, pose_from_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
+from sorvolo.registration.camera_fit import PosePrior, fit_camera
 from sorvolo.registration.features import (
     FeatureSettings,
     gray_from_rgb,
@@ -33,6 +35,9 @@ _NO_FEATURES = Features("orb", np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
 _SMALL = 4  # times smaller are the copies that are shifted onto each other
 _SEARCHED_MISSES = 8  # frames in a row
 _CELLS = 4, 3
+_LOCAL_SIDE_PX = 960  # of the pictures that a local fit is made from
+_LOCAL_ROUNDS, _FAR_M = 2, 0.6  # a place that moves by so much is fitted once more
+_LOCAL_PRIOR = np.full(3, 2.0), np.radians([2.0, 2.0, 2.0])  # m, and by axis: what a local fit moves a camera by
 _TRACKED_S = 2.0  # a fit older than this foretells nothing
 
 
@@ -45,6 +50,8 @@ class AlignmentSettings:
     most_residual_px: float = 2.2  # of the registered image: worse, and what differs is the fit, not the ground
     doubtful_px: float = 1.5  # a fit that leaves more is checked: a foretold one by features, others by the search
     least_spread: float = 0.6  # share of a frame's cells with points: with less a homography may swing
+    confirms_rest: float = 0.42  # of a local fit: less confirms a place in doubt; other ground had 0.53 once
+    settled_px: float = 1.2  # a fit that leaves more is followed by a local one
     most_features: int = 60_000  # of the whole map, to look for a frame whose place is not known at all
     links: LinkSettings = field(
         default_factory=lambda: LinkSettings(FeatureSettings(orb_count=900), min_inliers=20, max_pairs=150)
@@ -57,13 +64,16 @@ class Aligned:
     """A frame that fits the map. `site_from_image` (3, 3) takes its undistorted pixels to site metres on the ground.
 
     `residual_px` is the median distance that paired points keep, in the frame's own pixels. `followed`: the last fit
-    foretold this one, no features were needed.
+    foretold this one, no features were needed. `local` is what the frame is moved by on the map beyond that homography,
+    None where nothing is; `local_m` how far a local fit moved it in all (median, m).
     """
 
     site_from_image: Matrix3
     camera_m: Vector3
     residual_px: float
     followed: bool
+    local: LocalFit | None = None
+    local_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -97,6 +107,28 @@ class _Place:
     residual_px: float
     followed: bool
     ratio: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """A frame that is laid over the map: as taken, its gray at the size at which frames are aligned, the same with its
+    contrast normalised, and what telemetry has of it."""
+
+    image: ImageRGB
+    camera: Camera
+    gray: ImageGray
+    even: Keyframe
+    prior: CameraPrior
+
+
+@dataclass(frozen=True, eq=False)
+class _Moved:
+    """A place after local fits: `left` is what no camera explains of them, in the frame's own pixels, `size_m` how far
+    they moved it in all (median)."""
+
+    place: _Place
+    left: LocalFit | None
+    size_m: float
 
 
 class _Share:
@@ -138,17 +170,19 @@ class Aligner:
             return site_from_told if share.known >= self._settings.least_known else None
 
         placed = self._by_homographies(new, prior, time_ns, told_inside)
-        if self._is_doubtful(placed, prior) and told is not None and told_inside() is not None and self._may_search():
-            placed = self._by_search(gray, new, prior, told) or placed  # type: ignore[arg-type]
+        frame = _Frame(image, camera, gray, new, prior)  # type: ignore[arg-type]
+        if self._is_doubtful(placed, prior) and self._may_search():
+            placed = self._by_search(frame, told, is_inside=told_inside() is not None) or placed
         if isinstance(placed, NotAligned):
             is_outside = share.known < self._settings.least_known
             reason = self._beside() if is_outside else placed.reason
             return NotAligned(reason, placed.residual_px / scale, is_outside)
-        self._remember(time_ns, placed, prior, new)
+        moved = self._settled(frame, placed)
+        self._remember(time_ns, moved.place, prior, new)
         small_from_full = resized(size[0] / image.shape[1], size[1] / image.shape[0])
         return Aligned(
-            placed.site_from_image @ small_from_full, placed.pose.translation_m, placed.residual_px / scale,
-            placed.followed,
+            moved.place.site_from_image @ small_from_full, moved.place.pose.translation_m, placed.residual_px / scale,
+            placed.followed, moved.left, moved.size_m,
         )
 
     # ---- inside -----------------------------------------------------------------------------------------------
@@ -179,12 +213,51 @@ class Aligner:
         """Whether the dear search is worth its time: a flight that fits nowhere is asked every fifth frame."""
         return self._misses < _SEARCHED_MISSES or self._misses % 5 == 1
 
-    def _by_search(self, gray: ImageGray, new: Keyframe, prior: CameraPrior, told: Pose) -> "_Place | None":
-        """The frame placed by learned features, telemetry and its neighbours."""
-        found = self._search.find(gray, new.gray, new.camera, prior, told)
+    def _by_search(self, frame: "_Frame", told: Pose | None, *, is_inside: bool) -> "_Place | None":
+        """The frame placed by learned features, telemetry and its neighbours; what these leave in doubt a local fit
+        must confirm. Without telemetry's place the search begins at the last frame's."""
+        if told is None and self._fits and not frame.prior.knows_place:
+            start = self._fits[-1].pose
+        elif told is not None and is_inside:
+            start = told
+        else:
+            return None
+        found = self._search.find(frame.gray, frame.even.gray, frame.even.camera, frame.prior, start)
         if found is None:
             return None
-        return _Place(found.fit.site_from_image, found.fit.pose, found.fit.residual_px, False, found.ratio)
+        place = _Place(found.fit.site_from_image, found.fit.pose, found.fit.residual_px, False, found.ratio)
+        if found.is_sure:
+            return place
+        local = self._local(frame, place)
+        return place if local is not None and local.rest <= self._settings.confirms_rest else None
+
+    def _settled(self, frame: "_Frame", placed: "_Place") -> "_Moved":
+        """The place moved as a camera by what a local fit finds where the last fit leaves much, and what is left."""
+        moved = _Moved(placed, None, 0.0)
+        if placed.residual_px <= self._settings.settled_px and (placed.followed or np.isinf(placed.ratio)):
+            return moved
+        for _ in range(_LOCAL_ROUNDS):
+            local = self._local(frame, moved.place)
+            if local is None:
+                break
+            fine = _fine(frame.camera)
+            size_m = float(local.median_px * moved.place.pose.translation_m[2] / fine.fx_px)
+            place, left = _as_camera(moved.place, local, fine, _small_from(fine, frame.even.camera))
+            moved = _Moved(place, left.resized(frame.camera.width_px / fine.width_px), max(size_m, moved.size_m))
+            if size_m < _FAR_M:
+                break
+        return moved
+
+    def _local(self, frame: "_Frame", placed: "_Place") -> LocalFit | None:
+        """The local fit of a frame at its place, in pixels of the `_fine` camera."""
+        fine = _fine(frame.camera)
+        size = fine.width_px, fine.height_px
+        seen = self._seen(placed.site_from_image @ _small_from(fine, frame.even.camera), fine)
+        if seen is None:
+            return None
+        gray: ImageGray = cv2.resize(gray_from_rgb(frame.image), size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+        m_per_px = float(placed.pose.translation_m[2]) / fine.fx_px
+        return fit_locally(gray_from_rgb(seen[0]), gray, seen[1], m_per_px)
 
     def _keyframe(self, camera: Camera, gray: ImageGray) -> Keyframe:
         self._count += 1
@@ -209,27 +282,29 @@ class Aligner:
         if foretold is not None:
             yield self._shifted(new, foretold), True
         told = told_inside()
-        near = foretold if foretold is not None else told
         features = orb_features(new.gray, self._settings.links.features)
-        tries: list[Callable[[], Matrix3 | None]] = []
-        if near is not None:
-            tries.append(lambda: self._by_features(new, features, near, prior, is_free=False))
-        if told is not None:
-            if foretold is not None:
-                tries.append(lambda: self._by_features(new, features, told, prior, is_free=False))
-            # a compass may be off by any angle
-            tries.append(lambda: self._by_features(new, features, told, prior, is_free=True))
         self._misses += 1
-        if self._misses % 5 == 1:
-            # dear searches; the next frame of a video may be found by its telemetry again
-            if told is not None:
-                tries.append(lambda: self._by_sift(new, told))
-            if told is not None or not prior.knows_place:
-                tries.append(lambda: self._anywhere(features))
-        for attempt in tries:
+        for attempt in self._tries(new, features, prior, foretold, told):
             found = attempt()
             if found is not None:
                 yield found, False
+
+    def _tries(
+        self, new: Keyframe, features: Features, prior: CameraPrior, foretold: Matrix3 | None, told: Matrix3 | None
+    ) -> Iterator[Callable[[], Matrix3 | None]]:
+        """What may find a frame by its features, the cheapest first: around each place that it could have, then
+        anywhere. The dear searches come every fifth time: a video's next frame may be found by its telemetry again."""
+        for near in (foretold, told):
+            if near is not None:
+                yield partial(self._by_features, new, features, near, prior, is_free=False)
+        if told is not None:  # a compass may be off by any angle
+            yield partial(self._by_features, new, features, told, prior, is_free=True)
+        if self._misses % 5 != 1:
+            return
+        if told is not None:
+            yield partial(self._by_sift, new, told)
+        if told is not None or not prior.knows_place:
+            yield partial(self._anywhere, features)
 
     def _foretold(self, camera: Camera, prior: CameraPrior, time_ns: int) -> Matrix3 | None:
         """The last fit moved on at the flight's velocity, turned as telemetry says the camera turned."""
@@ -443,6 +518,35 @@ def _stiffened(site_from_image: Matrix3, link: Link, site_from_old: Matrix3, cam
     stiff_miss = _miss_px(stiff, ground_m, link.new_px)
     worse = float(np.median(stiff_miss[near])) > 1.15 * float(np.median(free_miss[near])) + 0.1
     return site_from_image if worse else stiff
+
+
+def _fine(camera: Camera) -> Camera:
+    """The camera at the size at which local fits are made."""
+    share = min(1.0, _LOCAL_SIDE_PX / max(camera.width_px, camera.height_px))
+    return camera.resized(round(camera.width_px * share), round(camera.height_px * share))
+
+
+def _small_from(fine: Camera, small: Camera) -> Matrix3:
+    """(3, 3) from the pixels of one size of a frame to those of another."""
+    return resized(small.width_px / fine.width_px, small.height_px / fine.height_px)
+
+
+def _as_camera(placed: _Place, local: LocalFit, camera: Camera, small_from_image: Matrix3) -> tuple[_Place, LocalFit]:
+    """The place moved as a local fit in this camera's pixels has it, as far as a camera over level ground can; and what
+    is left of the fit. `small_from_image` leads to the place's own pixels."""
+    old_px = local.places_px(camera.width_px, camera.height_px)
+    new_px = old_px + local.moved_px.reshape(-1, 2)
+    ground_m = apply_homography(placed.site_from_image @ small_from_image, old_px)
+    known = local.is_known.ravel()
+    found = fit_camera(
+        new_px[known], ground_m[known], camera, PosePrior(placed.pose, *_LOCAL_PRIOR), start_px=6.0, band_px=3.0
+    )
+    if found is None:
+        return placed, local
+    left_px = new_px - apply_homography(np.linalg.inv(found.site_from_image), ground_m)
+    site_from_small = found.site_from_image @ np.linalg.inv(small_from_image)
+    place = replace(placed, site_from_image=site_from_small, pose=found.pose)
+    return place, replace(local, moved_px=left_px.reshape(local.moved_px.shape))
 
 
 def _miss_px(site_from_image: Matrix3, ground_m: PointsM, image_px: PointsPx) -> Floats:

@@ -37,6 +37,8 @@ class SearchSettings:
     near_px: float = 24.0  # pairs around the first fit that compete for the second
     band_px: float = 5.0  # band of the final fit: 1 m from 100 m, what maps differ by locally
     least_pairs: int = 20
+    weak_pairs: int = 10  # of a place that something else must confirm ...
+    weak_ratio: float = 1.6  # ... and its least ratio
     first_ratio: float = 4.0  # times the pairs that chance leaves in the band; other ground leaves 0.3 to 2.8
     least_ratio: float = 2.5  # the same once the flight is known to lie on this map
     least_surplus: float = 3.0  # beside a neighbour, whose place is known: standard deviations above chance
@@ -55,6 +57,7 @@ class Found:
     new_px: PointsPx
     ground_m: PointsM
     ratio: float
+    is_sure: bool = True  # False: too few pairs agree to believe it unless something else confirms it
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,23 +123,21 @@ class MapSearch:
     def find(
         self, gray: ImageGray, even: ImageGray, camera: Camera, prior: CameraPrior, told: Pose
     ) -> Found | None:
-        """Where a frame lies, or None. `told` is where telemetry has its camera, `even` its gray, contrast normalised.
+        """Where a frame lies, or None. `told` is where telemetry has its camera, or, without it, where a frame that was
+        placed before had its own; `even` is its gray, contrast normalised.
 
         Beside a frame that was placed, the search starts from their common features; else around telemetry's place,
         turned as frames before were, then as telemetry has it, then by quarters: a compass may be off by any angle.
         """
         sought = _Sought(gray, even, camera, prior, told)
         features = learned_features(gray, self._settings.frame_points)
-        beside = self._beside(sought)
-        if len(beside):
-            found = self._near_neighbours(sought, features, beside)
-            if found is not None:
+        best = None
+        for found in self._tries(sought, features):
+            if found.is_sure:
                 return found
-        for turn_rad in self._turns_rad(prior):
-            found = self._around(sought, features, turn_rad)
-            if found is not None:
-                return found
-        return None
+            if best is None or found.ratio > best.ratio:
+                best = found
+        return best
 
     def is_odd(self, pose: Pose, prior: CameraPrior) -> bool:
         """Whether a camera lies far from where telemetry, less what it was off by so far, has it."""
@@ -150,7 +151,18 @@ class MapSearch:
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
-    def _turns_rad(self, prior: CameraPrior) -> list[float]:
+    def _tries(self, sought: _Sought, features: Features) -> Iterator[Found]:
+        """The places that a frame could have, beside its neighbours first."""
+        beside = self._beside(sought)
+        found = self._near_neighbours(sought, features, beside) if len(beside) else None
+        if found is not None:
+            yield found
+        for turn_rad in self._turns_rad():
+            found = self._around(sought, features, turn_rad)
+            if found is not None:
+                yield found
+
+    def _turns_rad(self) -> list[float]:
         turned = [each.turned_rad for each in self._placed if each.is_strong]
         quarters = [float(np.radians(each)) for each in _QUARTERS_DEG]
         if not turned:
@@ -165,7 +177,7 @@ class MapSearch:
         sigma_m = np.clip(prior.position_sigma_m, 1.5, 1e3)
         sigma_rad = np.radians(np.clip(prior.attitude_sigma_deg, 1.0, 15.0))
         place_m = sought.pose.translation_m
-        if len(off_m) >= settings.least_strong:
+        if len(off_m) >= settings.least_strong and prior.knows_place:
             place_m = place_m + np.median(off_m, axis=0)
         else:
             sigma_m[2] += 0.03 * place_m[2]  # heights are above a ground that may lie elsewhere
@@ -237,13 +249,14 @@ class MapSearch:
         return self._judged(of_map, near, 1 + settings.least_surplus / max(np.sqrt(chance), 1.0))
 
     def _judged(self, fit: CameraFit, pairs: _Pairs, least_ratio: float) -> Found | None:
-        """The fit where more pairs agree than chance leaves in the band."""
+        """The fit where more pairs agree than chance leaves in the band; none where hardly any do."""
         settings, agree = self._settings, fit.agree
         chance = len(pairs) * (settings.band_px / settings.near_px) ** 2
         ratio = float(agree.sum() / max(chance, 1.0))
-        if agree.sum() < settings.least_pairs or ratio < least_ratio:
+        if agree.sum() < settings.weak_pairs or ratio < settings.weak_ratio:
             return None
-        return Found(fit, pairs.image_px[agree], pairs.ground_m[agree], ratio)
+        is_sure = bool(agree.sum() >= settings.least_pairs and ratio >= least_ratio)
+        return Found(fit, pairs.image_px[agree], pairs.ground_m[agree], ratio, is_sure)
 
     def _near(self, features: Features, old: Features, site_from_old: Matrix3, new_from_old: Matrix3) -> _Pairs:
         pairs = match_learned(features, old, new_from_old, self._settings.near_px)
@@ -288,7 +301,7 @@ class MapSearch:
 
     def _neighbours(self, sought: _Sought) -> Iterator[_Placed]:
         """The nearest placed frames that may show some of the same ground."""
-        if not self._placed or not sought.prior.knows_place:
+        if not self._placed:
             return
         away_m = np.array([np.linalg.norm(each.place_m[:2] - sought.pose.translation_m[:2]) for each in self._placed])
         reach_m = sought.camera.width_px / sought.camera.fx_px * sought.pose.translation_m[2]

@@ -38,6 +38,7 @@ class ViewOutcome:
     frame) when it was aligned. `known` is the share of the frame that lies on known ground, `brightness` how many times
     as bright as the map the flight is so far, NaN where that is not known. `doubted` (h, w) is what surely differs from
     the map in a compared view and is contradicted by earlier pictures; `planted` what is found of things drawn in.
+    `local_m` is how far a local fit moved the frame on the map (median, m), 0 without any.
     """
 
     status: ViewStatus
@@ -49,6 +50,7 @@ class ViewOutcome:
     brightness: float = float("nan")
     doubted: Mask | None = None
     planted: tuple[Planted, ...] = ()
+    local_m: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,10 +128,13 @@ class ViewMaker:
             return ViewOutcome(
                 ViewStatus.OUTSIDE, reason, residual_px, share, site_from_full, brightness=self.brightness
             )
+        if aligned.local is not None:
+            image, valid = aligned.local.warped(image, valid)
         query = as_bgr(image)
         found = self._difference(as_bgr(reference), query, valid)
         outcome = ViewOutcome(
-            ViewStatus.COMPARED, "", residual_px, share, site_from_full, brightness=self.brightness
+            ViewStatus.COMPARED, "", residual_px, share, site_from_full, brightness=self.brightness,
+            local_m=aligned.local_m,
         )
         return OneSided(posed, aligned, image, reference, query, valid, found, self._settings_now(), outcome)
 

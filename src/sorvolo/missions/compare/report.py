@@ -26,6 +26,7 @@ class ViewCounts:
         self._statuses: Counter[ViewStatus] = Counter()
         self._reasons: Counter[str] = Counter()
         self._residuals_px: list[float] = []
+        self._local_m: list[float] = []
 
     def end(self, status: ViewStatus, reason: str) -> None:
         """Count a frame that ended so."""
@@ -38,6 +39,8 @@ class ViewCounts:
         self.end(outcome.status, outcome.reason)
         if outcome.site_from_image is not None:
             self._residuals_px.append(outcome.residual_px)
+        if outcome.local_m > 0:
+            self._local_m.append(outcome.local_m)
         if outcome.view is not None:
             is_dark = outcome.brightness < NIGHT
             self.ground.compare(outcome.view, is_dark=is_dark, doubted=outcome.doubted, planted=outcome.planted)
@@ -65,6 +68,10 @@ class ViewCounts:
             "reasons": dict(self._reasons.most_common()),
             "residual_px": {
                 "median": median_of_known(self._residuals_px), "p95": percentile_of_known(self._residuals_px, 95),
+            },
+            "local_fit": {
+                "views": len(self._local_m), "median_m": median_of_known(self._local_m),
+                "p95_m": percentile_of_known(self._local_m, 95),
             },
         }
 
