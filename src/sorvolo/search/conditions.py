@@ -65,6 +65,11 @@ class Conditions:
         """(N,) whether crowns hide the ground in most views."""
         return np.asarray(self.crowns > _CROWN_SHARE, bool)
 
+    @property
+    def beside_trees(self) -> Mask:
+        """(N,) whether any view shows crowns there: they may hide some of the ground."""
+        return np.asarray(self.crowns > 0, bool)
+
     def m_per_px(self) -> Floats:
         """(N,) the ground that a pixel covers, the geometric mean over the views."""
         return np.exp(self.columns[:, CONDITIONS.index("resolution")])

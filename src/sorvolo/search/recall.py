@@ -14,7 +14,7 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Mask, frozen
 
-_SLOPE_SIGMA, _CHANCE_SIGMA = 1.0, 2.5  # before any plant: of a weight for one standard deviation, of the log odds
+_SLOPE_SIGMA, _CHANCE_SIGMA = 0.5, 2.5  # before any plant: of a weight for one standard deviation, of the log odds
 _FARTHEST = 2.5  # standard deviations: beyond what plants covered, nothing is extrapolated
 _DRAWS = 400
 _STEPS = 40

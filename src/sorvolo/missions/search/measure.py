@@ -169,7 +169,7 @@ def _looks(frames: Sequence[SearchFrame]) -> tuple[list[FrameLight], list[FrameL
 def _usable(seen: Conditions, cells: Cells, settings: SearchSettings) -> Mask:
     """Where plants may stand: wanted ground that was seen, under trees only where some of them would show."""
     usable = cells.wanted & seen.seen
-    return usable if settings.through_crowns > 0 else usable & ~seen.under_trees
+    return usable if settings.through_crowns > 0 else usable & ~seen.beside_trees
 
 
 def _sun(frames: Sequence[SearchFrame], site: Site, settings: SearchSettings) -> Vector3 | None:
