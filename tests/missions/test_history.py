@@ -138,12 +138,36 @@ def test_what_cannot_be_written_is_said(site: Path, tmp_path: Path) -> None:
         export_version(tmp_path / "pond", None, tmp_path / "map.kmz")
 
 
+def test_lists_fit_a_terminal_of_eighty_letters(
+    site: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Archive.open(site, write=True) as archive, archive.begin_flight("flight12", "", {}) as writer:
+        changes = [fake_change(3, kind=ChangeKind.DISAPPEARED)]
+        writer.commit([frame(0)], {}, {}, "<html></html>", changes=changes)
+    monkeypatch.setenv("COLUMNS", "80")
+    for command in ("history", "review"):
+        assert main([command, str(site)]) == 0
+        shown = capsys.readouterr().out
+        for word in ("disappeared", "confirmed", "2023-11-14", "1 moving" if command == "history" else "moving"):
+            assert word in shown, f"{command} cuts {word}"
+
+
+def test_a_site_without_a_map_is_listed_as_such(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As a flight leaves it that was refused before its first frame."""
+    with Archive.open(tmp_path / "site", write=True):
+        pass
+    assert main(["history", str(tmp_path / "site")]) == 0
+    printed = capsys.readouterr()
+    assert "no map yet" in printed.out and not printed.err
+
+
 def test_the_command_lists_and_writes(
     site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "160")
     assert main(["history", str(site)]) == 0
-    assert "1 appeared, 1 moving" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "1 appeared" in shown and "1 moving" in shown
     assert main(["history", str(site), "--json"]) == 0
     versions = json.loads(capsys.readouterr().out)["versions"]
     assert [each["kind"] for each in versions] == ["map", "compare"]

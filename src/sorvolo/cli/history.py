@@ -48,7 +48,8 @@ def history(
             typer.echo(json.dumps({"site": str(site), "versions": plain_json(entries)}, indent=1))
         else:
             _show(entries, Console())
-            _show_place(site, coordinates, Console())
+            if entries:
+                _show_place(site, coordinates, Console())
         return
     version = export_version(site, at, export, compress=compress.value)
     if as_json:
@@ -62,28 +63,32 @@ def _show(entries: Sequence["HistoryEntry"], console: Console) -> None:
     if not entries:
         console.print("no map yet: sorvolo map makes one")
         return
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = Table(box=SIMPLE_HEAD, padding=0)  # 80 letters hold it
     for name in ("no", "flown", "complete (UTC)", "flight", "by", "tiles", "MB", "changes", "reviewed"):
         # folded between words, never within: "2 appeared,", "2026-11-22"
         table.add_column(
             name, no_wrap=name in ("no", "flown", "tiles", "MB"), overflow="fold",
-            min_width={"complete (UTC)": 10, "changes": 11, "reviewed": 9, "by": 7}.get(name),
+            min_width={"complete (UTC)": 10, "changes": 14, "reviewed": 11, "by": 7}.get(name),
         )
     for each in entries:
-        removed = f" (-{each.tiles_removed})" if each.tiles_removed else ""
-        changes = ", ".join(f"{count} {kind}" for kind, count in each.changes.items())
-        reviewed = ", ".join(
-            f"{count} {word}" for word, count in (("confirmed", each.confirmed), ("rejected", each.rejected)) if count
-        )
-        again = " (repeated later)" if each.is_replaced else ""
-        table.add_row(
-            str(each.version), each.flown_utc[:10] or "-", each.date_utc[:16].replace("T", " "),
-            escape(each.flight) + again, each.kind,
-            f"{each.tiles_changed}/{each.tiles}{removed}", f"{each.bytes_changed / 1e6:.1f}",
-            changes or ("none" if each.kind == "compare" else ""), reviewed,
-        )
+        table.add_row(*_cells(each))
     console.print(table)
     console.print("tiles: new or changed, of all; MB: written for this version", style="dim", highlight=False)
+
+
+def _cells(entry: "HistoryEntry") -> tuple[str, ...]:
+    """One version's row of the list."""
+    removed = f" (-{entry.tiles_removed})" if entry.tiles_removed else ""
+    changes = "\n".join(f"{count} {kind}" for kind, count in entry.changes.items())
+    verdicts = ("confirmed", entry.confirmed), ("rejected", entry.rejected)
+    again = " (repeated later)" if entry.is_replaced else ""
+    return (
+        str(entry.version), entry.flown_utc[:10] or "-", entry.date_utc[:16].replace("T", " "),
+        escape(entry.flight) + again, entry.kind,
+        f"{entry.tiles_changed}/{entry.tiles}{removed}", f"{entry.bytes_changed / 1e6:.1f}",
+        changes or ("none" if entry.kind == "compare" else ""),
+        "\n".join(f"{count} {word}" for word, count in verdicts if count),
+    )
 
 
 def _show_place(folder: Path, form: PlaceFormat, console: Console) -> None:

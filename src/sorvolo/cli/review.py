@@ -78,12 +78,12 @@ def _show(changes: Sequence["StoredChange"], site: "Site", form: PlaceFormat, co
     if not changes:
         console.print("no changes: none were found, or no flight was compared yet (sorvolo compare)")
         return
-    table, place = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0)), place_words(site, form)
+    table, place = Table(box=SIMPLE_HEAD, padding=0), place_words(site, form)  # 80 letters hold it, no word cut
     place_name = place_heading(site.is_local, form)
     for name in ("id", "kind", place_name, f"length {unit_of(site)}", "score", "first seen (UTC)", "verdict"):
         table.add_column(
-            name, no_wrap=name in ("id", place_name), overflow="fold",
-            min_width=10 if name.startswith("first") else None,
+            name, no_wrap=name in ("id", "kind", place_name), overflow="fold",
+            min_width={"first seen (UTC)": 10, "verdict": 9}.get(name),
         )
     for each in changes:
         verdict = ""

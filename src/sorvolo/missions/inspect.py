@@ -38,7 +38,7 @@ _ADVICE = {
     "unreadable_photo": "copy the photos again from the drone's card",
     "photo_without_gps": "nothing if most have one: these photos are placed by their overlap alone",
     "time_zone_unknown": "nothing, unless telemetry from another file must fit: then give --offset",
-    "empty_telemetry": "copy it from the drone's card again, or give other telemetry with --telemetry",
+    "empty_telemetry": "or give other telemetry with --telemetry",
     "unusable_telemetry": "give a readable file with --telemetry",
     "mixed_cameras": "map each camera's pictures as its own flight",
     "zoom": "map each focal length as its own flight",
