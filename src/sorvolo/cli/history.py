@@ -65,10 +65,10 @@ def _show(entries: Sequence["HistoryEntry"], console: Console) -> None:
         return
     table = Table(box=SIMPLE_HEAD, padding=0)  # 80 letters hold it
     for name in ("no", "flown", "complete (UTC)", "flight", "by", "tiles", "MB", "changes", "reviewed"):
-        # folded between words, never within: "2 appeared,", "2026-11-22"
+        # folded between words, never within: "2 disappeared", "2026-11-22"
         table.add_column(
             name, no_wrap=name in ("no", "flown", "tiles", "MB"), overflow="fold",
-            min_width={"complete (UTC)": 10, "changes": 14, "reviewed": 11, "by": 7}.get(name),
+            min_width={"complete (UTC)": 10, "changes": 13, "reviewed": 11, "by": 7}.get(name),
         )
     for each in entries:
         table.add_row(*_cells(each))
