@@ -496,3 +496,11 @@ def test_a_stop_by_the_keyboard_keeps_the_flights_before(photos: Path, photograp
     with Archive.open(site, write=False) as archive:
         assert [flight.id for flight in archive.flights()] == ["photos"] and len(archive.keyframes()) == 12
         assert [version.complete for version in archive.versions()][-1] and archive.tiles()
+
+
+def test_too_little_memory_is_refused_before_anything_is_written(
+    film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = refused(capsys, film, "--site", tmp_path / "site", "--memory", "10")
+    assert "--memory must be at least 64 MB, got 10" in error
+    assert not (tmp_path / "site").exists()
