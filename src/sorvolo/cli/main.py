@@ -19,6 +19,7 @@ from sorvolo.cli.calibrate import calibrate
 from sorvolo.cli.compare import compare
 from sorvolo.cli.demo import demo
 from sorvolo.cli.evaluate import evaluate_app
+from sorvolo.cli.heights import heights
 from sorvolo.cli.history import history
 from sorvolo.cli.inspect import inspect
 from sorvolo.cli.map import map_command
@@ -38,6 +39,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "inspect": inspect, "plan": plan, "map": map_command, "compare": compare, "watch": watch_command,
     "search": search_command, "simulate": simulate, "train": train,
     "calibrate": calibrate, "demo": demo, "history": history, "review": review,
+    "heights": heights,
 }
 _FAILED, _STOPPED = 1, 130
 _FULL = (errno.ENOSPC, errno.EDQUOT)

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sorvolo.cli.heights import make_and_read, show_heights
 from sorvolo.cli.options import (
     Area,
     AsJson,
@@ -110,6 +111,9 @@ def map_command(
     model: Model = "default",
     memory: Memory = None,
     give_up: GiveUp = 30.0,
+    heights: Annotated[
+        bool, typer.Option("--heights/--flat", help="Also make heights and a true orthophoto of each flight.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Make a geo-referenced map of one or more flights, or extend the map in the site folder.
@@ -122,6 +126,8 @@ def map_command(
     Example: sorvolo map photos/ --site field --camera phantom.xml --area field.geojson
 
     Example: sorvolo map photos/ --site field --gcp gcp_list.txt --check CP*
+
+    Example: sorvolo map photos/ --site field --heights
 
     Example: sorvolo map rtsp://192.168.1.10/live --telemetry serial:/dev/ttyUSB0 --site field
     """

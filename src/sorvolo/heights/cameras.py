@@ -1,0 +1,126 @@
+"""Cameras of a flight in 3D: from the map's poses, which take the ground for level, to poses and points in space."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Floats, ImageGray, Mask, PointsM
+from sorvolo.geometry.pose import Pose
+from sorvolo.heights.adjustment import AdjustmentSettings, Priors, Scene, adjust, triangulate
+from sorvolo.heights.tracks import Tracks, TrackSettings, find_tracks
+from sorvolo.heights.views import View
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """How the cameras in 3D are solved."""
+
+    tracks: TrackSettings = field(default_factory=TrackSettings)
+    adjustment: AdjustmentSettings = field(default_factory=AdjustmentSettings)
+    rejected_px: tuple[float, ...] = (8.0, 3.0)  # observations farther off are dropped, round by round
+    least_sigma_m: float = 0.02  # of a fix
+
+
+@dataclass(frozen=True, eq=False)
+class Cameras3D:
+    """The views where they stand in 3D (those that tracks hold), and the points that they see.
+
+    `radial` is the left-over distortion to be taken out of pictures; the views' cameras have the focal length found.
+    `lost` are the names of views that no track holds. `points_m` (P, 3), `residual_px` the rms of all observations at
+    the views' size, `fix_rms_m` (3,) cameras minus fixes, NaN without; `height_sigma_m` what points err in height.
+    """
+
+    views: tuple[View, ...]
+    lost: tuple[str, ...]
+    points_m: PointsM
+    residual_px: float
+    focal_scale: float
+    radial: float
+    fix_rms_m: Floats
+    observations: int
+    height_sigma_m: float = 0.0
+
+
+def solve_cameras(
+    views: Sequence[View], gray: Callable[[int], ImageGray], settings: CameraSettings = CameraSettings()
+) -> Cameras3D:
+    """The cameras of a flight in 3D. Raises InputError where photos share too little for it."""
+    tracks = find_tracks(views, gray, settings.tracks)
+    held = np.bincount(tracks.view, minlength=len(views)) >= settings.tracks.least_inliers
+    if held.sum() < 3:
+        raise InputError(
+            f"only {int(held.sum())} of {len(views)} photos share enough points for heights, 3 were needed; "
+            "fly with at least 70 % overlap along and 60 % across the strips"
+        )
+    priors = _priors(views, settings)
+    scene = _first(views, tracks)
+    for limit_px in (*settings.rejected_px, None):
+        scene = adjust(scene, priors, settings.adjustment)
+        if limit_px is not None:
+            scene = scene.keeping(_fitting(scene, limit_px))
+    return _solved(views, scene, priors, held)
+
+
+def _first(views: Sequence[View], tracks: Tracks) -> Scene:
+    scene = Scene(
+        np.array([each.site_from_camera.rotation for each in views]),
+        np.array([each.site_from_camera.translation_m for each in views]),
+        np.array([each.camera.fx_px for each in views]),
+        np.full((tracks.count, 3), np.nan), tracks.view, tracks.point, tracks.seen, np.zeros(2),
+    )
+    scene = replace(scene, points_m=triangulate(scene))
+    known = np.asarray(np.isfinite(scene.points_m).all(axis=1))
+    scene = scene.keeping(known[scene.point])
+    return scene.keeping(_in_front(scene))
+
+
+def _in_front(scene: Scene) -> Mask:
+    return np.asarray(np.isfinite(scene.residuals_px()).all(axis=1))
+
+
+def _fitting(scene: Scene, limit_px: float) -> Mask:
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.linalg.norm(scene.residuals_px(), axis=1) < limit_px)
+
+
+def _priors(views: Sequence[View], settings: CameraSettings) -> Priors:
+    """Fixes weighed by how they scatter about the map's cameras; the map's own height is kept in the mean."""
+    fixes = np.array([each.fix_m for each in views])
+    centres = np.array([each.site_from_camera.translation_m for each in views])
+    rotations = np.array([each.site_from_camera.rotation for each in views])
+    miss = centres - fixes
+    if not np.isfinite(miss).any():
+        return Priors(centres, np.full_like(centres, 0.5), rotations)
+    middle = np.nanmedian(miss, axis=0)
+    spread = 1.4826 * np.nanmedian(np.abs(miss - middle), axis=0)
+    sigmas = np.broadcast_to(np.maximum(spread, settings.least_sigma_m), fixes.shape)
+    return Priors(fixes + middle, sigmas, rotations)
+
+
+def _solved(views: Sequence[View], scene: Scene, priors: Priors, held: Mask) -> Cameras3D:
+    scale = float(np.exp(scene.shared[0]))
+    moved = tuple(
+        replace(view, camera=view.camera.with_focal_px(view.camera.fx_px * scale),
+                site_from_camera=Pose(scene.rotations[k], scene.centres_m[k]))
+        for k, view in enumerate(views) if held[k]
+    )
+    residual = scene.residuals_px()
+    with np.errstate(invalid="ignore"):
+        off = (scene.centres_m - priors.fixes_m)[held]
+    return Cameras3D(
+        moved, tuple(view.name for k, view in enumerate(views) if not held[k]), scene.points_m,
+        float(np.sqrt(np.nanmean((residual**2).sum(axis=1)))), scale, float(scene.shared[1]),
+        np.sqrt(np.nanmean(off**2, axis=0)), len(scene.view), _height_sigma_m(scene, residual),
+    )
+
+
+def _height_sigma_m(scene: Scene, residual_px: Floats) -> float:
+    """What heights err by the cameras' own error: the median residual of a view's points, as a height."""
+    depth_m = np.median(scene.centres_m[:, 2]) - np.median(scene.points_m[:, 2])
+    by_view = np.linalg.norm([
+        np.median(residual_px[scene.view == each], axis=0) for each in np.unique(scene.view)
+    ], axis=1)
+    # a typical base is half the height: an error across the base counts twice
+    return float(2 * depth_m / np.median(scene.focal_px) * np.sqrt(np.mean(by_view**2)))

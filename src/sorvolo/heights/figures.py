@@ -1,0 +1,83 @@
+"""What a report says of a flight's heights: figures, and what a user should know before using them."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from sorvolo.geometry.arrays import Mask
+from sorvolo.heights.cameras import Cameras3D
+from sorvolo.heights.surface import Surface
+
+_OBLIQUE_DEG = 25.0
+_FEW_STRIPS = 0.08  # how wide a path is, as a share of its length, below which it is one strip
+
+
+def camera_figures(solved: Cameras3D) -> Mapping[str, Any]:
+    """The solution of the cameras in 3D, as plain values."""
+    return {
+        "views": len(solved.views), "lost": list(solved.lost), "points": len(solved.points_m),
+        "observations": solved.observations, "residual_rms_px": solved.residual_px,
+        "focal_px": solved.views[0].camera.fx_px, "focal_scale": solved.focal_scale, "radial": solved.radial,
+        "fix_rms_m": {axis: float(each) for axis, each in zip(("east", "north", "up"), solved.fix_rms_m)},
+        "height_sigma_m": solved.height_sigma_m,
+        "places": [
+            {"frame": view.name, "east_m": float(e), "north_m": float(n), "up_m": float(u),
+             "rotation": view.site_from_camera.rotation.ravel()}
+            for view in solved.views for e, n, u in [view.site_from_camera.translation_m]
+        ],
+    }
+
+
+def surface_figures(surface: Surface, shows_ground: Mask) -> Mapping[str, Any]:
+    """The height model, as plain values; shares are of the ground that photos cover."""
+    known = np.isfinite(surface.up_m)
+    low, middle, high = np.nanpercentile(surface.up_m, [1, 50, 99]) if known.any() else (np.nan,) * 3
+    covered = max(int(surface.covered.sum()), 1)
+    return {
+        "columns": surface.lattice.width, "rows": surface.lattice.height,
+        "covered_m2": covered * surface.lattice.cell_m**2,
+        "holes_share": 1 - known.sum() / covered,
+        "ground_share": float((shows_ground & known).sum() / max(int(known.sum()), 1)),
+        "up_m": {"p01": float(low), "median": float(middle), "p99": float(high)},
+        "sigma_median_m": float(np.nanmedian(surface.sigma_m)) if known.any() else None,
+        "sigma_p95_m": float(np.nanpercentile(surface.sigma_m, 95)) if known.any() else None,
+    }
+
+
+def camera_warnings(solved: Cameras3D) -> list[str]:
+    """What in the flight makes its heights weak."""
+    said = []
+    if solved.lost:
+        said.append(
+            f"{len(solved.lost)} of {len(solved.lost) + len(solved.views)} photos share too few points with others "
+            "and are not part of the heights"
+        )
+    places = np.array([view.site_from_camera.translation_m for view in solved.views])
+    spread = np.linalg.svd(places[:, :2] - places[:, :2].mean(axis=0), compute_uv=False)
+    if spread[1] < _FEW_STRIPS * spread[0]:
+        said.append(
+            "the photos lie along one strip: the tilt of the ground across it is known from the drone's attitude "
+            "alone (about 3 degrees); fly at least two strips, or one across, for heights"
+        )
+    tilt = np.degrees(np.arccos(np.clip([-view.site_from_camera.rotation[2, 2] for view in solved.views], -1, 1)))
+    if np.median(tilt) > _OBLIQUE_DEG:
+        said.append(
+            f"the photos look {np.median(tilt):.0f} degrees off the vertical: walls and what lies behind things have "
+            "heights of their surroundings"
+        )
+    if not np.isfinite(solved.fix_rms_m).all():
+        said.append("no GPS position: the heights have the map's own scale")
+    return said
+
+
+def surface_warnings(surface: Surface) -> list[str]:
+    """What in the height model is weak."""
+    covered = max(int(surface.covered.sum()), 1)
+    holes = 1 - np.isfinite(surface.up_m).sum() / covered
+    if holes > 0.1:
+        return [
+            f"{holes:.0%} of the ground that photos cover has no height: water, bare ground without texture, or ground "
+            "that only one photo sees"
+        ]
+    return []

@@ -1,0 +1,204 @@
+"""The true orthophoto: each piece of ground seen by a photo that nothing hides it from, on its own height."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, ImageRGBA, Mask, Matrix3, Numbers
+from sorvolo.geometry.grid import SiteGrid, TileIndex
+from sorvolo.heights.lattice import Lattice
+from sorvolo.heights.surface import Surface
+from sorvolo.heights.terrain import filled
+from sorvolo.heights.views import View, ground_outlines_m
+from sorvolo.mosaic.blending import (
+    ALIGN_PX,
+    LAYER_APRON_PX,
+    Layer,
+    Winners,
+    blend,
+    pixels_of,
+    winners_from_shares,
+)
+
+
+@dataclass(frozen=True)
+class OrthophotoSettings:
+    """Which photo shows a piece of ground."""
+
+    hidden_cells: float = 3.0  # a height this much above the line of sight, in cells, hides what is behind
+    hidden_merit: float = 0.02  # of a photo that does not see the ground, against one that does
+
+
+def paint_orthophoto(
+    surface: Surface, site_grid: SiteGrid, views: Sequence[View], pictures: Callable[[int], ImageRGB],
+    settings: OrthophotoSettings = OrthophotoSettings(),
+) -> Iterator[tuple[TileIndex, ImageRGBA, float]]:
+    """The tiles of the true orthophoto, row by row, each with the share that is done; those unseen are left out.
+
+    `pictures(i)` is view i's picture without distortion, its exposure corrected; holes of the surface are closed from
+    the ground around.
+    """
+    ground = filled(surface.up_m, np.isfinite(surface.up_m))
+    painter = _Painter(surface.lattice, ground, choose_photos(surface.lattice, ground, views, settings), site_grid,
+                       views, pictures)
+    tiles = sorted(painter.tiles(), key=lambda index: (index[1], index[0]))
+    for number, tile in enumerate(tiles, start=1):
+        rgba = painter.tile(tile)
+        if rgba is not None:
+            yield tile, rgba, number / len(tiles)
+
+
+def choose_photos(lattice: Lattice, up_m: Numbers, views: Sequence[View], settings: OrthophotoSettings) -> Winners:
+    """(H, W) which view shows each cell of a height model without holes best; -1 where none does."""
+    labels = np.full(lattice.shape, -1, np.int16)
+    best = np.zeros(lattice.shape, np.float32)
+    for number, view in enumerate(views):
+        x0, y0, x1, y1 = _window_of(view, lattice, up_m)
+        if x1 <= x0 or y1 <= y0:
+            continue
+        here = slice(y0, y1), slice(x0, x1)
+        window = lattice.window(x0, y0, x1, y1)
+        heights: Anything = np.ascontiguousarray(up_m[here])
+        seen = cv2.medianBlur(visible(window, heights, view, settings).view(np.uint8), 5) > 0
+        merit = _merit(window, heights, view) * np.where(seen, 1.0, settings.hidden_merit)
+        wins = merit > best[here]
+        labels[here][wins] = number
+        best[here][wins] = merit[wins]
+    return labels
+
+
+def visible(lattice: Lattice, up_m: Numbers, view: View, settings: OrthophotoSettings) -> Mask:
+    """(H, W) which cells of a height model without holes nothing of it hides from a view."""
+    eye = view.site_from_camera.translation_m
+    at = lattice.cells_from_site(eye[None, :2])[0]
+    column, row = np.meshgrid(np.arange(lattice.width, dtype=np.float32), np.arange(lattice.height, dtype=np.float32))
+    dx, dy = np.float32(at[0]) - column, np.float32(at[1]) - row
+    far = np.maximum(np.hypot(dx, dy), 1e-3)
+    dx, dy = dx / far, dy / far
+    climb = (np.float32(eye[2]) - up_m) / far  # metres a cell on the way to the camera
+    highest = float(up_m.max())
+    margin = settings.hidden_cells * lattice.cell_m
+    steepest = float(np.min(climb))
+    reach = min((highest - float(up_m.min())) / max(steepest, 1e-3), float(far.max()))
+    hidden = np.zeros(up_m.shape, bool)
+    step = 2.0
+    while step < reach:
+        seen = cv2.remap(up_m, column + dx * step, row + dy * step, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        hidden |= (seen > up_m + climb * step + margin) & (step < far)
+        step = max(step + 1.0, step * 1.06)
+    return ~hidden
+
+
+class _Painter:
+    """What all tiles share: the heights without holes, and which photo shows each cell."""
+
+    def __init__(
+        self, lattice: Lattice, ground: Numbers, labels: Winners, site_grid: SiteGrid, views: Sequence[View],
+        pictures: Callable[[int], ImageRGB],
+    ) -> None:
+        self._ground, self._labels, self._views = ground, labels, views
+        self._pictures, self._grid = pictures, site_grid.grid
+        right, bottom = lattice.width - 1, lattice.height - 1
+        corners = lattice.site_from_cells @ np.array([[0, right, right, 0], [0, 0, bottom, bottom], [1, 1, 1, 1]])
+        middle = corners[:2].mean(axis=1)
+        reach_m = float(np.abs(corners[:2].T - middle).max())
+        site_from_grid = np.linalg.inv(site_grid.grid_from_site_affine(middle, reach_m))
+        self._site_from_grid: Matrix3 = np.asarray(site_from_grid, np.float64)
+        self._cells_from_grid: Matrix3 = np.linalg.inv(lattice.site_from_cells) @ site_from_grid
+        self._outline = (np.linalg.inv(site_from_grid) @ corners)[:2].T
+
+    def tiles(self) -> frozenset[TileIndex]:
+        """The tiles over the height model."""
+        return self._grid.tiles_touched(self._outline)
+
+    def tile(self, tile: TileIndex) -> ImageRGBA | None:
+        """(tile_px, tile_px, 4) a tile's picture; None where no photo sees it."""
+        apron = -(-LAYER_APRON_PX // ALIGN_PX) * ALIGN_PX
+        side = self._grid.tile_px + 2 * apron
+        shift = _shift(tile[0] * self._grid.tile_px - apron, tile[1] * self._grid.tile_px - apron)
+        labels = self._fine_labels(self._cells_from_grid @ shift, side)
+        inner = slice(apron, side - apron)
+        if (labels[inner, inner] < 0).all():
+            return None
+        picture = blend(labels, self._layers(labels, shift, side))[inner, inner]
+        alpha = (labels[inner, inner] >= 0).view(np.uint8) * np.uint8(255)
+        rgba = np.dstack([picture, alpha])
+        rgba[alpha == 0] = 0
+        return rgba
+
+    def _fine_labels(self, cells_from_here: Matrix3, side: int) -> Winners:
+        """(side, side) the view of each pixel of a tile, the borders between views drawn straight between cells."""
+        ends = cells_from_here @ np.array([[0, side, 0, side], [0, 0, side, side], [1, 1, 1, 1]])
+        limit = np.array(self._labels.shape[::-1])
+        low = np.clip(np.floor(ends[:2].min(axis=1)).astype(int) - 2, 0, limit)
+        high = np.clip(np.ceil(ends[:2].max(axis=1)).astype(int) + 3, 0, limit)
+        coarse = self._labels[low[1]:high[1], low[0]:high[0]]
+        there = (_shift(-low[0], -low[1]) @ cells_from_here)[:2]
+        return winners_from_shares((
+            (number, 0, 0, np.asarray(cv2.warpAffine(
+                pixels_of(coarse, number), there, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            ), np.uint8))
+            for number in np.unique(coarse[coarse >= 0]).tolist()
+        ), side, side)
+
+    def _layers(self, labels: Winners, shift: Matrix3, side: int) -> Iterator[Layer]:
+        up_m: Anything = cv2.warpAffine(
+            self._ground, (self._cells_from_grid @ shift)[:2], (side, side),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
+        )
+        for number in np.unique(labels[labels >= 0]).tolist():
+            left, top, width, height = cv2.boundingRect(pixels_of(labels, number))
+            x0, y0 = (max(0, each - LAYER_APRON_PX) // ALIGN_PX * ALIGN_PX for each in (left, top))
+            x1, y1 = (
+                min(side, -(-(each + LAYER_APRON_PX) // ALIGN_PX) * ALIGN_PX) for each in (left + width, top + height)
+            )
+            u, v = _project(self._views[number], self._site_from_grid @ shift @ _shift(x0, y0), up_m[y0:y1, x0:x1])
+            seen = cv2.remap(self._pictures(number), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+            yield Layer(number, x0, y0, np.asarray(seen, np.uint8))
+
+
+def _shift(x: float, y: float) -> Matrix3:
+    return np.array([[1.0, 0, x], [0, 1, y], [0, 0, 1]])
+
+
+def _window_of(view: View, lattice: Lattice, up_m: Numbers) -> tuple[int, int, int, int]:
+    """The cells that a view may see, and the way from them to below the camera: x0, y0, x1, y1, ends exclusive."""
+    low_m, high_m = float(up_m.min()), float(up_m.max())
+    corners = np.concatenate([
+        ground_outlines_m([view], each) for each in (low_m, high_m) if each < view.site_from_camera.translation_m[2]
+    ] + [view.site_from_camera.translation_m[None, :2]])
+    cells = lattice.cells_from_site(corners)
+    x0, y0 = np.clip(np.floor(cells.min(axis=0)).astype(int) - 1, 0, [lattice.width, lattice.height]).tolist()
+    x1, y1 = np.clip(np.ceil(cells.max(axis=0)).astype(int) + 2, 0, [lattice.width, lattice.height]).tolist()
+    return x0, y0, x1, y1
+
+
+def _merit(window: Lattice, up_m: Numbers, view: View) -> Floats:
+    """(H, W) how well a view shows each cell, 0 (not at all) to 1: from above, and not at the picture's border."""
+    u, v = _project(view, window.site_from_cells, up_m)
+    across = (u - (view.camera.width_px - 1) / 2) / (view.camera.width_px / 2)
+    down = (v - (view.camera.height_px - 1) / 2) / (view.camera.height_px / 2)
+    eye = window.cells_from_site(view.site_from_camera.translation_m[None, :2])[0]
+    column, row = np.meshgrid(np.arange(window.width), np.arange(window.height))
+    far_m = window.cell_m * np.hypot(column - eye[0], row - eye[1])
+    depth_m = np.maximum(view.site_from_camera.translation_m[2] - up_m, 0.1)
+    steep = depth_m / np.hypot(depth_m, far_m)
+    border = np.clip(1 - across**2, 0, 1) * np.clip(1 - down**2, 0, 1)
+    inside = (np.abs(across) < 1) & (np.abs(down) < 1)
+    return np.where(inside, 0.05 + 0.95 * steep**4 * np.sqrt(border), 0.0)
+
+
+def _project(view: View, site_from_pixels: Matrix3, up_m: Numbers) -> tuple[Anything, Anything]:
+    """(H, W) float32 picture x and y of raster pixels on their heights."""
+    turn = view.site_from_camera.rotation.T
+    project = view.camera.matrix @ np.column_stack([turn, -turn @ view.site_from_camera.translation_m])
+    level = project[:, :2] @ site_from_pixels[:2] + np.outer(project[:, 3], [0, 0, 1])
+    columns, rows = np.arange(up_m.shape[1], dtype=np.float32), np.arange(up_m.shape[0], dtype=np.float32)
+    x, y, z = (
+        np.float32(a) * columns[None, :] + (np.float32(b) * rows[:, None] + np.float32(c)) + np.float32(up) * up_m
+        for (a, b, c), up in zip(level, project[:, 2])
+    )
+    z = np.where(z > 1e-6, z, np.float32(np.nan))
+    return np.nan_to_num(x / z, nan=-1e6), np.nan_to_num(y / z, nan=-1e6)

@@ -1,0 +1,147 @@
+"""The height model of a flight: swept coarsely over all ground, then finely tile by tile around what was found."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from sorvolo.geometry.arrays import Anything, Floats, ImageGray, Mask, Numbers, PointsM
+from sorvolo.heights.lattice import Lattice
+from sorvolo.heights.sweep import SweepSettings, Swept, sweep
+from sorvolo.heights.views import View
+
+
+@dataclass(frozen=True)
+class SurfaceSettings:
+    """How the height model is made, and how its sigma follows from what the sweep saw."""
+
+    sweep: SweepSettings = field(default_factory=SweepSettings)
+    coarser: int = 4  # cells of the first sweep, in those of the model
+    tile_cells: int = 320
+    tile_share: float = 0.3  # of a photo's ground: a tile is seen whole by the photos that are compared on it
+    apron_cells: int = 20  # beyond a tile, so that neighbouring tiles agree
+    margin_cells: float = 12.0  # heights searched above and below what the first sweep found, in cells
+    match_cells: float = 0.25  # sigma of a match where photos agree perfectly, in cells of parallax
+    relief_share: float = 0.25  # of the heights' spread around a cell: at an edge it is not known which is right
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A height model: `up_m` (H, W) float32 above the site's ground, NaN in holes; `sigma_m` one sigma of it.
+
+    `covered` (H, W) are the cells that at least one photo sees.
+    """
+
+    lattice: Lattice
+    up_m: Numbers
+    sigma_m: Numbers
+    covered: Mask
+
+    def above(self, zero_m: float) -> tuple[Numbers, Numbers]:
+        """The heights when the site's ground is at `zero_m`, and their sigma, (H, W) float32."""
+        return self.up_m + np.float32(zero_m), self.sigma_m
+
+
+def sweep_surface(
+    lattice: Lattice, views: Sequence[View], pictures: Callable[[int, float], ImageGray], points_m: PointsM,
+    camera_sigma_m: float, settings: SurfaceSettings = SurfaceSettings(),
+) -> Iterator[Surface | float]:
+    """Yields the share of tiles done, 0 to 1, and in the end the surface.
+
+    `pictures(i, size_m)` is view i's gray picture whose pixels cover about `size_m` of ground; `points_m` (P, 3) are
+    points in space that bound the heights to look for; `camera_sigma_m` is what the cameras err in common.
+    """
+    heights_m = np.array([view.site_from_camera.translation_m[2] for view in views])
+    low_m, high_m = _bounds(points_m, float(np.median(heights_m)))
+    side = _tile_cells(lattice.cell_m, views, settings)
+    coarse = _coarse(lattice.coarser(settings.coarser), views, pictures, low_m, high_m, settings)
+    up_m, sigma_m = (np.full(lattice.shape, np.nan, np.float32) for _ in range(2))
+    covered = np.zeros(lattice.shape, bool)
+    tiles = list(lattice.windows(side))
+    for number, (x0, y0, x1, y1) in enumerate(tiles):
+        apron = settings.apron_cells
+        window = lattice.window(x0 - apron, y0 - apron, x1 + apron, y1 + apron)
+        bounds = _tile_bounds(coarse, settings, (x0, y0, x1, y1), lattice.cell_m)
+        if bounds is not None:
+            swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), *bounds, settings.sweep)
+            found = _calmed(swept)
+            sigma = _sigma_m(swept, found, lattice.cell_m, camera_sigma_m, settings)
+            inner = slice(apron, -apron), slice(apron, -apron)
+            up_m[y0:y1, x0:x1], sigma_m[y0:y1, x0:x1] = found[inner], sigma[inner]
+            covered[y0:y1, x0:x1] = swept.seen_by[inner] >= 1
+        yield (number + 1) / len(tiles)
+    yield Surface(lattice, up_m, sigma_m, covered)
+
+
+def _bounds(points_m: PointsM, camera_m: float) -> tuple[float, float]:
+    """The heights to look for: those of the points, and beyond them, for crowns have few points, or none."""
+    low, high = np.percentile(points_m[:, 2], [0.5, 99.5])
+    ground = float(np.median(points_m[:, 2]))
+    return float(low - 0.05 * (camera_m - ground)), float(max(high, ground + 0.4 * (camera_m - ground)))
+
+
+def _coarse(
+    lattice: Lattice, views: Sequence[View], pictures: Callable[[int, float], ImageGray], low_m: float, high_m: float,
+    settings: SurfaceSettings,
+) -> Numbers:
+    up_m = np.full(lattice.shape, np.nan, np.float32)
+    apron = settings.apron_cells // 2
+    for x0, y0, x1, y1 in lattice.windows(_tile_cells(lattice.cell_m, views, settings)):
+        window = lattice.window(x0 - apron, y0 - apron, x1 + apron, y1 + apron)
+        swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), low_m, high_m, settings.sweep)
+        up_m[y0:y1, x0:x1] = _calmed(swept)[apron:-apron, apron:-apron]
+    return up_m
+
+
+def _tile_cells(cell_m: float, views: Sequence[View], settings: SurfaceSettings) -> int:
+    ground_m = [
+        view.site_from_camera.translation_m[2] * min(view.camera.width_px, view.camera.height_px) / view.camera.fx_px
+        for view in views
+    ]
+    return int(np.clip(settings.tile_share * np.median(ground_m) / cell_m, 32, settings.tile_cells))
+
+
+def _tile_bounds(
+    coarse: Numbers, settings: SurfaceSettings, window: tuple[int, int, int, int], cell_m: float
+) -> tuple[float, float] | None:
+    """The heights to search in a tile; None where the coarse model has a hole as large as the tile."""
+    x0, y0, x1, y1 = (round(each / settings.coarser) for each in window)
+    around = coarse[max(0, y0 - 6):y1 + 7, max(0, x0 - 6):x1 + 7]
+    known = around[np.isfinite(around)]
+    if not len(known):
+        return None
+    low, high = np.percentile(known, [0.5, 99.5])
+    margin = settings.margin_cells * cell_m
+    return float(low - margin), float(high + margin)
+
+
+def _calmed(swept: Swept) -> Numbers:
+    """(H, W) the heights with single cells that differ from all around put right: the median of 5 x 5."""
+    known = np.isfinite(swept.up_m)
+    if not known.any():
+        return swept.up_m
+    filled = np.where(known, swept.up_m, np.nanmedian(swept.up_m)).astype(np.float32)
+    return np.where(known, cv2.medianBlur(filled, 5), np.nan).astype(np.float32)
+
+
+def _sigma_m(
+    swept: Swept, up_m: Anything, cell_m: float, camera_sigma_m: float, settings: SurfaceSettings
+) -> Numbers:
+    """(H, W) one sigma of the heights: of the match, of an edge nearby, and of the cameras."""
+    if swept.spread <= 0:
+        return np.full(up_m.shape, np.nan, np.float32)
+    match = settings.match_cells * cell_m / swept.spread / np.maximum(np.sqrt(np.maximum(swept.score, 0)), 0.1)
+    relief = settings.relief_share * _relief(up_m)
+    sigma = np.sqrt(match**2 + relief**2 + camera_sigma_m**2).astype(np.float32)
+    sigma[~np.isfinite(up_m)] = np.nan
+    return sigma
+
+
+def _relief(up_m: Anything) -> Floats:
+    """(H, W) highest minus lowest within two cells."""
+    known = np.isfinite(up_m)
+    around = np.ones((5, 5), np.uint8)
+    high = cv2.dilate(np.where(known, up_m, -1e6).astype(np.float32), around)
+    low = cv2.erode(np.where(known, up_m, 1e6).astype(np.float32), around)
+    return np.where(known, high - low, 0.0)

@@ -1,0 +1,1 @@
+"""`sorvolo heights` and `sorvolo measure`: heights of mapped flights, and what is measured on them."""

@@ -1,0 +1,131 @@
+"""Cameras in 3D from poses that are off: bundle adjustment against cameras and points that are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import hills_with_houses, photo, survey_views, texture
+
+from sorvolo.errors import InputError
+from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose, rotation_from_vector
+from sorvolo.heights.adjustment import AdjustmentSettings, Priors, Scene, adjust, triangulate
+from sorvolo.heights.cameras import solve_cameras
+from sorvolo.heights.figures import camera_warnings
+from sorvolo.registration.features import gray_from_rgb
+
+
+def scene(focal_scale: float = 1.0, radial: float = 0.0) -> Scene:
+    """Nine cameras over 200 points with 4 m of relief, seen without noise by a lens that is off as given."""
+    rng = np.random.default_rng(1)
+    grid = np.array([(x, y) for x in (-10.0, 0, 10) for y in (-10.0, 0, 10)])
+    rotations = rotation_from_vector(rng.normal(0, 0.03, (9, 3))) @ NADIR_CAMERA_NORTH_UP
+    centres = np.column_stack([grid, 40 + rng.normal(0, 1, 9)])
+    points = rng.uniform([-14, -14, -2], [14, 14, 2], (200, 3))
+    view, point = np.repeat(np.arange(9), 200), np.tile(np.arange(200), 9)
+    made = Scene(rotations, centres, np.full(9, 1000.0), points, view, point, np.zeros((1800, 2)), np.zeros(2))
+    local = np.einsum("mji,mj->mi", rotations[view], points[point] - centres[view])
+    ideal = focal_scale * local[:, :2] / local[:, 2:]
+    seen = ideal.copy()
+    for _ in range(50):
+        seen = ideal / (1 + radial * (seen**2).sum(axis=1, keepdims=True))
+    return replace(made, seen=seen)
+
+
+def test_derivatives_are_those_of_the_residuals() -> None:
+    from sorvolo.heights.adjustment import _advance, _derivatives
+
+    made = replace(scene(), shared=np.array([0.02, 0.01]))
+    residual, by_camera, by_shared, by_point = _derivatives(made)
+    step = 1e-6
+    for k in range(6):
+        cameras = np.zeros((9, 6))
+        cameras[:, k] = step
+        moved = _advance(made, np.concatenate([cameras.ravel(), [0, 0]]), np.zeros_like(made.points_m))
+        np.testing.assert_allclose((moved.residuals_px() - residual) / step, by_camera[:, :, k], atol=0.01)
+    for k in range(2):
+        cameras = np.zeros(56)
+        cameras[54 + k] = step
+        moved = _advance(made, cameras, np.zeros_like(made.points_m))
+        np.testing.assert_allclose((moved.residuals_px() - residual) / step, by_shared[:, :, k], atol=0.01)
+    for k in range(3):
+        points = np.zeros_like(made.points_m)
+        points[:, k] = step
+        moved = _advance(made, np.zeros(56), points)
+        np.testing.assert_allclose((moved.residuals_px() - residual) / step, by_point[:, :, k], atol=0.01)
+
+
+def test_points_are_triangulated_where_they_are() -> None:
+    made = scene()
+    np.testing.assert_allclose(triangulate(made), made.points_m, atol=1e-6)
+
+
+def test_adjustment_finds_cameras_points_and_lens() -> None:
+    true = scene(focal_scale=1.01, radial=0.02)
+    rng = np.random.default_rng(4)
+    turn = rotation_from_vector(rng.normal(0, 0.01, (9, 3)))
+    off = replace(
+        true, rotations=turn @ true.rotations, centres_m=true.centres_m + rng.normal(0, 0.5, (9, 3)),
+    )
+    off = replace(off, points_m=triangulate(off))
+    priors = Priors(true.centres_m, np.full((9, 3), 0.05), true.rotations)
+    found = adjust(off, priors, AdjustmentSettings())
+    assert np.sqrt((found.residuals_px() ** 2).mean()) < 0.05
+    assert np.abs(found.centres_m - true.centres_m).max() < 0.1
+    assert np.abs(found.points_m - true.points_m).max() < 0.1
+    np.testing.assert_allclose(np.exp(found.shared[0]), 1.01, atol=0.002)
+    np.testing.assert_allclose(found.shared[1], 0.02, atol=0.004)
+
+
+def test_wrong_matches_do_not_bend_the_cameras() -> None:
+    true = scene()
+    rng = np.random.default_rng(2)
+    seen = true.seen.copy()
+    wrong = rng.random(len(seen)) < 0.1
+    seen[wrong] += rng.normal(0, 0.1, (int(wrong.sum()), 2))
+    priors = Priors(true.centres_m, np.full((9, 3), 0.5), true.rotations)
+    found = adjust(replace(true, seen=seen), priors, AdjustmentSettings())
+    assert np.abs(found.centres_m - true.centres_m).max() < 0.05
+
+
+@pytest.fixture(scope="module")
+def survey():
+    views = survey_views(strips=2, photos=4, side_px=320)
+    look = texture()
+    return views, [gray_from_rgb(photo(view, hills_with_houses, look)) for view in views]
+
+
+def test_cameras_are_solved_from_pictures(survey) -> None:
+    """Poses off by decimetres and a degree, as a map of level ground leaves them, come back to centimetres."""
+    views, pictures = survey
+    rng = np.random.default_rng(0)
+    off = [
+        replace(view, site_from_camera=Pose(
+            rotation_from_vector(rng.normal(0, 0.015, (1, 3)))[0] @ view.site_from_camera.rotation,
+            view.site_from_camera.translation_m + rng.normal(0, 0.4, 3),
+        )) for view in views
+    ]
+    solved = solve_cameras(off, lambda number: pictures[number])
+    assert not solved.lost
+    places = np.array([view.site_from_camera.translation_m for view in solved.views])
+    true = np.array([view.site_from_camera.translation_m for view in views])
+    start = np.array([view.site_from_camera.translation_m for view in off])
+    shape = places - places.mean(axis=0) - (true - true.mean(axis=0))
+    before = start - start.mean(axis=0) - (true - true.mean(axis=0))
+    assert np.sqrt((shape[:, :2] ** 2).sum(axis=1).mean()) < 0.25
+    assert (shape**2).sum() < 0.3 * (before**2).sum()
+    assert solved.residual_px < 0.5
+    assert not camera_warnings(solved)
+
+
+def test_one_strip_is_named_as_weak(survey) -> None:
+    views, pictures = survey
+    solved = solve_cameras(views[:4], lambda number: pictures[number])
+    assert any("one strip" in each for each in camera_warnings(solved))
+
+
+def test_pictures_without_common_points_are_refused() -> None:
+    views = survey_views(strips=2, photos=2, side_px=320)
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 255, (240, 320), dtype=np.uint8) for _ in views]
+    with pytest.raises(InputError, match="overlap"):
+        solve_cameras(views, lambda number: noise[number])

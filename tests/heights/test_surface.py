@@ -1,0 +1,171 @@
+"""Heights, bare ground and orthophoto against a scene whose height is known everywhere."""
+
+import cv2
+import numpy as np
+import pytest
+from scenes import HOUSE, hills, hills_with_houses, photo, survey_views, texture
+
+from sorvolo.geometry.geodesy import Geodetic
+from sorvolo.geometry.grid import SiteGrid
+from sorvolo.heights.lattice import Lattice
+from sorvolo.heights.orthophoto import OrthophotoSettings, choose_photos, paint_orthophoto, visible
+from sorvolo.heights.relief import relief_picture
+from sorvolo.heights.semiglobal import SmoothingSettings, smoothed
+from sorvolo.heights.surface import Surface, sweep_surface
+from sorvolo.heights.terrain import TerrainSettings, filled, terrain
+from sorvolo.registration.features import gray_from_rgb
+
+ORIGIN, CRS = Geodetic(46.0, -91.0, 100.0), "EPSG:32615"
+
+
+@pytest.fixture(scope="module")
+def survey():
+    views, look = survey_views(side_px=320), texture()
+    return views, [photo(view, hills_with_houses, look) for view in views], look
+
+
+@pytest.fixture(scope="module")
+def surface(survey) -> Surface:
+    views, pictures, _ = survey
+    gsd_m = 30 / views[0].camera.fx_px
+    lattice = Lattice.over(np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, gsd_m, CRS))
+
+    def gray(number: int, size_m: float):
+        picture, scale = gray_from_rgb(pictures[number]), min(1.0, gsd_m / size_m)
+        return cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+
+    points = lattice.points_m().reshape(-1, 2)[::300]
+    points = np.column_stack([points, hills_with_houses(*points.T)])
+    *shares, found = sweep_surface(lattice, views, gray, points, 0.01)
+    assert shares[-1] == 1.0 and np.all(np.diff(shares) > 0)
+    assert isinstance(found, Surface)
+    return found
+
+
+def true_heights(lattice: Lattice):
+    points = lattice.points_m()
+    return hills_with_houses(points[..., 0], points[..., 1])
+
+
+def away_from_edges(true) -> np.ndarray:
+    edges = cv2.Laplacian(true.astype(np.float32), -1) ** 2 > 0.04
+    return cv2.dilate(edges.astype(np.uint8), np.ones((17, 17), np.uint8)) == 0
+
+
+def test_heights_are_right_to_two_pixels_and_their_sigma_is_honest(surface: Surface) -> None:
+    true = true_heights(surface.lattice)
+    off, known = surface.up_m - true, np.isfinite(surface.up_m)
+    assert known.mean() > 0.98
+    calm = known & away_from_edges(true)
+    assert np.sqrt((off[calm] ** 2).mean()) < 1.0 * surface.lattice.cell_m  # a cell is a pixel here
+    inside = np.abs(off[known]) < 2 * surface.sigma_m[known]
+    assert inside.mean() > 0.9
+
+
+def test_the_roof_has_its_height(surface: Surface) -> None:
+    points = surface.lattice.points_m()
+    west, south, east, north, tall = HOUSE
+    roof = ((points[..., 0] > west + 1) & (points[..., 0] < east - 1)
+            & (points[..., 1] > south + 1) & (points[..., 1] < north - 1))
+    floor = float(hills(np.array((west + east) / 2), np.array((south + north) / 2)))
+    assert np.nanmedian(surface.up_m[roof]) == pytest.approx(floor + tall, abs=0.1)
+
+
+def test_bare_ground_is_what_the_houses_stand_on(surface: Surface) -> None:
+    ground, shows = terrain(surface.lattice, surface.up_m, TerrainSettings(widest_m=10.0))
+    points = surface.lattice.points_m()
+    off = ground - hills(points[..., 0], points[..., 1])
+    assert np.sqrt((off**2).mean()) < 0.4
+    west, south, east, north, _ = HOUSE
+    roof = ((points[..., 0] > west + 1) & (points[..., 0] < east - 1)
+            & (points[..., 1] > south + 1) & (points[..., 1] < north - 1))
+    assert not shows[roof].any() and shows.mean() > 0.6
+
+
+def test_holes_are_closed_from_around() -> None:
+    plane = np.add.outer(np.arange(40.0), np.zeros(50)).astype(np.float32)
+    known = np.ones(plane.shape, bool)
+    known[15:20, 20:28] = False
+    closed = filled(np.where(known, plane, np.nan), known)
+    assert np.abs(closed - plane).max() < 2.0
+    np.testing.assert_array_equal(closed[known], plane[known])
+    assert np.isfinite(filled(np.full((8, 8), np.nan), np.zeros((8, 8), bool))).all()
+
+
+def test_a_wall_hides_the_ground_behind_it() -> None:
+    view = survey_views(strips=1, photos=1)[0]
+    lattice = Lattice.over(np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 0.2, CRS))
+    up_m = np.zeros(lattice.shape, np.float32)
+    points = lattice.points_m()
+    x, y = points[..., 0], points[..., 1]
+    eye = view.site_from_camera.translation_m
+    up_m[(x > 5) & (x < 6) & (np.abs(y) < 3)] = 6.0
+    seen = visible(lattice, up_m, view, OrthophotoSettings())
+    # the shadow of the wall's far edge, seen from the eye, reaches to 6 + 6 (6 - eye) / (eye up - 6)
+    reach = 6 + 6 * (6 - eye[0]) / (eye[2] - 6)
+    behind = (x > 6.3) & (x < reach - 0.8) & (np.abs(y) < 2)
+    assert not seen[behind].any()
+    assert seen[(x > reach + 0.8) & (np.abs(y) < 2)].all()
+    assert seen[x < 4.5].all()
+
+
+def test_photos_are_chosen_from_above(survey) -> None:
+    views, _, _ = survey
+    lattice = Lattice.over(np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 0.2, CRS))
+    labels = choose_photos(lattice, np.zeros(lattice.shape, np.float32), views, OrthophotoSettings())
+    eyes = np.array([view.site_from_camera.translation_m[:2] for view in views])
+    away = np.linalg.norm(lattice.points_m()[:, :, None] - eyes, axis=3)
+    chosen = np.take_along_axis(away, np.maximum(labels, 0)[..., None].astype(int), axis=2)[..., 0]
+    assert (labels >= 0).all()
+    assert np.median(chosen - away.min(axis=2)) < 1.0
+
+
+def test_the_orthophoto_shows_roofs_and_ground_in_their_place(survey, surface: Surface) -> None:
+    """Against the ground's own picture; laid on level ground the roof would lean outwards."""
+    views, pictures, look = survey
+    site_grid = SiteGrid.at(ORIGIN, 30 / views[0].camera.fx_px, CRS)
+    tiles = {
+        index: rgba for index, rgba, _ in paint_orthophoto(surface, site_grid, views, lambda k: pictures[k])
+    }
+    lattice = surface.lattice
+    picture = np.zeros((*lattice.shape, 4), np.uint8)
+    first = lattice.first
+    for (column, row), rgba in tiles.items():
+        for y in range(512):
+            at = row * 512 + y - first[1]
+            x0 = column * 512 - first[0]
+            if 0 <= at < lattice.height:
+                left, right = max(0, x0), min(lattice.width, x0 + 512)
+                if left < right:
+                    picture[at, left:right] = rgba[y, left - x0:right - x0]
+    points = lattice.points_m()
+    true = look(points[..., 0], points[..., 1])
+    west, south, east, north, _ = HOUSE
+    inner = (slice(20, -20), slice(20, -20))
+    assert (picture[inner][..., 3] == 255).mean() > 0.99
+    roof = ((points[..., 0] > west + 0.6) & (points[..., 0] < east - 0.6)
+            & (points[..., 1] > south + 0.6) & (points[..., 1] < north - 0.6))
+    x, y = np.flatnonzero(roof.any(axis=0)), np.flatnonzero(roof.any(axis=1))
+    piece = slice(y[0], y[-1] + 1), slice(x[0], x[-1] + 1)
+    shift, likeness = cv2.phaseCorrelate(
+        cv2.cvtColor(picture[piece][..., :3], cv2.COLOR_RGB2GRAY).astype(np.float32),
+        cv2.cvtColor(np.clip(true[piece], 0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY).astype(np.float32),
+    )
+    assert np.hypot(*shift) < 1.0 and likeness > 0.3
+
+
+def test_smoothing_keeps_a_step_and_drops_a_lone_cell() -> None:
+    cost = np.ones((9, 6, 12), np.float32)
+    for row in range(9):
+        for column in range(12):
+            cost[row, 1 if column < 6 else 4, column] = 0.2
+    cost[4, 1, 3], cost[4, 5, 3] = 0.5, 0.3
+    best = smoothed(cost, SmoothingSettings(0.1, 0.5)).argmin(axis=1)
+    assert (best[:, :6] == 1).all() and (best[:, 6:] == 4).all()
+
+
+def test_heights_as_a_picture_have_holes(surface: Surface) -> None:
+    up_m = surface.up_m.copy()
+    up_m[:10] = np.nan
+    picture = relief_picture(Surface(surface.lattice, up_m, surface.sigma_m, surface.covered))
+    assert (picture[:9, :, 3] == 0).all() and (picture[12:, :, 3] == 255).mean() > 0.95

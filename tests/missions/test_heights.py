@@ -1,0 +1,95 @@
+"""`sorvolo heights` on a mapped flight: files that fit each other, and refusals that name what to do."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from real_data import real_data
+
+from sorvolo.cli.main import main
+from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.heights.run import HeightSettings, make_heights
+from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.simulate.site import simulate_site
+from sorvolo.simulation.settings import (
+    ImagingSettings,
+    OutputSettings,
+    PathSettings,
+    SceneSettings,
+    SensorSettings,
+    SimulationSettings,
+)
+
+_SURVEY = SimulationSettings(
+    seed=12, flights=1, scene=SceneSettings(people=0, cars=2, small_objects=2, has_scenery=True),
+    path=PathSettings(height_m=25, speed_m_s=4, length_m=24, strips=2, strip_spacing_m=8),
+    imaging=ImagingSettings(width_px=480, height_px=360, fps=6, noise=1.0),
+    sensor=SensorSettings(noise_m=(0.1, 0.1, 0.1)),
+    output=OutputSettings(photos=True, photo_overlap=0.8),
+)
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A site with one small photo survey."""
+    folder = tmp_path_factory.mktemp("heights")
+    for _ in simulate_site(folder / "made", _SURVEY):
+        pass
+    list(map_flights([folder / "made" / "flight1"], folder / "site", MapSettings(model="none")))
+    return folder / "site"
+
+
+def test_heights_of_a_mapped_flight_are_files_that_fit_each_other(
+    mapped: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    map_before = (mapped / "mosaic.tif").read_bytes()
+    assert main(["heights", str(mapped), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)["heights"]
+    folder = mapped / "flights" / report["flight"]
+    with rasterio.open(folder / "heights.tif") as heights, rasterio.open(folder / "terrain.tif") as ground:
+        up_m, sigma_m = heights.read()
+        assert heights.transform == ground.transform and heights.crs == ground.crs
+        bare_m = ground.read(1)
+        assert heights.units == ("metre", "metre")
+    known = np.isfinite(up_m)
+    assert known.mean() > 0.5 and np.isfinite(bare_m).all()
+    assert (sigma_m[known] > 0).all() and np.isnan(sigma_m[~known]).all()
+    # the simulated ground is level and things stand on it
+    assert np.median(np.abs(up_m[known] - np.median(bare_m))) < 0.3
+    with rasterio.open(folder / "orthophoto.tif") as picture, rasterio.open(mapped / "mosaic.tif") as flat:
+        assert picture.res == flat.res and picture.crs == flat.crs
+        assert (picture.read(4) == 255).mean() > 0.3
+    assert report["surface"]["holes_share"] < 0.2
+    assert (mapped / "mosaic.tif").read_bytes() == map_before
+
+
+def test_heights_name_what_is_missing(mapped: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nowhere"):
+        list(make_heights(mapped, flight="nowhere"))
+    with pytest.raises(StoreError, match="no site"):
+        list(make_heights(tmp_path / "none"))
+    with pytest.raises(SettingsError, match="--cell"):
+        HeightSettings(cell_m=0.0)
+
+
+def test_a_flight_without_gps_has_no_heights(tmp_path: Path) -> None:
+    silent = replace(_SURVEY, seed=13, output=replace(_SURVEY.output, telemetry="none"))
+    for _ in simulate_site(tmp_path / "made", silent):
+        pass
+    list(map_flights([tmp_path / "made" / "flight1"], tmp_path / "site", MapSettings(model="none")))
+    with pytest.raises(InputError, match="no GPS"):
+        list(make_heights(tmp_path / "site"))
+
+
+@pytest.mark.slow
+def test_brighton_beach_has_heights(tmp_path: Path) -> None:
+    photos = real_data("flights/brighton_beach")
+    list(map_flights([photos], tmp_path / "site", MapSettings(model="none")))
+    list(make_heights(tmp_path / "site", HeightSettings(cell_m=0.3, has_orthophoto=False)))
+    report = json.loads(next((tmp_path / "site").glob("flights/*/heights.json")).read_text())
+    assert report["cameras"]["views"] == 18 and report["cameras"]["residual_rms_px"] < 1.5
+    assert 8 < report["surface"]["up_m"]["p99"] - report["surface"]["up_m"]["median"] < 20  # the trees
