@@ -19,7 +19,7 @@ def heights(
     site: Annotated[Path, typer.Argument(help="Folder of the map.")],
     flight: Annotated[str, typer.Option(help="Which flight. Without it: that of the newest map.")] = "",
     cell: Annotated[
-        float | None, typer.Option(help="Side of the height model's cells, m. Without it: 6 pixels of the map.")
+        float | None, typer.Option(help="Side of the height model's cells, m. Without it: 3 to 6 pixels of the map.")
     ] = None,
     orthophoto: Annotated[bool, typer.Option(help="Also make a true orthophoto.")] = True,
     as_json: AsJson = False,

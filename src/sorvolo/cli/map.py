@@ -14,7 +14,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.heights import make_and_read, show_heights
 from sorvolo.cli.options import (
     Area,
     AsJson,
@@ -89,6 +88,10 @@ Memory = Annotated[
     typer.Option(help="Memory for pictures that are needed again, MB. Without it: a quarter of the machine's."),
 ]
 
+WithHeights = Annotated[
+    bool, typer.Option("--heights/--flat", help="Also make heights and a true orthophoto of each flight.")
+]
+
 
 def map_command(
     inputs: Annotated[list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources.")],
@@ -111,9 +114,7 @@ def map_command(
     model: Model = "default",
     memory: Memory = None,
     give_up: GiveUp = 30.0,
-    heights: Annotated[
-        bool, typer.Option("--heights/--flat", help="Also make heights and a true orthophoto of each flight.")
-    ] = False,
+    heights: WithHeights = False,
     as_json: AsJson = False,
 ) -> None:
     """Make a geo-referenced map of one or more flights, or extend the map in the site folder.

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import csr_matrix
 
-from sorvolo.geometry.arrays import Anything, Floats, Mask, PointsM, Rows
+from sorvolo.geometry.arrays import Floats, Mask, PointsM, Rows
 from sorvolo.geometry.pose import rotation_from_vector
 
 _SHARED = 2  # logarithm of the focal scale, left-over radial distortion
@@ -104,7 +104,7 @@ def triangulate(scene: Scene) -> PointsM:
     right = _summed(np.einsum("mij,mj->mi", across, scene.centres_m[scene.view]), scene.point, count)
     # the least eigenvalue is the spread of the rays' directions: 1e-5 is about 0.3 degrees between two
     weak = np.linalg.eigvalsh(left)[:, 0] < 1e-5
-    points: Anything = np.linalg.solve(np.where(weak[:, None, None], np.eye(3), left), right[..., None])[..., 0]
+    points = np.asarray(np.linalg.solve(np.where(weak[:, None, None], np.eye(3), left), right[..., None])[..., 0])
     points[weak] = np.nan
     return points
 

@@ -12,6 +12,16 @@ from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import apply_homography
 
 
+@dataclass(frozen=True)
+class CellSettings:
+    """How large cells are: `fine_px` pixels of the map, up to `coarse_px` above `few_cells` of them."""
+
+    fine_px: float = 3.0
+    coarse_px: float = 6.0
+    few_cells: float = 2e6
+    most_cells: float = 60e6  # bounds the memory: larger sites get larger cells still
+
+
 @dataclass(frozen=True, eq=False)
 class Lattice:
     """`width` x `height` cells of `cell_m`; `site_from_cells` (3, 3) is the affine map of (column, row) to site metres.
@@ -51,10 +61,11 @@ class Lattice:
         return cls(np.linalg.inv(grid_from_site) @ shift, width, height, grid.m_per_px, first)
 
     @staticmethod
-    def cell_for(points_m: PointsM, wanted_m: float, most_cells: float) -> float:
-        """The cells' side: as wanted, or larger where the box of these points would have more cells than that."""
-        area_m2 = float(np.prod(points_m.max(axis=0) - points_m.min(axis=0)))
-        return float(f"{max(wanted_m, np.sqrt(area_m2 / most_cells)):.3g}")
+    def cell_for(points_m: PointsM, pixel_m: float, settings: "CellSettings") -> float:
+        """The cells' side over the box of these points: fine on small sites, coarser on larger ones."""
+        side_m = float(np.sqrt(np.prod(points_m.max(axis=0) - points_m.min(axis=0))))
+        few_m, most_m = side_m / np.sqrt(settings.few_cells), side_m / np.sqrt(settings.most_cells)
+        return float(f"{max(np.clip(few_m, settings.fine_px * pixel_m, settings.coarse_px * pixel_m), most_m):.3g}")
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, Floats, ImageRGB, ImageRGBA, Mask, Matrix3, Numbers
+from sorvolo.geometry.arrays import Floats, Floats32, ImageRGB, ImageRGBA, Mask, Matrix3
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.surface import Surface
@@ -50,7 +50,7 @@ def paint_orthophoto(
             yield tile, rgba, number / len(tiles)
 
 
-def choose_photos(lattice: Lattice, up_m: Numbers, views: Sequence[View], settings: OrthophotoSettings) -> Winners:
+def choose_photos(lattice: Lattice, up_m: Floats32, views: Sequence[View], settings: OrthophotoSettings) -> Winners:
     """(H, W) which view shows each cell of a height model without holes best; -1 where none does."""
     labels = np.full(lattice.shape, -1, np.int16)
     best = np.zeros(lattice.shape, np.float32)
@@ -60,7 +60,7 @@ def choose_photos(lattice: Lattice, up_m: Numbers, views: Sequence[View], settin
             continue
         here = slice(y0, y1), slice(x0, x1)
         window = lattice.window(x0, y0, x1, y1)
-        heights: Anything = np.ascontiguousarray(up_m[here])
+        heights: Floats32 = np.ascontiguousarray(up_m[here])
         seen = cv2.medianBlur(visible(window, heights, view, settings).view(np.uint8), 5) > 0
         merit = _merit(window, heights, view) * np.where(seen, 1.0, settings.hidden_merit)
         wins = merit > best[here]
@@ -69,7 +69,7 @@ def choose_photos(lattice: Lattice, up_m: Numbers, views: Sequence[View], settin
     return labels
 
 
-def visible(lattice: Lattice, up_m: Numbers, view: View, settings: OrthophotoSettings) -> Mask:
+def visible(lattice: Lattice, up_m: Floats32, view: View, settings: OrthophotoSettings) -> Mask:
     """(H, W) which cells of a height model without holes nothing of it hides from a view."""
     eye = view.site_from_camera.translation_m
     at = lattice.cells_from_site(eye[None, :2])[0]
@@ -95,7 +95,7 @@ class _Painter:
     """What all tiles share: the heights without holes, and which photo shows each cell."""
 
     def __init__(
-        self, lattice: Lattice, ground: Numbers, labels: Winners, site_grid: SiteGrid, views: Sequence[View],
+        self, lattice: Lattice, ground: Floats32, labels: Winners, site_grid: SiteGrid, views: Sequence[View],
         pictures: Callable[[int], ImageRGB],
     ) -> None:
         self._ground, self._labels, self._views = ground, labels, views
@@ -144,10 +144,10 @@ class _Painter:
         ), side, side)
 
     def _layers(self, labels: Winners, shift: Matrix3, side: int) -> Iterator[Layer]:
-        up_m: Anything = cv2.warpAffine(
+        up_m = np.asarray(cv2.warpAffine(
             self._ground, (self._cells_from_grid @ shift)[:2], (side, side),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
-        )
+        ), np.float32)
         for number in np.unique(labels[labels >= 0]).tolist():
             left, top, width, height = cv2.boundingRect(pixels_of(labels, number))
             x0, y0 = (max(0, each - LAYER_APRON_PX) // ALIGN_PX * ALIGN_PX for each in (left, top))
@@ -163,7 +163,7 @@ def _shift(x: float, y: float) -> Matrix3:
     return np.array([[1.0, 0, x], [0, 1, y], [0, 0, 1]])
 
 
-def _window_of(view: View, lattice: Lattice, up_m: Numbers) -> tuple[int, int, int, int]:
+def _window_of(view: View, lattice: Lattice, up_m: Floats32) -> tuple[int, int, int, int]:
     """The cells that a view may see, and the way from them to below the camera: x0, y0, x1, y1, ends exclusive."""
     low_m, high_m = float(up_m.min()), float(up_m.max())
     corners = np.concatenate([
@@ -175,7 +175,7 @@ def _window_of(view: View, lattice: Lattice, up_m: Numbers) -> tuple[int, int, i
     return x0, y0, x1, y1
 
 
-def _merit(window: Lattice, up_m: Numbers, view: View) -> Floats:
+def _merit(window: Lattice, up_m: Floats32, view: View) -> Floats:
     """(H, W) how well a view shows each cell, 0 (not at all) to 1: from above, and not at the picture's border."""
     u, v = _project(view, window.site_from_cells, up_m)
     across = (u - (view.camera.width_px - 1) / 2) / (view.camera.width_px / 2)
@@ -190,7 +190,7 @@ def _merit(window: Lattice, up_m: Numbers, view: View) -> Floats:
     return np.where(inside, 0.05 + 0.95 * steep**4 * np.sqrt(border), 0.0)
 
 
-def _project(view: View, site_from_pixels: Matrix3, up_m: Numbers) -> tuple[Anything, Anything]:
+def _project(view: View, site_from_pixels: Matrix3, up_m: Floats32) -> tuple[Floats32, Floats32]:
     """(H, W) float32 picture x and y of raster pixels on their heights."""
     turn = view.site_from_camera.rotation.T
     project = view.camera.matrix @ np.column_stack([turn, -turn @ view.site_from_camera.translation_m])

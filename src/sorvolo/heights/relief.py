@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, ImageRGBA
+from sorvolo.geometry.arrays import Floats32, ImageRGBA
 from sorvolo.heights.surface import Surface
 
 _LONGEST_PX = 1600
@@ -16,9 +16,9 @@ def relief_picture(surface: Surface) -> ImageRGBA:
     if not known.any():
         return np.zeros((1, 1, 4), np.uint8)
     scale = min(1.0, _LONGEST_PX / max(surface.up_m.shape))
-    up_m: Anything = np.where(known, surface.up_m, np.nanmedian(surface.up_m)).astype(np.float32)
+    up_m: Floats32 = np.where(known, surface.up_m, np.nanmedian(surface.up_m)).astype(np.float32)
     size = (max(1, round(up_m.shape[1] * scale)), max(1, round(up_m.shape[0] * scale)))
-    up_m = cv2.resize(up_m, size, interpolation=cv2.INTER_AREA)
+    up_m = np.asarray(cv2.resize(up_m, size, interpolation=cv2.INTER_AREA), np.float32)
     seen = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
     down, across = np.gradient(up_m, surface.lattice.cell_m / scale) if min(up_m.shape) > 1 else (up_m * 0, up_m * 0)
     light = (-across * _SUN[0] + down * _SUN[1] + _SUN[2]) / np.sqrt(1 + across**2 + down**2)

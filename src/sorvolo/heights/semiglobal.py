@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, Numbers
+from sorvolo.geometry.arrays import Floats32
 
 
 @dataclass(frozen=True)
@@ -15,12 +15,12 @@ class SmoothingSettings:
     more_levels: float = 1.2
 
 
-def smoothed(cost: Numbers, settings: SmoothingSettings) -> Numbers:
+def smoothed(cost: Floats32, settings: SmoothingSettings) -> Floats32:
     """(H, D, W) sums over eight paths of a matching cost, (H, D, W) float32: rows, levels, columns."""
     total = np.zeros_like(cost)
     _sweep(cost, total, settings)
     _sweep(cost[::-1], total[::-1], settings)
-    turned: Anything = np.ascontiguousarray(cost.transpose(2, 1, 0))
+    turned: Floats32 = np.ascontiguousarray(cost.transpose(2, 1, 0))
     across = np.zeros_like(turned)
     _straight(turned, across, settings)
     _straight(turned[::-1], across[::-1], settings)
@@ -28,7 +28,7 @@ def smoothed(cost: Numbers, settings: SmoothingSettings) -> Numbers:
     return total
 
 
-def _sweep(cost: Anything, total: Anything, settings: SmoothingSettings) -> None:
+def _sweep(cost: Floats32, total: Floats32, settings: SmoothingSettings) -> None:
     """Add the paths that come from the row above: straight, from the left and from the right."""
     before = [cost[0]] * 3
     total[0] += 3 * cost[0]
@@ -41,7 +41,7 @@ def _sweep(cost: Anything, total: Anything, settings: SmoothingSettings) -> None
             total[row] += each
 
 
-def _straight(cost: Anything, total: Anything, settings: SmoothingSettings) -> None:
+def _straight(cost: Floats32, total: Floats32, settings: SmoothingSettings) -> None:
     before = cost[0]
     total[0] += before
     for row in range(1, len(cost)):
@@ -49,7 +49,7 @@ def _straight(cost: Anything, total: Anything, settings: SmoothingSettings) -> N
         total[row] += before
 
 
-def _next(cost: Anything, before: Anything, settings: SmoothingSettings) -> Anything:
+def _next(cost: Floats32, before: Floats32, settings: SmoothingSettings) -> Floats32:
     """(D, W) the cost of paths that go on from `before`, (D, W), the least of it taken off so that sums stay small."""
     least = before.min(axis=0)
     reached = np.minimum(before, least + np.float32(settings.more_levels))

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, Floats, ImageGray, Mask, Numbers, PointsM
+from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, PointsM
 from sorvolo.heights.lattice import Lattice
-from sorvolo.heights.sweep import SweepSettings, Swept, sweep
+from sorvolo.heights.sweep import Bounds, SweepSettings, Swept, sweep
 from sorvolo.heights.views import View
 
 
@@ -34,11 +34,11 @@ class Surface:
     """
 
     lattice: Lattice
-    up_m: Numbers
-    sigma_m: Numbers
+    up_m: Floats32
+    sigma_m: Floats32
     covered: Mask
 
-    def above(self, zero_m: float) -> tuple[Numbers, Numbers]:
+    def above(self, zero_m: float) -> tuple[Floats32, Floats32]:
         """The heights when the site's ground is at `zero_m`, and their sigma, (H, W) float32."""
         return self.up_m + np.float32(zero_m), self.sigma_m
 
@@ -53,9 +53,9 @@ def sweep_surface(
     points in space that bound the heights to look for; `camera_sigma_m` is what the cameras err in common.
     """
     heights_m = np.array([view.site_from_camera.translation_m[2] for view in views])
-    low_m, high_m = _bounds(points_m, float(np.median(heights_m)))
+    everywhere = _bounds(points_m, float(np.median(heights_m)))
     side = _tile_cells(lattice.cell_m, views, settings)
-    coarse = _coarse(lattice.coarser(settings.coarser), views, pictures, low_m, high_m, settings)
+    coarse = _coarse(lattice.coarser(settings.coarser), views, pictures, everywhere, settings)
     up_m, sigma_m = (np.full(lattice.shape, np.nan, np.float32) for _ in range(2))
     covered = np.zeros(lattice.shape, bool)
     tiles = list(lattice.windows(side))
@@ -64,7 +64,7 @@ def sweep_surface(
         window = lattice.window(x0 - apron, y0 - apron, x1 + apron, y1 + apron)
         bounds = _tile_bounds(coarse, settings, (x0, y0, x1, y1), lattice.cell_m)
         if bounds is not None:
-            swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), *bounds, settings.sweep)
+            swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, settings.sweep)
             found = _calmed(swept)
             sigma = _sigma_m(swept, found, lattice.cell_m, camera_sigma_m, settings)
             inner = slice(apron, -apron), slice(apron, -apron)
@@ -74,22 +74,23 @@ def sweep_surface(
     yield Surface(lattice, up_m, sigma_m, covered)
 
 
-def _bounds(points_m: PointsM, camera_m: float) -> tuple[float, float]:
+def _bounds(points_m: PointsM, camera_m: float) -> Bounds:
     """The heights to look for: those of the points, and beyond them, for crowns have few points, or none."""
     low, high = np.percentile(points_m[:, 2], [0.5, 99.5])
     ground = float(np.median(points_m[:, 2]))
-    return float(low - 0.05 * (camera_m - ground)), float(max(high, ground + 0.4 * (camera_m - ground)))
+    reach = camera_m - ground
+    return Bounds(float(low - 0.05 * reach), float(max(high, ground + 0.4 * reach)), ground)
 
 
 def _coarse(
-    lattice: Lattice, views: Sequence[View], pictures: Callable[[int, float], ImageGray], low_m: float, high_m: float,
+    lattice: Lattice, views: Sequence[View], pictures: Callable[[int, float], ImageGray], bounds: Bounds,
     settings: SurfaceSettings,
-) -> Numbers:
+) -> Floats32:
     up_m = np.full(lattice.shape, np.nan, np.float32)
     apron = settings.apron_cells // 2
     for x0, y0, x1, y1 in lattice.windows(_tile_cells(lattice.cell_m, views, settings)):
         window = lattice.window(x0 - apron, y0 - apron, x1 + apron, y1 + apron)
-        swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), low_m, high_m, settings.sweep)
+        swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, settings.sweep)
         up_m[y0:y1, x0:x1] = _calmed(swept)[apron:-apron, apron:-apron]
     return up_m
 
@@ -103,8 +104,8 @@ def _tile_cells(cell_m: float, views: Sequence[View], settings: SurfaceSettings)
 
 
 def _tile_bounds(
-    coarse: Numbers, settings: SurfaceSettings, window: tuple[int, int, int, int], cell_m: float
-) -> tuple[float, float] | None:
+    coarse: Floats32, settings: SurfaceSettings, window: tuple[int, int, int, int], cell_m: float
+) -> Bounds | None:
     """The heights to search in a tile; None where the coarse model has a hole as large as the tile."""
     x0, y0, x1, y1 = (round(each / settings.coarser) for each in window)
     around = coarse[max(0, y0 - 6):y1 + 7, max(0, x0 - 6):x1 + 7]
@@ -113,10 +114,10 @@ def _tile_bounds(
         return None
     low, high = np.percentile(known, [0.5, 99.5])
     margin = settings.margin_cells * cell_m
-    return float(low - margin), float(high + margin)
+    return Bounds(float(low - margin), float(high + margin), float(np.median(known)))
 
 
-def _calmed(swept: Swept) -> Numbers:
+def _calmed(swept: Swept) -> Floats32:
     """(H, W) the heights with single cells that differ from all around put right: the median of 5 x 5."""
     known = np.isfinite(swept.up_m)
     if not known.any():
@@ -126,19 +127,18 @@ def _calmed(swept: Swept) -> Numbers:
 
 
 def _sigma_m(
-    swept: Swept, up_m: Anything, cell_m: float, camera_sigma_m: float, settings: SurfaceSettings
-) -> Numbers:
+    swept: Swept, up_m: Floats32, cell_m: float, camera_sigma_m: float, settings: SurfaceSettings
+) -> Floats32:
     """(H, W) one sigma of the heights: of the match, of an edge nearby, and of the cameras."""
-    if swept.spread <= 0:
-        return np.full(up_m.shape, np.nan, np.float32)
-    match = settings.match_cells * cell_m / swept.spread / np.maximum(np.sqrt(np.maximum(swept.score, 0)), 0.1)
+    likeness = np.sqrt(np.clip(swept.score, 0.01, 1))
+    match = settings.match_cells * cell_m / np.maximum(swept.spread, 0.02) / likeness
     relief = settings.relief_share * _relief(up_m)
     sigma = np.sqrt(match**2 + relief**2 + camera_sigma_m**2).astype(np.float32)
     sigma[~np.isfinite(up_m)] = np.nan
     return sigma
 
 
-def _relief(up_m: Anything) -> Floats:
+def _relief(up_m: Floats32) -> Floats:
     """(H, W) highest minus lowest within two cells."""
     known = np.isfinite(up_m)
     around = np.ones((5, 5), np.uint8)

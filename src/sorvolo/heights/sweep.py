@@ -10,10 +10,12 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Anything, Floats, ImageGray, Matrix3, Numbers
+from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Matrix3
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.semiglobal import SmoothingSettings, smoothed
 from sorvolo.heights.views import View, inside
+
+_MORE = 3  # views beyond the wanted ones
 
 
 @dataclass(frozen=True)
@@ -29,44 +31,56 @@ class SweepSettings:
     smoothing: SmoothingSettings = field(default_factory=SmoothingSettings)
 
 
+@dataclass(frozen=True)
+class Bounds:
+    """Which heights are looked for, and at which most ground lies, m."""
+
+    low_m: float
+    high_m: float
+    usual_m: float
+
+
 @dataclass(frozen=True, eq=False)
 class Swept:
-    """Heights of a window of cells, (H, W) each: `up_m` NaN where nothing agrees, the agreement (0 to 1) and how many
-    photos could see the cell; `level_m` between planes."""
+    """Heights of a window of cells, (H, W) each: `up_m` NaN where nothing agrees, the agreement (0 to 1), how many
+    photos see the cell, and the tangent of the angle between the two of them farthest apart."""
 
-    up_m: Numbers
-    score: Numbers
-    seen_by: Numbers
-    level_m: float
-    spread: float  # tangent of the angle between the two photos farthest apart
+    up_m: Floats32
+    score: Floats32
+    seen_by: Floats32
+    spread: Floats32
 
 
 def sweep(
-    lattice: Lattice, views: Sequence[View], pictures: Callable[[int], ImageGray], low_m: float, high_m: float,
+    lattice: Lattice, views: Sequence[View], pictures: Callable[[int], ImageGray], bounds: Bounds,
     settings: SweepSettings,
 ) -> Swept:
-    """The heights between `low_m` and `high_m` of a lattice's cells.
+    """The heights within bounds of a lattice's cells.
 
-    `pictures(i)` is view i's gray picture, uint8, of any size; it should have about a cell's detail.
+    `pictures(i)` is view i's gray picture, uint8, of any size; it should have about a cell's detail. A cell that fewer
+    than two photos see when it lies at the usual height is a hole: two photos see more of the depth than of the ground,
+    so that at their rim every match is too low.
     """
-    chosen = choose_views(lattice, views, (low_m + high_m) / 2, settings.views)
+    low_m, high_m = bounds.low_m, bounds.high_m
+    chosen = choose_views(lattice, views, bounds.usual_m, settings.views)
     shape = lattice.shape
     if len(chosen) < 2:
         nothing = np.full(shape, np.nan, np.float32)
-        return Swept(nothing, np.zeros(shape, np.float32), np.full(shape, len(chosen), np.float32), np.nan, 0.0)
-    spread = _widest(lattice, [views[k] for k in chosen], (low_m + high_m) / 2)
-    level_m = max(settings.level_px * lattice.cell_m / spread, (high_m - low_m) / (settings.most_levels - 1))
+        return Swept(nothing, *(np.full(shape, each, np.float32) for each in (0.0, len(chosen), 0.0)))
+    spreads = _spreads(lattice, [views[k] for k in chosen], bounds.usual_m)
+    finest_m = settings.level_px * lattice.cell_m / max(float(spreads.max()), 0.05)
+    level_m = max(finest_m, (high_m - low_m) / (settings.most_levels - 1))
     levels = low_m + level_m * np.arange(int(np.ceil((high_m - low_m) / level_m)) + 1)
     laid = [_Laid(views[k], pictures(k), lattice) for k in chosen]
     agreement = np.empty((shape[0], len(levels), shape[1]), np.float32)
-    seen_by = np.zeros(shape, np.float32)
     for number, up_m in enumerate(levels):
-        agreement[:, number], seen = _agreement([each.at(float(up_m)) for each in laid], settings)
-        np.maximum(seen_by, seen, out=seen_by)
+        agreement[:, number] = _agreement([each.at(float(up_m)) for each in laid], settings)
+    seen = [_whole(each.at(bounds.usual_m), max(settings.window_cells)) for each in laid]
+    seen_by = np.sum(seen, axis=0).astype(np.float32)
     total = smoothed(1 - agreement, settings.smoothing)
     up_m, score = _best(total, agreement, levels)
     up_m[(score < settings.least_score) | (seen_by < 2)] = np.nan
-    return Swept(up_m, score, seen_by, float(level_m), spread)
+    return Swept(up_m, score, seen_by, _widest(seen, spreads))
 
 
 def choose_views(lattice: Lattice, views: Sequence[View], up_m: float, count: int) -> list[int]:
@@ -82,7 +96,8 @@ def choose_views(lattice: Lattice, views: Sequence[View], up_m: float, count: in
     chosen: list[int] = []
     least = np.ones(len(views))
     seen = np.zeros(len(ground))
-    while len(chosen) < count:
+    wanted = np.minimum(covers.sum(axis=0), 2)  # ground that only photos left out see would be a hole
+    while len(chosen) < count or (len(chosen) < count + _MORE and (seen < wanted).any()):
         need = 1 / (1.0 + seen) ** 2
         worth = (covers * need).sum(axis=1) / need.sum() * (np.abs(rays[:, 2]) if not chosen else least)
         worth[chosen] = 0
@@ -101,11 +116,21 @@ def _usefulness(angle: Floats) -> Floats:
     return np.clip(angle / 0.35, 0.05, 1) * np.clip((1.2 - angle) / 0.5, 0.02, 1)
 
 
-def _widest(lattice: Lattice, views: Sequence[View], up_m: float) -> float:
+def _spreads(lattice: Lattice, views: Sequence[View], up_m: float) -> Floats:
+    """(V, V) how far apart two photos stand, seen from the lattice's middle, over how high they are."""
     middle = lattice.site_from_cells @ [(lattice.width - 1) / 2, (lattice.height - 1) / 2, 1.0]
     rays = np.array([view.site_from_camera.translation_m for view in views]) - [middle[0], middle[1], up_m]
     rays = rays[:, :2] / np.maximum(rays[:, 2:], 0.1)
-    return max(0.05, float(np.linalg.norm(rays[:, None] - rays[None], axis=2).max()))
+    return np.asarray(np.linalg.norm(rays[:, None] - rays[None], axis=2))
+
+
+def _widest(seen: Sequence[Mask], spreads: Floats) -> Floats32:
+    """(H, W) the largest spread of two photos that see a cell; 0 where fewer do."""
+    widest = np.zeros(seen[0].shape, np.float32)
+    for i in range(len(seen)):
+        for j in range(i):
+            np.maximum(widest, np.float32(spreads[i, j]), out=widest, where=seen[i] & seen[j])
+    return widest
 
 
 class _Laid:
@@ -121,7 +146,7 @@ class _Laid:
         self._level = project[:, :2] @ lattice.site_from_cells[:2] + np.outer(project[:, 3], [0, 0, 1])
         self._up = np.outer(project[:, 2], [0, 0, 1])
 
-    def at(self, up_m: float) -> Anything:
+    def at(self, up_m: float) -> Floats32:
         """(H, W) float32 the photo on the plane at a height; 0 outside of it."""
         picture_from_cells: Matrix3 = self._level + up_m * self._up
         return cv2.warpPerspective(
@@ -129,41 +154,46 @@ class _Laid:
         ).astype(np.float32)
 
 
-def _agreement(laid: list[Anything], settings: SweepSettings) -> tuple[Anything, Anything]:
-    """(H, W) how well the photos agree, 0 to 1, and how many there are: the mean over pairs and sizes of patches."""
-    known = [(each > 0).astype(np.float32) for each in laid]
+def _agreement(laid: list[Floats32], settings: SweepSettings) -> Floats32:
+    """(H, W) how well the photos agree, 0 to 1: the mean over pairs and over the sizes of patches that they have."""
     total, pairs = np.zeros_like(laid[0]), np.zeros_like(laid[0])
-    patches = [_Patches(laid, known, side, settings.noise_levels) for side in settings.window_cells]
+    patches = [_Patches(laid, side, settings.noise_levels) for side in settings.window_cells]
     for i in range(len(laid)):
         for j in range(i):
-            product = cv2.multiply(laid[i], laid[j])
+            product = laid[i] * laid[j]
             for each in patches:
                 total += each.likeness(product, i, j)
-            pairs += known[i] * known[j]
-    return total / (len(patches) * np.maximum(pairs, 1)), np.sum(known, axis=0)
+                pairs += each.known[i] * each.known[j]
+    return np.asarray(total / np.maximum(pairs, 1), np.float32)
 
 
 class _Patches:
-    """Means and spreads of the patches of one size, in each of the photos."""
+    """Means and spreads of the patches of one size in each of the photos, where they lie in it as a whole."""
 
-    def __init__(self, laid: list[Anything], known: list[Anything], side: int, noise_levels: float) -> None:
+    def __init__(self, laid: list[Floats32], side: int, noise_levels: float) -> None:
         self._side = side, side
+        self.known = [_whole(each, side).astype(np.float32) for each in laid]
         self._means = [cv2.boxFilter(each, -1, self._side) for each in laid]
         self._weights = []
-        for each, mean, there in zip(laid, self._means, known):
+        for each, mean, there in zip(laid, self._means, self.known):
             spread = cv2.sqrBoxFilter(each, -1, self._side) - mean * mean
             self._weights.append(there / np.sqrt(np.maximum(spread, 0) + np.float32(noise_levels**2)))
 
-    def likeness(self, product: Anything, i: int, j: int) -> Anything:
+    def likeness(self, product: Floats32, i: int, j: int) -> Floats32:
         """(H, W) the correlation of two photos' patches, 0 where they do not agree or are not known."""
-        likeness: Anything = cv2.boxFilter(product, -1, self._side)
+        likeness = np.asarray(cv2.boxFilter(product, -1, self._side), np.float32)
         likeness -= self._means[i] * self._means[j]
         likeness *= self._weights[i]
         likeness *= self._weights[j]
         return np.maximum(likeness, 0, out=likeness)
 
 
-def _best(total: Anything, agreement: Anything, levels: Anything) -> tuple[Anything, Anything]:
+def _whole(laid: Floats32, side: int) -> Mask:
+    """(H, W) where a patch lies in the photo as a whole: beyond its border it would see the border, not the ground."""
+    return cv2.erode((laid > 0).view(np.uint8), np.ones((side, side), np.uint8)) > 0
+
+
+def _best(total: Floats32, agreement: Floats32, levels: Floats32) -> tuple[Floats32, Floats32]:
     """(H, W) the height of least total cost, between levels by a parabola, and the agreement there."""
     best = total.argmin(axis=1)
     around = np.clip(best, 1, max(len(levels) - 2, 1))

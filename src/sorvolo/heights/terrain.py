@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 
-from sorvolo.geometry.arrays import Anything, Mask, Numbers
+from sorvolo.geometry.arrays import Floats32, Mask
 from sorvolo.heights.lattice import Lattice
 
 
@@ -23,7 +24,7 @@ class TerrainSettings:
     least_height_m: float = 0.3
 
 
-def terrain(lattice: Lattice, up_m: Numbers, settings: TerrainSettings = TerrainSettings()) -> tuple[Numbers, Mask]:
+def terrain(lattice: Lattice, up_m: Floats32, settings: TerrainSettings = TerrainSettings()) -> tuple[Floats32, Mask]:
     """(H, W) the ground's height, everywhere, and which cells show it; `up_m` (H, W) may have holes (NaN)."""
     factor = max(1, round(settings.cell_m / lattice.cell_m))
     low, known = _lowest(up_m, factor)
@@ -41,14 +42,14 @@ def terrain(lattice: Lattice, up_m: Numbers, settings: TerrainSettings = Terrain
     return np.where(shows, up_m, fine).astype(np.float32), shows
 
 
-def filled(up_m: Anything, known: Mask) -> Numbers:
+def filled(up_m: Floats32, known: Mask) -> Floats32:
     """(H, W) the heights with what is not known continued from around, coarse to fine."""
-    values: Anything = np.where(known, up_m, 0).astype(np.float32)
-    weights: Anything = known.astype(np.float32)
+    values: Floats32 = np.where(known, up_m, 0).astype(np.float32)
+    weights: Floats32 = known.astype(np.float32)
     levels = []
     while min(weights.shape) > 2 and weights.min() <= 0:
         levels.append((values, weights))
-        values, weights = cv2.pyrDown(values), cv2.pyrDown(weights)
+        values, weights = (np.asarray(cv2.pyrDown(each), np.float32) for each in (values, weights))
     mean = float(up_m[known].mean()) if known.any() else 0.0
     result = np.where(weights > 1e-6, values / np.maximum(weights, 1e-6), mean).astype(np.float32)
     for values, weights in reversed(levels):
@@ -57,7 +58,7 @@ def filled(up_m: Anything, known: Mask) -> Numbers:
     return result
 
 
-def _lowest(up_m: Numbers, factor: int) -> tuple[Numbers, Mask]:
+def _lowest(up_m: Floats32, factor: int) -> tuple[Floats32, Mask]:
     """The lowest height but for the lowest tenth of each block of cells, and which blocks have any."""
     height, width = (-(-side // factor) for side in up_m.shape)
     padded = np.full((height * factor, width * factor), np.nan, np.float32)
@@ -69,7 +70,7 @@ def _lowest(up_m: Numbers, factor: int) -> tuple[Numbers, Mask]:
     return np.where(known, low, np.nan).astype(np.float32), known & np.isfinite(low)
 
 
-def _ground_cells(low: Numbers, known: Mask, cell_m: float, settings: TerrainSettings) -> Mask:
+def _ground_cells(low: Floats32, known: Mask, cell_m: float, settings: TerrainSettings) -> Mask:
     # lone low cells are false matches: an opening of the negative takes them off before they pull the ground down
     surface = cv2.morphologyEx(cv2.medianBlur(low.astype(np.float32), 3), cv2.MORPH_CLOSE, _disk(1))
     is_ground = known.copy()
@@ -84,5 +85,5 @@ def _ground_cells(low: Numbers, known: Mask, cell_m: float, settings: TerrainSet
     return is_ground & (np.abs(low - surface) < settings.least_height_m)
 
 
-def _disk(radius: int) -> Anything:
+def _disk(radius: int) -> MatLike:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))

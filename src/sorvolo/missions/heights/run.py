@@ -11,7 +11,7 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.heights.cameras import Cameras3D, CameraSettings, solve_cameras
 from sorvolo.heights.figures import camera_figures, camera_warnings, surface_figures, surface_warnings
-from sorvolo.heights.lattice import Lattice
+from sorvolo.heights.lattice import CellSettings, Lattice
 from sorvolo.heights.orthophoto import OrthophotoSettings, paint_orthophoto
 from sorvolo.heights.relief import relief_picture
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
@@ -38,9 +38,8 @@ HEIGHTS, TERRAIN, ORTHOPHOTO, RELIEF, REPORT = (
 class HeightSettings:
     """What a person may choose, and the settings of the stages."""
 
-    cell_m: float | None = None  # of the height model; None: `cell_px` pixels of the map
-    cell_px: float = 6.0
-    most_cells: float = 60e6  # larger sites get larger cells
+    cell_m: float | None = None  # of the height model; None: by `cells`
+    cells: CellSettings = field(default_factory=CellSettings)
     has_orthophoto: bool = True
     cameras: CameraSettings = field(default_factory=CameraSettings)
     surface: SurfaceSettings = field(default_factory=SurfaceSettings)
@@ -69,6 +68,7 @@ def make_heights(
     Raises InputError for a flight that has no heights to give (no GPS, too few photos that overlap), StoreError for a
     folder that is no site.
     """
+    Archive.open(site, write=False).close()  # to write would make a folder that is not there
     with Archive.open(site, write=True) as archive:
         flight_id = flight or newest_flight(archive)
         keyframes = [each for each in archive.keyframes(flight_id) if each.site_from_camera is not None]
@@ -117,9 +117,7 @@ def _sweep(
 ) -> Generator[HeightsUpdate, None, Surface]:
     site = archive.site()
     outlines_m = ground_outlines_m(solved.views)
-    cell_m = settings.cell_m or Lattice.cell_for(
-        outlines_m, site.m_per_px * settings.cell_px, settings.most_cells
-    )
+    cell_m = settings.cell_m or Lattice.cell_for(outlines_m, site.m_per_px, settings.cells)
     lattice = Lattice.over(outlines_m, height_grid(site, cell_m))
 
     def gray(number: int, size_m: float) -> Any:

@@ -11,7 +11,7 @@ from rasterio.errors import RasterioError
 from rasterio.transform import Affine
 
 from sorvolo.errors import InputError, StoreError
-from sorvolo.geometry.arrays import Numbers
+from sorvolo.geometry.arrays import Floats32
 from sorvolo.geometry.grid import Grid
 from sorvolo.store.atomic import atomic_path, scratch_folder
 from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, quiet_gdal
@@ -27,11 +27,11 @@ _COG = {
 class HeightBands:
     """Bands (H, W) float32 of a raster whose top-left cell is column and row `first` of the grid."""
 
-    bands: tuple[Numbers, ...]
+    bands: tuple[Floats32, ...]
     first: tuple[int, int]
 
 
-def write_height_cog(bands: Sequence[Numbers], names: Sequence[str], first: tuple[int, int], grid: Grid,
+def write_height_cog(bands: Sequence[Floats32], names: Sequence[str], first: tuple[int, int], grid: Grid,
                      path: Path) -> None:
     """Write bands of metres, (H, W) float32, NaN unknown, each with its name, in place of what was at `path`.
 
