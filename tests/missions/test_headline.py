@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from sorvolo.cli.main import main
 from sorvolo.geometry.camera import Camera
@@ -55,11 +56,52 @@ def test_a_video_of_one_view_is_no_map(frames: list[PlacedFrame], why: str) -> N
 @pytest.mark.parametrize("frames, why", [
     ([placed(10.0 * k, Status.GPS_ONLY if k == 2 else Status.VISION) for k in range(8)], "1 frame is placed by GPS"),
     ([placed(10.0 * k, residual_px=4.0) for k in range(8)], "badly"),
-    ([placed(10.0 * k, off_m=60.0) for k in range(8)], "disagree by 60 m"),
 ])
-def test_steps_and_contradictions_make_a_map_to_check(frames: list[PlacedFrame], why: str) -> None:
+def test_steps_make_a_map_to_check(frames: list[PlacedFrame], why: str) -> None:
     headline = map_headline(frames, flight_figures(frames, _CAMERA.fx_px), is_video=True)
     assert headline.quality is MapQuality.DOUBTFUL and why in headline.text
+
+
+def test_a_map_with_faults_is_none_to_build_on() -> None:
+    frames = [placed(10.0 * k, off_m=60.0) for k in range(8)]
+    figures = flight_figures(frames, _CAMERA.fx_px)
+    headline = map_headline(frames, figures, is_video=True, faults=["it is twice as large as its GPS track"])
+    assert headline.quality is MapQuality.CONTRADICTORY and "twice as large" in headline.text
+
+
+def test_a_map_of_fixes_that_are_another_flights_is_refused_and_nothing_is_compared_with_it(
+    photographed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photos, camera = _with_shuffled_fixes(photographed, tmp_path / "photos"), str(photographed / "camera.xml")
+    site = tmp_path / "site"
+    common = ["--site", str(site), "--model", "none", "--camera", camera]
+    assert main(["map", str(photos), *common]) == 3
+    assert "a map that contradicts itself: " in capsys.readouterr().out
+    report = json.loads((site / "flights" / "photos" / "report.json").read_text())
+    assert report["headline"]["quality"] == "contradictory" and len(report["pieces"]) >= 1
+
+    later = str(photographed / "flight1" / "photos")
+    before = (site / "mosaic.tif").read_bytes()
+    assert main(["compare", later, *common]) == 1
+    error = capsys.readouterr().err
+    assert "contradicts itself" in error and "--trust-map" in error
+    assert (site / "mosaic.tif").read_bytes() == before
+
+
+def _with_shuffled_fixes(photographed: Path, folder: Path) -> Path:
+    """The photos, each with the place of another one."""
+    folder.mkdir()
+    paths = sorted((photographed / "flight1" / "photos").glob("*.jpg"))
+    places = []
+    for path in paths:
+        with Image.open(path) as picture:
+            places.append(picture.getexif().get_ifd(0x8825))
+    for path, other in zip(paths, np.random.default_rng(3).permutation(len(paths)), strict=True):
+        with Image.open(path) as picture:
+            exif = picture.getexif()
+            exif.get_ifd(0x8825).update({tag: places[other][tag] for tag in (1, 2, 3, 4)})
+            picture.save(folder / path.name, "JPEG", exif=exif, quality=95)
+    return folder
 
 
 def test_a_video_from_one_place_ends_with_a_warning_and_its_own_exit_code(

@@ -90,6 +90,11 @@ class FlightTelemetry:
         return float(np.nanmedian(self.track.up_m))
 
     @property
+    def usual_sigma_m(self) -> float:
+        """The median of the fixes' stated sigma, horizontal."""
+        return float(np.nanmedian(self.track.horizontal_sigma_m[self._known]))
+
+    @property
     def speed_m_s(self) -> float:
         """The speed that three quarters of the flight stay below, over steps of a second or more."""
         return _speed_m_s(self.track.sample_s[self._known], self.track.east_north_m[self._known])

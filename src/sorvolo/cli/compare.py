@@ -71,6 +71,9 @@ ThesisValues = Annotated[
 UpdatesMap = Annotated[
     bool, typer.Option("--update/--no-update", help="Update the map where the ground changed or is new.")
 ]
+TrustsMap = Annotated[
+    bool, typer.Option("--trust-map", help="Compare even with a map that contradicts itself.")
+]
 NamingModel = Annotated[str, typer.Option(help="Detector that names what changed: a model's name, a file, or none.")]
 
 
@@ -90,6 +93,7 @@ def compare(
     steps: StepsFolder = None,
     thesis: ThesisValues = None,
     update: UpdatesMap = True,
+    trust_map: TrustsMap = False,
     model: NamingModel = "default",
     give_up: GiveUp = 30.0,
     coordinates: PlaceFormatOption = PlaceFormat.LATLON,
@@ -110,7 +114,7 @@ def compare(
 
     settings = CompareSettings(
         method.value, views_per_second, votes, voters, offset, ground_elevation, updates_map=update, writes_masks=masks,
-        model=model, thesis=thesis_options(thesis or []),
+        model=model, thesis=thesis_options(thesis or []), trusts_map=trust_map,
     )
     results = compare_and_read_results(
         inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area, steps=steps,

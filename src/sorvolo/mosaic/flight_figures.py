@@ -65,6 +65,16 @@ def track_row(each: PlacedFrame) -> dict[str, Any]:
     }
 
 
+def stated_height_m(placed: Sequence[PlacedFrame], altitude_offset_m: float) -> float:
+    """The median height above ground that telemetry states for the placed frames, whose residuals count from it less
+    the offset that the flight showed; NaN without any."""
+    stated = median_of_known([
+        float(each.site_from_camera.translation_m[2] + altitude_offset_m - each.gps_residual_m[2]) for each in placed
+        if each.site_from_camera is not None
+    ])
+    return float("nan") if stated is None else stated
+
+
 def shown_m2(tiles: Mapping[TileIndex, ImageRGBA], m_per_px: float) -> float:
     """The ground that a map's tiles show."""
     return float(sum(int(np.count_nonzero(tile[..., 3])) for tile in tiles.values()) * m_per_px**2)

@@ -172,6 +172,10 @@ class PlanarMapper:
         """What the flight taught about itself."""
         return self._graph.report()
 
+    def pieces(self) -> list[list[int]]:
+        """See `PoseGraph.pieces`."""
+        return self._graph.pieces()
+
     def residuals_px(self, full: Camera) -> dict[int, float]:
         """Median transfer residual of each keyframe, px of the full frame's size."""
         return {

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix
+from scipy.sparse import coo_matrix, csc_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Rows
@@ -186,6 +187,21 @@ class PoseGraph:
         at, old, new = self._ids[keyframe_id], self._links.old, self._links.new
         theirs = np.flatnonzero((old == at) | (new == at))
         return [self._names[int(old[k] if new[k] == at else new[k])] for k in theirs]
+
+    def pieces(self) -> list[list[int]]:
+        """The flight's keyframes in groups that links tie together, in the order of their coming; a known map's
+        keyframes tie as well."""
+        size = len(self._nodes)
+        ties = coo_matrix((np.ones(len(self._links)), (self._links.old, self._links.new)), shape=(size, size))
+        known = np.flatnonzero(~self._own())
+        if len(known):
+            ones = np.ones(len(known))
+            ties = ties + coo_matrix((ones, (known, np.full(len(known), known[0]))), shape=(size, size))
+        count, labels = connected_components(ties, directed=False)
+        groups: list[list[int]] = [[] for _ in range(count)]
+        for at in np.flatnonzero(self._own()).tolist():
+            groups[labels[at]].append(self._names[at])
+        return [each for each in groups if each]
 
     def add_known(self, keyframe_id: int, camera: Camera, site_from_camera: Pose) -> None:
         """A keyframe of the known map: it ties others down and never moves."""

@@ -13,6 +13,7 @@ from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.compare.run import CompareRun, Pending
 from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.headline import MapQuality
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.map_objects import open_detector
 from sorvolo.missions.flight.settings import CompareSettings
@@ -50,6 +51,8 @@ def compare_flights(
     with Archive.open(site, write=False) as archive:
         if not archive.tiles():
             raise StoreError(f"{site} holds no map yet; make one of an earlier flight: sorvolo map INPUT --site {site}")
+        if not settings.trusts_map:
+            _refuse_contradictory(archive, site)
     looks = open_detector(settings.model) if detector is None else detector
     opened = opened_sources(
         inputs, telemetry, camera, known_flights(site), live=live, until=until,
@@ -59,6 +62,17 @@ def compare_flights(
         for source in sources:
             yield from _compare_one(
                 source, archive, settings, wanted, steps, looks, telemetry_named=telemetry is not None
+            )
+
+
+def _refuse_contradictory(archive: Archive, site: Path) -> None:
+    """Raise StoreError for a map that contradicts itself: changes found on it would be its own faults."""
+    for each in archive.flights():
+        headline = archive.report(each.id).get("headline")
+        if isinstance(headline, dict) and headline.get("quality") == MapQuality.CONTRADICTORY:
+            raise StoreError(
+                f"the map in {site} contradicts itself (flight {each.id}): {headline.get('text')}; map that flight "
+                "again with what it lacks, or compare all the same with --trust-map"
             )
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from sorvolo.missions.flight.warnings import OBLIQUE_DEG, contradictions
+from sorvolo.missions.flight.warnings import OBLIQUE_DEG, doubts
 from sorvolo.mosaic.flight_figures import FlightFigures
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.wording import counted
@@ -16,7 +16,8 @@ class MapQuality(StrEnum):
     """What a flight's frames make together."""
 
     MAP = "map"
-    DOUBTFUL = "doubtful"  # a map with steps, or one whose sources contradict each other
+    DOUBTFUL = "doubtful"  # a map with steps, or of pictures that fit each other badly
+    CONTRADICTORY = "contradictory"  # its parts, or pictures and telemetry, exclude each other: nothing builds on it
     ONE_VIEW = "one-view"  # no map: the whole flight shows one piece of ground from one place
 
 
@@ -28,12 +29,17 @@ class Headline:
     text: str
 
 
-def map_headline(placed: Sequence[PlacedFrame], figures: FlightFigures, *, is_video: bool) -> Headline:
-    """The headline of a flight that was mapped; photos were each meant, so that one photo is a map."""
+def map_headline(
+    placed: Sequence[PlacedFrame], figures: FlightFigures, *, is_video: bool, faults: Sequence[str] = ()
+) -> Headline:
+    """The headline of a flight that was mapped; photos were each meant, so that one photo is a map. `faults` are how
+    the map contradicts itself (see `Consistency`)."""
     seen = sum(each.status is not Status.REJECTED for each in placed)
     if is_video and (seen == 1 or figures.reach_m < _HOVERING * figures.diagonal_m):
         return Headline(MapQuality.ONE_VIEW, f"no map: {_one_view(figures, seen)}")
-    found = contradictions(placed, figures)
+    if faults:
+        return Headline(MapQuality.CONTRADICTORY, f"a map that contradicts itself: {'; '.join(faults)}")
+    found = doubts(placed, figures)
     if found:
         return Headline(MapQuality.DOUBTFUL, f"a map to check before use: {'; '.join(found)}")
     matched = sum(each.status is Status.VISION for each in placed)

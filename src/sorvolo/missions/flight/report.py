@@ -18,7 +18,8 @@ from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.flight.warnings import flight_warnings
-from sorvolo.mosaic.flight_figures import FlightFigures, flight_figures, shown_m2, track_row
+from sorvolo.mosaic.consistency import Consistency, Stated, consistency
+from sorvolo.mosaic.flight_figures import FlightFigures, flight_figures, shown_m2, stated_height_m, track_row
 from sorvolo.mosaic.pose_graph import GraphReport
 from sorvolo.store.exports.control_files import control_summary
 from sorvolo.store.exports.plain import utc_text
@@ -41,6 +42,7 @@ class FlightResult:
     colour_spread: float = float("nan")
     makes_map: bool = True  # else it was compared with one
     control: ControlReport | None = None
+    pieces: Sequence[Sequence[int]] = ()  # frames, by index, that links tie together
 
 
 def build_report(
@@ -53,6 +55,7 @@ def build_report(
     """
     source, placed, graph = setup.source, result.placed, result.graph
     figures = flight_figures(placed, result.camera.fx_px)
+    agreement = consistency(placed, result.pieces, figures, _stated(setup, result))
     return {
         "sorvolo": sorvolo.__version__,
         "flight": source.name,
@@ -61,11 +64,12 @@ def build_report(
         "inputs": list(source.inputs),
         "georeferenced": not site.is_local,
         "flown": utc_text(setup.flown_ns) if setup.flown_ns else None,
-        **_headline(result, figures, is_video=source.kind == "video"),
+        **_headline(result, figures, agreement, is_video=source.kind == "video"),
         "frames": _frames(placed, source.frame_count),
         "camera": _camera(source.camera, result.camera, graph),
         "telemetry": _telemetry(setup),
         "time_offset": _offset(settings, log, result.offset),
+        "pieces": [asdict(each) for each in agreement.pieces],
         **_figures(figures),
         "control": control_summary(result.control) if result.control else None,
         "relief_m": graph.relief_m if graph else None,
@@ -78,17 +82,30 @@ def build_report(
         "area_m2": shown_m2(tiles, site.m_per_px),
         **_effort(log, seconds, max(1, len(placed))),
         "notices": [asdict(each) for each in (*source.telemetry.notices, *setup.notices, *notices)],
-        "warnings": flight_warnings(placed, figures, setup, log),
+        "warnings": flight_warnings(placed, figures, setup, log, agreement),
         "settings": asdict(settings),
         "versions": {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}},
         "track": [track_row(each) for each in placed],
     }
 
 
-def _headline(result: FlightResult, figures: FlightFigures, *, is_video: bool) -> dict[str, Any]:
+def _headline(
+    result: FlightResult, figures: FlightFigures, agreement: Consistency, *, is_video: bool
+) -> dict[str, Any]:
     if not result.makes_map:
         return {}
-    return {"headline": asdict(map_headline(result.placed, figures, is_video=is_video))}
+    headline = map_headline(result.placed, figures, is_video=is_video, faults=agreement.faults)
+    return {"headline": asdict(headline)}
+
+
+def _stated(setup: FlightSetup, result: FlightResult) -> Stated:
+    """What telemetry states, to hold the map against; heights only where they are known to count from the ground."""
+    telemetry, graph = setup.telemetry, result.graph
+    source = "the photos' heights" if setup.source.kind == "photos" else "the telemetry's heights"
+    if telemetry is None or graph is None:
+        return Stated(0.0, float("nan"), source)
+    height_m = stated_height_m(result.placed, graph.altitude_offset_m) if telemetry.knows_ground else float("nan")
+    return Stated(telemetry.usual_sigma_m, height_m, source)
 
 
 def _frames(placed: Sequence[PlacedFrame], total: int) -> dict[str, Any]:

@@ -73,6 +73,7 @@ class CompareSettings:
     side_px: int | None = None  # longest side at which frames are compared; None: photos larger than a video's frames
     updates_map: bool = True  # make a new version of the map where the ground changed or is new
     writes_masks: bool = False
+    trusts_map: bool = False  # also a map that contradicts itself
     model: str = "default"  # that looks for objects: an installed one's name, a file, or "none"
     thesis: ThesisOptions = field(default_factory=ThesisOptions)  # of method thesis: Table 4.2, threads
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from sorvolo.missions.flight.log import FlightLog
 from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.mosaic.consistency import NOTHING_KNOWN, Consistency
 from sorvolo.mosaic.flight_figures import FlightFigures
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.wording import counted, plural
@@ -11,17 +12,17 @@ from sorvolo.survey.wording import counted, plural
 OBLIQUE_DEG = 35.0  # pictures that look to opposite sides share too little to be linked
 _MANY = 0.1  # share of the frames
 _BAD_FIT_PX = 3.0
-_OFF_M, _OFF_SHARE = 8.0, 0.25  # by which telemetry may disagree: metres, and a share of how far the flight reaches
 _GUESSED = 0.1  # relative: a focal length that is hardly known
 
 
 def flight_warnings(
-    placed: Sequence[PlacedFrame], figures: FlightFigures, setup: FlightSetup, log: FlightLog
+    placed: Sequence[PlacedFrame], figures: FlightFigures, setup: FlightSetup, log: FlightLog,
+    agreement: Consistency = NOTHING_KNOWN,
 ) -> list[str]:
     """The warnings of a flight's report."""
     return [
-        *_frame_warnings(placed), *contradictions(placed, figures), *_camera_warnings(figures, setup),
-        *_clock_warnings(setup, log),
+        *agreement.faults, *_frame_warnings(placed), *doubts(placed, figures), *agreement.remarks,
+        *_camera_warnings(figures, setup), *_clock_warnings(setup, log),
     ]
 
 
@@ -32,21 +33,14 @@ def _frame_warnings(placed: Sequence[PlacedFrame]) -> list[str]:
     return [f"{lost} of {counted(len(placed), 'frame')} have no place in the map; `reasons` lists why"]
 
 
-def contradictions(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
-    """What makes the map itself doubtful: steps in it, or pictures and telemetry that do not agree."""
+def doubts(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
+    """What makes the map doubtful: steps in it, or pictures that fit each other badly."""
     warnings = []
     by_gps = sum(each.status is Status.GPS_ONLY for each in placed)
     if by_gps > _MANY * len(placed):
         warnings.append(
             f"{counted(by_gps, 'frame')} {plural('is', by_gps)} placed by GPS alone: expect steps of some metres at "
             "their edges"
-        )
-    seen = sum(each.status is not Status.REJECTED for each in placed)
-    off_m = figures.gps_median_m
-    if off_m is not None and seen > 3 and off_m > max(_OFF_SHARE * figures.reach_m, _OFF_M):
-        warnings.append(
-            f"the pictures' own path and the telemetry disagree by {off_m:.0f} m (median): is this the telemetry "
-            "of this flight, and is the clock offset right?"
         )
     if figures.residual_median_px is not None and figures.residual_median_px > _BAD_FIT_PX:
         warnings.append("pictures fit each other badly: high trees or houses, a wrong camera, or a rolling shutter")

@@ -134,6 +134,7 @@ class PlanarRun(FlightRun):
         result = FlightResult(
             placed, self._refined(self._setup.source.camera.camera), self._offset, self._mapper.report(),
             self._exposure.spread, control=self._control,
+            pieces=[[self._frames[each].frame.index for each in ids] for ids in self._mapper.pieces()],
         )
         report = build_report(
             self._setup, self._settings, self._log, result, self._archive.site(), writer.tiles,

@@ -1,0 +1,171 @@
+"""Whether a finished map agrees with itself: its pieces in one scale, its cameras where GPS and heights have them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.mosaic.flight_figures import FlightFigures
+from sorvolo.survey.mosaic import PlacedFrame, Status
+from sorvolo.survey.wording import counted
+
+
+@dataclass(frozen=True)
+class ConsistencySettings:
+    """When a map contradicts itself. A consumer receiver errs by metres, a poor one by 20 m (real flights: 14 m)."""
+
+    least_frames: int = 4  # of a piece, for its scale to be known
+    most_scale: float = 0.2  # relative, between pieces or between a piece and GPS ...
+    scale_sigmas: float = 4.0  # ... and so many times what the fixes leave open
+    most_rms_m: float = 25.0  # of cameras from their fixes ...
+    rms_sigmas: float = 8.0  # ... or so many stated sigmas
+    most_off_m: float = 5.0  # median, if it is also a quarter of how far the flight reaches
+    off_share: float = 0.25
+    most_uneven: float = 0.35  # of the height above ground: heights of frames that scatter so against telemetry's
+    least_uneven_m: float = 8.0
+    heights_differ: float = 0.15  # of the stated height: more is reported ...
+    heights_differ_m: float = 4.0  # ... if it is so many metres as well
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Frames tied to each other by their pictures. `scale` is the map's over that of GPS, NaN where fixes are few."""
+
+    frames: int
+    first: str
+    last: str
+    scale: float
+    scale_sigma: float
+    height_m: float  # above the ground, median
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What telemetry states of a flight: sigma of its fixes, and the median height above ground of the placed frames,
+    NaN where the ground's own height is not known."""
+
+    position_sigma_m: float
+    height_m: float
+    source: str  # in words: "the photos' heights"
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """The pieces of a map, the largest first; `faults`, in words, make it no map to rely on; `remarks` do not."""
+
+    pieces: tuple[Piece, ...]
+    faults: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+
+NOTHING_KNOWN = Consistency((), (), ())
+
+
+def consistency(
+    placed: Sequence[PlacedFrame], pieces: Sequence[Sequence[int]], figures: FlightFigures, stated: Stated,
+    settings: ConsistencySettings = ConsistencySettings(),
+) -> Consistency:
+    """Hold a map against itself and against telemetry. `pieces` are the frames, by index, that links tie together."""
+    by_index = {each.index: each for each in placed if each.status is not Status.REJECTED}
+    found = [_piece([by_index[k] for k in ids if k in by_index], stated) for ids in pieces]
+    known = tuple(sorted((each for each in found if each is not None), key=lambda each: -each.frames))
+    faults = [
+        *_scale_faults(known, settings), *_gps_faults(list(by_index.values()), figures, stated, settings),
+        *_height_faults(list(by_index.values()), figures, settings),
+    ]
+    return Consistency(known, tuple(faults), tuple(_height_remarks(figures, stated, settings)))
+
+
+def _piece(frames: Sequence[PlacedFrame], stated: Stated) -> Piece | None:
+    if len(frames) < 2:
+        return None
+    centres_m, fixes_m = _centres_and_fixes(frames)
+    heights = [each.site_from_camera.translation_m[2] for each in frames if each.site_from_camera is not None]
+    scale = sigma = float("nan")
+    spread_m = float(np.linalg.norm(fixes_m.std(axis=0))) if len(fixes_m) else 0.0
+    if len(fixes_m) >= ConsistencySettings.least_frames and spread_m > 2 * stated.position_sigma_m:
+        change = fit_similarity(fixes_m, centres_m)
+        scale = float(1 / max(np.hypot(change[0, 0], change[1, 0]), 1e-9))
+        miss_m = np.linalg.norm(apply_homography(change, centres_m) - fixes_m, axis=1)
+        noise_m = max(stated.position_sigma_m, float(np.sqrt((miss_m**2).mean() / 2)))
+        sigma = noise_m / (np.sqrt(len(fixes_m)) * spread_m)
+    height_m = float(np.median(heights)) if heights else float("nan")
+    return Piece(len(frames), frames[0].name, frames[-1].name, scale, float(sigma), height_m)
+
+
+def _centres_and_fixes(frames: Sequence[PlacedFrame]) -> tuple[PointsM, PointsM]:
+    """(N, 2) each: camera places and the fixes they are held against, of frames that have both."""
+    rows = [
+        (each.site_from_camera.translation_m[:2], each.gps_residual_m[:2]) for each in frames
+        if each.site_from_camera is not None and np.isfinite(each.gps_residual_m[:2]).all()
+    ]
+    centres_m, off_m = (np.array([row[k] for row in rows]).reshape(-1, 2) for k in (0, 1))
+    return centres_m, centres_m - off_m
+
+
+def _scale_faults(pieces: Sequence[Piece], settings: ConsistencySettings) -> list[str]:
+    known = [each for each in pieces if np.isfinite(each.scale)]
+    faults = []
+    for piece in known[:1]:
+        if abs(np.log(piece.scale)) > max(settings.most_scale, settings.scale_sigmas * piece.scale_sigma):
+            faults.append(
+                f"the map is {piece.scale:.2f} times as large as its GPS track (frames {piece.first} to {piece.last})"
+            )
+    for piece in known[1:]:
+        apart = abs(np.log(piece.scale / known[0].scale))
+        sigma = np.hypot(piece.scale_sigma, known[0].scale_sigma)
+        if apart > max(settings.most_scale, settings.scale_sigmas * sigma):
+            faults.append(
+                f"its pieces differ in scale: {counted(piece.frames, 'frame')} from {piece.first} to {piece.last} by "
+                f"{piece.scale / known[0].scale:.2f} against {counted(known[0].frames, 'frame')} from {known[0].first}"
+            )
+    return faults
+
+
+def _gps_faults(
+    frames: Sequence[PlacedFrame], figures: FlightFigures, stated: Stated, settings: ConsistencySettings
+) -> list[str]:
+    median_m, rms_m = figures.gps_median_m, figures.gps_rms_m
+    if median_m is None or rms_m is None or len(frames) <= 3:
+        return []
+    if median_m > max(settings.off_share * figures.reach_m, settings.most_off_m):
+        return [
+            f"the pictures' own path and the telemetry disagree by {median_m:.0f} m (median): is this the telemetry of "
+            "this flight, and is the clock offset right?"
+        ]
+    if rms_m > max(settings.most_rms_m, settings.rms_sigmas * stated.position_sigma_m):
+        return [
+            f"the cameras lie {rms_m:.0f} m from their GPS fixes (root mean square), more than a receiver errs: give "
+            "control points (--gcp), or photos with more overlap"
+        ]
+    return []
+
+
+def _height_faults(
+    frames: Sequence[PlacedFrame], figures: FlightFigures, settings: ConsistencySettings
+) -> list[str]:
+    off_m: Floats = np.array([each.gps_residual_m[2] for each in frames])
+    off_m = off_m[np.isfinite(off_m)]
+    if len(off_m) < settings.least_frames or figures.height_m is None:
+        return []
+    uneven_m = float(np.percentile(np.abs(off_m - np.median(off_m)), 75))
+    if uneven_m <= max(settings.most_uneven * figures.height_m, settings.least_uneven_m):
+        return []
+    return [
+        f"the pictures put frames {uneven_m:.0f} m higher or lower than telemetry, at {figures.height_m:.0f} m above "
+        "the ground: the map has several scales; give control points (--gcp), or photos with more overlap"
+    ]
+
+
+def _height_remarks(figures: FlightFigures, stated: Stated, settings: ConsistencySettings) -> list[str]:
+    found_m, stated_m = figures.height_m, stated.height_m
+    if found_m is None or not np.isfinite(stated_m):
+        return []
+    if abs(found_m - stated_m) <= max(settings.heights_differ * abs(stated_m), settings.heights_differ_m):
+        return []
+    return [
+        f"{stated.source} give {stated_m:.0f} m above the ground, the pictures and GPS {found_m:.0f} m: the ground "
+        "lies higher or lower than the take-off, or the camera's focal length is another (--camera)"
+    ]
