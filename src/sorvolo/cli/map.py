@@ -62,6 +62,9 @@ ControlPoints = Annotated[
     Path | None, typer.Option(help="Ground control points: a gcp_list.txt, as OpenDroneMap reads it.")
 ]
 ControlAccuracy = Annotated[float, typer.Option(help="Accuracy of the control points, m (1 sigma).")]
+BaseMap = Annotated[
+    Path | None, typer.Option(help="Tie the map to this one: a GeoTIFF, or the folder of an earlier map.")
+]
 CheckPoints = Annotated[
     str, typer.Option(help="Control points held back to measure the map: labels with commas; CP* for a prefix.")
 ]
@@ -108,6 +111,7 @@ def map_command(
     gcp: ControlPoints = None,
     gcp_accuracy: ControlAccuracy = 0.05,
     check: CheckPoints = "",
+    base: BaseMap = None,
     compress: MapCompression = None,
     transform: TransformOption = Transform.SIMILARITY,
     thesis: StitchingValues = None,
@@ -143,7 +147,7 @@ def map_command(
     )
     reports = map_and_read_reports(
         inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area,
-        live=LiveSettings(keeps_all=True, give_up_s=give_up), control=gcp,
+        live=LiveSettings(keeps_all=True, give_up_s=give_up), control=gcp, base=base,
     )
     if as_json:
         _print_json(reports, site)
@@ -162,7 +166,7 @@ def _print_json(reports: Sequence[Mapping[str, Any]], site: Path) -> None:
 def map_and_read_reports(
     inputs: Sequence[Path | str], site: Path, settings: "MapSettings", *, telemetry: Path | str | None = None,
     camera: str | None = None, area: Path | None = None,
-    live: "LiveSettings | None" = None, control: Path | None = None,
+    live: "LiveSettings | None" = None, control: Path | None = None, base: Path | None = None,
 ) -> list[dict[str, Any]]:
     """Map with progress on stderr; the reports of the mapped flights, in order."""
     from sorvolo.capture.live.reconnect import LiveSettings
@@ -173,7 +177,7 @@ def map_and_read_reports(
     with ended_by_signal(inputs) as until:
         mapping = map_flights(
             inputs, site, settings, telemetry=telemetry, camera=camera, area=area,
-            live=live or LiveSettings(keeps_all=True), until=until, control=control,
+            live=live or LiveSettings(keeps_all=True), until=until, control=control, base=base,
         )
         # closed even when the bar is stopped: then the site is as it was
         with closing(mapping) as updates:
@@ -255,6 +259,7 @@ def _quality_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [
         *rows,
         *_control_rows(report.get("control")),
+        ("base map", _base(report.get("base"))),
         ("map", _size(report)),
         ("objects found", _objects(report.get("objects") or {})),
         ("clock offset", _clock_offset(report["time_offset"])),
@@ -263,7 +268,19 @@ def _quality_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _placed_by(report: Mapping[str, Any]) -> str:
+    if report.get("base"):
+        return "places on the base map"
     return "control points" if report.get("control") else "GPS fixes"
+
+
+def _base(base: Mapping[str, Any] | None) -> str:
+    if base is None:
+        return ""
+    moved = "" if base["moved_m"] is None else f", which moved the map by {base['moved_m']:.2f} m"
+    return escape(
+        f"{base['found']:,} of {counted(base['sought'], 'frame')} found on {base['name']}, {base['residual_m']:.2f} m "
+        f"off (median){moved}"
+    )
 
 
 def _control_rows(control: Mapping[str, Any] | None) -> list[tuple[str, str]]:

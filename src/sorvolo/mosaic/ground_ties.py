@@ -24,12 +24,13 @@ class GroundTies:
     place_m: PointsM  # (M, 3) in the site
     sigma_px: Floats  # (M,) of the point in the picture
     sigma_m: Floats  # (M,) of the place
+    common_m: float = 0.0  # what all places err in common, one sigma
 
     def of(self, chosen: Rows) -> "GroundTies":
         """Some of them, by index or mask (M,)."""
         return GroundTies(
             self.keyframe_ids[chosen], self.ideal[chosen], self.place_m[chosen], self.sigma_px[chosen],
-            self.sigma_m[chosen],
+            self.sigma_m[chosen], self.common_m,
         )
 
     def __len__(self) -> int:

@@ -14,6 +14,7 @@ from sorvolo.geometry.pose import Pose
 from sorvolo.mosaic.exposure import ColourPairs, Exposure, ExposureSettings, solve_exposure, tie_colours
 from sorvolo.mosaic.ground_ties import GroundTies
 from sorvolo.mosaic.keyframes import Keyframes
+from sorvolo.mosaic.overview import Overview, lay_out
 from sorvolo.mosaic.pose_graph import GraphReport, PoseGraph, PoseGraphSettings, pose_from_link
 from sorvolo.registration.features import gray_from_rgb, normalise_contrast, orb_features
 from sorvolo.registration.link import Effort, LinkCache, LinkPrediction, LinkSettings, link
@@ -131,6 +132,28 @@ class PlanarMapper:
     def ground_places_m(self, ties: GroundTies) -> PointsM:
         """See `PoseGraph.ground_places_m`."""
         return self._graph.ground_places_m(ties)
+
+    def overview(self, side_px: int) -> Overview | None:
+        """All of the flight in one small picture; None before any frame lies on the ground."""
+        frames = []
+        for each in self._own:
+            small, camera = self._keyframes.thumbnail(each), self._graph.camera(each)
+            resized = camera.resized(small.shape[1], small.shape[0])
+            frames.append((small, site_from_image_homography(resized, self._graph.pose(each))))
+        return lay_out(frames, side_px)
+
+    def refined(self, camera: Camera) -> Camera:
+        """A camera of this flight with the focal length found so far."""
+        return self._graph.refined(camera)
+
+    def m_per_px(self, full: Camera) -> float:
+        """What a pixel of the flight's pictures, of `full`'s size, usually covers on the ground."""
+        return float(np.median(self._graph.centres_m(self._own)[:, 2]) / self._graph.refined(full).fx_px)
+
+    def median_move_m(self, before_m: PointsM) -> float:
+        """How far cameras are from where `path_m` had them, median; NaN without any."""
+        away_m = np.linalg.norm((self.path_m() - before_m)[:, :2], axis=1)
+        return float(np.nanmedian(away_m)) if np.isfinite(away_m).any() else float("nan")
 
     def registration_scale(self, keyframe_id: int, full: Camera) -> float:
         """Pixels at which a keyframe was registered in one of its full size."""

@@ -134,6 +134,7 @@ class PoseGraph:
         self._trust = _Trust()
         self._as_reported = np.zeros(len(SHARED), bool)
         self._ground = NO_GROUND
+        self._ground_common_m = 0.0
 
     def __contains__(self, keyframe_id: int) -> bool:
         return keyframe_id in self._ids
@@ -252,6 +253,7 @@ class PoseGraph:
         self._ground = Ground(
             node, ties.ideal, ties.place_m, focal_px, np.maximum(ties.sigma_px, self._settings.sigma_px), ties.sigma_m
         )
+        self._ground_common_m = ties.common_m
         self._align()
         if is_datum:
             self._forget_places()
@@ -336,7 +338,7 @@ class PoseGraph:
         it is that of the mean of all places.
         """
         if len(self._ground.node):
-            return float(1 / np.sqrt((self._ground.sigma_m**-2.0).sum()))
+            return float(np.hypot(self._ground_common_m, 1 / np.sqrt((self._ground.sigma_m**-2.0).sum())))
         stated_m = self._rows.stated_sigma_m[self._own(), 0]
         stated_m = stated_m[np.isfinite(stated_m)]
         fixes = self._own().any() and len(stated_m) >= 2

@@ -27,6 +27,16 @@ class FlightControl:
     notices: tuple[Notice, ...]
     is_datum: bool
 
+    @property
+    def words(self) -> str:
+        """They, in words."""
+        return f"the control point file ({self.file.path.name})"
+
+    @property
+    def frame(self) -> LocalFrame:
+        """A site frame amid the points, for a flight without GPS."""
+        return LocalFrame(self.control.middle)
+
     def tie(self, mapper: PlanarMapper, keyframe_of: Mapping[str, int], frame: LocalFrame) -> ControlReport:
         """Tie the map to them; see `tie_control`. `keyframe_of`: the keyframe that shows each frame, by name."""
         camera = self.source.camera.camera

@@ -18,6 +18,7 @@ from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.flight.warnings import flight_warnings
+from sorvolo.mosaic.base_ties import BaseReport
 from sorvolo.mosaic.consistency import Consistency, Stated, consistency
 from sorvolo.mosaic.flight_figures import FlightFigures, flight_figures, shown_m2, stated_height_m, track_row
 from sorvolo.mosaic.pose_graph import GraphReport
@@ -42,6 +43,7 @@ class FlightResult:
     colour_spread: float = float("nan")
     makes_map: bool = True  # else it was compared with one
     control: ControlReport | None = None
+    base: BaseReport | None = None
     pieces: Sequence[Sequence[int]] = ()  # frames, by index, that links tie together
 
 
@@ -71,7 +73,7 @@ def build_report(
         "time_offset": _offset(settings, log, result.offset),
         "pieces": [asdict(each) for each in agreement.pieces],
         **_figures(figures),
-        "control": control_summary(result.control) if result.control else None,
+        **_known_ground(result),
         "relief_m": graph.relief_m if graph else None,
         "altitude_offset_m": graph.altitude_offset_m if graph else None,
         "links": {"kept": graph.links, "dropped_as_false": graph.links_dropped} if graph else None,
@@ -96,6 +98,13 @@ def _headline(
         return {}
     headline = map_headline(result.placed, figures, is_video=is_video, faults=agreement.faults)
     return {"headline": asdict(headline)}
+
+
+def _known_ground(result: FlightResult) -> dict[str, Any]:
+    return {
+        "control": control_summary(result.control) if result.control else None,
+        "base": asdict(result.base) if result.base else None,
+    }
 
 
 def _stated(setup: FlightSetup, result: FlightResult) -> Stated:

@@ -10,6 +10,7 @@ from sorvolo.capture.sync import DATED_NS, Clock, Track, site_origin
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame, utm_epsg
+from sorvolo.missions.flight.base_map import FlightBase
 from sorvolo.missions.flight.control import FlightControl
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.mosaic.selection import FramePlan, live_plan, untimed_plan, video_plan
@@ -17,6 +18,9 @@ from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import CATALOGUE
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import CameraPrior, Frame, Notice, PosedFrame, Site
+
+KnownGround = FlightControl | FlightBase
+"""What places a map beside GPS, or without any."""
 
 _ANOTHER_PLACE_M = 2_000.0  # from known ground: a map's files hold all between, which takes minutes where it is far
 
@@ -31,12 +35,12 @@ class FlightSetup:
     site: Site | None
     notices: tuple[Notice, ...]
     telemetry: FlightTelemetry | None = None
-    control: FlightControl | None = None
+    known_ground: KnownGround | None = None
 
     @property
     def is_placed_late(self) -> bool:
         """Whether the flight has no GPS, and finds its place on Earth, its scale and north once all of it is seen."""
-        return self.control is not None and self.control.is_datum
+        return self.known_ground is not None and self.known_ground.is_datum
 
     @property
     def track(self) -> Track | None:
@@ -85,13 +89,13 @@ class FlightSetup:
 
 def prepare(
     source: Source, settings: MapSettings, site: Site | None, *, telemetry_named: bool, finds_itself: bool = False,
-    ground_m: PointsM | None = None, control: FlightControl | None = None,
+    ground_m: PointsM | None = None, known_ground: KnownGround | None = None,
 ) -> FlightSetup:
     """Tie clocks, lay the flight into the site frame and foresee its keyframes.
 
     `ground_m` (N, 2) are places all over the ground that the site shows, see `known_ground_m`. `finds_itself`: the
-    flight's frames are looked for in the site's map, so that they need no GPS. `control` are its control points, which
-    place a flight without GPS. Raises InputError when the flight is of
+    flight's frames are looked for in the site's map, so that they need no GPS. `known_ground` are its control points or
+    its base map, which place a flight without GPS. Raises InputError when the flight is of
     another place than the site, or the telemetry of another flight.
     """
     if isinstance(source, LiveSource):
@@ -99,40 +103,43 @@ def prepare(
     if finds_itself and site is not None and (site.is_local or not source.telemetry.has_fixes):
         return _found_by_pictures(source, site)
     if not source.telemetry.has_fixes:
-        return _without_gps(source, settings, site, telemetry_named, control)
+        return _without_gps(source, settings, site, telemetry_named, known_ground)
     if site is not None and site.is_local:
         raise InputError(
             f"the site {site.name} has no geo-reference, but the flight {source.name} has GPS: map it into a new site "
             "folder"
         )
     setup = _with_gps(source, settings, site, telemetry_named, ground_m)
-    return setup if control is None else _with_control(setup, control)
+    return setup if known_ground is None else _with_known_ground(setup, known_ground)
 
 
-def _with_control(setup: FlightSetup, control: FlightControl) -> FlightSetup:
-    """A flight with GPS and control points that lie on it."""
+def _with_known_ground(setup: FlightSetup, known_ground: KnownGround) -> FlightSetup:
+    """A flight with GPS that is tied to known ground as well."""
+    if isinstance(known_ground, FlightControl):
+        _check_control(setup, known_ground)
+    return replace(setup, known_ground=known_ground, notices=(*setup.notices, *known_ground.notices))
+
+
+def _check_control(setup: FlightSetup, control: FlightControl) -> None:
     assert setup.track is not None
     track, frame = setup.track, setup.frame
     control.check_place(lambda each: distance_m(track, frame.ground_from_lonlat(
         [(point.longitude_deg, point.latitude_deg) for point in each.points]
     )))
-    return replace(setup, control=control, notices=(*setup.notices, *control.notices))
 
 
-def _by_control(source: Source, settings: MapSettings, site: Site | None, control: FlightControl) -> FlightSetup:
-    """A first flight that has no GPS and is placed by its control points."""
+def _by_known_ground(source: Source, settings: MapSettings, site: Site | None, known: KnownGround) -> FlightSetup:
+    """A first flight that has no GPS and is placed by its control points or its base map."""
     if site is not None:
         raise InputError(
-            f"the flight {source.name} has no GPS, and control points alone cannot join it to a map that exists: map "
-            "it into a site folder of its own"
+            f"the flight {source.name} has no GPS, and {known.words} alone cannot join it to a map that exists: map it "
+            " into a site folder of its own"
         )
     if settings.offset_s is not None:
         raise SettingsError("--offset was given, but the flight has no telemetry with fixes")
-    name = control.file.path.name
-    notice = Notice("no_telemetry", 1, f"no GPS: control points alone give the map its place, scale and north ({name})")
-    plan = _untimed(source)
+    notice = Notice("no_telemetry", 1, f"no GPS: {known.words} alone gives the map its place, scale and north")
     return FlightSetup(
-        source, LocalFrame(control.control.middle), plan, None, (notice, *control.notices), control=control
+        source, known.frame, _untimed(source), None, (notice, *known.notices), known_ground=known
     )
 
 
@@ -151,11 +158,11 @@ def _found_by_pictures(source: Source, site: Site) -> FlightSetup:
 
 
 def _without_gps(
-    source: Source, settings: MapSettings, site: Site | None, telemetry_named: bool, control: FlightControl | None
+    source: Source, settings: MapSettings, site: Site | None, telemetry_named: bool, known_ground: KnownGround | None
 ) -> FlightSetup:
-    """A first flight in a frame of its own, or in that of its control points."""
-    if control is not None:
-        return _by_control(source, settings, site, control)
+    """A first flight in a frame of its own, or in that of known ground."""
+    if known_ground is not None:
+        return _by_known_ground(source, settings, site, known_ground)
     if site is not None and not site.is_local:
         raise InputError(
             f"the site is geo-referenced, but the flight {source.name} has no GPS: give --telemetry, or map it "

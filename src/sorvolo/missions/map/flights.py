@@ -10,12 +10,13 @@ from sorvolo.capture.areas import read_area
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import Source, opened_sources
 from sorvolo.errors import SettingsError
-from sorvolo.missions.flight.control import FlightControl, open_control
+from sorvolo.missions.flight.base_map import open_base
+from sorvolo.missions.flight.control import open_control
 from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.glimpses import refuse_without_texture
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.settings import MapSettings
-from sorvolo.missions.flight.setup import known_flights, known_ground_m, prepare, repeated
+from sorvolo.missions.flight.setup import KnownGround, known_flights, known_ground_m, prepare, repeated
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.missions.map.thesis_run import ThesisRun
@@ -32,6 +33,7 @@ def map_flights(
     telemetry: Path | str | None = None, camera: Path | str | None = None, area: Path | None = None,
     detector: Detects | None = None, live: LiveSettings = LiveSettings(keeps_all=True),  # noqa: B008 (frozen)
     until: threading.Event | None = None, control: Path | None = None,
+    base: Path | None = None,
 ) -> Generator[MosaicUpdate]:
     """Map one or more flights into the site folder, yielding an update for each selected frame.
 
@@ -39,41 +41,48 @@ def map_flights(
     only flight (else what lies in or beside it is used), or a receiver's link; `camera` a calibration file, a preset's
     name, "aov=DEG" or "focal_px=PX"; `area` a polygon outside of which frames are not used; `detector` one that finds
     objects in place of the model that the settings name; `control` a file of the only flight's control points
-    (gcp_list.txt). A live flight is read, by the settings `live`, until it ends
-    or `until` is set; then its map is finished like any other's.
+    (gcp_list.txt), `base` a GeoTIFF or a site folder whose map shows its ground, to which it is tied. A live
+    flight is read, by the settings `live`, until it ends or `until` is set; then its map is finished like any other's.
     Nothing of a flight is part of the site until its last update was yielded.
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being mapped is left out, those before it are in.
     """
+    if control is not None and base is not None:
+        raise SettingsError("a map is tied to control points (--gcp) or to a base map (--base), not to both")
     if settings.checks and control is None:
         raise SettingsError("check points (--check) are of a control point file: give it with --gcp")
     wanted = None if area is None else read_area(area)
     looks = open_detector(settings.model) if detector is None else detector
     opened = opened_sources(inputs, telemetry, camera, known_flights(site), live=live, until=until)
     with opened as sources, Archive.open(site, write=True) as archive:
-        points = None if control is None else _control_of(control, sources, settings)
+        ground = _known_ground(control, base, sources, settings)
         for source in sources:
-            yield from _map_one(source, archive, settings, wanted, looks, points, telemetry_named=telemetry is not None)
+            yield from _map_one(source, archive, settings, wanted, looks, ground, telemetry_named=telemetry is not None)
 
 
-def _control_of(path: Path, sources: Sequence[Source], settings: MapSettings) -> FlightControl:
+def _known_ground(
+    control: Path | None, base: Path | None, sources: Sequence[Source], settings: MapSettings
+) -> KnownGround | None:
+    if control is None and base is None:
+        return None
     if settings.method != "planar":
-        raise SettingsError("control points (--gcp) tie maps of method planar only; leave --method out")
+        raise SettingsError("--gcp and --base tie maps of method planar only; leave --method out")
     if len(sources) != 1:
-        raise SettingsError(
-            f"one control point file for {len(sources)} flights; map the flights one by one, each with its own --gcp"
-        )
-    return open_control(path, sources[0], ControlSettings(settings.control_sigma_m, checks=settings.checks))
+        raise SettingsError(f"--gcp and --base tie one flight, not {len(sources)}; map the flights one by one")
+    if control is not None:
+        return open_control(control, sources[0], ControlSettings(settings.control_sigma_m, checks=settings.checks))
+    assert base is not None
+    return open_base(base, sources[0])
 
 
 def _map_one(
     source: Source, archive: Archive, settings: MapSettings, area: Area | None, detector: Detects | None,
-    control: FlightControl | None, *, telemetry_named: bool,
+    ground: KnownGround | None, *, telemetry_named: bool,
 ) -> Generator[MosaicUpdate]:
     started_s = time.monotonic()
     setup = prepare(
         source, settings, archive.site() if archive.has_site else None, telemetry_named=telemetry_named,
-        ground_m=known_ground_m(archive), control=control,
+        ground_m=known_ground_m(archive), known_ground=ground,
     )
     refuse_without_texture(source)
     setup = replace(setup, notices=(*setup.notices, *repeated(archive, source.name, "mapped")))

@@ -9,6 +9,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.level_ground import footprint, is_on_ground
+from sorvolo.missions.flight.control import FlightControl
 from sorvolo.missions.flight.log import Ending, Stage, nothing_placed
 from sorvolo.missions.flight.map_objects import ObjectFinder, crops_of
 from sorvolo.missions.flight.memory import memory_budget_bytes
@@ -18,6 +19,7 @@ from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.map.known_keyframes import KnownKeyframes
 from sorvolo.missions.map.painting import FlightPainter, site_from_image
 from sorvolo.missions.map.run import FlightRun
+from sorvolo.mosaic.base_ties import BaseReport
 from sorvolo.mosaic.exposure import Exposure
 from sorvolo.mosaic.keyframes import Keyframes
 from sorvolo.mosaic.placing import map_m_per_px, sees_horizon
@@ -55,7 +57,7 @@ class PlanarRun(FlightRun):
         self._spill = SpillFile(archive.folder)
         self._mapper = PlanarMapper(
             PoseGraphSettings.of_flight(
-                model.focal_sigma, offset_sigma_m, joins_map=self._known.count > 0 or setup.control is not None
+                model.focal_sigma, offset_sigma_m, joins_map=self._known.count > 0 or setup.known_ground is not None
             ),
             known=self._known.for_graph(),
             keyframes=Keyframes(self._spill, memory_budget_bytes(settings.memory_mb) // 2),
@@ -65,6 +67,7 @@ class PlanarRun(FlightRun):
         self._painter: FlightPainter | None = None
         self._offset: OffsetEstimate | None = None
         self._control: ControlReport | None = None
+        self._base: BaseReport | None = None
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -133,8 +136,8 @@ class PlanarRun(FlightRun):
             shown = picture(writer.tiles, 1600).rgba
         result = FlightResult(
             placed, self._refined(self._setup.source.camera.camera), self._offset, self._mapper.report(),
-            self._exposure.spread, control=self._control,
-            pieces=[[self._frames[each].frame.index for each in ids] for ids in self._mapper.pieces()],
+            self._exposure.spread, control=self._control, base=self._base,
+            pieces=[[each - self._known.count for each in ids] for ids in self._mapper.pieces()],
         )
         report = build_report(
             self._setup, self._settings, self._log, result, self._archive.site(), writer.tiles,
@@ -194,12 +197,21 @@ class PlanarRun(FlightRun):
         return refined_camera(camera, self._mapper.focal_scale, self._mapper.radial)
 
     def _tie_to_ground(self) -> None:
-        """Bring the map to its control points, where it has any."""
-        control = self._setup.control
-        if control is not None:
+        """Bring the map to its control points or its base map, where it has any."""
+        ground = self._setup.known_ground
+        if isinstance(ground, FlightControl):
             endings = self._log.endings
             keyframe_of = {endings[each - self._known.count].name: each for each in self._mapper.placed()}
-            self._control = control.tie(self._mapper, keyframe_of, self._setup.frame)
+            self._control = ground.tie(self._mapper, keyframe_of, self._setup.frame)
+        elif ground is not None:
+            self._base = ground.tie(self._mapper, self._picture, self._lens.camera, self._setup.frame)
+
+    def _picture(self, keyframe_id: int) -> ImageRGB:
+        """A keyframe's undistorted picture, from wherever it is kept."""
+        held = self._held.get(keyframe_id)
+        if held is None:
+            return self.begin().image(keyframe_id - self._known.count)
+        return image_from_jpeg(held, "") if isinstance(held, bytes) else held
 
     def _find_offset(self) -> OffsetEstimate | None:
         """The clock offset that motion shows, applied when it is well seen and none was given."""

@@ -119,6 +119,7 @@ def _summary(report: Mapping[str, Any]) -> str:
     sentences = []
     if sigma_m is not None:
         sources = "control points" if report.get("control") else "GPS fixes"
+        sources = "places on the base map" if report.get("base") else sources
         sentences.append(
             f"Position accuracy {length_words(sigma_m)} (1 sigma, including the error shared by all {sources})."
         )
