@@ -43,7 +43,7 @@ def page_of_stored(stored: list[StoredChange], changes: list[Change], report: di
 @pytest.mark.parametrize("count", [0, 1, 12, 150])
 def test_any_number_of_changes_makes_a_whole_page(count: int) -> None:
     changes = [
-        fake_change(k + 1, kind=KINDS[k % 4], east_m=k % 13 - 6, north_m=k % 9 - 4, size_m=0.5) for k in range(count)
+        fake_change(k + 1, kind=KINDS[k % 5], east_m=k % 13 - 6, north_m=k % 9 - 4, size_m=0.5) for k in range(count)
     ]
     page = page_of(changes)
     checker = checked(page)

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from sorvolo.missions.flight.settings import CompareSettings
     from sorvolo.survey.findings import Change, CompareUpdate
 
-_COLOURS = {"appeared": "green", "disappeared": "red", "replaced": "yellow", "moving": "cyan"}
+_COLOURS = {"appeared": "green", "disappeared": "red", "replaced": "yellow", "area": "blue", "moving": "cyan"}
 _MOST_ROWS, _MOST_REASONS = 40, 6
 _LEAST_SHOWN = 0.01  # of the compared ground: gaps smaller than that are in the report alone
 

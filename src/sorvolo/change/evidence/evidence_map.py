@@ -151,6 +151,11 @@ class EvidenceMap:
                 self._stopped[number] = verdict
         return self.changes()
 
+    @property
+    def next_number(self) -> int:
+        """The first number that no change of the flight has."""
+        return self._number + 1
+
     def outcomes(self) -> dict[str, dict[str, int]]:
         """What became of the candidates, for a report after `conclude`: how many changes are `announced`, those that
         stay in place and those that move; by reason how many candidates were `withdrawn`, or `never_announced`."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from sorvolo.change.shape.outlines import KnownPlace, is_known
 from sorvolo.change.shape.shadows import without_shadow
-from sorvolo.survey.findings import Change
+from sorvolo.survey.findings import Change, ChangeKind
 
 
 def reported(changes: Iterable[Change], map_sigma_m: float, rejected: Sequence[KnownPlace]) -> list[Change]:
@@ -15,7 +15,7 @@ def reported(changes: Iterable[Change], map_sigma_m: float, rejected: Sequence[K
 
     Those at places in `rejected` are left out: a person rejected them on an earlier flight.
     """
-    finished = [without_shadow(each) for each in changes]
+    finished = [each if each.kind is ChangeKind.AREA else without_shadow(each) for each in changes]
     return [
         replace(each, sigma_m=float(np.hypot(each.sigma_m, map_sigma_m))) for each in finished
         if not is_known(each.outline_m, each.kind, rejected)

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from sorvolo.change.areas.area_map import AreaMap, with_areas
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
 from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
 from sorvolo.change.map_update import paint_changes
@@ -71,6 +72,7 @@ class CompareRun:
         )
         self._views = _view_maker(setup, archive, settings, base_version)
         self._evidence: EvidenceMap | None = None
+        self._areas = AreaMap()
         self._rejected = [
             KnownPlace(each.outline_m, each.kind) for each in archive.reviews()
             if each.verdict is Verdict.REJECTED and each.flight_id != source.name
@@ -146,7 +148,7 @@ class CompareRun:
                 "another place, another season, or night? `sorvolo inspect` shows what the flight holds"
             )
         with self._log.stage(Stage.EVIDENCE):
-            found = () if self._evidence is None else self._evidence.conclude()
+            found = self._found()
             changes = self._reported(found)
         suppressed = len(found) - len(changes)
         shown_as_well = self._extend_map()
@@ -179,12 +181,22 @@ class CompareRun:
                     EvidenceSettings(k=self._settings.votes, n=self._settings.voters), self._setup.source.name,
                 )
             announced: Sequence[Change] = self._reported(self._evidence.add(view))
+            if self._settings.method != "thesis":
+                self._areas.add(view)
         if announced:
             with self._log.stage(Stage.DETECT):
                 announced = self._objects.named(announced)
         with self._log.stage(Stage.STORE):
             self._write_masks(view)
         return tuple(announced)
+
+    def _found(self) -> Sequence[Change]:
+        """All changes of the flight, after its last view: things, and ground that changed as an area."""
+        if self._evidence is None:
+            return ()
+        things = self._evidence.conclude()
+        areas = self._areas.conclude(self._setup.source.name, self._evidence.next_number)
+        return with_areas(things, areas)
 
     def _reported(self, changes: Sequence[Change]) -> list[Change]:
         return reported(changes, self._map_sigma_m, self._rejected)

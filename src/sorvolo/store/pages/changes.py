@@ -33,6 +33,7 @@ _KIND_WORDS = {
     ChangeKind.APPEARED: "is there now and was not before",
     ChangeKind.DISAPPEARED: "was there before and is gone",
     ChangeKind.REPLACED: "something else stands in its place, or it looks different",
+    ChangeKind.AREA: "the ground itself is another one: paved, ploughed, heaped, flooded or built over",
     ChangeKind.MOVING: "moved while it was seen: no change of the ground",
 }
 _VIEW_WORDS = {

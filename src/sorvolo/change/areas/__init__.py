@@ -1,0 +1,1 @@
+"""Ground that changed as an area: paved, ploughed, heaped, flooded, built over."""

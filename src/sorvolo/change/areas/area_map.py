@@ -1,0 +1,207 @@
+"""Ground that changed as an area, gathered over a flight's views: each area is one change, however large.
+
+The ground is divided into cells. Cells whose structure is that of the map are the same ground, and show what light,
+season and cameras do on this flight. An area is connected ground of other structure whose colour and roughness differ
+much more than that, in the views on the whole and in most of them alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.change.areas.ground_pictures import GroundPictures
+from sorvolo.change.areas.segments import AreaSettings, GroundSigns, segments
+from sorvolo.change.areas.signs import SIDE_PX, AreaSigns, area_signs
+from sorvolo.change.evidence.cells import CellWindow, window_around
+from sorvolo.change.shape.outlines import mask_of, measures, outline_of
+from sorvolo.geometry.arrays import Mask, PointsM
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
+
+_CELL_PX = 2  # of the small size at which views are examined
+_PICTURE_PX = 8  # of the pictures, in a cell
+_LEAST_VIEWS = 2
+_AGREES = 0.5  # of the views of an area's ground must differ from the map there, each by itself
+_OWN_UNITS = 2.0  # by which a view alone differs
+_SURE_UNITS = 6.0  # an area that differs by so much is sure
+_MOST_CELLS = 4_000_000  # of the raster, which bounds its memory: views beyond are left out
+_LEAST_SCORE = 0.3
+_INSIDE, _STANDS_OUT = 0.7, 1.5  # of a change in an area; spreads of the ground around from which it is a thing
+_EXPLAINED = 0.5  # of an area by things: it is nothing more than they
+_SUMS = ("seen", "agree", "likeness", "blue", "red", "detail", "blue_now", "red_now")
+
+
+class AreaMap:
+    """The areas of one flight while its views come in. Only `add` changes it."""
+
+    def __init__(self, settings: AreaSettings = AreaSettings()) -> None:  # noqa: B008 (frozen)
+        self._settings = settings
+        self._cell_m = 0.0
+        self._window = CellWindow(0, 0, 0, 0)
+        self._sums: dict[str, NDArray[np.float32]] = {name: np.zeros((0, 0), np.float32) for name in _SUMS}
+        self._times_ns: list[int] = []
+        self._residuals_m: list[float] = []
+        self._pictures = GroundPictures(1.0)
+
+    def add(self, view: ComparedView) -> None:
+        """Take in one view."""
+        height, width = view.valid.shape
+        if not self._cell_m:
+            self._cell_m = _CELL_PX * view.m_per_px * max(1.0, max(height, width) / SIDE_PX)
+            self._pictures = GroundPictures(self._cell_m / _PICTURE_PX)
+        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+        window = window_around(apply_homography(view.site_from_image, corners), self._cell_m)
+        if not self._grow(window):
+            return
+        laid = self._laid(view, area_signs(view), window)
+        part = window.within(self._window)
+        for name, values in laid.items():
+            self._sums[name][part] += values
+        self._times_ns.append(view.time_ns)
+        if np.isfinite(view.residual_px):
+            self._residuals_m.append(view.residual_px * view.m_per_px)
+        rows, columns = np.nonzero(laid["agree"])
+        if len(rows):
+            cells = np.column_stack([columns, rows]).astype(float)
+            self._pictures.show(view, apply_homography(window.site_from_cell(self._cell_m), cells))
+
+    def conclude(self, id_prefix: str, first_number: int) -> tuple[Change, ...]:
+        """After the last view: all areas, the largest first, numbered from `first_number` on."""
+        seen = self._sums["seen"]
+        if not seen.size:
+            return ()
+        known = seen >= _LEAST_VIEWS
+        mean = {name: np.asarray(values / np.maximum(seen, 1), np.float32) for name, values in self._sums.items()}
+        colour, surface = np.dstack([mean["blue"], mean["red"]]), np.dstack([mean["blue_now"], mean["red_now"]])
+        signs = GroundSigns(mean["likeness"], colour, mean["detail"], surface, known)
+        found = []
+        for cells, units in segments(signs, self._settings):
+            agreement = float(mean["agree"][cells].mean())
+            score = agreement * min(1.0, units / _SURE_UNITS)
+            if agreement >= _AGREES and score >= _LEAST_SCORE:
+                found.append(self._record(cells, score))
+        found.sort(key=lambda each: -each.area_m2)
+        return tuple(replace(each, id=f"{id_prefix}-{first_number + place}") for place, each in enumerate(found))
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _record(self, cells: Mask, score: float) -> Change:
+        site_from_cell = self._window.site_from_cell(self._cell_m)
+        outline_m = outline_of(cells, site_from_cell, 0.5, 1.0)
+        if outline_m is None:
+            raise AssertionError("an area has cells")
+        size = measures(outline_m)
+        residual_m = float(np.mean(self._residuals_m)) if self._residuals_m else 0.0
+        return Change(
+            "", ChangeKind.AREA, score, outline_m, min(self._times_ns), max(self._times_ns),
+            round(float(self._sums["agree"][cells].mean())), float(np.count_nonzero(cells)) * self._cell_m**2,
+            size.length_m, float(np.hypot(residual_m, self._cell_m / np.sqrt(12))), self._pictures.patch(outline_m),
+        )
+
+    def _grow(self, window: CellWindow) -> bool:
+        """Make the raster hold a window; whether it does."""
+        old = self._window
+        new = window if 0 in old.shape else old.joined(window)
+        if new == old:
+            return True
+        spare = max(new.shape) // 4
+        new = CellWindow(
+            *(min(new.x0, old.x0 - spare if new.x0 < old.x0 else new.x0),
+              min(new.y0, old.y0 - spare if new.y0 < old.y0 else new.y0)),
+            *(max(new.x1, old.x1 + spare if new.x1 > old.x1 else new.x1),
+              max(new.y1, old.y1 + spare if new.y1 > old.y1 else new.y1)),
+        )
+        if new.shape[0] * new.shape[1] > _MOST_CELLS:
+            return False
+        part = old.within(new)
+        for name, values in self._sums.items():
+            self._sums[name] = np.zeros(new.shape, np.float32)
+            if values.size:
+                self._sums[name][part] = values
+        self._window = new
+        return True
+
+    def _laid(self, view: ComparedView, signs: AreaSigns, window: CellWindow) -> dict[str, NDArray[np.float32]]:
+        """What the view adds to the sums in a window."""
+        cell_from_signs = (
+            np.linalg.inv(window.site_from_cell(self._cell_m)) @ view.site_from_image @ signs.view_from_signs
+        )
+
+        def laid(values: NDArray[np.float32]) -> NDArray[np.float32]:
+            found = cv2.warpPerspective(
+                values, cell_from_signs, window.shape[::-1], flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
+            )
+            return np.asarray(found * seen, np.float32)
+
+        seen = np.ones(window.shape, np.float32)
+        seen = (laid(signs.known.astype(np.float32)) > 0.99).astype(np.float32)
+        return {
+            "seen": seen, "agree": laid(_differs(signs, self._settings)), "likeness": laid(signs.likeness),
+            "blue": laid(signs.colour[..., 0]), "red": laid(signs.colour[..., 1]), "detail": laid(signs.detail),
+            "blue_now": laid(signs.surface[..., 0]), "red_now": laid(signs.surface[..., 1]),
+        }
+
+
+def _differs(signs: AreaSigns, settings: AreaSettings) -> NDArray[np.float32]:
+    """1 where a view by itself shows another ground: other structure, and other colour or roughness than elsewhere."""
+    same = signs.known & (signs.likeness > settings.same)
+    colour, detail = settings.least_units
+    length = np.hypot(signs.colour[..., 0], signs.colour[..., 1])
+    middle = 0.0
+    if np.count_nonzero(same) > 100:
+        middle = float(np.median(signs.detail[same]))
+        colour = max(colour, float(np.percentile(length[same], settings.quiet_percent)))
+        detail = max(detail, float(np.percentile(np.abs(signs.detail[same] - middle), settings.quiet_percent)))
+    differs = np.hypot(length / colour, (signs.detail - middle) / detail) > _OWN_UNITS
+    return (differs & signs.known & (signs.likeness < settings.other)).astype(np.float32)
+
+
+def with_areas(changes: Sequence[Change], areas: Sequence[Change]) -> list[Change]:
+    """Changes and areas, each piece of ground reported once.
+
+    A change that is a part of an area is left out, unless it is a thing that stands out from the ground around it on
+    either date; an area that things explain for the most part is left out itself.
+    """
+    kept = [
+        each for each in changes
+        if each.kind is ChangeKind.MOVING or _is_thing(each.patch)
+        or not any(_inside(each, area.outline_m) > _INSIDE for area in areas)
+    ]
+    still = [each for each in kept if each.kind is not ChangeKind.MOVING]
+    return kept + [area for area in areas if _explained(area, still) < _EXPLAINED]
+
+
+def _explained(area: Change, things: Sequence[Change]) -> float:
+    """The share of an area that lies within things."""
+    shape, site_from_patch = area.patch.changed.shape, area.patch.site_from_patch
+    own, theirs = mask_of(area.outline_m, site_from_patch, shape), np.zeros(shape, bool)
+    for each in things:
+        theirs |= mask_of(each.outline_m, site_from_patch, shape)
+    return float((own & theirs).sum() / max(1, own.sum()))
+
+
+def _inside(change: Change, outline_m: PointsM) -> float:
+    """The share of a change that lies within an outline, (N, 2)."""
+    shape, site_from_patch = change.patch.changed.shape, change.patch.site_from_patch
+    own, theirs = (mask_of(each, site_from_patch, shape) for each in (change.outline_m, outline_m))
+    return float((own & theirs).sum() / max(1, own.sum()))
+
+
+def _is_thing(patch: Patch) -> bool:
+    """Whether what changed differs from the ground around it by more than that ground varies, before or after."""
+    reach = max(3, round(0.15 * max(patch.changed.shape)))
+    near = cv2.dilate(patch.changed.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
+    for picture in (patch.before, patch.after):
+        known = picture[..., 3] > 0
+        ring, own = near & ~patch.changed & known, patch.changed & known
+        if np.count_nonzero(ring) < 20 or not own.any():
+            continue
+        levels = np.log2(picture[..., :3].astype(np.float32) + 8.0)
+        spread = levels[ring].std(axis=0) + 0.1
+        contrast = np.median(levels[own], axis=0) - np.median(levels[ring], axis=0)
+        if float(np.abs(contrast / spread).max()) > _STANDS_OUT:
+            return True
+    return False

@@ -1,0 +1,138 @@
+"""Ground that changed as an area is one change with its outline; what light does to the same ground is none."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from sorvolo.change.areas.area_map import AreaMap, with_areas
+from sorvolo.change.shape.outlines import overlap
+from sorvolo.simulation.canvas import Area
+from sorvolo.simulation.ground import GroundKind, paint_ground
+from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
+
+M_PER_PX = 0.05
+VIEW_PX = 640, 480  # 32 x 24 m
+REPAVED_M = np.array([[22.0, -18.0], [42.0, -18.0], [42.0, -28.0], [22.0, -28.0]])  # 20 x 10 m
+
+Rgb = np.ndarray
+
+
+def painted(kind: GroundKind, seed: int) -> Rgb:
+    """64 x 48 m of ground, north up, its north west corner at the site's origin."""
+    return paint_ground(kind, Area(0.0, -48.0, 64.0, 0.0), M_PER_PX, np.random.default_rng(seed)).raster.rgb.copy()
+
+
+@pytest.fixture(scope="module")
+def grass() -> Rgb:
+    return painted(GroundKind.COUNTRYSIDE, 1)
+
+
+def same_light(image: Rgb, index: int) -> Rgb:
+    return image
+
+
+def changes_of(before: Rgb, after: Rgb, light: Callable[[Rgb, int], Rgb] = same_light) -> tuple[Change, ...]:
+    """The areas that a flight of nine views finds; `light` gives a view's picture its light."""
+    areas, rng = AreaMap(), np.random.default_rng(3)
+    for index in range(9):
+        x, y = 300 * (index % 3), 220 * (index // 3)
+        part = np.s_[y : y + VIEW_PX[1], x : x + VIEW_PX[0]]
+        seen = light(after[part], index).astype(float) + rng.normal(0, 2.0, (*VIEW_PX[::-1], 3))
+        site_from_image = np.array([[M_PER_PX, 0, x * M_PER_PX], [0, -M_PER_PX, -y * M_PER_PX], [0, 0, 1.0]])
+        areas.add(ComparedView(
+            index, f"{index}", index * 10**9, site_from_image, np.array([x * M_PER_PX + 16, -y * M_PER_PX - 12, 40.0]),
+            np.clip(np.rint(seen), 0, 255).astype(np.uint8), before[part].copy(), np.ones(VIEW_PX[::-1], bool),
+            np.zeros(VIEW_PX[::-1], np.uint8), np.zeros((0, 4), np.int64), np.zeros(0), 0.4,
+        ))
+    return areas.conclude("b", 7)
+
+
+def laid(ground: Rgb, other: Rgb, outline_m: np.ndarray) -> Rgb:
+    """The ground with another one inside of an outline."""
+    inside = np.zeros(ground.shape[:2], np.uint8)
+    cv2.fillPoly(inside, [np.rint(outline_m / M_PER_PX * [1, -1]).astype(np.int32)], 255)
+    share = cv2.GaussianBlur(inside, (0, 0), 1.0)[..., None] / 255.0
+    return np.rint(ground * (1 - share) + other * share).astype(np.uint8)
+
+
+@pytest.mark.parametrize("kind", [GroundKind.URBAN, GroundKind.DIRT])
+def test_a_repaved_area_is_one_change_with_its_outline(grass, kind):
+    (found,) = changes_of(grass, laid(grass, painted(kind, 2), REPAVED_M))
+    assert found.kind is ChangeKind.AREA and found.id == "b-7" and found.score > 0.5
+    union, _ = overlap(found.outline_m, REPAVED_M)
+    assert union > 0.75
+    assert found.area_m2 == pytest.approx(200, rel=0.25) and found.length_m == pytest.approx(20, rel=0.15)
+    middle = found.patch.changed.shape[0] // 2, found.patch.changed.shape[1] // 2
+    assert found.patch.changed[middle] and found.patch.before[middle][3] == found.patch.after[middle][3] == 255
+    assert np.abs(found.patch.before[middle][:3].astype(int) - found.patch.after[middle][:3]).max() > 15
+
+
+def test_an_area_far_larger_than_a_view_is_one_change(grass):
+    road_m = np.array([[3.0, -18.0], [61.0, -26.0], [61.0, -34.0], [3.0, -26.0]])
+    (found,) = changes_of(grass, laid(grass, painted(GroundKind.SAND, 2), road_m))
+    assert overlap(found.outline_m, road_m)[0] > 0.8
+
+
+def exposure(image: Rgb, index: int) -> Rgb:
+    """Another gain, gamma and white balance in each view."""
+    gain = np.array([1.0, 0.95, 0.85]) * (0.6 + 0.12 * index)
+    return np.clip(255 * (image / 255.0) ** (0.8 + 0.05 * index) * gain, 0, 255)
+
+
+def cloud(image: Rgb, index: int) -> Rgb:
+    """A shadow of a cloud whose rim is metres wide moves through the views, and is bluer than the sun."""
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    share = 1 / (1 + np.exp(-(np.hypot(x - 60 * index, y - 240) - 190) / 25.0))[..., None]
+    return image * (share + (1 - share) * np.array([0.40, 0.44, 0.52]))
+
+
+def evening(image: Rgb, index: int) -> Rgb:
+    """The sun is lower and yellower, less so in one corner."""
+    slope = np.linspace(0.55, 1.1, image.shape[1])[None, :, None]
+    return np.clip(image * slope * [1.12, 1.0, 0.8], 0, 255)
+
+
+def cast_shadow(image: Rgb, index: int) -> Rgb:
+    """A wall's shadow with a sharp rim lies where it did not."""
+    shaded = image.astype(float)
+    shaded[120:330] *= [0.30, 0.34, 0.42]
+    return shaded
+
+
+@pytest.mark.parametrize("light", [exposure, cloud, evening, cast_shadow])
+@pytest.mark.parametrize("kind", [GroundKind.COUNTRYSIDE, GroundKind.DIRT, GroundKind.URBAN])
+def test_light_is_no_change(kind, light):
+    ground = painted(kind, 1)
+    assert changes_of(ground, ground, light) == ()
+
+
+@pytest.mark.parametrize("light", [exposure, cloud])
+def test_an_area_is_found_in_other_light(grass, light):
+    found = changes_of(grass, laid(grass, painted(GroundKind.URBAN, 2), REPAVED_M), light)
+    assert len(found) == 1 and overlap(found[0].outline_m, REPAVED_M)[0] > 0.7
+
+
+def test_the_last_bit_of_misalignment_is_no_change(grass):
+    moved = np.roll(grass, (2, -2), axis=(0, 1))
+    assert changes_of(grass, moved) == ()
+
+
+def test_what_is_part_of_an_area_is_not_reported_beside_it(grass):
+    (area,) = changes_of(grass, laid(grass, painted(GroundKind.URBAN, 2), REPAVED_M))
+    ground = np.full((60, 60, 4), 255, np.uint8)
+    ground[..., :3] = np.random.default_rng(0).normal(110, 8, (60, 60, 3)).clip(0, 255)
+    inside = np.zeros((60, 60), bool)
+    inside[20:40, 20:40] = True
+    thing = ground.copy()
+    thing[inside, :3] = 230
+    plain = Patch(29.0, -21.0, 0.05, ground, ground, inside)
+    outline_m = np.array([[30.0, -22.0], [31.0, -22.0], [31.0, -23.0], [30.0, -23.0]])
+    part = replace(area, id="b-1", kind=ChangeKind.REPLACED, outline_m=outline_m, patch=plain)
+    car = replace(part, id="b-2", patch=replace(plain, after=thing))
+    beside = replace(part, id="b-3", outline_m=outline_m + np.array([20.0, 0.0]), patch=replace(plain, west_m=49.0))
+    assert [each.id for each in with_areas([part, car, beside], [area])] == ["b-2", "b-3", "b-7"]
+    stack = replace(car, id="b-4", outline_m=area.outline_m)
+    assert [each.id for each in with_areas([stack], [area])] == ["b-4"]
