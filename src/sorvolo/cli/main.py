@@ -28,6 +28,7 @@ from sorvolo.cli.plan import plan
 from sorvolo.cli.review import review
 from sorvolo.cli.search import search_command
 from sorvolo.cli.simulate import simulate
+from sorvolo.cli.telemetry import telemetry_command
 from sorvolo.cli.train import train
 from sorvolo.cli.watch import watch_command
 from sorvolo.errors import SorvoloError, SorvoloWarning
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
 _COMMANDS: dict[str, Callable[..., None]] = {
     "inspect": inspect, "plan": plan, "map": map_command, "compare": compare, "watch": watch_command,
-    "search": search_command, "simulate": simulate, "train": train,
+    "search": search_command, "telemetry": telemetry_command, "simulate": simulate, "train": train,
     "calibrate": calibrate, "demo": demo, "history": history, "review": review,
     "heights": heights,
 }

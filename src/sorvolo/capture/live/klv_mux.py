@@ -1,0 +1,100 @@
+"""KLV put into a video: its pictures and sound copied as they are into a transport stream, the metadata beside them."""
+
+from collections.abc import Sequence
+from fractions import Fraction
+from math import isnan, nan
+from pathlib import Path
+
+import av
+
+from sorvolo.capture.live.klv import encode
+from sorvolo.capture.live.klv_telemetry import klv_streams
+from sorvolo.errors import InputError
+from sorvolo.survey.corrected import CorrectedFrame
+
+_CLOCK = Fraction(1, 90_000)
+_COPIED = ("h264", "hevc", "mpeg2video", "mpeg4", "av1")  # pictures that a transport stream holds
+
+
+def mux_klv(video: Path, target: Path, samples: Sequence[CorrectedFrame], height_reference: str) -> None:
+    """Write `target`, an MPEG transport stream with the video's own packets and these samples as MISB ST 0601.
+
+    Nothing is encoded anew; metadata streams of the video are left out. `samples` are in order of time, `video_s` from
+    the first frame. Raises InputError for a file that is no video, or whose pictures no transport stream holds.
+    """
+    try:
+        with av.open(f"file:{video}", options={"protocol_whitelist": "file"}) as source:
+            if not source.streams.video:
+                raise InputError(f"{video}: no pictures in it; KLV is written into videos")
+            pictures = source.streams.video[0]
+            if pictures.codec_context.name not in _COPIED:
+                raise InputError(
+                    f"{video}: pictures in {pictures.codec_context.name} do not go into a transport stream as they are;"
+                    f" {', '.join(_COPIED)} do"
+                )
+            _copy(source, pictures, target, samples, height_reference)
+    except av.FFmpegError as error:
+        raise InputError(f"{video}: cannot be copied into a transport stream ({error})") from error
+
+
+def packet_of(sample: CorrectedFrame, height_reference: str) -> bytes:
+    """The local set of one sample.
+
+    The camera is given as a sensor on a level platform that heads where the camera looks: receivers find the camera's
+    own angles from the two together.
+    """
+    values = {
+        "platform_heading_deg": sample.yaw_deg % 360, "platform_pitch_deg": 0.0, "platform_roll_deg": 0.0,
+        "sensor_latitude_deg": sample.latitude_deg, "sensor_longitude_deg": (sample.longitude_deg + 180) % 360 - 180,
+        "sensor_horizontal_fov_deg": sample.horizontal_fov_deg, "sensor_vertical_fov_deg": sample.vertical_fov_deg,
+        "sensor_relative_azimuth_deg": 0.0, "sensor_relative_elevation_deg": sample.pitch_deg,
+        "sensor_relative_roll_deg": sample.roll_deg % 360,
+    }
+    ground_m = sample.height_m - sample.above_ground_m
+    if height_reference == "ellipsoidal":
+        values |= {
+            "sensor_ellipsoid_height_m": sample.height_m, "sensor_ellipsoid_height_extended_m": sample.height_m,
+            "frame_center_ellipsoid_height_m": ground_m,
+        }
+    elif height_reference == "orthometric":
+        values |= {"sensor_true_altitude_m": sample.height_m, "frame_center_elevation_m": ground_m}
+    return encode(sample.time_ns, values)
+
+
+def _copy(
+    source: av.container.InputContainer, pictures: av.VideoStream, target: Path, samples: Sequence[CorrectedFrame],
+    height_reference: str,
+) -> None:
+    known = [pictures, *source.streams.audio]
+    metadata = klv_streams(source)
+    with av.open(str(target), "w", format="mpegts") as output:
+        copies = {stream.index: output.add_stream_from_template(stream) for stream in known if stream not in metadata}
+        data = output.add_data_stream("klv")
+        waiting, first_s = list(samples), nan
+        for packet in source.demux(known):
+            if packet.dts is None:
+                continue
+            now_s = _seconds(packet)
+            if packet.stream.index == pictures.index and isnan(first_s):
+                first_s = now_s
+            while waiting and first_s + waiting[0].video_s <= now_s:
+                _mux(output, data, waiting.pop(0), first_s, height_reference)
+            packet.stream = copies[packet.stream.index]
+            output.mux(packet)
+        for sample in waiting:
+            _mux(output, data, sample, 0.0 if isnan(first_s) else first_s, height_reference)
+
+
+def _seconds(packet: av.Packet) -> float:
+    stamp = packet.pts if packet.pts is not None else packet.dts
+    return float((stamp or 0) * (packet.time_base or _CLOCK))
+
+
+def _mux(
+    output: av.container.OutputContainer, stream: av.stream.Stream, sample: CorrectedFrame, first_s: float,
+    height_reference: str,
+) -> None:
+    packet = av.Packet(packet_of(sample, height_reference))
+    stamp = max(0, round((first_s + sample.video_s) / _CLOCK))
+    packet.stream, packet.time_base, packet.pts, packet.dts = stream, _CLOCK, stamp, stamp
+    output.mux(packet)

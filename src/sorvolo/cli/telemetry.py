@@ -1,0 +1,82 @@
+"""`sorvolo telemetry`: a mapped flight's telemetry corrected by its map, and in words what was wrong with it."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from sorvolo.cli.options import AsJson, Camera
+from sorvolo.cli.shown import show_path
+from sorvolo.errors import SettingsError
+
+_Site = Annotated[Path | None, typer.Option(help="Folder of the map that the flight is in, or is mapped into first.")]
+_Flight = Annotated[str, typer.Option(help="Flight of the map.", show_default="its only one")]
+_Log = Annotated[str, typer.Option(help="The flight's log if it is not beside the video.")]
+_Out = Annotated[Path | None, typer.Option(help="Folder for results.", show_default="SITE-telemetry/FLIGHT")]
+
+
+def telemetry_command(
+    source: Annotated[Path, typer.Argument(help="A flight (video, folder of photos), with --site; or a map's folder.")],
+    site: _Site = None,
+    flight: _Flight = "",
+    telemetry: _Log = "",
+    camera: Camera = "",
+    out: _Out = None,
+    as_json: AsJson = False,
+) -> None:
+    """Correct a flight's telemetry by its map, and report what was wrong: compass, clock, heights.
+
+    Writes geo.txt (OpenDroneMap), track.gpx, track.csv, cot.xml (Cursor on Target with the camera's field of view), and
+    for a video the same pictures as a transport stream with corrected KLV (MISB ST 0601). Nothing is encoded anew.
+
+    Example: sorvolo telemetry DJI_0042.MP4 --site field
+
+    Example: sorvolo telemetry field --flight DJI_0042
+    """
+    from sorvolo.missions.telemetry.doctor import correct_telemetry
+    from sorvolo.store.site.files import CATALOGUE
+
+    is_site = (source / CATALOGUE).is_file()
+    if is_site == (site is not None):
+        raise SettingsError("give a flight and --site FOLDER, or the folder of a map alone")
+    folder = source if site is None else site
+    if site is not None:
+        _map_if_new(source, site, telemetry, camera)
+    target = out or folder.with_name(f"{folder.resolve().name}-telemetry") / (flight or source.stem)
+    report = correct_telemetry(
+        folder, target, flight=flight, source=None if is_site else source, telemetry=telemetry or None,
+        camera=camera or None,
+    )
+    if as_json:
+        typer.echo(json.dumps({"folder": str(target), **report}, indent=1))
+    else:
+        _show(report, target, Console())
+
+
+def _show(report: Mapping[str, Any], target: Path, console: Console) -> None:
+    console.print(f"Telemetry of {escape(report['flight'])}, {report['frames']} frames", style="bold", highlight=False)
+    for sentence in report["sentences"]:
+        console.print(f"  {sentence}", highlight=False, soft_wrap=True)
+    for warning in report["warnings"]:
+        console.print(f"[yellow]warning[/yellow]  {escape(warning)}", highlight=False)
+    for name in report["files"]:
+        show_path("written", target / name, console)
+
+
+def _map_if_new(source: Path, site: Path, telemetry: str, camera: str) -> None:
+    """Map the flight where the site does not have it yet."""
+    from sorvolo.capture.source import opened_sources
+    from sorvolo.cli.map import map_and_read_reports
+    from sorvolo.missions.flight.settings import MapSettings
+    from sorvolo.missions.flight.setup import known_flights
+
+    with opened_sources([source], telemetry or None, camera or None, known_flights(site)) as sources:
+        is_known = sources[0].name in known_flights(site)
+    if not is_known:
+        map_and_read_reports(
+            [source], site, MapSettings(model="none"), telemetry=telemetry or None, camera=camera or None
+        )

@@ -1,0 +1,1 @@
+"""Corrected telemetry: what the map knows of the camera better than the log."""

@@ -1,0 +1,196 @@
+"""`sorvolo telemetry`: a mapped flight's telemetry corrected by its map, and what was wrong with it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from math import isfinite, nan
+from pathlib import Path
+from typing import Any
+
+from sorvolo.capture.correction import corrected_poses, even_times_s, path_scale, rescaled, telemetry_faults
+from sorvolo.capture.live.klv_mux import mux_klv
+from sorvolo.capture.source import Source, opened_sources
+from sorvolo.capture.video import VideoSource
+from sorvolo.errors import InputError
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.pose import Pose, gimbal_angles_from_rotation
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.flight.setup import FlightSetup, prepare
+from sorvolo.missions.telemetry.words import fault_sentences
+from sorvolo.store.atomic import atomic_path, atomic_write_bytes, writing
+from sorvolo.store.exports.places import longitude_latitude
+from sorvolo.store.exports.plain import json_bytes, plain_json
+from sorvolo.store.exports.telemetry_files import cot_track, geo_txt, track_csv, track_gpx
+from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue import StoredKeyframe
+from sorvolo.survey.corrected import Bias, CorrectedFrame, TelemetryFaults
+from sorvolo.survey.flight import Site
+from sorvolo.survey.mosaic import Status
+
+_KLV_STEP_S = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """A frame that has a camera, and when it was taken, seconds into the flight."""
+
+    stored: StoredKeyframe
+    pose: Pose
+    seconds: float
+
+
+def correct_telemetry(
+    site_folder: Path, folder: Path, *, flight: str = "", source: Path | None = None, telemetry: str | None = None,
+    camera: str | None = None,
+) -> dict[str, Any]:
+    """Write a flight's corrected telemetry into `folder`; the report, which telemetry.json holds as well.
+
+    Without `flight` it is the site's only one, or that of `source`. With `source`, the flight's video or photos, its
+    own telemetry is compared with the map, and a video is written again as a transport stream with corrected metadata.
+    Raises InputError for a site without GPS, a flight that it has not, and a source of another flight.
+    """
+    with Archive.open(site_folder, write=False) as archive:
+        site = archive.site()
+        if site.is_local:
+            raise InputError(f"{site_folder} was mapped without GPS: its cameras have no place on Earth to write down")
+        if source is None:
+            name = _flight(archive, flight)
+            return _written(archive, site, name, folder, _solved(archive, name, 0), None, None)
+        with opened_sources([source], telemetry, camera) as sources:
+            opened = sources[0]
+            name = _flight(archive, flight or opened.name)
+            setup = prepare(opened, MapSettings(), site, telemetry_named=telemetry is not None)
+            solved = _solved(archive, name, _first_ns(setup))
+            solved, faults = _judged(setup, solved, archive.report(name))
+            return _written(archive, site, name, folder, solved, setup, faults)
+
+
+def _flight(archive: Archive, wanted: str) -> str:
+    known = [each.id for each in archive.flights() if archive.keyframes(each.id)]
+    if wanted and wanted not in known:
+        raise InputError(f"{archive.folder} has no flight {wanted!r}, only {', '.join(known) or 'none'}: map it first")
+    if not wanted and len(known) != 1:
+        raise InputError(f"{archive.folder} has the flights {', '.join(known) or 'none'}; choose one with --flight")
+    return wanted or known[0]
+
+
+def _first_ns(setup: FlightSetup) -> int:
+    """The UTC of the flight's first frame, from which its seconds count."""
+    return setup.utc_ns(setup.source.start_ns)
+
+
+def _solved(archive: Archive, name: str, first_ns: int) -> list[_Solved]:
+    stored = [each for each in archive.keyframes(name) if each.status is not Status.REJECTED]
+    begin_ns = first_ns or min((each.time_ns for each in stored), default=0)
+    solved = [
+        _Solved(each, each.site_from_camera, (each.time_ns - begin_ns) / 1e9)
+        for each in stored if each.site_from_camera is not None
+    ]
+    if not solved:
+        raise InputError(f"no frame of {name} has a camera in space; map it with --method planar")
+    return sorted(solved, key=lambda each: each.seconds)
+
+
+def _judged(
+    setup: FlightSetup, solved: Sequence[_Solved], report: Mapping[str, Any]
+) -> tuple[list[_Solved], TelemetryFaults]:
+    """The cameras in the fixes' own scale, and what was wrong with the telemetry by the frames that pictures placed."""
+    track = setup.telemetry
+    seen = [number for number, each in enumerate(solved) if each.stored.status is Status.VISION]
+    if track is None or not seen:
+        raise InputError("no frame of the flight was placed by its pictures: telemetry has nothing to be compared with")
+    clock, applied_s = _clock(report)
+    priors = track.priors([solved[k].seconds for k in seen], applied_s, setup.plan.smooth_s)
+    scale = path_scale(priors, [solved[k].pose for k in seen])
+    poses = rescaled([each.pose for each in solved], scale)
+    faults = telemetry_faults(priors, [poses[k] for k in seen], clock, scale, knows_height=track.knows_ground)
+    return [replace(each, pose=pose) for each, pose in zip(solved, poses)], faults
+
+
+def _clock(report: Mapping[str, Any]) -> tuple[Bias, float]:
+    """The clock offset that the map found, and the one that it applied, s."""
+    offset = report.get("time_offset") or {}
+    value, sigma = (nan if offset.get(key) is None else float(offset[key]) for key in ("estimate_s", "sigma_s"))
+    return Bias(value, sigma), float(offset.get("applied_s") or 0.0)
+
+
+def _written(
+    archive: Archive, site: Site, name: str, folder: Path, solved: Sequence[_Solved], setup: FlightSetup | None,
+    faults: TelemetryFaults | None,
+) -> dict[str, Any]:
+    frames = [_frame(each, site) for each in solved]
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    texts = {
+        "geo.txt": geo_txt(frames).encode(), "track.csv": track_csv(frames, site.height_reference).encode(),
+        "track.gpx": track_gpx(frames, name),
+        "cot.xml": cot_track(frames, name, is_ellipsoidal=site.height_reference == "ellipsoidal"),
+    }
+    for file, text in texts.items():
+        atomic_write_bytes(folder / file, text)
+    files = [*texts]
+    if setup is not None and (video := _video(setup.source)) is not None:
+        _, applied_s = _clock(archive.report(name))
+        with atomic_path(folder / f"{name}.ts") as temporary:
+            mux_klv(video, temporary, _samples(setup, solved, site, applied_s), site.height_reference)
+        files.append(f"{name}.ts")
+    report = dict(plain_json({
+        "flight": name, "site": site.name, "frames": len(frames), "height_reference": site.height_reference,
+        "faults": None if faults is None else asdict(faults),
+        "sentences": [] if faults is None else fault_sentences(faults), "files": files,
+        "warnings": _warnings(site),
+    }))
+    atomic_write_bytes(folder / "telemetry.json", json_bytes(report))
+    return report
+
+
+def _video(source: Source) -> Path | None:
+    """The video file of a flight; None for photos."""
+    return source.info.path if isinstance(source, VideoSource) else None
+
+
+def _samples(
+    setup: FlightSetup, solved: Sequence[_Solved], site: Site, applied_s: float
+) -> list[CorrectedFrame]:
+    """The corrected camera five times a second, by the telemetry between the solved frames."""
+    assert setup.telemetry is not None  # faults were found
+    key_s = [each.seconds for each in solved]
+    times_s = even_times_s(key_s, _KLV_STEP_S)
+    key_priors = setup.telemetry.priors(key_s, applied_s, setup.plan.smooth_s)
+    priors = setup.telemetry.priors(times_s, applied_s, setup.plan.smooth_s)
+    poses = corrected_poses(times_s, priors, key_s, key_priors, [each.pose for each in solved])
+    stored, first_ns = solved[0].stored, _first_ns(setup)
+    return [
+        _row("", number, first_ns + round(time_s * 1e9), time_s, pose, stored.camera, nan, "interpolated", site)
+        for number, (time_s, pose) in enumerate(zip(times_s, poses))
+    ]
+
+
+def _frame(each: _Solved, site: Site) -> CorrectedFrame:
+    stored = each.stored
+    return _row(
+        stored.name, stored.index, stored.time_ns, each.seconds, each.pose, stored.camera, stored.sigma_m,
+        stored.status.value, site,
+    )
+
+
+def _row(
+    name: str, index: int, time_ns: int, seconds: float, pose: Pose, camera: Camera, sigma_m: float, status: str,
+    site: Site,
+) -> CorrectedFrame:
+    longitudes, latitudes = longitude_latitude(pose.translation_m[None], site)
+    yaw_deg, pitch_deg, roll_deg = gimbal_angles_from_rotation(pose.rotation)
+    up_m = float(pose.translation_m[2])
+    across_deg, along_deg = camera.angle_of_view_deg
+    return CorrectedFrame(
+        name, index, time_ns, seconds, float(latitudes[0]), float(longitudes[0]), site.origin.height_m + up_m, up_m,
+        yaw_deg, pitch_deg, roll_deg, sigma_m if isfinite(sigma_m) else nan, across_deg, along_deg, status,
+    )
+
+
+def _warnings(site: Site) -> list[str]:
+    if site.height_reference in ("ellipsoidal", "orthometric"):
+        return []
+    return [
+        f"heights are {site.height_reference}: geo.txt, GPX and CSV hold them as such, and KLV and Cursor on Target "
+        "leave the height out, since both want it above the ellipsoid or the sea"
+    ]

@@ -1,0 +1,114 @@
+"""A flight's corrected telemetry for other programs: ODM's geo.txt, GPX, CSV, Cursor on Target."""
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from xml.etree.ElementTree import Element, SubElement, tostring
+
+from sorvolo.store.exports.plain import utc_text
+from sorvolo.survey.corrected import CorrectedFrame
+
+_UNKNOWN_M = "9999999.0"
+_DRONE = "a-f-A-M-H-Q"  # friendly, air, military, rotary wing, unmanned: how TAK shows small drones
+_STALE_NS = 30_000_000_000
+_EARTH_M = 6_371_000.0
+
+
+def geo_txt(frames: Sequence[CorrectedFrame]) -> str:
+    """OpenDroneMap's image geolocation file: name, longitude, latitude, height, yaw, pitch, roll, two accuracies.
+
+    ODM counts the pitch from straight down. A name with spaces would end its column early: these become underscores.
+    """
+    rows = ["EPSG:4326"]
+    for each in frames:
+        sigma = "" if math.isnan(each.sigma_m) else f" {each.sigma_m:.3f} {1.5 * each.sigma_m:.3f}"
+        rows.append(
+            f"{each.name.replace(' ', '_')} {each.longitude_deg:.9f} {each.latitude_deg:.9f} {each.height_m:.3f} "
+            f"{each.yaw_deg:.3f} {each.pitch_deg + 90:.3f} {each.roll_deg:.3f}{sigma}"
+        )
+    return "\n".join(rows) + "\n"
+
+
+def track_csv(frames: Sequence[CorrectedFrame], height_reference: str) -> str:
+    """One line for each frame; the header names what heights count from."""
+    text = io.StringIO()
+    names = list(asdict(frames[0])) if frames else []
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*(name for name in names if name != "time_ns"), "utc", "height_reference"])
+    for each in frames:
+        row = {name: value for name, value in asdict(each).items() if name != "time_ns"}
+        plain = ["" if isinstance(value, float) and math.isnan(value) else value for value in row.values()]
+        writer.writerow([*plain, utc_text(each.time_ns), height_reference])
+    return text.getvalue()
+
+
+def track_gpx(frames: Sequence[CorrectedFrame], name: str) -> bytes:
+    """A GPX 1.1 track; each point's description has its sigma."""
+    gpx = Element("gpx", {"version": "1.1", "creator": "sorvolo", "xmlns": "http://www.topografix.com/GPX/1/1"})
+    track = SubElement(gpx, "trk")
+    SubElement(track, "name").text = name
+    segment = SubElement(track, "trkseg")
+    for each in frames:
+        point = SubElement(segment, "trkpt", {"lat": f"{each.latitude_deg:.9f}", "lon": f"{_wrapped(each):.9f}"})
+        SubElement(point, "ele").text = f"{each.height_m:.3f}"
+        SubElement(point, "time").text = utc_text(each.time_ns)
+        SubElement(point, "name").text = each.name
+        if not math.isnan(each.sigma_m):
+            SubElement(point, "desc").text = f"position accuracy {each.sigma_m:.2f} m (1 sigma)"
+    return b'<?xml version="1.0" encoding="UTF-8"?>\n' + bytes(tostring(gpx, encoding="utf-8")) + b"\n"
+
+
+def cot_track(frames: Sequence[CorrectedFrame], name: str, *, is_ellipsoidal: bool) -> bytes:
+    """A Cursor on Target event a line for each frame: the drone, its course, and its camera's field of view.
+
+    `<sensor>` has the azimuth of the view, its angles across (`fov`) and along (`vfov`), the elevation (-90 is down)
+    and the distance to the ground along the axis, metres.
+    """
+    lines = []
+    for number, each in enumerate(frames):
+        event = Element("event", {
+            "version": "2.0", "uid": f"sorvolo.{name}", "type": _DRONE, "how": "m-g", "time": _moment(each.time_ns),
+            "start": _moment(each.time_ns), "stale": _moment(each.time_ns + _STALE_NS),
+        })
+        SubElement(event, "point", {
+            "lat": f"{each.latitude_deg:.7f}", "lon": f"{_wrapped(each):.7f}",
+            "hae": f"{each.height_m:.1f}" if is_ellipsoidal else _UNKNOWN_M,
+            "ce": _UNKNOWN_M if math.isnan(each.sigma_m) else f"{each.sigma_m:.1f}", "le": _UNKNOWN_M,
+        })
+        detail = SubElement(event, "detail")
+        SubElement(detail, "contact", {"callsign": name})
+        SubElement(detail, "sensor", _sensor(each))
+        if number:
+            SubElement(detail, "track", _course(frames[number - 1], each))
+        SubElement(detail, "remarks").text = f"frame {each.name}, corrected by Sorvolo"
+        lines.append(bytes(tostring(event, encoding="utf-8")))
+    return b"\n".join(lines) + b"\n"
+
+
+def _sensor(each: CorrectedFrame) -> dict[str, str]:
+    down = math.sin(math.radians(-each.pitch_deg))
+    return {
+        "azimuth": f"{each.yaw_deg % 360:.1f}", "elevation": f"{each.pitch_deg:.1f}", "roll": f"{each.roll_deg:.1f}",
+        "fov": f"{each.horizontal_fov_deg:.1f}", "vfov": f"{each.vertical_fov_deg:.1f}",
+        "range": f"{each.above_ground_m / down:.0f}" if down > 0.05 else "0", "model": "camera", "type": "r-e",
+        "version": "0.6",
+    }
+
+
+def _course(before: CorrectedFrame, now: CorrectedFrame) -> dict[str, str]:
+    latitude = math.radians(now.latitude_deg)
+    east_m = math.radians(now.longitude_deg - before.longitude_deg) * _EARTH_M * math.cos(latitude)
+    north_m = (latitude - math.radians(before.latitude_deg)) * _EARTH_M
+    passed_s = (now.time_ns - before.time_ns) / 1e9
+    speed = math.hypot(east_m, north_m) / passed_s if passed_s > 0 else 0.0
+    return {"course": f"{math.degrees(math.atan2(east_m, north_m)) % 360:.1f}", "speed": f"{speed:.2f}"}
+
+
+def _wrapped(each: CorrectedFrame) -> float:
+    return (each.longitude_deg + 180) % 360 - 180
+
+
+def _moment(time_ns: int) -> str:
+    return utc_text(time_ns)[:23] + "Z"
