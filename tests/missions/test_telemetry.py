@@ -133,7 +133,8 @@ def test_files_for_other_programs_hold_the_same_places(corrected: tuple[dict[str
         assert float(pitch) == pytest.approx(float(row["pitch_deg"]) + 90, abs=1e-2)
     space = {"g": "http://www.topografix.com/GPX/1/1"}
     points = ElementTree.parse(out / "track.gpx").getroot().findall(".//g:trkpt", space)
-    assert [float(each.get("lat", "0")) for each in points] == pytest.approx([float(row["latitude_deg"]) for row in rows])
+    latitudes = [float(row["latitude_deg"]) for row in rows]
+    assert [float(each.get("lat", "0")) for each in points] == pytest.approx(latitudes)
     events = [ElementTree.fromstring(line) for line in (out / "cot.xml").read_bytes().splitlines()]
     assert len(events) == len(rows) and len({event.get("uid") for event in events}) == 1
     sensor = events[-1].find("detail/sensor")

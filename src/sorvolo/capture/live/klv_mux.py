@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from math import isnan, nan
 from pathlib import Path
+from typing import Any
 
 import av
 
@@ -71,9 +72,7 @@ def _copy(
         copies = {stream.index: output.add_stream_from_template(stream) for stream in known if stream not in metadata}
         data = output.add_data_stream("klv")
         waiting, first_s = list(samples), nan
-        for packet in source.demux(known):
-            if packet.dts is None:
-                continue
+        for packet in (each for each in source.demux(known) if each.dts is not None):
             now_s = _seconds(packet)
             if packet.stream.index == pictures.index and isnan(first_s):
                 first_s = now_s
@@ -85,7 +84,7 @@ def _copy(
             _mux(output, data, sample, 0.0 if isnan(first_s) else first_s, height_reference)
 
 
-def _seconds(packet: av.Packet) -> float:
+def _seconds(packet: Any) -> float:
     stamp = packet.pts if packet.pts is not None else packet.dts
     return float((stamp or 0) * (packet.time_base or _CLOCK))
 
