@@ -87,18 +87,26 @@ def _refuse_other_lens_models(file_name: str, nodes: Mapping[str, Node]) -> None
 def _matrix(file_name: str, nodes: Mapping[str, Node]) -> Matrix3:
     found = _first(nodes, _MATRIX_KEYS)
     if found is None:
-        numbers = [_first(nodes, (f"{name}px", name)) for name in ("fx", "fy", "cx", "cy")]
-        if any(not isinstance(each, float) for each in numbers):
-            raise InputError(
-                f"{file_name}: no camera matrix; a node such as camera_matrix (3 x 3), or fx, fy, cx and "
-                "cy, is needed"
-            )
-        fx, fy, cx, cy = (float(each) for each in numbers if isinstance(each, float))
-        found = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        return _checked_matrix(file_name, _matrix_of_names(file_name, nodes))
     matrix = np.asarray(found) if isinstance(found, np.ndarray) else np.zeros(0)
     if matrix.size != 9:
         raise InputError(f"{file_name}: the camera matrix must be 3 x 3, got shape {matrix.shape}")
-    matrix = matrix.reshape(3, 3)
+    return _checked_matrix(file_name, matrix.reshape(3, 3))
+
+
+def _matrix_of_names(file_name: str, nodes: Mapping[str, Node]) -> Matrix3:
+    numbers = [_first(nodes, (f"{name}px", name)) for name in ("fx", "fy", "cx", "cy")]
+    if any(not isinstance(each, float) for each in numbers):
+        raise InputError(
+            f"{file_name}: no camera matrix; a node such as camera_matrix (3 x 3), or fx, fy, cx and "
+            "cy, is needed"
+        )
+    fx, fy, cx, cy = (float(each) for each in numbers if isinstance(each, float))
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def _checked_matrix(file_name: str, matrix: Matrix3) -> Matrix3:
+    """The matrix (3, 3) as it is; raises InputError where it is no pinhole camera's without skew."""
     if not np.isfinite(matrix).all():
         raise InputError(f"{file_name}: the camera matrix holds a value that is no number")
     if not np.allclose(matrix[2], [0, 0, 1], atol=1e-6) or abs(matrix[1, 0]) > 1e-6:

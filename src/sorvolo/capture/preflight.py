@@ -100,16 +100,8 @@ def frame_facts(source: Source, glimpses: Sequence[Frame]) -> FrameFacts:
             camera.height_px, info.codec, info.container, info.path.stat().st_size, info.start_ns,
             info.start_origin, sharp, texture, _shared_view(glimpses),
         )
-    times_s, suffixes, container, size = np.zeros(0), "", "", 0
-    if isinstance(source, LiveSource):
-        times_s = np.array([frame.time_ns for frame in glimpses]) / _SECOND_NS
-    if isinstance(source, LiveStream):
-        suffixes, container = source.facts.codec, source.facts.container
-    if isinstance(source, PhotoSource):
-        photos = source.album.photos
-        times_s = np.array([photo.time_ns for photo in photos]) / _SECOND_NS
-        suffixes = ", ".join(sorted({photo.path.suffix.lower().lstrip(".") for photo in photos}))
-        size = sum(photo.path.stat().st_size for photo in photos)
+    suffixes, container, size = _file_facts(source)
+    times_s = _times_s(source, glimpses)
     return FrameFacts(
         source.frame_count, source.frame_rate_hz,
         _median(np.diff(times_s)) if source.kind == "photos" else math.nan,
@@ -117,6 +109,26 @@ def frame_facts(source: Source, glimpses: Sequence[Frame]) -> FrameFacts:
         suffixes, container, size, source.start_ns, source.start_origin, sharp, texture,
         math.nan,
     )
+
+
+def _file_facts(source: Source) -> tuple[str, str, int]:
+    """Codec or endings, container, and bytes of photos or of a stream; "" and 0 for what is not known."""
+    if isinstance(source, LiveStream):
+        return source.facts.codec, source.facts.container, 0
+    if not isinstance(source, PhotoSource):
+        return "", "", 0
+    photos = source.album.photos
+    suffixes = ", ".join(sorted({photo.path.suffix.lower().lstrip(".") for photo in photos}))
+    return suffixes, "", sum(photo.path.stat().st_size for photo in photos)
+
+
+def _times_s(source: Source, glimpses: Sequence[Frame]) -> Floats:
+    """(N,) when photos were taken, or when a live source's glimpses came; none where a source has no such times."""
+    if isinstance(source, LiveSource):
+        return np.array([frame.time_ns for frame in glimpses]) / _SECOND_NS
+    if isinstance(source, PhotoSource):
+        return np.array([photo.time_ns for photo in source.album.photos]) / _SECOND_NS
+    return np.zeros(0)
 
 
 def _shared_view(glimpses: Sequence[Frame]) -> float:

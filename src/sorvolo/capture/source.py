@@ -43,6 +43,9 @@ _SITE_MARK = "site.db"  # in a folder whose pictures are a map, no photos
 LiveSource = LiveStream | GrowingFolder
 """The sources that grow while they are read: their telemetry does, and frames come when they come."""
 
+BetterCamera = Callable[[CameraModel], CameraModel]
+"""The camera to use in place of the one that an input or a person gives."""
+
 
 class Source(Protocol):
     """One flight's frames and telemetry, wherever they come from."""
@@ -101,7 +104,7 @@ class Source(Protocol):
 def open_sources(
     inputs: Sequence[Path | str], telemetry: Path | str | None = None, camera: Path | str | None = None,
     known: Mapping[str, str] = MappingProxyType({}), *, live: LiveSettings = LiveSettings(),  # noqa: B008 (frozen)
-    until: threading.Event | None = None, better_camera: Callable[[CameraModel], CameraModel] | None = None,
+    until: threading.Event | None = None, better_camera: BetterCamera | None = None,
 ) -> list[Source]:
     """Each video, each folder of photos, all photos given one by one together, and each live source, as a flight.
 
@@ -119,11 +122,7 @@ def open_sources(
     addresses = [live_address(text) for text in map(str, inputs) if is_live_address(text)]
     videos, albums = _sort_inputs(_recorded(inputs))
     names = _distinct_names([*(path.resolve() for path in videos), *(album.place for album in albums)])
-    if telemetry is not None and len(names) + len(addresses) > 1:
-        raise InputError(
-            f"one telemetry file for {len(names) + len(addresses)} flights; map the flights one by one, or put each "
-            "telemetry file beside its video under the same name"
-        )
+    _demand_one_flight(telemetry, len(names) + len(addresses))
     log = _telemetry_file(telemetry, is_live=bool(addresses))
     sources: list[VideoSource | PhotoSource | LiveSource] = [
         *(_open_video(path, name, log, camera) for path, name in zip(videos, names)),
@@ -131,10 +130,23 @@ def open_sources(
         *(_open_live(address, telemetry, camera, live, until or threading.Event()) for address in addresses),
     ]
     _give_names(sources, known)
-    if better_camera is not None:
-        for each in sources:
-            each.camera = better_camera(each.camera)
+    _use_better_cameras(sources, better_camera)
     return list(sources)
+
+
+def _demand_one_flight(telemetry: Path | str | None, flights: int) -> None:
+    """Raises InputError where telemetry was given for more than one flight."""
+    if telemetry is not None and flights > 1:
+        raise InputError(
+            f"one telemetry file for {flights} flights; map the flights one by one, or put each telemetry file beside "
+            "its video under the same name"
+        )
+
+
+def _use_better_cameras(sources: Sequence[VideoSource | PhotoSource | LiveSource], better: BetterCamera | None) -> None:
+    if better is not None:
+        for each in sources:
+            each.camera = better(each.camera)
 
 
 def _recorded(inputs: Sequence[Path | str]) -> list[Path]:
@@ -149,7 +161,7 @@ def _recorded(inputs: Sequence[Path | str]) -> list[Path]:
 def opened_sources(
     inputs: Sequence[Path | str], telemetry: Path | str | None = None, camera: Path | str | None = None,
     known: Mapping[str, str] = MappingProxyType({}), *, live: LiveSettings = LiveSettings(),  # noqa: B008 (frozen)
-    until: threading.Event | None = None, better_camera: Callable[[CameraModel], CameraModel] | None = None,
+    until: threading.Event | None = None, better_camera: BetterCamera | None = None,
 ) -> Iterator[list[Source]]:
     """The same as `open_sources`; live sources are closed at the end, however it comes."""
     sources = open_sources(inputs, telemetry, camera, known, live=live, until=until, better_camera=better_camera)

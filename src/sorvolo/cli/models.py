@@ -44,26 +44,27 @@ def list_models(
     if as_json:
         typer.echo(json.dumps(rows, indent=1))
         return
-    console = Console()
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in ("name", "preset", "classes", "light", "numbers", "MB", "file"):
-        table.add_column(name, overflow="fold")
-    for row in rows:
-        if "error" in row:
-            continue
-        table.add_row(
-            escape(row["name"]), escape(row["preset"]), escape(", ".join(row["classes"])),
-            _light(row), row["precision"], f"{row['bytes'] / 1e6:.1f}",
-            "with the package" if row["is_packaged"] else escape(row["path"]),
-        )
-    if table.rows:
-        console.print(table)
+    _show_rows([row for row in rows if "error" not in row])
     for row in rows:
         if "error" in row:  # below the table: no column is wide enough for the reason
             typer.echo(f"{row['name']} cannot be used: {row['error']}")
     if not rows:
         typer.echo(f"no models are installed; put your own into {models_folder()}")
     _show_hidden()
+
+
+def _show_rows(rows: Sequence[Mapping[str, Any]]) -> None:
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in ("name", "preset", "classes", "light", "numbers", "MB", "file"):
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        table.add_row(
+            escape(row["name"]), escape(row["preset"]), escape(", ".join(row["classes"])),
+            _light(row), row["precision"], f"{row['bytes'] / 1e6:.1f}",
+            "with the package" if row["is_packaged"] else escape(row["path"]),
+        )
+    if rows:
+        Console().print(table)
 
 
 def _show_hidden() -> None:
@@ -141,16 +142,11 @@ def verify(
 
     Example of a file: sorvolo models verify coast.onnx --sha256 9f86d081884c7d65...
     """
-    from sorvolo.detection.models import InstalledModel, find_model, installed_models
     from sorvolo.missions.model_files import parse_sha256
 
-    if model:
-        path = find_model(model)
-        chosen = [each for each in installed_models() if each.path == path] or [InstalledModel(path.stem, path, False)]
-    else:
-        chosen = installed_models()
     if sha256 and not model:
         raise typer.BadParameter("name the model that has this hash", param_hint="--sha256")
+    chosen = _chosen(model)
     wanted = parse_sha256(sha256) if sha256 else ""
     all_good = _verify_each(chosen, wanted)
     if not chosen:
@@ -159,6 +155,16 @@ def verify(
         _show_hidden()
     if not all_good:
         raise typer.Exit(1)
+
+
+def _chosen(model: str) -> Sequence["InstalledModel"]:
+    """The model of this name or file, all that are installed without one."""
+    from sorvolo.detection.models import InstalledModel, find_model, installed_models
+
+    if not model:
+        return installed_models()
+    path = find_model(model)
+    return [each for each in installed_models() if each.path == path] or [InstalledModel(path.stem, path, False)]
 
 
 def _verify_each(models: Sequence["InstalledModel"], sha256: str) -> bool:

@@ -108,9 +108,7 @@ def messages_in(data: bytes, counts: Counter[str]) -> list[Any]:
 
 def epochs_of(messages: list[Any]) -> tuple[list[Epoch], bool]:
     """The sentences by moment, in the file's order, and whether any of them states the date."""
-    dated = [message for message in messages if isinstance(getattr(message, "date", None), date)]
-    # a receiver without a fix often invents its date
-    trusted = [message for message in dated if message.status == "A"] or dated
+    trusted = _dated(messages)
     days = {id(message) for message in trusted}
     now_ns = _stamp(trusted[0]) if trusted else _time_of_day_ns(messages[0])
     epochs: list[Epoch] = []
@@ -122,6 +120,12 @@ def epochs_of(messages: list[Any]) -> tuple[list[Epoch], bool]:
         _add(epochs[-1], message)
     _forget_without_fix(epochs)
     return epochs, bool(trusted)
+
+
+def _dated(messages: list[Any]) -> list[Any]:
+    """The sentences whose date can be trusted: a receiver without a fix often invents its date."""
+    dated = [message for message in messages if isinstance(getattr(message, "date", None), date)]
+    return [message for message in dated if message.status == "A"] or dated
 
 
 def _forget_without_fix(epochs: list[Epoch]) -> None:

@@ -94,30 +94,39 @@ def export_version(site: Path, at: str | None, path: Path, *, compress: str = "d
     Returns the version. Raises SettingsError for another ending, InputError when there was no map or the file's
     folder does not exist, StoreError on a full disk.
     """
-    ending = path.suffix.lower()
-    if ending not in _ENDINGS:
-        raise SettingsError(f"{path.name}: the map is written as .tif, .png or .kmz; end the file's name so")
-    if not path.resolve().parent.is_dir():
-        raise InputError(f"no folder {path.resolve().parent} to write {path.name} to; make it first")
-    if path.is_dir():
-        raise InputError(f"{path} is a folder, a file was needed; choose another name")
+    _check_target(path)
     with Archive.open(site, write=False) as archive:
         complete = [version for version in archive.versions() if version.complete]
         if not complete:
             raise InputError(f"{site} has no map yet; map a flight into it first")
         version = complete[-1] if at is None else find_version(archive, at)
-        tiles, current = archive.tiles(version.id), archive.site()
-        if not tiles:
-            raise StoreError(f"version {version.id} of the map of {site} is empty; there is nothing to write")
-        if ending == ".png":
-            write_preview(tiles, path)
-        elif ending == ".kmz":
-            if current.is_local:
-                raise SettingsError(f"{site} has no place on Earth, so its map cannot be a KMZ; write .tif or .png")
-            write_kmz(tiles, archive.site_grid(), current.name, path)
-        else:
-            write_cog(tiles, archive.site_grid(), path, crs=version.export_crs or None, compress=compress)
+        _write_map(archive, version, path, compress)
     return version
+
+
+def _check_target(path: Path) -> None:
+    """Raises SettingsError or InputError where no map can be written to the path."""
+    if path.suffix.lower() not in _ENDINGS:
+        raise SettingsError(f"{path.name}: the map is written as .tif, .png or .kmz; end the file's name so")
+    if not path.resolve().parent.is_dir():
+        raise InputError(f"no folder {path.resolve().parent} to write {path.name} to; make it first")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder, a file was needed; choose another name")
+
+
+def _write_map(archive: Archive, version: VersionEntry, path: Path, compress: str) -> None:
+    tiles, site = archive.tiles(version.id), archive.site()
+    if not tiles:
+        raise StoreError(f"version {version.id} of the map of {archive.folder} is empty; there is nothing to write")
+    ending = path.suffix.lower()
+    if ending == ".kmz" and site.is_local:
+        raise SettingsError(f"{archive.folder} has no place on Earth, so its map cannot be a KMZ; write .tif or .png")
+    if ending == ".png":
+        write_preview(tiles, path)
+    elif ending == ".kmz":
+        write_kmz(tiles, archive.site_grid(), site.name, path)
+    else:
+        write_cog(tiles, archive.site_grid(), path, crs=version.export_crs or None, compress=compress)
 
 
 def _moment(text: str) -> datetime:

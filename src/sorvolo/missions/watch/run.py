@@ -97,8 +97,8 @@ class WatchRun:
             )
         with log.stage("track"):
             taken = self._places.take(frame, time_ns, found)
-        placed = 0 if self._places.site.is_local else sum(each is not None for each in taken.sightings)
-        log.searched(time_ns, found, placed)
+        sighted = [each for each in taken.sightings if each is not None]
+        log.searched(time_ns, found, 0 if self._places.site.is_local else len(sighted))
         confirmed = [track for track in self._places.tracks() if track.confirmed]
         counts = count_by_class(confirmed)
         seen_ids = set(taken.track_ids)
@@ -114,7 +114,7 @@ class WatchRun:
         log.latency_s.append(latency_s)
         source = self._setup.source
         return WatchUpdate(
-            frame.name, time_ns, found, [each for each in taken.sightings if each is not None], new, seen, counts,
+            frame.name, time_ns, found, sighted, new, seen, counts,
             latency_s, log.read, log.detected, source.frame_count, log.seconds, self._folder,
             self._places.site, taken.segment,
         )
