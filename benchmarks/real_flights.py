@@ -1,10 +1,11 @@
 """Real photo flights: how many frames vision places, and how far off cameras lie whose own GPS fix was withheld.
 
-python benchmarks/real_flights.py DATA    (a folder with brighton_beach/ and caliterra/, see CONTRIBUTING.md)
+python benchmarks/real_flights.py DATA [--flights fixed_wing]    (DATA: a folder with the flights, see CONTRIBUTING.md)
 
-Each flight is mapped as it is. brighton_beach is then mapped twice more with the GPS position taken out of every
-second photo (the odd ones, then the even ones), and the cameras found are compared with the fixes taken out. Those
-fixes err themselves, by about half a metre, so the figure is an upper bound. Written to results/real_flights.json.
+Each flight is mapped as it is; those that are not asked for keep their figures, each with the commit it is of.
+brighton_beach is then mapped twice more with the GPS position taken out of every second photo (the odd ones, then the
+even ones), and the cameras found are compared with the fixes taken out. Those fixes err themselves, by about half a
+metre, so the figure is an upper bound. Written to results/real_flights.json.
 """
 
 import argparse
@@ -23,6 +24,7 @@ from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
 
 RESULTS = Path(__file__).parent / "results" / "real_flights.json"
+FLIGHTS = ("brighton_beach", "caliterra", "fixed_wing")
 _GPS_IFD = 0x8825
 
 
@@ -31,13 +33,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--output", type=Path, default=RESULTS)
+    parser.add_argument("--flights", nargs="+", choices=FLIGHTS, default=FLIGHTS)
     options = parser.parse_args()
-    flights = {name: mapped(options.data / name) for name in ("brighton_beach", "caliterra")}
-    withheld = [withheld_rms_m(options.data / "brighton_beach", parity) for parity in (1, 0)]
-    result = {
-        "benchmark": "real_flights", "machine": machine(), "commit": commit(), "flights": flights,
-        "brighton_beach_withheld_rms_m": {"odd photos": withheld[0], "even photos": withheld[1]},
-    }
+    result = json.loads(options.output.read_text()) if options.output.is_file() else {}
+    flights = {name: each if "commit" in each else each | {"commit": result["commit"]}
+               for name, each in result.get("flights", {}).items()}
+    flights |= {name: mapped(options.data / name) | {"commit": commit()} for name in options.flights}
+    result |= {"benchmark": "real_flights", "machine": machine(), "commit": commit(), "flights": flights}
+    if "brighton_beach" in options.flights:
+        withheld = [withheld_rms_m(options.data / "brighton_beach", parity) for parity in (1, 0)]
+        result["brighton_beach_withheld_rms_m"] = {"odd photos": withheld[0], "even photos": withheld[1]}
     options.output.parent.mkdir(exist_ok=True)
     options.output.write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps(result, indent=1))
@@ -54,7 +59,11 @@ def mapped(folder: Path) -> dict[str, object]:
     return {
         **frames, "wall_s": round(wall_s, 1), "cpu_s": round(cpu_s, 1),
         "peak_memory_mb": round(report["peak_memory_mb"]),
+        "pieces": len(report["pieces"]),
         "gps_residual_median_m": report["gps_residual_m"]["median"],
+        "gps_residual_rms_m": report["gps_residual_m"]["rms"],
+        "height_above_ground_m": report["height_above_ground_m"],
+        "quality": report["headline"]["quality"],
         "residual_median_px": report["residual_px"]["median"],
     }
 

@@ -165,6 +165,23 @@ def _survey(ground: str, name: str) -> SimulationSettings:
     )
 
 
+def _fixed_wing() -> SimulationSettings:
+    """A survey by a small flying wing: 60 % overlap, gusts that roll it by 15 degrees, wind across, poor light."""
+    return SimulationSettings(
+        preset="fixed-wing", flights=1,
+        scene=SceneSettings("countryside"),
+        # 65 m and 72 degrees give 0.06 m a pixel; strips at 60 % overlap both ways
+        path=PathSettings(height_m=65, speed_m_s=13, length_m=260, strips=4, strip_spacing_m=38, heading_deg=60),
+        motion=MotionSettings(
+            tilt_rms_deg=3.0, yaw_rms_deg=3.0, height_rms_m=3.0, drift_rms_m=2.0, roll_rms_deg=6.0, is_fixed_wing=True,
+            wind_m_s=5.0, wind_from_deg=300.0,
+        ),
+        imaging=ImagingSettings(1600, 1200, 72.0, fps=5, exposure_s=1 / 400),
+        sensor=SensorSettings(noise_m=(1.0, 1.0, 1.5), wander_m=1.0, attitude_noise_deg=2.0),
+        output=OutputSettings(photos=True, photo_overlap=0.6),
+    )
+
+
 def _compare(name: str, ground: str = "countryside", later: LaterSettings | None = None) -> SimulationSettings:
     """Two short video flights over the same path: things added, taken away, moved and moving, in other weather."""
     return SimulationSettings(
@@ -216,6 +233,7 @@ _GENERAL: Mapping[str, Callable[[], SimulationSettings]] = {
     "survey-urban": lambda: _survey("urban", "survey-urban"),
     "survey-dirt": lambda: _survey("dirt", "survey-dirt"),
     "sand": lambda: _survey("sand", "sand"),
+    "fixed-wing": _fixed_wing,
     "compare": lambda: _compare("compare"),
     "compare-urban": lambda: _compare("compare-urban", "urban"),
     "compare-dirt": lambda: _compare("compare-dirt", "dirt"),

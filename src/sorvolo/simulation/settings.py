@@ -74,8 +74,16 @@ class MotionSettings:
     height_rms_m: float = 0.4
     drift_rms_m: float = 0.4  # east and north each, wind over ten seconds
     camera_pitch_deg: float = -90.0  # -90 looks straight down
+    roll_rms_deg: float | None = None  # of roll alone; None: as tilt_rms_deg
+    is_fixed_wing: bool = False  # banks into turns, and keeps its speed through the air instead of over the ground
+    wind_m_s: float = 0.0  # of a fixed wing: it is carried along and turns its nose into the wind
+    wind_from_deg: float = 0.0  # clockwise from north
 
     def __post_init__(self) -> None:
+        _demand("roll_rms_deg", self.roll_rms_deg or 0.0, 0, 15)
+        _demand("wind_m_s", self.wind_m_s, 0, 20)
+        if self.wind_m_s and not self.is_fixed_wing:
+            raise SettingsError("wind_m_s carries fixed wings only; a rotor drone's drift is drift_rms_m")
         _demand("tilt_rms_deg", self.tilt_rms_deg, 0, 15)
         _demand("height_rms_m", self.height_rms_m, 0, 50)
         _demand("drift_rms_m", self.drift_rms_m, 0, 50)
