@@ -57,7 +57,7 @@ RESULTS = Path(__file__).parent / "results" / "search_pod.json"
 SUN_DEG = (215.0, 48.0)  # of every first day in the simulation
 PEOPLE, CARS = 28, 12  # hidden in a flight
 GROUNDS = ("countryside", "dirt", "urban", "sand")
-HEIGHTS_M = (18.0, 30.0, 45.0)
+HEIGHTS_M = (25.0, 35.0, 45.0)
 
 
 def main() -> None:
@@ -166,9 +166,11 @@ def rows_of(
         laid += [one for one in lay_on_ground(found, each.placed) if one is not None]
         boxes[index] = boxes_px(flight, index, targets)
     reported = reported_plants(laid, [each.placed for each in frames], boxes, [str(each.label) for each in targets])
+    empty = without_targets(flight)
+    bare = [taken(empty, index, measured.is_thermal) for index in range(len(images))]
     looks = [
         look_at(image, each.placed.camera, flight.true_poses[k], frame_light(image).blur_px)
-        for k, (each, image) in enumerate(zip(frames, images))
+        for k, (each, image) in enumerate(zip(frames, bare))
     ]
     rows = []
     for label in measured.classes:
@@ -186,6 +188,13 @@ def rows_of(
                     "trees": bool(seen.under_trees[row]), "height_m": round(flight.path.height_m, 1),
                 })
     return rows
+
+
+def without_targets(flight: SimulatedFlight) -> SimulatedFlight:
+    """The same ground bare: the conditions of a place are those of its ground, not of what is hidden there."""
+    things = tuple(thing for thing in flight.day.things if not thing.label.is_target)
+    world = replace(flight.world, days=(things,))
+    return replace(flight, world=world, day=build_day(world, flight.settings, 1, flight.settings.m_per_px))
 
 
 def boxes_px(flight: SimulatedFlight, index: int, targets: Sequence[Thing]) -> np.ndarray:

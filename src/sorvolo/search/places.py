@@ -74,7 +74,7 @@ def _free_place(
 ) -> Floats | None:
     for index in rng.choice(len(chances), _TRIES, p=chances / chances.sum()):
         place_m = cells.centres_m[index] + rng.uniform(-0.5, 0.5, 2) * cells.cell_m
-        if len(keep_off_m) and np.hypot(*(keep_off_m - place_m).T).min() < free_m:
+        if len(keep_off_m) and np.hypot(*(keep_off_m - place_m).T).min() < max(free_m, _room_m(label) / 2 + 1.0):
             continue
         if all(
             np.hypot(*(each.place_m - place_m)) > (_room_m(each.label) + _room_m(label)) / 2 for each in placed
