@@ -14,7 +14,6 @@ import argparse
 import json
 import resource
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -26,6 +25,7 @@ from statistics import median
 from rich.console import Console
 from rich.table import Table
 
+from child import run_child
 from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.evaluate.changes import as_json, evaluate_changes
@@ -147,17 +147,8 @@ def flight(simulation: Path, number: int) -> Path:
 
 def run_apart(method: str, simulation: Path, site: Path, limit_s: float, *, masks: bool) -> dict:
     """Run one comparison in a process of its own; what it cost, or how it failed."""
-    command = [
-        sys.executable, __file__, "--run", method, "masks" if masks else "no", str(simulation), str(site),
-    ]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit_s)
-    except subprocess.TimeoutExpired:
-        return {"failure": f"not done after {limit_s:.0f} s"}
-    if done.returncode:
-        last = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
-        return {"failure": last[0]}
-    return json.loads(done.stdout.splitlines()[-1])
+    arguments = ["--run", method, "masks" if masks else "no", str(simulation), str(site)]
+    return run_child(__file__, arguments, limit_s)
 
 
 def run_method(method: str, masks: bool, simulation: Path, site: Path) -> None:

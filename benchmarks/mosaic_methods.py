@@ -10,7 +10,6 @@ and, after +-, half the range; everything is written to results/mosaic_methods.j
 import argparse
 import json
 import resource
-import subprocess
 import sys
 import tempfile
 import time
@@ -23,6 +22,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from child import run_child
 from provenance import commit, machine, seeds_or_drawn
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
@@ -102,15 +102,7 @@ def photos_of(simulation: Path) -> Path:
 
 def run_apart(method: str, simulation: Path, site: Path, limit_s: float) -> dict[str, float | str]:
     """Run one method in a process of its own; what it cost, or how it failed."""
-    command = [sys.executable, __file__, "--run", method, str(simulation), str(site)]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit_s)
-    except subprocess.TimeoutExpired:
-        return {"failure": f"not done after {limit_s:.0f} s"}
-    if done.returncode:
-        last = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
-        return {"failure": last[0]}
-    return json.loads(done.stdout.splitlines()[-1])
+    return run_child(__file__, ["--run", method, str(simulation), str(site)], limit_s)
 
 
 def run_method(method: str, simulation: Path, site: Path) -> None:

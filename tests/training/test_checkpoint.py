@@ -188,7 +188,7 @@ def test_nothing_to_learn_from() -> None:
 def test_history_means_rows_and_survives_json() -> None:
     history = History()
     for step in range(1, 8):
-        history = history.after(Progress(step, 7, step, 0, 1, 2, 0.0), seconds=0.5 * step, every=3)
+        history = history.after(Progress(step, step, 0, 1, 2, 0.0, 7), seconds=0.5 * step, every=3)
     assert [(row.step, row.proposal_score, row.loss) for row in history.rows] == [(3, 2, 5), (6, 5, 8), (7, 7, 10)]
     assert history.seconds == 3.5 and not history.pending
     history = history.checked(Check(3, 0.4, 0.2, {"car": 0.4})).checked(Check(6, 0.3, 0.2, {"car": 0.3}))

@@ -86,8 +86,8 @@ class FourStepTraining:
         self.step += 1
         values = [float(part.detach()) for part in parts]
         return Progress(
-            self.step, self.settings.steps, values[0], values[1], values[2], values[3],
-            time.monotonic() - self._started_s,
+            self.step, values[0], values[1], values[2], values[3], time.monotonic() - self._started_s,
+            self.settings.steps,
         )
 
     def state(self) -> dict[str, object]:

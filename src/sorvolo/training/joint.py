@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from sorvolo.training.faster_rcnn import FasterRCNN
-from sorvolo.training.losses import Answer, joint_proposal_loss
+from sorvolo.training.losses import Answer, LossRow, joint_proposal_loss
 from sorvolo.training.proposals import Proposed
 from sorvolo.training.regions import draw_regions
 from sorvolo.training.samples import Sample
@@ -34,21 +34,10 @@ class JointSettings:
 
 
 @dataclass(frozen=True)
-class Progress:
-    """Where training stands after a step; the losses are this step's."""
+class Progress(LossRow):
+    """Where training stands after a step of `steps`; the losses are this step's, the seconds this run's."""
 
-    step: int
     steps: int
-    proposal_score: float
-    proposal_box: float
-    region_score: float
-    region_box: float
-    seconds: float
-
-    @property
-    def loss(self) -> float:
-        """The sum that is minimised."""
-        return self.proposal_score + self.proposal_box + self.region_score + self.region_box
 
 
 class JointTraining:
@@ -90,8 +79,8 @@ class JointTraining:
         self._average()
         values = [float(part.detach()) for part in parts]
         return Progress(
-            self.step, self.settings.steps, values[0], values[1], values[2], values[3],
-            time.monotonic() - self._started_s,
+            self.step, values[0], values[1], values[2], values[3], time.monotonic() - self._started_s,
+            self.settings.steps,
         )
 
     def state(self) -> dict[str, object]:

@@ -26,6 +26,23 @@ class Answer:
 
 
 @dataclass(frozen=True)
+class LossRow:
+    """The losses of `step`, or their means over the steps since the row before; the seconds of learning until then."""
+
+    step: int
+    proposal_score: float
+    proposal_box: float
+    region_score: float
+    region_box: float
+    seconds: float
+
+    @property
+    def loss(self) -> float:
+        """Their sum, which is minimised."""
+        return self.proposal_score + self.proposal_box + self.region_score + self.region_box
+
+
+@dataclass(frozen=True)
 class Match:
     """What boxes stand for, (K,): `target` the row of the answer, -1 background, -2 neither."""
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.joint import Progress
+from sorvolo.training.losses import LossRow
 from sorvolo.training.samples import Sample
 
 
@@ -29,23 +30,6 @@ class Learner(Protocol):
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Go on from there."""
-
-
-@dataclass(frozen=True)
-class LossRow:
-    """Mean losses of the steps up to `step` since the row before, and the seconds of learning until then."""
-
-    step: int
-    proposal_score: float
-    proposal_box: float
-    region_score: float
-    region_box: float
-    seconds: float
-
-    @property
-    def loss(self) -> float:
-        """Their sum."""
-        return self.proposal_score + self.proposal_box + self.region_score + self.region_box
 
 
 @dataclass(frozen=True)
