@@ -10,8 +10,9 @@ import rasterio
 
 from real_data import real_data
 from sorvolo.cli.main import main
-from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.errors import GeometryError, InputError, SettingsError, StoreError
 from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.heights.measure import measure_profile, measure_volume, write_contours
 from sorvolo.missions.heights.run import HeightSettings, make_heights
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.simulate.site import simulate_site
@@ -84,6 +85,73 @@ def test_a_flight_without_gps_has_no_heights(tmp_path: Path) -> None:
     list(map_flights([tmp_path / "made" / "flight1" / "photos"], tmp_path / "site", MapSettings(model="none")))
     with pytest.raises(InputError, match="no GPS"):
         list(make_heights(tmp_path / "site"))
+
+
+@pytest.fixture(scope="module")
+def with_heights(mapped: Path) -> Path:
+    """The site with heights of its flight."""
+    list(make_heights(mapped, HeightSettings(has_orthophoto=False)))
+    return mapped
+
+
+def _area(site: Path, path: Path) -> Path:
+    """A square of 16 m around the middle of the cameras, as GeoJSON."""
+    frames = json.loads(next(site.glob("flights/*/frames.geojson")).read_text())["features"]
+    places = np.array([[each["properties"][f"camera_{axis}_deg"] for axis in ("longitude", "latitude")]
+                       for each in frames])
+    middle = places.mean(axis=0)
+    half = 8 / 111_000 / np.array([np.cos(np.radians(middle[1])), 1.0])
+    corners = middle + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    polygon = {"type": "Polygon", "coordinates": [corners.tolist()]}
+    path.write_text(json.dumps(polygon))
+    return path
+
+
+def test_volumes_profiles_and_contours_are_measured(
+    with_heights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    area = _area(with_heights, tmp_path / "area.geojson")
+    assert main(["measure", "volume", str(with_heights), "--area", str(area), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["volume"]["area_m2"] == pytest.approx(256, rel=0.05) and found["volume"]["sigma_m3"] > 0
+    assert main(["measure", "volume", str(with_heights), "--area", str(area)]) == 0
+    assert "above the ground around" in capsys.readouterr().out
+    corners = json.loads(area.read_text())["coordinates"][0]
+    at = [f"--at={latitude},{longitude}" for longitude, latitude in corners[:3:2]]
+    assert main(["measure", "profile", str(with_heights), *at]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("way_m,latitude_deg") and len(lines) > 50
+    assert float(lines[-1].split(",")[0]) == pytest.approx(16 * 2**0.5, rel=0.02)
+    out = tmp_path / "lines.geojson"
+    assert main(["measure", "contours", str(with_heights), "--interval", "0.5", "--out", str(out), "--surface"]) == 0
+    features = json.loads(out.read_text())["features"]
+    assert features and all(each["properties"]["height_m"] % 0.5 == 0 for each in features)
+
+
+def test_measuring_names_what_is_missing(with_heights: Path, tmp_path: Path) -> None:
+    area = _area(with_heights, tmp_path / "area.geojson")
+    flight = next(with_heights.glob("flights/*/heights.json")).parent.name
+    with pytest.raises(InputError, match="sorvolo heights"):
+        measure_volume(with_heights, area, since="april")
+    with pytest.raises(SettingsError, match="earlier"):
+        measure_volume(with_heights, area, since=flight)
+    with pytest.raises(SettingsError, match="two places"):
+        measure_profile(with_heights, ["46.8,-91.9"])
+    with pytest.raises(GeometryError, match="LAT,LON"):
+        measure_profile(with_heights, ["here", "there"])
+    with pytest.raises(SettingsError, match="--interval"):
+        write_contours(with_heights, tmp_path / "lines.geojson", 0.0)
+
+
+def test_heights_of_an_earlier_map_of_the_flight_are_refused(with_heights: Path, tmp_path: Path) -> None:
+    report = next(with_heights.glob("flights/*/heights.json"))
+    kept = report.read_text()
+    try:
+        report.write_text(json.dumps({**json.loads(kept), "run": "999"}))
+        with pytest.raises(InputError, match="earlier map"):
+            write_contours(with_heights, tmp_path / "lines.geojson", 1.0)
+    finally:
+        report.write_text(kept)
 
 
 @pytest.mark.slow

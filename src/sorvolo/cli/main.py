@@ -23,6 +23,7 @@ from sorvolo.cli.heights import heights
 from sorvolo.cli.history import history
 from sorvolo.cli.inspect import inspect
 from sorvolo.cli.map import map_command
+from sorvolo.cli.measure import measure_app
 from sorvolo.cli.models import models_app
 from sorvolo.cli.plan import plan
 from sorvolo.cli.review import review
@@ -50,6 +51,7 @@ app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 for _name, _command in _COMMANDS.items():
     app.command(_name)(_command)
 app.add_typer(evaluate_app, name="evaluate")
+app.add_typer(measure_app, name="measure")
 app.add_typer(models_app, name="models")
 
 

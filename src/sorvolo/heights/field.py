@@ -1,0 +1,69 @@
+"""Heights with their sigma over a lattice, asked by place, and brought onto another lattice."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sorvolo.errors import GeometryError
+from sorvolo.geometry.arrays import Floats, Floats32, Mask, PointsM
+from sorvolo.geometry.polygons import points_inside
+from sorvolo.heights.lattice import Lattice
+
+
+@dataclass(frozen=True, eq=False)
+class HeightField:
+    """`up_m` and `sigma_m` (H, W) float32 over a lattice, NaN in holes."""
+
+    lattice: Lattice
+    up_m: Floats32
+    sigma_m: Floats32
+
+    def __post_init__(self) -> None:
+        if self.up_m.shape != self.lattice.shape or self.sigma_m.shape != self.lattice.shape:
+            raise GeometryError(f"heights {self.up_m.shape} do not fit a lattice of {self.lattice.shape}")
+
+    def at(self, points_m: PointsM) -> tuple[Floats, Floats]:
+        """(N,) heights and sigmas at site points, (N, 2), between cells; NaN outside and beside holes."""
+        cells = self.lattice.cells_from_site(points_m).astype(np.float32).reshape(-1, 1, 2)
+        heights, sigmas = (
+            cv2.remap(band, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR, borderValue=float("nan"))[:, 0]
+            for band in (self.up_m, self.sigma_m)
+        )
+        return heights.astype(np.float64), sigmas.astype(np.float64)
+
+    def on(self, lattice: Lattice, shift_m: Floats | None = None) -> "HeightField":
+        """The same heights over another lattice, moved by (east, north), m."""
+        points = lattice.points_m().reshape(-1, 2) - (np.zeros(2) if shift_m is None else shift_m)
+        some = 1 << 20  # OpenCV takes no more than 32767 rows at a time
+        bands = [self._bands_at(points[first:first + some]) for first in range(0, len(points), some)]
+        up_m, sigma_m = (np.concatenate(each).reshape(lattice.shape).astype(np.float32) for each in zip(*bands))
+        return HeightField(lattice, up_m, sigma_m)
+
+    def inside(self, polygons: Sequence[Sequence[PointsM]]) -> Mask:
+        """(H, W) which cells lie within polygons of rings, site metres."""
+        points = self.lattice.points_m().reshape(-1, 2)
+        within = np.zeros(len(points), bool)
+        for rings in polygons:
+            within |= points_inside(rings, points)
+        return within.reshape(self.lattice.shape)
+
+    def _bands_at(self, points_m: PointsM) -> tuple[Floats, Floats]:
+        side = 1024
+        padded = np.full((-(-len(points_m) // side) * side, 2), 1e9)
+        padded[: len(points_m)] = points_m
+        cells = self.lattice.cells_from_site(padded).astype(np.float32).reshape(-1, side, 2)
+        heights, sigmas = (
+            cv2.remap(band, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR, borderValue=float("nan")).ravel()
+            for band in (self.up_m, self.sigma_m)
+        )
+        return heights[: len(points_m)].astype(np.float64), sigmas[: len(points_m)].astype(np.float64)
+
+
+def along(points_m: PointsM, step_m: float) -> tuple[PointsM, Floats]:
+    """(M, 2) points every `step_m` along a line through `points_m`, (N, 2), and their way from its start, (M,), m."""
+    lengths = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
+    ways = np.concatenate([[0.0], np.cumsum(lengths)])
+    wanted = np.append(np.arange(0.0, ways[-1], step_m), ways[-1])
+    return np.column_stack([np.interp(wanted, ways, points_m[:, axis]) for axis in (0, 1)]), wanted

@@ -1,0 +1,148 @@
+"""Volumes: what was dug and heaped between two dates, and what stands above the ground around it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Floats, Floats32, Mask
+from sorvolo.heights.field import HeightField
+from sorvolo.heights.terrain import filled
+
+
+@dataclass(frozen=True)
+class VolumeSettings:
+    """How two dates are tied to each other, and how errors of cells add up."""
+
+    rounds: int = 6
+    clip_sigmas: float = 3.0  # of the spread: what changed outside the area does not tie
+    block_m: float = 5.0  # errors of a height model hold on for about as long
+    least_stable: int = 500  # cells
+    least_known: float = 0.5  # of the area
+
+
+@dataclass(frozen=True, eq=False)
+class Tie:
+    """How a later height model lies on an earlier one where nothing changed.
+
+    `shift_m` (3,) is to be added to the later one's places, east, north, up; `sigma_m` of its height on the area;
+    `spread_m` of the difference that is left, over `cells` cells.
+    """
+
+    shift_m: Floats
+    sigma_m: float
+    spread_m: float
+    cells: int
+
+
+@dataclass(frozen=True)
+class Volume:
+    """`cut_m3` was taken away, `fill_m3` came; `sigma_m3` of their difference. Holes in the area count as unchanged."""
+
+    cut_m3: float
+    fill_m3: float
+    sigma_m3: float
+    area_m2: float
+    known_share: float
+
+    @property
+    def net_m3(self) -> float:
+        """What came less what was taken away."""
+        return self.fill_m3 - self.cut_m3
+
+
+def tie(earlier: HeightField, later: HeightField, stable: Mask, settings: VolumeSettings = VolumeSettings()) -> Tie:
+    """How `later` is to be moved onto `earlier`, by the cells of `earlier` that are `stable`, (H, W).
+
+    Nuth and Kaab 2011: a shift east or north shows as a difference in height along the slope. Raises InputError where
+    the two share too little stable ground.
+    """
+    shift_m = np.zeros(3)
+    down, east = (np.asarray(np.gradient(earlier.up_m.astype(np.float64), earlier.lattice.cell_m, axis=axis))
+                  for axis in (0, 1))
+    north = -down
+    spread, sigma, count = np.inf, np.inf, 0
+    for _ in range(settings.rounds):
+        moved = later.on(earlier.lattice, shift_m[:2])
+        off = earlier.up_m - (moved.up_m + shift_m[2])
+        usable = stable & np.isfinite(off) & np.isfinite(east) & np.isfinite(north) & (np.hypot(east, north) < 1.0)
+        if usable.sum() < settings.least_stable:
+            raise InputError(
+                f"the two flights share {int(usable.sum())} cells of ground outside the area, "
+                f"{settings.least_stable} are needed to tie them; give a smaller area, or flights that reach beyond it"
+            )
+        middle = float(np.median(off[usable]))
+        spread = max(1.4826 * float(np.median(np.abs(off[usable] - middle))), 1e-4)
+        usable &= np.abs(off - middle) < settings.clip_sigmas * spread
+        step = _step(off[usable], east[usable], north[usable])
+        shift_m += step
+        sigma, count = _offset_sigma(off - step[2], usable, earlier.lattice.cell_m, settings), int(usable.sum())
+        if np.abs(step).max() < 1e-3:
+            break
+    return Tie(shift_m, sigma, spread, count)
+
+
+def between(
+    earlier: HeightField, later: HeightField, inside: Mask, tied: Tie, settings: VolumeSettings = VolumeSettings()
+) -> Volume:
+    """Cut and fill within cells of `earlier`, (H, W). Raises InputError where most of them have no heights."""
+    moved = later.on(earlier.lattice, tied.shift_m[:2])
+    rise = np.asarray(moved.up_m + tied.shift_m[2] - earlier.up_m, np.float32)
+    sigma = np.asarray(np.hypot(earlier.sigma_m, moved.sigma_m), np.float32)
+    return _added_up(rise, sigma, inside, earlier.lattice.cell_m, tied.sigma_m, settings)
+
+
+def above_rim(surface: HeightField, inside: Mask, settings: VolumeSettings = VolumeSettings()) -> Volume:
+    """What stands above (fill) and lies below (cut) the ground that goes on from around the area, (H, W)."""
+    around = np.isfinite(surface.up_m) & ~inside
+    if not around.any():
+        raise InputError("no heights around the area to measure from; give a smaller area, or two flights")
+    base = filled(surface.up_m, around)
+    rim = _rim_sigma(surface, inside)
+    return _added_up(surface.up_m - base, surface.sigma_m, inside, surface.lattice.cell_m, rim, settings)
+
+
+def _added_up(
+    rise: Floats32, sigma: Floats32, inside: Mask, cell_m: float, common_m: float, settings: VolumeSettings
+) -> Volume:
+    known = inside & np.isfinite(rise) & np.isfinite(sigma)
+    share = float(known.sum() / max(int(inside.sum()), 1))
+    if share < settings.least_known:
+        raise InputError(
+            f"only {share:.0%} of the area has heights, {settings.least_known:.0%} are needed; fly it with more overlap"
+        )
+    cell_m2 = cell_m**2
+    alike = max(1.0, (settings.block_m / cell_m) ** 2)  # cells whose errors are one
+    scatter = float(np.sqrt((sigma[known].astype(np.float64) ** 2).sum() * min(alike, float(known.sum()))))
+    return Volume(
+        cut_m3=float(-np.minimum(rise[known], 0).sum(dtype=np.float64) * cell_m2),
+        fill_m3=float(np.maximum(rise[known], 0).sum(dtype=np.float64) * cell_m2),
+        sigma_m3=cell_m2 * float(np.hypot(scatter, common_m * known.sum())),
+        area_m2=float(inside.sum() * cell_m2), known_share=share,
+    )
+
+
+def _step(off: Floats, east: Floats, north: Floats) -> Floats:
+    """(3,) the shift that explains the differences; along east and north only as far as slopes can tell."""
+    columns = np.column_stack([-east, -north, np.ones_like(off)])
+    normal = columns.T @ columns
+    # flat ground tells nothing of a shift along it: a prior of 1 m against differences of 0.1 m
+    normal[[0, 1], [0, 1]] += 0.01
+    return np.asarray(np.linalg.solve(normal, columns.T @ off), np.float64)
+
+
+def _offset_sigma(off: Floats, usable: Mask, cell_m: float, settings: VolumeSettings) -> float:
+    """One sigma of the height of the tie: blocks of cells whose errors are alike count once."""
+    side = max(1, round(settings.block_m / cell_m))
+    rows, columns = np.nonzero(usable)
+    block = (rows // side) * (usable.shape[1] // side + 1) + columns // side
+    _, at, count = np.unique(block, return_inverse=True, return_counts=True)
+    means = np.bincount(at, off[usable])[count >= 4] / count[count >= 4]
+    if len(means) < 2:
+        return float(np.std(off[usable]))
+    return float(means.std(ddof=1) / np.sqrt(len(means)))
+
+
+def _rim_sigma(surface: HeightField, inside: Mask) -> float:
+    around = np.isfinite(surface.sigma_m) & ~inside
+    return float(np.median(surface.sigma_m[around]))

@@ -1,0 +1,136 @@
+"""`sorvolo measure`: volumes, profiles and contours of flights that have heights."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sorvolo.capture.areas import read_area
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.coordinates import lonlat_from_text
+from sorvolo.heights.contours import contours
+from sorvolo.heights.field import HeightField, along
+from sorvolo.heights.lattice import Lattice
+from sorvolo.heights.volumes import Tie, Volume, VolumeSettings, above_rim, between, tie
+from sorvolo.missions.heights.flight_views import run_of
+from sorvolo.missions.heights.run import HEIGHTS, REPORT, TERRAIN, height_grid, newest_flight
+from sorvolo.store.atomic import atomic_write_bytes
+from sorvolo.store.exports.places import longitude_latitude
+from sorvolo.store.exports.plain import feature_collection, geojson_bytes
+from sorvolo.store.nofollow import read_below
+from sorvolo.store.rasters.heights import read_height_cog
+from sorvolo.store.site.archive import Archive
+from sorvolo.survey.flight import Site
+
+_MOST_BYTES = 16_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredVolume:
+    """A volume, between which flights, and how they were tied; one flight alone is measured from the area's rim."""
+
+    flight: str
+    earlier: str
+    volume: Volume
+    tied: Tie | None
+
+
+@dataclass(frozen=True)
+class ProfilePoint:
+    """A point of a profile: its way along the line, its place, surface and bare ground, m, NaN in holes."""
+
+    way_m: float
+    longitude_deg: float
+    latitude_deg: float
+    surface_m: float
+    sigma_m: float
+    ground_m: float
+
+
+def measure_volume(
+    site: Path, area: Path, *, flight: str = "", since: str = "", settings: VolumeSettings = VolumeSettings()  # noqa: B008
+) -> MeasuredVolume:
+    """What was dug and heaped in an area from the flight `since` to `flight`; without `since`, above the area's rim.
+
+    Raises InputError for flights without heights, or without ground in common.
+    """
+    wanted = read_area(area)
+    with Archive.open(site, write=False) as archive:
+        later_id = flight or newest_flight(archive)
+        later = read_field(archive, later_id, HEIGHTS)
+        polygons = wanted.polygons_m(archive.site().frame)
+        if not since:
+            return MeasuredVolume(later_id, "", above_rim(later, later.inside(polygons), settings), None)
+        if since == later_id:
+            raise SettingsError(f"--since {since} is the flight that is measured; name an earlier one")
+        earlier = read_field(archive, since, HEIGHTS)
+        inside = earlier.inside(polygons)
+        tied = tie(earlier, later, ~inside, settings)
+        return MeasuredVolume(later_id, since, between(earlier, later, inside, tied, settings), tied)
+
+
+def measure_profile(site: Path, places: Sequence[str], *, flight: str = "", step_m: float = 0.0) -> list[ProfilePoint]:
+    """Heights along a line through places ("latitude,longitude"), every `step_m` (0: every cell)."""
+    if len(places) < 2:
+        raise SettingsError(f"a profile needs at least two places, got {len(places)}: --at LAT,LON --at LAT,LON")
+    with Archive.open(site, write=False) as archive:
+        flight_id = flight or newest_flight(archive)
+        surface, ground = (read_field(archive, flight_id, name) for name in (HEIGHTS, TERRAIN))
+        described = archive.site()
+        corners = described.frame.ground_from_lonlat([lonlat_from_text(each) for each in places])
+        points, ways = along(corners, step_m or surface.lattice.cell_m)
+        heights, sigmas = surface.at(points)
+        bare, _ = ground.at(points)
+        longitudes, latitudes = longitude_latitude(points, described)
+        rows = zip(ways, longitudes, latitudes, heights, sigmas, bare)
+        return [ProfilePoint(*(float(each) for each in row)) for row in rows]
+
+
+def write_contours(site: Path, path: Path, interval_m: float, *, flight: str = "", of_surface: bool = False) -> int:
+    """Write contour lines of the bare ground (or of the surface) as GeoJSON; how many lines there are."""
+    if not 0.01 <= interval_m <= 1000:
+        raise SettingsError(f"--interval {interval_m}: give metres, 0.01 to 1000")
+    with Archive.open(site, write=False) as archive:
+        flight_id = flight or newest_flight(archive)
+        field = read_field(archive, flight_id, HEIGHTS if of_surface else TERRAIN)
+        described = archive.site()
+        features = [_line(line, level, described) for level, line in contours(field, interval_m)]
+        atomic_write_bytes(path, geojson_bytes(feature_collection("contours", features, is_local=False)))
+        return len(features)
+
+
+def read_field(archive: Archive, flight_id: str, name: str) -> HeightField:
+    """A height model of a flight. Raises InputError where there is none, or none of the flight's present map."""
+    report = _report(archive, flight_id)
+    keyframes = archive.keyframes(flight_id)
+    if not keyframes or report.get("run") != run_of(keyframes):
+        raise InputError(
+            f"the heights of flight {flight_id} are of an earlier map of it; make them again: "
+            f"sorvolo heights {archive.folder} --flight {flight_id}"
+        )
+    site_grid = height_grid(archive.site(), float(report["cell_m"]))
+    read = read_height_cog(archive.flight_folder(flight_id) / name, site_grid.grid)
+    rows, columns = read.bands[0].shape
+    return HeightField(Lattice.at(site_grid, read.first, columns, rows), read.bands[0], read.bands[-1])
+
+
+def _report(archive: Archive, flight_id: str) -> Mapping[str, Any]:
+    folder = archive.flight_folder(flight_id)
+    try:
+        report = json.loads(read_below(folder, REPORT, _MOST_BYTES))
+        return {"run": report["run"], "cell_m": float(report["cell_m"])}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(
+            f"flight {flight_id} of {archive.folder} has no heights; make them: "
+            f"sorvolo heights {archive.folder} --flight {flight_id}"
+        ) from error
+
+
+def _line(line: Any, level_m: float, site: Site) -> dict[str, Any]:
+    longitudes, latitudes = longitude_latitude(line, site)
+    places = [[round(float(x), 8), round(float(y), 8)] for x, y in zip(longitudes, latitudes)]
+    return {
+        "type": "Feature", "geometry": {"type": "LineString", "coordinates": places},
+        "properties": {"height_m": round(level_m, 3)},
+    }

@@ -1,0 +1,93 @@
+"""Volumes, profiles and contours of height models whose answer is known."""
+
+import numpy as np
+import pytest
+
+from sorvolo.errors import InputError
+from sorvolo.geometry.geodesy import Geodetic
+from sorvolo.geometry.grid import SiteGrid
+from sorvolo.heights.contours import contours
+from sorvolo.heights.field import HeightField, along
+from sorvolo.heights.lattice import Lattice
+from sorvolo.heights.volumes import above_rim, between, tie
+
+GRID = SiteGrid.at(Geodetic(46.0, -91.0, 100.0), 0.2, "EPSG:32615")
+COARSE = SiteGrid.at(Geodetic(46.0, -91.0, 100.0), 0.25, "EPSG:32615")
+BOX = np.array([[-20.0, -15], [20, 15]])
+SQUARE = ((np.array([[-5.0, -5], [5, -5], [5, 5], [-5, 5]]),),)
+
+
+def rolling(x, y):
+    return 0.6 * np.sin(x / 3) + 0.4 * np.cos(y / 2.5)
+
+
+def field(grid, heights, sigma_m=0.05, seed=0) -> HeightField:
+    lattice = Lattice.over(BOX, grid)
+    points = lattice.points_m()
+    noise = np.random.default_rng(seed).normal(0, 0.02, lattice.shape)
+    up_m = (heights(points[..., 0], points[..., 1]) + noise).astype(np.float32)
+    return HeightField(lattice, up_m, np.full(lattice.shape, sigma_m, np.float32))
+
+
+def test_a_later_model_that_lies_off_is_tied_and_its_volume_is_right() -> None:
+    """A pile of 3 x 4 x 1 m and a pit of 2 x 2 x 0.5 m; the later model lies 0.3, -0.2, 0.7 m off."""
+
+    def later(x, y):
+        x, y = x - 0.3, y + 0.2
+        pile = (np.abs(x + 2) < 1.5) & (np.abs(y) < 2)
+        pit = (np.abs(x - 3) < 1) & (np.abs(y) < 1)
+        return rolling(x, y) + pile * 1.0 - pit * 0.5 + 0.7
+
+    first, second = field(GRID, rolling), field(COARSE, later, seed=1)
+    inside = first.inside(SQUARE)
+    tied = tie(first, second, ~inside)
+    np.testing.assert_allclose(tied.shift_m, [-0.3, 0.2, -0.7], atol=0.02)
+    assert tied.sigma_m < 0.02
+    found = between(first, second, inside, tied)
+    # noise of each cell, whose sign is not known, is cut or fill as well: compare their difference exactly
+    assert found.net_m3 == pytest.approx(12 - 2, abs=0.5)
+    assert found.fill_m3 == pytest.approx(12, abs=1.5) and found.cut_m3 == pytest.approx(2, abs=1.5)
+    assert abs(found.net_m3 - 10) < 2 * found.sigma_m3 < 10
+    assert found.area_m2 == pytest.approx(100, rel=0.03) and found.known_share > 0.99
+
+
+def test_a_pile_is_measured_from_the_ground_around_it() -> None:
+    pile = field(GRID, lambda x, y: 0.1 * x + np.maximum(0, 2 - np.hypot(x, y)))
+    found = above_rim(pile, pile.inside(SQUARE))
+    assert found.net_m3 == pytest.approx(np.pi * 4 * 2 / 3, abs=2.0)  # a cone
+
+
+def test_areas_without_heights_or_ground_to_tie_by_are_refused() -> None:
+    first, second = field(GRID, rolling), field(GRID, rolling, seed=1)
+    everywhere = np.ones(first.lattice.shape, bool)
+    with pytest.raises(InputError, match="outside the area"):
+        tie(first, second, ~everywhere)
+    holes = HeightField(first.lattice, np.full_like(first.up_m, np.nan), first.sigma_m)
+    with pytest.raises(InputError, match="has heights"):
+        between(first, holes, first.inside(SQUARE), tie(first, second, everywhere))
+    with pytest.raises(InputError, match="around the area"):
+        above_rim(first, everywhere)
+
+
+def test_heights_along_a_line() -> None:
+    ramp = field(GRID, lambda x, y: 0.5 * x)
+    points, ways = along(np.array([[-10.0, 0], [10, 0], [10, 10]]), 0.5)
+    assert ways[0] == 0 and ways[-1] == 30 and len(points) == 61
+    heights, sigmas = ramp.at(points)
+    np.testing.assert_allclose(heights, 0.5 * points[:, 0], atol=0.1)
+    np.testing.assert_allclose(sigmas, 0.05, atol=1e-6)
+    assert np.isnan(ramp.at(np.array([[100.0, 0]]))[0]).all()
+
+
+def test_contours_of_a_cone_are_closed_circles() -> None:
+    cone = field(GRID, lambda x, y: 5 - np.hypot(x, y) / 2, sigma_m=0.0)
+    smooth = HeightField(cone.lattice, (5 - np.hypot(*np.moveaxis(cone.lattice.points_m(), 2, 0)) / 2).astype(
+        np.float32), cone.sigma_m)
+    found = list(contours(smooth, 1.0, zero_m=100.0))
+    assert {level for level, _ in found} >= {101.0, 102.0, 103.0, 104.0}
+    for level, line in found:
+        radius = np.linalg.norm(line, axis=1)
+        np.testing.assert_allclose(radius, 2 * (105 - level), atol=0.02)
+        if level >= 99:  # those that the model holds as a whole
+            np.testing.assert_array_equal(line[0], line[-1])
+    assert sum(level == 103.0 for level, _ in found) == 1
