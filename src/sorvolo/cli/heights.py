@@ -63,8 +63,8 @@ def show_heights(site: Path, report: Mapping[str, Any], console: Console) -> Non
     rows = [
         ("photos", f"{cameras['views']} with {cameras['points']:,} points in space"),
         ("match error", f"{cameras['residual_rms_px']:.2f} px (root mean square)"),
-        ("cells", f"{100 * report['cell_m']:.1f} cm, {surface['covered_m2']:,.0f} m2 covered"),
-        ("holes", f"{surface['holes_share']:.1%} of the covered ground"),
+        ("cells", f"{100 * report['cell_m']:.1f} cm, {surface['covered_m2']:,.0f} m2 seen by two photos"),
+        ("holes", f"{surface['holes_share']:.1%} of the ground that two photos see"),
         ("height error", "" if surface["sigma_median_m"] is None else
          f"{surface['sigma_median_m']:.2f} m (1 sigma, median; without the error shared by all GPS fixes)"),
         ("bare ground", f"{surface['ground_share']:.0%} of the cells"),

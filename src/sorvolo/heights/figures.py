@@ -30,7 +30,7 @@ def camera_figures(solved: Cameras3D) -> Mapping[str, Any]:
 
 
 def surface_figures(surface: Surface, shows_ground: Mask) -> Mapping[str, Any]:
-    """The height model, as plain values; shares are of the ground that photos cover."""
+    """The height model, as plain values; shares are of the ground that two photos see."""
     known = np.isfinite(surface.up_m)
     low, middle, high = np.nanpercentile(surface.up_m, [1, 50, 99]) if known.any() else (np.nan,) * 3
     covered = max(int(surface.covered.sum()), 1)
@@ -77,7 +77,7 @@ def surface_warnings(surface: Surface) -> list[str]:
     holes = 1 - np.isfinite(surface.up_m).sum() / covered
     if holes > 0.1:
         return [
-            f"{holes:.0%} of the ground that photos cover has no height: water, bare ground without texture, or ground "
-            "that only one photo sees"
+            f"{holes:.0%} of the ground that two photos see has no height: water, bare ground without texture, or "
+            "things that move"
         ]
     return []

@@ -30,7 +30,7 @@ class SurfaceSettings:
 class Surface:
     """A height model: `up_m` (H, W) float32 above the site's ground, NaN in holes; `sigma_m` one sigma of it.
 
-    `covered` (H, W) are the cells that at least one photo sees.
+    `covered` (H, W) are the cells that two photos see at least.
     """
 
     lattice: Lattice
@@ -69,7 +69,7 @@ def sweep_surface(
             sigma = _sigma_m(swept, found, lattice.cell_m, camera_sigma_m, settings)
             inner = slice(apron, -apron), slice(apron, -apron)
             up_m[y0:y1, x0:x1], sigma_m[y0:y1, x0:x1] = found[inner], sigma[inner]
-            covered[y0:y1, x0:x1] = swept.seen_by[inner] >= 1
+            covered[y0:y1, x0:x1] = swept.seen_by[inner] >= 2
         yield (number + 1) / len(tiles)
     yield Surface(lattice, up_m, sigma_m, covered)
 

@@ -75,7 +75,7 @@ def sweep(
     agreement = np.empty((shape[0], len(levels), shape[1]), np.float32)
     for number, up_m in enumerate(levels):
         agreement[:, number] = _agreement([each.at(float(up_m)) for each in laid], settings)
-    seen = [_whole(each.at(bounds.usual_m), max(settings.window_cells)) for each in laid]
+    seen = [_whole(each.at(bounds.usual_m), min(settings.window_cells)) for each in laid]
     seen_by = np.sum(seen, axis=0).astype(np.float32)
     total = smoothed(1 - agreement, settings.smoothing)
     up_m, score = _best(total, agreement, levels)
