@@ -14,6 +14,7 @@ import pytest
 
 from sorvolo.cli.main import main
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.simulation.flight import SimulatedFlight, simulate_flights
 from sorvolo.simulation.settings import (
     ImagingSettings,
@@ -123,3 +124,40 @@ def flooded(image: ImageRGB, index: int) -> ImageRGB:
     water = np.array([60, 84, 92]) + 9 * waves[..., None]
     shore = np.arange(width)[:, None] > 0.4 * width
     return np.clip(np.where(shore, water, image), 0, 255).astype(np.uint8)
+
+
+def test_ground_that_differs_all_over_is_warned_of(
+    flights: tuple[SimulatedFlight, ...], site: Path, tmp_path: Path
+) -> None:
+    assert warned(site, written(flights[1], tmp_path / "plain")) == []
+    snowy = written(flights[1], tmp_path / "snowy", edit=lambda image, index: snowed(flights[1], image, index))
+    (warning,) = warned(site, snowy)
+    assert "of the compared ground looks changed (snow" in warning and "same season" in warning
+
+
+def test_a_map_far_coarser_than_the_flight_is_warned_of(
+    flights: tuple[SimulatedFlight, ...], tmp_path: Path
+) -> None:
+    first = written(flights[0], tmp_path / "first")
+    coarse = tmp_path / "coarse"
+    assert main(["map", str(first), "--site", str(coarse), "--model", "none", "--gsd", "0.4", *camera(first)]) == 0
+    (warning,) = warned(coarse, written(flights[1], tmp_path / "second", [0, 1, 2]))
+    assert warning.startswith("the map's pixels are 9 times as large as the flight's")
+
+
+def warned(site: Path, photos: Path) -> list[str]:
+    """What a comparison warns of, of its ground and its map; it may list changes."""
+    assert main(["compare", str(photos), "--site", str(site), "--model", "none", *camera(photos)]) in (0, 3)
+    report = json.loads((site / "flights" / photos.name / "report.json").read_text())
+    return [each for each in report["warnings"] if "season" in each or "pixels" in each]
+
+
+def snowed(flight: SimulatedFlight, image: ImageRGB, index: int) -> ImageRGB:
+    """The photo with snow on a quarter of the ground, the same in every photo."""
+    height, width = image.shape[:2]
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    ground_from_image = site_from_image_homography(flight.camera.undistorted(), flight.true_poses[index])
+    places = apply_homography(ground_from_image, np.column_stack([x.ravel(), y.ravel()]).astype(float))
+    drifts = np.sin(places[:, 0] * 1.1) + np.sin(places[:, 1] * 1.3 + 1)
+    cover = np.clip(4 * (drifts - 0.7), 0, 1).reshape(height, width, 1)
+    return np.asarray(image * (1 - cover) + 228 * cover, np.uint8)

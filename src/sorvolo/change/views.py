@@ -185,6 +185,11 @@ class ViewMaker:
         """How many times as bright as the map the flight is; NaN where that is not known."""
         return float("nan") if self._tuning is None else self._tuning.brightness
 
+    @property
+    def times_coarser(self) -> float:
+        """The map's pixels over those of the flight's own frames, at its usual height; NaN where that is not known."""
+        return self._site_grid.grid.m_per_px * self._flight.full.fx_px / self._flight.height_m
+
     # ---- inside -----------------------------------------------------------------------------------------------
 
     @property

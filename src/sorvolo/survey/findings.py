@@ -81,6 +81,11 @@ class ComparedView:
             raise GeometryError(f"view {self.name}: {len(self.boxes)} boxes but {len(self.scores)} scores")
 
     @cached_property
+    def changed_share(self) -> float:
+        """Of the ground that was compared, the share that differs."""
+        return float(np.count_nonzero(self.changed)) / max(1, int(np.count_nonzero(self.valid)))
+
+    @cached_property
     def m_per_px(self) -> float:
         """Ground metres of a pixel in the middle of the view's picture."""
         height, width = self.changed.shape

@@ -16,6 +16,8 @@ from sorvolo.survey.findings import Change, ChangeKind, ViewStatus
 from sorvolo.survey.wording import area_text, plural
 
 _DARK = 0.4  # times the map's brightness: less hides things
+_ALL_OVER = 0.1  # share of the compared ground: a day without changes has 0.01, other leaves 0.13, half snow 0.4
+_COARSE = 3.0  # times the flight's pixels: a map with larger ones hides what the flight shows
 
 
 class ViewCounts:
@@ -26,6 +28,7 @@ class ViewCounts:
         self._statuses: Counter[ViewStatus] = Counter()
         self._reasons: Counter[str] = Counter()
         self._residuals_px: list[float] = []
+        self._differing: list[float] = []
         self._local_m: list[float] = []
 
     def end(self, status: ViewStatus, reason: str) -> None:
@@ -43,6 +46,7 @@ class ViewCounts:
             self._local_m.append(outcome.local_m)
         if outcome.view is not None:
             is_dark = outcome.brightness < NIGHT
+            self._differing.append(outcome.view.changed_share)
             self.ground.compare(outcome.view, is_dark=is_dark, doubted=outcome.doubted, planted=outcome.planted)
         else:
             gap = Gap.NO_MAP if outcome.status is ViewStatus.OUTSIDE else Gap.REJECTED
@@ -57,6 +61,11 @@ class ViewCounts:
         return self._statuses.total()
 
     @property
+    def differing_share(self) -> float:
+        """The share of a view's compared ground that differs, announced or not: the median over the views."""
+        return median_of_known(self._differing) or 0.0
+
+    @property
     def commonest_reason(self) -> str:
         """Why most frames could not be compared, in words."""
         return self._reasons.most_common(1)[0][0] if self._reasons else "there is none"
@@ -66,6 +75,7 @@ class ViewCounts:
         return {
             "views": {status.value: self._statuses[status] for status in ViewStatus},
             "reasons": dict(self._reasons.most_common()),
+            "differing_share": self.differing_share,
             "residual_px": {
                 "median": median_of_known(self._residuals_px), "p95": percentile_of_known(self._residuals_px, 95),
             },
@@ -114,10 +124,14 @@ def comparison_headline(changes: int, coverage: Mapping[str, Any], *, is_local: 
     return {"quality": "doubtful", "text": f"not to be relied on, most of the ground could not be compared: {found}"}
 
 
-def comparison_warnings(counts: ViewCounts, brightness: float) -> list[str]:
-    """What makes this comparison show less than a user would expect of it; `brightness` is in times the map's."""
+def comparison_warnings(counts: ViewCounts, brightness: float, times_coarser: float) -> list[str]:
+    """What makes this comparison show less than a user would expect of it; `brightness` is in times the map's, and the
+    map's pixels are `times_coarser` than the flight's (NaN: not known)."""
+    return [*_light_and_size_warnings(brightness, times_coarser), *_ground_warnings(counts)]
+
+
+def _light_and_size_warnings(brightness: float, times_coarser: float) -> list[str]:
     warnings = []
-    views = max(1, counts.total)
     if brightness < NIGHT:
         warnings.append(
             f"the flight is {brightness:.2f} times as bright as the map: most changes are missed, so that finding "
@@ -128,6 +142,17 @@ def comparison_warnings(counts: ViewCounts, brightness: float) -> list[str]:
             f"the flight is {brightness:.2f} times as bright as the map: changes that are small, dark or of the "
             "ground's colour are missed; compare flights by daylight"
         )
+    if times_coarser > _COARSE:
+        warnings.append(
+            f"the map's pixels are {times_coarser:.0f} times as large as the flight's: only what is large on the map "
+            "is compared, and finding nothing means little for the rest; compare with a map as fine as the flight"
+        )
+    return warnings
+
+
+def _ground_warnings(counts: ViewCounts) -> list[str]:
+    warnings = []
+    views = max(1, counts.total)
     if counts[ViewStatus.OUTSIDE] == counts.total - counts[ViewStatus.LOST]:
         warnings.append(
             f"none of {counts.total} views lies on the map, which grew beside what it showed: if the flight was over "
@@ -141,5 +166,11 @@ def comparison_warnings(counts: ViewCounts, brightness: float) -> list[str]:
         warnings.append(
             f"{all_changed} of {views} views look changed all over (water, snow, ploughing?) and were left out: fly "
             "again when that is gone, or map the site anew"
+        )
+    if counts.differing_share > _ALL_OVER:
+        warnings.append(
+            f"{counts.differing_share:.0%} of the compared ground looks changed (snow, water, another season?): some "
+            "of the listed changes may be the ground's own, and things may be missed among them; compare with a map of "
+            "the same season"
         )
     return warnings

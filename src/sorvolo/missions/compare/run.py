@@ -229,7 +229,7 @@ class CompareRun:
             self._setup, self._settings.mapping, self._log, result, self._archive.site(), self._writer.tiles,
             [*notices, *self._objects.notices], time.monotonic() - started_s,
         )
-        warnings = comparison_warnings(self._counts, self._views.brightness)
+        warnings = comparison_warnings(self._counts, self._views.brightness, self._views.times_coarser)
         comparison = comparison_summary(
             changes, suppressed, self._counts, self._views, self._settings, self._base_version, ground,
             is_local=self._archive.site().is_local,
