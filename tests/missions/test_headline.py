@@ -14,6 +14,7 @@ from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.missions.flight.headline import MapQuality, map_headline
+from sorvolo.mosaic.consistency import Consistency
 from sorvolo.mosaic.flight_figures import flight_figures
 from sorvolo.store.exports.flight_files import video_writer
 from sorvolo.survey.mosaic import PlacedFrame, Status
@@ -65,7 +66,8 @@ def test_steps_make_a_map_to_check(frames: list[PlacedFrame], why: str) -> None:
 def test_a_map_with_faults_is_none_to_build_on() -> None:
     frames = [placed(10.0 * k, off_m=60.0) for k in range(8)]
     figures = flight_figures(frames, _CAMERA.fx_px)
-    headline = map_headline(frames, figures, is_video=True, faults=["it is twice as large as its GPS track"])
+    agreement = Consistency((), ("it is twice as large as its GPS track",), (), ())
+    headline = map_headline(frames, figures, is_video=True, agreement=agreement)
     assert headline.quality is MapQuality.CONTRADICTORY and "twice as large" in headline.text
 
 

@@ -1,5 +1,7 @@
 """Maps that contradict themselves are named, those of poor GPS or uneven take-off places are not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -53,6 +55,15 @@ def test_gps_that_errs_as_receivers_do_is_no_fault(gps_rms_m: float) -> None:
 ])
 def test_what_no_receiver_could_err_is_named(frames: list[PlacedFrame], words: str) -> None:
     assert any(words in each for each in held(frames).faults), held(frames)
+
+
+def test_pieces_beside_each_other_are_steps_and_areas_far_apart_are_not() -> None:
+    (step,) = held(flown()).steps
+    assert "2 pieces" in step and "0.jpg to 11.jpg" in step
+    frames = flown()
+    far_m = np.array([0.0, 900.0])
+    apart = [replace(each, outline_m=each.outline_m + far_m) if each.index >= 12 else each for each in frames]
+    assert not held(apart).steps
 
 
 def test_heights_that_pictures_contradict_are_reported_with_both_numbers() -> None:

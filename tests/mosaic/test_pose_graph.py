@@ -317,3 +317,18 @@ def test_a_map_that_telemetry_turns_as_one_follows_it_at_once():
     assert absolute_error_m(graph, poses) > 1.5
     graph.retime(dict(enumerate(priors(poses))))
     assert absolute_error_m(graph, poses) < 0.15
+
+
+def test_stated_angles_that_pictures_rule_out_are_counted_and_a_compass_that_is_off_is_measured():
+    rng = np.random.default_rng(12)
+    poses = flown(12, strips=3)
+    wrong = {3, 11, 20}
+    settings = PoseGraphSettings(heading_offset_sigma_deg=5.0)
+    priors = [
+        prior_of(pose, rng, yaw_off_deg=8.0 + 60.0 * (number in wrong)) for number, pose in enumerate(poses)
+    ]
+    graph = build(poses, priors, rng, settings)
+    graph.conclude()
+    report = graph.report()
+    assert report.angles_contradicted == len(wrong)
+    assert abs(report.turned_deg[1]) == pytest.approx(8.0, abs=1.5)

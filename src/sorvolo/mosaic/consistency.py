@@ -53,14 +53,16 @@ class Stated:
 
 @dataclass(frozen=True)
 class Consistency:
-    """The pieces of a map, the largest first; `faults`, in words, make it no map to rely on; `remarks` do not."""
+    """The pieces of a map, the largest first; `faults`, in words, make it no map to rely on, `steps` one to check,
+    `remarks` neither."""
 
     pieces: tuple[Piece, ...]
     faults: tuple[str, ...]
+    steps: tuple[str, ...]
     remarks: tuple[str, ...]
 
 
-NOTHING_KNOWN = Consistency((), (), ())
+NOTHING_KNOWN = Consistency((), (), (), ())
 
 
 def consistency(
@@ -69,13 +71,37 @@ def consistency(
 ) -> Consistency:
     """Hold a map against itself and against telemetry. `pieces` are the frames, by index, that links tie together."""
     by_index = {each.index: each for each in placed if each.status is not Status.REJECTED}
-    found = [_piece([by_index[k] for k in ids if k in by_index], stated) for ids in pieces]
-    known = tuple(sorted((each for each in found if each is not None), key=lambda each: -each.frames))
+    groups = sorted(([by_index[k] for k in ids if k in by_index] for ids in pieces), key=lambda group: -len(group))
+    found = [_piece(group, stated) for group in groups]
+    known = tuple(each for each in found if each is not None)
     faults = [
         *_scale_faults(known, settings), *_gps_faults(list(by_index.values()), figures, stated, settings),
         *_height_faults(list(by_index.values()), figures, settings),
     ]
-    return Consistency(known, tuple(faults), tuple(_height_remarks(figures, stated, settings)))
+    steps = _steps(groups[: len(known)], figures)
+    return Consistency(known, tuple(faults), tuple(steps), tuple(_height_remarks(figures, stated, settings)))
+
+
+def _steps(groups: Sequence[Sequence[PlacedFrame]], figures: FlightFigures) -> list[str]:
+    """Pieces that lie beside each other, tied by telemetry alone: two areas far apart are none."""
+    centres = [np.array([each.outline_m.mean(axis=0) for each in group]) for group in groups]
+    beside = [
+        k for k in range(1, len(groups))
+        if any(_apart_m(centres[k], other) < 0.6 * figures.diagonal_m for other in centres[:k])
+    ]
+    if not beside:
+        return []
+    listed = "; ".join(
+        f"{counted(len(groups[k]), 'frame')} from {groups[k][0].name} to {groups[k][-1].name}" for k in [0, *beside][:4]
+    )
+    return [
+        f"the map is in {len(beside) + 1} pieces that no picture ties together ({listed}): expect steps of some metres "
+        "between them; fly with more overlap, or give control points (--gcp)"
+    ]
+
+
+def _apart_m(first_m: PointsM, second_m: PointsM) -> float:
+    return float(np.linalg.norm(first_m[:, None] - second_m[None], axis=-1).min())
 
 
 def _piece(frames: Sequence[PlacedFrame], stated: Stated) -> Piece | None:

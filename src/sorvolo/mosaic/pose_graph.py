@@ -96,6 +96,8 @@ class GraphReport:
     links_dropped: int
     relief_m: float
     rms_px: float
+    angles_contradicted: int = 0  # frames whose stated angles the pictures rule out: these angles are not used
+    turned_deg: tuple[float, float] = (0.0, 0.0)  # tilt and heading that all stated angles are off by
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +291,8 @@ class PoseGraph:
         return GraphReport(
             float(np.exp(self._shared[0])), sigma, float(self._shared[1]), float(self._shared[2]), len(self._links),
             self._dropped, float(np.median(self._links.relief_m)) if len(self._links) else 0.0,
-            float(np.sqrt(np.mean(rms**2))) if len(rms) else float("nan"),
+            float(np.sqrt(np.mean(rms**2))) if len(rms) else float("nan"), len(self._trust.contradicted),
+            (float(np.degrees(np.linalg.norm(self._shared[5:7]))), float(np.degrees(self._shared[7]))),
         )
 
     def residuals_px(self) -> dict[int, float]:

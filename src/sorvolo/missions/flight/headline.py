@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from sorvolo.missions.flight.warnings import OBLIQUE_DEG, doubts
+from sorvolo.mosaic.consistency import NOTHING_KNOWN, Consistency
 from sorvolo.mosaic.flight_figures import FlightFigures
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.wording import counted
@@ -30,16 +31,15 @@ class Headline:
 
 
 def map_headline(
-    placed: Sequence[PlacedFrame], figures: FlightFigures, *, is_video: bool, faults: Sequence[str] = ()
+    placed: Sequence[PlacedFrame], figures: FlightFigures, *, is_video: bool, agreement: Consistency = NOTHING_KNOWN
 ) -> Headline:
-    """The headline of a flight that was mapped; photos were each meant, so that one photo is a map. `faults` are how
-    the map contradicts itself (see `Consistency`)."""
+    """The headline of a flight that was mapped; photos were each meant, so that one photo is a map."""
     seen = sum(each.status is not Status.REJECTED for each in placed)
     if is_video and (seen == 1 or figures.reach_m < _HOVERING * figures.diagonal_m):
         return Headline(MapQuality.ONE_VIEW, f"no map: {_one_view(figures, seen)}")
-    if faults:
-        return Headline(MapQuality.CONTRADICTORY, f"a map that contradicts itself: {'; '.join(faults)}")
-    found = doubts(placed, figures)
+    if agreement.faults:
+        return Headline(MapQuality.CONTRADICTORY, f"a map that contradicts itself: {'; '.join(agreement.faults)}")
+    found = [*agreement.steps, *doubts(placed, figures)]
     if found:
         return Headline(MapQuality.DOUBTFUL, f"a map to check before use: {'; '.join(found)}")
     matched = sum(each.status is Status.VISION for each in placed)

@@ -84,7 +84,7 @@ def build_report(
         "area_m2": shown_m2(tiles, site.m_per_px),
         **_effort(log, seconds, max(1, len(placed))),
         "notices": [asdict(each) for each in (*source.telemetry.notices, *setup.notices, *notices)],
-        "warnings": flight_warnings(placed, figures, setup, log, agreement),
+        "warnings": flight_warnings(placed, figures, setup, log, agreement, graph),
         "settings": asdict(settings),
         "versions": {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}},
         "track": [track_row(each) for each in placed],
@@ -96,7 +96,7 @@ def _headline(
 ) -> dict[str, Any]:
     if not result.makes_map:
         return {}
-    headline = map_headline(result.placed, figures, is_video=is_video, faults=agreement.faults)
+    headline = map_headline(result.placed, figures, is_video=is_video, agreement=agreement)
     return {"headline": asdict(headline)}
 
 

@@ -6,23 +6,25 @@ from sorvolo.missions.flight.log import FlightLog
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.consistency import NOTHING_KNOWN, Consistency
 from sorvolo.mosaic.flight_figures import FlightFigures
+from sorvolo.mosaic.pose_graph import GraphReport
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.wording import counted, plural
 
 OBLIQUE_DEG = 35.0  # pictures that look to opposite sides share too little to be linked
 _MANY = 0.1  # share of the frames
 _BAD_FIT_PX = 3.0
+_TURNED_DEG = 6.0  # by which all stated angles may be off without a word
 _GUESSED = 0.1  # relative: a focal length that is hardly known
 
 
 def flight_warnings(
     placed: Sequence[PlacedFrame], figures: FlightFigures, setup: FlightSetup, log: FlightLog,
-    agreement: Consistency = NOTHING_KNOWN,
+    agreement: Consistency = NOTHING_KNOWN, graph: GraphReport | None = None,
 ) -> list[str]:
     """The warnings of a flight's report."""
     return [
-        *agreement.faults, *_frame_warnings(placed), *doubts(placed, figures), *agreement.remarks,
-        *_camera_warnings(figures, setup), *_clock_warnings(setup, log),
+        *agreement.faults, *agreement.steps, *_frame_warnings(placed), *doubts(placed, figures), *agreement.remarks,
+        *_angle_warnings(placed, graph), *_camera_warnings(figures, setup), *_clock_warnings(setup, log),
     ]
 
 
@@ -44,6 +46,23 @@ def doubts(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
         )
     if figures.residual_median_px is not None and figures.residual_median_px > _BAD_FIT_PX:
         warnings.append("pictures fit each other badly: high trees or houses, a wrong camera, or a rolling shutter")
+    return warnings
+
+
+def _angle_warnings(placed: Sequence[PlacedFrame], graph: GraphReport | None) -> list[str]:
+    """Where the pictures contradict the stated angles of the camera or the aircraft."""
+    warnings = []
+    if graph is not None and graph.angles_contradicted:
+        warnings.append(
+            f"the stated angles of {counted(graph.angles_contradicted, 'frame')} of {len(placed)} contradict the "
+            "pictures by 15 deg or more and were not used"
+        )
+    if graph is not None and max(graph.turned_deg[0], abs(graph.turned_deg[1])) > _TURNED_DEG:
+        tilt_deg, heading_deg = graph.turned_deg
+        warnings.append(
+            f"all stated angles are off from the pictures: tilt by {tilt_deg:.0f} deg, heading by {heading_deg:+.0f} "
+            "deg (a compass beside motors, a mount that is not level); the pictures were followed"
+        )
     return warnings
 
 
