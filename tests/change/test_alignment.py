@@ -314,3 +314,20 @@ def test_one_strip_that_is_not_found_does_not_lose_the_flight(tiles):
         )
         assert isinstance(found, NotAligned) == lost
         assert lost or error_px(found, pose) * 30 / CAMERA.fx_px < 0.6
+
+
+def test_a_frame_tried_again_is_placed_beside_its_neighbours(tiles):
+    """Ground that stayed in its west third only: nothing there places the frame until those beside it have been."""
+    along = aligner(tiles)
+    ground = np.concatenate([rebuilt(0.3)[:, :1000], textured(8 * TILE_PX, 31)[:, 1000:]], axis=1)
+    poses = [Pose(turned(0.0), np.array([east_m, 0.0, 30.0])) for east_m in (10.0, -12.0, -6.0, 0.0, 5.0)]
+
+    def tried(number: int) -> Aligned | NotAligned:
+        prior = prior_at(poses[number], (1.0, 1.0, 0.0))
+        return along.align(photographed(poses[number], ground), CAMERA, prior, number * 3 * 10**9)
+
+    assert isinstance(tried(0), NotAligned)
+    assert all(isinstance(tried(number), Aligned) for number in (1, 2, 3, 4))
+    again = tried(0)
+    assert isinstance(again, Aligned)
+    assert error_px(again, poses[0]) * 30 / CAMERA.fx_px < 2.0  # m, at the worst corner

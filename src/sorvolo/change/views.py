@@ -74,12 +74,14 @@ class OneSided:
 @dataclass(frozen=True, eq=False)
 class FlightCamera:
     """The camera of a flight to be compared, its usual height above ground (m, NaN: unknown), the longest side of a
-    compared picture, and how a frame's time becomes UTC."""
+    compared picture, how a frame's time becomes UTC, and how many times as fine as frame and map a compared picture may
+    be."""
 
     full: Camera
     height_m: float
     side_px: int
     utc_ns: Callable[[int], int]
+    finer: float = 1.0
 
 
 class ViewMaker:
@@ -95,7 +97,9 @@ class ViewMaker:
         pictures: EarlierPictures | None,
     ) -> None:
         self._flight, self._reference, self._site_grid = flight, reference, site_grid
-        small = comparison_camera(flight.full, flight.height_m, site_grid.grid.m_per_px, flight.side_px)
+        small = comparison_camera(
+            flight.full, flight.height_m, site_grid.grid.m_per_px, flight.side_px, flight.finer
+        )
         self.pixels = FramePixels(flight.full, small)
         self._lens = Undistorter(small, flight.full)
         size = small.width_px, small.height_px
