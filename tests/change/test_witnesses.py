@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from sorvolo.change.pair.corroboration import Difference, believed
+from sorvolo.change.pair.corroboration import Difference, believed, is_whole, unwitnessed
+from sorvolo.change.pair.robust import RobustSettings, compare_robust
 
 SHAPE = (60, 80)
 ALL = np.ones(SHAPE, bool)
@@ -65,3 +66,27 @@ def test_nothing_is_found_where_the_map_knows_no_ground():
     known = ALL.copy()
     known[:, :60] = False
     assert not believed((says((30, 0.9)), known), [(says((30, 0.9)), ALL), (says((30, 0.9)), ALL)]).mask.any()
+
+
+def test_a_seam_of_the_map_through_a_thing_is_no_change_where_a_whole_picture_shows_it(ground):
+    """The left half of a car comes from one photo of the map, the right half from another that lies 14 px off."""
+    whole = ground.copy()
+    whole[150:180, 200:262] = (200, 60, 40)
+    whole[156:174, 215:230] = (40, 30, 30)
+    torn = whole.copy()
+    torn[:, 230:] = np.roll(whole, 14, axis=0)[:, 230:]
+    sees = np.ones(ground.shape[:2], bool)
+
+    def differences(reference: np.ndarray) -> Difference:
+        found = compare_robust(reference, whole, sees, RobustSettings(least_score=0.2))
+        return Difference(found.mask, found.boxes, found.scores)
+
+    by_map = differences(torn)
+    assert len(believed((by_map, sees), []).boxes) > 0
+    assert unwitnessed(by_map, [])
+    half = sees.copy()
+    half[:, 232:] = False
+    assert unwitnessed(by_map, [half])  # a picture that ends within the thing is no witness
+    assert all(is_whole(by_map.mask, part, sees) for part in unwitnessed(by_map, [half]))
+    assert not unwitnessed(by_map, [half, sees])
+    assert len(believed((by_map, sees), [(differences(whole), sees)]).boxes) == 0

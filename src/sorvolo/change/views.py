@@ -11,7 +11,7 @@ from sorvolo.change.alignment import Aligned, Aligner
 from sorvolo.change.coverage.planting import Planted, Planting
 from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.frame_pixels import FramePixels, comparison_camera
-from sorvolo.change.pair.corroboration import LEAST_SURENESS, SURE, Difference, believed
+from sorvolo.change.pair.corroboration import LEAST_SURENESS, SURE, Difference, believed, is_whole, unwitnessed
 from sorvolo.change.pair.flight_tuning import FlightTuning
 from sorvolo.change.pair.robust import RobustSettings, compare_robust
 from sorvolo.change.pair.thesis import compare_thesis
@@ -27,6 +27,7 @@ from sorvolo.survey.mosaic import PlacedFrame
 
 _KNOWN_ENOUGH = 0.1  # share of a frame on known ground: with less there is nothing to compare
 _WITNESSES = 2  # earlier pictures asked about a difference: one from each side
+_FURTHER = 3  # pictures asked besides where those do not show all of it
 _COARSER = 1.25  # times the map's pixels: views less coarse than that have its pixels
 _ALL_CHANGED = 0.5  # share of a view: more is snow, a flood or another place, not a list of changes
 _ALL_CHANGED_REASON = "more than half of it looks changed (water, snow, ploughing?)"
@@ -211,11 +212,17 @@ class ViewMaker:
         if self._pictures is None or compared.settings is None:
             return compared.found
         height, width = compared.valid.shape
-        earlier = []
-        for picture, sees in self._pictures.seen_from(
-            compared.aligned.site_from_image, compared.aligned.camera_m, width, height, _WITNESSES
-        ):
+        earlier: list[tuple[Difference, Mask]] = []
+        for number, (picture, sees) in enumerate(self._pictures.seen_from(
+            compared.aligned.site_from_image, compared.aligned.camera_m, width, height, _WITNESSES + _FURTHER
+        )):
             sees &= self._lens_sees
+            if number >= _WITNESSES:
+                open_parts = unwitnessed(compared.found, [seen for _, seen in earlier])
+                if not open_parts:
+                    break
+                if not any(is_whole(compared.found.mask, part, sees) for part in open_parts):
+                    continue
             found = compare_robust(picture, compared.query, sees, compared.settings)
             earlier.append((Difference(found.mask, found.boxes, found.scores), sees))
         return believed((compared.found, compared.valid), earlier)

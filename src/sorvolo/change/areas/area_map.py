@@ -167,8 +167,8 @@ def with_areas(changes: Sequence[Change], areas: Sequence[Change]) -> list[Chang
     """
     kept = [
         each for each in changes
-        if each.kind is ChangeKind.MOVING or _is_thing(each.patch)
-        or not any(_inside(each, area.outline_m) > _INSIDE for area in areas)
+        if each.kind is ChangeKind.MOVING
+        or not any(_inside(each, area.outline_m) > _INSIDE for area in areas) or _is_thing(each.patch)
     ]
     still = [each for each in kept if each.kind is not ChangeKind.MOVING]
     return kept + [area for area in areas if _explained(area, still) < _EXPLAINED]

@@ -22,8 +22,9 @@ from sorvolo.survey.coverage import CoveredGround, Gap
 from sorvolo.survey.findings import ComparedView
 
 _CHUNK = 64
+_SMOOTH = 7  # cells over which the roughness of ground is averaged
 _MOST_REASONS = 250  # a byte holds which one
-_STEPS_M = (0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # sizes are written in these steps
+_STEPS_M = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # sizes are written in these steps
 
 
 @dataclass(frozen=True)
@@ -156,7 +157,8 @@ class GroundCoverage:
         ]
         clean = classes == _CLEAN
         if clean.any() and self._planted:
-            rough = chunk.texture[clean] / chunk.clean[clean]
+            near = np.dstack([chunk.texture * clean, chunk.clean * clean]).astype(np.float32)
+            rough = np.divide(*cv2.blur(near, (_SMOOTH, _SMOOTH))[clean].T)  # what differs from cell to cell is luck
             sizes_m = [each.smallest_px(rough) * chunk.finest[clean] for each in (plain, faint)]
             labels[clean, 1], labels[clean, 2] = (_step_of(each) for each in sizes_m)
             labels[clean, 0] = np.where(plain.is_blind(rough), list(Gap).index(Gap.INSENSITIVE), _CLEAN)
@@ -221,20 +223,23 @@ def coverage_summary(
     `large_found` is the share found of plain things of the largest size that was drawn, None where none was.
     """
     compared = [each for each in parts if each.gap is None]
-    gaps_m2 = {
-        gap.value: sum(each.area_m2 for each in parts if each.gap is gap) for gap in Gap
-        if any(each.gap is gap for each in parts)
-    }
+    gaps_m2 = _gaps_m2(parts)
     compared_m2, missing_m2 = sum(each.area_m2 for each in compared), sum(gaps_m2.values())
     on_map_m2 = compared_m2 + missing_m2 - gaps_m2.get(Gap.NO_MAP.value, 0.0)
     return {
         "compared_m2": compared_m2, "not_compared_m2": missing_m2,
-        "gaps_m2": dict(sorted(gaps_m2.items(), key=lambda item: -item[1])), "views_without_a_place": unplaced,
+        "gaps_m2": gaps_m2, "views_without_a_place": unplaced,
         "smallest_m": _middle([(each.smallest_m, each.area_m2) for each in compared]),
         "faint_m": _middle([(each.faint_m, each.area_m2) for each in compared]),
         "large_found": _large_found(planted),
         "is_enough": compared_m2 >= 0.5 * on_map_m2 and compared_m2 > 0,
     }
+
+
+def _gaps_m2(parts: Sequence[CoveredGround]) -> dict[str, float]:
+    """The ground that was not compared by reason, the largest part first."""
+    areas_m2 = {gap.value: sum(each.area_m2 for each in parts if each.gap is gap) for gap in Gap}
+    return {name: area for name, area in sorted(areas_m2.items(), key=lambda item: -item[1]) if area}
 
 
 def _large_found(planted: Sequence[Planted]) -> float | None:

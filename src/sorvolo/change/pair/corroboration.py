@@ -63,6 +63,26 @@ def believed(by_map: tuple[Difference, Mask], earlier: Sequence[tuple[Difference
     return Difference(mask, np.array(boxes, np.int64).reshape(-1, 4), np.array(scores, np.float64))
 
 
+def unwitnessed(by_map: Difference, seen: Sequence[Mask]) -> list[tuple[slice, slice]]:
+    """The parts of the picture with sure differences from the map that no earlier picture shows whole.
+
+    The map is a mosaic: a seam through a thing tears it, and only a picture that is in one piece can tell that from a
+    change. `seen` (h, w) is what each earlier picture shows.
+    """
+    parts = []
+    for x, y, w, h in by_map.boxes[by_map.scores >= SURE]:
+        part = np.s_[y : y + h, x : x + w]
+        if not any(is_whole(by_map.mask, part, each) for each in seen):
+            parts.append(part)
+    return parts
+
+
+def is_whole(mask: ImageGray, part: tuple[slice, slice], seen: Mask) -> bool:
+    """Whether a picture that shows the `seen` ground shows all that differs in a part of it."""
+    shown = mask[part] > 0
+    return bool(np.count_nonzero(shown & seen[part]) > _SEEN * np.count_nonzero(shown))
+
+
 def _is_confirmed(
     shown: Mask, part: tuple[slice, slice], own: int, opinions: Sequence[_Opinion], score: float
 ) -> bool:

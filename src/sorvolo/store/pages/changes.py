@@ -150,12 +150,13 @@ def _headline(report: Mapping[str, Any], changes: Sequence[StoredChange]) -> str
     if views and not views.get(ViewStatus.COMPARED.value):
         return "No view could be compared with the map: this flight cannot show changes."
     area_m2 = number_at(report, "comparison", "compared_area_m2")
-    ground = ""
+    ground = missing = ""
     if area_m2 is not None and report.get("georeferenced", True):
-        ground = coverage_words(at(report, "comparison") or {}) or f" on {area_words(area_m2)} of ground"
+        covered = coverage_words(at(report, "comparison") or {})
+        ground, missing = covered or (f" on {area_words(area_m2)} of ground", "")
     kinds: Counter[ChangeKind] = Counter(each.kind for each in changes if each.kind is not ChangeKind.MOVING)
     moving = sum(each.kind is ChangeKind.MOVING for each in changes)
-    also = f"; also {plural(moving, 'moving object')}" if moving else ""
+    also = (f"; also {plural(moving, 'moving object')}" if moving else "") + missing
     is_dark = at(report, "comparison", "most_missed") is True
     return _found_words(kinds, ground, also, is_dark=is_dark)
 

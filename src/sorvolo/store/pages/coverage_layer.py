@@ -73,13 +73,14 @@ def _area_m2(feature: Any) -> float:
     return finite_or_none(at(feature, "properties", "area_m2")) or 0.0
 
 
-def coverage_words(comparison: Mapping[str, Any]) -> str | None:
-    """What of the ground was compared: " in 2.1 ha; 0.4 ha could not be compared"; None for reports that lack it."""
+def coverage_words(comparison: Mapping[str, Any]) -> tuple[str, str] | None:
+    """The ground that was compared and the ground that was not: " in 2.1 ha", "; 0.4 ha could not be compared"; None
+    for reports that lack it."""
     compared_m2 = finite_or_none(at(comparison, "coverage", "compared_m2"))
     missing_m2 = finite_or_none(at(comparison, "coverage", "not_compared_m2"))
     if compared_m2 is None or missing_m2 is None:
         return None
-    return f" in {area_words(compared_m2)}; {area_words(missing_m2)} could not be compared"
+    return f" in {area_words(compared_m2)}", f"; {area_words(missing_m2)} could not be compared"
 
 
 def _size_words(size_m: float) -> str:
