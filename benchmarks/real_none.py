@@ -343,7 +343,7 @@ def scored(name: str, folder: Path, whole: WholeMap, things: list[tuple[Planted,
 def laid_on(whole: WholeMap, rows: list[FrameRow]) -> Floats:
     """(3, 3) from metres of a strip's own map to those of the whole map, by the photos that both hold."""
     pairs = [(row.outline_m, whole.outline_m(row.name)) for row in rows if np.isfinite(row.outline_m).all()]
-    return fit_similarity(np.concatenate([mine for mine, _ in pairs]), np.concatenate([true for _, true in pairs]))
+    return fit_similarity(np.concatenate([true for _, true in pairs]), np.concatenate([mine for mine, _ in pairs]))
 
 
 def matched(
