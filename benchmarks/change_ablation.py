@@ -40,6 +40,7 @@ from sorvolo.change.metrics import FoundEvent, match_events, score_events
 from sorvolo.change.pair import robust
 from sorvolo.change.pair.corroboration import LEAST_SURENESS, Difference, believed
 from sorvolo.change.pair.flight_tuning import FlightTuning
+from sorvolo.change.pair.shade import shade_of_view
 from sorvolo.change.shape.shadows import without_shadow
 from sorvolo.missions.compare import run
 from sorvolo.missions.compare.flights import compare_flights
@@ -108,9 +109,14 @@ class Recorded:
             yield pickle.loads(path.read_bytes())
 
     def found(self) -> Iterator[ComparedView]:
-        """The views with the differences that were found then."""
+        """The views with the differences that were found then; their shade is made anew."""
         for path in sorted(self.folder.glob("found-*.pickle")):
-            yield pickle.loads(path.read_bytes())
+            yield with_shade(pickle.loads(path.read_bytes()))
+
+
+def with_shade(view: ComparedView) -> ComparedView:
+    """The view with its shade mask, as `ViewMaker` makes it."""
+    return replace(view, shade=shade_of_view(view.reference, view.image, view.valid))
 
 
 class RecordingViewMaker(views.ViewMaker):
@@ -133,7 +139,7 @@ class RecordingViewMaker(views.ViewMaker):
             view = ComparedView(
                 frame.index, frame.name, self._flight.utc_ns(frame.time_ns), aligned.site_from_image, aligned.camera_m,
                 looked.image, looked.reference, looked.valid, blank, np.zeros((0, 4), np.int64), np.zeros(0),
-                aligned.residual_px,
+                aligned.residual_px, blank,
             )
             place = self.folder / f"view-{frame.index:06d}.pickle"
             place.write_bytes(pickle.dumps((view, earlier), protocol=5))
@@ -245,7 +251,7 @@ def compared_again(recorded: Recorded) -> Iterator[ComparedView]:
             opinions.append((Difference(other.mask, other.boxes, other.scores), sees))
         kept = believed((by_map, view.valid), opinions)
         if np.count_nonzero(kept.mask) <= 0.5 * max(1, np.count_nonzero(view.valid)):
-            yield replace(view, changed=kept.mask, boxes=kept.boxes, scores=kept.scores)
+            yield with_shade(replace(view, changed=kept.mask, boxes=kept.boxes, scores=kept.scores, shade=kept.mask))
 
 
 def gathered(recorded: Recorded, compared: Iterator[ComparedView]) -> tuple[list[Any], int]:
@@ -383,12 +389,25 @@ def _no(*_: Any) -> bool:
     return False
 
 
+def _yes(*_: Any) -> bool:
+    return True
+
+
+def _new_at_once(parts: Any, row: int, thing: Any, named: Any, now_ns: int, next_id: Any) -> dict[int, Any]:
+    whole = all(each.id != thing.id for each in named.values())
+    return {row: thing if whole else replace(thing, id=next_id(), announced_ns=now_ns)}
+
+
 def _no_pieces(*_: Any) -> list[Any]:
     return []
 
 
-def _all_parts_one(_: Any, kind: Any, changed: Any) -> list[Any]:
+def _all_parts_one(_: Any, kind: Any, changed: Any, __: Any) -> list[Any]:
     return [(changed, kind)]
+
+
+def _thing_alone(thing: Any, *_: Any) -> Any:
+    return thing
 
 
 def _rule(name: str, decision: str, *switches: tuple[str, Any], stage: str = "evidence") -> Rule:
@@ -396,7 +415,8 @@ def _rule(name: str, decision: str, *switches: tuple[str, Any], stage: str = "ev
 
 
 _INFINITE = float("inf")
-_ANNOUNCING, _SHADOWS, _TRACKER = "evidence.announcing:AnnounceSettings", "shape.shadows", "motion.blob_tracker"
+_ANNOUNCING, _TRACKER = "evidence.announcing:AnnounceSettings", "motion.blob_tracker"
+_THINGS, _EVIDENCE = "shape.shadows:ThingSettings", "evidence.evidence_map"
 RULES: tuple[Rule, ...] = (
     # when a change is announced, and when it is withdrawn
     _rule("large must be sure", "0018", (f"{_ANNOUNCING}.large_score", 0.0)),
@@ -405,34 +425,77 @@ RULES: tuple[Rule, ...] = (
     _rule("restless ground, only for the unsure", "0007", (f"{_ANNOUNCING}.doubt", _INFINITE)),
     _rule("never seen whole", "0007", (f"{_ANNOUNCING}.cut_off", 1.0)),
     _rule("from one place", "before 0014", (f"{_ANNOUNCING}.one_place", 0.0)),
-    _rule("leaning neighbours", "0015", ("evidence.evidence_map:_PASSING", 0.0)),
-    _rule("unsteady blobs must stand", "0017", ("evidence.evidence_map:_STANDS_S", 0.0)),
-    _rule("frames all changed", "before 0014", ("evidence.evidence_map:_ALL_CHANGED", 2.0)),
-    _rule("only new places count", "before 0014", ("evidence.evidence_map:_MOVED_HEIGHTS", 0.0)),
+    _rule("leaning neighbours", "0015", (f"{_EVIDENCE}:_PASSING", 0.0)),
+    _rule("unsteady blobs must stand", "0017", (f"{_EVIDENCE}:_STANDS_S", 0.0)),
+    _rule("frames all changed", "before 0014", (f"{_EVIDENCE}:_ALL_CHANGED", 2.0)),
+    _rule("only new places count", "before 0014", (f"{_EVIDENCE}:_MOVED_HEIGHTS", 0.0)),
+    _rule("restless ground: not what leans with it", "before 0014", (f"{_EVIDENCE}:_LEAN", 0.0)),
+    _rule("restless ground: not what changed itself", "before 0014", (f"{_EVIDENCE}:_CHANGED_ITSELF", 1.0)),
     # what a change is made of
-    _rule("a dark car stays whole", "before 0014", (f"{_SHADOWS}:_may_be_a_car", _no)),
-    _rule("pieces that lie apart", "0016", (f"{_SHADOWS}:_groups", _no_pieces)),
-    _rule("solid things", "0018", (f"{_SHADOWS}:_SOLID", 0.0)),
+    _rule("a dark car stays whole", "before 0014", ("shape.shadows:_may_be_a_car", _no)),
+    _rule("pieces that lie apart", "0016", ("shape.shadows:_groups", _no_pieces)),
+    _rule("pieces: came and left by a neck", "0016", (f"{_THINGS}.neck_m", 0.0)),
+    _rule("solid things", "0018", (f"{_THINGS}.solid", 0.0)),
+    _rule("large things", "0018", (f"{_THINGS}.least_m2", 0.0)),
+    _rule("the shadow of what came", "before 0014", ("shape.shadows:_CONTRARY", {})),
     _rule("parts at all", "before 0014", ("evidence.pictures:things_of", _all_parts_one)),
+    _rule("parts: shown twice first", "before 0014", ("shape.things:Parts._new_at", _new_at_once)),
     _rule("replaced is seldom", "before 0014", ("shape.kinds:_REPLACED_PRIOR", 1.0)),
+    _rule("outlines without tiny pieces", "before 0014", ("shape.outlines:_LEAST_PART", 0.0)),
+    _rule("outlines by the majority of masks", "before 0014", ("evidence.pictures:_LEAST_MAJORITY", _INFINITE)),
     # what moves
     _rule("walks against the flight, photos", "0016", (f"{_TRACKER}:_floats", _no)),
-    _rule("very steady blobs", "0017", (f"{_TRACKER}:_is_very_steady", _no)),
     _rule("rigid blobs", "before 0016", (f"{_TRACKER}:_is_rigid", _no)),
-    _rule("much larger where it set out", "0017", (f"{_TRACKER}:_MUCH_LARGER", _INFINITE)),
-    _rule("still there", "before 0014", (f"{_TRACKER}:_is_still_there", _no)),
-    _rule("two blobs of one thing, by length", "0017", (f"{_TRACKER}:_ONE_THING_LENGTHS", 0.0)),
     _rule("photos: three views", "0016", (f"{_TRACKER}:_PHOTOS_APART_S", _INFINITE)),
     _rule("lost ones known again", "before 0014", (f"{_TRACKER}:_LOST_FOR_S", 0.0)),
     _rule("unlikely parallax", "before 0014", (f"{_TRACKER}:_UNLIKELY_PARALLAX", _INFINITE)),
-    _rule("over the rim", "before 0014", (f"{_TRACKER}:_follow_over_rim", _nothing)),
+    _rule("steady motion", "before 0014", (f"{_TRACKER}:_is_plausible", _yes)),
+    _rule("nothing goes with the camera", "before 0014", (f"{_TRACKER}:_goes_with_camera", _no)),
+    _rule("two blobs of one thing", "before 0014", (f"{_TRACKER}:_ONE_THING_M", 0.0)),
+    _rule("blobs without their shadows", "before 0014", ("motion.blobs:thing_of", _thing_alone)),
+    _rule("blobs: no large part of the view", "before 0014", ("motion.blobs:_MOST_OF_VIEW", 1.0)),
+    _rule("blobs: on known ground", "before 0014", ("motion.blobs:_is_known_around", _yes)),
     _rule("feet of people", "before 0014", ("motion.blobs:_foot_m", _nothing)),
-    # one pair of pictures
+    # one pair of pictures, on flights
     _rule("one very sure opinion", "0016", ("pair.corroboration:_VERY_SURE", 2.0), stage="pair"),
-    _rule("moved shadows", "0014", ("pair.light:_shades", _nothing), stage="pair"),
-    _rule("moved shadows: three levels", "0014", ("pair.moved_shadows:LEVELS", (8,)), stage="pair"),
-    _rule("growing", "0007", ("pair.robust:LEAST_GROWN", 2.0), stage="pair"),
+    _rule("opinions: what leans lies beside", "0007", ("pair.corroboration:_NEAR_PX", 1), stage="pair"),
+    _rule("opinions: all of it seen", "0007", ("pair.corroboration:_SEEN", 0.0), stage="pair"),
+    _rule("growing: not what is doubted", "0007", ("pair.robust:MaskSettings.least_grown", 0.0), stage="pair"),
+    _rule("hulls", "0007", ("pair.robust:MaskSettings.convexity", 2.0), stage="pair"),
+    _rule("growing: limit by quiet ground", "0007", ("pair.region_extent:ExtentSettings.of_quiet", 0.0), stage="pair"),
 )
+_LIGHT, _MOVED = "pair.illumination:LightSettings", "pair.moved_shadows:MovedShadowSettings"
+_EXTENT, _MASKS = "pair.region_extent:ExtentSettings", "pair.robust:MaskSettings"
+PAIR_RULES: tuple[Rule, ...] = tuple(_rule(name, decision, *switches, stage="pairs") for name, decision, *switches in (
+    ("light: small things do not count", "0007", (f"{_LIGHT}.median_cells", 1)),
+    ("light: only the same ground counts", "0007", (f"{_LIGHT}.alike", (-2.0, -1.0))),
+    ("light: flat ground counts a little", "0007", (f"{_LIGHT}.flat_trust", 0.0)),
+    ("light: four reaches", "0007", (f"{_LIGHT}.reaches", ((7, 1.0), (49, 1e-3)))),
+    ("light: slopes drawn to one", "0007", (f"{_LIGHT}.no_slope", 0.0)),
+    ("moved shadows", "0014", ("pair.illumination:_shades", _nothing)),
+    ("moved shadows: three levels", "0014", (f"{_MOVED}.levels", (8,))),
+    ("moved shadows: colours alike", "0014", (f"{_MOVED}.most_tint", 256)),
+    ("moved shadows: no cloud", "0014", (f"{_MOVED}.largest", 1.0)),
+    ("moved shadows: sharp edge", "0014", (f"{_MOVED}.sharp", 0.0)),
+    ("moved shadows: same structure", "0014", (f"{_MOVED}.least_alike", -_INFINITE)),
+    ("moved shadows: surer where small", "0014", (f"{_MOVED}.alike_of_few", 0.0)),
+    ("moved shadows: narrow parts beside", "0014", (f"{_MOVED}.most_apart", 0)),
+    ("growing", "0007", (f"{_MASKS}.least_grown", 2.0)),
+    ("growing: limit by the thing's height", "0007", (f"{_EXTENT}.of_top", 0.0)),
+    ("growing: limit by quiet ground", "0007", (f"{_EXTENT}.of_quiet", 0.0)),
+    ("growing: not into shade", "0007", (f"{_EXTENT}.shade_of_top", 0.0)),
+    ("growing: blurred rim", "0007", (f"{_EXTENT}.blurred", 0.0)),
+    ("growing: nearly convex", "0007", (f"{_EXTENT}.convexity", 0.0)),
+    ("growing: sharp rim", "0007", (f"{_EXTENT}.beside", _INFINITE)),
+    ("regions: activity around", "0007", ("pair.regions:RegionSettings.activity_factor", 0.0)),
+    ("regions: bounded activity", "0007", ("pair.regions:RegionSettings.most_clutter", 255.0)),
+    ("calm pairs search less far", "0007", ("pair.robust:RobustSettings.calm_px", -1.0)),
+    ("hulls", "0007", (f"{_MASKS}.convexity", 2.0)),
+    ("rims drawn anew", "0007", ("pair.robust:_outlined", _thing_alone)),
+    ("what left in the reference's pixels", "0007", (f"{_MASKS}.same_place_px", _INFINITE)),
+    ("rim of the unknown", "0007", ("pair.robust:RobustSettings.unknown_px", 0)),
+))
+"""For pair_ablation.py."""
 
 if __name__ == "__main__":
     main()

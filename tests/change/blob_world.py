@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sorvolo.change.pair.shade import shade_between
 from sorvolo.survey.findings import ComparedView
 
 M_PER_PX = 0.05
@@ -94,7 +95,7 @@ def view_of(
     noisy = np.clip(image + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
     return ComparedView(
         index, f"frame {index}", START_NS + round(time_s * 1e9), matrix, np.array(camera_m, float), noisy, reference,
-        valid, changed, stats[1:, :4].astype(np.int64), np.full(count - 1, score), 0.5,
+        valid, changed, stats[1:, :4].astype(np.int64), np.full(count - 1, score), 0.5, shade_between(reference, noisy),
     )
 
 

@@ -46,6 +46,7 @@ def changes_of(before: Rgb, after: Rgb, light: Callable[[Rgb, int], Rgb] = same_
             index, f"{index}", index * 10**9, site_from_image, np.array([x * M_PER_PX + 16, -y * M_PER_PX - 12, 40.0]),
             np.clip(np.rint(seen), 0, 255).astype(np.uint8), before[part].copy(), np.ones(VIEW_PX[::-1], bool),
             np.zeros(VIEW_PX[::-1], np.uint8), np.zeros((0, 4), np.int64), np.zeros(0), 0.4,
+            np.zeros(VIEW_PX[::-1], np.uint8),
         ))
     return areas.conclude("b", 7)
 
@@ -128,7 +129,7 @@ def test_what_is_part_of_an_area_is_not_reported_beside_it(grass):
     inside[20:40, 20:40] = True
     thing = ground.copy()
     thing[inside, :3] = 230
-    plain = Patch(29.0, -21.0, 0.05, ground, ground, inside)
+    plain = Patch(29.0, -21.0, 0.05, ground, ground, inside, np.zeros((60, 60), np.uint8))
     outline_m = np.array([[30.0, -22.0], [31.0, -22.0], [31.0, -23.0], [30.0, -23.0]])
     part = replace(area, id="b-1", kind=ChangeKind.REPLACED, outline_m=outline_m, patch=plain)
     car = replace(part, id="b-2", patch=replace(plain, after=thing))

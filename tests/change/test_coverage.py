@@ -23,7 +23,7 @@ def view_of(ground: np.ndarray, index: int = 0, west_m: float = 0.0, north_m: fl
     return ComparedView(
         index, f"{index}", index * 10**9, site_from_image, np.array([16.0 + west_m, -12.0 + north_m, 40.0]), picture,
         picture, np.ones(picture.shape[:2], bool), np.zeros(picture.shape[:2], np.uint8), np.zeros((0, 4), np.int64),
-        np.zeros(0), 0.3,
+        np.zeros(0), 0.3, np.zeros(picture.shape[:2], np.uint8),
     )
 
 

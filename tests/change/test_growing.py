@@ -3,13 +3,8 @@
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from sensor_noise import camera
 
-from sorvolo.change.pair.illumination import fit_light, light_around, relit, relit_parts
-from sorvolo.change.pair.region_extent import Views, _moved, _strength, _widened
-from sorvolo.change.pair.regions import RegionSettings
 from sorvolo.change.pair.robust import RobustResult, compare_robust
 
 SIZE = (360, 480)
@@ -75,31 +70,3 @@ def test_a_soft_shadow_is_no_part_of_the_thing() -> None:
     changed = plain(150) * (1 - cv2.GaussianBlur(shade, (0, 0), 2)[..., None])
     changed[THING] = (60, 60, 220)
     assert overlap(compared(plain(150), changed).mask, THING) > 0.8
-
-
-def test_the_light_beside_a_thing_is_that_of_the_plain_ground_there() -> None:
-    changed = street()
-    changed[THING] = (60, 180, 90)
-    light = fit_light(camera(street() * CLOUD, 1), camera(changed, 2))
-    around = light_around(light, THING * np.uint8(255))
-    size = light.gains.shape[1::-1]
-    cells = cv2.resize(CLOUD[..., 0], size, interpolation=cv2.INTER_AREA)
-    beside = cv2.resize(cv2.dilate(THING.view(np.uint8), np.ones((97, 97), np.uint8)), size) > 0
-    beside &= cv2.resize(cv2.dilate(THING.view(np.uint8), np.ones((33, 33), np.uint8)), size) == 0
-    off = [np.abs(np.log2(each.gains[..., 1] * each.brightness[1] * cells))[beside].mean() for each in (light, around)]
-    assert off[1] < 0.75 * off[0]
-    assert light_around(around, np.zeros(SIZE, np.uint8)) is around
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.integers(0, 60), st.integers(0, 80), st.integers(1, 3), st.integers(0, 2**32 - 1))
-def test_parts_lit_and_compared_alone_are_those_of_the_whole(top: int, left: int, reach_px: int, seed: int) -> None:
-    before, after = (np.random.default_rng(seed + k).integers(0, 256, (72, 96, 3), np.uint8) for k in range(2))
-    light = fit_light(before, after)
-    views = Views(before, after, before, None, RegionSettings(reach_px=reach_px))
-    place = np.s_[5:70, 0:90]
-    window = np.s_[max(top, 5) : top + 10, left : left + 10]
-    wide = _widened(window, place, reach_px + 2)
-    whole = _strength(relit(before, light), views, place)
-    alone = _strength(relit_parts(before, light, [wide]), views, wide)
-    np.testing.assert_array_equal(alone[_moved(window, wide)], whole[_moved(window, place)])

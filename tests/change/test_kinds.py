@@ -38,7 +38,8 @@ def picture(seed, colour=None, light=1.0):
 
 
 def patch(seed, before, after, light=1.0):
-    return Patch(0, 0, 0.05, picture(seed, before), picture(seed, after, light), thing_mask(seed))
+    no_shade = np.zeros((SIZE, SIZE), np.uint8)
+    return Patch(0, 0, 0.05, picture(seed, before), picture(seed, after, light), thing_mask(seed), no_shade)
 
 
 @settings(max_examples=25, deadline=None)

@@ -21,7 +21,7 @@ from sorvolo.change.metrics import (
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.survey.findings import ChangeKind
 
-APPEARED, GONE, REPLACED, MOVING = ChangeKind
+APPEARED, GONE, REPLACED, _, MOVING = ChangeKind
 BOX = np.array([[-0.5, -0.25], [0.5, -0.25], [0.5, 0.25], [-0.5, 0.25]])
 SECOND = 10**9
 

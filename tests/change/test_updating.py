@@ -1,5 +1,7 @@
 """Tiles with a change painted in: the change and a narrow rim, in the map's light, nothing else."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -28,7 +30,7 @@ def patch_with(brightness=1.0, hole=False):
         after[:20, :, 3] = 0
     changed = np.zeros((40, 40), bool)
     changed[14:26, 14:26] = True
-    return Patch(39.5 / 20, -39.5 / 20, 0.05, before, after, changed)
+    return Patch(39.5 / 20, -39.5 / 20, 0.05, before, after, changed, np.zeros((40, 40), np.uint8))
 
 
 def test_the_change_is_painted_and_the_rest_stays_byte_for_byte():
@@ -56,7 +58,7 @@ def test_a_tile_that_it_does_not_touch_is_the_same_object():
     old = tile()
     assert patched(old, (512, 512, 640, 640), GRID_FROM_SITE, patch_with()) is old
     nothing = patch_with()
-    unmarked = Patch(nothing.west_m, nothing.north_m, 0.05, nothing.before, nothing.after, np.zeros((40, 40), bool))
+    unmarked = replace(nothing, changed=np.zeros((40, 40), bool))
     assert patched(old, WINDOW, GRID_FROM_SITE, unmarked) is old
 
 

@@ -40,17 +40,6 @@ def test_differences_are_as_specified(
     assert np.array_equal(kernels.differences(before, after, known, reach, weight), plain)
 
 
-@settings(max_examples=60, deadline=None)
-@given(SIDES, SIDES, st.integers(1, 60), st.integers(0, 2**32 - 1))
-def test_shades_are_as_specified(height: int, width: int, apart: int, seed: int) -> None:
-    lighter, darker = pictures(height, width, seed)
-    darker[: height // 2] = lighter[: height // 2] * 0.7 + 0.5
-    part = np.s_[height // 4 : height // 4 + max(2, height // 2), 0:width]
-    plain = np.empty((max(2, height // 2), width), np.uint8)
-    numpy_robust.darker_alike(lighter, darker, 0, height // 4, width, len(plain), apart, plain)
-    assert np.array_equal(kernels.darker_alike(lighter, darker, part, apart), plain)
-
-
 @settings(max_examples=100, deadline=None)
 @given(SIDES, SIDES, st.floats(0.02, 0.98), st.floats(0, 0.2), st.integers(0, 2**32 - 1))
 def test_held_parts_are_as_specified(height: int, width: int, share: float, seeded: float, seed: int) -> None:

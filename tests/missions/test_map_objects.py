@@ -164,8 +164,8 @@ def change_at(kind: ChangeKind, velocity_m_s: tuple[float, float] = (0.0, 0.0)) 
     changed = np.zeros((20, 20), bool)
     changed[5:15, 5:15] = True
     return Change(
-        "f-1", kind, 0.9, outline_m, 0, 10 * 10**9, 5, 1.0, 1.0, 0.1, Patch(9.0, 21.0, 0.1, rgba, rgba, changed),
-        np.array(velocity_m_s),
+        "f-1", kind, 0.9, outline_m, 0, 10 * 10**9, 5, 1.0, 1.0, 0.1,
+        Patch(9.0, 21.0, 0.1, rgba, rgba, changed, np.zeros((20, 20), np.uint8)), np.array(velocity_m_s),
     )
 
 

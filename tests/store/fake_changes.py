@@ -23,7 +23,7 @@ def fake_change(
     thing = ground.copy()
     thing[inside, :3] = (200, 40 + 20 * (number % 8), 40)
     before, after = (ground, thing) if kind is not ChangeKind.DISAPPEARED else (thing, ground)
-    patch = Patch(east_m - size_m, north_m + size_m, m_per_px, before, after, inside)
+    patch = Patch(east_m - size_m, north_m + size_m, m_per_px, before, after, inside, np.zeros(inside.shape, np.uint8))
     return Change(
         f"{flight_id}-{number}", kind, score, outline_m, SEEN_NS + number, SEEN_NS + 3_000_000_000, 4, size_m**2 * 0.9,
         size_m, 0.07, patch, np.array(velocity_m_s),

@@ -14,6 +14,7 @@ from sorvolo.change.frame_pixels import FramePixels, comparison_camera
 from sorvolo.change.pair.corroboration import LEAST_SURENESS, SURE, Difference, believed, is_whole, unwitnessed
 from sorvolo.change.pair.flight_tuning import FlightTuning
 from sorvolo.change.pair.robust import RobustSettings, compare_robust
+from sorvolo.change.pair.shade import shade_of_view
 from sorvolo.change.pair.thesis import compare_thesis
 from sorvolo.change.pair.thesis_options import ThesisOptions
 from sorvolo.change.reference import ReferenceMap
@@ -152,9 +153,11 @@ class ViewMaker:
         changed = np.count_nonzero(found.mask) / max(1, int(np.count_nonzero(valid)))
         if changed > _ALL_CHANGED:
             return replace(outcome, status=ViewStatus.ALL_CHANGED, reason=_ALL_CHANGED_REASON)
+        shade = shade_of_view(compared.reference, compared.image, valid) if len(found.boxes) else found.mask
         view = ComparedView(
             frame.index, frame.name, self._flight.utc_ns(frame.time_ns), aligned.site_from_image, aligned.camera_m,
             compared.image, compared.reference, valid, found.mask, found.boxes, found.scores, aligned.residual_px,
+            shade,
         )
         return replace(outcome, view=view, doubted=_doubted(compared.found, found), planted=self._plant(view, compared))
 

@@ -106,12 +106,11 @@ _robust = numpy_robust if _native is None else _native
 
 def relight(
     image: NDArray[np.uint8], curves: NDArray[np.int32], gains: NDArray[np.float32],
-    parts: Sequence[tuple[slice, slice]] | None = None, out: NDArray[np.uint8] | None = None,
+    out: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.uint8]:
     """A picture (h, w, 3) through curves (3, 256) and times lines of gains (H, w, 3) over it: see numpy_robust.
 
-    Only `parts` of it, rows and columns from a start to a stop, are filled where they are given. `out` (h, w, 3) is
-    written over where it is given, and returned.
+    `out` (h, w, 3) is written over where it is given, and returned.
     """
     if image.ndim != 3 or image.shape[2] != 3 or curves.shape != (3, 256):
         raise ValueError(f"relight: image {image.shape} and curves {curves.shape} do not fit")
@@ -121,13 +120,7 @@ def relight(
     out = _target(out, image.shape)
     image, curves = np.ascontiguousarray(image, np.uint8), np.ascontiguousarray(curves, np.int32)
     gains = np.ascontiguousarray(gains, np.float32)
-    whole = [(slice(0, height), slice(0, width))]
-    for rows, columns in whole if parts is None else parts:
-        if not (0 <= rows.start <= rows.stop <= height and 0 <= columns.start <= columns.stop <= width):
-            raise ValueError(f"relight: part {rows}, {columns} lies outside of the {width} x {height} px picture")
-        _robust.relight(
-            image, curves, gains, columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start, out
-        )
+    _robust.relight(image, curves, gains, 0, 0, width, height, out)
     return out
 
 
@@ -169,21 +162,6 @@ def differences(
         np.ascontiguousarray(before, np.uint8), np.ascontiguousarray(after, np.uint8), marked, reach, weight, out
     )
     return out
-
-
-def darker_alike(
-    lighter: NDArray[np.uint8], darker: NDArray[np.uint8], part: tuple[slice, slice], apart: int
-) -> NDArray[np.bool_]:
-    """Where in a part of two pictures (h, w, 3) one is darker in all colours alike: see numpy_robust."""
-    (height, width), (rows, columns) = lighter.shape[:2], part
-    if lighter.shape != (height, width, 3) or darker.shape != lighter.shape:
-        raise ValueError(f"darker_alike: pictures {lighter.shape} and {darker.shape} do not fit")
-    if not (0 <= rows.start <= rows.stop - 2 < height - 1 and 0 <= columns.start <= columns.stop - 2 < width - 1):
-        raise ValueError(f"darker_alike: part {rows}, {columns} does not fit the {width} x {height} px picture")
-    high, wide = rows.stop - rows.start, columns.stop - columns.start
-    out = np.empty((high, wide), np.uint8)
-    _robust.darker_alike(_bytes(lighter), _bytes(darker), columns.start, rows.start, wide, high, apart, out)
-    return out.view(np.bool_)
 
 
 def tint(

@@ -187,66 +187,12 @@ void differences(const Bytes &reference, const Bytes &query, const std::optional
     }
 }
 
-// How many 128ths of the light are left.
-SORVOLO_INLINE float left_of(std::uint8_t lighter, std::uint8_t darker) {
-    constexpr float TO_WHOLE = 12582912.0f;  // 1.5 * 2**23: added and taken off again, it rounds to the nearest even
-    const float over = static_cast<float>(std::min(darker + 8, 255));
-    const float under = static_cast<float>(std::min(lighter + 8, 255));
-    return std::min((over * 128.0f / under + TO_WHOLE) - TO_WHOLE, 255.0f);
-}
-
-// Where what is left of all colours is less than all, and less than `apart` from colour to colour.
-SORVOLO_CLONES
-void darker_row(const std::uint8_t *blue, const std::uint8_t *green, const std::uint8_t *red,
-                const std::uint8_t *dark_blue, const std::uint8_t *dark_green, const std::uint8_t *dark_red,
-                float apart, std::uint8_t *to, std::ptrdiff_t columns) {
-    SORVOLO_INDEPENDENT
-    for (std::ptrdiff_t x = 0; x < columns; ++x) {
-        const float b = left_of(blue[x], dark_blue[x]), g = left_of(green[x], dark_green[x]);
-        const float r = left_of(red[x], dark_red[x]);
-        const float most = std::max(std::max(b, g), r), least = std::min(std::min(b, g), r);
-        to[x] = (most < 128.0f) & (most - least < apart);
-    }
-}
-
-void darker_alike(const Bytes &lighter, const Bytes &darker, int left, int top, int wide, int high, int apart,
-                  Bytes &out) {
-    const std::ptrdiff_t width = lighter.shape(1);
-    const std::uint8_t *pixels[2] = {lighter.data(), darker.data()};
-    std::uint8_t *to = out.mutable_data();
-    pybind11::gil_scoped_release released;
-    const int stride = in_lanes(wide);
-    std::vector<std::uint8_t> split(2 * 9 * static_cast<std::size_t>(stride)), blurred(6 * stride), row(stride);
-    std::vector<std::uint16_t> sums(stride + 2);
-    const auto plane = [&](int picture, int y, int band) {
-        return split.data() + (static_cast<std::size_t>(picture) * 9 + (y % 3) * 3 + band) * stride;
-    };
-    const auto split_at = [&](int y) {
-        for (int picture = 0; picture < 2; ++picture)
-            split_row(pixels[picture] + 3 * ((top + y) * width + left), plane(picture, y, 0), plane(picture, y, 1),
-                      plane(picture, y, 2), wide);
-    };
-    const auto band = [&](int number) { return blurred.data() + static_cast<std::size_t>(number) * stride; };
-    split_at(0), split_at(1);
-    for (int y = 0; y < high; ++y) {
-        if (y >= 1 && y + 1 < high) split_at(y + 1);
-        const int above = mirrored(y - 1, high), below = mirrored(y + 1, high);
-        for (int each = 0; each < 6; ++each)
-            blur_row(plane(each / 3, above, each % 3), plane(each / 3, y, each % 3), plane(each / 3, below, each % 3),
-                     sums.data(), band(each), wide, stride);
-        darker_row(band(0), band(1), band(2), band(3), band(4), band(5), static_cast<float>(apart), row.data(), stride);
-        std::memcpy(to + static_cast<std::size_t>(y) * wide, row.data(), wide);
-    }
-}
-
 }  // namespace
 
 void bind_differences(pybind11::module_ &module) {
     using pybind11::arg;
     module.def("differences", &differences, arg("reference").noconvert(), arg("query").noconvert(),
                arg("known").noconvert(), arg("reach"), arg("weight"), arg("out").noconvert());
-    module.def("darker_alike", &darker_alike, arg("lighter").noconvert(), arg("darker").noconvert(), arg("left"),
-               arg("top"), arg("wide"), arg("high"), arg("apart"), arg("out").noconvert());
 }
 
 }  // namespace sorvolo

@@ -82,22 +82,6 @@ def _outside(
     return np.minimum(luma + weight * colour, 255), colour
 
 
-def darker_alike(
-    lighter: NDArray[np.uint8], darker: NDArray[np.uint8], left: int, top: int, wide: int, high: int, apart: int,
-    out: NDArray[np.uint8],
-) -> None:
-    """Fills `out` (high, wide) of a part of two pictures (h, w, 3): 1 where `darker` is so, all colours alike, else 0.
-
-    Both are blurred by 3 x 3 with the part's rim mirrored, and lifted by 8; by how many 128ths they are alike is below
-    128 in each colour, and less than `apart` from colour to colour.
-    """
-    part = np.s_[top : top + high, left : left + wide]
-    under, over = (np.minimum(_blurred(each[part]) + 8, 255).astype(np.float32) for each in (lighter, darker))
-    parts = np.minimum(np.rint(over * np.float32(128) / under), 255)
-    most, least = parts.max(axis=2), parts.min(axis=2)
-    out[:] = (most < 128) & (most - least < apart)
-
-
 def tint(
     reference: NDArray[np.uint8], query: NDArray[np.uint8], logs: NDArray[np.uint8], boxes: NDArray[np.int32],
     margin: int, out: NDArray[np.uint8],

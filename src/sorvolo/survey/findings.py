@@ -1,7 +1,7 @@
 """What a later flight finds: views laid over the known map, and the changes of the ground that they show."""
 
 from dataclasses import dataclass, field
-from enum import StrEnum
+from enum import IntFlag, StrEnum
 from functools import cached_property
 
 import numpy as np
@@ -42,6 +42,18 @@ class ChangeKind(StrEnum):
     MOVING = "moving"  # someone or something that moves while it is seen: no change of the ground
 
 
+class Shade(IntFlag):
+    """Bits of a shade mask: where one date shows the ground no brighter than the other, all colours alike.
+
+    So does a shadow that came (on the later date) or left (on the earlier one), and unchanged ground on both.
+    """
+
+    LATER = 1
+    LATER_DARK = 2  # clearly darker
+    EARLIER = 4
+    EARLIER_DARK = 8
+
+
 class Verdict(StrEnum):
     """A person's verdict on a change."""
 
@@ -57,7 +69,8 @@ class ComparedView:
     `valid` where both are known (elsewhere the answer is *unknown*); `changed` 0 or 255, 0 where not valid.
     `boxes` (N, 4) are x, y, width, height of the connected changes and `scores` (N,) how sure each is, 0 to 1.
     `site_from_image` (3, 3) takes pixels to the ground; `camera_m` (3,) is where the camera was, up being its height
-    above the ground. `residual_px` is what is left between the image and the map after alignment.
+    above the ground. `residual_px` is what is left between the image and the map after alignment. `shade` holds bits
+    of `Shade`, the reference being the earlier date.
     """
 
     index: int
@@ -72,11 +85,12 @@ class ComparedView:
     boxes: Boxes
     scores: Floats
     residual_px: float
+    shade: ImageGray
 
     def __post_init__(self) -> None:
         size = self.image.shape[:2]
-        if not size == self.reference.shape[:2] == self.valid.shape == self.changed.shape:
-            raise GeometryError(f"view {self.name}: image, reference, valid and changed differ in size")
+        if not size == self.reference.shape[:2] == self.valid.shape == self.changed.shape == self.shade.shape:
+            raise GeometryError(f"view {self.name}: image, reference, valid, changed and shade differ in size")
         if len(self.boxes) != len(self.scores):
             raise GeometryError(f"view {self.name}: {len(self.boxes)} boxes but {len(self.scores)} scores")
 
@@ -101,7 +115,8 @@ class Patch:
     (column + 1/2) `m_per_px`, north = `north_m` - (row + 1/2) `m_per_px`, in the site frame.
 
     `before` comes from the map, `after` from the flight's best view; alpha 0 where nothing is known. `changed` marks
-    the change itself; the patch shows some of its surroundings, too.
+    the change itself; the patch shows some of its surroundings, too. `shade` holds bits of `Shade`, as the views had
+    them, 0 where nothing is known.
     """
 
     west_m: float
@@ -110,9 +125,10 @@ class Patch:
     before: ImageRGBA
     after: ImageRGBA
     changed: Mask
+    shade: ImageGray
 
     def __post_init__(self) -> None:
-        if not self.before.shape[:2] == self.after.shape[:2] == self.changed.shape:
+        if not self.before.shape[:2] == self.after.shape[:2] == self.changed.shape == self.shade.shape:
             raise GeometryError("a patch's pictures differ in size")
 
     @property

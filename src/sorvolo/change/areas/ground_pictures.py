@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sorvolo.change.evidence.pictures import BETTER, quality
-from sorvolo.change.shape.patches import Cut, PatchWindow, cut, moved, patch_of
+from sorvolo.change.shape.patches import Cut, PatchWindow, cut, patch_of
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.survey.findings import ComparedView, Patch
 
@@ -52,10 +52,10 @@ class GroundPictures:
         (west, south), (east, north) = np.floor((low_m - margin_m) / coarse), np.ceil((high_m + margin_m) / coarse)
         window = PatchWindow(west * coarse, north * coarse, coarse, int(east - west), int(north - south))
         empty = np.zeros((window.height_px, window.width_px, 4), np.uint8)
-        pictures = Cut(empty, empty)
+        pictures = Cut(empty, empty, empty[..., 0])
         for key in self._around(low_m - margin_m, high_m + margin_m):
             square, own = self._squares[key][0], self._window(key)
-            pictures = pictures.over(Cut(moved(square.before, window, own), moved(square.after, window, own)))
+            pictures = pictures.over(square.moved(window, own))
         return patch_of(window, pictures, outline_m)
 
     def _window(self, key: tuple[int, int]) -> PatchWindow:

@@ -49,7 +49,9 @@ class AnnounceSettings:
     least_score: float = 0.38  # 0007: half of what the trees asked for that had seen no flights
     large_m2: float = 2.0  # 0018: from this size on ...
     large_score: float = 0.52  # 0018: ... and shorter than the flying height, a less sure one is a wall that leans
-    shade_score: float = 0.6  # 0015: what is mostly shade must be surer than this
+    shade_score: float = 0.6  # 0015: a speck that is mostly shade must be surer than this
+    speck_m2: float = 0.2  # 0015: what is smaller may be a speck of shade ...
+    shade_share: float = 0.7  # 0015: ... if so much of it is
     restless_half: float = 0.05  # share of views that flag the ground around for nothing: half the score is left
     doubt: float = 2.0  # 0007: restless ground counts in full where half of the score is missing
     cut_off: float = 0.5  # 0007: of the score is left where no view shows all of it
@@ -66,7 +68,7 @@ class Look:
 
     area_m2: float
     length_m: float
-    is_shade: bool  # mostly ground in another shade
+    shade_share: float  # of it is ground in another shade, 0 to 1
 
 
 @dataclass(frozen=True)
@@ -165,7 +167,8 @@ def _objection(tally: Tally, settings: AnnounceSettings) -> Reason | None:
         return Reason.UNSURE
     if look is None:
         return None
-    if look.is_shade and score < settings.shade_score:
+    is_speck_of_shade = look.area_m2 < settings.speck_m2 and look.shade_share >= settings.shade_share
+    if is_speck_of_shade and score < settings.shade_score:
         return Reason.SHADE
     may_be_a_wall = look.area_m2 >= settings.large_m2 and look.length_m < tally.flying_height_m  # snow is longer
     if may_be_a_wall and score < settings.large_score and not tally.is_from_one_place(settings):

@@ -34,7 +34,7 @@ from sorvolo.change.evidence.cells import (
 from sorvolo.change.evidence.pictures import BETTER
 from sorvolo.change.motion.blob_tracker import BlobTracker, MovingSettings, Track
 from sorvolo.change.motion.moving_changes import Movers
-from sorvolo.change.shape.shadows import is_mostly_shade
+from sorvolo.change.shape.shadows import ThingSettings, shade_share
 from sorvolo.change.shape.things import Parts
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, Mask
@@ -67,6 +67,7 @@ class EvidenceSettings:
     single_view_score: float = 2.0  # a single view's change this sure is announced at the end; above 1: never
     moving: MovingSettings = field(default_factory=MovingSettings)
     announcing: AnnounceSettings = field(default_factory=AnnounceSettings)
+    things: ThingSettings = field(default_factory=ThingSettings)
 
     def __post_init__(self) -> None:
         if not 1 <= self.k <= self.n <= 8:
@@ -388,7 +389,7 @@ class EvidenceMap:
         whole = self._record(candidate) if isinstance(verdict, Announce) else None
         if whole is None:
             return verdict, None
-        look = Look(whole.area_m2, whole.length_m, is_mostly_shade(whole))
+        look = Look(whole.area_m2, whole.length_m, shade_share(whole.patch))
         return judge(replace(candidate.tally, look=look), rules, is_over=is_over), whole
 
     def _restlessness(self, candidate: Candidate) -> float:
@@ -399,7 +400,7 @@ class EvidenceMap:
         if whole is None:
             return []
         things = candidate.pictures.parted(
-            whole, candidate.cells, self._cells_of(candidate), self._cell_m, self._join_m
+            whole, candidate.cells, self._cells_of(candidate), self._cell_m, self._join_m, self._settings.things
         )
         parts = self._parts.setdefault(candidate.number, Parts())
         return parts.take(things, candidate.tally.views, now_ns, lambda: f"{self._prefix}-{self._next_number()}")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sorvolo.change.evidence.cells import CellWindow
 from sorvolo.change.shape.outlines import measures, outline_of
 from sorvolo.change.shape.patches import Cut, PatchWindow, cut, moved, patch_of
-from sorvolo.change.shape.shadows import things_of
+from sorvolo.change.shape.shadows import ThingSettings, things_of
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Floats, Mask, Matrix3, PointsM
 from sorvolo.geometry.homography import apply_homography
@@ -87,14 +87,14 @@ class Pictures:
         return patch_of(self._window, self._best, outline_m)
 
     def parted(
-        self, whole: Change, window: CellWindow, cells: Mask, cell_m: float, join_m: float
+        self, whole: Change, window: CellWindow, cells: Mask, cell_m: float, join_m: float, settings: ThingSettings
     ) -> list[Change]:
         """The records of the things that `whole` holds, the largest first, all under its id; `whole` if it is one."""
         majority = self._majority(window, cells, cell_m)
         own, best = self._window, self._best
         if majority is None or own is None or best is None:
             return [whole]
-        things = things_of(whole.patch, whole.kind, majority)
+        things = things_of(whole.patch, whole.kind, majority, settings)
         tolerance_px = max(0.5 * cell_m / own.m_per_px, 0.5)
         parts = []
         for mask, kind in things:
@@ -102,7 +102,7 @@ class Pictures:
             if len(things) < 2 or outline_m is None:
                 return [whole]
             around = PatchWindow.around(outline_m.min(axis=0), outline_m.max(axis=0), own.m_per_px, _MOST_PX)
-            near = Cut(moved(best.before, around, own), moved(best.after, around, own))
+            near = best.moved(around, own)
             size = measures(outline_m)
             parts.append(replace(
                 whole, kind=kind, outline_m=outline_m, area_m2=size.area_m2, length_m=size.length_m,
@@ -121,7 +121,7 @@ class Pictures:
             self._asked = np.zeros_like(self._yes)
         else:
             self._yes, self._asked = moved(self._yes, window, old), moved(self._asked, window, old)
-            self._best = Cut(moved(self._best.before, window, old), moved(self._best.after, window, old))
+            self._best = self._best.moved(window, old)
         return window
 
     def _majority(self, cell_window: CellWindow, cells: Mask, cell_m: float) -> Mask | None:

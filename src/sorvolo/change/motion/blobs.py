@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sorvolo.change.shape.shadows import shadow_of_arrival, thing_of
+from sorvolo.change.shape.shadows import thing_of
 from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.geometry.polygons import signed_area
-from sorvolo.survey.findings import ComparedView
+from sorvolo.survey.findings import ComparedView, Shade
 
 RIM_PX = 2  # a blob that comes nearer to the view's rim may be cut by it
 _MOST_BOXES = 64
@@ -89,7 +89,7 @@ def _around(view: ComparedView, box: int) -> tuple[int, int, Mask, Mask]:
     x, y, w, h = (int(each) for each in view.boxes[box])
     window = slice(max(y - _AROUND_PX, 0), y + h + _AROUND_PX), slice(max(x - _AROUND_PX, 0), x + w + _AROUND_PX)
     changed = view.changed[window] > 0
-    thing = thing_of(changed, shadow_of_arrival(view.reference[window], view.image[window], changed))
+    thing = thing_of(changed, (view.shade[window] & Shade.LATER) > 0)
     return window[1].start, window[0].start, changed, thing
 
 

@@ -1,39 +1,43 @@
 """One picture in the light of another: a power law per channel for the camera, a smooth gain for clouds' shadows."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.pair.moved_shadows import STEPS, moved_shades
+from sorvolo.change.pair.moved_shadows import STEPS, MovedShadowSettings, moved_shades
 from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.kernels import detail_products, relight, slopes
 
 Bgr = NDArray[np.uint8]
 """(height, width, 3) uint8, blue green red."""
 
-BLACK_LEVEL = 8.0  # added before logarithms: below it a camera shows noise, not light
-CELL_PX = 8
-FINE = 4  # pixels of a cell each way, where structure is compared
-DETAIL_PX = 9  # details of the finest structure are what is smaller
-NO_SLOPE = 2e-4  # squared octaves a cell by which a slope is drawn to one where there is little to see
-MEDIAN_CELLS = 5  # what is smaller than half of it cannot change the local gain
-LEAST_ALIKE, MOST_ALIKE = 0.25, 0.5  # correlation of details: the ground is another one, and surely the same
-FLAT = 6.0  # what noise leaves of the variance of details, in squared steps of the logarithm
-FLAT_TRUST = 0.003  # of cells without any structure: they tell where nothing better is near
-REACHES_CELLS = ((3, 1.0), (7, 0.1), (17, 0.01), (49, 1e-3))  # how far a cell's gain tells about its neighbours'
-NEAR_CELLS = 11  # around things: there the ground tells the light once it is known what hides it
-LEAST_HIDDEN = 12  # of 255: cells that are hidden to more do not count
-LEAST_GAIN = 0.02  # of a gain: less makes no difference
-STEPS_PER_OCTAVE = 48.0
-GAIN_ONE = 4096
-CURVE_ONE = 16
+BLACK_LEVEL = 8.0  # grey levels added before logarithms: below it a camera shows noise, not light
+STEPS_PER_OCTAVE = 48.0  # of local gains in a byte
+GAIN_ONE, CURVE_ONE = 4096, 16  # fixed point of the kernel `relight`
 
 _LOG = (np.log2(np.arange(256) + BLACK_LEVEL) * 48).astype(np.float32)
 _OCTAVES = np.log2(np.arange(256, dtype=np.float32) + np.float32(BLACK_LEVEL))
+
+
+@dataclass(frozen=True)
+class LightSettings:
+    """How the light is fitted (0007). Lengths in px of the half size pictures, or in cells."""
+
+    cell_px: int = 8  # side of a cell that has one gain
+    fine: int = 4  # pixels of a cell each way, where structure is compared and moved shadows are looked for
+    detail_px: int = 9  # details of the finest structure are what is smaller; fine pixels
+    median_cells: int = 5  # what is smaller than half of it cannot change the local gain
+    no_slope: float = 2e-4  # squared octaves a cell by which a slope is drawn to one where there is little to see
+    alike: tuple[float, float] = (0.25, 0.5)  # correlation of details: the ground is another one, and surely the same
+    flat: float = 6.0  # what noise leaves of the variance of details, in squared steps of the logarithm
+    flat_trust: float = 0.003  # of cells without any structure: they count where nothing better is near
+    reaches: tuple[tuple[int, float], ...] = ((3, 1.0), (7, 0.1), (17, 0.01), (49, 1e-3))
+    # cells each way within which a cell's gain counts for its neighbours', and with what weight
+    moved: MovedShadowSettings = field(default_factory=MovedShadowSettings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,15 +45,14 @@ class Light:
     """What turns the reference's light into the query's: query + 8 = 2**offset * (reference + 8)**exponent * gain.
 
     `exponents` and `offsets` (3,) are per channel, blue green red; `gains` (h, w, 3) float32 are factors on a coarse
-    grid over the picture; `unevenness` is their spread in octaves, what clouds do. `cells` is what the gains are from.
-    `shades` (h, w, 3) are further factors on a finer grid, where shadows of tall things moved; None if nowhere.
+    grid over the picture; `unevenness` is their spread in octaves, what clouds do. `shades` (h, w, 3) are further
+    factors on a finer grid, where shadows of tall things moved; None if nowhere.
     """
 
     exponents: Floats
     offsets: Floats
     gains: NDArray[np.float32]
     unevenness: float
-    cells: "Cells"
     shades: NDArray[np.float32] | None = None
 
     @property
@@ -59,80 +62,48 @@ class Light:
         return np.asarray(2.0 ** (self.offsets + (self.exponents - 1.0) * middle))
 
 
-@dataclass(frozen=True, eq=False)
-class Cells:
-    """The local gain by each cell alone: `steps` (h, w, 3) float32, `STEPS_PER_OCTAVE` to an octave.
-
-    `trust` (h, w) float32, 0 to 1, is how sure it shows the same ground; nothing is known of it where not `known`.
-    """
-
-    steps: NDArray[np.float32]
-    trust: NDArray[np.float32]
-    known: Mask | None
-
-
-def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
+def fit_light(
+    reference: Bgr, query: Bgr, known: Mask | None = None, settings: LightSettings = LightSettings()
+) -> Light:
     """The light of `query` seen against `reference`, aligned to a few pixels; where not `known` it is the middle one.
 
     The exponents come from what both pictures show at middle scales, where neither clouds nor pixels' noise matter;
     fits are robust against things that changed.
     """
     height, width = reference.shape[:2]
-    size = max(4, width // CELL_PX), max(4, height // CELL_PX)
-    fine = FINE * size[0], FINE * size[1]
+    size = max(4, width // settings.cell_px), max(4, height // settings.cell_px)
+    fine = settings.fine * size[0], settings.fine * size[1]
     reference, query = _smaller(reference, fine), _smaller(query, fine)
     before, after = (_logarithm(_smaller(each, size)) for each in (reference, query))
     sure = _surely(known, size)
     if sure is not None and sure.sum() < 16:
-        nothing = np.zeros((*size[::-1], 3), np.float32)
-        return Light(np.ones(3), np.zeros(3), nothing + 1, 0.0, Cells(nothing, nothing[..., 0], sure))
+        return Light(np.ones(3), np.zeros(3), np.ones((*size[::-1], 3), np.float32), 0.0)
     window = (9, 9)
     detail_before = _chosen(before - cv2.blur(before, window), sure)[::2]
     detail_after = _chosen(after - cv2.blur(after, window), sure)[::2]
     # the ratio of spreads, the geometric mean of the regressions of each on the other: that of the query on the
     # reference alone would be too low by what noise, misalignment and clouds add to the spread of the reference
-    exponents = slopes(detail_before, detail_after, NO_SLOPE * len(detail_before)).clip(0.5, 2.0)
+    exponents = slopes(detail_before, detail_after, settings.no_slope * len(detail_before)).clip(0.5, 2.0)
     offset = after - exponents.astype(np.float32) * before
     kept = _chosen(offset, sure)
     offsets = np.median(kept, axis=0).astype(np.float64)
-    shades = _shades(reference, query, exponents, offsets, known)
+    shades = _shades(reference, query, exponents, offsets, known, settings.moved)
     if shades is not None:
         offset -= cv2.resize(shades, size, interpolation=cv2.INTER_AREA)
     local = np.clip(np.rint((offset - offsets.astype(np.float32)) * STEPS_PER_OCTAVE + 128), 0, 255).astype(np.uint8)
-    same = _sameness(reference, query)
+    same = _sameness(reference, query, settings)
     if sure is not None:
         same[~sure] = 0
-    cells = Cells(cv2.medianBlur(local, MEDIAN_CELLS).astype(np.float32) - 128, same, sure)
-    octaves = _spread(cells.steps, same) / STEPS_PER_OCTAVE
+    steps = cv2.medianBlur(local, settings.median_cells).astype(np.float32) - 128
+    octaves = _spread(steps, same, settings.reaches) / STEPS_PER_OCTAVE
     unevenness = float(_chosen(octaves, sure).mean(axis=1).std())
     factors = None if shades is None else np.exp2(shades)
-    return Light(exponents, offsets, np.exp2(octaves).astype(np.float32), unevenness, cells, factors)
-
-
-def light_around(light: Light, things: NDArray[np.uint8]) -> Light:
-    """The light where it is known what hides the ground: `things` (h, w) uint8, 255 or 0, of the pictures' size.
-
-    All other ground near is trusted, plain ground too. The same `light` where that makes no difference near a thing.
-    """
-    size = light.cells.trust.shape[1], light.cells.trust.shape[0]
-    covers = cv2.resize(cv2.dilate(things, np.ones((5, 5), np.uint8)), size, interpolation=cv2.INTER_AREA)
-    hidden = covers > LEAST_HIDDEN
-    near = cv2.dilate(hidden.view(np.uint8), np.ones((NEAR_CELLS, NEAR_CELLS), np.uint8)) > 0
-    trusted = near & ~hidden if light.cells.known is None else near & ~hidden & light.cells.known
-    trust = np.where(hidden, np.float32(0), np.where(trusted, np.float32(1), light.cells.trust))
-    gains = np.exp2(_spread(light.cells.steps, trust) / STEPS_PER_OCTAVE).astype(np.float32)
-    changes = np.abs(gains[near] - light.gains[near]) > LEAST_GAIN * light.gains[near]
-    return replace(light, gains=gains) if changes.any() else light
+    return Light(exponents, offsets, np.exp2(octaves).astype(np.float32), unevenness, factors)
 
 
 def relit(image: Bgr, light: Light, out: Bgr | None = None) -> Bgr:
     """`image`, of the reference, in the query's light; written to `out` (h, w, 3) where it is given."""
     return relight(image, *_curves_and_gains(light, image.shape[1]), out=out)
-
-
-def relit_parts(image: Bgr, light: Light, parts: Sequence[tuple[slice, slice]]) -> Bgr:
-    """Some parts of `image`, of the reference, in the query's light; the rest of the picture holds anything."""
-    return relight(image, *_curves_and_gains(light, image.shape[1]), parts)
 
 
 def _curves_and_gains(light: Light, width: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
@@ -149,7 +120,8 @@ def _curves_and_gains(light: Light, width: int) -> tuple[NDArray[np.int32], NDAr
 
 
 def _shades(
-    reference: Bgr, query: Bgr, exponents: Floats, offsets: Floats, known: Mask | None
+    reference: Bgr, query: Bgr, exponents: Floats, offsets: Floats, known: Mask | None,
+    settings: MovedShadowSettings,
 ) -> NDArray[np.float32] | None:
     """Octaves (h, w, 3) by which shadows that moved changed the ground of two pictures (h, w, 3); None if nowhere."""
     levels, black = np.log2(np.arange(256)[:, None] + BLACK_LEVEL), np.log2(BLACK_LEVEL)
@@ -158,7 +130,7 @@ def _shades(
         for each in (exponents * levels + offsets, np.repeat(levels, 3, axis=1))
     )
     before, after = (np.asarray(cv2.LUT(*each), np.uint8) for each in zip((reference, query), tables))
-    return moved_shades(before, after, _surely(known, (reference.shape[1], reference.shape[0])))
+    return moved_shades(before, after, _surely(known, (reference.shape[1], reference.shape[0])), settings)
 
 
 def _chosen(values: NDArray[np.float32], sure: Mask | None) -> NDArray[np.float32]:
@@ -166,25 +138,30 @@ def _chosen(values: NDArray[np.float32], sure: Mask | None) -> NDArray[np.float3
     return values.reshape(-1, 3) if sure is None else values[sure]
 
 
-def _sameness(reference: Bgr, query: Bgr) -> NDArray[np.float32]:
-    """How sure each cell (h, w) of `FINE` pixels a side shows the same ground, 0 to 1: both have its finest structure.
+def _sameness(reference: Bgr, query: Bgr, settings: LightSettings) -> NDArray[np.float32]:
+    """How sure each cell (h, w) shows the same ground, 0 to 1: both pictures have its finest structure.
 
     Things put on the ground, however large, hide its structure: their cells do not count for the light.
     """
     before, after = (cv2.cvtColor(each, cv2.COLOR_BGR2GRAY) for each in (reference, query))
-    products = detail_products(np.asarray(before, np.uint8), np.asarray(after, np.uint8), _LOG, DETAIL_PX, FINE)
+    grays = np.asarray(before, np.uint8), np.asarray(after, np.uint8)
+    products = detail_products(*grays, _LOG, settings.detail_px, settings.fine)
     sums = [cv2.blur(each, (5, 5)) for each in products]
-    alike = sums[0] / np.sqrt((sums[1] + FLAT) * (sums[2] + FLAT))
-    sure = np.clip((alike - LEAST_ALIKE) / (MOST_ALIKE - LEAST_ALIKE), 0, 1)
-    flat = np.exp(-(sums[1] + sums[2]) / (2 * FLAT)) * np.float32(FLAT_TRUST)
+    noise = settings.flat
+    alike = sums[0] / np.sqrt((sums[1] + noise) * (sums[2] + noise))
+    least, most = settings.alike
+    sure = np.clip((alike - least) / (most - least), 0, 1)
+    flat = np.exp(-(sums[1] + sums[2]) / (2 * noise)) * np.float32(settings.flat_trust)
     return np.asarray(np.maximum(cv2.erode(sure, np.ones((3, 3), np.uint8)), flat), np.float32)
 
 
-def _spread(values: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
+def _spread(
+    values: NDArray[np.float32], weights: NDArray[np.float32], reaches: Sequence[tuple[int, float]]
+) -> NDArray[np.float32]:
     """Values (h, w, 3) smoothed with weights (h, w); where there are none, those of the nearest around."""
     stack = np.dstack([values * weights[..., None], weights])
     total = np.zeros_like(stack)
-    for reach, weight in REACHES_CELLS:
+    for reach, weight in reaches:
         total += np.float32(weight) * cv2.blur(stack, (reach, reach))
     return np.asarray(total[..., :3] / (total[..., 3:] + np.float32(1e-6)), np.float32)
 

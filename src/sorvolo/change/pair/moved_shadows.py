@@ -1,5 +1,7 @@
 """Shadows of tall things that lie elsewhere on the later date: the same ground in other light with a sharp edge."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from cv2.typing import MatLike
@@ -10,63 +12,77 @@ from sorvolo.geometry.arrays import Floats, Mask
 
 STEPS = 24  # to an octave, of differences of logarithms; these are 8 bit, 128 alike
 ALIKE = 128
-LEVELS = (8, 14, 22)  # steps darker or brighter: more comes free of what it touches
-MOST_TINT = 15  # steps between the colours: a shadow takes somewhat less of blue
-MOST_SPREAD, MOST_OFF = 3.0, 9  # steps from a shadow's own depth, mean, and of each pixel
-LEAST_WIDTH = 5  # pixels of the pictures given: narrower shadows are those of people and small things, which tell them
-LEAST_ALIKE, ALIKE_OF_FEW = 0.35, 2.5  # correlation of the ground's details within; more where few pixels tell
-FINEST = 9  # pixels: details are what is smaller
-APART = 1  # pixels that the pictures may be apart
-MOST_ASKED = 4000  # pixels that are asked
-SHARP, LEAST_SHARP = 0.4, 0.4  # of its depth is left beside a shadow, at most, along so much of its edge
-BESIDE = 9  # pixels, the width of the window by which that is beside it
-LARGEST = 0.05  # of the picture: what is larger is a cloud, and smooth gains follow it
-HOLE = 11  # pixels wide, at most: what stands in a shadow and is no ground
-NEAR = 15  # pixels: how far the depth of a shadow is the same
-MOST_APART = 6  # steps from a shadow's depth: ground beside it that it covers, too
-LEAST_PART, MOST_UNLIKE = -0.25, 0.5  # of a shadow's depth, and between the colours: else it is no shadow's edge
-RIM, SOFT = 2, 5  # pixels on both sides of a shadow's edge, where it is blurred; outside where it is soft
 
 
-def moved_shades(before: Image, after: Image, known: Mask | None) -> NDArray[np.float32] | None:
+@dataclass(frozen=True)
+class MovedShadowSettings:
+    """What is the same ground under another shadow (0014). Lengths in px of the pictures given, a quarter of a view's.
+
+    Depths are in steps, `STEPS` to an octave.
+    """
+
+    levels: tuple[int, ...] = (8, 14, 22)  # darker or brighter by so much: more comes free of what it touches
+    most_tint: int = 15  # between the colours: a shadow takes somewhat less of blue
+    least_width_px: int = 5  # narrower shadows are those of people and small things, which reveal them
+    least_alike: float = 0.35  # correlation of the ground's details within, at least, and ...
+    alike_of_few: float = 2.5  # ... so much more, by the root of the number of pixels
+    sharp: float = 0.4  # of its depth is left beside a shadow, at most, along as large a share of its edge
+    largest: float = 0.05  # of the picture: what is larger is a cloud, and smooth gains follow it
+    near_px: int = 15  # how far the depth of a shadow is the same
+    most_apart: int = 6  # from a shadow's depth: ground beside it that it covers, too
+    rim_px: int = 2  # on both sides of a shadow's edge, where it is blurred
+
+
+def moved_shades(
+    before: Image, after: Image, known: Mask | None, settings: MovedShadowSettings = MovedShadowSettings()
+) -> NDArray[np.float32] | None:
     """Octaves (h, w, 3) by which ground is brighter that a shadow left (below 0: darker, it came); None if nowhere.
 
     `before` and `after` (h, w, 3) uint8 are logarithms, 2 `STEPS` an octave, of two pictures in the same light; nothing
-    is said where not `known` (h, w). What changes its brightness evenly, keeps its finest structure and is wide enough
-    is the same ground under another shadow; a new thing hides the ground's structure.
+    is reported where not `known` (h, w). What changes its brightness evenly, keeps its finest structure and is wide
+    enough is the same ground under another shadow; a new thing hides the ground's structure.
     """
-    apart = cv2.blur(cv2.addWeighted(after, 0.5, before, -0.5, ALIKE), (3, 3))
+    apart = np.asarray(cv2.blur(cv2.addWeighted(after, 0.5, before, -0.5, ALIKE), (3, 3)), np.uint8)
     blue, green, red = cv2.split(apart)
     tint = cv2.subtract(cv2.max(cv2.max(blue, green), red), cv2.min(cv2.min(blue, green), red))
-    alike = cv2.threshold(tint, MOST_TINT - 1, 255, cv2.THRESH_BINARY_INV)[1]
+    alike = cv2.threshold(tint, settings.most_tint - 1, 255, cv2.THRESH_BINARY_INV)[1]
     if known is not None:
         alike = cv2.min(alike, known.view(np.uint8) * np.uint8(255))
     middle = cv2.addWeighted(cv2.addWeighted(blue, 0.5, red, 0.5, 0), 2 / 3, green, 1 / 3, 0)
-    details: tuple[Image, Image] | None = None
     octaves: NDArray[np.float32] | None = None
     for sign in (-1, 1):
-        shaded = np.zeros(middle.shape, np.uint8)
-        brighter = cv2.addWeighted(middle, sign, middle, 0, ALIKE - sign * ALIKE)
-        for level in LEVELS:
-            differs = cv2.threshold(brighter, ALIKE + level, 255, cv2.THRESH_BINARY)[1]
-            pieces = _Pieces(cv2.min(cv2.min(differs, alike), cv2.bitwise_not(shaded)), middle)
-            if pieces.count == 1:
-                break
-            details = details or (_details(before), _details(after))
-            kept = pieces.are_shadows()
-            if kept.any():
-                kept = pieces.show_the_same(kept, *details)
-                shaded |= pieces.like_the_rest(kept)
+        shaded = _shaded(middle, alike, sign, (before, after), settings)
         if shaded.any():
-            if octaves is None:
-                octaves = np.zeros(apart.shape, np.float32)
-            weak = cv2.min(cv2.threshold(brighter, ALIKE + LEVELS[0] // 2, 255, cv2.THRESH_BINARY)[1], alike)
+            octaves = np.zeros(apart.shape, np.float32) if octaves is None else octaves
             x, y, wide, high = cv2.boundingRect(shaded)
-            part = slice(max(0, y - NEAR), y + high + NEAR), slice(max(0, x - NEAR), x + wide + NEAR)
-            octaves[part] += _octaves(shaded[part], weak[part], apart[part])
+            near = settings.near_px
+            part = slice(max(0, y - near), y + high + near), slice(max(0, x - near), x + wide + near)
+            octaves[part] += _octaves(shaded[part], apart[part], settings)
     if octaves is not None and known is not None:
         octaves[~known] = 0
     return octaves
+
+
+def _shaded(
+    middle: MatLike, alike: MatLike, sign: int, pictures: tuple[Image, Image], settings: MovedShadowSettings
+) -> Image:
+    """Where (h, w), 255 or 0, ground became brighter (`sign` 1) or darker (-1) under another shadow.
+
+    `middle` (h, w) is by how much, `alike` (h, w) where all colours did so, in `pictures` before and after.
+    """
+    shaded = np.zeros(middle.shape, np.uint8)
+    brighter = cv2.addWeighted(middle, sign, middle, 0, ALIKE - sign * ALIKE)
+    details: tuple[Image, Image] | None = None
+    for level in settings.levels:
+        differs = cv2.threshold(brighter, ALIKE + level, 255, cv2.THRESH_BINARY)[1]
+        pieces = _Pieces(cv2.min(cv2.min(differs, alike), cv2.bitwise_not(shaded)), middle, settings)
+        if pieces.count == 1:
+            break
+        kept = pieces.are_shadows()
+        if kept.any():
+            details = details or (_details(pictures[0]), _details(pictures[1]))
+            shaded[pieces.show_the_same(kept, *details)[pieces.labels]] = 255
+    return shaded
 
 
 class _Pieces:
@@ -75,16 +91,17 @@ class _Pieces:
     `middle` (h, w) is how much brighter the ground became.
     """
 
-    def __init__(self, mask: MatLike, middle: MatLike) -> None:
-        window = np.ones((LEAST_WIDTH, LEAST_WIDTH), np.uint8)
+    def __init__(self, mask: MatLike, middle: MatLike, settings: MovedShadowSettings) -> None:
+        self._settings = settings
+        window = np.ones((settings.least_width_px, settings.least_width_px), np.uint8)
         self._opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, window)
         self.count, self.labels = 1, self._opened
         if cv2.countNonZero(self._opened) == 0:
             return
         self.count, self.labels = cv2.connectedComponents(self._opened, connectivity=4, ltype=cv2.CV_16U)
-        # some of the pixels that lie within pieces, and whose they are
+        # some of the pixels that lie within pieces, 4000 at most, and whose they are
         places = _places(cv2.erode(self._opened, np.ones((3, 3), np.uint8)))
-        step = max(1, -(-len(places) // MOST_ASKED))
+        step = max(1, -(-len(places) // 4000))
         self._places, self._share = places[::step], step / self.labels.size
         own = self.labels.ravel()[self._places]
         order = np.argsort(own, kind="stable")  # piece by piece
@@ -95,41 +112,24 @@ class _Pieces:
         self._depth = self._mean(self._steps)
 
     def are_shadows(self) -> NDArray[np.bool_]:
-        """Which (count,) are no more than a part of the picture, about as deep everywhere, and end all at once.
+        """Which (count,) are no more than a part of the picture, and end all at once.
 
         The edge of a cloud's shadow is soft.
         """
-        off = self._mean(np.abs(self._steps - self._depth[self._own]))
-        fits = self._is_held & (self._number * self._share < LARGEST) & (off < MOST_SPREAD)
+        fits = self._is_held & (self._number * self._share < self._settings.largest)
         if not fits.any():
             return fits
-        outer = cv2.dilate(self.labels, np.ones((BESIDE, BESIDE), np.uint8))
+        outer = cv2.dilate(self.labels, np.ones((9, 9), np.uint8))
         outer[cv2.dilate(self._opened, np.ones((3, 3), np.uint8)) > 0] = 0
         ring = _places(outer)
-        own = outer.ravel()[ring]
-        ends = np.bincount(own, np.abs(_steps(self._middle, ring)) < SHARP * np.abs(self._depth)[own], self.count)
-        return fits & (ends >= LEAST_SHARP * np.maximum(np.bincount(own, minlength=self.count), 1))
-
-    def like_the_rest(self, kept: NDArray[np.bool_]) -> Image:
-        """The pixels (h, w), 255 or 0, of the `kept` pieces (count,) that are about as deep as their piece.
-
-        What is not is a thing in the shadow.
-        """
-        lowest, highest = (
-            np.rint(ALIKE + self._depth + off).clip(0, 255).astype(np.uint8) for off in (-MOST_OFF, MOST_OFF)
-        )
-        alike = np.zeros(self.labels.shape, np.uint8)
-        if not kept.any():
-            return alike
-        places = np.flatnonzero(kept[self.labels])
-        own, steps = self.labels.ravel()[places], self._middle.ravel()[places]
-        alike.ravel()[places] = np.uint8(255) * ((steps >= lowest[own]) & (steps <= highest[own]))
-        return alike
+        own, sharp = outer.ravel()[ring], self._settings.sharp
+        ends = np.bincount(own, np.abs(_steps(self._middle, ring)) < sharp * np.abs(self._depth)[own], self.count)
+        return fits & (ends >= sharp * np.maximum(np.bincount(own, minlength=self.count), 1))
 
     def show_the_same(self, asked: NDArray[np.bool_], before: Image, after: Image) -> NDArray[np.bool_]:
         """Which (count,) of those `asked` show the same structure in the details (h, w) of both pictures.
 
-        They may be up to `APART` pixels apart.
+        They may be a pixel apart.
         """
         chosen = asked[self._own]
         places, own = self._places[chosen], self._own[chosen]
@@ -140,15 +140,15 @@ class _Pieces:
             means = np.add.reduceat(values, starts, axis=-1) / number
             return values - np.repeat(means, number, axis=-1)
 
-        padded = cv2.copyMakeBorder(before, APART, APART, APART, APART, cv2.BORDER_REPLICATE)
+        padded = cv2.copyMakeBorder(before, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
         rows, columns = np.divmod(places, before.shape[1])
-        shifts = np.array([y * padded.shape[1] + x for y in range(2 * APART + 1) for x in range(2 * APART + 1)])
+        shifts = np.array([y * padded.shape[1] + x for y in range(3) for x in range(3)])
         a = centred(_steps(after, places))
         b = centred(_steps(padded, rows * padded.shape[1] + columns + shifts[:, None]))
         energies = np.add.reduceat(a * a, starts) * np.add.reduceat(b * b, starts, axis=1)
         alike = np.add.reduceat(a * b, starts, axis=1) / np.sqrt(energies + 1e-9)
         same = np.zeros(self.count, bool)
-        same[kept] = alike.max(axis=0) > LEAST_ALIKE + ALIKE_OF_FEW / np.sqrt(number)
+        same[kept] = alike.max(axis=0) > self._settings.least_alike + self._settings.alike_of_few / np.sqrt(number)
         return same
 
     def _mean(self, values: Floats) -> Floats:
@@ -166,31 +166,24 @@ def _steps(image: MatLike, places: NDArray[np.int64]) -> Floats:
 
 
 def _details(logarithm: Image) -> Image:
+    """What is smaller than 9 pixels."""
     gray = cv2.cvtColor(logarithm, cv2.COLOR_BGR2GRAY)
-    return np.asarray(cv2.addWeighted(gray, 1, cv2.blur(gray, (FINEST, FINEST)), -1, ALIKE), np.uint8)
+    return np.asarray(cv2.addWeighted(gray, 1, cv2.blur(gray, (9, 9)), -1, ALIKE), np.uint8)
 
 
-def _octaves(shaded: MatLike, weak: MatLike, apart: MatLike) -> NDArray[np.float32]:
-    """(h, w, 3) how deep the shadow is where `shaded`, smooth; about its rim the part of it that all colours show.
-
-    Its rim is as wide as what near it is `weak`, dimmed a little. What stands in it leaves holes: they are as deep.
-    """
+def _octaves(shaded: Image, apart: Image, settings: MovedShadowSettings) -> NDArray[np.float32]:
+    """(h, w, 3) how deep the shadow is where `shaded`, smooth; about its rim the part of it that all colours show."""
+    near, rim = (settings.near_px, settings.near_px), np.ones((2 * settings.rim_px + 1,) * 2, np.uint8)
     steps = apart.astype(np.float32) - ALIKE
-    known = np.asarray(cv2.blur(shaded.astype(np.float32), (NEAR, NEAR)))
+    known = np.asarray(cv2.blur(shaded.astype(np.float32), near))
     share = np.maximum(known, np.float32(1e-3))
-    depth = cv2.divide(cv2.blur(cv2.copyTo(steps, shaded), (NEAR, NEAR)), cv2.merge([share] * 3), scale=255)
+    depth = cv2.divide(cv2.blur(cv2.copyTo(steps, shaded), near), cv2.merge([share] * 3), scale=255)
     # narrow parts beside it
     off = cv2.split(cv2.absdiff(steps, depth))
-    beside = (cv2.max(cv2.max(off[0], off[1]), off[2]) < MOST_APART) & (known > 0.5)
+    beside = (cv2.max(cv2.max(off[0], off[1]), off[2]) < settings.most_apart) & (known > 0.5)
     whole = cv2.max(shaded, np.asarray(beside).view(np.uint8) * np.uint8(255))
-    window = np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)
-    soft = cv2.min(weak, cv2.dilate(whole, np.ones((2 * SOFT + 1, 2 * SOFT + 1), np.uint8)))
     parts = cv2.split(steps / np.where(depth == 0, np.float32(1), depth))
-    least, most = cv2.min(cv2.min(parts[0], parts[1]), parts[2]), cv2.max(cv2.max(parts[0], parts[1]), parts[2])
-    part = np.clip(least, 0, 1)
-    part[cv2.max(cv2.dilate(whole, window), soft) == 0] = 0
-    # what stands in it hides the ground's light; ground between two shadows shows its own
-    hides = (least < LEAST_PART) | (np.asarray(most) - least > MOST_UNLIKE)
-    filled = cv2.morphologyEx(whole, cv2.MORPH_CLOSE, np.ones((HOLE, HOLE), np.uint8))
-    part[(cv2.erode(whole, window) > 0) | ((filled > 0) & hides)] = 1
+    part = np.clip(cv2.min(cv2.min(parts[0], parts[1]), parts[2]), 0, 1)
+    part[cv2.dilate(whole, rim) == 0] = 0
+    part[cv2.erode(whole, rim) > 0] = 1
     return np.asarray(cv2.multiply(depth, cv2.merge([part] * 3), scale=1 / STEPS), np.float32)

@@ -10,18 +10,6 @@ from sorvolo.change.pair.scratch import Scratch
 from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.kernels import core_regions, differences, match_regions, measure_regions, rim_balance, tint
 
-RING_PX = 4
-WIDE_PX = 20  # what the ground does around a region and its neighbours, wind among it
-NEIGHBOUR_PX = 100
-GREEN_CELL_PX = 4
-SPECK_PX = 9
-NEAR_PX = 31
-WEAK_PART = 0.1  # of the largest difference near: what is weaker belongs to clouds and shadows, not to the thing
-MOST_SPECK = 48.0
-MATCH_MARGIN_PX = 3
-MATCH_REACH_PX = 6
-DETAIL_PX = 11
-LOOKED_AT_PX = WIDE_PX + DETAIL_PX  # around regions: what is farther away changes nothing in what is measured of them
 MOST_REGIONS = 250  # a byte holds their labels
 
 FEATURES = (
@@ -40,6 +28,27 @@ Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
+class MeasureSettings:
+    """Where a region's features are measured. The trees of `region_score` learnt from these: another value, new trees.
+
+    Lengths in px of the (half size) pictures.
+    """
+
+    ring_px: int = 4  # around a region, where its ground is measured
+    wide_px: int = 20  # what the ground does around a region and its neighbours, wind among it
+    neighbour_px: float = 100.0  # regions nearer to each other are neighbours
+    green_cell_px: int = 4  # side of the cell in a region's middle whose green is measured
+    match_margin_px: int = 3  # around a region's box, when its details are looked for in the other picture ...
+    match_reach_px: int = 6  # ... so far away
+    detail_px: int = 11  # details are what is smaller
+
+    @property
+    def looked_at_px(self) -> int:
+        """Around regions: what is farther away changes nothing in what is measured of them."""
+        return self.wide_px + self.detail_px
+
+
+@dataclass(frozen=True)
 class RegionSettings:
     """What is looked at as a possible change. Lengths in px of the (half size) pictures."""
 
@@ -52,6 +61,9 @@ class RegionSettings:
     core: float = 0.45  # a region keeps what exceeds this part of its own height
     least_area_px: int = 6
     least_noise: float = 0.0  # what the flight shows elsewhere: a frame is not taken for quieter than this
+    speck_px: int = 9  # small differences are clutter, which raises thresholds around; a large thing's inside is none
+    most_clutter: float = 48.0  # grey levels that a small difference counts as clutter at most
+    around_px: int = 41  # side of the window that clutter is averaged over
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,30 +102,29 @@ def find_regions(
     difference, chroma, came, went, light_before, light_after = planes
     spare, specks, smooth, threshold = scratch.stack("thresholds", size, 4)
     # a large thing's inside is no clutter: only what is small among the differences raises the thresholds around it
-    window = np.ones((SPECK_PX, SPECK_PX), np.uint8)
+    window = np.ones((settings.speck_px, settings.speck_px), np.uint8)
     cv2.subtract(difference, cv2.morphologyEx(difference, cv2.MORPH_OPEN, window, dst=spare), dst=specks)
     some = np.asarray(cv2.calcHist([np.ascontiguousarray(specks[::4, ::4])], [0], None, [256], [0, 256]))
     counts = some.ravel().cumsum(dtype=np.float64)
     noise = float(np.searchsorted(counts, 0.95 * counts[-1]))
     cv2.blur(difference, (3, 3), dst=smooth)
-    cv2.threshold(specks, MOST_SPECK, MOST_SPECK, cv2.THRESH_TRUNC, dst=specks)
-    activity = cv2.blur(specks, (41, 41), dst=spare)
+    cv2.threshold(specks, settings.most_clutter, settings.most_clutter, cv2.THRESH_TRUNC, dst=specks)
+    activity = cv2.blur(specks, (settings.around_px, settings.around_px), dst=spare)
     base = settings.least_difference + settings.noise_factor * max(noise, settings.least_noise)
     cv2.addWeighted(activity, settings.activity_factor, activity, 0.0, base, dst=threshold)
-    near = np.ones((NEAR_PX, NEAR_PX), np.uint8)
-    low = cv2.addWeighted(cv2.dilate(smooth, near, dst=specks), WEAK_PART, smooth, 0.0, 0.0, dst=specks)
-    weak = np.asarray(cv2.compare(smooth, cv2.max(threshold, low, dst=low), cv2.CMP_GT), np.uint8)
+    weak = np.asarray(cv2.compare(smooth, threshold, cv2.CMP_GT), np.uint8)
     labels, boxes = core_regions(
         smooth, threshold, settings.strong_factor, settings.core, settings.least_area_px, MOST_REGIONS
     )
     if len(boxes) == 0:
         return Regions(labels, boxes, np.zeros((0, len(FEATURES))), smooth, weak, noise, known, np.zeros(0))
     # a shadow takes from all colours alike: red over blue stays
-    colour = tint(reference, query, _LOG, boxes, RING_PX, scratch.take("tint", size))
+    measures = MeasureSettings()
+    colour = tint(reference, query, _LOG, boxes, measures.ring_px, scratch.take("tint", size))
     channels = [difference, chroma, activity, light_before, light_after, came, went, colour]
     frame = np.array([noise, rest_px, unevenness, np.log1p(len(boxes))])
-    green = _green(reference, boxes), _green(query, boxes)
-    features = _measured(labels, boxes, channels, green, frame, scratch)
+    green = _green(reference, boxes, measures.green_cell_px), _green(query, boxes, measures.green_cell_px)
+    features = _measured(labels, boxes, channels, green, frame, scratch, measures)
     # along its outline a thing's values are new, while the ground's are still to be seen near
     balance = rim_balance(labels, boxes, came, went).astype(np.float64)
     return Regions(labels, boxes, features, smooth, weak, noise, known, balance)
@@ -121,11 +132,11 @@ def find_regions(
 
 def _measured(
     labels: NDArray[np.uint8], boxes: NDArray[np.int32], channels: list[Image], green: tuple[Floats, Floats],
-    frame: NDArray[np.float64], scratch: Scratch,
+    frame: NDArray[np.float64], scratch: Scratch, settings: MeasureSettings,
 ) -> Floats:
     planes = scratch.stack("measured", (labels.shape[0], labels.shape[1]), 10)
-    searched = scratch.take("searched", (labels.shape[0], labels.shape[1]), margin_px=MATCH_REACH_PX)
-    part, corner = _looked_at(boxes, labels.shape)
+    searched = scratch.take("searched", (labels.shape[0], labels.shape[1]), margin_px=settings.match_reach_px)
+    part, corner = _looked_at(boxes, labels.shape, settings.looked_at_px)
     labels, *channels = (np.ascontiguousarray(each[part]) for each in (labels, *channels))
     difference, chroma, activity, light_before, level, came, went, colour = channels
     boxes = boxes - corner
@@ -135,26 +146,27 @@ def _measured(
     ) = planes.reshape(-1)[: 10 * labels.size].reshape(10, height, width)
     cv2.LUT(light_before, _LOG, dst=log_before)
     cv2.LUT(level, _LOG, dst=log_after)
-    _details(log_before, detail_before)
-    _details(log_after, detail_after)
+    _details(log_before, detail_before, settings.detail_px)
+    _details(log_after, detail_after, settings.detail_px)
     window = np.ones((3, 3), np.uint8)
     cv2.addWeighted(log_after, 0.5, log_before, -0.5, 128, dst=ratio)
     cv2.morphologyEx(log_after, cv2.MORPH_GRADIENT, window, dst=edges_after)
     cv2.morphologyEx(log_before, cv2.MORPH_GRADIENT, window, dst=edges_before)
     cv2.absdiff(detail_after, detail_before, dst=detail)
     stack = [difference, chroma, activity, level, ratio, edges_after, edges_before, detail, came, went, colour]
-    sums = measure_regions(labels, boxes, [*stack, detail_before, detail_after], RING_PX)
+    sums = measure_regions(labels, boxes, [*stack, detail_before, detail_after], settings.ring_px)
     means, spreads = _moments(sums)
     within, around = means[:, 0], means[:, 1]
     kept, had, has = _structure(means[..., (7, 11, 12)], spreads[..., (7, 11, 12)])
     cv2.morphologyEx(ratio, cv2.MORPH_GRADIENT, window, dst=sharp)
     cv2.morphologyEx(difference, cv2.MORPH_GRADIENT, window, dst=steep)
     rim = _moments(measure_regions(_rims(labels), boxes, [sharp, steep], 0))[0][:, 0]
-    wide, wide_spreads = (each[:, 1] for each in _moments(measure_regions(labels, boxes, [ratio, detail], WIDE_PX)))
-    reach = MATCH_REACH_PX
+    around_wide = measure_regions(labels, boxes, [ratio, detail], settings.wide_px)
+    wide, wide_spreads = (each[:, 1] for each in _moments(around_wide))
+    reach = settings.match_reach_px
     searched = searched.reshape(-1)[: (height + 2 * reach) * (width + 2 * reach)].reshape(height + 2 * reach, -1)
     cv2.copyMakeBorder(detail_before, reach, reach, reach, reach, cv2.BORDER_REFLECT, dst=searched)
-    matched = match_regions(detail_after, searched, _grown(boxes, labels.shape), reach)
+    matched = match_regions(detail_after, searched, _grown(boxes, labels.shape, settings.match_margin_px), reach)
     long, short = boxes[:, 2:].max(axis=1), boxes[:, 2:].min(axis=1)
     area = sums[:, 0, 0].astype(np.float64)
     difference_in, noise = within[:, 0], frame[0]
@@ -171,7 +183,7 @@ def _measured(
         (within[:, 8] - within[:, 9]) / np.maximum(difference_in, 1), within[:, 10] - around[:, 10], spreads[:, 0, 10],
         kept[:, 0], kept[:, 1], had[:, 0], has[:, 0], rim[:, 0] / (np.abs(step) + 4), rim[:, 1] / (difference_in + 4),
         step / (wide_spreads[:, 0] + 2), wide_spreads[:, 0], wide[:, 1], *green,
-        *_standing_out(boxes, area * difference_in),
+        *_standing_out(boxes, area * difference_in, settings.neighbour_px),
     ]
     return np.column_stack(columns + [np.full(len(boxes), value) for value in frame])
 
@@ -195,18 +207,20 @@ def _structure(means: Floats, spreads: Floats) -> tuple[Floats, Floats, Floats]:
     return alike, spreads[..., 1], spreads[..., 2]
 
 
-def _standing_out(boxes: NDArray[np.int32], strength: Floats) -> tuple[Floats, Floats, Floats]:
+def _standing_out(boxes: NDArray[np.int32], strength: Floats, neighbour_px: float) -> tuple[Floats, Floats, Floats]:
     """Each region's strength (N,) against the strongest, and against all near, in logarithms; how many are near."""
     middles = boxes[:, :2] + boxes[:, 2:] / 2
-    near = np.abs(middles[:, None] - middles[None]).max(axis=2) < NEIGHBOUR_PX
+    near = np.abs(middles[:, None] - middles[None]).max(axis=2) < neighbour_px
     strength = strength + 1.0
     return np.log(strength / strength.max()), np.log(strength / (near @ strength)), np.log(near.sum(axis=1))
 
 
-def _looked_at(boxes: NDArray[np.int32], shape: tuple[int, ...]) -> tuple[tuple[slice, slice], NDArray[np.int32]]:
+def _looked_at(
+    boxes: NDArray[np.int32], shape: tuple[int, ...], margin_px: int
+) -> tuple[tuple[slice, slice], NDArray[np.int32]]:
     """The part of a picture of `shape` (h, w) that determines the measures of regions in boxes (N, 4); its corner."""
-    corner = np.maximum(boxes[:, :2].min(axis=0) - LOOKED_AT_PX, 0)
-    right, bottom = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) + LOOKED_AT_PX
+    corner = np.maximum(boxes[:, :2].min(axis=0) - margin_px, 0)
+    right, bottom = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) + margin_px
     part = np.s_[int(corner[1]) : min(int(bottom), shape[0]), int(corner[0]) : min(int(right), shape[1])]
     return part, np.array([*corner, 0, 0], np.int32)
 
@@ -216,23 +230,23 @@ def _rims(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return labels * (cv2.erode(labels, np.ones((3, 3), np.uint8)) == 0)
 
 
-def _green(image: Image, boxes: NDArray[np.int32]) -> Floats:
+def _green(image: Image, boxes: NDArray[np.int32], cell_px: int) -> Floats:
     """How much greener (N,) than red and blue a BGR picture (h, w, 3) is in the middle of boxes, grey levels."""
-    columns, rows = ((boxes[:, :2] + boxes[:, 2:] // 2) // GREEN_CELL_PX * GREEN_CELL_PX).T
-    y, x = np.mgrid[:GREEN_CELL_PX, :GREEN_CELL_PX]
+    columns, rows = ((boxes[:, :2] + boxes[:, 2:] // 2) // cell_px * cell_px).T
+    y, x = np.mgrid[:cell_px, :cell_px]
     y, x = (np.minimum(start[:, None, None] + step, side - 1)
             for start, step, side in ((rows, y, image.shape[0]), (columns, x, image.shape[1])))
     blue, green, red = image[y, x].mean(axis=(1, 2)).T
     return np.asarray(green - (red + blue) / 2)
 
 
-def _details(logarithm: Image, to: Image) -> None:
-    cv2.blur(logarithm, (DETAIL_PX, DETAIL_PX), dst=to)
+def _details(logarithm: Image, to: Image, detail_px: int) -> None:
+    cv2.blur(logarithm, (detail_px, detail_px), dst=to)
     cv2.addWeighted(logarithm, 1, to, -1, 128, dst=to)
 
 
-def _grown(boxes: NDArray[np.int32], shape: tuple[int, ...]) -> NDArray[np.int32]:
+def _grown(boxes: NDArray[np.int32], shape: tuple[int, ...], margin_px: int) -> NDArray[np.int32]:
     """Boxes with a margin, inside the picture."""
-    low = np.maximum(boxes[:, :2] - MATCH_MARGIN_PX, 0)
-    high = np.minimum(boxes[:, :2] + boxes[:, 2:] + MATCH_MARGIN_PX, [shape[1], shape[0]])
+    low = np.maximum(boxes[:, :2] - margin_px, 0)
+    high = np.minimum(boxes[:, :2] + boxes[:, 2:] + margin_px, [shape[1], shape[0]])
     return np.ascontiguousarray(np.hstack([low, high - low]), np.int32)

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.pair.illumination import Light, fit_light, relit
-from sorvolo.change.pair.region_extent import Piece, Views, grown, without_halos
+from sorvolo.change.pair.illumination import Light, LightSettings, fit_light, relit
+from sorvolo.change.pair.region_extent import ExtentSettings, Piece, Views, grown
 from sorvolo.change.pair.region_score import how_sure
 from sorvolo.change.pair.regions import FEATURES, Regions, RegionSettings, find_regions
 from sorvolo.change.pair.residual_alignment import Settling, settle
@@ -18,17 +18,17 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
 from sorvolo.kernels import looked_up
 
-LEAST_SIDE_PX = 32
-CLOSES_PX = 9
-LEAST_CONVEXITY = 0.5
-LEAST_GROWN = 0.5  # sureness: what is doubted is shown as it differs, and takes no ground from around
-SAME_PLACE_PX = 0.6  # half size pixels
-ALL_KNOWN = 0x0101  # two True side by side
-CALM_PX = 0.4  # rest of the flow below: values are looked for one pixel less far around
-RIM_WIDTH_PX = 5  # a thing's outline runs where half of the difference within this is left ...
-SLACK, LEAST_SHARE = 5.0, 0.4  # ... of what it was before the ground's own range was taken off, at least this share
-RIM_PX = 4  # around the unknown, in half size pixels: resampling mixes the unknown into it
 
+@dataclass(frozen=True)
+class MaskSettings:
+    """How regions become masks (0007). Lengths in px of the half size pictures."""
+
+    least_grown: float = 0.5  # score: what is doubted is shown as it differs, and takes no ground from around
+    convexity: float = 0.5  # part of its hull: what fills more fills all of it, for it may have the ground's colours
+    rim_px: int = 5  # side of the window within which an outline is drawn, where half of the difference is left ...
+    slack_levels: float = 5.0  # ... of what it was before the ground's own range, grey levels, was taken off ...
+    least_share: float = 0.4  # ... at least this share
+    same_place_px: float = 0.6  # a reference displaced by more shows what left at its own pixels
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,12 @@ class RobustSettings:
 
     least_score: float = 0.69  # for a pair on its own; where several views vote less will do
     settles: bool = True  # take out the last pixels of misalignment
+    calm_px: float = 0.4  # half size; where less is left of the flow, values are looked for one pixel less far around
+    unknown_px: int = 4  # half size; around the unknown nothing is compared: resampling mixes it into what is known
+    light: LightSettings = field(default_factory=LightSettings)
     regions: RegionSettings = field(default_factory=RegionSettings)
+    extent: ExtentSettings = field(default_factory=ExtentSettings)
+    masks: MaskSettings = field(default_factory=MaskSettings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +76,7 @@ def compare_robust(
     scratch = scratch_of_thread()
     examined = examine(reference, query, valid, settings, scratch)
     scores = how_sure(examined.regions.features, FEATURES)
-    return _result(examined, scores, scores >= settings.least_score, query.shape[1::-1], scratch)
+    return _result(examined, scores, settings, query.shape[1::-1], scratch)
 
 
 class Examined(NamedTuple):
@@ -115,19 +120,15 @@ def examine(
             borderMode=cv2.BORDER_REPLICATE,
         )
         cv2.cvtColor(moved, cv2.COLOR_BGRA2BGR, dst=before)
-    light = fit_light(before, after, known)
-    rim = None if known is None else _without_rim(known, RIM_PX + int(np.ceil(settling.moved_px)))
+    light = fit_light(before, after, known, settings.light)
+    known = None if known is None else _without_rim(known, settings.unknown_px + int(np.ceil(settling.moved_px)))
     lit = relit(before, light, spare)
-    for_pair = _for_pair(settings.regions, settling)
-    regions = find_regions(lit, after, rim, for_pair, settling.rest_px, light.unevenness, scratch)
-    share = 1.0 if rim is None else cv2.countNonZero(rim.view(np.uint8)) / rim.size
-    return Examined(regions, light, settling, share, Views(before, after, lit, rim, for_pair))
-
-
-def _for_pair(settings: RegionSettings, settling: Settling) -> RegionSettings:
-    """Where hardly anything moves values need not be looked for as far around, and less is hidden by them."""
-    is_calm = settling.rest_px < CALM_PX and settings.reach_px > 1
-    return replace(settings, reach_px=settings.reach_px - 1) if is_calm else settings
+    # where hardly anything moves values need not be looked for as far around, and less is hidden by them
+    reach_px = settings.regions.reach_px - int(settling.rest_px < settings.calm_px)
+    for_pair = replace(settings.regions, reach_px=max(1, reach_px))
+    regions = find_regions(lit, after, known, for_pair, settling.rest_px, light.unevenness, scratch)
+    share = 1.0 if known is None else cv2.countNonZero(known.view(np.uint8)) / known.size
+    return Examined(regions, light, settling, share, Views(lit, after, settings.extent.shade))
 
 
 def _check(reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask | None) -> None:
@@ -137,8 +138,8 @@ def _check(reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask |
     if reference.shape != query.shape:
         raise InputError(f"the reference is {reference.shape}, the query {query.shape}; align them to the same pixels")
     height, width = query.shape[:2]
-    if min(height, width) < LEAST_SIDE_PX:
-        raise InputError(f"the pictures are {width} x {height} px; at least {LEAST_SIDE_PX} px are needed each way")
+    if min(height, width) < 32:
+        raise InputError(f"the pictures are {width} x {height} px; at least 32 px are needed each way")
     if valid is not None and (valid.shape != query.shape[:2] or valid.dtype != np.bool_):
         raise InputError(f"valid: found {valid.dtype} of shape {valid.shape}; give a bool mask of {query.shape[:2]}")
 
@@ -148,7 +149,7 @@ def _half_known(valid: Mask | None, half: tuple[int, int]) -> Mask | None:
         return None
     height, width = valid.shape
     if height % 2 == 0 and width % 2 == 0:
-        pairs = np.ascontiguousarray(valid).view(np.uint16) == ALL_KNOWN
+        pairs = np.ascontiguousarray(valid).view(np.uint16) == 0x0101  # two True side by side
         return np.logical_and(pairs[::2], pairs[1::2])
     return np.asarray(cv2.resize(valid.astype(np.uint8) * 255, half, interpolation=cv2.INTER_AREA) == 255)
 
@@ -159,37 +160,36 @@ def _without_rim(known: Mask, rim_px: int) -> Mask:
 
 
 def _result(
-    examined: Examined, scores: Floats, sure: Mask, size: tuple[int, int], scratch: Scratch
+    examined: Examined, scores: Floats, settings: RobustSettings, size: tuple[int, int], scratch: Scratch
 ) -> RobustResult:
-    """The answer at full `size` (w, h): the `sure` (N,) among the regions."""
+    """The answer at full `size` (w, h): the regions whose scores (N,) suffice."""
     regions, light, settling, known, views = examined
+    masks, sure = settings.masks, scores >= settings.least_score
     if not sure.any():
         nothing = np.zeros(size[::-1], np.uint8), np.zeros((0, 4), np.int64), np.zeros(0)
         return RobustResult(*nothing, light, settling, regions.noise, known)
     count, labelled = cv2.connectedComponents(regions.weak, connectivity=8)
     parts = np.asarray(labelled, np.int32)
     went = _went(regions, parts)
-    grows = sure & (scores >= LEAST_GROWN)
     pieces: dict[int, Piece] = {}
-    if grows.any():
-        regions, views = without_halos(regions, grows, views, light)
-    for region in np.flatnonzero(grows):
-        piece = grown(regions, int(region), not went[region], views)
+    for region in np.flatnonzero(sure & (scores >= masks.least_grown)):
+        piece = grown(regions, int(region), not went[region], views, settings.extent)
         if piece is not None:
             pieces[int(region)] = piece
     half = regions.labels.shape[::-1]
     boxes_px = np.array([_around(box, pieces.get(each)) for each, box in enumerate(regions.boxes)], np.float64)
-    if settling.moved_px < SAME_PLACE_PX or not (sure & went).any():
-        half_mask = _filled(sure, regions, pieces, parts, count, scratch)
+    if settling.moved_px < masks.same_place_px or not (sure & went).any():
+        half_mask = _filled(sure, regions, pieces, parts, count, scratch, masks)
     else:  # what disappeared is seen in the reference: it keeps the reference's pixels
-        gone = _filled(sure & went, regions, pieces, parts, count, scratch)
+        gone = _filled(sure & went, regions, pieces, parts, count, scratch, masks)
         gone = np.asarray(
             cv2.warpPerspective(gone, settling.reference_from_query, half, flags=cv2.INTER_LINEAR), np.uint8
         )
         stays = sure & ~went
         half_mask = gone
         if stays.any():
-            half_mask = np.asarray(cv2.max(_filled(stays, regions, pieces, parts, count, scratch), gone), np.uint8)
+            here = _filled(stays, regions, pieces, parts, count, scratch, masks)
+            half_mask = np.asarray(cv2.max(here, gone), np.uint8)
         middle = boxes_px[:, :2] + boxes_px[:, 2:] / 2
         moved = np.column_stack([middle, np.ones(len(middle))]) @ settling.reference_from_query.T
         boxes_px[went, :2] += (moved[:, :2] / moved[:, 2:] - middle)[went]
@@ -236,7 +236,7 @@ def _went(regions: Regions, parts: NDArray[np.int32]) -> Mask:
 
 def _filled(
     chosen: Mask, regions: Regions, pieces: Mapping[int, Piece], parts: NDArray[np.int32], count: int,
-    scratch: Scratch,
+    scratch: Scratch, settings: MaskSettings,
 ) -> ImageGray:
     """The things of the `chosen` (N,) regions: their `pieces`, and where there is none the region with what weakly
     differs around its core, less a rim of blur; without gaps.
@@ -267,27 +267,27 @@ def _filled(
     for region in np.flatnonzero(chosen & ~alone):
         piece = pieces[int(region)]
         around[piece.window][piece.mask] = 255
-    x, y, wide, high = cv2.boundingRect(around)
-    things = np.s_[max(0, y - CLOSES_PX) : y + high + CLOSES_PX, max(0, x - CLOSES_PX) : x + wide + CLOSES_PX]
-    window = np.ones((CLOSES_PX, CLOSES_PX), np.uint8)
-    closed = np.asarray(cv2.morphologyEx(around[things], cv2.MORPH_CLOSE, window), np.uint8)
-    outlines, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outlines, _ = cv2.findContours(around, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     for outline in outlines:
         hull = cv2.convexHull(outline)
-        is_full = cv2.contourArea(outline) > LEAST_CONVEXITY * cv2.contourArea(hull)
-        cv2.drawContours(closed, [hull if is_full else outline], -1, 255.0, cv2.FILLED)
+        is_full = cv2.contourArea(outline) > settings.convexity * cv2.contourArea(hull)
+        cv2.drawContours(around, [hull if is_full else outline], -1, 255.0, cv2.FILLED)
+    x, y, wide, high = cv2.boundingRect(around)
+    things = np.s_[max(0, y - settings.rim_px) : y + high + settings.rim_px,
+                   max(0, x - settings.rim_px) : x + wide + settings.rim_px]
     outlined = np.zeros(size, np.uint8)
-    outlined[things] = _outlined(closed, regions.strength[things])
+    outlined[things] = _outlined(around[things], regions.strength[things], settings)
     if regions.known is not None:
         outlined[~regions.known] = 0
     return outlined
 
 
-def _outlined(thing: ImageGray, strength: ImageGray) -> ImageGray:
+def _outlined(thing: ImageGray, strength: ImageGray, settings: MaskSettings) -> ImageGray:
     """Things (h, w) 0 or 255 whose rim is drawn anew where the difference falls below a part of its height nearby."""
-    near = np.ones((RIM_WIDTH_PX, RIM_WIDTH_PX), np.uint8)
+    near = np.ones((settings.rim_px, settings.rim_px), np.uint8)
     height = np.maximum(cv2.dilate(cv2.min(thing, strength), near), 1).astype(np.float32)
-    limit = np.maximum(np.float32(0.5) * height - np.float32(SLACK), np.float32(LEAST_SHARE) * height)
+    least = np.float32(settings.least_share) * height
+    limit = np.maximum(np.float32(0.5) * height - np.float32(settings.slack_levels), least)
     rim = np.clip(127.5 + 255 * (strength - limit) / height, 0, 255).astype(np.uint8)
     rim[cv2.dilate(thing, np.ones((3, 3), np.uint8)) == 0] = 0
     return np.asarray(cv2.max(rim, cv2.erode(thing, near)), np.uint8)

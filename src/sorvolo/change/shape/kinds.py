@@ -5,7 +5,6 @@ picture stands out it appeared, where only the earlier one does it disappeared, 
 place. How much each sign counts was fitted (logistic regression) to changes of simulated flights.
 """
 
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +21,6 @@ _REPLACED_PRIOR = 0.5  # seldom does one thing leave where another comes; else s
 _OWN = np.array([0.88, 0.39, 0.61, 1.53, 1.5, 0.17])  # of the date's own signs
 _OTHER = np.array([-0.32, -0.12, -0.3, -0.36, -0.4, 0.11])  # of the other date's
 _BIAS = 0.55
-_MOST_SAMPLED = 8192  # pixels: more do not make a median surer
 _LEVELS = np.arange(256, dtype=np.float32)
 
 
@@ -117,30 +115,6 @@ def _outwards(marked: np.ndarray[tuple[int, int], np.dtype[np.uint8]]) -> tuple[
     x, y = cv2.Sobel(distance, cv2.CV_32F, 1, 0), cv2.Sobel(distance, cv2.CV_32F, 0, 1)
     length = np.hypot(x, y) + 1e-6
     return x / length, y / length
-
-
-def _median(values: NDArray[Any]) -> Any:
-    """The median of values (N,), N > 0, in their own type."""
-    half = len(values) // 2
-    if len(values) % 2:
-        return np.partition(values, half)[half]
-    low, high = np.partition(values, (half - 1, half))[half - 1 : half + 1]
-    return (low + high) / values.dtype.type(2)
-
-
-def median_ratio(
-    above: NDArray[np.uint8], below: NDArray[np.uint8], where: Mask, offset: float
-) -> NDArray[np.float32]:
-    """(3,) the medians of (above + `offset`) / (below + `offset`) by channel of two pictures (h, w, 3 or more).
-
-    `where` (h, w) marks the pixels that count, in one at least; of many, some. Offsets keep black from weighing
-    too much.
-    """
-    places = np.flatnonzero(where)
-    places = places[:: -(-len(places) // _MOST_SAMPLED)]
-    offset32 = np.float32(offset)
-    upper, lower = (each.reshape(-1, each.shape[-1])[places, :3] + offset32 for each in (above, below))
-    return np.array([_median(each) for each in np.ascontiguousarray((upper / lower).T)], np.float32)
 
 
 def middle_and_deviation(picture: NDArray[np.uint8], where: Mask) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

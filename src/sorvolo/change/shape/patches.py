@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.change.shape.outlines import mask_of
-from sorvolo.geometry.arrays import ImageRGB, ImageRGBA, Matrix3, PointsM
+from sorvolo.geometry.arrays import ImageGray, ImageRGB, ImageRGBA, Matrix3, PointsM
 from sorvolo.survey.findings import ComparedView, Patch
 
 _LEAST_MARGIN_M = 0.5
@@ -60,21 +60,30 @@ class PatchWindow:
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """Both dates' pictures of a window, as one view has them; alpha 0 where the view knows nothing."""
+    """Both dates' pictures of a window, and their shade, as one view has them; 0 (alpha) where it knows nothing."""
 
     before: ImageRGBA
     after: ImageRGBA
+    shade: ImageGray
 
     def over(self, older: "Cut") -> "Cut":
         """This cut, and the older one where this one knows nothing."""
         known = self.after[..., 3:] > 0
-        return Cut(np.where(known, self.before, older.before), np.where(known, self.after, older.after))
+        return Cut(
+            np.where(known, self.before, older.before), np.where(known, self.after, older.after),
+            np.where(known[..., 0], self.shade, older.shade),
+        )
+
+    def moved(self, new: "PatchWindow", old: "PatchWindow") -> "Cut":
+        """The cut of one window as another one has it."""
+        return Cut(moved(self.before, new, old), moved(self.after, new, old), moved(self.shade, new, old))
 
 
 def cut(view: ComparedView, window: PatchWindow) -> Cut:
     """The view's pictures of both dates, resampled to a window of the ground."""
     shrink = max(1, int(window.m_per_px / view.m_per_px))
     patch_from_image = np.linalg.inv(window.site_from_patch) @ view.site_from_image
+    shade = cv2.warpPerspective(view.shade, patch_from_image, window.size_px, flags=cv2.INTER_NEAREST)
     valid = view.valid.view(np.uint8) * np.uint8(255)
     before, after = view.reference, view.image
     if shrink > 1:
@@ -90,7 +99,7 @@ def cut(view: ComparedView, window: PatchWindow) -> Cut:
         )
         return np.asarray(cv2.copyTo(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), known.view(np.uint8)), np.uint8)
 
-    return Cut(laid(before), laid(after))
+    return Cut(laid(before), laid(after), np.asarray(cv2.copyTo(shade, known.view(np.uint8)), np.uint8))
 
 
 def moved(image: NDArray[np.uint8], new: PatchWindow, old: PatchWindow) -> NDArray[np.uint8]:
@@ -102,7 +111,8 @@ def moved(image: NDArray[np.uint8], new: PatchWindow, old: PatchWindow) -> NDArr
 def patch_of(window: PatchWindow, pictures: Cut, outline_m: PointsM) -> Patch:
     """The record of a change's pictures; the change itself is what lies inside its outline."""
     changed = mask_of(outline_m, window.site_from_patch, (window.height_px, window.width_px))
-    return Patch(window.west_m, window.north_m, window.m_per_px, pictures.before, pictures.after, changed)
+    place = window.west_m, window.north_m, window.m_per_px
+    return Patch(*place, pictures.before, pictures.after, changed, pictures.shade)
 
 
 def _shrunk(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:

@@ -40,17 +40,24 @@ class Parts:
         self._views = views
         named = dict(enumerate(things[:1])) if len(things) == 1 else self._known_again(things)
         for row, thing in enumerate(things):
-            if row in named:
-                continue
-            if all(each.id != things[0].id for each in named.values()):
-                named[row] = thing
-            elif now_ns < 0 or any(_is_same(thing, each) for each in self._seen):
-                named[row] = replace(thing, id=next_id(), announced_ns=now_ns)
+            if row not in named:
+                named |= self._new_at(row, thing, named, now_ns, next_id)
         self._seen = tuple(things)
         self.things = tuple(named[row] for row in sorted(named))
         new = [each for each in self.things if each.id not in self._announced]
         self._announced |= {each.id: each for each in self.things}
         return new
+
+    def _new_at(
+        self, row: int, thing: Change, named: dict[int, Change], now_ns: int, next_id: Callable[[], str]
+    ) -> dict[int, Change]:
+        """A thing without a known id, by its row: under the whole's id where none of the `named` has it, else under a
+        new one; nothing where it was not there when last looked at."""
+        if all(each.id != thing.id for each in named.values()):
+            return {row: thing}
+        if now_ns < 0 or any(_is_same(thing, each) for each in self._seen):
+            return {row: replace(thing, id=next_id(), announced_ns=now_ns)}
+        return {}
 
     def _known_again(self, things: Sequence[Change]) -> dict[int, Change]:
         """Those things, by row, that lie where something was announced already, under its id; each id once."""
