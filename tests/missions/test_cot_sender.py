@@ -1,13 +1,19 @@
 """Cursor on Target events arrive over real sockets."""
 
+import shutil
 import socket
+import ssl
+import subprocess
+import threading
 import time
+from pathlib import Path
 
 import pytest
 from live_sender import free_port
 
-from sorvolo.errors import SettingsError
-from sorvolo.missions.watch.cot_sender import CotPlace, CotSender, cot_place
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.missions.watch.cot_sender import CotPlace, CotSender, CotTls, cot_place
+from sorvolo.missions.watch.settings import WatchOutputs
 
 
 @pytest.mark.parametrize(
@@ -17,6 +23,7 @@ from sorvolo.missions.watch.cot_sender import CotPlace, CotSender, cot_place
         ("udp://tak.local", CotPlace("udp", "tak.local", 6969)),
         ("tcp://[::1]:9000", CotPlace("tcp", "::1", 9000)),
         ("tcp://tak.local", CotPlace("tcp", "tak.local", 8087)),
+        ("tls://tak.local", CotPlace("tls", "tak.local", 8089)),
     ],
 )
 def test_places(url: str, place: CotPlace) -> None:
@@ -75,3 +82,85 @@ def test_tcp_is_connected_again_after_the_server_went_away() -> None:
     with pytest.raises(OSError):
         sender.send(b"<d/>")
     sender.close()
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A server's and a client's certificate with their keys, each its own authority."""
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not installed")
+    folder = tmp_path_factory.mktemp("certificates")
+    made = {}
+    for name in ("server", "client"):
+        path = folder / f"{name}.pem"
+        subprocess.run(
+            [
+                "openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", f"/CN={name}",
+                "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1", "-keyout", str(folder / "key"), "-out",
+                str(folder / "cert"),
+            ],
+            check=True, capture_output=True,
+        )
+        path.write_bytes((folder / "cert").read_bytes() + (folder / "key").read_bytes())
+        made[name] = path
+    return made
+
+
+def _tls_server(certificates: dict[str, Path], server: socket.socket, received: list[bytes]) -> threading.Thread:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificates["server"])
+    context.load_verify_locations(certificates["client"])
+    context.verify_mode = ssl.CERT_REQUIRED
+
+    def serve() -> None:
+        plain, _ = server.accept()
+        plain.settimeout(5)
+        try:
+            with context.wrap_socket(plain, server_side=True) as stream:
+                received.append(stream.recv(100))
+                received.append(stream.recv(100))
+        except OSError:
+            plain.close()
+
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+    return thread
+
+
+def test_tls_with_certificates_on_both_sides(certificates: dict[str, Path]) -> None:
+    received: list[bytes] = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(5)
+        thread = _tls_server(certificates, server, received)
+        place = CotPlace("tls", "127.0.0.1", server.getsockname()[1])
+        sender = CotSender(place, CotTls(certificates["server"], certificates["client"]))
+        sender.send(b"<event n='1'/>")
+        while not received:
+            time.sleep(0.01)
+        sender.send(b"<event n='2'/>")
+        thread.join(5)
+        sender.close()
+    assert received == [b"<event n='1'/>", b"<event n='2'/>"]
+
+
+def test_an_unknown_server_is_refused(certificates: dict[str, Path]) -> None:
+    received: list[bytes] = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(5)
+        thread = _tls_server(certificates, server, received)
+        sender = CotSender(CotPlace("tls", "127.0.0.1", server.getsockname()[1]))
+        with pytest.raises(ssl.SSLCertVerificationError):
+            sender.send(b"<event/>")
+        thread.join(5)
+    assert not received
+
+
+def test_certificates_that_cannot_be_used(tmp_path: Path) -> None:
+    broken = tmp_path / "broken.pem"
+    broken.write_text("nothing")
+    with pytest.raises(InputError, match=r"broken\.pem"):
+        CotTls(certificate=broken).context()
+    with pytest.raises(InputError, match="missing"):
+        CotTls(ca=tmp_path / "missing.pem").context()
+    with pytest.raises(SettingsError, match="tls://"):
+        WatchOutputs(cot="udp://tak.local", cot_tls=CotTls(ca=broken))

@@ -49,7 +49,11 @@ SearchedClasses = Annotated[
 ResultsFolder = Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="SOURCE-watch")]
 SaveOption = Annotated[Save, typer.Option(help="Keep the frames with the objects drawn in.")]
 Labels = Annotated[str, typer.Option(help="Write labels to correct and train with: coco, yolo or coco,yolo.")]
-Cot = Annotated[str, typer.Option(help="Send objects to a TAK server or team: udp://host:port or tcp://host:port.")]
+Cot = Annotated[
+    str, typer.Option(help="Send objects to a TAK server or team: udp://host:port, tcp://host:port, tls://host:port.")
+]
+CotAuthority = Annotated[Path | None, typer.Option(help="For tls://: the authority of the server's certificate, PEM.")]
+CotCertificate = Annotated[Path | None, typer.Option(help="For tls://: own certificate and its key in one PEM file.")]
 CotType = Annotated[
     list[str] | None, typer.Option(help="Cursor on Target type of a class, such as person=a-f-G. Can be repeated.")
 ]
@@ -88,6 +92,8 @@ def watch_command(
     labels: Labels = "",
     cot: Cot = "",
     cot_type: CotType = None,
+    cot_ca: CotAuthority = None,
+    cot_cert: CotCertificate = None,
     alert_command: AlertCommand = "",
     alert_url: AlertUrl = "",
     every: EveryNth = None,
@@ -111,6 +117,7 @@ def watch_command(
     Example: sorvolo watch rtsp://192.168.1.10/live --telemetry udp://:10110 --cot udp://239.2.3.1:6969
     """
     from sorvolo.capture.live.reconnect import LiveSettings
+    from sorvolo.missions.watch.cot_sender import CotTls
     from sorvolo.missions.watch.flights import watch
     from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
     from sorvolo.store.exports.cursor_on_target import COT_TYPES
@@ -120,7 +127,7 @@ def watch_command(
     )
     outputs = WatchOutputs(
         out, save.value, names(labels), cot, {**COT_TYPES, **_types(cot_type or [])}, alert_command=alert_command,
-        alert_url=alert_url,
+        alert_url=alert_url, cot_tls=CotTls(cot_ca, cot_cert),
     )
     _warn_of_interpreted(alert_command)
     stop = _Stop()
@@ -129,7 +136,10 @@ def watch_command(
         live=LiveSettings(give_up_s=give_up), until=stop.until,
     )
     folders = _folders_watched(watching, stop, coordinates, is_quiet=as_json)
-    results = [_result(folder) for folder in folders]
+    _show_results([_result(folder) for folder in folders], coordinates, as_json=as_json)
+
+
+def _show_results(results: Sequence[Mapping[str, Any]], coordinates: PlaceFormat, *, as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps({"watches": results}, indent=1))
     else:

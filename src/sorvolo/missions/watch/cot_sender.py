@@ -1,14 +1,18 @@
-"""The way of Cursor on Target events to a TAK server or a team's phones: UDP datagrams or a TCP stream."""
+"""The way of Cursor on Target events to a TAK server or a team's phones: UDP datagrams, a TCP stream or TLS."""
 
 import socket
+import ssl
 from dataclasses import dataclass
 from ipaddress import ip_address
+from pathlib import Path
 from typing import Literal
 from urllib.parse import urlsplit
 
 from sorvolo.errors import InputError, SettingsError
 
-_DEFAULT_PORTS = {"udp": 6969, "tcp": 8087}
+Transport = Literal["udp", "tcp", "tls"]
+
+_DEFAULT_PORTS: dict[Transport, int] = {"udp": 6969, "tcp": 8087, "tls": 8089}
 _TIMEOUT_S = 3.0
 
 
@@ -16,7 +20,7 @@ _TIMEOUT_S = 3.0
 class CotPlace:
     """Where events are sent to."""
 
-    transport: Literal["udp", "tcp"]
+    transport: Transport
     host: str
     port: int
 
@@ -24,21 +28,44 @@ class CotPlace:
         return f"{self.transport}://{self.host}:{self.port}"
 
 
+@dataclass(frozen=True)
+class CotTls:
+    """What a TLS connection needs besides the system's authorities: PEM files of the server's authority (`ca`), and of
+    one's own certificate with its key, without a password (`certificate`)."""
+
+    ca: Path | None = None
+    certificate: Path | None = None
+
+    def context(self) -> ssl.SSLContext:
+        """Ready to connect: the server's certificate and its name are checked. Raises InputError for unusable files."""
+        try:
+            made = ssl.create_default_context(cafile=None if self.ca is None else str(self.ca))
+            if self.certificate is not None:
+                made.load_cert_chain(str(self.certificate), password=lambda: "")
+        except (OSError, ssl.SSLError, ValueError) as error:
+            named = " and ".join(str(each) for each in (self.ca, self.certificate) if each is not None)
+            raise InputError(
+                f"{named}: no usable certificate ({error}); give PEM files, --cot-cert with the certificate and its "
+                "key, the key without a password (openssl pkcs12 -in FILE.p12 -out FILE.pem -nodes)"
+            ) from error
+        return made
+
+
 def cot_place(url: str) -> CotPlace:
-    """The place that `udp://host[:port]` or `tcp://host[:port]` names; ports 6969 and 8087 where none is given.
+    """The place that `udp://host[:port]`, `tcp://...` or `tls://...` names; ports 6969, 8087, 8089 where none is given.
 
     A multicast group (udp://239.2.3.1:6969 is the one that ATAK listens to) is a host as any other. Raises
     SettingsError for anything else.
     """
-    wanted = "give udp://host:port or tcp://host:port, such as udp://239.2.3.1:6969"
+    wanted = "give udp://host:port, tcp://host:port or tls://host:port, such as udp://239.2.3.1:6969"
     try:
         parts = urlsplit(url)
         port = parts.port
     except ValueError as error:
         raise SettingsError(f"--cot {url}: {error}; {wanted}") from error
-    if parts.scheme not in ("udp", "tcp") or not parts.hostname or parts.path.strip("/") or port == 0:
+    transport = next((each for each in _DEFAULT_PORTS if each == parts.scheme), None)
+    if transport is None or not parts.hostname or parts.path.strip("/") or port == 0:
         raise SettingsError(f"--cot {url} is no place to send events to; {wanted}")
-    transport: Literal["udp", "tcp"] = "udp" if parts.scheme == "udp" else "tcp"
     return CotPlace(transport, parts.hostname, port or _DEFAULT_PORTS[transport])
 
 
@@ -56,8 +83,9 @@ def check_host(place: CotPlace) -> None:
 class CotSender:
     """Sends events to one place; a connection that broke is made anew with the next event."""
 
-    def __init__(self, place: CotPlace) -> None:
+    def __init__(self, place: CotPlace, tls: CotTls = CotTls()) -> None:
         self._place = place
+        self._tls = tls.context() if place.transport == "tls" else None
         self._socket: socket.socket | None = None
 
     def send(self, event: bytes) -> None:
@@ -66,10 +94,10 @@ class CotSender:
         Raises OSError when that fails, or when an earlier datagram was refused (this one is then sent all the same).
         """
         try:
-            if self._socket is not None and self._place.transport == "tcp" and not _is_open(self._socket):
+            if self._socket is not None and self._place.transport != "udp" and not _is_open(self._socket):
                 self.close()
             if self._socket is None:
-                self._socket = _connected(self._place)
+                self._socket = _connected(self._place, self._tls)
             self._socket.sendall(event)
         except OSError:
             self.close()
@@ -92,15 +120,22 @@ def _is_open(stream: socket.socket) -> bool:
         while stream.recv(65_536):
             pass
         return False
-    except BlockingIOError:
+    except (BlockingIOError, ssl.SSLWantReadError):
         return True
     finally:
         stream.settimeout(_TIMEOUT_S)
 
 
-def _connected(place: CotPlace) -> socket.socket:
-    if place.transport == "tcp":
-        return socket.create_connection((place.host, place.port), timeout=_TIMEOUT_S)
+def _connected(place: CotPlace, tls: ssl.SSLContext | None = None) -> socket.socket:
+    if place.transport != "udp":
+        plain = socket.create_connection((place.host, place.port), timeout=_TIMEOUT_S)
+        if tls is None:
+            return plain
+        try:
+            return tls.wrap_socket(plain, server_hostname=place.host)
+        except OSError:
+            plain.close()
+            raise
     family, kind, protocol, _, address = socket.getaddrinfo(place.host, place.port, type=socket.SOCK_DGRAM)[0]
     made = socket.socket(family, kind, protocol)
     try:

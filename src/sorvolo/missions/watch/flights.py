@@ -48,6 +48,7 @@ def watch(
     until = until or threading.Event()
     if outputs.cot:
         check_host(cot_place(outputs.cot))
+        outputs.cot_tls.context()
     finder = Detector.load(settings.model) if detector is None else detector
     _demand_known_classes(finder, settings, outputs)
     sources = open_sources([source], telemetry, camera, live=live, until=until)

@@ -26,7 +26,7 @@ class Notifier:
         self._sender: CotSender | None = None
         self._alerts: list[Outbox[Mapping[str, Any]]] = []
         if outputs.cot and not site.is_local:
-            self._sender = CotSender(cot_place(outputs.cot))
+            self._sender = CotSender(cot_place(outputs.cot), outputs.cot_tls)
             self._cot = Outbox(self._sender.send, code="cot", what=f"sending to {outputs.cot}")
         if outputs.alert_command:
             run = alert_command(outputs.alert_command)

@@ -8,7 +8,7 @@ from typing import Literal
 from sorvolo.errors import SettingsError
 from sorvolo.missions.flight.settings import check_offset
 from sorvolo.missions.watch import alerts
-from sorvolo.missions.watch.cot_sender import cot_place
+from sorvolo.missions.watch.cot_sender import CotTls, cot_place
 from sorvolo.store.exports.cursor_on_target import COT_TYPES
 
 DEFAULT_FRAMES_PER_SECOND = 10.0
@@ -57,12 +57,13 @@ class WatchOutputs:
     folder: Path | None = None  # None: `<source>-watch` where the command runs
     save: Literal["none", "video", "pictures"] = "none"  # frames with what was found drawn in
     labels: tuple[str, ...] = ()  # of "coco", "yolo": what was found, as labels to correct and train with
-    cot: str = ""  # udp://host:port or tcp://host:port
+    cot: str = ""  # udp://host:port, tcp://host:port or tls://host:port
     cot_types: Mapping[str, str] = field(default_factory=lambda: COT_TYPES)  # Cursor on Target's type of each class
     cot_every_s: float = 3.0  # of one track, once it was reported
     cot_stale_s: float = 300.0
     alert_command: str = ""
     alert_url: str = ""
+    cot_tls: CotTls = field(default_factory=CotTls)  # certificates for tls://
 
     def __post_init__(self) -> None:
         if self.save not in ("none", "video", "pictures"):
@@ -73,6 +74,8 @@ class WatchOutputs:
             raise SettingsError("events are sent every 0 s or more, and are stale after more than 0 s")
         if self.cot:
             cot_place(self.cot)
+        if self.cot_tls != CotTls() and not self.cot.startswith("tls://"):
+            raise SettingsError("--cot-ca and --cot-cert are for --cot tls://host:port")
         if self.alert_command:
             alerts.alert_command(self.alert_command)
         if self.alert_url:
