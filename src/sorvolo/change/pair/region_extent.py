@@ -29,7 +29,7 @@ class ExtentSettings:
     convexity: float = 0.8  # part of its hull that a thing fills
     beside: float = 0.5  # of the limit, that three quarters of what lies beside a thing do not pass: light fades slowly
     shade_of_top: float = 0.35  # of the largest difference: what differs less and is darker is the thing's shadow
-    shade: ShadeSettings = field(default_factory=lambda: ShadeSettings(no_brighter=1.0, alike=0.1))  # 0023
+    shade: ShadeSettings = field(default_factory=lambda: ShadeSettings(no_brighter=1.0, alike=0.1))  # 0024
     blurred: float = 0.2  # of the largest difference within 5 px: what differs less is a thing's blurred rim
 
 
