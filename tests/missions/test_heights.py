@@ -40,7 +40,12 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("heights")
     for _ in simulate_site(folder / "made", _SURVEY):
         pass
-    list(map_flights([folder / "made" / "flight1" / "photos"], folder / "site", MapSettings(model="none")))
+    photos = folder / "made" / "flight1" / "photos"
+    assert main(["map", str(photos), "--site", str(folder / "site"), "--model", "none", "--heights", "--json"]) == 0
+    made = list((folder / "site").glob("flights/*/heights.tif"))
+    assert made, "map --heights makes heights"
+    for name in ("heights.tif", "terrain.tif", "orthophoto.tif", "heights.json"):
+        (made[0].parent / name).unlink()
     return folder / "site"
 
 

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sorvolo.cli.heights import make_and_read, show_heights
 from sorvolo.cli.options import (
     Area,
     AsJson,
@@ -149,18 +150,23 @@ def map_command(
         inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area,
         live=LiveSettings(keeps_all=True, give_up_s=give_up), control=gcp, base=base,
     )
-    if as_json:
-        _print_json(reports, site)
-    else:
-        show_reports(reports, site, Console())
+    _print(reports, site, with_heights=heights, as_json=as_json)
     if any(each["headline"]["quality"] != "map" for each in reports):
         raise typer.Exit(TO_CHECK)
 
 
-def _print_json(reports: Sequence[Mapping[str, Any]], site: Path) -> None:
-    plain = [{key: value for key, value in each.items() if key != "track"} for each in reports]
-    files = {path.name.replace(".", "_"): str(path) for path in _map_files(site).values()}
-    typer.echo(json.dumps({"site": str(site), **files, "flights": plain}, indent=1))
+def _print(reports: Sequence[Mapping[str, Any]], site: Path, *, with_heights: bool, as_json: bool) -> None:
+    """Print what became of the flights; with heights, make and print them, too."""
+    if not as_json:
+        show_reports(reports, site, Console())
+    heights = [make_and_read(site, each["flight"]) for each in reports] if with_heights else []
+    if as_json:
+        plain = [{key: value for key, value in each.items() if key != "track"} for each in reports]
+        files = {path.name.replace(".", "_"): str(path) for path in _map_files(site).values()}
+        typer.echo(json.dumps({"site": str(site), **files, "flights": plain, "heights": heights}, indent=1))
+        return
+    for each in heights:
+        show_heights(site, each, Console())
 
 
 def map_and_read_reports(

@@ -1,22 +1,23 @@
 """The answers: where every frame lies, what stands where, and which pixels show it; plain values for
 files."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGBA, PointsM
+from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, ImageRGBA, PointsM
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import gimbal_angles_from_rotation
 from sorvolo.simulation.canvas import GroundRaster
 from sorvolo.simulation.flight import SimulatedFlight, has_changed
-from sorvolo.simulation.objects import Label, Thing
+from sorvolo.simulation.objects import Body, Label, Thing
 from sorvolo.simulation.rendering import Labels, render_labels
+from sorvolo.simulation.view import View, sample_patches
 from sorvolo.simulation.world import World
 
 CATEGORIES = (Label.PERSON, Label.CAR, Label.SMALL)
@@ -220,3 +221,25 @@ def polygon_geometry(outline_m: PointsM, site: LocalFrame) -> dict[str, Any] | N
         "type": "Polygon",
         "coordinates": [[[round(float(c), DEGREE_DECIMALS) for c in p] for p in closed]],
     }
+
+
+def surface_heights(things: Sequence[Thing], bodies: Mapping[int, Body], view: View) -> Floats32:
+    """(H, W) the height of the topmost surface above the ground at each pixel of a map view, m: 0 is bare ground.
+
+    What looks like a leaf (crowns, silhouettes) counts where it is opaque.
+    """
+    heights = np.zeros((view.camera.height_px, view.camera.width_px), np.float32)
+    for thing in things:
+        for patch in bodies[thing.id].placed(thing.turn, thing.place_m(0.0), view.eye_m):
+            corners = patch.corners_m
+            normal = np.cross(corners[1] - corners[0], corners[3] - corners[0])
+            if abs(normal[2]) < 1e-3 * np.linalg.norm(normal):
+                continue  # a wall has no ground of its own
+            for (x0, y0, x1, y1), rgba in sample_patches(view, [patch]):
+                rays = view.rays_in((x0, y0, x1, y1))
+                east, north = rays[..., 0] - view.ray_from_site[0, 3], view.ray_from_site[1, 3] - rays[..., 1]
+                slope = (normal[0] * (east - corners[0, 0]) + normal[1] * (north - corners[0, 1])) / normal[2]
+                up = np.clip(corners[0, 2] - slope, corners[:, 2].min(), corners[:, 2].max())
+                here = heights[y0:y1, x0:x1]
+                np.maximum(here, up, out=here, where=rgba[..., 3] > 127, casting="same_kind")
+    return heights
