@@ -7,7 +7,7 @@ as long as some h below 0.6 H explains it; only the rest of its motion counts.
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,16 +17,34 @@ from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.survey.findings import ComparedView
 
-_MOST_PARALLAX = 0.6 / (1 - 0.6)  # h / (H - h) of a thing 0.6 times as high as the camera flies
-_UNLIKELY_PARALLAX = 0.5  # no thing that came is a third as high as the camera flies
-_POINTS = 12  # of a track, that its velocity is fitted to
-_RIGID_POINTS, _RIGID_LENGTHS, _RIGID_LENGTH_M = 5, 2.0, 2.5
-_FLOATS_LENGTH_M = 1.3
-_STEADY_AREA, _STEADY_LENGTH = 1.7, 1.35  # of the largest by the smallest, for one that keeps its size
-_PHOTOS_APART_S = 0.7  # at least, on average
-# two that move alike so near each other are one thing, seen now with its shadow, now without
-_ONE_THING_M = 0.4
-_LOST_FOR_S = 45.0  # a thing that moves steadily is known again after so long: on the next strip, too
+_POINTS = 12  # of a track are kept
+
+
+@dataclass(frozen=True)
+class ParallaxSettings:
+    """What a thing's height may explain of a blob's motion, and when nothing does (before 0014; photos 0016).
+
+    Shares are of the camera's own way over the ground; a thing h high, seen from H, has h / (H - h).
+    """
+
+    most: float = 1.5  # h = 0.6 H: no taller thing is expected
+    unlikely: float = 0.5  # h = H / 3: no thing that came is so high
+    least_own: float = 0.35  # of a mover's speed that no height explains
+    rigid_views: int = 5  # a blob that keeps its size over so many views, ...
+    rigid_lengths: float = 2.0  # ... on a way of so many of its lengths, moves whatever its direction ...
+    rigid_m: float = 2.5  # ... if it is no longer, m
+    photos_apart_s: float = 0.7  # views that are seldom, on average; they may show a blob ...
+    floats_m: float = 1.3  # ... no longer than this, m, too far from any foot that it could stand on
+    steady_area: float = 1.7  # the largest by the smallest of one that keeps its size, and ...
+    steady_length: float = 1.35  # ... the longest by the shortest
+
+
+@dataclass(frozen=True)
+class IdentitySettings:
+    """When two tracks show one thing (before 0014)."""
+
+    near_m: float = 0.4  # two that move alike so near each other: now with its shadow, now without
+    lost_for_s: float = 45.0  # a thing that moves steadily is known again after so long: on the next strip, too
 
 
 @dataclass(frozen=True)
@@ -43,6 +61,8 @@ class MovingSettings:
     most_step_m: float = 6.0  # between two views: further away anything could be it
     forget_s: float = 2.5  # a track without a blob for so long has ended ...
     forget_views: int = 2  # ... and so many views
+    parallax: ParallaxSettings = field(default_factory=ParallaxSettings)
+    identity: IdentitySettings = field(default_factory=IdentitySettings)
 
     def __post_init__(self) -> None:
         if not 3 <= self.least_photos <= self.least_views:
@@ -111,12 +131,12 @@ class Track:
         """The time over which its last points are spread."""
         return (self.points[-1].time_ns - self.points[0].time_ns) * 1e-9
 
-    def with_point(self, point: TrackPoint) -> "Track":
+    def with_point(self, point: TrackPoint, settings: ParallaxSettings) -> "Track":
         """The track, one view longer."""
         points = (*self.points, point)[-_POINTS:]
+        velocity_m_s = motion(points, settings).velocity_m_s
         return Track(
-            self.first, points, self.count + 1, self.score_sum + point.blob.score, motion(points).velocity_m_s,
-            self.mover,
+            self.first, points, self.count + 1, self.score_sum + point.blob.score, velocity_m_s, self.mover,
         )
 
 
@@ -131,7 +151,7 @@ class Followed:
     movers: tuple[Track, ...]
 
 
-def motion(points: Sequence[TrackPoint]) -> Motion:
+def motion(points: Sequence[TrackPoint], settings: ParallaxSettings = ParallaxSettings()) -> Motion:
     """The steady motion that fits a track's points best (least squares), N >= 2, less what parallax explains."""
     # plain numbers: a dozen points are too few for arrays to be faster
     start_ns, count = points[0].time_ns, len(points)
@@ -146,7 +166,7 @@ def motion(points: Sequence[TrackPoint]) -> Motion:
     centre = sum(places) / count
     rest = sum(abs(place - centre - s * velocity) ** 2 for s, place in zip(spread, places))
     against = -(velocity * camera.conjugate()).real
-    parallax = min(max(against / abs(camera) ** 2, 0.0), _MOST_PARALLAX) if abs(camera) > 1e-2 else 0.0
+    parallax = min(max(against / abs(camera) ** 2, 0.0), settings.most) if abs(camera) > 1e-2 else 0.0
     own = velocity + parallax * camera
     return Motion(
         np.array([velocity.real, velocity.imag]), np.array([camera.real, camera.imag]),
@@ -166,7 +186,7 @@ class BlobTracker:
 
     def follow(self, view: ComparedView) -> Followed:
         """Take the next view's blobs; views come in order of time."""
-        now_ns, camera_m = view.time_ns, np.array(view.camera_m[:2])
+        now_ns, camera_m, parallax = view.time_ns, np.array(view.camera_m[:2]), self._settings.parallax
         tracks = self._still_followed(now_ns)
         self._times_ns.append(now_ns)
         blobs = blobs_of(view)
@@ -175,14 +195,14 @@ class BlobTracker:
         pairs = _pairs(tracks, blobs, now_ns, self._settings)
         for index, blob_index in pairs:
             blob = blobs[blob_index]
-            track = tracks[index].with_point(TrackPoint(now_ns, blob, camera_m))
-            move = motion(track.points)
+            track = tracks[index].with_point(TrackPoint(now_ns, blob, camera_m), parallax)
+            move = motion(track.points, parallax)
             if not track.mover and self._moves(track, move):
                 track = replace(track, mover=self._number_of(track, move, tracks))
             if track.mover:
                 movers.append(track)
             # a thing that stopped is a change of the ground, whatever it was before
-            may_move[blob.box] = _may_move(track, motion(track.points[-5:]))
+            may_move[blob.box] = _may_move(track, motion(track.points[-5:], parallax), parallax)
             is_moving[blob.box] = bool(track.mover) and may_move[blob.box]
             tracks[index] = track
         taken = {blob for _, blob in pairs}
@@ -198,7 +218,8 @@ class BlobTracker:
         oldest_ns = min([now_ns - round(self._settings.forget_s * 1e9), *self._times_ns])
         gone = [each for each in self._tracks if each.last.time_ns < oldest_ns]
         self._lost += [each for each in gone if each.mover]
-        self._lost = [each for each in self._lost if (now_ns - each.last.time_ns) * 1e-9 <= _LOST_FOR_S]
+        longest_s = self._settings.identity.lost_for_s
+        self._lost = [each for each in self._lost if (now_ns - each.last.time_ns) * 1e-9 <= longest_s]
         return [each for each in self._tracks if each not in gone]
 
     def _moves(self, track: Track, move: Motion) -> bool:
@@ -210,20 +231,23 @@ class BlobTracker:
         if not _is_plausible(track, move, length_m, settings) or _goes_with_camera(move):
             return False
         needed_m = max(settings.least_move_m, settings.least_lengths * length_m)
-        is_own = move.path_m > needed_m and float(np.hypot(*move.own_m_s)) > 0.35 * move.speed_m_s
-        return is_own or _is_rigid(track, length_m) or (are_photos and _floats(track, move, length_m))
+        parallax = settings.parallax
+        is_own = move.path_m > needed_m and float(np.hypot(*move.own_m_s)) > parallax.least_own * move.speed_m_s
+        return is_own or _is_rigid(track, length_m, parallax) or (
+            are_photos and _floats(track, move, length_m, parallax)
+        )
 
     def _are_photos(self, track: Track) -> bool:
         """Whether the views were taken seldom while the track lasted."""
         seen = [each for each in self._times_ns if each >= track.points[0].time_ns]
-        return len(seen) > 1 and (seen[-1] - seen[0]) * 1e-9 >= _PHOTOS_APART_S * (len(seen) - 1)
+        return len(seen) > 1 and (seen[-1] - seen[0]) * 1e-9 >= self._settings.parallax.photos_apart_s * (len(seen) - 1)
 
     def _number_of(self, track: Track, move: Motion, others: Sequence[Track]) -> int:
         """The number of the mover that the track shows: of one of `others` at the same place, of a lost one, or new."""
         now_ns, start = track.last.time_ns, track.points[0]
         for other in others:
             expected_m = other.last.blob.place_m + (now_ns - other.last.time_ns) * 1e-9 * other.velocity_m_s
-            is_there = float(np.hypot(*(track.last.blob.place_m - expected_m))) < _ONE_THING_M
+            is_there = float(np.hypot(*(track.last.blob.place_m - expected_m))) < self._settings.identity.near_m
             if other.mover and is_there and _goes_with(move, other):
                 return other.mover
         for lost in self._lost:
@@ -254,17 +278,17 @@ def _goes_with(move: Motion, track: Track) -> bool:
     return apart_m_s < 0.3 + 0.5 * float(np.hypot(*move.velocity_m_s))
 
 
-def _is_rigid(track: Track, length_m: float) -> bool:
+def _is_rigid(track: Track, length_m: float, settings: ParallaxSettings) -> bool:
     """Whether a blob went far without changing its size, so that no parallax explains it after all.
 
     What leans over the ground stands on it: its ghost grows and shrinks with the camera's way, down to nothing.
     """
-    if len(track.points) < _RIGID_POINTS or length_m > _RIGID_LENGTH_M:
+    if len(track.points) < settings.rigid_views or length_m > settings.rigid_m:
         return False
-    return _way_m(track) > max(1.0, _RIGID_LENGTHS * length_m) and _keeps_its_size(track)
+    return _way_m(track) > max(1.0, settings.rigid_lengths * length_m) and _keeps_its_size(track, settings)
 
 
-def _floats(track: Track, move: Motion, length_m: float) -> bool:
+def _floats(track: Track, move: Motion, length_m: float, settings: ParallaxSettings) -> bool:
     """Whether a small blob of steady size is far from where anything tall enough to move so would stand.
 
     What leans is seen from its foot to its top; the foot of a thing whose top moves against the camera's way with a
@@ -272,10 +296,10 @@ def _floats(track: Track, move: Motion, length_m: float) -> bool:
     """
     camera_m_s = float(np.hypot(*move.camera_m_s))
     k = -float(move.velocity_m_s @ move.camera_m_s) / max(camera_m_s, 1e-6) ** 2
-    if length_m > _FLOATS_LENGTH_M or k <= 0 or not _keeps_its_size(track):
+    if length_m > settings.floats_m or k <= 0 or not _keeps_its_size(track, settings):
         return False  # where k is not above 0, no height explains it
     apart_m = [k / (1 + k) * float(np.hypot(*(each.blob.place_m - each.camera_m))) for each in track.points]
-    return _way_m(track) > _RIGID_LENGTHS * length_m and float(np.median(apart_m)) > length_m
+    return _way_m(track) > settings.rigid_lengths * length_m and float(np.median(apart_m)) > length_m
 
 
 def _way_m(track: Track) -> float:
@@ -283,14 +307,14 @@ def _way_m(track: Track) -> float:
     return float(np.hypot(*(track.last.blob.place_m - track.points[0].blob.place_m)))
 
 
-def _keeps_its_size(track: Track) -> bool:
+def _keeps_its_size(track: Track, settings: ParallaxSettings) -> bool:
     """Whether a track's area and length have hardly changed: nothing that grew explains its motion."""
     areas = [each.blob.area_m2 for each in track.points]
     lengths = [each.blob.length_m for each in track.points]
-    return max(areas) < _STEADY_AREA * min(areas) and max(lengths) < _STEADY_LENGTH * min(lengths)
+    return max(areas) < settings.steady_area * min(areas) and max(lengths) < settings.steady_length * min(lengths)
 
 
-def _may_move(track: Track, move: Motion) -> bool:
+def _may_move(track: Track, move: Motion, settings: ParallaxSettings) -> bool:
     if track.count < 3:
         return True
     recent = track.points[-5:]
@@ -298,7 +322,7 @@ def _may_move(track: Track, move: Motion) -> bool:
     way_m = move.velocity_m_s * (recent[-1].time_ns - recent[0].time_ns) * 1e-9
     camera_way_m = float(np.hypot(*camera_m))
     against_m = -float(way_m @ camera_m) / camera_way_m if camera_way_m > 0.1 else 0.0
-    is_ghost = against_m > max(_UNLIKELY_PARALLAX * camera_way_m, 0.25)
+    is_ghost = against_m > max(settings.unlikely * camera_way_m, 0.25)
     return bool(move.path_m > max(0.25, 2 * move.error_m) or is_ghost)
 
 
