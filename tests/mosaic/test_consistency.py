@@ -66,6 +66,14 @@ def test_pieces_beside_each_other_are_steps_and_areas_far_apart_are_not() -> Non
     assert not held(apart).steps
 
 
+def test_heights_that_drift_in_telemetry_alone_are_no_fault_of_the_map() -> None:
+    frames = [
+        replace(each, gps_residual_m=each.gps_residual_m - np.array([0.0, 0.0, 4.0 * each.index]))
+        for each in flown(step_m=40.0)
+    ]
+    assert not held(frames).faults
+
+
 def test_heights_that_pictures_contradict_are_reported_with_both_numbers() -> None:
     (remark,) = held(flown(), stated_m=120.0).remarks
     assert "120 m" in remark and "60 m" in remark

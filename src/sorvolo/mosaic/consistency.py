@@ -172,17 +172,26 @@ def _gps_faults(
 def _height_faults(
     frames: Sequence[PlacedFrame], figures: FlightFigures, settings: ConsistencySettings
 ) -> list[str]:
-    off_m: Floats = np.array([each.gps_residual_m[2] for each in frames])
-    off_m = off_m[np.isfinite(off_m)]
-    if len(off_m) < settings.least_frames or figures.height_m is None:
+    rows = np.array([
+        (each.site_from_camera.translation_m[2], each.gps_residual_m[2]) for each in frames
+        if each.site_from_camera is not None and np.isfinite(each.gps_residual_m[2])
+    ]).reshape(-1, 2)
+    if len(rows) < settings.least_frames or figures.height_m is None:
         return []
-    uneven_m = float(np.percentile(np.abs(off_m - np.median(off_m)), 75))
-    if uneven_m <= max(settings.most_uneven * figures.height_m, settings.least_uneven_m):
+    up_m, off_m = rows.T
+    uneven_m = _uneven_m(off_m)
+    telemetry_drifts = _uneven_m(up_m) < _uneven_m(up_m - off_m)  # a barometer or a poor receiver, not the map
+    if telemetry_drifts or uneven_m <= max(settings.most_uneven * figures.height_m, settings.least_uneven_m):
         return []
     return [
         f"the pictures put frames {uneven_m:.0f} m higher or lower than telemetry, at {figures.height_m:.0f} m above "
         "the ground: the map has several scales; give control points (--gcp), or photos with more overlap"
     ]
+
+
+def _uneven_m(values_m: Floats) -> float:
+    """How far three quarters of the values stay from their median."""
+    return float(np.percentile(np.abs(values_m - np.median(values_m)), 75))
 
 
 def _height_remarks(figures: FlightFigures, stated: Stated, settings: ConsistencySettings) -> list[str]:
