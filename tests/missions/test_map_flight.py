@@ -101,7 +101,10 @@ def test_a_video_that_looks_ahead_by_half_a_right_angle(oblique: Path, tmp_path:
     absolute_m, shape_m = corner_errors_m(site, "flight1", oblique / "truth")
     # The far corners lie 60 m off, where a pixel covers 20 cm: over draws of the camera's noise 1 to 11 cm.
     assert shape_m < 4 * _M_PER_PX and absolute_m < 0.4
-    run_map(tmp_path / "blind", flight / "flight1.mp4", "--telemetry", flight / "other" / "flight1.gpx")
+    blind = [str(flight / "flight1.mp4"), "--telemetry", str(flight / "other" / "flight1.gpx"), "--model", "none"]
+    # pictures that look to opposite sides are not tied: a map to check
+    assert cli.main(["map", *blind, "--site", str(tmp_path / "blind")]) == 3
+    assert "2 pieces" in report_of(tmp_path / "blind", "flight1")["headline"]["text"]
     (warning,) = (each for each in report_of(tmp_path / "blind", "flight1")["warnings"] if "straight down" in each)
     told_deg = float(warning.split(" deg")[0].rpartition(" ")[2])
     assert told_deg == pytest.approx(45, abs=10) and "angles" in warning

@@ -57,6 +57,13 @@ def test_what_no_receiver_could_err_is_named(frames: list[PlacedFrame], words: s
     assert any(words in each for each in held(frames).faults), held(frames)
 
 
+def test_a_poor_receiver_that_follows_the_path_makes_a_map_to_check_and_another_path_none() -> None:
+    poor = held(flown(gps_rms_m=16.0, step_m=8.0))
+    assert not poor.faults and any("disagree by" in each for each in poor.steps)
+    other = held(flown(gps_rms_m=40.0, step_m=4.0))
+    assert any("disagree by" in each for each in other.faults)
+
+
 def test_pieces_beside_each_other_are_steps_and_areas_far_apart_are_not() -> None:
     (step,) = held(flown()).steps
     assert "2 pieces" in step and "0.jpg to 11.jpg" in step

@@ -23,6 +23,7 @@ class ConsistencySettings:
     rms_sigmas: float = 8.0  # ... or so many stated sigmas
     most_off_m: float = 5.0  # median, if it is also a quarter of how far the flight reaches
     off_share: float = 0.25
+    least_alike: float = 0.6  # rms misfit over the fixes' spread: more, and the path is another one
     most_uneven: float = 0.35  # of the height above ground: heights of frames that scatter so against telemetry's
     least_uneven_m: float = 8.0
     heights_differ: float = 0.15  # of the stated height: more is reported ...
@@ -74,11 +75,12 @@ def consistency(
     groups = sorted(([by_index[k] for k in ids if k in by_index] for ids in pieces), key=lambda group: -len(group))
     found = [_piece(group, stated) for group in groups]
     known = tuple(each for each in found if each is not None)
+    frames = list(by_index.values())
     faults = [
-        *_scale_faults(known, settings), *_gps_faults(list(by_index.values()), figures, stated, settings),
-        *_height_faults(list(by_index.values()), figures, settings),
+        *_scale_faults(known, settings), *_gps_faults(frames, figures, stated, settings),
+        *_height_faults(frames, figures, settings),
     ]
-    steps = _steps(groups[: len(known)], figures)
+    steps = [*_steps(groups[: len(known)], figures), *(_gps_doubts(figures, settings) if not faults else [])]
     return Consistency(known, tuple(faults), tuple(steps), tuple(_height_remarks(figures, stated, settings)))
 
 
@@ -153,20 +155,38 @@ def _scale_faults(pieces: Sequence[Piece], settings: ConsistencySettings) -> lis
 def _gps_faults(
     frames: Sequence[PlacedFrame], figures: FlightFigures, stated: Stated, settings: ConsistencySettings
 ) -> list[str]:
-    median_m, rms_m = figures.gps_median_m, figures.gps_rms_m
-    if median_m is None or rms_m is None or len(frames) <= 3:
+    rms_m = figures.gps_rms_m
+    if rms_m is None or len(frames) <= 3:
         return []
-    if median_m > max(settings.off_share * figures.reach_m, settings.most_off_m):
-        return [
-            f"the pictures' own path and the telemetry disagree by {median_m:.0f} m (median): is this the telemetry of "
-            "this flight, and is the clock offset right?"
-        ]
+    doubts = _gps_doubts(figures, settings)
+    if doubts and not _is_alike(frames, settings):
+        return doubts
     if rms_m > max(settings.most_rms_m, settings.rms_sigmas * stated.position_sigma_m):
         return [
             f"the cameras lie {rms_m:.0f} m from their GPS fixes (root mean square), more than a receiver errs: give "
             "control points (--gcp), or photos with more overlap"
         ]
     return []
+
+
+def _gps_doubts(figures: FlightFigures, settings: ConsistencySettings) -> list[str]:
+    median_m = figures.gps_median_m
+    if median_m is None or median_m <= max(settings.off_share * figures.reach_m, settings.most_off_m):
+        return []
+    return [
+        f"the pictures' own path and the telemetry disagree by {median_m:.0f} m (median): is this the telemetry of "
+        "this flight, and is the clock offset right?"
+    ]
+
+
+def _is_alike(frames: Sequence[PlacedFrame], settings: ConsistencySettings) -> bool:
+    """Whether the fixes follow the cameras' path, however badly: a poor receiver's do, another flight's do not."""
+    centres_m, fixes_m = _centres_and_fixes(frames)
+    if len(fixes_m) < settings.least_frames or not np.ptp(centres_m, axis=0).any():
+        return False
+    left_m = apply_homography(fit_similarity(fixes_m, centres_m), centres_m) - fixes_m
+    spread_m = float(np.linalg.norm(fixes_m.std(axis=0)))
+    return float(np.sqrt((left_m**2).sum(axis=1).mean())) < settings.least_alike * spread_m
 
 
 def _height_faults(
