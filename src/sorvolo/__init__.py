@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
     from sorvolo.missions.evaluate.objects import evaluate_objects
     from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+    from sorvolo.missions.heights.run import HeightSettings, make_heights
     from sorvolo.missions.inspect import inspect_input
     from sorvolo.missions.map.flights import map_flights
     from sorvolo.missions.plan_flight import (
@@ -62,6 +63,7 @@ __all__ = [
     "Detector",
     "EvaluationSettings",
     "GeometryError",
+    "HeightSettings",
     "InputError",
     "MapSettings",
     "PictureSettings",
@@ -89,6 +91,7 @@ __all__ = [
     "evaluate_objects",
     "find_views",
     "inspect_input",
+    "make_heights",
     "map_flights",
     "parse_board",
     "plan_over",
@@ -121,6 +124,7 @@ _HOMES = {
     "missions.evaluate.detector": ("EvaluationSettings", "evaluate_detector", "read_sets", "write_evaluation"),
     "missions.evaluate.mosaic": ("evaluate_mosaic",),
     "missions.evaluate.objects": ("evaluate_objects",),
+    "missions.heights.run": ("HeightSettings", "make_heights"),
     "missions.inspect": ("inspect_input",),
     "missions.map.flights": ("map_flights",),
     "missions.plan_flight": (

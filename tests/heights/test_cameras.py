@@ -9,7 +9,7 @@ from scenes import hills_with_houses, photo, survey_views, texture
 from sorvolo.errors import InputError
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose, rotation_from_vector
 from sorvolo.heights.adjustment import AdjustmentSettings, Priors, Scene, adjust, triangulate
-from sorvolo.heights.cameras import solve_cameras
+from sorvolo.heights.cameras import Cameras3D, solve_cameras
 from sorvolo.heights.figures import camera_warnings
 from sorvolo.registration.features import gray_from_rgb
 
@@ -121,6 +121,17 @@ def test_one_strip_is_named_as_weak(survey) -> None:
     views, pictures = survey
     solved = solve_cameras(views[:4], lambda number: pictures[number])
     assert any("one strip" in each for each in camera_warnings(solved))
+
+
+def test_an_oblique_orbit_is_named_as_weak() -> None:
+    views = tuple(
+        replace(view, site_from_camera=Pose(
+            rotation_from_vector(np.array([[0.7, 0.0, 0.0]]))[0] @ view.site_from_camera.rotation,
+            view.site_from_camera.translation_m,
+        )) for view in survey_views()
+    )
+    solved = Cameras3D(views, (), np.zeros((1, 3)), 0.5, 1.0, 0.0, np.full(3, 0.1), 100)
+    assert any("off the vertical" in each for each in camera_warnings(solved))
 
 
 def test_pictures_without_common_points_are_refused() -> None:

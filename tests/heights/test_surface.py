@@ -7,6 +7,7 @@ from scenes import HOUSE, hills, hills_with_houses, photo, survey_views, texture
 
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.heights.figures import surface_figures, surface_warnings
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.orthophoto import OrthophotoSettings, choose_photos, paint_orthophoto, visible
 from sorvolo.heights.relief import relief_picture
@@ -169,3 +170,25 @@ def test_heights_as_a_picture_have_holes(surface: Surface) -> None:
     up_m[:10] = np.nan
     picture = relief_picture(Surface(surface.lattice, up_m, surface.sigma_m, surface.covered))
     assert (picture[:9, :, 3] == 0).all() and (picture[12:, :, 3] == 255).mean() > 0.95
+
+
+def test_water_and_oblique_views_are_named(surface: Surface) -> None:
+    """Half of the ground without texture, as water is, gets holes that the report names."""
+    up_m = surface.up_m.copy()
+    up_m[:, : up_m.shape[1] // 2] = np.nan
+    half = Surface(surface.lattice, up_m, surface.sigma_m, np.ones(up_m.shape, bool))
+    assert any("water" in each for each in surface_warnings(half))
+    assert not surface_warnings(Surface(surface.lattice, surface.up_m, surface.sigma_m, np.isfinite(surface.up_m)))
+    figures = surface_figures(half, np.zeros(up_m.shape, bool))
+    assert 0.45 < figures["holes_share"] < 0.6
+
+
+def test_ground_without_texture_is_a_hole_or_unsure(survey) -> None:
+    """Photos that are grey all over agree at every height: no height comes of them."""
+    views, _, _ = survey
+    lattice = Lattice.over(np.array([[-3.0, -3], [3, 3]]), SiteGrid.at(ORIGIN, 0.2, CRS))
+    grey = np.full((240, 320), 128, np.uint8)
+    places = lattice.points_m().reshape(-1, 2)[::50]
+    points = np.column_stack([places, np.zeros(len(places))])
+    *_, found = sweep_surface(lattice, views, lambda number, size_m: grey, points, 0.01)
+    assert isinstance(found, Surface) and np.isnan(found.up_m).all()
