@@ -5,6 +5,7 @@ import importlib.util
 import numpy as np
 import pytest
 
+from sorvolo.detection.held_out import Checked
 from sorvolo.detection.intervals import differences, draw_groups, group_tables, intervals
 from sorvolo.detection.metrics import (
     SIZES_PX,
@@ -273,3 +274,19 @@ def coco_row(row_id, index, label, box, crowd):
     left, top, right, bottom = box
     return {"id": row_id, "image_id": index, "category_id": label, "iscrowd": crowd,
             "bbox": [left, top, right - left, bottom - top], "area": (right - left) * (bottom - top)}
+
+
+@pytest.mark.parametrize(("people", "kept"), [(8, True), (60, False)])
+def test_few_held_out_labels_keep_the_threshold_of_the_model_before(people: int, kept: bool) -> None:
+    boxes = [square(20 * index, 0) for index in range(people)]
+    truth = LabelledSet("held out", CLASSES, (picture(boxes, [0] * people),))
+    found = [(box, 0, 0.99 - 0.8 * index / people) for index, box in enumerate(boxes)]
+    matches, _, _ = match_pictures(truth, [seen(*found)], CLASSES)
+    checked = Checked({each.label: (each,) for each in matches if each.label == "person"}, {})
+    chosen = checked.thresholds(CLASSES, {"person": 0.55, "car": 0.4})
+    assert (chosen["person"].score == 0.55) is kept
+    if kept:
+        assert chosen["person"].precision == 1.0 and 0.3 < chosen["person"].recall < 0.8
+    assert chosen["car"].score == 0.4 and np.isnan(chosen["car"].recall)
+    assert checked.thresholds(CLASSES)["car"].score == 0.5
+    assert checked.too_few(CLASSES) == (("person", "car") if kept else ("car",))

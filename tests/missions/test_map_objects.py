@@ -11,7 +11,7 @@ import pytest
 from truth_detector import TruthDetector
 
 from sorvolo.change.classes import object_at, seen_at
-from sorvolo.errors import InputError, StoreError
+from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.compare.change_classes import ChangeClasses
 from sorvolo.missions.compare.flights import compare_flights
@@ -257,3 +257,31 @@ def test_a_class_that_is_reported_on_request_alone_is_not_looked_for(simulated: 
     reported = report_of(tmp_path / "site", "flight1")["objects"]
     assert reported["looked_for"] == ["person", "car"]
     assert set(reported["classes"]) == {"person", "car"} and reported["count"] > 0
+
+
+def test_small_objects_are_looked_for_where_they_are_asked_for(simulated: Path, tmp_path: Path) -> None:
+    asked: list[tuple[str, ...]] = []
+
+    class Listening(Knowing):
+        """Notes what was asked for."""
+
+        def detect(
+            self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
+            least_score: float | None = None, classes: Sequence[str] | None = None,
+        ) -> Detections:
+            asked.append(tuple(classes or ()))
+            return no_detections(self.classes)
+
+    detector = Listening(simulated)
+    detector.info = replace(detector.info, on_request=("small object",))
+    video, camera = simulated / "flight1" / "flight1.mp4", simulated / "camera.xml"
+    for classes, wanted in (((), ("person", "car")), (("small object",), ("small object",))):
+        settings = MapSettings(classes=classes)
+        for _ in map_flights([video], tmp_path / f"site{len(classes)}", settings, camera=camera, detector=detector):
+            pass
+        assert asked and set(asked) == {wanted}
+        asked.clear()
+    with pytest.raises(SettingsError, match="bicycle"):
+        list(map_flights(
+            [video], tmp_path / "none", MapSettings(classes=("bicycle",)), camera=camera, detector=detector
+        ))

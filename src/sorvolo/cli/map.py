@@ -87,6 +87,9 @@ HowRegistered = Annotated[
 Model = Annotated[
     str, typer.Option(help="Detector for people, cars and small objects: a model's name, a file, or none.")
 ]
+SearchedClasses = Annotated[
+    str, typer.Option(help="What to look for, with commas.", show_default="what the model usually reports")
+]
 Memory = Annotated[
     float | None,
     typer.Option(help="Memory for pictures that are needed again, MB. Without it: a quarter of the machine's."),
@@ -117,6 +120,7 @@ def map_command(
     transform: TransformOption = Transform.SIMILARITY,
     thesis: StitchingValues = None,
     model: Model = "default",
+    classes: SearchedClasses = "",
     memory: Memory = None,
     give_up: GiveUp = 30.0,
     heights: WithHeights = False,
@@ -144,7 +148,7 @@ def map_command(
     settings = MapSettings(
         method.value, gsd, overlap, offset, ground_elevation, crs or None, compress.value if compress else None,
         model=model, thesis=stitching_settings(thesis or [], transform=transform.value),
-        control_sigma_m=gcp_accuracy, checks=names(check), memory_mb=memory,
+        control_sigma_m=gcp_accuracy, checks=names(check), memory_mb=memory, classes=names(classes),
     )
     reports = map_and_read_reports(
         inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area,

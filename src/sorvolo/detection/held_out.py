@@ -2,14 +2,17 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
-from sorvolo.detection.metrics import ClassMatch, CocoNumbers, Threshold, reporting_threshold
+from sorvolo.detection.metrics import ClassMatch, CocoNumbers, Threshold, at_score, reporting_threshold
 from sorvolo.geometry.arrays import Floats
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 
 _FALLBACK_THRESHOLD = 0.5  # where nothing was held out to choose one
+_FEW_LABELS = 50  # held-out labels of a class: with fewer, the best score on them may lie anywhere
+_NONE = Threshold(*[float("nan")] * 4)
 _FEW = 10  # objects found, from which on the range of their sizes means something
 
 
@@ -30,15 +33,24 @@ class Checked:
         """AP of each class, as `ap50`."""
         return {name: self._mean(name, "ap") for name in self.matches}
 
-    def thresholds(self, classes: Sequence[str]) -> dict[str, Threshold]:
-        """The score from which each class is reported: `metrics.reporting_threshold` over all sets together."""
+    def thresholds(
+        self, classes: Sequence[str], before: Mapping[str, float] = MappingProxyType({})
+    ) -> dict[str, Threshold]:
+        """The score from which each class is reported: `metrics.reporting_threshold` over all sets together.
+
+        `before` are the thresholds of the model that was learnt on from: kept for `too_few` classes.
+        """
         unknown = Threshold(_FALLBACK_THRESHOLD, float("nan"), float("nan"), float("nan"))
-        found = {name: reporting_threshold(_pooled(self.matches[name])) for name in classes if name in self.matches}
-        return {
-            name: replace(found[name], score=round(found[name].score, 3))
-            if name in found and np.isfinite(found[name].score) else unknown
-            for name in classes
-        }
+        chosen = {name: _chosen(_pooled(self.matches[name])) for name in classes if name in self.matches}
+        for name in set(self.too_few(classes)) & set(before):
+            matches = self.matches.get(name, ())
+            chosen[name] = at_score(_pooled(matches), before[name]) if matches else replace(unknown, score=before[name])
+        return {name: chosen[name] if np.isfinite(chosen.get(name, _NONE).score) else unknown for name in classes}
+
+    def too_few(self, classes: Sequence[str]) -> tuple[str, ...]:
+        """The classes with so few held-out labels that a threshold chosen by them is chance."""
+        counts = {name: sum(len(each.true_scores) for each in self.matches.get(name, ())) for name in classes}
+        return tuple(name for name in classes if counts[name] < _FEW_LABELS)
 
     def found_sides_px(self, name: str, score: float) -> Floats:
         """(N,) longer sides of the labels of a class that were found at this score."""
@@ -91,6 +103,11 @@ def _sides_px(labelled: LabelledSet, name: str) -> Floats:
 def _of_class(picture: LabelledPicture, label: int) -> Floats:
     boxes = picture.boxes_px[picture.labels == label]
     return np.asarray((boxes[:, 2:] - boxes[:, :2]).max(1, initial=0), float)
+
+
+def _chosen(match: ClassMatch) -> Threshold:
+    found = reporting_threshold(match)
+    return replace(found, score=round(found.score, 3)) if np.isfinite(found.score) else found
 
 
 def _pooled(matches: Sequence[ClassMatch]) -> ClassMatch:

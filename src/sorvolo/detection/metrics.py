@@ -220,6 +220,16 @@ def reporting_threshold(match: ClassMatch) -> Threshold:
     return Threshold(*(float(each[row]) for each in (scores, precision, recall, f1)))
 
 
+def at_score(match: ClassMatch, score: float) -> Threshold:
+    """What reporting from a given score on gives; NaN where nothing is labelled or nothing scores so high."""
+    scores, precision, recall = precision_recall(match)
+    reported = int((scores >= score).sum())
+    if not reported or not len(match.true_scores):
+        return Threshold(score, *[float("nan")] * 3)
+    p, r = float(precision[reported - 1]), float(recall[reported - 1])
+    return Threshold(score, p, r, 2 * p * r / max(p + r, 1e-12))
+
+
 def recall_by_size(
     matches: Sequence[ClassMatch], thresholds: Mapping[str, float], scale: Floats, edges: Sequence[float]
 ) -> dict[str, tuple[SizeRow, ...]]:

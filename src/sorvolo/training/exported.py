@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -30,6 +30,7 @@ class ExportedModel:
     sha256: str
     licence: str
     trained_on: str
+    thresholds: Mapping[str, float] = field(default_factory=dict)
 
 
 def load_exported(

@@ -10,6 +10,7 @@ from typing import Any
 
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import installed_models
+from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.missions.flight.detects import Detects
@@ -57,11 +58,15 @@ class _Seen:
 class ObjectFinder:
     """Searches the frames of one flight for objects, one frame after another, in a thread beside the mapping.
 
-    A context manager: leaving it ends the thread.
+    A context manager: leaving it ends the thread. No `classes` means those that the detector usually reports; raises
+    SettingsError for one that it does not know.
     """
 
-    def __init__(self, detector: Detects, camera: Camera) -> None:
-        self._detector, self._camera, self._classes = detector, camera, detector.info.usual_classes
+    def __init__(self, detector: Detects, camera: Camera, classes: Sequence[str] = ()) -> None:
+        if unknown := sorted(set(classes) - set(detector.classes)):
+            raise SettingsError(f"the model knows no {unknown[0]!r}; it knows {', '.join(detector.classes)}")
+        self._detector, self._camera = detector, camera
+        self._classes = tuple(classes) or detector.info.usual_classes
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="detector")
         self._waiting: deque[Future[_Seen]] = deque()
         self._seen: dict[int, _Seen] = {}

@@ -87,7 +87,7 @@ def _map_one(
     refuse_without_texture(source)
     setup = replace(setup, notices=(*setup.notices, *repeated(archive, source.name, "mapped")))
     make = ThesisRun if settings.method == "thesis" else PlanarRun
-    finder = None if detector is None else ObjectFinder(detector, source.camera.camera)
+    finder = None if detector is None else ObjectFinder(detector, source.camera.camera, settings.classes)
     with make(setup, archive, settings, finder=finder) as run:
         read = 0
 

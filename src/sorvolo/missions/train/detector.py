@@ -265,7 +265,8 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     if best is not None:
         load_weights_bytes(model, (run.out / BEST).read_bytes(), str(run.out / BEST))
     checked = _look(run, model, _MOST_CHECKED_LAST) if run.sets.held_out else Checked({}, {})
-    thresholds = checked.thresholds(classes)
+    before = run.start.thresholds if isinstance(run.start, ExportedModel) else {}
+    thresholds = checked.thresholds(classes, before)
     scores = {name: each.score for name, each in thresholds.items()}
     learnt = [share.labelled for share in run.sets.shares]
     thermal, by_day = run.sets.lights
@@ -280,7 +281,8 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     agreement = check_export(model.cpu(), exported, _some_pictures(run))
     atomic_write_bytes(run.out / MODEL, exported)
     check = check_of(checked, run.learner.step if best is None else best.step) if run.sets.held_out else None
-    notices = _closing_notices(run, agreement, check)
+    kept = [name for name in checked.too_few(classes) if name in before]
+    notices = (*_closing_notices(run, agreement, check), *_kept_notices(kept))
     report = _report(run, info, agreement, len(exported), check, notices) | {
         "reported": {name: asdict(each) for name, each in thresholds.items()},
         "found_px": found_sizes_px(checked, scores, classes),
@@ -335,6 +337,13 @@ def _closing_notices(run: _Run, agreement: ExportCheck, check: Check | None) -> 
             f"{agreement.unmatched} of {agreement.detections} detections unmatched"
         )
     return tuple(notices)
+
+
+def _kept_notices(kept: Sequence[str]) -> list[str]:
+    """Which scores to report from are those of the model before."""
+    if not kept:
+        return []
+    return [f"too few objects were held out to choose the score to report from: {', '.join(kept)} kept the model's own"]
 
 
 def _report(

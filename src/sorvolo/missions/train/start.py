@@ -84,5 +84,6 @@ def _model(choice: str, preset: Preset) -> ExportedModel:
     if info.preset and info.preset != preset:
         raise InputError(f"{path} is of the preset {info.preset}, not {preset}: train with --preset {info.preset}")
     return ExportedModel(
-        content, info.classes, f"the model {info.name}", file_sha256(path), info.licence, info.trained_on
+        content, info.classes, f"the model {info.name}", file_sha256(path), info.licence, info.trained_on,
+        info.thresholds,
     )
