@@ -83,7 +83,6 @@ def main() -> None:
         document = {
             "benchmark": "search_pod", "machine": machine(), "commit": commit(), "date": time.strftime("%Y-%m-%d"),
             "seeds": done, "plants": wishes.plants, "model": detector.info.name, "groups": summarised(rows),
-            "rows": rows,
         }
         wishes.results.write_text(json.dumps(document, indent=1) + "\n")
         print(number, seed, {name: each["bins"] for name, each in summarised(rows).items()}, flush=True)
