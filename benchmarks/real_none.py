@@ -276,7 +276,7 @@ def ground_colour(path: Path, place_m: Floats, whole: WholeMap, reach_m: float) 
     return np.asarray(mean)
 
 
-@lru_cache(maxsize=10)
+@lru_cache(maxsize=32)
 def read(path: Path) -> np.ndarray:
     """A photo, RGB uint8; a strip's stay in memory."""
     with Image.open(path) as image:
