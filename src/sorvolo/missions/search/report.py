@@ -173,8 +173,8 @@ def _warnings(searched: Searched, settings: SearchSettings) -> list[str]:
     for flight in searched.flights:
         few = [each for each in flight.classes if len(each.outcomes) < _FEW_PLANTS]
         warnings += [
-            f"{flight.name}: only {counted(len(each.outcomes), 'plant')} of the class {each.label} had room on open "
-            "ground; its probability is a guess, as its interval shows" for each in few
+            f"{flight.name}: only {counted(len(each.outcomes), 'plant')} of the class {each.label} (--plants, and room "
+            "on open ground); its probability is a guess, as its interval shows" for each in few
         ]
         if not flight.has_shadows and not flight.is_thermal:
             warnings.append(
