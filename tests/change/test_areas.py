@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sorvolo.change.areas.area_map import AreaMap, with_areas
+from sorvolo.change.areas.signs import leaning
 from sorvolo.change.shape.outlines import overlap
 from sorvolo.simulation.canvas import Area
 from sorvolo.simulation.ground import GroundKind, paint_ground
@@ -137,3 +138,18 @@ def test_what_is_part_of_an_area_is_not_reported_beside_it(grass):
     assert [each.id for each in with_areas([part, car, beside], [area])] == ["b-2", "b-3", "b-7"]
     stack = replace(car, id="b-4", outline_m=area.outline_m)
     assert [each.id for each in with_areas([stack], [area])] == ["b-4"]
+
+
+def test_ground_that_leans_in_pictures_of_one_date_is_no_area(grass):
+    """A crown that another photo of the same date shows elsewhere: the map shows one side of it, and no ground."""
+    rng = np.random.default_rng(4)
+    crown = cv2.GaussianBlur(rng.normal(90, 60, (200, 200, 3)), (0, 0), 1.5).clip(0, 255).astype(np.uint8)
+    shown, other = (grass[:480, :640].copy() for _ in range(2))
+    shown[100:300, 200:400] = crown
+    other[100:300, 200:400] = crown[::-1]
+    everywhere = np.ones((480, 640), bool)
+    leans = leaning(shown, other, everywhere)
+    assert leans[120:280, 220:380].mean() > 0.9 and leans[350:].mean() < 0.05
+    assert leaning(shown, np.roll(shown, 1, axis=0), everywhere).mean() < 0.05
+    smooth = np.full_like(shown, 120)
+    assert not leaning(smooth, np.full_like(shown, 90), everywhere).any()

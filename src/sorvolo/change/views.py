@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from sorvolo.change.alignment import Aligned, Aligner
+from sorvolo.change.areas.signs import leaning
 from sorvolo.change.coverage.planting import Planted, Planting
 from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.frame_pixels import FramePixels, comparison_camera
@@ -39,8 +40,9 @@ class ViewOutcome:
     """How one frame's comparison ended. `view` exists when it was compared, `site_from_image` (of the full undistorted
     frame) when it was aligned. `known` is the share of the frame that lies on known ground, `brightness` how many times
     as bright as the map the flight is so far, NaN where that is not known. `doubted` (h, w) is what surely differs from
-    the map in a compared view and is contradicted by earlier pictures; `planted` what is found of things drawn in.
-    `local_m` is how far a local fit moved the frame on the map (median, m), 0 without any.
+    the map in a compared view and is contradicted by earlier pictures, `leans` (h, w) what leans another way in those,
+    `planted` what is found of things drawn in. `local_m` is how far a local fit moved the frame on the map (median, m),
+    0 without any.
     """
 
     status: ViewStatus
@@ -51,6 +53,7 @@ class ViewOutcome:
     view: ComparedView | None = None
     brightness: float = float("nan")
     doubted: Mask | None = None
+    leans: Mask | None = None
     planted: tuple[Planted, ...] = ()
     local_m: float = 0.0
 
@@ -149,7 +152,7 @@ class ViewMaker:
         if isinstance(compared, ViewOutcome):
             return compared
         frame, aligned, valid, outcome = compared.posed.frame, compared.aligned, compared.valid, compared.outcome
-        found = self._corroborated(compared)
+        found, leans = self._corroborated(compared)
         changed = np.count_nonzero(found.mask) / max(1, int(np.count_nonzero(valid)))
         if changed > _ALL_CHANGED:
             return replace(outcome, status=ViewStatus.ALL_CHANGED, reason=_ALL_CHANGED_REASON)
@@ -159,7 +162,8 @@ class ViewMaker:
             compared.image, compared.reference, valid, found.mask, found.boxes, found.scores, aligned.residual_px,
             shade,
         )
-        return replace(outcome, view=view, doubted=_doubted(compared.found, found), planted=self._plant(view, compared))
+        doubted, planted = _doubted(compared.found, found), self._plant(view, compared)
+        return replace(outcome, view=view, doubted=doubted, leans=leans, planted=planted)
 
     def placed(self, posed: PosedFrame, outcome: ViewOutcome, map_sigma_m: float) -> PlacedFrame:
         """The frame's record: placed by the map it fits, or rejected with the reason."""
@@ -210,11 +214,13 @@ class ViewMaker:
         centre = site_from_image @ np.array([camera.cx_px, camera.cy_px, 1.0])
         return self._site_grid.grid_from_site_affine(centre[:2] / centre[2], 50.0) @ site_from_image
 
-    def _corroborated(self, compared: OneSided) -> Difference:
-        """What differs from the map or from one of the nearest earlier pictures, as far as they confirm it."""
+    def _corroborated(self, compared: OneSided) -> tuple[Difference, Mask | None]:
+        """What differs from the map or from one of the nearest earlier pictures, as far as they confirm it; and the
+        ground (h, w) that leans another way in them."""
         if self._pictures is None or compared.settings is None:
-            return compared.found
+            return compared.found, None
         height, width = compared.valid.shape
+        leans = np.zeros((height, width), bool)
         earlier: list[tuple[Difference, Mask]] = []
         for number, (picture, sees) in enumerate(self._pictures.seen_from(
             compared.aligned.site_from_image, compared.aligned.camera_m, width, height, _WITNESSES + _FURTHER
@@ -228,7 +234,8 @@ class ViewMaker:
                     continue
             found = compare_robust(picture, compared.query, sees, compared.settings)
             earlier.append((Difference(found.mask, found.boxes, found.scores), sees))
-        return believed((compared.found, compared.valid), earlier)
+            leans |= leaning(as_bgr(compared.reference), picture, sees & compared.valid)
+        return believed((compared.found, compared.valid), earlier), leans
 
     def _plant(self, view: ComparedView, compared: OneSided) -> tuple[Planted, ...]:
         """What is found of things drawn into a view, if it is its turn; nothing by method thesis."""

@@ -24,6 +24,7 @@ from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
 _CELL_PX = 2  # of the small size at which views are examined
 _PICTURE_PX = 8  # of the pictures, in a cell
 _LEAST_VIEWS = 2
+_LEAST_AGREEING = 2.5  # views on the mean that show an area by themselves: two may lean alike
 _AGREES = 0.5  # of the views of an area's ground must differ from the map there, each by itself
 _OWN_UNITS = 2.0  # by which a view alone differs
 _SURE_UNITS = 6.0  # an area that differs by so much is sure
@@ -46,8 +47,8 @@ class AreaMap:
         self._residuals_m: list[float] = []
         self._pictures = GroundPictures(1.0)
 
-    def add(self, view: ComparedView) -> None:
-        """Take in one view."""
+    def add(self, view: ComparedView, leans: Mask | None = None) -> None:
+        """Take in one view, of which earlier pictures show that some ground `leans` (h, w)."""
         height, width = view.valid.shape
         if not self._cell_m:
             self._cell_m = _CELL_PX * view.m_per_px * max(1.0, max(height, width) / SIDE_PX)
@@ -56,7 +57,7 @@ class AreaMap:
         window = window_around(apply_homography(view.site_from_image, corners), self._cell_m)
         if not self._grow(window):
             return
-        laid = self._laid(view, area_signs(view), window)
+        laid = self._laid(view, area_signs(view, leans), window)
         part = window.within(self._window)
         for name, values in laid.items():
             self._sums[name][part] += values
@@ -81,7 +82,8 @@ class AreaMap:
         for cells, units in segments(signs, self._settings):
             agreement = float(mean["agree"][cells].mean())
             score = agreement * min(1.0, units / _SURE_UNITS)
-            if agreement >= _AGREES and score >= _LEAST_SCORE:
+            views = float(self._sums["agree"][cells].mean())
+            if agreement >= _AGREES and score >= _LEAST_SCORE and views >= _LEAST_AGREEING:
                 found.append(self._record(cells, score))
         found.sort(key=lambda each: -each.area_m2)
         return tuple(replace(each, id=f"{id_prefix}-{first_number + place}") for place, each in enumerate(found))

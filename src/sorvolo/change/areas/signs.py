@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Mask, Matrix3
+from sorvolo.geometry.arrays import ImageRGB, Mask, Matrix3
 from sorvolo.survey.findings import ComparedView
 
 SIDE_PX = 320  # longest side at which views are examined: areas are large
@@ -16,6 +16,7 @@ _FINE_PX, _COARSE_PX = 1, 7  # structure is what lies between these sizes
 _MOST_DETAIL = np.float32(0.2)  # octaves: the rim of a shadow is no more than a coarse texture
 _COLOUR_PX = 7
 _NOISE_LEVELS = 1.5  # grey levels of detail that noise and compression make, in the darker of both pictures
+_LEANS, _ROUGH = 0.3, 6.0  # likeness of one date's pictures below which ground leans; power over noise that shows it
 _BLACK_LEVEL = 8.0  # grey levels added before logarithms: below it a camera shows noise, not light
 _SKY = np.array([0.7, -0.7], np.float32)  # blue and red over green, by which light from the sky differs from the sun's
 _MOST_SKY, _OTHER_LIGHT = 0.35, 0.08  # octaves of that for each octave of brightness, at most; of any other colour
@@ -40,15 +41,16 @@ class AreaSigns:
     view_from_signs: Matrix3
 
 
-def area_signs(view: ComparedView) -> AreaSigns:
-    """Compare the ground of a view with the map's."""
+def area_signs(view: ComparedView, leans: Mask | None = None) -> AreaSigns:
+    """Compare the ground of a view with the map's. What `leans` (h, w) is not known."""
     height, width = view.valid.shape
     scale = min(1.0, SIDE_PX / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    known = np.asarray(cv2.resize(view.valid.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255)
+    valid = view.valid if leans is None else view.valid & ~leans
+    known = np.asarray(cv2.resize(valid.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255)
     before, after = (_octaves(image, size) for image in (view.reference, view.image))
     levels = [each.mean(axis=2) for each in (before, after)]
-    likeness, detail = _structure(*levels)
+    likeness, detail, _ = _structure(*levels)
     surface = _colour(after)
     brighter = _centred(_blurred(levels[1] - levels[0]), known)
     colour = _centred(_blurred(surface - _colour(before)), known)
@@ -57,15 +59,29 @@ def area_signs(view: ComparedView) -> AreaSigns:
     return AreaSigns(likeness, _without_sky(colour, brighter), detail, surface, known, view_from_signs)
 
 
-def _structure(before: Signs, after: Signs) -> tuple[Signs, Signs]:
-    """The best correlation of detail over small shifts, and by how many octaves there is more of it."""
+def leaning(reference: ImageRGB, picture: ImageRGB, seen: Mask) -> Mask:
+    """(h, w) where two pictures of one date, (h, w, 3), have structure and not the same one: crowns and walls that lean
+    another way. Of such ground no area is reported. `seen` is where both show it."""
+    height, width = seen.shape
+    scale = min(1.0, SIDE_PX / max(height, width))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    before, after = (_octaves(image, size).mean(axis=2) for image in (reference, picture))
+    likeness, _, rough = _structure(before, after)
+    found = (likeness < _LEANS) & (rough > _ROUGH)
+    whole = cv2.morphologyEx(found.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_WINDOW_PX, _WINDOW_PX), np.uint8))
+    return np.asarray((cv2.resize(whole, (width, height), interpolation=cv2.INTER_NEAREST) > 0) & seen)
+
+
+def _structure(before: Signs, after: Signs) -> tuple[Signs, Signs, Signs]:
+    """The best correlation of detail over small shifts, by how many octaves there is more of it, and how many times as
+    strong as noise it is where there is less of it."""
     window = (_WINDOW_PX, _WINDOW_PX)
     details = [
         np.clip(cv2.blur(each, (_FINE_PX,) * 2) - cv2.blur(each, (_COARSE_PX,) * 2), -_MOST_DETAIL, _MOST_DETAIL)
         for each in (before, after)
     ]
-    noise = np.float32(_NOISE_LEVELS / np.log(2)) * np.exp2(-np.minimum(before, after))
-    power = [cv2.blur(each * each + noise * noise, window) for each in details]
+    noise = np.square(np.float32(_NOISE_LEVELS / np.log(2)) * np.exp2(-np.minimum(before, after)))
+    power = [cv2.blur(each * each + noise, window) for each in details]
     best = np.full(before.shape, -1.0, np.float32)
     pad = _REACH_PX
     shifted, their_power = (
@@ -77,7 +93,8 @@ def _structure(before: Signs, after: Signs) -> tuple[Signs, Signs]:
             part = np.s_[dy : dy + height, dx : dx + width]
             products = cv2.blur(details[1] * shifted[part], window)
             np.maximum(best, products / np.sqrt(power[1] * their_power[part]), out=best)
-    return best, np.asarray(0.5 * np.log2(power[1] / power[0]), np.float32)
+    rough = np.minimum(*power) / cv2.blur(noise, window)
+    return best, np.asarray(0.5 * np.log2(power[1] / power[0]), np.float32), np.asarray(rough, np.float32)
 
 
 def _blurred(values: Signs) -> Signs:

@@ -18,6 +18,7 @@ from sorvolo.change.shape.outlines import KnownPlace
 from sorvolo.change.shape.reported import reported
 from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome, as_bgr
 from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Mask
 from sorvolo.geometry.summary import median_of_known
 from sorvolo.missions.compare.extension import MapExtension
 from sorvolo.missions.compare.objects import ComparisonObjects
@@ -133,7 +134,7 @@ class CompareRun:
         self._placed[posed.frame.index] = self._views.placed(posed, outcome, self._map_sigma_m)
         with self._log.stage(Stage.DETECT):
             self._objects.search(posed, outcome, self._views)
-        announced = () if outcome.view is None else self._add_view(outcome.view)
+        announced = () if outcome.view is None else self._add_view(outcome.view, outcome.leans)
         with self._log.stage(Stage.REGISTER):
             self._extension.add(posed, outcome)
         return outcome, announced
@@ -173,7 +174,7 @@ class CompareRun:
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
-    def _add_view(self, view: ComparedView) -> tuple[Change, ...]:
+    def _add_view(self, view: ComparedView, leans: Mask | None) -> tuple[Change, ...]:
         """Add a compared view to the evidence; the changes announced by it."""
         with self._log.stage(Stage.EVIDENCE):
             if self._evidence is None:
@@ -183,7 +184,7 @@ class CompareRun:
                 )
             announced: Sequence[Change] = self._reported(self._evidence.add(view))
             if self._settings.method != "thesis":
-                self._areas.add(view)
+                self._areas.add(view, leans)
         if announced:
             with self._log.stage(Stage.DETECT):
                 announced = self._objects.named(announced)
