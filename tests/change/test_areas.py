@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sorvolo.change.areas.area_map import AreaMap, with_areas
+from sorvolo.change.areas.segments import AreaSettings
 from sorvolo.change.areas.signs import leaning
 from sorvolo.change.shape.outlines import overlap
 from sorvolo.simulation.canvas import Area
@@ -35,9 +36,11 @@ def same_light(image: Rgb, index: int) -> Rgb:
     return image
 
 
-def changes_of(before: Rgb, after: Rgb, light: Callable[[Rgb, int], Rgb] = same_light) -> tuple[Change, ...]:
+def changes_of(
+    before: Rgb, after: Rgb, light: Callable[[Rgb, int], Rgb] = same_light, settings: AreaSettings = AreaSettings(),  # noqa: B008 (frozen)
+) -> tuple[Change, ...]:
     """The areas that a flight of nine views finds; `light` gives a view's picture its light."""
-    areas, rng = AreaMap(), np.random.default_rng(3)
+    areas, rng = AreaMap(settings), np.random.default_rng(3)
     for index in range(9):
         x, y = 300 * (index % 3), 220 * (index // 3)
         part = np.s_[y : y + VIEW_PX[1], x : x + VIEW_PX[0]]
@@ -70,6 +73,14 @@ def test_a_repaved_area_is_one_change_with_its_outline(grass, kind):
     middle = found.patch.changed.shape[0] // 2, found.patch.changed.shape[1] // 2
     assert found.patch.changed[middle] and found.patch.before[middle][3] == found.patch.after[middle][3] == 255
     assert np.abs(found.patch.before[middle][:3].astype(int) - found.patch.after[middle][:3]).max() > 15
+
+
+def test_what_is_no_larger_than_things_are_is_no_area(grass):
+    """4 x 4 m is left to what finds things; with a smaller limit it would be an area."""
+    square_m = np.array([[22.0, -18.0], [26.0, -18.0], [26.0, -22.0], [22.0, -22.0]])
+    after = laid(grass, painted(GroundKind.URBAN, 2), square_m)
+    assert changes_of(grass, after) == ()
+    assert len(changes_of(grass, after, settings=AreaSettings(least_m2=5.0))) == 1
 
 
 def test_an_area_far_larger_than_a_view_is_one_change(grass):

@@ -80,6 +80,8 @@ class AreaMap:
         signs = GroundSigns(mean["likeness"], colour, mean["detail"], surface, known)
         found = []
         for cells, units in segments(signs, self._settings):
+            if np.count_nonzero(cells) * self._cell_m**2 < self._settings.least_m2:
+                continue
             agreement = float(mean["agree"][cells].mean())
             score = agreement * min(1.0, units / _SURE_UNITS)
             views = float(self._sums["agree"][cells].mean())

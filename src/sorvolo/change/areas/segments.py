@@ -17,6 +17,7 @@ class AreaSettings:
     """When ground is reported as an area. Lengths in cells: a view's longer side is about 160 of them."""
 
     least_cells: int = 110  # an area's size: of a view 140 m wide 85 m2; smaller things are found by their outline
+    least_m2: float = 25.0  # nor smaller, however low the flight: a car has 8 m2, what leans beside a roof 5 to 10
     same: float = 0.5  # likeness from which ground is surely the same
     other: float = 0.55  # likeness from which on a difference counts less and less ...
     other_range: float = 0.2  # ... and this much below in full
