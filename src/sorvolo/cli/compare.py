@@ -28,7 +28,6 @@ from sorvolo.cli.options import (
 from sorvolo.cli.places import place_heading, place_words
 from sorvolo.cli.progress import ProgressReport, rate_words
 from sorvolo.cli.shown import newest_version, read_json, show_notices_and_warnings, show_path, site_of, unit_of
-from sorvolo.survey.coverage import GAP_WORDS, Gap
 from sorvolo.survey.wording import area_text, counted, plural
 
 if TYPE_CHECKING:
@@ -261,6 +260,8 @@ def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat)
 
 def _show_coverage(coverage: Mapping[str, Any], console: Console, *, is_local: bool) -> None:
     """What kept ground from being compared, and how small a thing would have been found on the rest."""
+    from sorvolo.survey.coverage import GAP_WORDS, Gap
+
     gaps = {name: area for name, area in coverage["gaps_m2"].items() if area >= _LEAST_SHOWN * coverage["compared_m2"]}
     for name, area in gaps.items():
         console.print(f"  not compared: {area_text(area, is_local=is_local)}, {GAP_WORDS[Gap(name)]}", highlight=False)
