@@ -273,11 +273,11 @@ def _size_words(coverage: Mapping[str, Any]) -> str:
     """How small a thing is found in four of five pictures."""
     plain, faint, large = coverage["smallest_m"], coverage["faint_m"], coverage["large_found"]
     if large is None:
-        return "none, so that nobody knows how small a thing is found"
+        return "none: how small a thing would be found is unknown"
     if plain is None:
-        return f"of the largest {large:.0%} are found; no size is found in four of five pictures"
-    faint_words = "faint ones of no size" if faint is None else f"faint ones from {faint:g} m"
-    return f"on half of the ground plain ones from {plain:g} m on are found, {faint_words}"
+        return f"even of the largest only {large:.0%} are found"
+    faint_words = "faint ones are not found" if faint is None else f"faint ones from {faint:g} m on"
+    return f"on half of the ground, those that stand out are found from {plain:g} m on; {faint_words}"
 
 
 def _show_changes(features: Sequence[Any], console: Console, form: PlaceFormat, *, is_local: bool) -> None:
