@@ -73,7 +73,7 @@ def test_changes_come_back_as_they_were_found(folder: Path) -> None:
         assert list(second.velocity_m_s) == [1.0, -0.5]
         assert first.crop.width_px == 64 and first.crop.m_per_px == made[1].patch.m_per_px
         assert archive.changes("a") == []
-        assert archive.comparisons() == {2: {"appeared": 0, "disappeared": 1, "replaced": 0, "moving": 1}}
+        assert archive.comparisons() == {2: {"appeared": 0, "disappeared": 1, "replaced": 0, "moving": 1, "area": 0}}
     written = cv2.imread(str(folder / "flights/b/changes/b-1-before.png"), cv2.IMREAD_UNCHANGED)
     assert np.array_equal(cv2.cvtColor(written, cv2.COLOR_BGRA2RGBA), made[1].patch.before)
     page = (folder / "flights/b/changes.html").read_text()

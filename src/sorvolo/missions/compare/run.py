@@ -42,7 +42,8 @@ from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
 _VIDEO_SIDE_PX, _PHOTO_SIDE_PX = 1280, 1600  # frames come faster than photos, and show a place more often
-_PHOTO_FINER = 2.0  # times a photo's and the map's own pixels: the robust method looks at half of a picture's size
+_PHOTO_FINER = 2.0  # times a photo's and the map's own pixels, at most: the robust method looks at half of them
+_FINE_M_PER_PX = 0.07  # a car has 60 px: finer pictures gain nothing, and large smooth ground loses (decision 0022)
 _CACHE_BYTES = 128 * 2**20  # of earlier pictures
 
 
@@ -250,7 +251,9 @@ class CompareRun:
 def _view_maker(setup: FlightSetup, archive: Archive, settings: CompareSettings, base_version: int) -> ViewMaker:
     source, site_grid = setup.source, archive.site_grid()
     side_px = settings.side_px or (_VIDEO_SIDE_PX if source.kind == "video" else _PHOTO_SIDE_PX)
-    finer = _PHOTO_FINER if source.kind == "photos" and settings.method != "thesis" else 1.0
+    finer = 1.0
+    if source.kind == "photos" and settings.method != "thesis":
+        finer = max(1.0, min(_PHOTO_FINER, site_grid.grid.m_per_px / _FINE_M_PER_PX))
     flight = FlightCamera(source.camera.camera, setup.usual_height_m, side_px, setup.utc_ns, finer)
     reference = ReferenceMap(archive.tiles(base_version), site_grid.grid)
     if settings.method == "thesis":

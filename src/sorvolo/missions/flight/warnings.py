@@ -52,7 +52,7 @@ def doubts(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
 def _angle_warnings(placed: Sequence[PlacedFrame], graph: GraphReport | None) -> list[str]:
     """Where the pictures contradict the stated angles of the camera or the aircraft."""
     warnings = []
-    if graph is not None and graph.angles_contradicted:
+    if graph is not None and graph.angles_contradicted > _MANY * len(placed):
         warnings.append(
             f"the stated angles of {counted(graph.angles_contradicted, 'frame')} of {len(placed)} contradict the "
             "pictures by 15 deg or more and were not used"
