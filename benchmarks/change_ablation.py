@@ -38,7 +38,7 @@ from sorvolo.change import views
 from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
 from sorvolo.change.metrics import FoundEvent, match_events, score_events
 from sorvolo.change.pair import robust
-from sorvolo.change.pair.corroboration import LEAST_SURENESS, Difference, believed
+from sorvolo.change.pair.corroboration import CorroborationSettings, Difference, believed
 from sorvolo.change.pair.flight_tuning import FlightTuning
 from sorvolo.change.pair.shade import shade_of_view
 from sorvolo.change.shape.shadows import without_shadow
@@ -132,7 +132,8 @@ class RecordingViewMaker(views.ViewMaker):
             aligned, frame = looked.aligned, looked.posed.frame
             earlier = [] if self._pictures is None else [
                 (picture.copy(), sees & self._lens_sees) for picture, sees in self._pictures.seen_from(
-                    aligned.site_from_image, aligned.camera_m, width, height, views._WITNESSES
+                    aligned.site_from_image, aligned.camera_m, width, height,
+                    views.ViewSettings().witnesses,
                 )
             ]
             blank = np.zeros(looked.valid.shape, np.uint8)
@@ -237,19 +238,20 @@ def read_all(cache: Path) -> list[Recorded]:
 def compared_again(recorded: Recorded) -> Iterator[ComparedView]:
     """The views compared anew, as `missions/compare` does it."""
     tuning = FlightTuning()
+    rules = CorroborationSettings()
     for view, earlier in recorded.views():
         reference, query = (cv2.cvtColor(each, cv2.COLOR_RGB2BGR) for each in (view.reference, view.image))
         found = robust.compare_robust(
-            reference, query, view.valid, replace(tuning.settings(), least_score=LEAST_SURENESS)
+            reference, query, view.valid, replace(tuning.settings(), least_score=rules.least_score)
         )
         tuning.observe(found)
         by_map = Difference(found.mask, found.boxes, found.scores)
-        settings = replace(tuning.settings(), least_score=LEAST_SURENESS)
+        settings = replace(tuning.settings(), least_score=rules.least_score)
         opinions = []
         for picture, sees in earlier:
             other = robust.compare_robust(picture, query, sees, settings)
             opinions.append((Difference(other.mask, other.boxes, other.scores), sees))
-        kept = believed((by_map, view.valid), opinions)
+        kept = believed((by_map, view.valid), opinions, rules)
         if np.count_nonzero(kept.mask) <= 0.5 * max(1, np.count_nonzero(view.valid)):
             yield with_shade(replace(view, changed=kept.mask, boxes=kept.boxes, scores=kept.scores, shade=kept.mask))
 
@@ -417,6 +419,8 @@ def _rule(name: str, decision: str, *switches: tuple[str, Any], stage: str = "ev
 _INFINITE = float("inf")
 _ANNOUNCING, _TRACKER = "evidence.announcing:AnnounceSettings", "motion.blob_tracker"
 _THINGS, _EVIDENCE = "shape.shadows:ThingSettings", "evidence.evidence_map"
+_OPINIONS, _PICTURES = "pair.corroboration:CorroborationSettings", "evidence.pictures:PictureSettings"
+_RESTLESS = f"{_EVIDENCE}:RestlessSettings"
 RULES: tuple[Rule, ...] = (
     # when a change is announced, and when it is withdrawn
     _rule("large must be sure", "0018", (f"{_ANNOUNCING}.large_score", 0.0)),
@@ -425,12 +429,12 @@ RULES: tuple[Rule, ...] = (
     _rule("restless ground, only for the unsure", "0007", (f"{_ANNOUNCING}.doubt", _INFINITE)),
     _rule("never seen whole", "0007", (f"{_ANNOUNCING}.cut_off", 1.0)),
     _rule("from one place", "before 0014", (f"{_ANNOUNCING}.one_place", 0.0)),
-    _rule("leaning neighbours", "0015", (f"{_EVIDENCE}:_PASSING", 0.0)),
-    _rule("unsteady blobs must stand", "0017", (f"{_EVIDENCE}:_STANDS_S", 0.0)),
-    _rule("frames all changed", "before 0014", (f"{_EVIDENCE}:_ALL_CHANGED", 2.0)),
-    _rule("only new places count", "before 0014", (f"{_EVIDENCE}:_MOVED_HEIGHTS", 0.0)),
-    _rule("restless ground: not what leans with it", "before 0014", (f"{_EVIDENCE}:_LEAN", 0.0)),
-    _rule("restless ground: not what changed itself", "before 0014", (f"{_EVIDENCE}:_CHANGED_ITSELF", 1.0)),
+    _rule("leaning neighbours", "0015", (f"{_EVIDENCE}:PassingSettings.share", 0.0)),
+    _rule("unsteady blobs must stand", "0017", (f"{_EVIDENCE}:GatherSettings.stands_s", 0.0)),
+    _rule("frames all changed", "before 0014", (f"{_EVIDENCE}:GatherSettings.all_changed", 2.0)),
+    _rule("only new places count", "before 0014", (f"{_EVIDENCE}:GatherSettings.moved_heights", 0.0)),
+    _rule("restless ground: not what leans with it", "before 0014", (f"{_RESTLESS}.lean", 0.0)),
+    _rule("restless ground: not what changed itself", "before 0014", (f"{_RESTLESS}.changed_itself", 1.0)),
     # what a change is made of
     _rule("a dark car stays whole", "before 0014", ("shape.shadows:_may_be_a_car", _no)),
     _rule("pieces that lie apart", "0016", ("shape.shadows:_groups", _no_pieces)),
@@ -442,7 +446,7 @@ RULES: tuple[Rule, ...] = (
     _rule("parts: shown twice first", "before 0014", ("shape.things:Parts._new_at", _new_at_once)),
     _rule("replaced is seldom", "before 0014", ("shape.kinds:_REPLACED_PRIOR", 1.0)),
     _rule("outlines without tiny pieces", "before 0014", ("shape.outlines:_LEAST_PART", 0.0)),
-    _rule("outlines by the majority of masks", "before 0014", ("evidence.pictures:_LEAST_MAJORITY", _INFINITE)),
+    _rule("outlines by the majority of masks", "before 0014", (f"{_PICTURES}.least_majority", _INFINITE)),
     # what moves
     _rule("walks against the flight, photos", "0016", (f"{_TRACKER}:_floats", _no)),
     _rule("rigid blobs", "before 0016", (f"{_TRACKER}:_is_rigid", _no)),
@@ -457,9 +461,9 @@ RULES: tuple[Rule, ...] = (
     _rule("blobs: on known ground", "before 0014", ("motion.blobs:_is_known_around", _yes)),
     _rule("feet of people", "before 0014", ("motion.blobs:_foot_m", _nothing)),
     # one pair of pictures, on flights
-    _rule("one very sure opinion", "0016", ("pair.corroboration:_VERY_SURE", 2.0), stage="pair"),
-    _rule("opinions: what leans lies beside", "0007", ("pair.corroboration:_NEAR_PX", 1), stage="pair"),
-    _rule("opinions: all of it seen", "0007", ("pair.corroboration:_SEEN", 0.0), stage="pair"),
+    _rule("one very sure opinion", "0016", (f"{_OPINIONS}.very_sure", 2.0), stage="pair"),
+    _rule("opinions: what leans lies beside", "0007", (f"{_OPINIONS}.near_px", 1), stage="pair"),
+    _rule("opinions: all of it seen", "0007", (f"{_OPINIONS}.seen", 0.0), stage="pair"),
     _rule("growing: not what is doubted", "0007", ("pair.robust:MaskSettings.least_grown", 0.0), stage="pair"),
     _rule("hulls", "0007", ("pair.robust:MaskSettings.convexity", 2.0), stage="pair"),
     _rule("growing: limit by quiet ground", "0007", ("pair.region_extent:ExtentSettings.of_quiet", 0.0), stage="pair"),

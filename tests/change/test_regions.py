@@ -105,14 +105,17 @@ def test_a_cell_remembers_the_last_views_that_saw_it(history):
 
 def test_ground_where_nothing_changes_costs_no_memory_and_the_oldest_goes_first():
     grid = CellGrid(5, most_chunks=3)
+    earlier = CellWindow(-640, 0, -576, 64)
+    grid.record(laid_of(np.ones(earlier.shape, bool), np.ones(earlier.shape, bool), earlier), True)
     quiet = CellWindow(0, 0, 640, 640)
     grid.record(laid_of(np.zeros(quiet.shape, bool), np.ones(quiet.shape, bool), quiet), True)
-    assert grid.chunks == 0
+    assert (grid.read(earlier).votes == 1).all()  # 100 quiet pieces would have taken its place
     for step in range(6):
         window = CellWindow(64 * step, 0, 64 * step + 64, 64)
         grid.record(laid_of(np.ones(window.shape, bool), np.ones(window.shape, bool), window), True)
-    assert grid.chunks == 3
-    assert (grid.read(CellWindow(0, 0, 64, 64)).votes == 0).all()
+    assert (grid.read(earlier).votes == 0).all()
+    assert (grid.read(CellWindow(128, 0, 192, 64)).votes == 0).all()
+    assert (grid.read(CellWindow(192, 0, 256, 64)).votes == 1).all()  # three are kept
     assert (grid.read(CellWindow(320, 0, 384, 64)).votes == 1).all()
     assert (grid.read(CellWindow(320, 0, 384, 64)).seen == 2).all()  # the quiet view counts, too
 

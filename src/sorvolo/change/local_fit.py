@@ -9,10 +9,6 @@ from cv2.typing import MatLike
 
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, ImageRGB, Mask, PointsPx, Rows
 
-_FLAT = 1.0  # grey levels squared: gradients of the sensor's noise get no full voice
-_EVEN_PX = 31  # window in which gradients are made even
-_HARDLY = 1e-3  # of the largest weight: pulls to no displacement where nothing is known
-
 
 @dataclass(frozen=True)
 class LocalFitSettings:
@@ -25,6 +21,9 @@ class LocalFitSettings:
     window_cells: float = 3.0  # sigma of the window that looks for its displacement: things are much smaller
     smooth_cells: float = 2.5  # sigma over which displacements are made smooth
     band_px: float = 0.7  # windows that differ more from those around them have little weight
+    flat_levels2: float = 1.0  # grey levels squared: gradients of the sensor's noise get no full voice
+    even_px: int = 31  # window in which gradients are made even
+    hardly: float = 1e-3  # of the largest weight: pulls to no displacement where nothing is known
     most_rest: float = 0.65  # of what cells held back moved by, squared, is left; 0.8 to 1.4 over other ground
 
 
@@ -92,7 +91,7 @@ def fit_locally(
     share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     seen = cv2.erode((share > 0.99).astype(np.float32), np.ones((5, 5), np.uint8))  # no gradients of the map's rim
     on_map = np.asarray(cv2.resize(seen, cells, interpolation=cv2.INTER_AREA), np.float32)
-    still, moving = _even_gradients(reference, size), _even_gradients(query, size)
+    still, moving = (_even_gradients(image, size, settings) for image in (reference, query))
     agreement = _agreement((still[0] * seen, still[1] * seen), moving, reach, cells)
     checks = np.indices(cells[::-1]).sum(axis=0) % 2 == 0
     rest = _rest(agreement, (on_map * checks, on_map * ~checks), reach, settings)
@@ -102,13 +101,13 @@ def fit_locally(
     return LocalFit(_bounded(moved, most_px) / scale, on_map > 0.5, rest)
 
 
-def _even_gradients(image: ImageGray, size: tuple[int, int]) -> tuple[MatLike, MatLike]:
+def _even_gradients(image: ImageGray, size: tuple[int, int], settings: LocalFitSettings) -> tuple[MatLike, MatLike]:
     """Gradients in x and y, (h, w) each, of a small copy, of like strength everywhere: light falls out of them."""
     gray = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     across, down = (cv2.Scharr(gray, cv2.CV_32F, 1 - axis, axis, scale=1 / 16) for axis in (0, 1))
     strength = cv2.add(cv2.multiply(across, across), cv2.multiply(down, down))
-    around = cv2.blur(strength, (_EVEN_PX, _EVEN_PX))
-    even = cv2.sqrt(np.asarray(strength) + np.asarray(around) + np.float32(_FLAT))
+    around = cv2.blur(strength, (settings.even_px, settings.even_px))
+    even = cv2.sqrt(np.asarray(strength) + np.asarray(around) + np.float32(settings.flat_levels2))
     return cv2.divide(across, even), cv2.divide(down, even)
 
 
@@ -168,7 +167,7 @@ def _field(
     sure: Floats = np.maximum(0, (top - gathered.mean(axis=0)) / spread - 2) * np.maximum(0, top) * is_inside
     weight, field = sure, moved
     for _ in range(5):
-        total = _smooth(weight[None], settings.smooth_cells)[0] + _HARDLY * sure.max() + 1e-12
+        total = _smooth(weight[None], settings.smooth_cells)[0] + settings.hardly * sure.max() + 1e-12
         field = np.moveaxis(_smooth(np.moveaxis(moved * weight[..., None], 2, 0), settings.smooth_cells) / total, 0, 2)
         apart = np.linalg.norm(moved - field, axis=2)
         weight = sure / (1 + (apart / settings.band_px) ** 2) ** 2

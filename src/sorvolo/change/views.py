@@ -1,7 +1,7 @@
 """Frames of a later flight to views compared with the map: aligned, resampled, searched for differences."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -12,7 +12,7 @@ from sorvolo.change.areas.signs import leaning
 from sorvolo.change.coverage.planting import Planted, Planting
 from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.frame_pixels import FramePixels, comparison_camera
-from sorvolo.change.pair.corroboration import LEAST_SURENESS, SURE, Difference, believed, is_whole, unwitnessed
+from sorvolo.change.pair.corroboration import CorroborationSettings, Difference, believed, is_whole, unwitnessed
 from sorvolo.change.pair.flight_tuning import FlightTuning
 from sorvolo.change.pair.robust import RobustSettings, compare_robust
 from sorvolo.change.pair.shade import shade_of_view
@@ -27,12 +27,19 @@ from sorvolo.survey.findings import ComparedView, ViewStatus
 from sorvolo.survey.flight import PosedFrame
 from sorvolo.survey.mosaic import PlacedFrame
 
-_KNOWN_ENOUGH = 0.1  # share of a frame on known ground: with less there is nothing to compare
-_WITNESSES = 2  # earlier pictures asked about a difference: one from each side
-_FURTHER = 3  # pictures asked besides where those do not show all of it
-_COARSER = 1.25  # times the map's pixels: views less coarse than that have its pixels
-_ALL_CHANGED = 0.5  # share of a view: more is snow, a flood or another place, not a list of changes
 _ALL_CHANGED_REASON = "more than half of it looks changed (water, snow, ploughing?)"
+
+
+@dataclass(frozen=True)
+class ViewSettings:
+    """Which frames are compared, and with how many earlier pictures (0007, 0009)."""
+
+    least_known: float = 0.1  # share of a frame on known ground: with less there is nothing to compare
+    witnesses: int = 2  # earlier pictures asked about a difference: one from each side
+    further: int = 3  # pictures asked besides where those do not show all of it
+    coarser: float = 1.25  # times the map's pixels: views less coarse than that have its pixels
+    all_changed: float = 0.5  # share of a view: more is snow, a flood or another place, not a list of changes
+    corroboration: CorroborationSettings = field(default_factory=CorroborationSettings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +106,9 @@ class ViewMaker:
 
     def __init__(
         self, flight: FlightCamera, reference: ReferenceMap, site_grid: SiteGrid, thesis: ThesisOptions | None,
-        pictures: EarlierPictures | None,
+        pictures: EarlierPictures | None, settings: ViewSettings = ViewSettings(),
     ) -> None:
+        self._settings = settings
         self._flight, self._reference, self._site_grid = flight, reference, site_grid
         small = comparison_camera(
             flight.full, flight.height_m, site_grid.grid.m_per_px, flight.side_px, flight.finer
@@ -132,8 +140,8 @@ class ViewMaker:
         )
         valid = known & self._lens_sees
         share = np.count_nonzero(valid) / np.count_nonzero(self._lens_sees)
-        if share < _KNOWN_ENOUGH:
-            reason = f"less than {_KNOWN_ENOUGH:.0%} of it lies on the map"
+        if share < self._settings.least_known:
+            reason = f"less than {self._settings.least_known:.0%} of it lies on the map"
             return ViewOutcome(
                 ViewStatus.OUTSIDE, reason, residual_px, share, site_from_full, brightness=self.brightness
             )
@@ -154,7 +162,7 @@ class ViewMaker:
         frame, aligned, valid, outcome = compared.posed.frame, compared.aligned, compared.valid, compared.outcome
         found, leans = self._corroborated(compared)
         changed = np.count_nonzero(found.mask) / max(1, int(np.count_nonzero(valid)))
-        if changed > _ALL_CHANGED:
+        if changed > self._settings.all_changed:
             return replace(outcome, status=ViewStatus.ALL_CHANGED, reason=_ALL_CHANGED_REASON)
         shade = shade_of_view(compared.reference, compared.image, valid) if len(found.boxes) else found.mask
         view = ComparedView(
@@ -162,7 +170,8 @@ class ViewMaker:
             compared.image, compared.reference, valid, found.mask, found.boxes, found.scores, aligned.residual_px,
             shade,
         )
-        doubted, planted = _doubted(compared.found, found), self._plant(view, compared)
+        doubted = _doubted(compared.found, found, self._settings.corroboration.sure)
+        planted = self._plant(view, compared)
         return replace(outcome, view=view, doubted=doubted, leans=leans, planted=planted)
 
     def placed(self, posed: PosedFrame, outcome: ViewOutcome, map_sigma_m: float) -> PlacedFrame:
@@ -183,7 +192,7 @@ class ViewMaker:
         """
         map_m_per_px = self._site_grid.grid.m_per_px
         views_m_per_px = float(np.fmin(self._m_per_px, first.m_per_px))
-        return views_m_per_px if views_m_per_px > _COARSER * map_m_per_px else map_m_per_px
+        return views_m_per_px if views_m_per_px > self._settings.coarser * map_m_per_px else map_m_per_px
 
     def brightness_beside_map(self, posed: PosedFrame, outcome: ViewOutcome) -> float:
         """How many times as bright as the map a frame is. Where no ground was compared in its light yet (and method
@@ -219,29 +228,32 @@ class ViewMaker:
         ground (h, w) that leans another way in them."""
         if self._pictures is None or compared.settings is None:
             return compared.found, None
-        height, width = compared.valid.shape
+        settings, (height, width) = self._settings, compared.valid.shape
         leans = np.zeros((height, width), bool)
         earlier: list[tuple[Difference, Mask]] = []
         for number, (picture, sees) in enumerate(self._pictures.seen_from(
-            compared.aligned.site_from_image, compared.aligned.camera_m, width, height, _WITNESSES + _FURTHER
+            compared.aligned.site_from_image, compared.aligned.camera_m, width, height,
+            settings.witnesses + settings.further,
         )):
             sees &= self._lens_sees
-            if number >= _WITNESSES:
-                open_parts = unwitnessed(compared.found, [seen for _, seen in earlier])
+            if number >= settings.witnesses:
+                open_parts = unwitnessed(compared.found, [seen for _, seen in earlier], settings.corroboration)
                 if not open_parts:
                     break
-                if not any(is_whole(compared.found.mask, part, sees) for part in open_parts):
+                mask = compared.found.mask
+                if not any(is_whole(mask, part, sees, settings.corroboration) for part in open_parts):
                     continue
             found = compare_robust(picture, compared.query, sees, compared.settings)
             earlier.append((Difference(found.mask, found.boxes, found.scores), sees))
             leans |= leaning(as_bgr(compared.reference), picture, sees & compared.valid)
-        return believed((compared.found, compared.valid), earlier), leans
+        return believed((compared.found, compared.valid), earlier, settings.corroboration), leans
 
     def _plant(self, view: ComparedView, compared: OneSided) -> tuple[Planted, ...]:
         """What is found of things drawn into a view, if it is its turn; nothing by method thesis."""
         if compared.settings is None:
             return ()
-        settings, reference = replace(compared.settings, least_score=SURE), as_bgr(compared.reference)
+        sure, reference = self._settings.corroboration.sure, as_bgr(compared.reference)
+        settings = replace(compared.settings, least_score=sure)
         return self._planting.plant(
             view, lambda picture: compare_robust(reference, as_bgr(picture), compared.valid, settings).mask > 0
         )
@@ -258,13 +270,14 @@ class ViewMaker:
 
     def _settings_now(self) -> RobustSettings | None:
         """Those of the robust method as the flight has set them so far; None for method thesis."""
-        return None if self._tuning is None else replace(self._tuning.settings(), least_score=LEAST_SURENESS)
+        least_score = self._settings.corroboration.least_score
+        return None if self._tuning is None else replace(self._tuning.settings(), least_score=least_score)
 
 
-def _doubted(found: Difference, kept: Difference) -> Mask:
+def _doubted(found: Difference, kept: Difference, least_score: float) -> Mask:
     """(h, w) what a view surely shows to differ from the map, less what was kept of it."""
     sure = np.zeros(found.mask.shape, bool)
-    for x, y, w, h in found.boxes[found.scores >= SURE]:
+    for x, y, w, h in found.boxes[found.scores >= least_score]:
         sure[y : y + h, x : x + w] = True
     return sure & (found.mask > 0) & (kept.mask == 0)
 

@@ -1,43 +1,51 @@
 """Pictures of the ground on both dates, kept in squares where a flight's views show that an area may have changed."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from sorvolo.change.evidence.pictures import BETTER, quality
+from sorvolo.change.evidence.pictures import PictureSettings, quality
 from sorvolo.change.shape.patches import Cut, PatchWindow, cut, patch_of
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.survey.findings import ComparedView, Patch
 
-_SIDE_PX = 256
-_MOST_SQUARES = 400  # 200 MB; further squares have no pictures
-_MOST_PATCH_PX = 2048
-_MARGIN = 0.1  # of an area's length is shown around it
+
+@dataclass(frozen=True)
+class GroundPictureSettings:
+    """How pictures of areas are kept (0025)."""
+
+    side_px: int = 256  # of a square
+    most_squares: int = 400  # 200 MB; further squares have no pictures
+    most_patch_px: int = 2048  # longest side of an area's picture
+    margin: float = 0.1  # of an area's length is shown around it
+    better: float = PictureSettings.better  # times as good a view's pictures must be to replace older ones
 
 
 class GroundPictures:
     """The best pictures of squares of ground, `m_per_px` a pixel. Only `show` changes it."""
 
-    def __init__(self, m_per_px: float) -> None:
-        self._m_per_px = m_per_px
+    def __init__(self, m_per_px: float, settings: GroundPictureSettings = GroundPictureSettings()) -> None:
+        self._m_per_px, self._settings = m_per_px, settings
+        self._side_m = settings.side_px * m_per_px
         self._squares: dict[tuple[int, int], tuple[Cut, float]] = {}
 
     def show(self, view: ComparedView, places_m: PointsM) -> None:
         """Take the view's pictures of the squares that hold any of these places, (N, 2), where they are better."""
-        side_m = _SIDE_PX * self._m_per_px
+        side_m = self._side_m
         for column, row in np.unique(np.floor(places_m / side_m).astype(int), axis=0):
             key = int(column), int(row)
-            if key not in self._squares and len(self._squares) >= _MOST_SQUARES:
+            if key not in self._squares and len(self._squares) >= self._settings.most_squares:
                 continue
             low_m = np.array(key) * side_m
             good = quality(view, low_m, low_m + side_m)
             old = self._squares.get(key)
-            if old is not None and good <= BETTER * old[1] and (old[0].after[..., 3] > 0).all():
+            if old is not None and good <= self._settings.better * old[1] and (old[0].after[..., 3] > 0).all():
                 continue
             new = cut(view, self._window(key))
             if old is None:
                 self._squares[key] = new, good
-            elif good > BETTER * old[1]:
+            elif good > self._settings.better * old[1]:
                 self._squares[key] = new.over(old[0]), good
             else:
                 self._squares[key] = old[0].over(new), old[1]
@@ -45,9 +53,9 @@ class GroundPictures:
     def patch(self, outline_m: PointsM) -> Patch:
         """The pictures of an outline, (N, 2), and of a little ground around it; nothing is known beyond the squares."""
         low_m, high_m = outline_m.min(axis=0), outline_m.max(axis=0)
-        margin_m = _MARGIN * float((high_m - low_m).max())
+        margin_m = self._settings.margin * float((high_m - low_m).max())
         coarse = self._m_per_px
-        while float((high_m - low_m).max() + 2 * margin_m) / coarse > _MOST_PATCH_PX - 2:
+        while float((high_m - low_m).max() + 2 * margin_m) / coarse > self._settings.most_patch_px - 2:
             coarse *= 2
         (west, south), (east, north) = np.floor((low_m - margin_m) / coarse), np.ceil((high_m + margin_m) / coarse)
         window = PatchWindow(west * coarse, north * coarse, coarse, int(east - west), int(north - south))
@@ -59,11 +67,11 @@ class GroundPictures:
         return patch_of(window, pictures, outline_m)
 
     def _window(self, key: tuple[int, int]) -> PatchWindow:
-        side_m = _SIDE_PX * self._m_per_px
-        return PatchWindow(key[0] * side_m, (key[1] + 1) * side_m, self._m_per_px, _SIDE_PX, _SIDE_PX)
+        side_m = self._side_m
+        return PatchWindow(key[0] * side_m, (key[1] + 1) * side_m, self._m_per_px, *(self._settings.side_px,) * 2)
 
     def _around(self, low_m: PointsM, high_m: PointsM) -> Sequence[tuple[int, int]]:
-        side_m = _SIDE_PX * self._m_per_px
+        side_m = self._side_m
         first, last = np.floor(low_m / side_m), np.floor(high_m / side_m)
         return [
             key for key in sorted(self._squares)

@@ -10,18 +10,22 @@ import numpy as np
 
 from sorvolo.change.evidence.announcing import Tally
 from sorvolo.change.evidence.cells import CellEvidence, CellGrid, CellReport, CellWindow, LaidView, pieces
-from sorvolo.change.evidence.pictures import Pictures
+from sorvolo.change.evidence.pictures import Pictures, PictureSettings
 from sorvolo.change.shape.kinds import kind_of
 from sorvolo.change.shape.outlines import measures
 from sorvolo.geometry.arrays import Floats, ImageGray, Mask, Matrix3, PointsM
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 
-SHOWS = 0.12
-"""Share of a candidate's cells that a view must flag to show it: from above a person covers few of them."""
 
-_SEEN, _ALL_SEEN = 0.5, 0.99  # shares of its cells: a view that sees fewer is not asked; the place is that of all
-_MOST_PLACES = 64
-_MOST_SEEDS = 256
+@dataclass(frozen=True)
+class CandidateSettings:
+    """When a view counts for a candidate, in shares of its cells, and what is kept (before 0014)."""
+
+    shows: float = 0.12  # a view that flags less of what it sees misses it: from above a person covers few cells
+    seen: float = 0.5  # a view that sees less is not asked
+    all_seen: float = 0.99  # a view that sees more knows its place
+    most_places: int = 64  # of views, for the spread of its place
+    most_seeds: int = 256  # uncertain candidates; the oldest go first
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +49,13 @@ class Candidate:
     a seed a number.
     """
 
-    def __init__(self, number: int, cells: CellWindow, first_seen_ns: int) -> None:
+    def __init__(
+        self, number: int, cells: CellWindow, first_seen_ns: int, settings: CandidateSettings = CandidateSettings(),
+        pictures: PictureSettings = PictureSettings(),  # noqa: B008 (frozen)
+    ) -> None:
         self.number = number
-        self.pictures = Pictures()
+        self.pictures = Pictures(pictures)
+        self._settings = settings
         self._cells = cells
         self._tally = Tally(first_seen_ns, first_seen_ns)
         self._places: list[Floats] = []
@@ -71,9 +79,9 @@ class Candidate:
     def recall(self, view: KeptView, cells: Mask, cell_m: float) -> None:
         """Count a view from before the candidate was found, whose `cells` lie in its window, and its mask."""
         report = view.laid.report(self._cells, cells, cell_m)
-        if report.seen < _SEEN:
+        if report.seen < self._settings.seen:
             return
-        if report.flagged < SHOWS * report.seen:
+        if report.flagged < self._settings.shows * report.seen:
             self.miss()
             return
         self._count(view, report, residual_m=0.0, knows_place=True)
@@ -84,23 +92,23 @@ class Candidate:
         the candidate is as large as the view."""
         report = view.laid.report(self._cells, cells, cell_m)
         is_large = max(self._cells.shape) > 0.5 * max(view.laid.window.shape)
-        if report.seen < _SEEN and not (is_large and report.flagged > 0):
+        if report.seen < self._settings.seen and not (is_large and report.flagged > 0):
             return False
-        if report.flagged < SHOWS * report.seen:
+        if report.flagged < self._settings.shows * report.seen:
             self.miss()
             return False
-        self._count(view, report, view.residual_m, knows_place=report.seen > _ALL_SEEN)
+        self._count(view, report, view.residual_m, knows_place=report.seen > self._settings.all_seen)
         self._note_rim(view, cells)
         return True
 
     def ask(self, view: KeptView, cells: Mask, cell_m: float) -> None:
         """Count this view as for a seed: whatever shows some of it shows it; and its mask."""
         report = view.laid.report(self._cells, cells, cell_m)
-        if report.flagged >= max(SHOWS * report.seen, 1e-9):
-            self._count(view, report, view.residual_m, knows_place=report.seen > _ALL_SEEN)
+        if report.flagged >= max(self._settings.shows * report.seen, 1e-9):
+            self._count(view, report, view.residual_m, knows_place=report.seen > self._settings.all_seen)
             self.pictures.vote(view.site_from_image, view.changed, view.valid)
             self._note_rim(view, cells)
-        elif report.seen >= _SEEN:
+        elif report.seen >= self._settings.seen:
             self.miss()
 
     def miss(self, times: int = 1) -> None:
@@ -160,7 +168,7 @@ class Candidate:
 
     def _count(self, view: KeptView, report: CellReport, residual_m: float, *, knows_place: bool) -> None:
         self._tally = self._tally.with_view(view.time_ns, report.score, residual_m, view.camera_m)
-        if knows_place and len(self._places) < _MOST_PLACES:
+        if knows_place and len(self._places) < self._settings.most_places:
             self._places.append(report.place_m)
 
     def _note_rim(self, view: KeptView, cells: Mask) -> None:
@@ -174,9 +182,12 @@ class Seeds:
     `grid` holds the evidence; seeds are at least `least_cells` cells of `cell_m` and `gap` cells apart.
     """
 
-    def __init__(self, grid: CellGrid, cell_m: float, gap: int, least_cells: float, m_per_px: float) -> None:
+    def __init__(
+        self, grid: CellGrid, cell_m: float, gap: int, least_cells: float, m_per_px: float,
+        settings: CandidateSettings, pictures: PictureSettings,
+    ) -> None:
         self._grid, self._cell_m, self._gap, self._least_cells = grid, cell_m, gap, least_cells
-        self._m_per_px = m_per_px
+        self._m_per_px, self._settings, self._pictures = m_per_px, settings, pictures
         self._seeds: list[Candidate] = []
 
     def __iter__(self) -> Iterator[Candidate]:
@@ -201,11 +212,11 @@ class Seeds:
         if most_pictures <= 0 or not weak.any():
             return
         for window in self._new(laid, weak)[:most_pictures]:
-            seed = Candidate(0, window, view.time_ns)
+            seed = Candidate(0, window, view.time_ns, self._settings, self._pictures)
             seed.pictures.show(view, *window.box_m(self._cell_m), self._m_per_px)
             self._ask(seed, kept_view)
             self._seeds.append(seed)
-        del self._seeds[:-_MOST_SEEDS]
+        del self._seeds[:-self._settings.most_seeds]
 
     def _ask(self, seed: Candidate, kept_view: KeptView) -> None:
         seed.ask(kept_view, self._grid.read(seed.cells).changed > 0, self._cell_m)

@@ -14,10 +14,22 @@ from sorvolo.geometry.arrays import Floats, ImageGray, Mask, Matrix3, PointsM
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import ComparedView
 
-_CHUNK = 64
-_FAR_HEIGHTS = 5.0  # ground further away than this many flying heights shows nothing that a cell could hold
-_MOST_CELLS = 2_000_000
+_CHUNK = 64  # cells, along a side of a stored piece
 _VOTES: NDArray[np.uint8] = np.array([bin(bits).count("1") for bits in range(256)], np.uint8)
+
+
+@dataclass(frozen=True)
+class CellSettings:
+    """How large a cell is, and how far views are laid on cells (before 0014)."""
+
+    side_px: int = 3  # pixels of changes' pictures, along a cell's side
+    least_m: float = 0.05  # along a cell's side
+    far_heights: float = 5.0  # flying heights: ground further away shows nothing that a cell could hold
+    most: int = 2_000_000  # cells of one view, which bounds its memory
+
+    def side_m(self, m_per_px: float) -> float:
+        """A cell's side for changes' pictures with pixels of this size."""
+        return max(self.least_m, self.side_px * m_per_px)
 
 
 @dataclass(frozen=True)
@@ -132,7 +144,9 @@ class LaidView:
         return marked[window.within(self.window)] & cells[self.window.within(window)]
 
 
-def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask) -> LaidView:
+def lay(
+    view: ComparedView, cell_m: float, ignored: Mask, held: Mask, settings: CellSettings = CellSettings(),
+) -> LaidView:
     """The view as cells of the ground.
 
     `ignored` and `held`, (number of boxes,), choose boxes: what lies in ignored ones is taken for unknown ground. A
@@ -161,7 +175,7 @@ def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask) -> LaidVie
             valid[part][changed[part] > 0] = 0
         if held[index]:
             in_held[part] = 255
-    window = _window_of(view, cell_m)
+    window = _window_of(view, cell_m, settings)
     image_from_small = np.array([
         [shrink, 0, (shrink - 1) / 2], [0, shrink, (shrink - 1) / 2], [0, 0, 1.0]
     ])
@@ -189,12 +203,12 @@ def pieces(cells: Mask, gap: int) -> Iterator[tuple[Mask, tuple[slice, slice]]]:
         yield labels[part] == label, part
 
 
-def _window_of(view: ComparedView, cell_m: float) -> CellWindow:
+def _window_of(view: ComparedView, cell_m: float, settings: CellSettings) -> CellWindow:
     height, width = view.changed.shape
     x, y = np.meshgrid(np.linspace(-0.5, width - 0.5, 5), np.linspace(-0.5, height - 0.5, 5))
     ground_m = apply_homography(view.site_from_image, np.column_stack([x.ravel(), y.ravel()]))
-    reach_m = max(_FAR_HEIGHTS * float(view.camera_m[2]), 1.0)
-    reach_m = min(reach_m, 0.5 * cell_m * np.sqrt(_MOST_CELLS))
+    reach_m = max(settings.far_heights * float(view.camera_m[2]), 1.0)
+    reach_m = min(reach_m, 0.5 * cell_m * np.sqrt(settings.most))
     low, high = view.camera_m[:2] - reach_m, view.camera_m[:2] + reach_m
     near = np.isfinite(ground_m).all(axis=1)
     if not near.any():
@@ -289,11 +303,6 @@ class CellGrid:
             chunk = self._chunks.get(key)
             if chunk is not None:
                 chunk.owner[inside][cells[part]] = number
-
-    @property
-    def chunks(self) -> int:
-        """How many pieces of ground are kept."""
-        return len(self._chunks)
 
     def _new_chunk(self, key: tuple[int, int]) -> _Chunk:
         if len(self._chunks) >= self._most_chunks:

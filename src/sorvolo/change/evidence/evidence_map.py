@@ -23,15 +23,16 @@ from sorvolo.change.evidence.announcing import (
     sureness,
     views_score,
 )
-from sorvolo.change.evidence.candidate import Candidate, KeptView, Seeds
+from sorvolo.change.evidence.candidate import Candidate, CandidateSettings, KeptView, Seeds
 from sorvolo.change.evidence.cells import (
     CellEvidence,
     CellGrid,
+    CellSettings,
     CellWindow,
     lay,
     pieces,
 )
-from sorvolo.change.evidence.pictures import BETTER
+from sorvolo.change.evidence.pictures import PictureSettings
 from sorvolo.change.motion.blob_tracker import BlobTracker, MovingSettings, Track
 from sorvolo.change.motion.moving_changes import Movers
 from sorvolo.change.shape.shadows import ThingSettings, shade_share
@@ -40,18 +41,38 @@ from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.survey.findings import Change, ComparedView
 
-_CELL_PX = 3
-_LEAST_CELL_M = 0.05
-_PICTURES_A_VIEW, _MOST_PICTURES = 6, 30  # cut anew at most, which bounds the time a view takes ...
-_VIEWS_S = 5.0  # ... where so many come in a second; where they are seldom there is more time
-_MOVED_HEIGHTS = 0.01  # the camera's way, in flying heights, after which a view counts anew
-_ALL_CHANGED = 0.5  # share of the frame beyond which nothing in it can be followed
-_PASSING, _PASSING_VIEWS = 0.5, 8  # flagged in so much smaller a share of at least so many views than ...
-_SUREST = 97  # ... the surest of a change's cells, in per cent of them, cells are no part of it
-_STANDS_S = 2.0  # what the same ground shows for so long stands there, however unsteady its blobs are
-_AROUND_M = 5.0  # of a change its ground may be restless: a crown's width
-_APART_M, _LEAN = 0.5, 0.2  # nearer lies the change's own rim, and within so many of its lengths what leans with it
-_CHANGED_ITSELF = 0.5  # of its views: ground that more of them flag is changed itself, not restless
+
+@dataclass(frozen=True)
+class PassingSettings:
+    """Which cells are no part of a change: what leaned over its place for a few views (0015)."""
+
+    share: float = 0.5  # flagged in a share of views so many times as large as the surest cells' ...
+    views: int = 8  # ... of at least so many views
+    surest_percent: float = 97  # percentile of its cells' shares that is that of the surest
+
+
+@dataclass(frozen=True)
+class RestlessSettings:
+    """Which ground around a change shows how restless it is there (before 0014)."""
+
+    around_m: float = 5.0  # a crown's width
+    apart_m: float = 0.5  # nearer lies the change's own rim ...
+    lean: float = 0.2  # ... and within so many of its lengths what leans with it
+    changed_itself: float = 0.5  # of its views: ground that more of them flag is changed itself, not restless
+
+
+@dataclass(frozen=True)
+class GatherSettings:
+    """How views become cells, and cells candidates."""
+
+    moved_heights: float = 0.01  # flying heights that the camera moves until a view counts anew (before 0014)
+    all_changed: float = 0.5  # share of a frame beyond which nothing in it can be followed (before 0014)
+    stands_s: float = 2.0  # what the same ground shows for so long stands there, however unsteady its blobs are (0017)
+    cells: CellSettings = field(default_factory=CellSettings)
+    candidates: CandidateSettings = field(default_factory=CandidateSettings)
+    pictures: PictureSettings = field(default_factory=PictureSettings)
+    passing: PassingSettings = field(default_factory=PassingSettings)
+    restless: RestlessSettings = field(default_factory=RestlessSettings)
 
 
 @dataclass(frozen=True)
@@ -65,6 +86,7 @@ class EvidenceSettings:
     least_area_m2: float = 0.02
     join_m: float = 0.3  # a smaller gap does not make two things of one
     single_view_score: float = 2.0  # a single view's change this sure is announced at the end; above 1: never
+    gathering: GatherSettings = field(default_factory=GatherSettings)
     moving: MovingSettings = field(default_factory=MovingSettings)
     announcing: AnnounceSettings = field(default_factory=AnnounceSettings)
     things: ThingSettings = field(default_factory=ThingSettings)
@@ -87,9 +109,9 @@ class EvidenceMap:
 
     def __init__(self, m_per_px: float, settings: EvidenceSettings, id_prefix: str) -> None:
         self._settings, self._prefix = settings, id_prefix
-        self._rules = settings.announcing
+        self._rules, self._gathering = settings.announcing, settings.gathering
         self._m_per_px = m_per_px
-        self._cell_m = max(_LEAST_CELL_M, _CELL_PX * m_per_px)
+        self._cell_m = self._gathering.cells.side_m(m_per_px)
         self._join_m = max(settings.join_m, 3 * self._cell_m) if settings.join_m else 0.0
         self._gap = int(np.ceil(self._join_m / self._cell_m))
         self._grid = CellGrid(settings.n)
@@ -101,7 +123,10 @@ class EvidenceMap:
         self._stopped: dict[int, Verdict] = {}  # at the flight's end, by number
         self._movers = Movers(id_prefix, m_per_px, self._cell_m)
         self._least_cells = max(2, settings.least_area_m2 / self._cell_m**2)
-        self._seeds = Seeds(self._grid, self._cell_m, self._gap, self._least_cells, m_per_px)
+        self._seeds = Seeds(
+            self._grid, self._cell_m, self._gap, self._least_cells, m_per_px, self._gathering.candidates,
+            self._gathering.pictures,
+        )
         self._recent: deque[KeptView] = deque(maxlen=settings.n)
         self._number = 0
         self._last: tuple[int, int, Floats] | None = None  # index, time, camera of the last view that counted
@@ -181,24 +206,26 @@ class EvidenceMap:
             return False
         index, time_ns, camera_m = self._last
         # photos may carry whole seconds only: what was taken elsewhere is no repeat, whatever its time
-        has_moved = np.linalg.norm(view.camera_m - camera_m) >= 2 * _MOVED_HEIGHTS * float(view.camera_m[2])
+        least_m = 2 * self._gathering.moved_heights * float(view.camera_m[2])
+        has_moved = np.linalg.norm(view.camera_m - camera_m) >= least_m
         is_too_soon = (view.time_ns - time_ns) * 1e-9 < self._settings.least_views_apart_s
         return view.index == index or (is_too_soon and not bool(has_moved))
 
     def _pictures_for(self, view: ComparedView) -> int:
         """How many pictures there is time for since the last view."""
         waited_s = np.inf if self._last is None else (view.time_ns - self._last[1]) * 1e-9
-        return int(np.clip(_PICTURES_A_VIEW * _VIEWS_S * waited_s, _PICTURES_A_VIEW, _MOST_PICTURES))
+        return self._gathering.pictures.for_view(waited_s)
 
     def _lay(self, view: ComparedView) -> tuple[KeptView, tuple[Track, ...]]:
         """The view as cells, without what moves, and what moves in it."""
-        may_follow = np.count_nonzero(view.changed) < _ALL_CHANGED * int(np.count_nonzero(view.valid))
+        most = self._gathering.all_changed * int(np.count_nonzero(view.valid))
+        may_follow = np.count_nonzero(view.changed) < most
         followed = self._tracker.follow(view if may_follow else replace(
             view, boxes=view.boxes[:0], scores=view.scores[:0]
         ))
         nothing = np.zeros(len(view.boxes), bool)
         moving, held = (followed.is_moving, followed.may_move) if may_follow else (nothing, nothing)
-        laid = lay(view, self._cell_m, moving, held)
+        laid = lay(view, self._cell_m, moving, held, self._gathering.cells)
         residual_m = view.residual_px * view.m_per_px if np.isfinite(view.residual_px) else 0.0
         kept_view = KeptView(
             view.time_ns, laid, view.camera_m, view.site_from_image, view.changed, view.valid, residual_m,
@@ -207,8 +234,8 @@ class EvidenceMap:
         return kept_view, followed.movers
 
     def _is_new_place(self, view: ComparedView) -> bool:
-        last = self._counted_at_m
-        if last is None or np.linalg.norm(view.camera_m - last) >= _MOVED_HEIGHTS * float(view.camera_m[2]):
+        last, least_m = self._counted_at_m, self._gathering.moved_heights * float(view.camera_m[2])
+        if last is None or np.linalg.norm(view.camera_m - last) >= least_m:
             self._counted_at_m = np.array(view.camera_m)
             return True
         return False
@@ -230,7 +257,8 @@ class EvidenceMap:
             owner = evidence.owner[part]
             owners = sorted({self._current(int(each)) for each in np.unique(owner[piece & (owner > 0)])})
             fresh = cells & (owner == 0)
-            if not fresh.any() or (owners and _is_passing(evidence, part, piece & (owner > 0), fresh)):
+            owned = piece & (owner > 0)
+            if not fresh.any() or (owners and _is_passing(evidence, part, owned, fresh, self._gathering.passing)):
                 continue
             window = laid.window.part(part)
             if owners:
@@ -266,11 +294,13 @@ class EvidenceMap:
     ) -> bool:
         """Whether views over a long enough time show these very cells."""
         window = kept_view.laid.window.part(part)
-        long_ago = (each for each in earlier if (kept_view.time_ns - each.time_ns) * 1e-9 >= _STANDS_S)
+        long_ago = (each for each in earlier if (kept_view.time_ns - each.time_ns) * 1e-9 >= self._gathering.stands_s)
         return any(each.laid.report(window, cells, self._cell_m).flagged > 0.5 for each in long_ago)
 
     def _begin(self, view: ComparedView, earlier: Sequence[KeptView], window: CellWindow, cells: Mask) -> int:
-        candidate = Candidate(self._next_number(), window, view.time_ns)
+        candidate = Candidate(
+            self._next_number(), window, view.time_ns, self._gathering.candidates, self._gathering.pictures
+        )
         self._found[candidate.number] = candidate
         candidate.pictures.show(view, *window.box_m(self._cell_m), self._m_per_px)
         for each in earlier:
@@ -334,7 +364,8 @@ class EvidenceMap:
     def _cut_pictures(self, view: ComparedView, shown: Sequence[Candidate], most_pictures: int) -> int:
         """Take the view's pictures of those candidates that gain most by it; how many."""
         gains = [(each.pictures.gain(*each.cells.box_m(self._cell_m), view), -each.number) for each in shown]
-        wanted = [-number for gain, number in sorted(gains, reverse=True) if gain > BETTER][: max(most_pictures, 0)]
+        better = self._gathering.pictures.better
+        wanted = [-number for gain, number in sorted(gains, reverse=True) if gain > better][: max(most_pictures, 0)]
         for number in wanted:
             candidate = self._found[number]
             candidate.pictures.show(view, *candidate.cells.box_m(self._cell_m), self._m_per_px)
@@ -348,7 +379,7 @@ class EvidenceMap:
         """
         evidence = self._grid.read(candidate.cells)
         own = evidence.owner == candidate.number
-        passing = _passing_cells(evidence, own)
+        passing = _passing_cells(evidence, own, self._gathering.passing)
         lost, held = int(np.count_nonzero(passing)), int(np.count_nonzero(own))
         if not lost or held - lost < self._least_cells:
             return own
@@ -393,7 +424,9 @@ class EvidenceMap:
         return judge(replace(candidate.tally, look=look), rules, is_over=is_over), whole
 
     def _restlessness(self, candidate: Candidate) -> float:
-        return restlessness(self._grid, candidate.cells, self._cells_of(candidate), self._cell_m)
+        return restlessness(
+            self._grid, candidate.cells, self._cells_of(candidate), self._cell_m, self._gathering.restless
+        )
 
     def _part(self, candidate: Candidate, now_ns: int, whole: Change | None) -> list[Change]:
         """Part a candidate, whose record is `whole`, into its things; those announced for the first time."""
@@ -473,45 +506,50 @@ class EvidenceMap:
         whole = candidate.cells.joined(window)
         evidence, there = self._grid.read(whole), np.zeros(whole.shape, bool)
         there[window.within(whole)] = cells
-        if not _is_passing(evidence, np.s_[:, :], evidence.owner == candidate.number, there):
+        if not _is_passing(evidence, np.s_[:, :], evidence.owner == candidate.number, there, self._gathering.passing):
             self._grid.own(window, cells, candidate.number)
             candidate.extend(window)
         return True
 
 
-def restlessness(grid: CellGrid, window: CellWindow, own: Mask, cell_m: float) -> float:
+def restlessness(
+    grid: CellGrid, window: CellWindow, own: Mask, cell_m: float, settings: RestlessSettings = RestlessSettings(),
+) -> float:
     """The share of the views of the ground around a change that flag it although most others do not, 0 to 1.
 
     Crowns, walls that lean into view and wind make views differ from the map all around, now here, now there: where
     much comes and goes, views agree by chance. What really came or left stands out on calm ground. `own` (rows,
     columns) are the change's cells in `window`. Where no other ground was seen twice, nothing is known: 0.
     """
-    apart_m = max(_APART_M, _LEAN * max(window.shape) * cell_m)
-    reach = int(np.ceil((apart_m + _AROUND_M) / cell_m))
+    apart_m = max(settings.apart_m, settings.lean * max(window.shape) * cell_m)
+    reach = int(np.ceil((apart_m + settings.around_m) / cell_m))
     evidence = grid.read(window.grown(reach))
     free = cv2.copyMakeBorder((~own).view(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=1)
     away_m = cv2.distanceTransform(free, cv2.DIST_L2, 5) * cell_m
-    around = (away_m > apart_m) & (away_m <= apart_m + _AROUND_M) & (evidence.seen >= 2)
+    around = (away_m > apart_m) & (away_m <= apart_m + settings.around_m) & (evidence.seen >= 2)
     seen, changed = evidence.seen[around].astype(float), evidence.changed[around]
     if not seen.size:
         return 0.0
-    return float(np.where(changed <= _CHANGED_ITSELF * seen, changed / seen, 0.0).mean())
+    return float(np.where(changed <= settings.changed_itself * seen, changed / seen, 0.0).mean())
 
 
-def _is_passing(evidence: CellEvidence, part: tuple[slice, slice], own: Mask, fresh: Mask) -> bool:
+def _is_passing(
+    evidence: CellEvidence, part: tuple[slice, slice], own: Mask, fresh: Mask, settings: PassingSettings
+) -> bool:
     """Whether `fresh` cells are flagged so much more seldom than those that candidates `own` that they are no part."""
     seen, changed = np.maximum(evidence.seen[part], 1), evidence.changed[part]
     of_own, of_fresh = changed[own] / seen[own], changed[fresh] / seen[fresh]
-    surest = np.percentile(of_own, _SUREST)
-    return bool(np.median(seen[fresh]) >= _PASSING_VIEWS and np.median(of_fresh) < _PASSING * surest)
+    least = settings.share * np.percentile(of_own, settings.surest_percent)
+    return bool(np.median(seen[fresh]) >= settings.views and np.median(of_fresh) < least)
 
 
-def _passing_cells(evidence: CellEvidence, own: Mask) -> Mask:
+def _passing_cells(evidence: CellEvidence, own: Mask, settings: PassingSettings) -> Mask:
     """Which of a candidate's `own` cells are flagged so much more seldom than its surest that they are no part."""
     share = evidence.changed[own] / np.maximum(evidence.seen[own], 1)
     passing = np.zeros_like(own)
     if share.size:
-        passing[own] = (share < _PASSING * np.percentile(share, _SUREST)) & (evidence.seen[own] >= _PASSING_VIEWS)
+        least = settings.share * np.percentile(share, settings.surest_percent)
+        passing[own] = (share < least) & (evidence.seen[own] >= settings.views)
     return passing
 
 

@@ -1,6 +1,6 @@
 """The pictures of one candidate for a change: the best of both dates, and its outline by the majority of masks."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,20 +15,32 @@ from sorvolo.geometry.arrays import Floats, Mask, Matrix3, PointsM
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import Change, ComparedView, Patch
 
-BETTER = 1.15
-"""A view's pictures replace older ones if they are so many times better."""
-
-_MOST_PX = 512
-_ENOUGH_VOTES = 40  # more masks hardly move the outline
 _MOST_VOTES = 250  # a byte counts them
-_GOOD = 0.75  # quality beyond which no better pictures are searched for
-_LEAST_MAJORITY = 0.3  # of the area of its cells: if masks agree on less, the cells are the outline
+
+
+@dataclass(frozen=True)
+class PictureSettings:
+    """Which views' pictures a candidate keeps, and how masks make its outline (before 0014; time 0019)."""
+
+    better: float = 1.15  # times as good a view's pictures must be to replace older ones
+    good: float = 0.75  # quality, 0 to 1, beyond which no better pictures are searched for
+    most_px: int = 512  # longest side of a picture
+    enough_votes: int = 40  # masks; more hardly move the outline
+    least_majority: float = 0.3  # of the area of its cells: if masks agree on less, the cells are the outline
+    a_view: int = 6  # cut anew at most, which bounds the time a view takes ...
+    most_a_view: int = 30  # ... and as many where views are seldom: there is more time
+    views_s: float = 5.0  # views a second up to which there is time for more than `a_view`
+
+    def for_view(self, waited_s: float) -> int:
+        """How many pictures there is time for, so long after the last view."""
+        return int(np.clip(self.a_view * self.views_s * waited_s, self.a_view, self.most_a_view))
 
 
 class Pictures:
     """The ground of a candidate on both dates. Only `show` and `vote` change it."""
 
-    def __init__(self) -> None:
+    def __init__(self, settings: PictureSettings = PictureSettings()) -> None:
+        self._settings = settings
         self._window: PatchWindow | None = None
         self._best: Cut | None = None
         self._quality = 0.0
@@ -40,14 +52,14 @@ class Pictures:
         """How much better, as a factor, the view shows a box of ground; infinite if the pictures have to grow."""
         if self._window is None or self._best is None or not self._window.holds(low_m, high_m):
             return np.inf
-        if self._quality > _GOOD:
+        if self._quality > self._settings.good:
             return 0.0
         return quality(view, low_m, high_m) / max(self._quality, 1e-9)
 
     @property
     def wants_votes(self) -> bool:
         """Whether more masks would make the outline better."""
-        return self._votes < _ENOUGH_VOTES
+        return self._votes < self._settings.enough_votes
 
     def show(self, view: ComparedView, low_m: Floats, high_m: Floats, m_per_px: float) -> None:
         """Take the view's pictures of the box of ground if they are better, or wherever there were none."""
@@ -55,7 +67,7 @@ class Pictures:
         new, good = cut(view, window), quality(view, low_m, high_m)
         if self._best is None:
             self._best, self._quality = new, good
-        elif good > BETTER * self._quality:
+        elif good > self._settings.better * self._quality:
             self._best, self._quality = new.over(self._best), good
         else:
             self._best = self._best.over(new)
@@ -101,7 +113,8 @@ class Pictures:
             outline_m = outline_of(mask, own.site_from_patch, tolerance_px, join_m / own.m_per_px)
             if len(things) < 2 or outline_m is None:
                 return [whole]
-            around = PatchWindow.around(outline_m.min(axis=0), outline_m.max(axis=0), own.m_per_px, _MOST_PX)
+            low_m, high_m = outline_m.min(axis=0), outline_m.max(axis=0)
+            around = PatchWindow.around(low_m, high_m, own.m_per_px, self._settings.most_px)
             near = best.moved(around, own)
             size = measures(outline_m)
             parts.append(replace(
@@ -115,7 +128,7 @@ class Pictures:
         old = self._window
         if old is not None and old.holds(low_m, high_m):
             return old
-        window = self._window = PatchWindow.around(low_m, high_m, m_per_px, _MOST_PX)
+        window = self._window = PatchWindow.around(low_m, high_m, m_per_px, self._settings.most_px)
         if old is None or self._best is None:
             self._yes = np.zeros((window.height_px, window.width_px), np.uint8)
             self._asked = np.zeros_like(self._yes)
@@ -136,7 +149,7 @@ class Pictures:
         patch_from_cells = np.linalg.inv(window.site_from_patch) @ site_from_padded
         near = cv2.warpAffine(grown, patch_from_cells[:2], window.size_px, flags=cv2.INTER_NEAREST) > 0
         majority = np.asarray((2 * self._yes.astype(np.int16) > self._asked) & near)
-        least_m2 = _LEAST_MAJORITY * np.count_nonzero(cells) * cell_m**2
+        least_m2 = self._settings.least_majority * np.count_nonzero(cells) * cell_m**2
         return majority if np.count_nonzero(majority) * window.m_per_px**2 >= least_m2 else None
 
 

@@ -12,7 +12,7 @@ from sorvolo.change.pair.illumination import Light, LightSettings, fit_light, re
 from sorvolo.change.pair.region_extent import ExtentSettings, Piece, Views, grown
 from sorvolo.change.pair.region_score import how_sure
 from sorvolo.change.pair.regions import FEATURES, Regions, RegionSettings, find_regions
-from sorvolo.change.pair.residual_alignment import Settling, settle
+from sorvolo.change.pair.residual_alignment import Settling, SettlingSettings, settle
 from sorvolo.change.pair.scratch import Scratch, scratch_of_thread
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
@@ -39,6 +39,7 @@ class RobustSettings:
     settles: bool = True  # take out the last pixels of misalignment
     calm_px: float = 0.4  # half size; where less is left of the flow, values are looked for one pixel less far around
     unknown_px: int = 4  # half size; around the unknown nothing is compared: resampling mixes it into what is known
+    settling: SettlingSettings = field(default_factory=SettlingSettings)
     light: LightSettings = field(default_factory=LightSettings)
     regions: RegionSettings = field(default_factory=RegionSettings)
     extent: ExtentSettings = field(default_factory=ExtentSettings)
@@ -110,7 +111,7 @@ def examine(
         grays = scratch.stack("grays", size, 2)
         for image, gray in zip((before, after), grays, strict=True):
             cv2.cvtColor(image, cv2.COLOR_BGR2GRAY, dst=gray)
-        settling = settle(grays[0], grays[1], known)
+        settling = settle(grays[0], grays[1], known, settings.settling)
     if settling.moved_px > 0:
         # OpenCV resamples four bands in half the time that three take it
         four, moved = (scratch.take(name, size, (4,)) for name in ("four", "moved"))
