@@ -457,7 +457,7 @@ RULES: tuple[Rule, ...] = (
     _rule("nothing goes with the camera", "before 0014", (f"{_TRACKER}:_goes_with_camera", _no)),
     _rule("two blobs of one thing", "before 0014", (f"{_TRACKER}:IdentitySettings.near_m", 0.0)),
     _rule("blobs without their shadows", "before 0014", ("motion.blobs:thing_of", _thing_alone)),
-    _rule("blobs: no large part of the view", "before 0014", ("motion.blobs:_MOST_OF_VIEW", 1.0)),
+    _rule("blobs: no large part of the view", "before 0014", ("motion.blobs:BlobSettings.most_of_view", 1.0)),
     _rule("blobs: on known ground", "before 0014", ("motion.blobs:_is_known_around", _yes)),
     _rule("feet of people", "before 0014", ("motion.blobs:_foot_m", _nothing)),
     # one pair of pictures, on flights

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.change.areas.area_map import AreaMap, with_areas
+from sorvolo.change.areas.area_map import AreaMap, AreaMapSettings, with_areas
 from sorvolo.change.areas.segments import AreaSettings
 from sorvolo.change.areas.signs import leaning
 from sorvolo.change.shape.outlines import overlap
@@ -40,7 +40,7 @@ def changes_of(
     before: Rgb, after: Rgb, light: Callable[[Rgb, int], Rgb] = same_light, settings: AreaSettings = AreaSettings(),  # noqa: B008 (frozen)
 ) -> tuple[Change, ...]:
     """The areas that a flight of nine views finds; `light` gives a view's picture its light."""
-    areas, rng = AreaMap(settings), np.random.default_rng(3)
+    areas, rng = AreaMap(AreaMapSettings(segments=settings)), np.random.default_rng(3)
     for index in range(9):
         x, y = 300 * (index % 3), 220 * (index // 3)
         part = np.s_[y : y + VIEW_PX[1], x : x + VIEW_PX[0]]

@@ -6,58 +6,83 @@ much more than that, in the views on the whole and in most of them alone.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.areas.ground_pictures import GroundPictures
+from sorvolo.change.areas.ground_pictures import GroundPictures, GroundPictureSettings
 from sorvolo.change.areas.segments import AreaSettings, GroundSigns, segments
-from sorvolo.change.areas.signs import SIDE_PX, AreaSigns, area_signs
+from sorvolo.change.areas.signs import AreaSigns, SignSettings, area_signs
 from sorvolo.change.evidence.cells import CellWindow, window_around
 from sorvolo.change.shape.outlines import mask_of, measures, outline_of
 from sorvolo.geometry.arrays import Mask, PointsM
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
 
-_CELL_PX = 2  # of the small size at which views are examined
-_PICTURE_PX = 8  # of the pictures, in a cell
-_LEAST_VIEWS = 2
-_LEAST_AGREEING = 2.5  # views on the mean that show an area by themselves: two may lean alike
-_AGREES = 0.5  # of the views of an area's ground must differ from the map there, each by itself
-_OWN_UNITS = 2.0  # by which a view alone differs
-_SURE_UNITS = 6.0  # an area that differs by so much is sure
-_MOST_CELLS = 4_000_000  # of the raster, which bounds its memory: views beyond are left out
-_LEAST_SCORE = 0.3
-_INSIDE, _STANDS_OUT = 0.7, 1.5  # of a change in an area; spreads of the ground around from which it is a thing
-_EXPLAINED = 0.5  # of an area by things: it is nothing more than they
 _SUMS = ("seen", "agree", "likeness", "blue", "red", "detail", "blue_now", "red_now")
+
+
+@dataclass(frozen=True)
+class AreaVotes:
+    """When the views of an area's ground make it one (0025). Units: see `segments`."""
+
+    least_views: int = 2  # that saw a cell
+    agreeing_views: float = 2.5  # on the mean that show an area by themselves: two may lean alike
+    agreeing_share: float = 0.5  # of the views of an area's ground must differ from the map there, each by itself
+    own_units: float = 2.0  # by which a view alone differs
+    sure_units: float = 6.0  # an area that differs by so much is sure
+    least_score: float = 0.3  # 0 to 1
+
+
+@dataclass(frozen=True)
+class AreaMapSettings:
+    """How views are gathered to areas (0025)."""
+
+    cell_px: int = 2  # a cell's side, in pixels of the small size at which views are examined
+    picture_px: int = 8  # pixels of an area's pictures, along a cell's side
+    most_cells: int = 4_000_000  # of the raster, which bounds its memory: views beyond are left out
+    votes: AreaVotes = field(default_factory=AreaVotes)
+    segments: AreaSettings = field(default_factory=AreaSettings)
+    signs: SignSettings = field(default_factory=SignSettings)
+    pictures: GroundPictureSettings = field(default_factory=GroundPictureSettings)
+
+
+@dataclass(frozen=True)
+class ApartSettings:
+    """When a change is a part of an area, or an area only changes (0025)."""
+
+    inside: float = 0.7  # share of a change within an area: it is a part of it ...
+    stands_out: float = 1.5  # ... unless it differs by so many spreads of the ground around
+    explained: float = 0.5  # share of an area within things: it is nothing more than they
 
 
 class AreaMap:
     """The areas of one flight while its views come in. Only `add` changes it."""
 
-    def __init__(self, settings: AreaSettings = AreaSettings()) -> None:  # noqa: B008 (frozen)
+    def __init__(self, settings: AreaMapSettings = AreaMapSettings()) -> None:
         self._settings = settings
         self._cell_m = 0.0
         self._window = CellWindow(0, 0, 0, 0)
         self._sums: dict[str, NDArray[np.float32]] = {name: np.zeros((0, 0), np.float32) for name in _SUMS}
         self._times_ns: list[int] = []
         self._residuals_m: list[float] = []
-        self._pictures = GroundPictures(1.0)
+        self._pictures = GroundPictures(1.0, settings.pictures)
 
     def add(self, view: ComparedView, leans: Mask | None = None) -> None:
         """Take in one view, of which earlier pictures show that some ground `leans` (h, w)."""
         height, width = view.valid.shape
         if not self._cell_m:
-            self._cell_m = _CELL_PX * view.m_per_px * max(1.0, max(height, width) / SIDE_PX)
-            self._pictures = GroundPictures(self._cell_m / _PICTURE_PX)
+            settings = self._settings
+            coarser = max(1.0, max(height, width) / settings.signs.side_px)
+            self._cell_m = settings.cell_px * view.m_per_px * coarser
+            self._pictures = GroundPictures(self._cell_m / settings.picture_px, settings.pictures)
         corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
         window = window_around(apply_homography(view.site_from_image, corners), self._cell_m)
         if not self._grow(window):
             return
-        laid = self._laid(view, area_signs(view, leans), window)
+        laid = self._laid(view, area_signs(view, leans, self._settings.signs), window)
         part = window.within(self._window)
         for name, values in laid.items():
             self._sums[name][part] += values
@@ -71,21 +96,22 @@ class AreaMap:
 
     def conclude(self, id_prefix: str, first_number: int) -> tuple[Change, ...]:
         """After the last view: all areas, the largest first, numbered from `first_number` on."""
-        seen = self._sums["seen"]
+        seen, votes = self._sums["seen"], self._settings.votes
         if not seen.size:
             return ()
-        known = seen >= _LEAST_VIEWS
+        known = seen >= votes.least_views
         mean = {name: np.asarray(values / np.maximum(seen, 1), np.float32) for name, values in self._sums.items()}
         colour, surface = np.dstack([mean["blue"], mean["red"]]), np.dstack([mean["blue_now"], mean["red_now"]])
         signs = GroundSigns(mean["likeness"], colour, mean["detail"], surface, known)
         found = []
-        for cells, units in segments(signs, self._settings):
-            if np.count_nonzero(cells) * self._cell_m**2 < self._settings.least_m2:
+        for cells, units in segments(signs, self._settings.segments):
+            if np.count_nonzero(cells) * self._cell_m**2 < self._settings.segments.least_m2:
                 continue
             agreement = float(mean["agree"][cells].mean())
-            score = agreement * min(1.0, units / _SURE_UNITS)
+            score = agreement * min(1.0, units / votes.sure_units)
             views = float(self._sums["agree"][cells].mean())
-            if agreement >= _AGREES and score >= _LEAST_SCORE and views >= _LEAST_AGREEING:
+            is_shown = agreement >= votes.agreeing_share and views >= votes.agreeing_views
+            if is_shown and score >= votes.least_score:
                 found.append(self._record(cells, score))
         found.sort(key=lambda each: -each.area_m2)
         return tuple(replace(each, id=f"{id_prefix}-{first_number + place}") for place, each in enumerate(found))
@@ -118,7 +144,7 @@ class AreaMap:
             *(max(new.x1, old.x1 + spare if new.x1 > old.x1 else new.x1),
               max(new.y1, old.y1 + spare if new.y1 > old.y1 else new.y1)),
         )
-        if new.shape[0] * new.shape[1] > _MOST_CELLS:
+        if new.shape[0] * new.shape[1] > self._settings.most_cells:
             return False
         part = old.within(new)
         for name, values in self._sums.items():
@@ -142,14 +168,15 @@ class AreaMap:
 
         seen = np.ones(window.shape, np.float32)
         seen = (laid(signs.known.astype(np.float32)) > 0.99).astype(np.float32)
+        differs = _differs(signs, self._settings.segments, self._settings.votes.own_units)
         return {
-            "seen": seen, "agree": laid(_differs(signs, self._settings)), "likeness": laid(signs.likeness),
+            "seen": seen, "agree": laid(differs), "likeness": laid(signs.likeness),
             "blue": laid(signs.colour[..., 0]), "red": laid(signs.colour[..., 1]), "detail": laid(signs.detail),
             "blue_now": laid(signs.surface[..., 0]), "red_now": laid(signs.surface[..., 1]),
         }
 
 
-def _differs(signs: AreaSigns, settings: AreaSettings) -> NDArray[np.float32]:
+def _differs(signs: AreaSigns, settings: AreaSettings, own_units: float) -> NDArray[np.float32]:
     """1 where a view by itself shows another ground: other structure, and other colour or roughness than elsewhere."""
     same = signs.known & (signs.likeness > settings.same)
     colour, detail = settings.least_units
@@ -159,11 +186,13 @@ def _differs(signs: AreaSigns, settings: AreaSettings) -> NDArray[np.float32]:
         middle = float(np.median(signs.detail[same]))
         colour = max(colour, float(np.percentile(length[same], settings.quiet_percent)))
         detail = max(detail, float(np.percentile(np.abs(signs.detail[same] - middle), settings.quiet_percent)))
-    differs = np.hypot(length / colour, (signs.detail - middle) / detail) > _OWN_UNITS
+    differs = np.hypot(length / colour, (signs.detail - middle) / detail) > own_units
     return (differs & signs.known & (signs.likeness < settings.other)).astype(np.float32)
 
 
-def with_areas(changes: Sequence[Change], areas: Sequence[Change]) -> list[Change]:
+def with_areas(
+    changes: Sequence[Change], areas: Sequence[Change], settings: ApartSettings = ApartSettings()
+) -> list[Change]:
     """Changes and areas, each piece of ground reported once.
 
     A change that is a part of an area is left out, unless it is a thing that stands out from the ground around it on
@@ -172,10 +201,11 @@ def with_areas(changes: Sequence[Change], areas: Sequence[Change]) -> list[Chang
     kept = [
         each for each in changes
         if each.kind is ChangeKind.MOVING
-        or not any(_inside(each, area.outline_m) > _INSIDE for area in areas) or _is_thing(each.patch)
+        or not any(_inside(each, area.outline_m) > settings.inside for area in areas)
+        or _is_thing(each.patch, settings.stands_out)
     ]
     still = [each for each in kept if each.kind is not ChangeKind.MOVING]
-    return kept + [area for area in areas if _explained(area, still) < _EXPLAINED]
+    return kept + [area for area in areas if _explained(area, still) < settings.explained]
 
 
 def _explained(area: Change, things: Sequence[Change]) -> float:
@@ -194,7 +224,7 @@ def _inside(change: Change, outline_m: PointsM) -> float:
     return float((own & theirs).sum() / max(1, own.sum()))
 
 
-def _is_thing(patch: Patch) -> bool:
+def _is_thing(patch: Patch, stands_out: float) -> bool:
     """Whether what changed differs from the ground around it by more than that ground varies, before or after."""
     reach = max(3, round(0.15 * max(patch.changed.shape)))
     near = cv2.dilate(patch.changed.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
@@ -206,6 +236,6 @@ def _is_thing(patch: Patch) -> bool:
         levels = np.log2(picture[..., :3].astype(np.float32) + 8.0)
         spread = levels[ring].std(axis=0) + 0.1
         contrast = np.median(levels[own], axis=0) - np.median(levels[ring], axis=0)
-        if float(np.abs(contrast / spread).max()) > _STANDS_OUT:
+        if float(np.abs(contrast / spread).max()) > stands_out:
             return True
     return False

@@ -21,10 +21,8 @@ from sorvolo.registration.features import sharpness
 from sorvolo.survey.coverage import CoveredGround, Gap
 from sorvolo.survey.findings import ComparedView
 
-_CHUNK = 64
-_SMOOTH = 7  # cells over which the roughness of ground is averaged
+_CHUNK = 64  # cells, along a side of a stored piece
 _MOST_REASONS = 250  # a byte holds which one
-_STEPS_M = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # sizes are written in these steps
 
 
 @dataclass(frozen=True)
@@ -36,6 +34,8 @@ class CoverageSettings:
     black: float = 14.0  # mean grey level of ground in whose shadow nothing can be seen
     least_sharpness: float = 0.5  # of the flight's usual one: a view with less is blurred
     black_px: int = 15  # over how many pixels that mean is taken
+    smooth_cells: int = 7  # over which the roughness of ground is averaged: what differs from cell to cell is luck
+    steps_m: tuple[float, ...] = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # in which sizes are written
     planting: PlantingSettings = field(default_factory=PlantingSettings)
 
 
@@ -142,7 +142,7 @@ class GroundCoverage:
         area_m2 = float(((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])).sum())
         polygons = tuple(tuple(rings) for rings in union_of_boxes(boxes))
         if kind == _CLEAN:
-            return CoveredGround(polygons, area_m2, None, "", _step_m(first), _step_m(second))
+            return CoveredGround(polygons, area_m2, None, "", self._step_m(first), self._step_m(second))
         gap = list(Gap)[kind]
         why = self._reasons[first - 1] if gap is Gap.REJECTED else ""
         return CoveredGround(polygons, area_m2, gap, why, np.nan, np.nan)
@@ -158,12 +158,21 @@ class GroundCoverage:
         clean = classes == _CLEAN
         if clean.any() and self._planted:
             near = np.dstack([chunk.texture * clean, chunk.clean * clean]).astype(np.float32)
-            rough = np.divide(*cv2.blur(near, (_SMOOTH, _SMOOTH))[clean].T)  # what differs from cell to cell is luck
+            rough = np.divide(*cv2.blur(near, (self._settings.smooth_cells,) * 2)[clean].T)
             sizes_m = [each.smallest_px(rough) * chunk.finest[clean] for each in (plain, faint)]
-            labels[clean, 1], labels[clean, 2] = (_step_of(each) for each in sizes_m)
+            labels[clean, 1], labels[clean, 2] = (self._step_of(each) for each in sizes_m)
             labels[clean, 0] = np.where(plain.is_blind(rough), list(Gap).index(Gap.INSENSITIVE), _CLEAN)
             labels[labels[..., 0] == list(Gap).index(Gap.INSENSITIVE), 1:] = 0
         return labels
+
+    def _step_of(self, sizes_m: Floats) -> NDArray[np.int32]:
+        """1 + the place of the next larger step; 0 where the size is not known or larger than all."""
+        steps_m = self._settings.steps_m
+        place = np.searchsorted(steps_m, np.nan_to_num(sizes_m, nan=np.inf))
+        return np.where(place < len(steps_m), place + 1, 0).astype(np.int32)
+
+    def _step_m(self, number: int) -> float:
+        return self._settings.steps_m[number - 1] if number else float("nan")
 
     def _classes(self, chunk: _Chunk) -> NDArray[np.int32]:
         """(rows, columns): `_CLEAN`, the place of a gap among all, or -1 where no view was."""
@@ -257,16 +266,6 @@ def _middle(sizes: Sequence[tuple[float, float]]) -> float | None:
         if 2 * covered >= total:
             return size_m
     return None
-
-
-def _step_of(sizes_m: Floats) -> NDArray[np.int32]:
-    """1 + the place of the next larger step; 0 where the size is not known or larger than all."""
-    place = np.searchsorted(_STEPS_M, np.nan_to_num(sizes_m, nan=np.inf))
-    return np.where(place < len(_STEPS_M), place + 1, 0).astype(np.int32)
-
-
-def _step_m(number: int) -> float:
-    return _STEPS_M[number - 1] if number else float("nan")
 
 
 def _runs(labels: NDArray[np.int32]) -> Iterator[tuple[tuple[int, int, int], int, int, int]]:

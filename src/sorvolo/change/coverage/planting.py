@@ -1,7 +1,7 @@
 """How small a thing the comparison finds on a flight: things of known sizes are drawn into its own views."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -15,8 +15,17 @@ _BLACK_LEVEL = 8.0  # grey levels added before logarithms, as the pair's light d
 _COLOURS = np.array([  # of cars, clothes and tarpaulins: white, silver, black, red, blue, yellow, green
     [235, 235, 230], [180, 182, 184], [28, 28, 32], [190, 40, 35], [40, 75, 160], [220, 180, 40], [60, 110, 60],
 ], np.float32)
-_BAND, _BAND_SHADE = (0.45, 0.8), 0.55  # a darker band across a thing, in its sides, and how much darker
-_SHADOW_PX, _SHADE = 0.22, 0.5  # how far a thing's shadow reaches, in its lengths, and how dark it is
+
+
+@dataclass(frozen=True)
+class DrawnThing:
+    """How a planted thing is painted (0025). Lengths in its own sides."""
+
+    width: float = 0.6  # of its length: between a person seen from above and a car
+    band: tuple[float, float] = (0.45, 0.8)  # length and width of a darker band across it ...
+    band_shade: float = 0.55  # ... and the share of light that it lacks
+    shadow: float = 0.22  # how far its shadow reaches
+    shade: float = 0.5  # the share of light that the shadow lacks
 
 
 @dataclass(frozen=True)
@@ -25,12 +34,12 @@ class PlantingSettings:
 
     sizes_px: tuple[float, ...] = (5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
     contrasts: tuple[float, ...] = (1.0, 0.35)  # plain and faint: of the thing's own colour, the rest is the ground's
-    width: float = 0.6  # of a thing's length: between a person seen from above and a car
     apart_px: int = 100  # a grid of this side, so that each thing stands on ground of its own
     first_step: int = 4  # every fourth view at first ...
     steps_alike: int = 6  # ... and after so many a half of them: planting costs a third of a comparison
     shown: float = 0.25  # of a thing's pixels marked as changed: found
     wanted: float = 0.8  # of the things of a size found: that size is found
+    drawn: DrawnThing = field(default_factory=DrawnThing)
     least: float = 0.5  # of the largest things found: on ground with less the comparison is blind
 
 
@@ -173,14 +182,15 @@ def _draw(
     x, y = int(place[0]) - reach, int(place[1]) - reach
     window = np.s_[y : y + 2 * reach + 1, x : x + 2 * reach + 1]
     ground, middle = picture[window].astype(np.float32), reach + rng.random(2)
-    sides = np.array([size_px, settings.width * size_px])
+    drawn = settings.drawn
+    sides = np.array([size_px, drawn.width * size_px])
     turn_deg = float(rng.uniform(0, 180))
     body, band, shadow = (
         _rectangle(len(ground), centre, size, turn_deg)[..., None]
-        for centre, size in ((middle, sides), (middle, sides * _BAND), (middle + _SHADOW_PX * size_px, sides))
+        for centre, size in ((middle, sides), (middle, sides * drawn.band), (middle + drawn.shadow * size_px, sides))
     )
-    thing = _COLOURS[rng.integers(len(_COLOURS))] * (1 - _BAND_SHADE * band) + rng.normal(0, 2.0, ground.shape)
-    under = ground * (1 - _SHADE * contrast * shadow)
+    thing = _COLOURS[rng.integers(len(_COLOURS))] * (1 - drawn.band_shade * band) + rng.normal(0, 2.0, ground.shape)
+    under = ground * (1 - drawn.shade * contrast * shadow)
     painted = under * (1 - body) + body * (ground + contrast * (thing - ground))
     picture[window] = np.clip(np.rint(painted), 0, 255).astype(np.uint8)
     return window, np.asarray(body[..., 0] > 0.5)
