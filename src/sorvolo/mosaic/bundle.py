@@ -5,17 +5,17 @@ projected into the new one; the miss in pixels is the residual. Residuals are in
 the whole map would gain by shrinking to a point.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.sparse import coo_matrix, csc_matrix
-from scipy.sparse.linalg import splu
+from scipy.sparse import csc_matrix
 
 from sorvolo.geometry.arrays import Floats, Rows
 from sorvolo.geometry.pose import rotation_from_vector
+from sorvolo.mosaic.normal_equations import NormalEquations, factorised
 
 SHARED = (
     "log_focal", "radial", "altitude_offset_m", "east_offset_m", "north_offset_m",
@@ -26,6 +26,7 @@ the calibration left over, the constant offsets of the altitude's zero and of GP
 turn of the camera, about its own axes, against the attitude that telemetry states (mounting, gimbal, compass)."""
 
 
+_LINKS_AT_ONCE = 256  # some megabytes of derivatives
 _STEPS_AS_ONE = 4  # of the whole map at once, before its cameras move one by one
 
 
@@ -55,9 +56,14 @@ class Pairs:
     sigma_px: Floats  # (L,) across the parallax
     sigma_relief_m: Floats  # (L,) height of things above the ground, from what residuals along the parallax show
 
-    def of(self, chosen: NDArray[np.bool_]) -> "Pairs":
+    def of(self, chosen: Rows | slice) -> "Pairs":
         """The pairs of some links only."""
         return Pairs(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+
+    def batches(self) -> "Iterator[Pairs]":
+        """Some links after the others, so few at once that their derivatives stay small, however long the flight."""
+        for first in range(0, len(self.old), _LINKS_AT_ONCE):
+            yield self.of(slice(first, first + _LINKS_AT_ONCE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +76,14 @@ class Ground:
     focal_px: Floats  # (M,)
     sigma_px: Floats  # (M,) of the mark
     sigma_m: Floats  # (M,) of the place
+
+    def among(self, nodes: Rows) -> "Ground":
+        """The points of some nodes, sorted, which are counted from 0 as they are listed."""
+        if not len(self.node):
+            return self
+        theirs = np.isin(self.node, nodes)
+        picked = Ground(*(getattr(self, name)[theirs] for name in self.__dataclass_fields__))
+        return replace(picked, node=np.searchsorted(nodes, picked.node))
 
 
 NO_GROUND = Ground(np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0))
@@ -280,83 +294,40 @@ def _move_as_one(nodes: Nodes, middle_m: Floats, step: Floats) -> Nodes:
     return replace(nodes, rotations=rotations, centres_m=centres_m)
 
 
-class _Assembly:
-    """The normal equations while terms are added: blocks of the matrix, the gradient, the cost."""
-
-    def __init__(self, cameras: int) -> None:
-        self.shared_at = 6 * cameras
-        self.cost = 0.0
-        self.gradient = np.zeros(self.shared_at + len(SHARED))
-        self._rows: list[Rows] = []
-        self._columns: list[Rows] = []
-        self._values: list[Floats] = []
-
-    def scatter(self, row_start: Rows, column_start: Rows, blocks: Floats) -> None:
-        """Add blocks (n, h, w) at rows and columns (n,); those at a negative place belong to held unknowns."""
-        keep = (row_start >= 0) & (column_start >= 0)
-        height, width = blocks.shape[1:]
-        r = row_start[keep, None, None] + np.arange(height)[None, :, None]
-        c = column_start[keep, None, None] + np.arange(width)[None, None, :]
-        self._rows.append(np.broadcast_to(r, (len(r), height, width)).ravel())
-        self._columns.append(np.broadcast_to(c, (len(c), height, width)).ravel())
-        self._values.append(blocks[keep].ravel())
-
-    def gather(self, start: Rows, blocks: Floats) -> None:
-        """Add blocks (n, h) to the gradient at rows (n,)."""
-        keep = start >= 0
-        np.add.at(self.gradient, start[keep, None] + np.arange(blocks.shape[1]), blocks[keep])
-
-    def add(self, jacobian: Floats, residual: Floats, places: Sequence[tuple[Rows, slice]]) -> None:
-        """Add whitened, weighted rows: `jacobian` (n, r, w), `residual` (n, r); `places` says where columns belong."""
-        information = jacobian.transpose(0, 2, 1) @ jacobian
-        pull = -np.einsum("nri,nr->ni", jacobian, residual)
-        for start_a, a in places:
-            self.gather(start_a, pull[:, a])
-            for start_b, b in places:
-                self.scatter(start_a, start_b, information[:, a, b])
-
-    def matrix(self) -> csc_matrix:
-        """The information matrix so far."""
-        size = len(self.gradient)
-        places = np.concatenate(self._rows), np.concatenate(self._columns)
-        return coo_matrix((np.concatenate(self._values), places), shape=(size, size)).tocsc()
-
-
 def _normal_equations(
     problem: _Problem, nodes: Nodes, shared: Floats, free: NDArray[np.bool_]
 ) -> tuple[float, csc_matrix, Floats, Rows]:
     position = np.full(len(free), -1)
     position[free] = np.arange(int(free.sum()))
-    into = _Assembly(int(free.sum()))
+    into = NormalEquations(int(free.sum()), len(SHARED))
     if len(problem.pairs.old):
         _add_links(into, nodes, problem.pairs, shared, position, problem.robust_sigmas)
     if len(problem.ground.node):
         _add_ground(into, nodes, problem.ground, shared, position, problem.robust_sigmas)
     _add_telemetry(into, nodes, shared, position, problem.robust_sigmas)
     _add_shared_priors(into, shared, problem.shared_sigma)
-    return into.cost, into.matrix(), into.gradient, position
+    return into.cost, into.matrix(), into.gradient(), position
 
 
 def _add_links(
-    into: _Assembly, nodes: Nodes, pairs: Pairs, shared: Floats, position: Rows, robust: float
+    into: NormalEquations, nodes: Nodes, pairs: Pairs, shared: Floats, position: Rows, robust: float
 ) -> None:
-    line = linearise(nodes, pairs, shared)
-    white = whiten(line, pairs)
-    residual = np.einsum("lkij,lkj->lki", white, line.residual_px)
-    weight = pairs.weight * line.seen
-    squared = (residual**2).sum(-1) / robust**2
-    into.cost += float((weight * np.log1p(squared)).sum()) * robust**2
-    root = np.sqrt(weight / (1 + squared))[..., None]
-    residual = (residual * root).reshape(len(pairs.old), -1)
-    jacobian = np.concatenate([line.by_old, line.by_new, line.by_shared], axis=-1)
-    jacobian = (white @ jacobian * root[..., None]).reshape(len(pairs.old), residual.shape[1], -1)
-    old_at, new_at = _start(position[pairs.old]), _start(position[pairs.new])
-    shared_at = np.full(len(old_at), into.shared_at)
-    into.add(jacobian, residual, ((old_at, slice(0, 6)), (new_at, slice(6, 12)), (shared_at, slice(12, 14))))
+    for some in pairs.batches():
+        line = linearise(nodes, some, shared)
+        white = whiten(line, some)
+        residual = np.einsum("lkij,lkj->lki", white, line.residual_px)
+        weight = some.weight * line.seen
+        squared = (residual**2).sum(-1) / robust**2
+        into.cost += float((weight * np.log1p(squared)).sum()) * robust**2
+        root = np.sqrt(weight / (1 + squared))[..., None]
+        residual = (residual * root).reshape(len(some.old), -1)
+        jacobian = np.concatenate([line.by_old, line.by_new, line.by_shared], axis=-1)
+        jacobian = (white @ jacobian * root[..., None]).reshape(len(some.old), residual.shape[1], -1)
+        into.add(jacobian, residual, (position[some.old], position[some.new]))
 
 
 def _add_ground(
-    into: _Assembly, nodes: Nodes, ground: Ground, shared: Floats, position: Rows, robust: float
+    into: NormalEquations, nodes: Nodes, ground: Ground, shared: Floats, position: Rows, robust: float
 ) -> None:
     rows = linearise_ground(nodes, ground, shared)
     residual = rows.residual_px / rows.sigma_px[:, None]
@@ -364,25 +335,21 @@ def _add_ground(
     into.cost += float((rows.seen * np.log1p(squared)).sum()) * robust**2
     root = np.sqrt(rows.seen / (1 + squared))[:, None]
     jacobian = np.concatenate([rows.by_camera, rows.by_shared], axis=-1) / rows.sigma_px[:, None, None]
-    camera_at = _start(position[ground.node])
-    shared_at = np.full(len(camera_at), into.shared_at)
-    into.add(jacobian * root[..., None], residual * root, ((camera_at, slice(0, 6)), (shared_at, slice(6, 8))))
+    into.add(jacobian * root[..., None], residual * root, (position[ground.node],))
 
 
-def _add_shared_priors(into: _Assembly, shared: Floats, shared_sigma: Floats) -> None:
+def _add_shared_priors(into: NormalEquations, shared: Floats, shared_sigma: Floats) -> None:
     held = shared_sigma <= 0
     prior = np.where(held, 1e12, 1 / np.maximum(shared_sigma, 1e-12) ** 2)
-    at = np.array([into.shared_at])
-    into.scatter(at, at, np.diag(prior)[None])
-    into.gradient[into.shared_at:] -= np.where(held, 0.0, prior * shared)
-    into.gradient[into.shared_at:][held] = 0.0
+    into.add_shared(np.diag(prior), np.where(held, 0.0, -prior * shared))
+    into.hold_shared(held)
     into.cost += float(np.where(held, 0.0, prior * shared**2).sum())
 
 
-def _add_telemetry(into: _Assembly, nodes: Nodes, shared: Floats, position: Rows, robust: float) -> None:
-    index = np.flatnonzero(position >= 0)
-    start = 6 * position[index]
-    shared_start = np.full(len(index), into.shared_at)
+def _add_telemetry(into: NormalEquations, nodes: Nodes, shared: Floats, position: Rows, robust: float) -> None:
+    index = np.flatnonzero(position >= 0)  # in the order of their positions
+    blocks, coupling = np.zeros((len(index), 6, 6)), np.zeros((len(index), 6, len(SHARED)))
+    own, shared_pull = np.zeros((len(SHARED), len(SHARED))), np.zeros(len(SHARED))
     # place: GPS belongs to the camera, up to the offsets that the flight shares
     root = 1 / nodes.prior_sigma_m[index]
     miss = nodes.centres_m[index] + shared[[3, 4, 2]] - nodes.prior_centres_m[index]
@@ -390,16 +357,11 @@ def _add_telemetry(into: _Assembly, nodes: Nodes, shared: Floats, position: Rows
     squared = np.column_stack([(white[:, :2] ** 2).sum(1), (white[:, :2] ** 2).sum(1), white[:, 2] ** 2]) / robust**2
     into.cost += float((np.log1p(squared[:, 1]) + np.log1p(squared[:, 2])).sum()) * robust**2
     information = root**2 / (1 + squared)
-    blocks = np.zeros((len(index), 6, 6))
     blocks[:, [3, 4, 5], [3, 4, 5]] = information
-    coupling = np.zeros((len(index), 6, 8))
     coupling[:, [3, 4, 5], [3, 4, 2]] = information
-    own = np.zeros((len(index), 8, 8))
-    own[:, [3, 4, 2], [3, 4, 2]] = information
-    pull = -information * miss
-    into.gather(start, np.concatenate([np.zeros_like(pull), pull], axis=1))
-    shared_pull = np.zeros((len(index), 8))
-    shared_pull[:, [3, 4, 2]] = pull
+    own[[3, 4, 2], [3, 4, 2]] = information.sum(axis=0)
+    shift_pull = -information * miss
+    shared_pull[[3, 4, 2]] = shift_pull.sum(axis=0)
     # attitude, about the camera's own axes
     rotation = nodes.rotations[index]
     relative = nodes.prior_rotations[index].transpose(0, 2, 1) @ rotation
@@ -410,15 +372,11 @@ def _add_telemetry(into: _Assembly, nodes: Nodes, shared: Floats, position: Rows
     information = root**2 / (1 + squared)
     blocks[:, :3, :3] = (rotation * information[:, None, :]) @ rotation.transpose(0, 2, 1)
     turn_pull = -np.einsum("nij,nj->ni", rotation, information * error)
-    into.gather(start, np.concatenate([turn_pull, np.zeros_like(turn_pull)], axis=1))
     coupling[:, :3, 5:] = -rotation * information[:, None, :]
-    own[:, [5, 6, 7], [5, 6, 7]] = information
-    shared_pull[:, 5:] = information * error
-    into.gather(shared_start, shared_pull)
-    into.scatter(start, shared_start, coupling)
-    into.scatter(shared_start, start, coupling.transpose(0, 2, 1))
-    into.scatter(shared_start, shared_start, own)
-    into.scatter(start, start, blocks)
+    own[[5, 6, 7], [5, 6, 7]] = information.sum(axis=0)
+    shared_pull[5:] = (information * error).sum(axis=0)
+    into.add_cameras(blocks, coupling, np.concatenate([turn_pull, shift_pull], axis=1))
+    into.add_shared(own, shared_pull)
 
 
 def _damped_step(normal: csc_matrix, gradient: Floats, damping: float) -> Floats:
@@ -431,7 +389,7 @@ def _damped_step(normal: csc_matrix, gradient: Floats, damping: float) -> Floats
             return cho_solve(cho_factor(damped.toarray(), check_finite=False), gradient, check_finite=False)
         except LinAlgError:
             pass  # not positive definite by a hair: the sparse LU below copes
-    return splu(damped, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(gradient)
+    return factorised(damped).solve(gradient)
 
 
 def _advance(nodes: Nodes, shared: Floats, step: Floats, position: Rows) -> tuple[Nodes, Floats]:
@@ -448,10 +406,6 @@ def _advance(nodes: Nodes, shared: Floats, step: Floats, position: Rows) -> tupl
     shift[:, 2] = np.clip(shift[:, 2], -limit, limit)  # a camera may not dive through the ground in one step
     centres[index] += shift
     return replace(nodes, rotations=rotations, centres_m=centres), shared + step[6 * len(index):]
-
-
-def _start(position: Rows) -> Rows:
-    return np.where(position >= 0, 6 * position, -1)
 
 
 def _times_cross(rows: Floats, vector: Floats) -> Floats:

@@ -105,15 +105,16 @@ class NodeRows:
         self.prior_centres_m[at], self.stated_sigma_m[at] = prior.position_m, prior.position_sigma_m
         self.prior_rotations[at], self.stated_sigma_rad[at] = prior.rotation, np.radians(prior.attitude_sigma_deg)
 
-    def nodes(self, place: Floats, attitude: Floats, contradicted: Rows) -> Nodes:
-        """For the solver: stated sigmas times `place` and `attitude`, (3,) each, no angles where contradicted."""
-        sigma_m, sigma_rad = self.stated_sigma_m * place, self.stated_sigma_rad * attitude
-        sigma_rad[contradicted] = np.inf
+    def nodes(self, place: Floats, attitude: Floats, contradicted: Rows, at: Rows | slice = slice(None)) -> Nodes:
+        """For the solver: stated sigmas times `place` and `attitude`, (3,) each, no angles where contradicted; all
+        nodes, or those `at` some rows."""
+        sigma_m, sigma_rad = self.stated_sigma_m[at] * place, self.stated_sigma_rad[at] * attitude
+        sigma_rad[np.isin(np.arange(len(self))[at], contradicted)] = np.inf
         return Nodes(
-            self.rotations, self.centres_m, self.prior_centres_m,
+            self.rotations[at], self.centres_m[at], self.prior_centres_m[at],
             np.where(np.isfinite(sigma_m), np.maximum(sigma_m, 1e-3), _UNKNOWN_SIGMA_M),
-            self.prior_rotations, np.where(np.isfinite(sigma_rad), np.maximum(sigma_rad, 1e-4), _UNKNOWN_SIGMA_M),
-            self.own,
+            self.prior_rotations[at], np.where(np.isfinite(sigma_rad), np.maximum(sigma_rad, 1e-4), _UNKNOWN_SIGMA_M),
+            self.own[at],
         )
 
 

@@ -1,13 +1,13 @@
 """The pose graph: keyframes come in one at a time with their links, and the ones that moved come out."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csc_matrix
+from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU
 
 from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Rows
 from sorvolo.geometry.camera import Camera
@@ -25,17 +25,16 @@ from sorvolo.mosaic.bundle import (
     Ground,
     Nodes,
     Solution,
-    linearise,
     linearise_ground,
-    rotation_vector,
     solve,
 )
 from sorvolo.mosaic.graph_rows import LinkRows, NodeRows
+from sorvolo.mosaic.graph_weights import LinkNoise, Trust, link_noise, miss_px, telemetry_trust
 from sorvolo.mosaic.ground_ties import GroundTies, similarity_of_most
+from sorvolo.mosaic.normal_equations import factorised
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
 
-_ENOUGH = 8  # frames from which telemetry's own errors are learnt
 _OFFSET_GROUPS = ((2,), (5, 6), (7,))  # of SHARED: altitude's zero, tilt, heading; judged together
 _OFFSETS = tuple(k for group in _OFFSET_GROUPS for k in group)
 # prior sigma of an offset that is taken as telemetry reports it
@@ -43,6 +42,7 @@ _AS_REPORTED_SIGMA = np.array([np.inf, np.inf, 0.1, np.inf, np.inf, 0.002, 0.002
 _CALIBRATED = 0.005  # relative: a focal length known so well is held
 _RADIAL_SIGMA = 0.03  # of a lens that nobody calibrated
 _FREE_M = 1e4  # a zero of heights that nothing is known of
+_STRAINED = 3.0  # times the noise that is believed of a link: the ground around it cannot be laid without bending more
 _GPS_OFFSET_M = 5.0  # of a receiver, the same all flight
 _TILT_OFFSET_DEG = 2.0  # a gimbal's zero, or a camera's mount
 _HEADING_OFFSET_DEG = 5.0  # a drone's compass beside its motors
@@ -56,6 +56,7 @@ class PoseGraphSettings:
     independent_pairs: float = 20.0  # matches of one link share lens and relief errors: they count as so many
     sigma_px: float = 0.3  # floor of a match's noise; calibration and rolling shutter never are better
     window: int = 6  # recent keyframes freed by each local solve
+    region: int = 120  # keyframes; a larger flight is solved around its newest ones only, until it ends or is strained
     focal_sigma: float = 0.0  # relative; 0 holds the focal length
     radial_sigma: float = 0.0  # prior of the left-over radial distortion; 0 holds it
     altitude_offset_sigma_m: float = 1.0  # how well the altitude's zero is known to be the ground
@@ -100,15 +101,6 @@ class GraphReport:
     turned_deg: tuple[float, float] = (0.0, 0.0)  # tilt and heading that all stated angles are off by
 
 
-@dataclass(frozen=True, eq=False)
-class _Trust:
-    """Factors on telemetry's stated sigmas, (3,) each, and the nodes whose angles are plainly wrong."""
-
-    place: Floats = field(default_factory=lambda: np.ones(3))
-    attitude: Floats = field(default_factory=lambda: np.ones(3))
-    contradicted: Rows = field(default_factory=lambda: np.zeros(0, int))
-
-
 @dataclass(eq=False)
 class _Node:
     camera: Camera
@@ -132,8 +124,9 @@ class PoseGraph:
         self._links = LinkRows(settings.pairs_per_link, settings.independent_pairs)
         self._shared = np.zeros(len(SHARED))
         self._dropped = 0
-        self._solved_at = 0
-        self._trust = _Trust()
+        self._solved_at = self._region_solved_at = 0
+        self._is_strained = False
+        self._trust = Trust()
         self._as_reported = np.zeros(len(SHARED), bool)
         self._ground = NO_GROUND
         self._ground_common_m = 0.0
@@ -224,15 +217,18 @@ class PoseGraph:
         free[-self._settings.window:] = True
         free[[self._ids[each.old_id] for each in links]] = True
         free &= self._own()
-        self._solve(free, shared=False, iterations=2)
+        self._solve_around(free, iterations=2)
         if self._due():
             return self.settle(iterations=3)
-        touched = np.flatnonzero(free)
-        return self._moved(touched)
+        grown, region = len(self._nodes) - self._region_solved_at, self._settings.region
+        if len(self._nodes) > region and grown >= max(1, region // 8):
+            return self._settle_region()
+        return self._moved(np.flatnonzero(free))
 
     def settle(self, iterations: int = 8) -> frozenset[int]:
         """Solve everything at once: align to GPS, weigh links by what they show, drop false ones."""
-        self._solved_at = len(self._nodes)
+        self._solved_at = self._region_solved_at = len(self._nodes)
+        self._is_strained = False
         self._align()
         self._solve(self._own(), shared=True, iterations=iterations)
         self._weigh_links()
@@ -286,7 +282,7 @@ class PoseGraph:
         if self._settings.focal_sigma > 0:
             unit = np.zeros(size)
             unit[size - len(SHARED)] = 1.0
-            sigma = float(np.sqrt(max(0.0, _solve_sparse(solution.normal, unit)[size - len(SHARED)])))
+            sigma = float(np.sqrt(max(0.0, factorised(solution.normal).solve(unit)[size - len(SHARED)])))
         rms = np.array([value for value in self.residuals_px().values() if np.isfinite(value)])
         return GraphReport(
             float(np.exp(self._shared[0])), sigma, float(self._shared[1]), float(self._shared[2]), len(self._links),
@@ -301,8 +297,7 @@ class PoseGraph:
         if not len(self._links):
             return result
         pairs = self._links.pairs()
-        miss = np.linalg.norm(linearise(self._state(), pairs, self._shared).residual_px, axis=-1)
-        miss[pairs.weight <= 0] = np.nan
+        miss = miss_px(self._state(), pairs, self._shared)
         gathered: dict[int, list[Floats]] = {}
         for row, ends in enumerate(zip(pairs.old.tolist(), pairs.new.tolist(), strict=True)):
             for at in ends:
@@ -317,19 +312,8 @@ class PoseGraph:
         solution = self._solve(own, shared=True, iterations=0)
         index = np.flatnonzero(own)
         sample = index if len(index) <= 250 else index[np.linspace(0, len(index) - 1, 250).round().astype(int)]
-        size = solution.normal.shape[0]
-        right = np.zeros((size, 2 * len(sample)))
-        blocks = []
-        for k, at in enumerate(sample):
-            block = self._ground_centre_jacobian(at)
-            start = 6 * solution.position[at]
-            right[start:start + 6, 2 * k:2 * k + 2] = block.T
-            blocks.append((start, block))
-        answer = _solve_sparse(solution.normal, right)
-        found = [
-            float(np.sqrt(max(0.0, np.trace(block @ answer[start:start + 6, 2 * k:2 * k + 2]) / 2)))
-            for k, (start, block) in enumerate(blocks)
-        ]
+        factors = factorised(solution.normal)
+        found = [self._ground_sigma_m(at, 6 * int(solution.position[at]), factors) for at in sample.tolist()]
         every = np.interp(index, sample, found) if len(sample) else np.zeros(0)
         return {self._names[at]: float(value) for at, value in zip(index, every, strict=True)}
 
@@ -370,22 +354,71 @@ class PoseGraph:
     def _own(self) -> NDArray[np.bool_]:
         return self._rows.own
 
-    def _state(self) -> Nodes:
-        return self._rows.nodes(self._trust.place, self._trust.attitude, self._trust.contradicted)
+    def _state(self, at: Rows | slice = slice(None)) -> Nodes:
+        """All nodes, or some of them."""
+        return self._rows.nodes(self._trust.place, self._trust.attitude, self._trust.contradicted, at)
 
     def _gps_miss_m(self) -> Floats:
         return self._rows.centres_m + self._shared[[3, 4, 2]] - self._rows.prior_centres_m
 
     def _solve(self, free: NDArray[np.bool_], *, shared: bool, iterations: int) -> Solution:
         pairs = self._links.pairs()
-        if len(pairs.old):
-            pairs = pairs.of(free[pairs.old] | free[pairs.new])
         sigma = self._shared_sigma() if shared else np.zeros(len(SHARED))
         solution = solve(self._state(), pairs, self._shared, sigma, free, iterations, ground=self._weighed_ground())
         if iterations:
             self._rows.rotations[:], self._rows.centres_m[:] = solution.nodes.rotations, solution.nodes.centres_m
             self._shared = solution.shared
         return solution
+
+    def _solve_around(self, free: NDArray[np.bool_], iterations: int) -> Rows:
+        """Move the free nodes, (N,) bool, among those that they have links with; the links (L,) that took part.
+
+        It costs the same however long the flight is.
+        """
+        chosen = self._links_of(free)
+        pairs = self._links.pairs().of(chosen)
+        near = np.unique(np.concatenate([np.flatnonzero(free), pairs.old, pairs.new]))
+        few = replace(pairs, old=np.searchsorted(near, pairs.old), new=np.searchsorted(near, pairs.new))
+        solution = solve(
+            self._state(near), few, self._shared, np.zeros(len(SHARED)), free[near], iterations,
+            ground=self._weighed_ground().among(near),
+        )
+        self._rows.rotations[near], self._rows.centres_m[near] = solution.nodes.rotations, solution.nodes.centres_m
+        return chosen
+
+    def _settle_region(self) -> frozenset[int]:
+        """Solve the ground around the newest keyframe, learn the noise of its links, and see whether it is strained."""
+        self._region_solved_at = len(self._nodes)
+        free = self._around_newest(self._settings.region) & self._own()
+        chosen = self._solve_around(free, iterations=3)
+        if not len(chosen):
+            return self._moved(np.flatnonzero(free))
+        noise = link_noise(self._state(), self._links.pairs().of(chosen), self._shared)
+        usual_px = float(np.median(self._links.sigma_px))
+        false = noise.is_false(usual_px)  # perhaps: the whole map is solved before one is dropped
+        believed_px = np.maximum(self._links.sigma_px[chosen], usual_px)
+        self._is_strained |= bool((noise.across_px > _STRAINED * believed_px).any())
+        self._weigh(chosen[~false], noise, ~false)
+        self._weigh_telemetry()
+        return self._moved(np.flatnonzero(free))
+
+    def _around_newest(self, most: int) -> NDArray[np.bool_]:
+        """(N,) the newest node and those that the fewest links part from it, the newer first, `most` in all."""
+        old, new = self._links.old, self._links.new
+        reached = np.zeros(len(self._nodes), bool)
+        reached[-1] = True
+        while True:
+            wider = reached.copy()
+            wider[old[reached[new]]] = wider[new[reached[old]]] = True
+            ring = np.flatnonzero(wider & ~reached)
+            room = most - int(reached.sum())
+            if not len(ring) or room <= 0:
+                return reached
+            reached[ring[-room:]] = True
+
+    def _links_of(self, free: NDArray[np.bool_]) -> Rows:
+        """The links that a free node, (N,) bool, has."""
+        return np.flatnonzero(free[self._links.old] | free[self._links.new])
 
     def _weighed_ground(self) -> Ground:
         """The ties to known ground, their sigmas as large as most of them miss by now: else none would pull."""
@@ -417,13 +450,14 @@ class PoseGraph:
         solution = self._solve(self._own(), shared=True, iterations=0)
         size = solution.normal.shape[0]
         first = size - len(SHARED)
+        factors = factorised(solution.normal)
         silent = set()
         for k in _OFFSETS:
             if not 0 < sigma[k] < 100.0:
                 continue
             unit = np.zeros(size)
             unit[first + k] = 1.0
-            variance = max(float(_solve_sparse(solution.normal, unit)[first + k]), 1e-30)
+            variance = max(float(factors.solve(unit)[first + k]), 1e-30)
             information = 1 / variance - 1 / sigma[k] ** 2  # of the flight alone, without the prior
             estimate = self._shared[k] / variance / information if information > 0 else 0.0
             if estimate**2 * max(information, 0.0) <= 4.0:
@@ -433,9 +467,11 @@ class PoseGraph:
                 self._as_reported[list(group)] = True
 
     def _due(self) -> bool:
-        """Whether it is time for a global solve: often at first, then with each tenth more; loops bend the map."""
-        grown = len(self._nodes) - self._solved_at
-        return grown >= max(4, len(self._nodes) // 6)
+        """Whether it is time to solve everything: often at first; of a large flight only where its newest ground is
+        strained, as it is after a loop without fixes."""
+        if len(self._nodes) > self._settings.region and not self._is_strained:
+            return False
+        return len(self._nodes) - self._solved_at >= max(4, len(self._nodes) // 6)
 
     def _align(self) -> None:
         """Bring the whole map to known ground, else to its GPS fixes, by a similarity where it is far off: the solve
@@ -509,58 +545,24 @@ class PoseGraph:
         """Learn each link's noise across the parallax and the relief along it; drop links that cannot be true."""
         if not len(self._links):
             return
-        pairs = self._links.pairs()
-        line = linearise(self._state(), pairs, self._shared)
-        length = np.linalg.norm(line.parallax, axis=-1)
-        along = line.parallax / np.maximum(length, 1e-9)[..., None]
-        miss_along = np.abs((line.residual_px * along).sum(-1))
-        miss_across = np.abs(line.residual_px[..., 0] * along[..., 1] - line.residual_px[..., 1] * along[..., 0])
-        unused = pairs.weight <= 0
-        with np.errstate(all="ignore"):
-            sigma_across = 1.4826 * np.nanmedian(np.where(unused, np.nan, miss_across), axis=1)
-            sigma_along = 1.4826 * np.nanmedian(np.where(unused, np.nan, miss_along), axis=1)
-            reach = np.nanmedian(np.where(unused, np.nan, length), axis=1)
-        relief = np.sqrt(np.maximum(sigma_along**2 - sigma_across**2, 0)) / np.maximum(reach, 1e-6)
-        overall = float(np.median(relief))
-        self._links.relief_m[:] = np.clip(np.sqrt(0.5 * (relief**2 + overall**2)), 0.0, 5.0)
-        self._links.sigma_px[:] = np.clip(sigma_across, self._settings.sigma_px, 5.0)
-        typical = float(np.median(sigma_across))
-        false = sigma_across > max(6.0, 8 * typical)
+        noise = link_noise(self._state(), self._links.pairs(), self._shared)
+        every = np.arange(len(self._links))
+        self._weigh(every, noise, np.ones(len(every), bool))
+        false = noise.is_false(float(np.median(noise.across_px)))
         if false.any():
             self._dropped += int(false.sum())
             self._links.keep(~false)
 
-    def _weigh_telemetry(self) -> None:
-        """Learn how good telemetry really is from how it departs from the pictures, once there are enough of them.
+    def _weigh(self, links: Rows, noise: LinkNoise, chosen: NDArray[np.bool_]) -> None:
+        """Give `links` the noise of those that are `chosen`, their relief half their own and half that of most."""
+        overall = float(np.median(noise.relief_m))
+        self._links.relief_m[links] = np.clip(np.sqrt(0.5 * (noise.relief_m[chosen] ** 2 + overall**2)), 0.0, 5.0)
+        self._links.sigma_px[links] = np.clip(noise.across_px[chosen], self._settings.sigma_px, 5.0)
 
-        Fixes and angles scatter more or less than they claim, and both are scaled to what they show. Angles that
-        are plainly wrong are left out one by one.
-        """
+    def _weigh_telemetry(self) -> None:
         tied = np.zeros(len(self._nodes), bool)
         tied[self._links.old] = tied[self._links.new] = True
-        tied &= self._own()
-        stated_m, stated_rad = self._rows.stated_sigma_m, self._rows.stated_sigma_rad
-        error_rad = rotation_vector(self._rows.prior_rotations.transpose(0, 2, 1) @ self._rows.rotations)
-        size = np.linalg.norm(error_rad, axis=1)
-        angled = np.isfinite(stated_rad[:, 2])
-        contradicted = np.flatnonzero(tied & angled & (size > np.maximum(5 * stated_rad.max(axis=1), np.radians(15))))
-        place, attitude = np.ones(3), np.ones(3)
-        miss_m = self._gps_miss_m()
-        fixed = tied & np.isfinite(stated_m[:, 0])
-        if fixed.sum() >= _ENOUGH:
-            ratio = np.linalg.norm(miss_m[fixed, :2], axis=1) / stated_m[fixed, 0] / 1.1774
-            place[:2] = np.clip(np.median(ratio), 0.5, 20.0)
-        high = tied & np.isfinite(stated_m[:, 2])
-        if high.sum() >= _ENOUGH:
-            place[2] = np.clip(1.4826 * np.median(np.abs(miss_m[high, 2]) / stated_m[high, 2]), 0.5, 20.0)
-        used = tied & angled
-        used[contradicted] = False
-        if used.sum() >= _ENOUGH:
-            scatter = error_rad[used] - np.median(error_rad[used], axis=0)
-            spread = 1.4826 * np.median(np.abs(scatter), axis=0)
-            # pictures see heading well, tilt hardly: a small scatter of tilt only shows that it was believed
-            attitude = np.clip(spread / np.median(stated_rad[used], axis=0), [1.0, 1.0, 0.25], 5.0)
-        self._trust = _Trust(place, attitude, contradicted)
+        self._trust = telemetry_trust(self._rows, tied & self._own(), self._gps_miss_m())
 
     def _moved(self, candidates: Iterable[int]) -> frozenset[int]:
         moved = set()
@@ -573,6 +575,13 @@ class PoseGraph:
                 node.reported_m = outline
                 moved.add(self._names[at])
         return frozenset(moved)
+
+    def _ground_sigma_m(self, at: int, start: int, factors: SuperLU) -> float:
+        """One sigma of the ground point at a node's image centre, per axis; its unknowns begin at `start`."""
+        block = self._ground_centre_jacobian(at)
+        right = np.zeros((factors.shape[0], 2))
+        right[start:start + 6] = block.T
+        return float(np.sqrt(max(0.0, np.trace(block @ factors.solve(right)[start:start + 6]) / 2)))
 
     def _ground_centre_jacobian(self, at: int) -> Floats:
         """(2, 6) how the ground point at the image's centre moves with the camera's turn and shift."""
@@ -597,7 +606,3 @@ def pose_from_link(each: Link, new: Camera, old: Camera, site_from_old: Pose) ->
     site_from_new = site_from_image_homography(old, site_from_old) @ np.linalg.inv(each.new_from_old)
     centre = site_from_new @ np.array([new.cx_px, new.cy_px, 1.0])
     return pose_from_homography(site_from_new * np.sign(centre[2]), new)
-
-
-def _solve_sparse(normal: csc_matrix, right: Floats) -> Floats:
-    return splu(normal, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(right)
