@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from sorvolo.errors import InputError, SettingsError, StoreError
-from sorvolo.geometry.arrays import ImageRGB, ImageRGBA
-from sorvolo.geometry.grid import SiteGrid, TileIndex
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.grid import SiteGrid
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
@@ -17,7 +17,7 @@ from sorvolo.store.site.files import SiteFiles
 from sorvolo.store.site.flight_writer import FlightWriter
 from sorvolo.store.site.names import is_plain_name
 from sorvolo.store.site.object_records import StoredObject, StoredSearch
-from sorvolo.store.site.tiles import GrowingTiles
+from sorvolo.store.site.tiles import GrowingTiles, TileView
 from sorvolo.store.site.upkeep import forget_unfinished, repair
 from sorvolo.survey.findings import Verdict
 from sorvolo.survey.flight import Site
@@ -217,7 +217,7 @@ class Archive:
         """A keyframe's undistorted image; raises StoreError when its flight was mapped again meanwhile."""
         return self._files.image(keyframe.flight_id, keyframe.image_path)
 
-    def tiles(self, version: int | None = None) -> Mapping[TileIndex, ImageRGBA]:
+    def tiles(self, version: int | None = None) -> TileView:
         """The tiles of a version, of the newest complete one by default, read when asked for; {} if none.
 
         Raises StoreError for a version that does not exist.
@@ -228,7 +228,7 @@ class Archive:
             newest = records.newest_version(connection)
         return self._files.tiles(newest if version is None else version)
 
-    def live_tiles(self) -> Mapping[TileIndex, ImageRGBA]:
+    def live_tiles(self) -> TileView:
         """The tiles of the map that is being made, as of its last flush; else of the newest complete one."""
         with self._files.catalogue.reading() as connection:
             version = records.newest_version(connection, complete=False) or records.newest_version(connection)

@@ -122,6 +122,11 @@ class TileView(Mapping[TileIndex, ImageRGBA]):
     ) -> None:
         self._blobs, self._hashes, self._refresh = blobs, dict(hashes), refresh
 
+    @property
+    def hashes(self) -> Mapping[TileIndex, str]:
+        """The SHA-256 of each tile as of when the view was made: what names its content."""
+        return self._hashes
+
     def __getitem__(self, index: TileIndex) -> ImageRGBA:
         """The tile; raises KeyError where there is none and StoreError when its version has been dropped."""
         sha256 = self._hashes[index]

@@ -1,0 +1,143 @@
+"""`sorvolo serve` and `sorvolo token`: the ground station, and who may use it."""
+
+import importlib.util
+import json
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from sorvolo.cli.options import AsJson
+from sorvolo.errors import InputError, SettingsError
+
+if TYPE_CHECKING:
+    from sorvolo.station.settings import StationSettings
+
+_NEEDED = ("fastapi", "uvicorn", "websockets", "titiler.core")
+
+Root = Annotated[Path, typer.Argument(help="Folder that holds the sites; a site folder itself will do.")]
+Host = Annotated[
+    str, typer.Option(help="Address to listen at; others than this machine's own need TLS and tokens.")
+]
+Port = Annotated[int, typer.Option(help="Port to listen at.")]
+Certificate = Annotated[Path | None, typer.Option(help="TLS certificate, PEM.")]
+Key = Annotated[Path | None, typer.Option(help="TLS key, PEM.")]
+InsecureLan = Annotated[bool, typer.Option("--insecure-lan", help="Listen without TLS in a network that you trust.")]
+Names = Annotated[list[str] | None, typer.Option("--name", help="A host name that browsers use. Can be repeated.")]
+StreamFrom = Annotated[
+    list[str] | None,
+    typer.Option(help="Network that streams may be called from, such as 192.168.1.0/24. Can be repeated."),
+]
+FreeFloor = Annotated[float, typer.Option(help="Disk space to leave free, GB: below it nothing new is taken in.")]
+UploadMost = Annotated[float, typer.Option(help="Largest upload, GB.")]
+Opens = Annotated[bool, typer.Option("--open", help="Open the page in a browser.")]
+TokenName = Annotated[str, typer.Argument(help="Who it is for, such as a person's name.", show_default="list tokens")]
+TokenRole = Annotated[str, typer.Option(help="view, review (also judge), or operate (also run missions).")]
+Days = Annotated[float | None, typer.Option(help="Days until it expires.", show_default="never")]
+Revoke = Annotated[bool, typer.Option("--revoke", help="Make the token of this name void.")]
+
+
+def serve(
+    root: Root, host: Host = "127.0.0.1", port: Port = 8750, tls_cert: Certificate = None, tls_key: Key = None,
+    insecure_lan: InsecureLan = False, name: Names = None, stream_from: StreamFrom = None, free_floor: FreeFloor = 2.0,
+    upload_most: UploadMost = 64.0, open_page: Opens = False,
+) -> None:
+    """Serve a folder of sites to browsers: the map while it grows, changes, objects, and what to do with them.
+
+    Only this machine reaches it unless --host states otherwise. Ctrl-C ends it; running missions go on.
+
+    Example: sorvolo serve demo-site --open
+
+    Example: sorvolo serve maps --host 0.0.0.0 --tls-cert cert.pem --tls-key key.pem
+    """
+    _demand_extra()
+    from sorvolo.station.server import run_station
+    from sorvolo.station.settings import StationSettings
+
+    _demand_folder(root)
+    settings = StationSettings(
+        root, host, port, tls_cert, tls_key, insecure_lan, tuple(name or ()), tuple(stream_from or ()), free_floor,
+        upload_most,
+    )
+    console = Console(stderr=True)
+
+    def announce() -> None:
+        _announce(settings, console)
+        if open_page:
+            webbrowser.open(settings.address)
+
+    run_station(settings, announce)
+
+
+def token(
+    root: Root, name: TokenName = "", role: TokenRole = "view", days: Days = None, revoke: Revoke = False,
+    as_json: AsJson = False,
+) -> None:
+    """Make a token for a person or a program, list the tokens, or revoke one.
+
+    A token is printed once; the station keeps a hash of it. From the first one on, everybody needs one.
+
+    Example: sorvolo token maps "Ada" --role review
+    """
+    _demand_extra()
+    from sorvolo.station.settings import STATE_FOLDER
+    from sorvolo.station.state import StationState
+    from sorvolo.station.tokens import list_tokens, make_token, revoke_token
+
+    _demand_folder(root)
+    if revoke and not name:
+        raise SettingsError("--revoke: of which token? give its name; without a name, tokens are listed")
+    state = StationState.open(root / STATE_FOLDER)
+    try:
+        if revoke:
+            revoke_token(state, name)
+            typer.echo(json.dumps({"revoked": name}) if as_json else f"the token of {name} is void")
+        elif name:
+            made = make_token(state, name, role, days)
+            typer.echo(json.dumps({"name": name, "role": role, "token": made}) if as_json else made)
+        else:
+            _show_tokens([(each.name, each.role.lower(), each.made_at, each.expires_at) for each in list_tokens(state)],
+                         as_json=as_json)
+    finally:
+        state.close()
+
+
+def _announce(settings: "StationSettings", console: Console) -> None:
+    console.print(f"station at {settings.address}", soft_wrap=True, highlight=False, markup=False)
+    if not settings.is_loopback and not settings.is_secure:
+        console.print("[yellow]warning[/yellow]  without TLS: who listens in this network can read tokens and maps")
+
+
+def _show_tokens(rows: list[tuple[str, str, str, str | None]], *, as_json: bool) -> None:
+    if as_json:
+        typer.echo(json.dumps([dict(zip(("name", "role", "made_at", "expires_at"), row)) for row in rows], indent=1))
+        return
+    if not rows:
+        typer.echo("no tokens: only this machine reaches the station, and needs none")
+        return
+    table = Table(box=SIMPLE_HEAD, padding=0)
+    for heading in ("name", "role", "made (UTC)", "expires (UTC)"):
+        table.add_column(heading)
+    for name, role, made_at, expires_at in rows:
+        table.add_row(name, role, made_at[:16], (expires_at or "never")[:16])
+    Console().print(table)
+
+
+def _demand_folder(root: Path) -> None:
+    if not root.is_dir():
+        raise InputError(f"no such folder: {root}; `sorvolo demo` makes one with a site in it")
+
+
+def _demand_extra() -> None:
+    """Raise SettingsError where the packages of the station are not installed."""
+    for name in _NEEDED:
+        try:
+            is_there = importlib.util.find_spec(name) is not None
+        except ModuleNotFoundError:
+            is_there = False
+        if not is_there:
+            raise SettingsError("the station needs more packages; install them: pip install 'sorvolo[station]'")

@@ -1,0 +1,182 @@
+"""The station as one web application: its parts joined, its routes, the page."""
+
+import os
+import shutil
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Body, Depends, FastAPI, Request, Response
+from fastapi.responses import FileResponse, JSONResponse
+from starlette.staticfiles import StaticFiles
+
+from sorvolo import __version__
+from sorvolo.station.event_routes import event_routes
+from sorvolo.station.events import EventLog
+from sorvolo.station.problems import Problem, answer_problems
+from sorvolo.station.security import COOKIE, Doorkeeper, holder_in, needs
+from sorvolo.station.settings import StationSettings
+from sorvolo.station.sites import SiteShelf, readable, site_detail
+from sorvolo.station.state import StationState
+from sorvolo.station.tiles import WebTiles
+from sorvolo.station.tokens import Role
+
+PAGE_FOLDER = Path(__file__).parent / "page"
+_FOR_EVER = "public, max-age=31536000, immutable"
+_UPLOADS = "/api/uploads"
+
+
+@dataclass(frozen=True)
+class Station:
+    """What all routes share."""
+
+    settings: StationSettings
+    state: StationState
+    shelf: SiteShelf
+    tiles: WebTiles
+    events: EventLog
+
+    @classmethod
+    def open(cls, settings: StationSettings) -> "Station":
+        """Open the station's own files. Raises StoreError where they cannot be used."""
+        state, shelf = StationState.open(settings.state_folder), SiteShelf(settings.root)
+        return cls(settings, state, shelf, WebTiles(shelf), EventLog(state))
+
+    def close(self) -> None:
+        """Close every file."""
+        self.shelf.close()
+        self.state.close()
+
+
+def station_app(settings: StationSettings) -> FastAPI:
+    """The application that serves the sites below the settings' root. Raises StoreError as `Station.open`."""
+    station = Station.open(settings)
+
+    @asynccontextmanager
+    async def while_it_runs(_: FastAPI) -> AsyncIterator[None]:
+        yield
+        station.close()
+
+    app = FastAPI(
+        title="Sorvolo station", version=__version__, lifespan=while_it_runs, docs_url=None, redoc_url=None,
+        description="Maps from small drones while they fly, what changed, what was found.",
+    )
+    app.state.station = station
+    answer_problems(app)
+    for router in (_about_routes(station), _site_routes(station), event_routes(station.events)):
+        app.include_router(router)
+    _serve_page(app)
+    app.add_middleware(Doorkeeper, settings=settings, state=station.state, upload_path=_UPLOADS)
+    return app
+
+
+def _about_routes(station: Station) -> APIRouter:
+    router = APIRouter(tags=["station"])
+
+    @router.get("/api/status")
+    def status(request: Request) -> dict[str, Any]:
+        """The station at a glance."""
+        free = shutil.disk_usage(station.settings.root).free
+        holder = holder_in(request)
+        return {
+            "version": __version__, "role": holder.role.word, "name": holder.name,
+            "sites": len(station.shelf.folders()), "memory_mb": _memory_mb(), "disk_free_gb": round(free / 1e9, 2),
+            "disk_floor_gb": station.settings.free_floor_gb, "units_default": "metric",
+            "last_event": station.events.last,
+        }
+
+    @router.post("/api/session")
+    async def log_in(request: Request, token: Annotated[str, Body(embed=True, max_length=200)]) -> JSONResponse:
+        """Exchange a token for a cookie that scripts cannot read."""
+        holder = await _doorkeeper(request).look_at(token, request.client.host if request.client else "")
+        if holder is None:
+            raise Problem(401, "this token is not known here, or has expired; ask who runs the station for another")
+        answer = JSONResponse({"name": holder.name, "role": holder.role.word})
+        answer.set_cookie(COOKIE, token, httponly=True, samesite="strict", secure=station.settings.is_secure, path="/")
+        return answer
+
+    @router.delete("/api/session")
+    def log_out() -> Response:
+        """Forget the cookie."""
+        answer = Response(status_code=204)
+        answer.delete_cookie(COOKIE, path="/")
+        return answer
+
+    return router
+
+
+def _site_routes(station: Station) -> APIRouter:
+    router = APIRouter(prefix="/api/sites", tags=["sites"], dependencies=[Depends(needs(Role.VIEW))])
+
+    @router.get("")
+    def sites() -> list[dict[str, Any]]:
+        """Every site below the root."""
+        return readable(station.shelf)
+
+    @router.get("/{site}")
+    def one_site(site: str) -> dict[str, Any]:
+        """A site with its versions and flights, and the revision of its live map."""
+        detail = site_detail(site, station.shelf.open(site))
+        return {**detail, "live_revision": station.tiles.live(site).revision}
+
+    @router.get("/{site}/tiles/{version}/{z}/{x}/{y}.webp", response_class=Response)
+    def tile_webp(site: str, version: str, z: int, x: int, y: int) -> Response:
+        """A Web Mercator tile, 256 px; `version` is a number, `live-REVISION` or `live`. 204 where the map is not."""
+        return _tile(station, site, version, (z, x, y), ".webp")
+
+    @router.get("/{site}/tiles/{version}/{z}/{x}/{y}.png", response_class=Response)
+    def tile_png(site: str, version: str, z: int, x: int, y: int) -> Response:
+        """The same as PNG, for programs that read no WebP."""
+        return _tile(station, site, version, (z, x, y), ".png")
+
+    return router
+
+
+def _tile(station: Station, site: str, version: str, place: tuple[int, int, int], ending: str) -> Response:
+    answer = station.tiles.tile(site, version, *place, ending)
+    headers = {"cache-control": _FOR_EVER.replace("public", "private") if answer.is_final else "no-cache"}
+    if not answer.data:
+        return Response(status_code=204, headers=headers)
+    return Response(answer.data, media_type=f"image/{ending[1:]}", headers=headers)
+
+
+def _serve_page(app: FastAPI) -> None:
+    """The page at / and its files below /page/, whose addresses carry what they are made of."""
+
+    @app.get("/", include_in_schema=False)
+    def page() -> Response:
+        path = PAGE_FOLDER / "index.html"
+        if not path.is_file():
+            raise Problem(404, "this installation has no page; the API is described by /openapi.json")
+        return FileResponse(path, headers={"cache-control": "no-cache"})
+
+    app.mount("/page", _PageFiles(directory=PAGE_FOLDER), name="page")
+
+
+class _PageFiles(StaticFiles):
+    """Files of the page: kept by browsers for ever where the address names the content (?v=HASH), else asked again."""
+
+    def file_response(self, *args: Any, **kwargs: Any) -> Response:
+        """The file, with how long it may be kept."""
+        response = super().file_response(*args, **kwargs)
+        scope = kwargs.get("scope") or args[2]
+        is_named = scope.get("query_string", b"").startswith(b"v=")
+        response.headers["cache-control"] = _FOR_EVER if is_named else "no-cache"
+        return response
+
+
+def _doorkeeper(request: Request) -> Doorkeeper:
+    keeper = request.scope["state"]["doorkeeper"]
+    assert isinstance(keeper, Doorkeeper)
+    return keeper
+
+
+def _memory_mb() -> float | None:
+    """Resident memory of this process; None where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except (OSError, ValueError, IndexError):
+        return None
+    return round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 1)

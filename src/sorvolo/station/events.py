@@ -1,0 +1,120 @@
+"""Live events: numbered, kept on the disk, sent by WebSocket and as Server-Sent Events without loss or doubling."""
+
+import asyncio
+import json
+import sqlite3
+import threading
+from collections import deque
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from sorvolo.station.state import StationState, compact_json, utc_now
+
+_IN_MEMORY = 4000
+_MOST_KEPT = 200_000
+_AT_ONCE = 500
+LOST = "events.lost"
+"""What a page gets that asks for events that are no longer kept: it has to load the site anew."""
+
+
+@dataclass(frozen=True)
+class NewEvent:
+    """An event before it has its number: its type, the site and the run that it is of, what it holds as plain JSON."""
+
+    type: str
+    data: Mapping[str, Any]
+    site: str | None = None
+    run: str | None = None
+
+
+class EventLog:
+    """All events of a station. `append` adds some, each with the next number; threads may share it."""
+
+    def __init__(self, state: StationState) -> None:
+        self._state = state
+        self._lock = threading.Lock()
+        rows = state.rows("SELECT * FROM events ORDER BY seq DESC LIMIT ?", (_IN_MEMORY,))
+        self._recent: deque[dict[str, Any]] = deque((_event(row) for row in reversed(rows)), maxlen=_IN_MEMORY)
+        last = state.rows("SELECT seq FROM sqlite_sequence WHERE name = 'events'")
+        self._last = int(last[0]["seq"]) if last else 0
+        self._waiting: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
+
+    @property
+    def last(self) -> int:
+        """The number of the newest event, 0 before the first."""
+        return self._last
+
+    def append(self, *events: NewEvent) -> int:
+        """Keep events, in order; the number of the last. They are on the disk when this returns."""
+        with self.appending(events):
+            pass
+        return self._last
+
+    @contextmanager
+    def appending(self, events: Sequence[NewEvent]) -> Iterator[sqlite3.Connection]:
+        """Keep events in one transaction with whatever the block writes: both are on the disk, or neither."""
+        at = utc_now()
+        with self._lock:
+            with self._state.changing() as connection:
+                made: list[dict[str, Any]] = []
+                for each in events:
+                    cursor = connection.execute(
+                        "INSERT INTO events (at, type, site, run, data) VALUES (?, ?, ?, ?, ?)",
+                        (at, each.type, each.site, each.run, compact_json(each.data)),
+                    )
+                    made.append({
+                        "seq": cursor.lastrowid, "at": at, "type": each.type, "site": each.site, "run": each.run,
+                        "data": dict(each.data),
+                    })
+                yield connection
+                if made and made[-1]["seq"] % 1000 < len(made):
+                    connection.execute("DELETE FROM events WHERE seq <= ?", (made[-1]["seq"] - _MOST_KEPT,))
+            self._recent.extend(made)
+            self._last = made[-1]["seq"] if made else self._last
+            waiting = list(self._waiting)
+        for loop, event in waiting:
+            try:
+                loop.call_soon_threadsafe(event.set)
+            except RuntimeError:  # the loop was closed: nobody waits there any more
+                self._waiting.discard((loop, event))
+
+    def after(self, seq: int) -> list[dict[str, Any]]:
+        """The events after a number, oldest first, some hundreds at most; what is lost is said by one event."""
+        with self._lock:
+            recent, last = list(self._recent), self._last
+        if seq >= last:
+            return []
+        if recent and recent[0]["seq"] <= seq + 1:
+            return recent[seq + 1 - recent[0]["seq"]:][:_AT_ONCE]
+        rows = self._state.rows("SELECT * FROM events WHERE seq > ? ORDER BY seq LIMIT ?", (seq, _AT_ONCE))
+        found = [_event(row) for row in rows]
+        if found and found[0]["seq"] > seq + 1:
+            gap = {"from": seq + 1, "to": found[0]["seq"] - 1}
+            lost = {"seq": gap["to"], "at": found[0]["at"], "type": LOST, "site": None, "run": None, "data": gap}
+            found = [lost, *found]
+        return found
+
+    async def follow(self, seq: int, quiet_s: float = 15.0) -> AsyncIterator[list[dict[str, Any]]]:
+        """The events after a number as they come, for ever; an empty list where none came for a while."""
+        loop, arrived = asyncio.get_running_loop(), asyncio.Event()
+        self._waiting.add((loop, arrived))
+        try:
+            while True:
+                arrived.clear()
+                events = await asyncio.to_thread(self.after, seq) if seq < self._last else []
+                if events:
+                    seq = events[-1]["seq"]
+                    yield events
+                    continue
+                try:
+                    await asyncio.wait_for(arrived.wait(), quiet_s)
+                except TimeoutError:
+                    yield []
+        finally:
+            self._waiting.discard((loop, arrived))
+
+
+def _event(row: sqlite3.Row) -> dict[str, Any]:
+    return {**{name: row[name] for name in ("seq", "at", "type", "site", "run")}, "data": json.loads(row["data"])}

@@ -1,0 +1,69 @@
+"""Errors as HTTP answers: RFC 9457 problem documents that state what was found, what was needed, what to do."""
+
+from collections.abc import Mapping
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from sorvolo.errors import InputError, SettingsError, SorvoloError, StoreError
+
+_TITLES = {
+    400: "Bad request", 401: "Token needed", 403: "Not allowed", 404: "Not found", 405: "Method not allowed",
+    409: "Conflict", 410: "Gone", 413: "Too large", 415: "Unknown kind", 421: "Misdirected request",
+    422: "Invalid request", 429: "Too many attempts", 500: "Error in the station", 507: "Disk full",
+}
+
+
+class Problem(Exception):
+    """A request that cannot be answered as it is: the HTTP status, what is wrong and what to do, more fields."""
+
+    def __init__(
+        self, status: int, detail: str, *, headers: Mapping[str, str] | None = None, **more: object
+    ) -> None:
+        super().__init__(detail)
+        self.status, self.detail, self.headers, self.more = status, detail, dict(headers or {}), more
+
+
+def problem_answer(
+    status: int, detail: str, headers: Mapping[str, str] | None = None, more: Mapping[str, object] | None = None
+) -> JSONResponse:
+    """The problem document of a status."""
+    body = {"title": _TITLES.get(status, "Error"), "status": status, "detail": detail, **(more or {})}
+    return JSONResponse(body, status, dict(headers or {}), media_type="application/problem+json")
+
+
+def status_of(error: SorvoloError) -> int:
+    """The HTTP status of an error that a person must act on."""
+    text = str(error)
+    if isinstance(error, InputError | SettingsError):
+        return 400
+    if isinstance(error, StoreError):
+        if "disk full" in text:
+            return 507
+        return 404 if text.startswith("no site at") or "has no version" in text else 409
+    return 400
+
+
+def answer_problems(app: FastAPI) -> None:
+    """Let every error of the app's routes be answered by a problem document."""
+
+    @app.exception_handler(Problem)
+    async def _of_problem(_: Request, error: Problem) -> JSONResponse:
+        return problem_answer(error.status, error.detail, error.headers, error.more)
+
+    @app.exception_handler(SorvoloError)
+    async def _of_ours(_: Request, error: SorvoloError) -> JSONResponse:
+        return problem_answer(status_of(error), str(error))
+
+    @app.exception_handler(RequestValidationError)
+    async def _of_request(_: Request, error: RequestValidationError) -> JSONResponse:
+        faults = "; ".join(
+            f"{'.'.join(str(part) for part in each['loc'])}: {each['msg']}" for each in error.errors()[:4]
+        )
+        return problem_answer(422, f"{faults}; /openapi.json describes what each request needs")
+
+    @app.exception_handler(HTTPException)
+    async def _of_http(_: Request, error: HTTPException) -> JSONResponse:
+        return problem_answer(error.status_code, str(error.detail), error.headers)

@@ -1,0 +1,229 @@
+"""Who may ask what: host names, origins, tokens, sizes, and the headers that keep a page to its own."""
+
+import asyncio
+import ipaddress
+import re
+import socket
+from collections.abc import Awaitable, Callable
+from http.cookies import CookieError, SimpleCookie
+from typing import Any
+from urllib.parse import urlsplit
+
+from starlette.requests import HTTPConnection
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from sorvolo.station.problems import Problem, problem_answer
+from sorvolo.station.settings import StationSettings, is_loopback
+from sorvolo.station.state import StationState
+from sorvolo.station.tokens import Guesses, Holder, Role, has_tokens, holder_of
+
+COOKIE = "sorvolo_session"
+_MOST_BODY_BYTES = 1_000_000
+_ANYBODY = re.compile(r"/(page/.*|api/session|favicon\.ico)?")
+_SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
+_HEADERS = {
+    "content-security-policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; font-src 'self'; "
+        "connect-src 'self'; worker-src 'self' blob:; media-src 'self' blob:; manifest-src 'self'; base-uri 'none'; "
+        "form-action 'self'; frame-ancestors 'none'"
+    ),
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "permissions-policy": "camera=(), microphone=(), geolocation=(self)",
+}
+
+
+class Doorkeeper:
+    """ASGI middleware before everything else: checks host, origin, token and size of every request and WebSocket.
+
+    What passes carries a `Holder` in its state. Takes `upload_path`, a prefix whose bodies have limits of their own.
+    """
+
+    def __init__(self, app: ASGIApp, settings: StationSettings, state: StationState, upload_path: str) -> None:
+        self._app, self._settings, self._state, self._upload_path = app, settings, state, upload_path
+        self._guesses = Guesses()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let a request through, or answer it with a problem."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        sending = _with_headers(send, self._settings) if scope["type"] == "http" else send
+        connection = HTTPConnection(scope)
+        try:
+            check_host(connection.headers.get("host", ""), self._settings)
+            check_origin(connection, is_websocket=scope["type"] == "websocket")
+            holder = await self._holder(connection)
+            scope["state"] = {**scope.get("state", {}), "holder": holder, "doorkeeper": self}
+            if not scope["path"].startswith(self._upload_path):
+                receive = _limited(connection, receive)
+            await self._app(scope, receive, sending)
+        except Problem as problem:
+            await _refuse(scope, receive, sending, problem)
+
+    async def _holder(self, connection: HTTPConnection) -> Holder:
+        """Who asks. Raises Problem (401, 429) where nobody who may."""
+        if not await asyncio.to_thread(has_tokens, self._state):
+            if self._settings.is_loopback:
+                return Holder("this machine", Role.OPERATE)
+            raise Problem(401, "this station has no token any more; make one with `sorvolo token`")
+        token = sent_token(connection)
+        address = connection.client.host if connection.client else ""
+        if token:
+            if holder := await self.look_at(token, address):
+                return holder
+            if not _ANYBODY.fullmatch(connection.scope["path"]):
+                raise Problem(
+                    401, "this token is not known here, or has expired; ask who runs the station for another",
+                    headers={"WWW-Authenticate": "Bearer"},
+                )
+        if _ANYBODY.fullmatch(connection.scope["path"]):
+            return Holder("", Role.VIEW)
+        raise Problem(
+            401, "a token is needed: send it as `Authorization: Bearer TOKEN`, or log in on the page",
+            headers={"WWW-Authenticate": "Bearer"},
+        )
+
+    async def look_at(self, token: str, address: str) -> Holder | None:
+        """Whose token it is. Raises Problem (429) where the address sent too many wrong ones."""
+        if (wait_s := self._guesses.wait_s(address)) > 0:
+            raise Problem(
+                429, f"too many wrong tokens came from {address}; wait {wait_s:.0f} s and try again",
+                headers={"Retry-After": str(int(wait_s) + 1)},
+            )
+        holder = await asyncio.to_thread(holder_of, self._state, token)
+        self._guesses.note(address, right=holder is not None)
+        return holder
+
+
+def sent_token(connection: HTTPConnection) -> str:
+    """The token in a request's header or cookie; "" without any."""
+    scheme, _, token = connection.headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer":
+        return token.strip()
+    try:
+        morsel = SimpleCookie(connection.headers.get("cookie", "")).get(COOKIE)
+    except CookieError:
+        return ""
+    return morsel.value if morsel is not None else ""
+
+
+def holder_in(connection: HTTPConnection) -> Holder:
+    """Who asks, as the doorkeeper found out."""
+    holder = connection.scope.get("state", {}).get("holder")
+    assert isinstance(holder, Holder)  # the doorkeeper stands before every route
+    return holder
+
+
+def needs(role: Role) -> Callable[[HTTPConnection], Holder]:
+    """A route's demand: who asks has at least this role. Raises Problem (403)."""
+
+    def demanded(connection: HTTPConnection) -> Holder:
+        holder = holder_in(connection)
+        if holder.role < role:
+            raise Problem(403, f"the role {role.word} is needed, this token has {holder.role.word}; ask for another")
+        return holder
+
+    return demanded
+
+
+def check_host(host: str, settings: StationSettings) -> None:
+    """Raise Problem unless the Host header names this station.
+
+    A page of another site may let its own name point to this address (DNS rebinding): names have to be known, while an
+    address cannot be pointed anywhere. On loopback only loopback addresses are right.
+    """
+    name = _host_name(host)
+    if name.lower() in {"localhost", settings.host.lower(), *(each.lower() for each in settings.names)}:
+        return
+    if not settings.is_loopback and (_is_address(name) or name.lower() == socket.gethostname().lower()):
+        return
+    if is_loopback(name):
+        return
+    raise Problem(421, f"this station is not {name[:100] or 'without a name'}; open it by its address, or start it "
+                       "with --name")
+
+
+def check_origin(connection: HTTPConnection, *, is_websocket: bool) -> None:
+    """Raise Problem where a page of another site asks for more than a navigation could.
+
+    Browsers name the page's origin with every WebSocket and every request that may change something; what sends none is
+    no browser.
+    """
+    origin = connection.headers.get("origin")
+    if origin is None:
+        if connection.headers.get("sec-fetch-site", "none") in ("none", "same-origin"):
+            return
+        if connection.scope.get("method") in _SAFE_METHODS and not is_websocket:
+            return
+        raise Problem(403, "a page of another site asked; open the station's own page")
+    if not is_websocket and connection.scope.get("method") in ("GET", "HEAD") and origin != "null":
+        # reading is kept from other origins by the browser: no answer allows them to read it
+        return
+    parts = urlsplit(origin)
+    scheme = {"ws": "http", "wss": "https"}.get(connection.scope["scheme"], connection.scope["scheme"])
+    if parts.scheme != scheme or parts.netloc.lower() != connection.headers.get("host", "").lower():
+        raise Problem(403, f"a page of {origin[:100]} asked; open the station's own page")
+
+
+def _host_name(host: str) -> str:
+    if host.startswith("["):
+        return host[1:].partition("]")[0]
+    return host.rpartition(":")[0] if ":" in host else host
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _with_headers(send: Send, settings: StationSettings) -> Send:
+    added = [(name.encode(), text.encode()) for name, text in _HEADERS.items()]
+    if settings.is_secure:
+        added.append((b"strict-transport-security", b"max-age=31536000"))
+
+    async def sending(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            there = {name.lower() for name, _ in message.get("headers", [])}
+            more = [(name, text) for name, text in added if name not in there]
+            if b"cache-control" not in there:
+                more.append((b"cache-control", b"no-store"))
+            message = {**message, "headers": [*message.get("headers", []), *more]}
+        await send(message)
+
+    return sending
+
+
+def _limited(connection: HTTPConnection, receive: Receive) -> Receive:
+    """`receive` that refuses a body of more than a megabyte, announced or not. Raises Problem (413)."""
+    if connection.scope["type"] == "websocket":
+        return receive
+    too_large = Problem(413, f"at most {_MOST_BODY_BYTES // 1000} kB were expected; flights go to /api/uploads")
+    announced = connection.headers.get("content-length", "0")
+    if not announced.isdecimal() or int(announced) > _MOST_BODY_BYTES:
+        raise too_large
+    taken = 0
+
+    async def receiving() -> Message:
+        nonlocal taken
+        message = await receive()
+        taken += len(message.get("body", b""))
+        if taken > _MOST_BODY_BYTES:
+            raise too_large
+        return message
+
+    return receiving
+
+
+async def _refuse(scope: Scope, receive: Receive, send: Callable[[Any], Awaitable[None]], problem: Problem) -> None:
+    answer = problem_answer(problem.status, problem.detail, problem.headers, problem.more)
+    if scope["type"] == "http" or "websocket.http.response" in scope.get("extensions", {}):
+        await answer(scope, receive, send)
+    else:
+        await receive()
+        await send({"type": "websocket.close", "code": 4000 + problem.status % 1000, "reason": problem.detail[:120]})

@@ -1,0 +1,54 @@
+"""The station's process: opened, announced, served until somebody ends it."""
+
+import asyncio
+import logging
+from collections.abc import Callable
+
+import uvicorn
+
+from sorvolo.errors import SettingsError
+from sorvolo.station.app import Station, station_app
+from sorvolo.station.settings import StationSettings, check_exposure
+from sorvolo.station.tokens import has_tokens
+
+_MOST_MESSAGE_BYTES = 16_000_000  # of one WebSocket message: a key frame of 4K video takes a tenth
+
+
+def run_station(settings: StationSettings, announce: Callable[[], None]) -> None:
+    """Serve until Ctrl-C or SIGTERM; `announce` is called once it listens.
+
+    Raises SettingsError where others could reach it unprotected or the port is taken, StoreError as `Station.open`.
+    """
+    app = station_app(settings)
+    station: Station = app.state.station
+    try:
+        check_exposure(settings, has_tokens=has_tokens(station.state))
+        config = uvicorn.Config(
+            app, settings.host, settings.port, log_level="warning", access_log=False, server_header=False,
+            ws="websockets-sansio", ws_max_size=_MOST_MESSAGE_BYTES, proxy_headers=False, timeout_graceful_shutdown=2,
+            ssl_certfile=settings.tls_cert, ssl_keyfile=settings.tls_key, h11_max_incomplete_event_size=64_000,
+        )
+        server = _Announcing(config, announce)
+        logging.getLogger("uvicorn.error").setLevel(logging.ERROR)
+        asyncio.run(server.serve())
+        if not server.started:
+            raise SettingsError(
+                f"cannot listen at {settings.host}:{settings.port}: another program does, or the address is not this "
+                "machine's; choose another --port or --host"
+            )
+    finally:
+        station.close()
+
+
+class _Announcing(uvicorn.Server):
+    """A server that says when it listens."""
+
+    def __init__(self, config: uvicorn.Config, announce: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._announce = announce
+
+    async def startup(self, sockets: list[object] | None = None) -> None:  # type: ignore[override]
+        """Listen, then announce it."""
+        await super().startup(sockets)  # type: ignore[arg-type]
+        if self.started:
+            self._announce()

@@ -1,0 +1,208 @@
+"""The sites below the root: found by looking, named by ids, opened once and kept open to be read."""
+
+import os
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sorvolo.errors import StoreError
+from sorvolo.geometry.arrays import PointsM
+from sorvolo.geometry.grid import SiteGrid, TileIndex
+from sorvolo.station.problems import Problem
+from sorvolo.station.settings import STATE_FOLDER
+from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue import FlightEntry, VersionEntry
+from sorvolo.store.site.files import CATALOGUE
+from sorvolo.store.site.names import is_plain_name
+
+_DEEPEST = 2  # folders below the root: `sorvolo demo` puts its site one deeper than its folder
+_MOST_FOLDERS = 2000
+_LOOK_EVERY_S = 1.0
+
+
+class SiteShelf:
+    """The sites of a root, by id. A site's id is its path below the root, its folders joined by a colon.
+
+    Ids are looked up in what was found; none is ever made into a path. Threads may share it.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._lock = threading.Lock()
+        self._found: dict[str, Path] = {}
+        self._looked_s = -_LOOK_EVERY_S
+        self._open: dict[str, tuple[tuple[int, int], Archive]] = {}
+
+    def folders(self) -> dict[str, Path]:
+        """The folder of each site by its id, those that are there now."""
+        with self._lock:
+            if time.monotonic() - self._looked_s >= _LOOK_EVERY_S:
+                self._found = _sites_below(self.root)
+                self._looked_s = time.monotonic()
+            return dict(self._found)
+
+    def folder(self, site_id: str) -> Path:
+        """The folder of a site. Raises Problem (404)."""
+        folder = self.folders().get(site_id)
+        if folder is None:
+            raise Problem(404, f"no site {site_id[:80]!r} here; /api/sites lists those there are")
+        return folder
+
+    def new_folder(self, site_id: str) -> Path:
+        """The folder of a site, or of one to be made beside the others. Raises Problem for what cannot name one."""
+        found = self.folders().get(site_id)
+        if found is not None:
+            return found
+        if not is_plain_name(site_id) or ":" in site_id or site_id == STATE_FOLDER or (self.root / CATALOGUE).exists():
+            raise Problem(400, f"{site_id[:80]!r} cannot name a new site; give letters and digits")
+        folder = self.root / site_id
+        if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
+            raise Problem(409, f"{site_id!r} is there already and is no site; choose another name")
+        return folder
+
+    def open(self, site_id: str) -> Archive:
+        """The site, opened to be read; not to be closed. Raises Problem (404, 410), StoreError as `Archive.open`."""
+        path = self.folder(site_id) / CATALOGUE
+        try:
+            about = path.stat()
+        except OSError as error:
+            self.forget(site_id)
+            raise Problem(410, f"the site {site_id!r} was deleted meanwhile; /api/sites lists the others") from error
+        key = (about.st_dev, about.st_ino)
+        with self._lock:
+            known = self._open.get(site_id)
+            if known is not None and known[0] == key:
+                return known[1]
+        archive = Archive.open(path.parent, write=False)
+        with self._lock:
+            if known is not None:
+                known[1].close()
+            self._open[site_id] = (key, archive)
+        return archive
+
+    def forget(self, site_id: str) -> None:
+        """Look anew: a site came or went."""
+        with self._lock:
+            self._looked_s = -_LOOK_EVERY_S
+            known = self._open.pop(site_id, None)
+        if known is not None:
+            known[1].close()
+
+    def close(self) -> None:
+        """Close every site."""
+        with self._lock:
+            for _, archive in self._open.values():
+                archive.close()
+            self._open.clear()
+
+
+def _sites_below(root: Path) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    waiting, seen = [(root, 0)], 0
+    while waiting and seen < _MOST_FOLDERS:
+        folder, depth = waiting.pop(0)
+        seen += 1
+        if (folder / CATALOGUE).is_file():
+            found[":".join(folder.relative_to(root).parts) or root.resolve().name or "site"] = folder
+            continue
+        if depth == _DEEPEST:
+            continue
+        try:
+            entries = sorted(os.scandir(folder), key=lambda each: each.name)
+        except OSError:  # unreadable, or taken away meanwhile: no sites in it
+            continue
+        waiting += [
+            (Path(each.path), depth + 1) for each in entries
+            if each.is_dir(follow_symlinks=False) and not each.name.startswith(".")
+            and not (depth == 0 and each.name == STATE_FOLDER)
+        ]
+    return found
+
+
+def outline_lonlat(tiles: Sequence[TileIndex], grid: SiteGrid) -> PointsM:
+    """(4, 2) longitudes and latitudes of the corners of the box around tiles."""
+    columns, rows = np.array(tiles).reshape(-1, 2).T
+    size = grid.grid.tile_px
+    west, east = columns.min() * size - 0.5, (columns.max() + 1) * size - 0.5
+    north, south = rows.min() * size - 0.5, (rows.max() + 1) * size - 0.5
+    corners_px = np.array([[west, north], [east, north], [east, south], [west, south]])
+    site_from_grid = np.linalg.inv(grid.grid_from_site_affine(np.zeros(2), 50.0))
+    corners_m = corners_px @ site_from_grid[:2, :2].T + site_from_grid[:2, 2]
+    latitude, longitude, _ = grid.frame.wgs84_from_site(corners_m)
+    return np.column_stack([longitude, latitude])
+
+
+def bounds_lonlat(tiles: Sequence[TileIndex], grid: SiteGrid) -> list[float] | None:
+    """West, south, east, north of tiles, deg; None without tiles."""
+    if not tiles:
+        return None
+    corners = outline_lonlat(tiles, grid)
+    return [round(float(each), 8) for each in (*corners.min(axis=0), *corners.max(axis=0))]
+
+
+def site_summary(site_id: str, archive: Archive) -> dict[str, Any]:
+    """A site as the list of sites has it."""
+    if not archive.has_site:
+        return {
+            "id": site_id, "name": archive.folder.name, "is_local": False, "center_wgs84": None,
+            "bounds_wgs84": None, "flights": 0, "versions": 0, "updated_at": None, "m_per_px": None,
+        }
+    site = archive.site()
+    complete = [each for each in archive.versions() if each.complete]
+    bounds = bounds_lonlat(list(archive.live_tiles()), archive.site_grid())
+    center = None if bounds is None else [(bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2]
+    return {
+        "id": site_id, "name": site.name, "is_local": site.is_local, "center_wgs84": center, "bounds_wgs84": bounds,
+        "flights": len({each.flight_id for each in complete}), "versions": len(complete),
+        "updated_at": complete[-1].created_utc if complete else None, "m_per_px": site.m_per_px,
+    }
+
+
+def site_detail(site_id: str, archive: Archive) -> dict[str, Any]:
+    """A site with its versions and flights."""
+    versions, comparisons = archive.versions(), archive.comparisons()
+    compared = {each.flight_id for each in versions if each.id in comparisons}
+    return {
+        **site_summary(site_id, archive),
+        "versions": [version_row(each) for each in versions if each.complete],
+        "flights": [
+            _flight_row(each, archive, versions, compared) for each in archive.flights() if each.status == "complete"
+        ],
+    }
+
+
+def version_row(version: VersionEntry) -> dict[str, Any]:
+    """A version of the map as the page lists it."""
+    return {
+        "n": version.id, "flight": version.flight_id, "made_at": version.created_utc,
+        "flown_at": version.flown_utc or None,
+    }
+
+
+def _flight_row(
+    flight: FlightEntry, archive: Archive, versions: Sequence[VersionEntry], compared: set[str]
+) -> dict[str, Any]:
+    frames: Mapping[str, Any] = archive.report(flight.id).get("frames") or {}
+    flown = next((each.flown_utc for each in reversed(versions) if each.flight_id == flight.id and each.complete), "")
+    reasons = frames.get("reasons")
+    return {
+        "id": flight.id, "kind": "compare" if flight.id in compared else "map", "flown_at": flown or None,
+        "frames": sum(flight.frames.values()), "matched": flight.frames.get("vision", 0),
+        "by_gps": flight.frames.get("gps-only", 0), "rejected": flight.frames.get("rejected", 0),
+        "reasons": dict(reasons) if isinstance(reasons, Mapping) else {}, "notes": list(flight.notes),
+    }
+
+
+def readable(shelf: SiteShelf) -> list[dict[str, Any]]:
+    """All sites; one that cannot be read is listed with its error instead of its figures."""
+    rows = []
+    for site_id in sorted(shelf.folders()):
+        try:
+            rows.append(site_summary(site_id, shelf.open(site_id)))
+        except (StoreError, Problem) as error:
+            rows.append({"id": site_id, "name": site_id, "error": str(error)})
+    return rows

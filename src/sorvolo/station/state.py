@@ -1,0 +1,107 @@
+"""The station's own memory: one small SQLite file with events, runs, tokens and reviews."""
+
+import json
+import sqlite3
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from sorvolo.errors import StoreError
+from sorvolo.store.atomic import writing
+
+_FILE = "station.db"
+_FORMAT = 1
+_TABLES = """
+CREATE TABLE IF NOT EXISTS events (
+  seq INTEGER PRIMARY KEY AUTOINCREMENT, at TEXT NOT NULL, type TEXT NOT NULL, site TEXT, run TEXT, data TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS runs (
+  id TEXT PRIMARY KEY, made_at TEXT NOT NULL, site TEXT NOT NULL, mission TEXT NOT NULL, state TEXT NOT NULL,
+  record TEXT NOT NULL, journal_offset INTEGER NOT NULL DEFAULT 0);
+CREATE TABLE IF NOT EXISTS tokens (
+  id TEXT PRIMARY KEY, name TEXT NOT NULL UNIQUE, role TEXT NOT NULL, hash TEXT NOT NULL, made_at TEXT NOT NULL,
+  expires_at TEXT);
+CREATE TABLE IF NOT EXISTS reviews (
+  number INTEGER PRIMARY KEY AUTOINCREMENT, site TEXT NOT NULL, kind TEXT NOT NULL, id TEXT NOT NULL,
+  revision INTEGER NOT NULL, verdict TEXT NOT NULL, note TEXT NOT NULL, who TEXT NOT NULL, at TEXT NOT NULL,
+  UNIQUE (site, kind, id, revision));
+"""
+
+
+class StationState:
+    """The open file `station/station.db` below the root; `reading` and `changing` give one transaction each.
+
+    Threads may share it. Made by `open`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = threading.RLock()
+        self._connection = sqlite3.connect(path, timeout=30, isolation_level=None, check_same_thread=False)
+        self._connection.row_factory = sqlite3.Row
+
+    @classmethod
+    def open(cls, folder: Path) -> "StationState":
+        """Open or make the file in the station's folder. Raises StoreError where it cannot be, or is another's."""
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            folder.chmod(0o700)  # it holds hashes of tokens and the addresses of streams
+        path = folder / _FILE
+        try:
+            state = cls(path)
+            with state._lock:
+                run = state._connection.execute
+                run("PRAGMA journal_mode = WAL")
+                run("PRAGMA synchronous = FULL")
+                run("PRAGMA trusted_schema = OFF")
+                found = run("PRAGMA user_version").fetchone()[0]
+                if found not in (0, _FORMAT):
+                    raise StoreError(
+                        f"{path} has format {found}, this Sorvolo works with {_FORMAT}; use the Sorvolo that made it, "
+                        "or move the file away"
+                    )
+                state._connection.executescript(_TABLES)
+                run(f"PRAGMA user_version = {_FORMAT}")
+        except sqlite3.Error as error:
+            raise StoreError(f"cannot use {path}: {error}; check the disk, or move the file away") from error
+        return state
+
+    def close(self) -> None:
+        """Close the file."""
+        with self._lock:
+            self._connection.close()
+
+    @contextmanager
+    def changing(self) -> Iterator[sqlite3.Connection]:
+        """A transaction that happens whole, on the disk, or not at all. Raises StoreError on a full disk."""
+        with self._lock:
+            try:
+                self._connection.execute("BEGIN IMMEDIATE")
+                try:
+                    yield self._connection
+                except BaseException:
+                    self._connection.execute("ROLLBACK")
+                    raise
+                self._connection.execute("COMMIT")
+            except sqlite3.OperationalError as error:
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
+                words = "disk full: could not write" if "full" in str(error) else "cannot write"
+                raise StoreError(f"{words} {self.path} ({error}); free some space") from error
+
+    def rows(self, query: str, values: Sequence[Any] = ()) -> list[sqlite3.Row]:
+        """The rows of a query."""
+        with self._lock:
+            return self._connection.execute(query, values).fetchall()
+
+
+def utc_now() -> str:
+    """The time, RFC 3339 UTC to the millisecond."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def compact_json(value: Any) -> str:
+    """The value as one line of JSON."""
+    return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))

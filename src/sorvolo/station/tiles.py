@@ -1,0 +1,181 @@
+"""Tiles of a site's map for web maps: any version, and the growing one, warped from the site's grid to Web Mercator."""
+
+import re
+import threading
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sorvolo.geometry.arrays import Floats, ImageRGBA
+from sorvolo.geometry.grid import SiteGrid
+from sorvolo.station.problems import Problem
+from sorvolo.station.pyramid import BytesCache, Pyramid
+from sorvolo.station.sites import SiteShelf, bounds_lonlat
+from sorvolo.store.site.archive import Archive
+
+TILE_PX = 256
+_SHALLOWEST_ZOOM = 8  # a tile of 150 km: a map is less than a pixel there, and the site's plane is no plane
+_DEEPEST_ZOOM = 26
+_LATTICE = 17  # places a side that are projected exactly; between them it is linear to a hundredth of a pixel
+_PICTURES_BYTES, _ANSWERS_BYTES = 192_000_000, 64_000_000
+_LIVE = re.compile(r"live(-[0-9a-f]{1,64})?")
+_QUALITY = 88
+
+
+@dataclass(frozen=True)
+class TileAnswer:
+    """An encoded tile, b"" where the map has nothing; `is_final`: what its address names never changes."""
+
+    data: bytes
+    is_final: bool
+
+
+class WebTiles:
+    """The web tiles of all sites. Threads may share it; what was made last is kept within bounds of memory."""
+
+    def __init__(self, shelf: SiteShelf) -> None:
+        self._shelf = shelf
+        self._pictures = BytesCache[str, ImageRGBA](_PICTURES_BYTES, lambda each: int(each.nbytes))
+        self._answers = BytesCache[tuple[str, ...], bytes](_ANSWERS_BYTES, lambda each: len(each) + 100)
+        self._states: dict[tuple[str, str], tuple[object, Pyramid]] = {}
+        self._lock = threading.Lock()
+
+    def live(self, site_id: str) -> Pyramid:
+        """The map as it is now: the growing one as of its last flush, else the newest version. Raises as `open`."""
+        archive = self._shelf.open(site_id)
+        return self._state(site_id, "live", archive, _change_mark(archive))
+
+    def tile(self, site_id: str, version: str, z: int, x: int, y: int, ending: str = ".webp") -> TileAnswer:
+        """An XYZ tile of a version: its number, `live-REVISION` or `live`. Raises Problem (404), StoreError."""
+        if not (0 <= z <= _DEEPEST_ZOOM and 0 <= x < 2**z and 0 <= y < 2**z):
+            raise Problem(404, f"no tile {z}/{x}/{y}: zooms go to {_DEEPEST_ZOOM}, columns and rows to 2^zoom - 1")
+        archive = self._shelf.open(site_id)
+        if not archive.has_site:
+            return TileAnswer(b"", False)
+        if _LIVE.fullmatch(version):
+            state = self.live(site_id)
+            is_final = version == f"live-{state.revision}"
+        elif version.isdecimal() and len(version) < 10:
+            state, is_final = self._version(site_id, archive, int(version)), True
+        else:
+            raise Problem(404, f"no version {version[:40]!r}: a number or live-REVISION was needed")
+        key = (site_id, state.revision, str(z), str(x), str(y), ending)
+        grid = archive.site_grid()
+        return TileAnswer(self._answers.get(key, lambda: render(state, grid, z, x, y, ending)), is_final)
+
+    def _version(self, site_id: str, archive: Archive, number: int) -> Pyramid:
+        if number not in {each.id for each in archive.versions() if each.complete}:
+            raise Problem(404, f"the map has no version {number}; /api/sites/{site_id} lists those there are")
+        return self._state(site_id, str(number), archive, number)
+
+    def _state(self, site_id: str, name: str, archive: Archive, mark: object) -> Pyramid:
+        with self._lock:
+            known = self._states.get((site_id, name))
+            if known is not None and known[0] == (id(archive), mark):
+                return known[1]
+        tiles = archive.live_tiles() if name == "live" else archive.tiles(int(name))
+        made = Pyramid(tiles, archive.site_grid().grid.tile_px, self._pictures)
+        with self._lock:
+            if len(self._states) > 200:
+                self._states.clear()
+            self._states[site_id, name] = ((id(archive), mark), made)
+        return made
+
+
+def _change_mark(archive: Archive) -> tuple[int, ...]:
+    """What changes whenever the catalogue does: sizes and times of its file and its log."""
+    mark: list[int] = []
+    for name in ("site.db", "site.db-wal"):
+        try:
+            about = (archive.folder / name).stat()
+        except FileNotFoundError:
+            continue
+        mark += [about.st_size, about.st_mtime_ns]
+    return tuple(mark)
+
+
+def render(state: Pyramid, site_grid: SiteGrid, z: int, x: int, y: int, ending: str = ".webp") -> bytes:
+    """An encoded tile of 256 x 256 pixels; b"" where the map has nothing there."""
+    if z < _SHALLOWEST_ZOOM or not _meets_map(state, site_grid, z, x, y):
+        return b""
+    wanted_px = _grid_places(site_grid, z, x, y)
+    step_px = np.hypot(*(wanted_px[-1, -1] - wanted_px[0, 0])) / (TILE_PX * np.sqrt(2))
+    level = int(np.clip(np.floor(np.log2(max(step_px, 1e-9)) + 0.25), 0, len(state.keys) - 1))
+    level_px = (wanted_px + 0.5) / 2**level - 0.5
+    source, corner_px = _gathered(state, level, level_px)
+    if source is None:
+        return b""
+    picture = _resampled(source, (_pixels_from_lattice(level_px) - corner_px).astype(np.float32))
+    return encoded(picture, ending) if picture[..., 3].any() else b""
+
+
+def encoded(rgba: ImageRGBA, ending: str) -> bytes:
+    """A picture as .webp or .png bytes."""
+    options = [cv2.IMWRITE_WEBP_QUALITY, _QUALITY] if ending == ".webp" else [cv2.IMWRITE_PNG_COMPRESSION, 3]
+    done, data = cv2.imencode(ending, cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA), options)
+    assert done  # uint8 RGBA can always be encoded
+    return data.tobytes()
+
+
+def _grid_places(site_grid: SiteGrid, z: int, x: int, y: int) -> Floats:
+    """(17, 17, 2) grid pixels of places spread over a tile, its outer edges included."""
+    steps = np.linspace(0.0, 1.0, _LATTICE)
+    across, down = np.meshgrid(x + steps, y + steps)
+    longitude = across / 2**z * 360.0 - 180.0
+    latitude = np.degrees(np.arctan(np.sinh(np.pi * (1 - 2 * down / 2**z))))
+    lonlat = np.column_stack([longitude.ravel(), latitude.ravel()])
+    return site_grid.grid_from_site(site_grid.frame.ground_from_lonlat(lonlat)).reshape(_LATTICE, _LATTICE, 2)
+
+
+def _pixels_from_lattice(places: Floats) -> Floats:
+    """(256, 256, 2) places of pixel centres from those of a lattice whose outer points lie on the tile's edges."""
+    at = (np.arange(TILE_PX) + 0.5) / TILE_PX * (_LATTICE - 1)
+    low = np.minimum(at.astype(int), _LATTICE - 2)
+    share = (at - low)[:, None]
+    rows = places[low] * (1 - share[:, None]) + places[low + 1] * share[:, None]
+    return rows[:, low] * (1 - share) + rows[:, low + 1] * share
+
+
+def _meets_map(state: Pyramid, site_grid: SiteGrid, z: int, x: int, y: int) -> bool:
+    """Whether a tile's ground meets the map's: far around the Earth the site's plane would show it again."""
+    bounds = bounds_lonlat(state.corner_tiles, site_grid)
+    if bounds is None:
+        return False
+    west, east = (each / 2**z * 360.0 - 180.0 for each in (x, x + 1))
+    south, north = (np.degrees(np.arctan(np.sinh(np.pi * (1 - 2 * each / 2**z)))) for each in (y + 1, y))
+    return bool(bounds[0] <= east and bounds[2] >= west and bounds[1] <= north and bounds[3] >= south)
+
+
+def _gathered(state: Pyramid, level: int, places_px: Floats) -> tuple[ImageRGBA | None, Floats]:
+    """The part of a level under these places in one picture, and where its first pixel lies; None without any."""
+    size, there = state.tile_px, state.keys[level]
+    flat = places_px.reshape(-1, 2)
+    low, high = (np.floor(each).astype(int) for each in (flat.min(axis=0) - 1, flat.max(axis=0) + 3))
+    first, last = low // size, (high - 1) // size
+    width, height = high - low
+    picture = np.zeros((height, width, 4), np.uint8)
+    is_empty = True
+    for column in range(first[0], last[0] + 1):
+        for row in range(first[1], last[1] + 1):
+            part = state.picture(level, (column, row)) if (column, row) in there else None
+            if part is None:
+                continue
+            is_empty = False
+            x0, y0 = column * size - low[0], row * size - low[1]
+            left, top = max(x0, 0), max(y0, 0)
+            right, bottom = min(x0 + size, width), min(y0 + size, height)
+            picture[top:bottom, left:right] = part[top - y0:bottom - y0, left - x0:right - x0]
+    return (None if is_empty else picture), low.astype(np.float64)
+
+
+def _resampled(source: ImageRGBA, places_px: Floats) -> ImageRGBA:
+    """A picture's pixels at places, (256, 256, 2), linear between them; transparent ones lend no colour."""
+    across, down = (np.ascontiguousarray(places_px[..., axis]) for axis in (0, 1))
+    if source[..., 3].min() == 255:
+        return cv2.remap(source, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT).astype(np.uint8)
+    share = source[..., 3:].astype(np.float32) / 255
+    weighted = np.dstack([source[..., :3] * share, share])
+    mixed = cv2.remap(weighted, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    colours = mixed[..., :3] / np.maximum(mixed[..., 3:], 1e-3)
+    return np.clip(np.round(np.dstack([colours, 255 * mixed[..., 3]])), 0, 255).astype(np.uint8)
