@@ -13,9 +13,13 @@ from fastapi.responses import FileResponse, JSONResponse
 from starlette.staticfiles import StaticFiles
 
 from sorvolo import __version__
+from sorvolo.station.collections import SiteCollections
+from sorvolo.station.crops import crop_routes
 from sorvolo.station.event_routes import event_routes
 from sorvolo.station.events import EventLog
+from sorvolo.station.features import feature_routes, landing_links
 from sorvolo.station.problems import Problem, answer_problems
+from sorvolo.station.reviews import Reviews, review_routes
 from sorvolo.station.security import COOKIE, Doorkeeper, holder_in, needs
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.sites import SiteShelf, readable, site_detail
@@ -37,12 +41,17 @@ class Station:
     shelf: SiteShelf
     tiles: WebTiles
     events: EventLog
+    collections: SiteCollections
+    reviews: Reviews
 
     @classmethod
     def open(cls, settings: StationSettings) -> "Station":
         """Open the station's own files. Raises StoreError where they cannot be used."""
         state, shelf = StationState.open(settings.state_folder), SiteShelf(settings.root)
-        return cls(settings, state, shelf, WebTiles(shelf), EventLog(state))
+        events = EventLog(state)
+        return cls(
+            settings, state, shelf, WebTiles(shelf), events, SiteCollections(shelf), Reviews(state, shelf, events),
+        )
 
     def close(self) -> None:
         """Close every file."""
@@ -65,7 +74,11 @@ def station_app(settings: StationSettings) -> FastAPI:
     )
     app.state.station = station
     answer_problems(app)
-    for router in (_about_routes(station), _site_routes(station), event_routes(station.events)):
+    for router in (
+        _about_routes(station), _site_routes(station), event_routes(station.events),
+        feature_routes(station.collections, station.reviews), review_routes(station.reviews, station.shelf),
+        crop_routes(station.shelf),
+    ):
         app.include_router(router)
     _serve_page(app)
     app.add_middleware(Doorkeeper, settings=settings, state=station.state, upload_path=_UPLOADS)
@@ -119,7 +132,8 @@ def _site_routes(station: Station) -> APIRouter:
     def one_site(site: str) -> dict[str, Any]:
         """A site with its versions and flights, and the revision of its live map."""
         detail = site_detail(site, station.shelf.open(site))
-        return {**detail, "live_revision": station.tiles.live(site).revision}
+        revision = station.tiles.live(site).revision if detail["versions"] or detail["bounds_wgs84"] else None
+        return {**detail, "live_revision": revision, "links": landing_links(f"/api/sites/{site}")}
 
     @router.get("/{site}/tiles/{version}/{z}/{x}/{y}.webp", response_class=Response)
     def tile_webp(site: str, version: str, z: int, x: int, y: int) -> Response:

@@ -44,7 +44,7 @@ class WebTiles:
     def live(self, site_id: str) -> Pyramid:
         """The map as it is now: the growing one as of its last flush, else the newest version. Raises as `open`."""
         archive = self._shelf.open(site_id)
-        return self._state(site_id, "live", archive, _change_mark(archive))
+        return self._state(site_id, "live", archive, change_mark(archive))
 
     def tile(self, site_id: str, version: str, z: int, x: int, y: int, ending: str = ".webp") -> TileAnswer:
         """An XYZ tile of a version: its number, `live-REVISION` or `live`. Raises Problem (404), StoreError."""
@@ -83,8 +83,8 @@ class WebTiles:
         return made
 
 
-def _change_mark(archive: Archive) -> tuple[int, ...]:
-    """What changes whenever the catalogue does: sizes and times of its file and its log."""
+def change_mark(archive: Archive) -> tuple[int, ...]:
+    """What changes whenever a site's catalogue does: sizes and times of its file and its log."""
     mark: list[int] = []
     for name in ("site.db", "site.db-wal"):
         try:

@@ -41,6 +41,17 @@ def review_changes(
         return [each for each in archive.changes() if each.id in wanted]
 
 
+def withdraw_reviews(site: Path, ids: Sequence[str]) -> None:
+    """Take verdicts on changes back, as if none had been given; the flights' change files follow.
+
+    Raises InputError for an unknown id, StoreError when the folder is no site or another process is writing.
+    """
+    with Archive.open(site, write=False):  # without a site there is nothing to take back: do not make one
+        pass
+    with Archive.open(site, write=True) as archive:
+        archive.withdraw_review(ids)
+
+
 def _require_flight(archive: Archive, flight: str | None) -> None:
     known = [entry.id for entry in archive.flights()]
     if flight is not None and flight not in known:

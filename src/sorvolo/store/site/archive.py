@@ -1,9 +1,11 @@
 """A site on disk, opened to be read or written: what is in it, and how a flight begins to enter."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
+
+from sqlalchemy import Connection
 
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
@@ -195,16 +197,27 @@ class Archive:
 
         A later review replaces an earlier one. Raises InputError, and stores nothing, when an id is unknown.
         """
-        self._require_writable()
         wanted = {change_ids} if isinstance(change_ids, str) else set(change_ids)
+        self._change_reviews(wanted, lambda connection, found: change_records.put_reviews(
+            connection, found, verdict, note
+        ))
+
+    def withdraw_review(self, change_ids: Iterable[str]) -> None:
+        """Take the reviews of changes back. Raises InputError, and changes nothing, when an id is unknown."""
+        self._change_reviews(set(change_ids), change_records.drop_reviews)
+
+    def _change_reviews(
+        self, wanted: Collection[str], change: Callable[[Connection, Sequence[StoredChange]], None]
+    ) -> None:
+        self._require_writable()
         with self._files.catalogue.changing() as connection:
             found = [each for each in change_records.load_changes(connection) if each.id in wanted]
-            unknown = sorted(wanted - {each.id for each in found})
+            unknown = sorted(set(wanted) - {each.id for each in found})
             if unknown:
                 raise InputError(
                     f"{self.folder} has no change {', '.join(unknown)}; `sorvolo review {self.folder}` lists them"
                 )
-            change_records.put_reviews(connection, found, verdict, note)
+            change(connection, found)
             records.owe_documents(connection, {each.flight_id for each in found})
         repair(self._files)
 

@@ -163,6 +163,12 @@ def put_reviews(connection: Connection, changes: Sequence[StoredChange], verdict
         ))
 
 
+def drop_reviews(connection: Connection, changes: Sequence[StoredChange]) -> None:
+    """Forget what was said of these changes."""
+    for each in changes:
+        connection.execute(delete(schema.reviews).where(schema.reviews.c.change_id == each.id))
+
+
 def compared_versions(connection: Connection) -> dict[int, Mapping[str, int]]:
     """The versions that comparisons made: the number of changes of each kind."""
     if _is_older(connection):

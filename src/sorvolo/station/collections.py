@@ -1,0 +1,227 @@
+"""What a site holds as features in WGS84, with their boxes in an R-tree: frames, objects, changes, coverage."""
+
+import json
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from shapely import STRtree, box
+from shapely.errors import ShapelyError
+from shapely.geometry import shape
+from shapely.geometry.base import BaseGeometry
+
+from sorvolo.station.problems import Problem
+from sorvolo.station.sites import SiteShelf
+from sorvolo.station.tiles import change_mark
+from sorvolo.store.exports.change_files import changes_geojson
+from sorvolo.store.exports.coverage_files import COVERAGE
+from sorvolo.store.exports.object_files import objects_geojson
+from sorvolo.store.exports.places import longitude_latitude
+from sorvolo.store.exports.plain import features_name
+from sorvolo.store.nofollow import read_below
+from sorvolo.store.site.archive import Archive
+from sorvolo.survey.flight import Site
+
+TITLES: Mapping[str, str] = {
+    "frames": "Frames: what of the ground each shows, and how it was placed",
+    "objects": "People, cars and small objects, each once, by the newest look at each place",
+    "changes": "Changes between flights",
+    "coverage": "Ground that comparisons could speak about, and the rest with its reason",
+    "pod": "Probability of detection of the latest measured search",
+    "track": "The drone's way, one line a flight",
+}
+SEARCH_FOLDER = "search"
+"""The folder of a site in which the station keeps its latest measured search."""
+
+_MOST_BYTES = 256_000_000
+
+Feature = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Collection:
+    """Features with a geometry, in order, and an R-tree over their boxes."""
+
+    features: Sequence[Feature]
+    shapes: Sequence[BaseGeometry]
+    tree: STRtree
+
+    @classmethod
+    def of(cls, features: Sequence[Feature]) -> "Collection":
+        """Of features; those whose geometry is missing or broken are left out."""
+        kept, shapes = [], []
+        for each in features:
+            try:
+                found = shape(each["geometry"]) if each.get("geometry") else None
+            except (ShapelyError, ValueError, TypeError, KeyError, AttributeError, IndexError):
+                continue
+            if found is not None and not found.is_empty:
+                kept.append(each)
+                shapes.append(found)
+        return cls(kept, shapes, STRtree(shapes))
+
+    def within(self, bbox: Sequence[float]) -> list[int]:
+        """Which features meet a box of west, south, east, north."""
+        return sorted(int(each) for each in self.tree.query(box(*bbox), predicate="intersects"))
+
+
+class SiteCollections:
+    """The collections of all sites, made when asked for and kept until the site changes. Threads may share it."""
+
+    def __init__(self, shelf: SiteShelf) -> None:
+        self._shelf = shelf
+        self._kept: dict[tuple[str, str], tuple[object, Collection]] = {}
+        self._lock = threading.Lock()
+
+    def get(self, site_id: str, name: str) -> Collection:
+        """A collection of a site. Raises Problem (404)."""
+        if name not in _MAKERS:
+            raise Problem(404, f"no collection {name[:40]!r}; there are {', '.join(_MAKERS)}")
+        archive = self._shelf.open(site_id)
+        mark = (id(archive), change_mark(archive), _search_mark(archive))
+        with self._lock:
+            known = self._kept.get((site_id, name))
+        if known is not None and known[0] == mark:
+            return known[1]
+        made = Collection.of(_MAKERS[name](archive) if archive.has_site else [])
+        with self._lock:
+            self._kept[site_id, name] = (mark, made)
+        return made
+
+
+def on_earth(site: Site) -> Site:
+    """The site with places in degrees: a local one's lie around its origin, as the station shows them."""
+    return replace(site, is_local=False)
+
+
+def _frames(archive: Archive) -> list[Feature]:
+    site, features = archive.site(), []
+    for flight in _flights(archive):
+        for each in _features_of(archive, f"flights/{flight}", "frames"):
+            values = dict(each.get("properties") or {})
+            values |= {"flight": flight, "datetime": values.get("time")}
+            geometry = _lonlat(each.get("geometry"), site)
+            if site.is_local:
+                values |= _camera_on_earth(values, site)
+            features.append({
+                "type": "Feature", "id": f"{flight}:{values.get('frame')}", "geometry": geometry, "properties": values,
+            })
+    return features
+
+
+def _track(archive: Archive) -> list[Feature]:
+    lines: dict[str, list[tuple[str, list[float]]]] = {}
+    for each in _frames(archive):
+        values = each["properties"]
+        place = [values.get(f"camera_{name}") for name in ("longitude_deg", "latitude_deg", "height_m")]
+        if None not in place[:2]:
+            known = [each for each in place if each is not None]
+            lines.setdefault(values["flight"], []).append((values["time"], known))
+    features = []
+    for flight, places in lines.items():
+        places.sort(key=lambda each: each[0])
+        if len(places) < 2:
+            continue
+        values = {
+            "flight": flight, "datetime": places[0][0], "end_datetime": places[-1][0],
+            "times": [time for time, _ in places],
+        }
+        geometry = {"type": "LineString", "coordinates": [place for _, place in places]}
+        features.append({"type": "Feature", "id": flight, "geometry": geometry, "properties": values})
+    return features
+
+
+def _objects(archive: Archive) -> list[Feature]:
+    made = objects_geojson(archive.newest_objects(), on_earth(archive.site()), crops_from_site=True)["features"]
+    return [_with(each, "object", each["properties"]["class"]) for each in made]
+
+
+def _changes(archive: Archive) -> list[Feature]:
+    stored = archive.changes()
+    versions = {each.flight_id: each for each in archive.versions() if each.complete}
+    features = []
+    for change, each in zip(stored, changes_geojson(stored, on_earth(archive.site()))["features"], strict=True):
+        label = change.class_after or change.class_before or change.kind.value
+        version = versions.get(change.flight_id)
+        more = {
+            "flight": change.flight_id, "class": label, "version": version and version.id,
+            "from_version": version and version.parent_id,
+        }
+        features.append(_with(each, "change", label, more))
+    return features
+
+
+def _with(feature: Feature, kind: str, label: str, more: Mapping[str, Any] | None = None) -> Feature:
+    values = {
+        **feature["properties"], **(more or {}), "class": label, "datetime": feature["properties"]["first_seen"],
+        "end_datetime": feature["properties"]["last_seen"], "review_kind": kind,
+    }
+    return {"type": "Feature", "id": values["id"], "geometry": feature["geometry"], "properties": values}
+
+
+def _coverage(archive: Archive) -> list[Feature]:
+    features = []
+    for flight in _flights(archive):
+        for number, each in enumerate(_features_of(archive, f"flights/{flight}", COVERAGE)):
+            values = {**(each.get("properties") or {}), "flight": flight}
+            geometry = _lonlat(each.get("geometry"), archive.site())
+            features.append({"type": "Feature", "id": f"{flight}:{number}", "geometry": geometry, "properties": values})
+    return features
+
+
+def _pod(archive: Archive) -> list[Feature]:
+    return [
+        {"type": "Feature", "id": str(number), "geometry": each.get("geometry"), "properties": each.get("properties")}
+        for number, each in enumerate(_features_of(archive, SEARCH_FOLDER, "pod", local=False))
+    ]
+
+
+_MAKERS: Mapping[str, Callable[[Archive], list[Feature]]] = {
+    "frames": _frames, "objects": _objects, "changes": _changes, "coverage": _coverage, "pod": _pod, "track": _track,
+}
+
+
+def _flights(archive: Archive) -> list[str]:
+    return [each.id for each in archive.flights() if each.status == "complete"]
+
+
+def _features_of(archive: Archive, folder: str, name: str, *, local: bool | None = None) -> list[Feature]:
+    """The features of a GeoJSON file of the site; none where there is no such file or somebody broke it."""
+    is_local = archive.site().is_local if local is None else local
+    try:
+        file = f"{folder}/{features_name(name, is_local=is_local)}"
+        features = json.loads(read_below(archive.folder, file, _MOST_BYTES)).get("features")
+    except (OSError, ValueError, RecursionError, AttributeError):
+        return []
+    return [each for each in features if isinstance(each, dict)] if isinstance(features, list) else []
+
+
+def _lonlat(geometry: Any, site: Site) -> Any:
+    """A geometry of a file in degrees: those of a local site are in its own units."""
+    if not site.is_local or not geometry:
+        return geometry
+
+    def turned(coordinates: Any) -> Any:
+        if coordinates and isinstance(coordinates[0], int | float):
+            longitudes, latitudes = longitude_latitude(np.array([coordinates[:2]], np.float64), site)
+            return [float(longitudes[0]), float(latitudes[0])]
+        return [turned(each) for each in coordinates]
+
+    return {**geometry, "coordinates": turned(geometry["coordinates"])}
+
+
+def _camera_on_earth(values: Mapping[str, Any], site: Site) -> dict[str, Any]:
+    east, north = values.get("camera_east"), values.get("camera_north")
+    if east is None or north is None:
+        return {}
+    longitudes, latitudes = longitude_latitude(np.array([[east, north]], np.float64), site)
+    return {"camera_longitude_deg": float(longitudes[0]), "camera_latitude_deg": float(latitudes[0])}
+
+
+def _search_mark(archive: Archive) -> int:
+    try:
+        return (archive.folder / SEARCH_FOLDER / "pod.geojson").stat().st_mtime_ns
+    except OSError:
+        return 0

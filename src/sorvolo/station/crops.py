@@ -1,0 +1,105 @@
+"""Pictures of objects and changes that missions stored, and of any place, cut on demand from key frames."""
+
+import threading
+
+import cv2
+import numpy as np
+from fastapi import APIRouter, Depends, Response
+
+from sorvolo.geometry.arrays import ImageRGB, PointsM
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.station.problems import Problem
+from sorvolo.station.security import needs
+from sorvolo.station.sites import SiteShelf
+from sorvolo.station.tokens import Role
+from sorvolo.store.exports.change_files import crop_names
+from sorvolo.store.exports.object_files import CROPS, crop_name
+from sorvolo.store.images import jpeg_from_image, rgba_from_png
+from sorvolo.store.nofollow import read_below
+from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue import StoredKeyframe
+
+CROP_PX = 320
+_KEPT = "private, max-age=86400"
+_CUTTING = threading.Semaphore(2)  # key frames decoded at once: a strip asks for dozens
+
+
+def crop_routes(shelf: SiteShelf) -> APIRouter:
+    """Pictures by the id of what they show; never by a path."""
+    router = APIRouter(prefix="/api/sites/{site}/crops", tags=["crops"], dependencies=[Depends(needs(Role.VIEW))])
+
+    @router.get("/change/{change_id}/{n}.jpg", response_class=Response)
+    def of_change(site: str, change_id: str, n: int) -> Response:
+        """A change: 0 before, 1 after."""
+        archive = shelf.open(site)
+        found = next((each for each in archive.changes() if each.id == change_id), None)
+        if found is None or n not in (0, 1):
+            raise Problem(404, "no such picture: 0 is before and 1 after, of a change that the site has")
+        file = f"flights/{found.flight_id}/changes/{crop_names(found.id)[n]}"
+        rgba = rgba_from_png(_read(archive, file), file)
+        return _jpeg(np.where(rgba[..., 3:] > 0, rgba[..., :3], 127).astype(np.uint8))
+
+    @router.get("/object/{object_id}/{n}.jpg", response_class=Response)
+    def of_object(site: str, object_id: str, n: int) -> Response:
+        """An object as its best frame shows it."""
+        archive = shelf.open(site)
+        found = next((each for each in archive.objects() if each.thing.id == object_id), None)
+        if found is None or n != 0:
+            raise Problem(404, "no such picture: 0 is the best one, of an object that the site has")
+        data = _read(archive, f"flights/{found.flight_id}/{CROPS}/{crop_name(found.thing.id)}")
+        return Response(data, media_type="image/jpeg", headers={"cache-control": _KEPT})
+
+    @router.get("/frame/{flight}/{index}/{east_mm}/{north_mm}.jpg", response_class=Response)
+    def of_frame(site: str, flight: str, index: int, east_mm: int, north_mm: int) -> Response:
+        """The ground around a place (site millimetres), north up, cut from a key frame."""
+        archive = shelf.open(site)
+        place_m = np.array([east_mm, north_mm]) / 1000
+        return _jpeg(cut(archive, keyframe(archive, flight, index), place_m))
+
+    return router
+
+
+def keyframe(archive: Archive, flight: str, index: int) -> StoredKeyframe:
+    """A key frame by its flight and number. Raises Problem (404)."""
+    found = [each for each in archive.keyframes(flight) if each.index == index]
+    if not found:
+        raise Problem(404, f"{flight[:80]!r} has no key frame {index}")
+    return found[0]
+
+
+def cut(archive: Archive, frame: StoredKeyframe, place_m: PointsM, side_m: float | None = None) -> ImageRGB:
+    """(320, 320, 3) of the ground around a place, north up, as the key frame shows it; grey where it does not.
+
+    Without `side_m` as wide as keeps the key frame's own resolution, at most 12 m. Raises StoreError.
+    """
+    m_per_px = (side_m or min(12.0, CROP_PX * _m_per_px(frame, place_m))) / CROP_PX
+    site_from_crop = np.array([
+        [m_per_px, 0, place_m[0] - m_per_px * (CROP_PX - 1) / 2],
+        [0, -m_per_px, place_m[1] + m_per_px * (CROP_PX - 1) / 2],
+        [0, 0, 1],
+    ])
+    with _CUTTING:
+        image = archive.image(frame)
+        image_from_crop = np.linalg.inv(frame.site_from_image) @ site_from_crop
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        cropped = cv2.warpPerspective(image, image_from_crop, (CROP_PX, CROP_PX), flags=flags, borderValue=(127,) * 3)
+    return np.asarray(cropped, np.uint8)
+
+
+def _m_per_px(frame: StoredKeyframe, place_m: PointsM) -> float:
+    """The ground that a pixel covers at a place."""
+    image_from_site = np.linalg.inv(frame.site_from_image)
+    ends_px = apply_homography(image_from_site, place_m + np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]]))
+    steps_px = np.hypot(*(ends_px[1:] - ends_px[0]).T)
+    return float(0.5 / max(steps_px.mean(), 1e-6))
+
+
+def _read(archive: Archive, file: str) -> bytes:
+    try:
+        return read_below(archive.folder, file)
+    except FileNotFoundError as error:
+        raise Problem(404, "this picture was not kept") from error
+
+
+def _jpeg(image: ImageRGB) -> Response:
+    return Response(jpeg_from_image(image), media_type="image/jpeg", headers={"cache-control": _KEPT})

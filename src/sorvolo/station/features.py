@@ -1,0 +1,219 @@
+"""OGC API Features over a site's collections: landing page, conformance, collections, items by place, time and more."""
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+from urllib.parse import urlencode
+
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import JSONResponse
+
+from sorvolo.station.collections import TITLES, Collection, Feature, SiteCollections
+from sorvolo.station.problems import Problem
+from sorvolo.station.reviews import Reviews
+from sorvolo.station.security import needs
+from sorvolo.station.tokens import Role
+
+_CONFORMS = [
+    f"http://www.opengis.net/spec/ogcapi-features-1/1.0/conf/{name}" for name in ("core", "oas30", "geojson")
+]
+_GEOJSON = "application/geo+json"
+_MOST = 10_000
+_REVIEWED = {"objects": "object", "changes": "change"}
+Limit = Query(1000, ge=1, le=_MOST, description="Features at most.")
+Offset = Query(0, ge=0, le=10**9)
+
+
+def landing_links(base: str) -> list[dict[str, str]]:
+    """The links of a site's landing page."""
+    return [
+        _link(base, "self", "application/json", "This site"),
+        _link("/openapi.json", "service-desc", "application/vnd.oai.openapi+json;version=3.0", "The API"),
+        _link(f"{base}/conformance", "conformance", "application/json", "What it conforms to"),
+        _link(f"{base}/collections", "data", "application/json", "Collections of features"),
+    ]
+
+
+def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
+    """Conformance, collections and items of each site."""
+    router = APIRouter(prefix="/api/sites/{site}", tags=["features"], dependencies=[Depends(needs(Role.VIEW))])
+
+    @router.get("/conformance")
+    def conformance(site: str) -> dict[str, Any]:
+        """Which classes of OGC API Features are fulfilled."""
+        collections.get(site, "frames")
+        return {"conformsTo": _CONFORMS}
+
+    @router.get("/collections")
+    def list_collections(site: str) -> dict[str, Any]:
+        """The collections of a site."""
+        base = f"/api/sites/{site}"
+        return {
+            "links": [_link(f"{base}/collections", "self", "application/json", "Collections")],
+            "collections": [_about(name, collections.get(site, name), base) for name in TITLES],
+        }
+
+    @router.get("/collections/{name}")
+    def one_collection(site: str, name: str) -> dict[str, Any]:
+        """One collection: its extent and links."""
+        return _about(name, collections.get(site, name), f"/api/sites/{site}")
+
+    @router.get("/collections/{name}/items")
+    def items(
+        request: Request, site: str, name: str, bbox: str = Query("", max_length=200),
+        datetime: str = Query("", max_length=100), limit: int = Limit, offset: int = Offset,
+        labels: str = Query("", alias="class", max_length=400), min_score: float | None = Query(None, ge=0, le=1),
+        flight: str = Query("", max_length=400), review: str = Query("", max_length=40),
+        from_version: int | None = Query(None, ge=0, le=2**62), to_version: int | None = Query(None, ge=0, le=2**62),
+    ) -> JSONResponse:
+        """Features: within a box, at a time, of classes, with a score at least, of flights, by verdict; in pages."""
+        collection = collections.get(site, name)
+        wanted = _places(collection, bbox)
+        features = _reviewed([collection.features[each] for each in wanted], name, site, reviews)
+        kept = _filtered(features, _interval(datetime), _words(labels), min_score, _words(flight), _words(review))
+        if name == "changes":
+            kept = [each for each in kept if _between(each["properties"], from_version, to_version)]
+        return JSONResponse(_page(request, kept, limit, offset), media_type=_GEOJSON)
+
+    @router.get("/collections/{name}/items/{feature_id}")
+    def one_item(site: str, name: str, feature_id: str) -> JSONResponse:
+        """One feature."""
+        found = [each for each in collections.get(site, name).features if str(each["id"]) == feature_id]
+        if not found:
+            raise Problem(404, f"{name} has no feature {feature_id[:80]!r}")
+        return JSONResponse(_reviewed(found, name, site, reviews)[0], media_type=_GEOJSON)
+
+    return router
+
+
+def _about(name: str, collection: Collection, base: str) -> dict[str, Any]:
+    extent = {}
+    if collection.shapes:
+        edges = [each.bounds for each in collection.shapes]
+        columns = list(zip(*edges))
+        bbox = [min(columns[0]), min(columns[1]), max(columns[2]), max(columns[3])]
+        extent = {"extent": {"spatial": {"bbox": [bbox], "crs": "http://www.opengis.net/def/crs/OGC/1.3/CRS84"}}}
+    return {
+        "id": name, "title": TITLES[name], "itemType": "feature", "count": len(collection.features), **extent,
+        "crs": ["http://www.opengis.net/def/crs/OGC/1.3/CRS84"],
+        "links": [
+            _link(f"{base}/collections/{name}", "self", "application/json", TITLES[name]),
+            _link(f"{base}/collections/{name}/items", "items", _GEOJSON, TITLES[name]),
+        ],
+    }
+
+
+def _link(href: str, rel: str, kind: str, title: str) -> dict[str, str]:
+    return {"href": href, "rel": rel, "type": kind, "title": title}
+
+
+def _page(request: Request, features: Sequence[Feature], limit: int, offset: int) -> dict[str, Any]:
+    shown = features[offset:offset + limit]
+    path = request.url.path
+    links = [_link(f"{path}?{request.url.query}" if request.url.query else path, "self", _GEOJSON, "This page")]
+    if offset + limit < len(features):
+        query = urlencode({**dict(request.query_params), "limit": limit, "offset": offset + limit})
+        links.append(_link(f"{path}?{query}", "next", _GEOJSON, "Next page"))
+    return {
+        "type": "FeatureCollection", "timeStamp": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "numberMatched": len(features), "numberReturned": len(shown), "links": links, "features": shown,
+    }
+
+
+def _places(collection: Collection, bbox: str) -> list[int]:
+    """Which features to look at: all, or those that meet the box. Raises Problem (400) for what is no box."""
+    if not bbox:
+        return list(range(len(collection.features)))
+    try:
+        edges = [float(each) for each in bbox.split(",")]
+    except ValueError:
+        edges = []
+    if len(edges) == 6:
+        edges = [edges[0], edges[1], edges[3], edges[4]]
+    if len(edges) != 4 or not all(-1e6 < each < 1e6 for each in edges) or edges[1] > edges[3]:
+        raise Problem(400, f"bbox={bbox[:80]}: west,south,east,north in degrees was needed")
+    if edges[0] > edges[2]:  # across the antimeridian
+        west, south, east, north = edges
+        found = {*collection.within([west, south, 180.0, north]), *collection.within([-180.0, south, east, north])}
+        return sorted(found)
+    return collection.within(edges)
+
+
+def _interval(text: str) -> tuple[datetime | None, datetime | None]:
+    """Start and end of an RFC 3339 moment or interval, None: open. Raises Problem (400)."""
+    if not text:
+        return None, None
+    parts = text.split("/")
+    if len(parts) > 2:
+        raise Problem(400, f"datetime={text[:80]}: a moment or START/END was needed, .. for an open end")
+    ends = [None if each in ("", "..") else _moment(each) for each in parts]
+    return (ends[0], ends[0]) if len(ends) == 1 else (ends[0], ends[1])
+
+
+def _moment(text: str) -> datetime:
+    try:
+        moment = datetime.fromisoformat(text.replace("Z", "+00:00"))
+    except ValueError as error:
+        raise Problem(400, f"datetime: {text[:60]!r} is no time such as 2026-05-31T12:00:00Z") from error
+    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(each.strip() for each in text.split(",") if each.strip())
+
+
+def _reviewed(features: Sequence[Feature], name: str, site: str, reviews: Reviews) -> list[Feature]:
+    """The features with what people said of them, where the collection is one that people judge."""
+    kind = _REVIEWED.get(name)
+    if kind is None:
+        return list(features)
+    current = reviews.current(site, kind)
+    result = []
+    for each in features:
+        review = current.get(str(each["id"]))
+        values = {
+            **each["properties"], "review": review and review.verdict, "revision": review.revision if review else 0,
+            "note": review and review.note, "reviewer": review and review.who, "reviewed_at": review and review.at,
+            "crops": crop_addresses(site, kind, str(each["id"])),
+        }
+        result.append({**each, "properties": values})
+    return result
+
+
+def crop_addresses(site: str, kind: str, feature_id: str) -> list[str]:
+    """Where the pictures of an object, or of a change before and after, are found."""
+    return [f"/api/sites/{site}/crops/{kind}/{feature_id}/{n}.jpg" for n in range(2 if kind == "change" else 1)]
+
+
+def _filtered(
+    features: Sequence[Feature], interval: tuple[datetime | None, datetime | None], labels: frozenset[str],
+    min_score: float | None, flights: frozenset[str], verdicts: frozenset[str],
+) -> list[Feature]:
+    def is_wanted(values: Mapping[str, Any]) -> bool:
+        return (
+            (not labels or not labels.isdisjoint({values.get("class"), values.get("kind"), values.get("status")}))
+            and (min_score is None or (values.get("score") or 0.0) >= min_score)
+            and (not flights or values.get("flight") in flights)
+            and (not verdicts or (values.get("review") or "none") in verdicts)
+            and _meets(values, interval)
+        )
+
+    return [each for each in features if is_wanted(each["properties"] or {})]
+
+
+def _meets(values: Mapping[str, Any], interval: tuple[datetime | None, datetime | None]) -> bool:
+    start, end = interval
+    if start is None and end is None:
+        return True
+    first = values.get("datetime")
+    if not isinstance(first, str):
+        return False
+    last = values.get("end_datetime") or first
+    return (start is None or _moment(str(last)) >= start) and (end is None or _moment(first) <= end)
+
+
+def _between(values: Mapping[str, Any], after: int | None, until: int | None) -> bool:
+    """Whether a change came between two versions of the map: after the first, at the second or before it."""
+    version = values.get("version") or 0
+    low, high = min(after or 0, until or 2**62), max(after or 0, until or 2**62)
+    return low < version <= high

@@ -1,0 +1,184 @@
+"""What people say of objects and changes: every verdict kept with who and when; none is lost to another's."""
+
+import sqlite3
+import threading
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from fastapi import APIRouter, Depends, Query
+from pydantic import BaseModel, Field
+
+from sorvolo.errors import StoreError
+from sorvolo.missions.site.review import review_changes, withdraw_reviews
+from sorvolo.station.events import EventLog, NewEvent
+from sorvolo.station.problems import Problem
+from sorvolo.station.security import needs
+from sorvolo.station.sites import SiteShelf
+from sorvolo.station.state import StationState, utc_now
+from sorvolo.station.tokens import Holder, Role
+from sorvolo.survey.findings import Verdict
+
+NO_VERDICT = "none"
+_ELSEWHERE = "sorvolo review"  # who said what came by the command line
+
+
+class ReviewWish(BaseModel):
+    """A verdict on an object or a change; `revision` is that of the verdict it was made upon, 0 for none."""
+
+    kind: Literal["object", "change"]
+    id: str = Field(min_length=1, max_length=400)
+    verdict: Literal["confirmed", "rejected", "none"]
+    note: str = Field("", max_length=2000)
+    revision: int = Field(ge=0, le=2**62)
+
+
+@dataclass(frozen=True)
+class Review:
+    """A person's verdict on one thing; each has the next revision. Times are RFC 3339 UTC."""
+
+    kind: str
+    id: str
+    revision: int
+    verdict: str
+    note: str
+    who: str
+    at: str
+
+
+class Reviews:
+    """The verdicts on all sites' objects and changes. Threads may share it.
+
+    Those on changes also go into the site, where missions look: at once, or when the mission that is writing into it is
+    done (`settle`).
+    """
+
+    def __init__(self, state: StationState, shelf: SiteShelf, events: EventLog) -> None:
+        self._state, self._shelf, self._events = state, shelf, events
+        self._settling = threading.Lock()
+
+    def current(self, site_id: str, kind: str) -> dict[str, Review]:
+        """The newest verdict on each thing of a kind, by id; those given by the command line included."""
+        rows = self._state.rows(
+            "SELECT kind, id, MAX(revision) AS revision, verdict, note, who, at FROM reviews "
+            "WHERE site = ? AND kind = ? GROUP BY id", (site_id, kind),
+        )
+        found = {row["id"]: Review(**dict(row)) for row in rows}
+        if kind == "change":
+            found |= self._from_site(site_id, found)
+        return found
+
+    def history(self, site_id: str, kind: str = "", thing_id: str = "") -> list[Review]:
+        """All verdicts of a site, newest first; of one thing."""
+        rows = self._state.rows(
+            "SELECT kind, id, revision, verdict, note, who, at FROM reviews "
+            "WHERE site = ? AND (? = '' OR kind = ?) AND (? = '' OR id = ?) ORDER BY number DESC LIMIT 5000",
+            (site_id, kind, kind, thing_id, thing_id),
+        )
+        return [Review(**dict(row)) for row in rows]
+
+    def give(self, site_id: str, wish: ReviewWish, who: str) -> Review:
+        """Keep a verdict. Raises Problem: 404 for an unknown thing, 409 where somebody said something since."""
+        self._demand_thing(site_id, wish.kind, wish.id)
+        now = self.current(site_id, wish.kind).get(wish.id)
+        revision = now.revision if now is not None else 0
+        if wish.revision != revision:
+            raise self._conflict(wish, now)
+        made = Review(wish.kind, wish.id, revision + 1, wish.verdict, wish.note, who, utc_now())
+        event = NewEvent("review.changed", asdict(made), site_id)
+        try:
+            with self._events.appending([event]) as connection:
+                if now is not None and now.who == _ELSEWHERE:
+                    _keep(connection, site_id, now)
+                _keep(connection, site_id, made)
+        except sqlite3.IntegrityError as error:  # another request was quicker
+            raise self._conflict(wish, self.current(site_id, wish.kind).get(wish.id)) from error
+        if wish.kind == "change":
+            self.settle(site_id)
+        return made
+
+    def settle(self, site_id: str) -> bool:
+        """Write the verdicts on changes that the site does not have yet into it; whether all are in it now."""
+        with self._settling:
+            archive = self._shelf.open(site_id)
+            inside = {each.id: (each.verdict, each.note) for each in archive.changes()}
+            waiting = [
+                each for each in self.current(site_id, "change").values()
+                if each.id in inside and inside[each.id] != (_as_stored(each), _stored_note(each))
+            ]
+            try:
+                for each in waiting:
+                    verdict = _as_stored(each)
+                    if verdict is None:
+                        withdraw_reviews(archive.folder, [each.id])
+                    else:
+                        review_changes(archive.folder, [each.id], verdict, each.note)
+            except StoreError:  # a mission is writing into the site: when it ends they are settled
+                return False
+            return True
+
+    def _from_site(self, site_id: str, known: Mapping[str, Review]) -> dict[str, Review]:
+        """Verdicts that the command line gave after ours."""
+        found = {}
+        archive = self._shelf.open(site_id)
+        at_utc = {each.change_id: each.at_utc for each in archive.reviews()}
+        for change in archive.changes():
+            if change.verdict is None:
+                continue
+            ours, at = known.get(change.id), at_utc.get(change.id, "")
+            if ours is None or (at > ours.at and (change.verdict, change.note) != (_as_stored(ours), ours.note)):
+                revision = 1 if ours is None else ours.revision + 1
+                found[change.id] = Review(
+                    "change", change.id, revision, change.verdict.value, change.note, _ELSEWHERE, at
+                )
+        return found
+
+    def _demand_thing(self, site_id: str, kind: str, thing_id: str) -> None:
+        archive = self._shelf.open(site_id)
+        changes, objects = archive.changes(), archive.objects()
+        ids = [each.id for each in changes] if kind == "change" else [each.thing.id for each in objects]
+        if thing_id not in ids:
+            raise Problem(404, f"the site has no {kind} {thing_id[:80]!r}; load the list again")
+
+    @staticmethod
+    def _conflict(wish: ReviewWish, now: Review | None) -> Problem:
+        said = f"{now.who} gave the verdict {now.verdict}" if now is not None else "there is no verdict any more"
+        return Problem(
+            409, f"{said} meanwhile; look at it, and give your verdict upon revision {now.revision if now else 0}",
+            current=None if now is None else asdict(now),
+        )
+
+
+def review_routes(reviews: Reviews, shelf: SiteShelf) -> APIRouter:
+    """Verdicts listed and given."""
+    router = APIRouter(prefix="/api/sites/{site}/reviews", tags=["reviews"])
+
+    @router.get("", dependencies=[Depends(needs(Role.VIEW))])
+    def history(
+        site: str, kind: Literal["", "object", "change"] = "", id: str = Query("", max_length=400),
+    ) -> list[dict[str, Any]]:
+        """Every verdict of the site with who gave it and when, newest first."""
+        shelf.folder(site)
+        return [asdict(each) for each in reviews.history(site, kind, id)]
+
+    @router.post("", status_code=201)
+    def give(site: str, wish: ReviewWish, holder: Holder = Depends(needs(Role.REVIEW))) -> dict[str, Any]:  # noqa: B008
+        """Confirm or reject an object or a change, or take a verdict back. 409 where another one came first."""
+        return asdict(reviews.give(site, wish, holder.name))
+
+    return router
+
+
+def _keep(connection: sqlite3.Connection, site_id: str, review: Review) -> None:
+    connection.execute(
+        "INSERT INTO reviews (site, kind, id, revision, verdict, note, who, at) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+        (site_id, review.kind, review.id, review.revision, review.verdict, review.note, review.who, review.at),
+    )
+
+
+def _as_stored(review: Review) -> Verdict | None:
+    return None if review.verdict == NO_VERDICT else Verdict(review.verdict)
+
+
+def _stored_note(review: Review) -> str:
+    return "" if review.verdict == NO_VERDICT else review.note

@@ -1,0 +1,104 @@
+"""Several people judge: every verdict is kept with who and when, and nobody overwrites what they did not see."""
+
+import threading
+from pathlib import Path
+from typing import Any
+
+from fake_flights import map_flight
+from starlette.testclient import TestClient
+
+from sorvolo.missions.site.review import list_changes, review_changes
+from sorvolo.station.app import station_app
+from sorvolo.station.settings import StationSettings
+from sorvolo.station.state import StationState
+from sorvolo.station.tokens import make_token
+from sorvolo.store.site.archive import Archive
+from sorvolo.survey.findings import Verdict
+
+REVIEWS = "/api/sites/field/reviews"
+
+
+def verdict(client: TestClient, change: str, word: str, revision: int, **more: Any) -> Any:
+    """What a POST gives back."""
+    return client.post(REVIEWS, json={
+        "kind": "change", "id": change, "verdict": word, "revision": revision, **more,
+    })
+
+
+def properties(client: TestClient, change: str) -> dict[str, Any]:
+    """A change as the page gets it."""
+    return client.get(f"/api/sites/field/collections/changes/items/{change}").json()["properties"]
+
+
+def test_a_verdict_reaches_the_site_and_a_stale_one_is_refused(client: TestClient, root: Path) -> None:
+    """409 carries the current verdict, so that a person can look at it."""
+    made = verdict(client, "b-1", "confirmed", 0, note="a shed")
+    assert made.status_code == 201 and made.json()["revision"] == 1
+    assert [(each.verdict, each.note) for each in list_changes(root / "field") if each.id == "b-1"] == [
+        (Verdict.CONFIRMED, "a shed")]
+    late = verdict(client, "b-1", "rejected", 0)
+    assert late.status_code == 409 and late.json()["current"]["verdict"] == "confirmed"
+    assert properties(client, "b-1")["review"] == "confirmed"
+    assert verdict(client, "b-1", "none", 1).status_code == 201
+    assert next(each for each in list_changes(root / "field") if each.id == "b-1").verdict is None
+    assert properties(client, "b-1")["revision"] == 2
+    history = client.get(REVIEWS, params={"id": "b-1"}).json()
+    assert [(each["verdict"], each["revision"]) for each in history] == [("none", 2), ("confirmed", 1)]
+
+
+def test_verdicts_of_the_command_line_are_seen_and_counted(client: TestClient, root: Path) -> None:
+    """`sorvolo review` beside the page: its verdict is the newest then."""
+    verdict(client, "b-0", "confirmed", 0)
+    review_changes(root / "field", ["b-0"], Verdict.REJECTED, "a shadow")
+    assert {**properties(client, "b-0"), "reviewed_at": 0}.items() >= {
+        "review": "rejected", "note": "a shadow", "revision": 2, "reviewer": "sorvolo review"}.items()
+    assert verdict(client, "b-0", "confirmed", 1).status_code == 409
+    assert verdict(client, "b-0", "confirmed", 2).json()["revision"] == 3
+    assert len(client.get(REVIEWS, params={"id": "b-0"}).json()) == 3
+
+
+def test_of_many_at_once_one_wins(client: TestClient) -> None:
+    """The others are told, so nothing is lost."""
+    codes: list[int] = []
+    threads = [
+        threading.Thread(target=lambda: codes.append(verdict(client, "b-2", "confirmed", 0).status_code))
+        for _ in range(6)
+    ]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()
+    assert sorted(codes) == [201, 409, 409, 409, 409, 409]
+
+
+def test_while_a_mission_writes_verdicts_wait_for_its_end(client: TestClient, root: Path) -> None:
+    """They are kept and shown at once, and reach the site afterwards."""
+    with Archive.open(root / "field", write=True) as archive:
+        with archive.begin_flight("c", "c", {}):
+            assert verdict(client, "b-3", "rejected", 0).status_code == 201
+            assert properties(client, "b-3")["review"] == "rejected"
+        map_flight(archive, "d", 20, count=1)
+    assert client.app.state.station.reviews.settle("field")  # type: ignore[attr-defined]
+    assert next(each for each in list_changes(root / "field") if each.id == "b-3").verdict is Verdict.REJECTED
+
+
+def test_who_judged_is_the_name_of_the_token(root: Path) -> None:
+    """Two people, two names; who may only look cannot judge."""
+    state = StationState.open(root / "station")
+    tokens = {name: make_token(state, name, role) for name, role in (("Ada", "review"), ("Ben", "view"))}
+    state.close()
+    with TestClient(station_app(StationSettings(root)), base_url="http://127.0.0.1:8750") as client:
+        client.headers["authorization"] = f"Bearer {tokens['Ben']}"
+        refused = verdict(client, "b-1", "confirmed", 0)
+        assert refused.status_code == 403 and "review" in refused.json()["detail"]
+        client.headers["authorization"] = f"Bearer {tokens['Ada']}"
+        assert verdict(client, "b-1", "confirmed", 0).json()["who"] == "Ada"
+
+
+def test_unknown_things_and_impossible_verdicts(client: TestClient) -> None:
+    """404 and 422."""
+    assert verdict(client, "b-99", "confirmed", 0).status_code == 404
+    assert verdict(client, "b-1", "perhaps", 0).status_code == 422
+    assert verdict(client, "b-1", "confirmed", -1).status_code == 422
+    assert client.post("/api/sites/nowhere/reviews", json={
+        "kind": "object", "id": "x", "verdict": "confirmed", "revision": 0}).status_code == 404
