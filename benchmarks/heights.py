@@ -29,7 +29,7 @@ from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.heights.field import HeightField
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.heights.measure import read_field
-from sorvolo.missions.heights.run import HEIGHTS, HeightSettings, make_heights
+from sorvolo.missions.heights.run import HeightSettings, make_heights
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.flight import simulate_flights
@@ -46,6 +46,7 @@ from sorvolo.simulation.truth import surface_heights
 from sorvolo.simulation.view import map_view
 from sorvolo.simulation.world import orthophoto
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.files import HeightFile
 
 RESULTS = Path(__file__).parent / "results" / "heights.json"
 _M_PER_PX = 0.05  # of the truth
@@ -88,7 +89,7 @@ def simulated(seed: int) -> dict[str, Any]:
         day = next(iter(simulate_flights(settings))).day
         with Archive.open(folder / "site", write=False) as archive:
             flight = archive.flights()[0].id
-            field = read_field(archive, flight, HEIGHTS)
+            field = read_field(archive, flight, HeightFile.SURFACE)
             m_per_px = archive.site().m_per_px
             shift_m = _site_shift(archive, settings)
         report = json.loads((folder / "site" / "flights" / flight / "heights.json").read_text())

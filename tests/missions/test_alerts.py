@@ -103,7 +103,7 @@ def test_an_outbox_goes_on_after_failures(server: str) -> None:
     outbox.put(_ALERT)
     outbox.close(10)
     (reported,) = outbox.notices()
-    assert (reported.code, reported.count, outbox.sent, len(_Receiver.got)) == ("alert_url_failed", 2, 0, 2)
+    assert (reported.code, reported.count, len(_Receiver.got)) == ("alert_url_failed", 2, 2)
     assert "500" in reported.text
 
 
@@ -134,20 +134,23 @@ def test_alerts_go_on_after_an_answer_that_is_no_http(rude_server: tuple[str, li
         outbox.put(_ALERT)
     outbox.close(20)
     (notice,) = outbox.notices()
-    assert (outbox.sent, notice.count, len(requests)) == (2, 1, 3)
+    assert (notice.count, len(requests)) == (1, 3)
     assert "does not answer as a web server does: GARBAGE" in notice.text
 
 
 def test_alerts_go_on_after_a_failure_of_any_kind() -> None:
+    sent = []
+
     def fails_once(number: int) -> None:
         if number == 0:
             raise RuntimeError
+        sent.append(number)
 
     outbox = Outbox(fails_once, code="x", what="it")
     outbox.put(0)
     outbox.put(1)
     outbox.close(10)
-    assert outbox.sent == 1 and outbox.notices()[0].text == "it failed 1 time, last: RuntimeError"
+    assert sent == [1] and outbox.notices()[0].text == "it failed 1 time, last: RuntimeError"
 
 
 def test_an_alert_is_not_sent_elsewhere(server: str) -> None:

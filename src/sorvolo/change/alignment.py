@@ -38,7 +38,7 @@ _CELLS = 4, 3
 _LOCAL_SIDE_PX = 960  # of the pictures that a local fit is made from
 _LOCAL_ROUNDS, _FAR_M = 2, 0.6  # a place that moves by so much is fitted once more
 _LOCAL_PRIOR = np.full(3, 2.0), np.radians([2.0, 2.0, 2.0])  # m, and by axis: what a local fit moves a camera by
-_TRACKED_S = 2.0  # a fit older than this foretells nothing
+_TRACKED_S = 2.0  # a fit older than this predicts nothing
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class AlignmentSettings:
     side_px: int = 640  # longest side at which frames are aligned
     least_known: float = 0.1  # share of the frame that must lie on known ground
     most_residual_px: float = 2.2  # of the registered image: worse, and what differs is the fit, not the ground
-    doubtful_px: float = 1.5  # a fit that leaves more is checked: a foretold one by features, others by the search
+    doubtful_px: float = 1.5  # a fit that leaves more is checked: a predicted one by features, others by the search
     least_spread: float = 0.6  # share of a frame's cells with points: with less a homography may swing
     confirms_rest: float = 0.42  # of a local fit: less confirms a place in doubt; other ground had 0.53 once
     settled_px: float = 1.2  # a fit that leaves more is followed by a local one
@@ -64,8 +64,8 @@ class Aligned:
     """A frame that fits the map. `site_from_image` (3, 3) takes its undistorted pixels to site metres on the ground.
 
     `residual_px` is the median distance that paired points keep, in the frame's own pixels. `followed`: the last fit
-    foretold this one, no features were needed. `local` is what the frame is moved by on the map beyond that homography,
-    None where nothing is; `local_m` how far a local fit moved it in all (median, m).
+    predicted this one, no features were needed. `local` is what the frame is moved by on the map beyond that
+    homography, None where nothing is; `local_m` how far a local fit moved it in all (median, m).
     """
 
     site_from_image: Matrix3
@@ -92,7 +92,7 @@ class NotAligned:
 class _Fit:
     time_ns: int
     pose: Pose
-    rotation_told: Matrix3  # by telemetry at that time
+    telemetry_rotation: Matrix3  # by telemetry at that time
     seen_from_ideal: Matrix3  # what the fit has beyond a perfect camera at that pose
     site_from_image: Matrix3
 
@@ -162,17 +162,19 @@ class Aligner:
         small_camera = camera.resized(*size)
         gray = cv2.resize(gray_from_rgb(image), size, interpolation=cv2.INTER_AREA)
         new = self._keyframe(small_camera, normalise_contrast(gray))  # type: ignore[arg-type]
-        told = self._told_pose(prior)
-        site_from_told = None if told is None else _homography_of(small_camera, told)
-        share = _Share(lambda: 1.0 if site_from_told is None else self._share_known(site_from_told, small_camera))
+        by_telemetry = self._telemetry_pose(prior)
+        telemetry_homography = None if by_telemetry is None else _homography_of(small_camera, by_telemetry)
+        share = _Share(
+            lambda: 1.0 if telemetry_homography is None else self._share_known(telemetry_homography, small_camera)
+        )
 
-        def told_inside() -> Matrix3 | None:
-            return site_from_told if share.known >= self._settings.least_known else None
+        def telemetry_inside() -> Matrix3 | None:
+            return telemetry_homography if share.known >= self._settings.least_known else None
 
-        placed = self._by_homographies(new, prior, time_ns, told_inside)
+        placed = self._by_homographies(new, prior, time_ns, telemetry_inside)
         frame = _Frame(image, camera, gray, new, prior)  # type: ignore[arg-type]
         if self._is_doubtful(placed, prior) and self._may_search():
-            placed = self._by_search(frame, told, is_inside=told_inside() is not None) or placed
+            placed = self._by_search(frame, by_telemetry, is_inside=telemetry_inside() is not None) or placed
         if isinstance(placed, NotAligned):
             is_outside = share.known < self._settings.least_known
             reason = self._beside() if is_outside else placed.reason
@@ -188,11 +190,11 @@ class Aligner:
     # ---- inside -----------------------------------------------------------------------------------------------
 
     def _by_homographies(
-        self, new: Keyframe, prior: CameraPrior, time_ns: int, told_inside: Callable[[], Matrix3 | None]
+        self, new: Keyframe, prior: CameraPrior, time_ns: int, telemetry_inside: Callable[[], Matrix3 | None]
     ) -> "_Place | NotAligned":
         """The frame placed by the first guess that its points confirm to a part of a pixel, or why none is."""
         nearest = NotAligned("its features are found nowhere in the map where it could be", np.nan)
-        for guess, followed in self._guesses(new, new.camera, prior, time_ns, told_inside):
+        for guess, followed in self._guesses(new, new.camera, prior, time_ns, telemetry_inside):
             found = self._fit(new, guess, self._settings.doubtful_px if followed else self._settings.most_residual_px)
             if isinstance(found, NotAligned):
                 nearest = _nearer(nearest, found)
@@ -213,13 +215,13 @@ class Aligner:
         """Whether the dear search is worth its time: a flight that fits nowhere is asked every fifth frame."""
         return self._misses < _SEARCHED_MISSES or self._misses % 5 == 1
 
-    def _by_search(self, frame: "_Frame", told: Pose | None, *, is_inside: bool) -> "_Place | None":
+    def _by_search(self, frame: "_Frame", by_telemetry: Pose | None, *, is_inside: bool) -> "_Place | None":
         """The frame placed by learned features, telemetry and its neighbours; what these leave in doubt a local fit
         must confirm. Without telemetry's place the search begins at the last frame's."""
-        if told is None and self._fits and not frame.prior.knows_place:
+        if by_telemetry is None and self._fits and not frame.prior.knows_place:
             start = self._fits[-1].pose
-        elif told is not None and is_inside:
-            start = told
+        elif by_telemetry is not None and is_inside:
+            start = by_telemetry
         else:
             return None
         found = self._search.find(frame.gray, frame.even.gray, frame.even.camera, frame.prior, start)
@@ -263,7 +265,7 @@ class Aligner:
         self._count += 1
         return Keyframe(self._count, camera, gray, _NO_FEATURES, _UNKNOWN)
 
-    def _told_pose(self, prior: CameraPrior) -> Pose | None:
+    def _telemetry_pose(self, prior: CameraPrior) -> Pose | None:
         """site_from_camera as telemetry alone gives it; None where it has no place."""
         if not prior.knows_place:
             return None
@@ -275,38 +277,40 @@ class Aligner:
         return Pose(prior.rotation, np.array([*prior.position_m[:2], max(up_m, 0.5)]))
 
     def _guesses(
-        self, new: Keyframe, camera: Camera, prior: CameraPrior, time_ns: int, told_inside: Callable[[], Matrix3 | None]
+        self, new: Keyframe, camera: Camera, prior: CameraPrior, time_ns: int,
+        telemetry_inside: Callable[[], Matrix3 | None],
     ) -> Iterator[tuple[Matrix3, bool]]:
         """site_from_image good to a few pixels, the cheapest first; telemetry is asked where the past is no help."""
-        foretold = self._foretold(camera, prior, time_ns)
-        if foretold is not None:
-            yield self._shifted(new, foretold), True
-        told = told_inside()
+        predicted = self._predicted(camera, prior, time_ns)
+        if predicted is not None:
+            yield self._shifted(new, predicted), True
+        by_telemetry = telemetry_inside()
         features = orb_features(new.gray, self._settings.links.features)
         self._misses += 1
-        for attempt in self._tries(new, features, prior, foretold, told):
+        for attempt in self._tries(new, features, prior, predicted, by_telemetry):
             found = attempt()
             if found is not None:
                 yield found, False
 
     def _tries(
-        self, new: Keyframe, features: Features, prior: CameraPrior, foretold: Matrix3 | None, told: Matrix3 | None
+        self, new: Keyframe, features: Features, prior: CameraPrior, predicted: Matrix3 | None,
+        by_telemetry: Matrix3 | None,
     ) -> Iterator[Callable[[], Matrix3 | None]]:
         """What may find a frame by its features, the cheapest first: around each place that it could have, then
         anywhere. The dear searches come every fifth time: a video's next frame may be found by its telemetry again."""
-        for near in (foretold, told):
+        for near in (predicted, by_telemetry):
             if near is not None:
                 yield partial(self._by_features, new, features, near, prior, is_free=False)
-        if told is not None:  # a compass may be off by any angle
-            yield partial(self._by_features, new, features, told, prior, is_free=True)
+        if by_telemetry is not None:  # a compass may be off by any angle
+            yield partial(self._by_features, new, features, by_telemetry, prior, is_free=True)
         if self._misses % 5 != 1:
             return
-        if told is not None:
-            yield partial(self._by_sift, new, told)
-        if told is not None or not prior.knows_place:
+        if by_telemetry is not None:
+            yield partial(self._by_sift, new, by_telemetry)
+        if by_telemetry is not None or not prior.knows_place:
             yield partial(self._anywhere, features)
 
-    def _foretold(self, camera: Camera, prior: CameraPrior, time_ns: int) -> Matrix3 | None:
+    def _predicted(self, camera: Camera, prior: CameraPrior, time_ns: int) -> Matrix3 | None:
         """The last fit moved on at the flight's velocity, turned as telemetry says the camera turned."""
         if not self._fits or not 0 <= time_ns - self._fits[-1].time_ns <= _TRACKED_S * 1e9:
             return None
@@ -320,7 +324,7 @@ class Aligner:
             velocity_m_s = prior.velocity_m_s
         rotation = last.pose.rotation
         if prior.attitude_sigma_deg.max() <= 2.0:
-            rotation = prior.rotation @ last.rotation_told.T @ rotation
+            rotation = prior.rotation @ last.telemetry_rotation.T @ rotation
         place_m = last.pose.translation_m + velocity_m_s * since_s
         try:
             ideal = site_from_image_homography(camera, Pose(rotation, np.array([*place_m[:2], max(place_m[2], 0.5)])))

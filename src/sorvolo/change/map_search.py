@@ -121,15 +121,15 @@ class MapSearch:
         self._placed = [*self._placed[1 - self._settings.most_kept:], place]
 
     def find(
-        self, gray: ImageGray, even: ImageGray, camera: Camera, prior: CameraPrior, told: Pose
+        self, gray: ImageGray, even: ImageGray, camera: Camera, prior: CameraPrior, by_telemetry: Pose
     ) -> Found | None:
-        """Where a frame lies, or None. `told` is where telemetry has its camera, or, without it, where a frame that was
-        placed before had its own; `even` is its gray, contrast normalised.
+        """Where a frame lies, or None. `by_telemetry` is where telemetry has its camera, or, without it, where a
+        frame that was placed before had its own; `even` is its gray, contrast normalised.
 
         Beside a frame that was placed, the search starts from their common features; else around telemetry's place,
         turned as frames before were, then as telemetry has it, then by quarters: a compass may be off by any angle.
         """
-        sought = _Sought(gray, even, camera, prior, told)
+        sought = _Sought(gray, even, camera, prior, by_telemetry)
         features = learned_features(gray, self._settings.frame_points)
         best = None
         for found in self._tries(sought, features):

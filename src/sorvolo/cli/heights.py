@@ -43,7 +43,8 @@ def make_and_read(
     site: Path, flight: str = "", cell_m: float | None = None, *, has_orthophoto: bool = True
 ) -> Mapping[str, Any]:
     """Make a flight's heights with progress on stderr; their report."""
-    from sorvolo.missions.heights.run import REPORT, HeightSettings, make_heights
+    from sorvolo.missions.heights.run import HeightSettings, make_heights
+    from sorvolo.store.site.files import HeightFile
 
     flight_id = ""
     with ProgressReport(Console(stderr=True)) as progress:
@@ -53,11 +54,13 @@ def make_and_read(
         ):
             flight_id = update.flight_id
             progress.show(f"heights: {update.stage}, percent", round(100 * update.share), 100)
-    return read_json(site / "flights" / flight_id / REPORT)
+    return read_json(site / "flights" / flight_id / HeightFile.REPORT)
 
 
 def show_heights(site: Path, report: Mapping[str, Any], console: Console) -> None:
     """Print what a flight's heights are good for, and where the files are."""
+    from sorvolo.store.site.files import HeightFile
+
     cameras, surface = report["cameras"], report["surface"]
     table = Table(title=f"Heights of {escape(report['flight'])}", show_header=False, title_justify="left")
     rows = [
@@ -78,8 +81,8 @@ def show_heights(site: Path, report: Mapping[str, Any], console: Console) -> Non
         console.print(f"[yellow]warning[/yellow] {escape(warning)}", highlight=False)
     folder = site / "flights" / report["flight"]
     for name, file in (
-        ("heights", "heights.tif"), ("bare ground", "terrain.tif"), ("orthophoto", "orthophoto.tif"),
-        ("picture", "heights.png"),
+        ("heights", HeightFile.SURFACE), ("bare ground", HeightFile.GROUND), ("orthophoto", HeightFile.ORTHOPHOTO),
+        ("picture", HeightFile.PICTURE),
     ):
         if (folder / file).is_file():
             show_path(name, folder / file, console)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sorvolo.errors import GeometryError, SettingsError
 from sorvolo.geometry.arrays import Floats, PointsM, frozen
@@ -145,17 +144,10 @@ class FlightPlan:
         return self.passes_m.reshape(-1, 2)
 
     @property
-    def photos_m(self) -> PointsM:
-        """(N, 2) where a photo is taken."""
-        places = []
-        for (start, end), count in zip(self.passes_m, self._photos_per_pass):
-            places.append(start + np.linspace(0, 1, count)[:, None] * (end - start))
-        return np.concatenate(places)
-
-    @property
     def photo_count(self) -> int:
-        """How many photos the plan takes."""
-        return int(self._photos_per_pass.sum())
+        """How many photos the plan takes: evenly along each pass, one at either end."""
+        lengths_m = np.linalg.norm(self.passes_m[:, 1] - self.passes_m[:, 0], axis=1)
+        return int((np.rint(lengths_m / self.photo_spacing_m) + 1).sum())
 
     @property
     def distance_m(self) -> float:
@@ -171,11 +163,6 @@ class FlightPlan:
     def photo_interval_s(self) -> float:
         """Time between photos on a pass, the inverse of eq. 3.17."""
         return self.photo_spacing_m / self.speed_m_s
-
-    @property
-    def _photos_per_pass(self) -> NDArray[np.int64]:
-        lengths_m = np.linalg.norm(self.passes_m[:, 1] - self.passes_m[:, 0], axis=1)
-        return np.rint(lengths_m / self.photo_spacing_m).astype(np.int64) + 1
 
 
 def plan_strips(

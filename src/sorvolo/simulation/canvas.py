@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, PointsM, PointsPx
+from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB
 from sorvolo.simulation.noise import FieldF32, fractal, layer
 
 _COARSE = 4  # materials are mixed on a raster this many times coarser than the picture
@@ -49,11 +49,6 @@ class GroundRaster:
             self.west_m + width * self.m_per_px[0],
             self.north_m,
         )
-
-    def raster_from_site(self, points_m: PointsM) -> PointsPx:
-        """(N, 2) pixels of east, north, shape (N, 2)."""
-        matrix = self.raster_from_site_matrix
-        return points_m @ matrix[:2, :2].T + matrix[:2, 2]
 
     @property
     def raster_from_site_matrix(self) -> Floats:

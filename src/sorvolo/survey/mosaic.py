@@ -10,14 +10,12 @@ from sorvolo.geometry.arrays import (
     Descriptors,
     Floats,
     ImageGray,
-    ImageRGBA,
     Matrix3,
     PointsM,
     PointsPx,
     frozen,
 )
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.grid import TileIndex
 from sorvolo.geometry.pose import Pose
 from sorvolo.survey.flight import CameraPrior
 
@@ -126,14 +124,6 @@ class PlacedFrame:
             name, index, time_ns, Status.REJECTED, reason, camera, None, nowhere, np.full((4, 2), np.nan), residual_px,
             float("nan"),
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Tile:
-    """One square of the map."""
-
-    index: TileIndex
-    rgba: ImageRGBA
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """KLV put into a video: its pictures and sound copied as they are into a transport stream, the metadata beside them."""
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from math import isnan, nan
 from pathlib import Path
@@ -66,22 +67,33 @@ def _copy(
     source: av.container.InputContainer, pictures: av.VideoStream, target: Path, samples: Sequence[CorrectedFrame],
     height_reference: str,
 ) -> None:
-    known = [pictures, *source.streams.audio]
     metadata = klv_streams(source)
+    known = [stream for stream in (pictures, *source.streams.audio) if stream not in metadata]
     with av.open(str(target), "w", format="mpegts") as output:
-        copies = {stream.index: output.add_stream_from_template(stream) for stream in known if stream not in metadata}
+        copies = {stream.index: output.add_stream_from_template(stream) for stream in known}
         data = output.add_data_stream("klv")
-        waiting, first_s = list(samples), nan
-        for packet in (each for each in source.demux(known) if each.dts is not None):
+        waiting, first_s = deque(samples), nan
+        for packet in _packets(source, known):
             now_s = _seconds(packet)
             if packet.stream.index == pictures.index and isnan(first_s):
                 first_s = now_s
-            while waiting and first_s + waiting[0].video_s <= now_s:
-                _mux(output, data, waiting.pop(0), first_s, height_reference)
+            for sample in _due(waiting, now_s - first_s):
+                _mux(output, data, sample, first_s, height_reference)
             packet.stream = copies[packet.stream.index]
             output.mux(packet)
         for sample in waiting:
             _mux(output, data, sample, 0.0 if isnan(first_s) else first_s, height_reference)
+
+
+def _packets(source: av.container.InputContainer, streams: Sequence[Any]) -> Iterator[Any]:
+    """The packets of some streams; one without a time only flushes its stream."""
+    return (each for each in source.demux(streams) if each.dts is not None)
+
+
+def _due(waiting: deque[CorrectedFrame], video_s: float) -> Iterator[CorrectedFrame]:
+    """Take the samples up to a time of the video out of those that wait; none while that is not known (NaN)."""
+    while waiting and waiting[0].video_s <= video_s:
+        yield waiting.popleft()
 
 
 def _seconds(packet: Any) -> float:

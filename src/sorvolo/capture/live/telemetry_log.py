@@ -28,7 +28,6 @@ class TelemetryLog:
         self._rows: Floats = np.full((_FIRST_ROWS, len(TELEMETRY_COLUMNS)), np.nan)
         self._count = self._fixes = self._late = 0
         self._newest_ns = -(2**62)
-        self._came_s = 0.0
         self._changed = threading.Condition()
         self._known = no_telemetry()
         self._known_count = 0
@@ -47,7 +46,6 @@ class TelemetryLog:
                 self._rows[self._count, TELEMETRY_COLUMNS.index(name)] = value
             self._fixes += bool(np.isfinite(self._rows[self._count, _PLACE]))
             self._count += 1
-            self._came_s = time.monotonic()
             self._changed.notify_all()
 
     @property

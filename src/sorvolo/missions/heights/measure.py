@@ -14,13 +14,14 @@ from sorvolo.heights.field import HeightField, along
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.volumes import Tie, Volume, VolumeSettings, above_rim, between, tie
 from sorvolo.missions.heights.flight_views import run_of
-from sorvolo.missions.heights.run import HEIGHTS, REPORT, TERRAIN, height_grid, newest_flight
+from sorvolo.missions.heights.run import height_grid, newest_flight
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import feature_collection, geojson_bytes
 from sorvolo.store.nofollow import read_below
 from sorvolo.store.rasters.heights import read_height_cog
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.flight import Site
 
 _MOST_BYTES = 16_000_000
@@ -58,13 +59,13 @@ def measure_volume(
     wanted = read_area(area)
     with Archive.open(site, write=False) as archive:
         later_id = flight or newest_flight(archive)
-        later = read_field(archive, later_id, HEIGHTS)
+        later = read_field(archive, later_id, HeightFile.SURFACE)
         polygons = wanted.polygons_m(archive.site().frame)
         if not since:
             return MeasuredVolume(later_id, "", above_rim(later, later.inside(polygons), settings), None)
         if since == later_id:
             raise SettingsError(f"--since {since} is the flight that is measured; name an earlier one")
-        earlier = read_field(archive, since, HEIGHTS)
+        earlier = read_field(archive, since, HeightFile.SURFACE)
         inside = earlier.inside(polygons)
         tied = tie(earlier, later, ~inside, settings)
         return MeasuredVolume(later_id, since, between(earlier, later, inside, tied, settings), tied)
@@ -76,7 +77,7 @@ def measure_profile(site: Path, places: Sequence[str], *, flight: str = "", step
         raise SettingsError(f"a profile needs at least two places, got {len(places)}: --at LAT,LON --at LAT,LON")
     with Archive.open(site, write=False) as archive:
         flight_id = flight or newest_flight(archive)
-        surface, ground = (read_field(archive, flight_id, name) for name in (HEIGHTS, TERRAIN))
+        surface, ground = (read_field(archive, flight_id, name) for name in (HeightFile.SURFACE, HeightFile.GROUND))
         described = archive.site()
         corners = described.frame.ground_from_lonlat([lonlat_from_text(each) for each in places])
         points, ways = along(corners, step_m or surface.lattice.cell_m)
@@ -93,14 +94,14 @@ def write_contours(site: Path, path: Path, interval_m: float, *, flight: str = "
         raise SettingsError(f"--interval {interval_m}: give metres, 0.01 to 1000")
     with Archive.open(site, write=False) as archive:
         flight_id = flight or newest_flight(archive)
-        field = read_field(archive, flight_id, HEIGHTS if of_surface else TERRAIN)
+        field = read_field(archive, flight_id, HeightFile.SURFACE if of_surface else HeightFile.GROUND)
         described = archive.site()
         features = [_line(line, level, described) for level, line in contours(field, interval_m)]
         atomic_write_bytes(path, geojson_bytes(feature_collection("contours", features, is_local=False)))
         return len(features)
 
 
-def read_field(archive: Archive, flight_id: str, name: str) -> HeightField:
+def read_field(archive: Archive, flight_id: str, file: HeightFile) -> HeightField:
     """A height model of a flight. Raises InputError where there is none, or none of the flight's present map."""
     report = _report(archive, flight_id)
     keyframes = archive.keyframes(flight_id)
@@ -110,7 +111,7 @@ def read_field(archive: Archive, flight_id: str, name: str) -> HeightField:
             f"sorvolo heights {archive.folder} --flight {flight_id}"
         )
     site_grid = height_grid(archive.site(), float(report["cell_m"]))
-    read = read_height_cog(archive.flight_folder(flight_id) / name, site_grid.grid)
+    read = read_height_cog(archive.height_path(flight_id, file), site_grid.grid)
     rows, columns = read.bands[0].shape
     return HeightField(Lattice.at(site_grid, read.first, columns, rows), read.bands[0], read.bands[-1])
 
@@ -118,7 +119,7 @@ def read_field(archive: Archive, flight_id: str, name: str) -> HeightField:
 def _report(archive: Archive, flight_id: str) -> Mapping[str, Any]:
     folder = archive.flight_folder(flight_id)
     try:
-        report = json.loads(read_below(folder, REPORT, _MOST_BYTES))
+        report = json.loads(read_below(folder, HeightFile.REPORT, _MOST_BYTES))
         return {"run": report["run"], "cell_m": float(report["cell_m"])}
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(

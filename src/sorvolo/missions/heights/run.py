@@ -25,13 +25,9 @@ from sorvolo.store.images import png_from_rgba
 from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.store.rasters.heights import write_height_cog
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.files import HeightFile
 from sorvolo.store.tile_folder import TileFolder
 from sorvolo.survey.flight import Site
-
-HEIGHTS, TERRAIN, ORTHOPHOTO, RELIEF, REPORT = (
-    "heights.tif", "terrain.tif", "orthophoto.tif", "heights.png", "heights.json"
-)
-"""The files of a flight's folder that hold its heights."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +91,7 @@ def make_heights(
             "seconds": {"cameras": cameras_s, "heights": heights_s, "total": time.monotonic() - started_s},
             "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }
-        atomic_write_bytes(archive.flight_folder(flight_id) / REPORT, json_bytes(report))
+        atomic_write_bytes(archive.height_path(flight_id, HeightFile.REPORT), json_bytes(report))
         yield HeightsUpdate(flight_id, "done", 1.0)
 
 
@@ -134,17 +130,18 @@ def _sweep(
 
 
 def _write_models(archive: Archive, flight_id: str, surface: Surface, ground: Any) -> None:
-    site, folder = archive.site(), archive.flight_folder(flight_id)
+    site = archive.site()
     grid = height_grid(site, surface.lattice.cell_m).grid
     zero_m = site.origin.height_m
     write_height_cog(
         surface.above(zero_m), (f"height, {site.height_reference}", "one sigma"), surface.lattice.first, grid,
-        folder / HEIGHTS,
+        archive.height_path(flight_id, HeightFile.SURFACE),
     )
     write_height_cog(
-        [ground + zero_m], (f"bare ground, {site.height_reference}",), surface.lattice.first, grid, folder / TERRAIN
+        [ground + zero_m], (f"bare ground, {site.height_reference}",), surface.lattice.first, grid,
+        archive.height_path(flight_id, HeightFile.GROUND),
     )
-    atomic_write_bytes(folder / RELIEF, png_from_rgba(relief_picture(surface)))
+    atomic_write_bytes(archive.height_path(flight_id, HeightFile.PICTURE), png_from_rgba(relief_picture(surface)))
 
 
 def _paint(
@@ -158,5 +155,5 @@ def _paint(
         for index, rgba, share in painting:
             tiles.save(index, rgba)
             yield HeightsUpdate(flight_id, "orthophoto", share)
-        write_cog(tiles, site_grid, folder / ORTHOPHOTO)
+        write_cog(tiles, site_grid, archive.height_path(flight_id, HeightFile.ORTHOPHOTO))
 

@@ -49,7 +49,7 @@ class Outbox(Generic[_Item]):
         self._waiting: deque[_Item] = deque()
         self._changed = threading.Condition()
         self._is_closing = False
-        self._sent, self._failed, self._dropped, self._last_words = 0, 0, 0, ""
+        self._failed, self._dropped, self._last_words = 0, 0, ""
         self._thread = threading.Thread(target=self._run, name=code, daemon=True)
         self._thread.start()
 
@@ -71,11 +71,6 @@ class Outbox(Generic[_Item]):
         with self._changed:
             self._dropped += len(self._waiting)
             self._waiting.clear()
-
-    @property
-    def sent(self) -> int:
-        """How many went out well."""
-        return self._sent
 
     def notices(self) -> tuple[Notice, ...]:
         """What failed so far."""
@@ -101,8 +96,6 @@ class Outbox(Generic[_Item]):
             except Exception as error:  # counted and reported: one bad answer must not end all later alerts
                 self._failed += 1
                 self._last_words = " ".join(str(error).split())[:200] or type(error).__name__
-            else:
-                self._sent += 1
 
 
 def alert_command(template: str, *, limit_s: float = _COMMAND_LIMIT_S) -> Callable[[Mapping[str, Any]], None]:

@@ -15,7 +15,7 @@ from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
 from sorvolo.store.site.catalogue import FlightEntry, StoredKeyframe, TileDifference, VersionEntry
 from sorvolo.store.site.change_records import StoredChange, StoredReview
-from sorvolo.store.site.files import SiteFiles
+from sorvolo.store.site.files import HeightFile, SiteFiles
 from sorvolo.store.site.flight_writer import FlightWriter
 from sorvolo.store.site.names import is_plain_name
 from sorvolo.store.site.object_records import StoredObject, StoredSearch
@@ -96,6 +96,10 @@ class Archive:
     def flight_folder(self, flight_id: str) -> Path:
         """Where a flight's frames.geojson, report.json, report.html, keyframes and changes lie."""
         return self._files.flight_folder(flight_id)
+
+    def height_path(self, flight_id: str, file: HeightFile) -> Path:
+        """Where a file of a flight's heights lies, whether it is there or not."""
+        return self._files.height_path(flight_id, file)
 
     def report(self, flight_id: str) -> Mapping[str, Any]:
         """A flight's report.json (docs/formats.md); empty when somebody took it away or broke it."""

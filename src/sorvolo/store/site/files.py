@@ -4,6 +4,7 @@ import fcntl
 import json
 import os
 from collections.abc import Mapping, Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, Self
 
@@ -27,6 +28,16 @@ STAGED = "staged"
 
 _LOCK = "site.lock"
 _MOST_REPORT_BYTES = 256_000_000  # of a report.json: an hour's track takes a hundredth
+
+
+class HeightFile(StrEnum):
+    """The files of a flight's folder that hold its heights."""
+
+    SURFACE = "heights.tif"
+    GROUND = "terrain.tif"
+    ORTHOPHOTO = "orthophoto.tif"
+    PICTURE = "heights.png"
+    REPORT = "heights.json"
 
 
 class SiteFiles:
@@ -103,6 +114,10 @@ class SiteFiles:
     def document_path(self, flight_id: str, name: str) -> Path:
         """A text file of a flight; raises StoreError for a name that could lie elsewhere."""
         return self.flight_folder(flight_id) / checked_document(name)
+
+    def height_path(self, flight_id: str, file: HeightFile) -> Path:
+        """Where a file of a flight's heights lies, whether it is there or not."""
+        return self.flight_folder(flight_id) / file
 
     def staged_folder(self, flight_id: str, run_id: int) -> Path:
         """Where a run collects pictures until it is committed."""
