@@ -26,6 +26,9 @@ LAYER_APRON_PX = 64
 WINDOW_APRON_PX = 80
 """How far a window must reach beyond the pixels wanted of it, so that they do not depend on where it ends."""
 
+FILL_PX = 8
+"""Image pixels that `coarse_fill` takes as one."""
+
 _HARD_BANDS = 2
 
 _Pixel = TypeVar("_Pixel", np.uint8, np.float32)
@@ -104,6 +107,24 @@ def fill_invalid(image: ImageRGB, valid: Mask) -> ImageRGB:
     result = np.clip(filled, 0, 255).astype(np.uint8)
     result[valid] = image[valid]
     return result
+
+
+def coarse_fill(image: ImageRGB, valid: Mask) -> ImageRGB:
+    """The image at an eighth of its size (rounded up), by its valid pixels alone, continued where there are none.
+
+    Enough for what lies beyond a frame's border: only the coarse bands of a blend look there.
+    """
+    height, width = valid.shape
+    below, beside = -height % FILL_PX, -width % FILL_PX
+    size = (width + beside) // FILL_PX, (height + below) // FILL_PX
+    known = valid.astype(np.uint8) * np.uint8(255)
+    seen = cv2.copyMakeBorder(cv2.copyTo(image, known), 0, below, 0, beside, cv2.BORDER_CONSTANT)
+    share = cv2.copyMakeBorder(known, 0, below, 0, beside, cv2.BORDER_CONSTANT)
+    colours, weights = (
+        cv2.resize(each, size, interpolation=cv2.INTER_AREA).astype(np.float32) for each in (seen, share)
+    )
+    small = np.clip(colours * 255 / np.maximum(weights, 1)[..., None] + 0.5, 0, 255).astype(np.uint8)
+    return fill_invalid(small, weights > 64)
 
 
 class _Bands:

@@ -24,6 +24,7 @@ from sorvolo.mosaic.blending import (
     Layer,
     Winners,
     blend,
+    coarse_fill,
     pixels_of,
     winners_from_shares,
 )
@@ -32,6 +33,7 @@ from sorvolo.mosaic.known_ground import SETTLING_PX, KnownGround, settled
 
 _CHUNK_CELLS = 64
 _NOBODY = -1
+_FILLINGS = 32  # kept: each has a 64th of its picture's pixels
 # A changed winner is felt as far as the bands spread (62 px) and its outline is smoothed (2 cells) around it.
 _REACH_CELLS = 10
 
@@ -83,6 +85,7 @@ class Canvas:
         self._chunks: dict[TileIndex, _Chunk] = {}
         self._known = KnownGround(grid, tiles) if keeps_known_ground else None
         self._painted_before: set[int] = set()
+        self._fillings: dict[int, ImageRGB] = {}
         self._bounded: set[TileIndex] = set()  # chunks where painted frames win what the map showed, no more
         for frame in painted:
             self._add(frame)
@@ -228,14 +231,15 @@ class Canvas:
         across, down = (max(1, -(-side * CELL_PX // self._settings.window_px)) for side in (width, height))
         xs = np.linspace(left, left + width, across + 1).astype(int)
         ys = np.linspace(top, top + height, down + 1).astype(int)
-        for y0, y1 in pairwise(ys.tolist()):
-            for x0, x1 in pairwise(xs.tolist()):
-                x, y, w, h = cv2.boundingRect(cells[y0:y1, x0:x1])
-                if w and h:
-                    first = low + np.array([x0 + x, y0 + y])
-                    begin = first * CELL_PX // ALIGN_PX * ALIGN_PX
-                    end = -(-(first + np.array([w, h])) * CELL_PX // ALIGN_PX) * ALIGN_PX
-                    yield int(begin[0]), int(begin[1]), int(end[0]), int(end[1])
+        rows, columns = list(pairwise(ys.tolist())), list(pairwise(xs.tolist()))
+        for column, row in _neighbours_first(len(columns), len(rows)):
+            (x0, x1), (y0, y1) = columns[column], rows[row]
+            x, y, w, h = cv2.boundingRect(cells[y0:y1, x0:x1])
+            if w and h:
+                first = low + np.array([x0 + x, y0 + y])
+                begin = first * CELL_PX // ALIGN_PX * ALIGN_PX
+                end = -(-(first + np.array([w, h])) * CELL_PX // ALIGN_PX) * ALIGN_PX
+                yield int(begin[0]), int(begin[1]), int(end[0]), int(end[1])
 
     def _render(self, x0: int, y0: int, x1: int, y1: int) -> ImageRGBA:
         """The picture of an aligned window of grid pixels, ends exclusive."""
@@ -278,7 +282,21 @@ class Canvas:
             x1 = min(labels.shape[1], -(-(left + width + LAYER_APRON_PX) // ALIGN_PX) * ALIGN_PX)
             y1 = min(labels.shape[0], -(-(top + height + LAYER_APRON_PX) // ALIGN_PX) * ALIGN_PX)
             frame = self._frames[each]
-            yield Layer(number, x0, y0, warp(self._images(each), frame, (x + x0, y + y0, x + x1, y + y1)))
+            image = self._images(each)
+            window = (x + x0, y + y0, x + x1, y + y1)
+            yield Layer(number, x0, y0, warp(image, frame, window, self._beyond(frame, image)))
+
+    def _beyond(self, frame: CanvasFrame, image: ImageRGB) -> ImageRGB | None:
+        """What `warp` wants of an image with invalid pixels, remembered for those used last."""
+        if frame.valid is None:
+            return None
+        found = self._fillings.pop(frame.id, None)
+        if found is None:
+            found = coarse_fill(image, frame.valid)
+            while len(self._fillings) >= _FILLINGS:
+                self._fillings.pop(next(iter(self._fillings)))
+        self._fillings[frame.id] = found
+        return found
 
     def _winners(self, column: int, row: int, width: int, height: int) -> NDArray[np.int64]:
         """(height, width) winners of a block of cells."""
@@ -331,6 +349,14 @@ class Canvas:
         else:
             del self._tiles[index]
         return True
+
+
+def _neighbours_first(across: int, down: int) -> list[tuple[int, int]]:
+    """Columns and rows so that those near each other follow each other (Z-order): they show the same few frames."""
+    def along_z(place: tuple[int, int]) -> int:
+        return sum((place[0] >> bit & 1) << 2 * bit | (place[1] >> bit & 1) << 2 * bit + 1 for bit in range(24))
+
+    return sorted(((column, row) for row in range(down) for column in range(across)), key=along_z)
 
 
 def _share(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Floats, ImageRGB, Mask, Matrix3, PointsPx, frozen
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.mosaic.blending import WINDOW_APRON_PX, fill_invalid
+from sorvolo.mosaic.blending import FILL_PX, WINDOW_APRON_PX, coarse_fill
 from sorvolo.mosaic.exposure import corrected
 
 CELL_PX = 8
@@ -54,34 +54,99 @@ class CanvasFrame:
         return apply_homography(self.grid_from_image, np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]]))
 
 
-def warp(image: ImageRGB, frame: CanvasFrame, window: tuple[int, int, int, int]) -> ImageRGB:
+def warp(
+    image: ImageRGB, frame: CanvasFrame, window: tuple[int, int, int, int], beyond: ImageRGB | None = None
+) -> ImageRGB:
     """A frame's image, its exposure corrected, in a window of grid pixels (x0, y0, x1, y1, ends exclusive).
 
-    Beyond its border the image is reflected as far as blending looks, and black from there on. Raises
-    GeometryError when the image is not of the frame's size.
+    Beyond its border the image is reflected as far as blending looks, and black from there on. Only the part of the
+    image that the window shows is looked at, and, but for rounding, no pixel depends on which window that is. `beyond`
+    is what `blending.coarse_fill` gives of an image with invalid pixels, where the caller has it. Raises GeometryError
+    when the image is not of the frame's size.
     """
     if image.shape[:2] != (frame.height_px, frame.width_px):
         raise GeometryError(
             f"frame {frame.id}: image {image.shape[1]}x{image.shape[0]}, "
             f"expected {frame.width_px}x{frame.height_px}"
         )
-    source = image if frame.valid is None else fill_invalid(image, frame.valid)
-    window_from_source = _shift(-window[0], -window[1]) @ frame.grid_from_image
     grid_px_per_px = float(np.sqrt(np.prod(_stretch(frame))))
-    while grid_px_per_px < 0.5 and min(source.shape[:2]) > 32:
-        # a mere interpolation would skip source pixels and shimmer
+    halvings = 0  # a mere interpolation would skip source pixels and shimmer
+    while grid_px_per_px * 2**halvings < 0.5 and min(image.shape[:2]) >> halvings > 32:
+        halvings += 1
+    pad = int(np.ceil(1.5 * WINDOW_APRON_PX / (grid_px_per_px * 2**halvings)))
+    part = _part_shown(frame, window, halvings, pad)
+    if part is None:
+        return np.zeros((window[3] - window[1], window[2] - window[0], 3), np.uint8)
+    source = _filled(image, frame, part, beyond)
+    for _ in range(halvings):
         source = cv2.pyrDown(source)  # type: ignore[assignment]
-        window_from_source = window_from_source @ np.diag([2.0, 2.0, 1.0])
-        grid_px_per_px *= 2
+    x0, y0, x1, y1 = part
+    place = x0 >> halvings, y0 >> halvings, -(-frame.width_px >> halvings), -(-frame.height_px >> halvings)
     # four channels and a constant border are OpenCV's fast path: three times faster than RGB and reflection
-    pad = int(np.ceil(1.5 * WINDOW_APRON_PX / grid_px_per_px))
-    rgba = cv2.cvtColor(corrected(source, frame.gains, frame.vignette), cv2.COLOR_RGB2RGBA)
-    warped = cv2.warpPerspective(
-        cv2.copyMakeBorder(rgba, pad, pad, pad, pad, cv2.BORDER_REFLECT),
-        window_from_source @ _shift(-pad, -pad),
-        (window[2] - window[0], window[3] - window[1]), flags=cv2.INTER_LINEAR,
+    rgba = cv2.cvtColor(corrected(source, frame.gains, frame.vignette, place), cv2.COLOR_RGB2RGBA)
+    left, top = pad * (x0 == 0), pad * (y0 == 0)
+    right, bottom = pad * (x1 == frame.width_px), pad * (y1 == frame.height_px)
+    window_from_source = (
+        _shift(-window[0], -window[1]) @ frame.grid_from_image @ _shift(x0, y0) @ np.diag([2.0**halvings] * 2 + [1.0])
     )
+    framed = cv2.copyMakeBorder(rgba, top, bottom, left, right, cv2.BORDER_REFLECT)
+    size = window[2] - window[0], window[3] - window[1]
+    warped = cv2.warpPerspective(framed, window_from_source @ _shift(-left, -top), size, flags=cv2.INTER_LINEAR)
     return cv2.cvtColor(warped, cv2.COLOR_RGBA2RGB)  # type: ignore[return-value]
+
+
+def _part_shown(
+    frame: CanvasFrame, window: tuple[int, int, int, int], halvings: int, pad: int
+) -> tuple[int, int, int, int] | None:
+    """The part of an image (x0, y0, x1, y1, ends exclusive) that a window shows, with what is reflected into it.
+
+    It begins at multiples of what is halved away. All of it where the window reaches the image's horizon, None where
+    none is shown.
+    """
+    x0, y0, x1, y1 = window
+    width, height, step = frame.width_px, frame.height_px, 1 << halvings
+    corners = np.linalg.inv(frame.grid_from_image) @ [[x0, x1, x1, x0], [y0, y0, y1, y1], [1.0] * 4]
+    depth = corners[2] * np.sign((np.linalg.inv(frame.grid_from_image) @ _centre_px(frame))[2])
+    if depth.min() <= 1e-3 * depth.max():
+        return 0, 0, width, height
+    low, high = (each(corners[:2] / corners[2], axis=1) for each in (np.min, np.max))
+    reach = pad * step
+    if (high < -reach).any() or (low > [width + reach, height + reach]).any():
+        return None
+    margin = 4 * step + 2  # of interpolation, and of the filter that halves
+    deep = reach + margin  # what is reflected beyond a border lies so deep within it
+    sides = []
+    for first, last, side in zip(low, high, (width, height), strict=True):
+        begin, end = int(np.floor(first)) - margin, int(np.ceil(last)) + margin + 1
+        begin = begin if end < side else min(begin, side - deep)
+        end = end if begin > 0 else max(end, deep)
+        begin, end = max(0, begin) // step * step, min(side, -(-end // step) * step)
+        if end < side and side - end < step:
+            end = side
+        sides.append((begin, end))
+    return sides[0][0], sides[1][0], sides[0][1], sides[1][1]
+
+
+def _filled(
+    image: ImageRGB, frame: CanvasFrame, part: tuple[int, int, int, int], beyond: ImageRGB | None
+) -> ImageRGB:
+    """A part of a frame's image, its invalid pixels continued from the valid ones around them."""
+    x0, y0, x1, y1 = part
+    source = image[y0:y1, x0:x1]
+    if frame.valid is None:
+        return source
+    valid = frame.valid[y0:y1, x0:x1]
+    if valid.all():
+        return source
+    small = coarse_fill(image, frame.valid) if beyond is None else beyond
+    rows, columns = np.nonzero(~valid)
+    filled = source.copy()
+    filled[rows, columns] = small[(rows + y0) // FILL_PX, (columns + x0) // FILL_PX]
+    return filled
+
+
+def _centre_px(frame: CanvasFrame) -> Floats:
+    return np.array([(frame.width_px - 1) / 2, (frame.height_px - 1) / 2, 1.0])
 
 
 def coverage(frame: CanvasFrame, window: tuple[int, int, int, int]) -> NDArray[np.uint8]:
@@ -130,7 +195,7 @@ def cell_merits(frame: CanvasFrame, column: int, row: int, width: int, height: i
     xs = (np.arange(column, column + width) + 0.5) * CELL_PX - 0.5
     ys = (np.arange(row, row + height) + 0.5) * CELL_PX - 0.5
     image_from_grid = np.linalg.inv(frame.grid_from_image)
-    centre = np.array([(frame.width_px - 1) / 2, (frame.height_px - 1) / 2, 1.0])
+    centre = _centre_px(frame)
     image_from_grid *= np.sign((frame.grid_from_image @ centre)[2])
     u, v, z = (a * xs[None, :] + b * ys[:, None] + c for a, b, c in image_from_grid)
     seen = z > 1e-9

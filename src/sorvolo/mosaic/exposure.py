@@ -126,9 +126,12 @@ def solve_exposure(
     return Exposure(gains, vignettes, spread)
 
 
-def corrected(image: ImageRGB, gains: Floats, vignette: Floats) -> ImageRGB:
-    """The image as it would be with gain 1 and no vignette: times gains (3,), divided by exp(a2 r^2 + a4
-    r^4).
+def corrected(
+    image: ImageRGB, gains: Floats, vignette: Floats, place: tuple[int, int, int, int] | None = None
+) -> ImageRGB:
+    """The image as it would be with gain 1 and no vignette: times gains (3,), divided by exp(a2 r^2 + a4 r^4).
+
+    `place` says which part of a whole picture the image is: its first pixel's x and y, the whole's width and height.
     """
     if not vignette.any():
         if (gains == 1).all():
@@ -136,16 +139,14 @@ def corrected(image: ImageRGB, gains: Floats, vignette: Floats) -> ImageRGB:
         table = np.clip(np.arange(256)[:, None] * gains + 0.5, 0, 255).astype(np.uint8)
         return cv2.LUT(image, table[None])  # type: ignore[return-value]
     height, width = image.shape[:2]
-    # the field is smooth: a sixteenth of its size and interpolation give it to a thousandth
-    x, y = np.linspace(-1, 1, width // 16 + 2), np.linspace(-1, 1, height // 16 + 2)
-    radius2 = (x[None, :] ** 2 * width**2 + y[:, None] ** 2 * height**2) / (width**2 + height**2)
-    field = np.exp(-(vignette[0] * radius2 + vignette[1] * radius2**2)).astype(np.float32)
-    wide = cv2.warpAffine(
-        field, np.array([[(width - 1) / (len(x) - 1), 0, 0], [0, (height - 1) / (len(y) - 1), 0.0]]),
-        (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE,
-    )
+    x0, y0, whole_width, whole_height = place or (0, 0, width, height)
+    diagonal2 = whole_width**2 + whole_height**2
+    x = (2 * np.arange(x0, x0 + width) - (whole_width - 1)) ** 2 / diagonal2
+    y = (2 * np.arange(y0, y0 + height) - (whole_height - 1)) ** 2 / diagonal2
+    radius2 = y.astype(np.float32)[:, None] + x.astype(np.float32)
+    field = cv2.exp(-(np.float32(vignette[0]) + np.float32(vignette[1]) * radius2) * radius2)
     return cv2.merge([  # type: ignore[return-value]
-        cv2.multiply(channel, wide, scale=float(gain), dtype=cv2.CV_8U)
+        cv2.multiply(channel, field, scale=float(gain), dtype=cv2.CV_8U)
         for channel, gain in zip(cv2.split(image), gains)
     ])
 
