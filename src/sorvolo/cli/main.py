@@ -30,6 +30,7 @@ from sorvolo.cli.review import review
 from sorvolo.cli.search import search_command
 from sorvolo.cli.serve import serve, token
 from sorvolo.cli.simulate import simulate
+from sorvolo.cli.stream import stream
 from sorvolo.cli.telemetry import telemetry_command
 from sorvolo.cli.train import train
 from sorvolo.cli.watch import watch_command
@@ -42,7 +43,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "inspect": inspect, "plan": plan, "map": map_command, "compare": compare, "watch": watch_command,
     "search": search_command, "telemetry": telemetry_command, "simulate": simulate, "train": train,
     "calibrate": calibrate, "demo": demo, "history": history, "review": review,
-    "heights": heights, "serve": serve, "token": token,
+    "heights": heights, "serve": serve, "stream": stream, "token": token,
 }
 _FAILED, _STOPPED = 1, 130
 _FULL = (errno.ENOSPC, errno.EDQUOT)

@@ -54,7 +54,7 @@ def serve(
 
     Example: sorvolo serve maps --host 0.0.0.0 --tls-cert cert.pem --tls-key key.pem
     """
-    _demand_extra()
+    demand_extra()
     from sorvolo.station.server import run_station
     from sorvolo.station.settings import StationSettings
 
@@ -83,7 +83,7 @@ def token(
 
     Example: sorvolo token maps "Ada" --role review
     """
-    _demand_extra()
+    demand_extra()
     from sorvolo.station.settings import STATE_FOLDER
     from sorvolo.station.state import StationState
     from sorvolo.station.tokens import list_tokens, make_token, revoke_token
@@ -132,7 +132,7 @@ def _demand_folder(root: Path) -> None:
         raise InputError(f"no such folder: {root}; `sorvolo demo` makes one with a site in it")
 
 
-def _demand_extra() -> None:
+def demand_extra() -> None:
     """Raise SettingsError where the packages of the station are not installed."""
     for name in _NEEDED:
         try:

@@ -18,18 +18,22 @@ from sorvolo.station.crops import crop_routes
 from sorvolo.station.event_routes import event_routes
 from sorvolo.station.events import EventLog
 from sorvolo.station.features import feature_routes, landing_links
+from sorvolo.station.ingest import Ingest, IngestLimits
 from sorvolo.station.problems import Problem, answer_problems
 from sorvolo.station.reviews import Reviews, review_routes
 from sorvolo.station.security import COOKIE, Doorkeeper, holder_in, needs
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.sites import SiteShelf, readable, site_detail
 from sorvolo.station.state import StationState
+from sorvolo.station.stream_routes import announcing, stream_routes
 from sorvolo.station.tiles import WebTiles
 from sorvolo.station.tokens import Role
 
 PAGE_FOLDER = Path(__file__).parent / "page"
 _FOR_EVER = "public, max-age=31536000, immutable"
 _UPLOADS = "/api/uploads"
+STREAMS_FOLDER = "streams"
+"""The folder below the root that keeps what drones send."""
 
 
 @dataclass(frozen=True)
@@ -43,14 +47,17 @@ class Station:
     events: EventLog
     collections: SiteCollections
     reviews: Reviews
+    ingest: Ingest
 
     @classmethod
     def open(cls, settings: StationSettings) -> "Station":
         """Open the station's own files. Raises StoreError where they cannot be used."""
         state, shelf = StationState.open(settings.state_folder), SiteShelf(settings.root)
         events = EventLog(state)
+        limits = IngestLimits(free_bytes=round(settings.free_floor_gb * 1e9))
         return cls(
             settings, state, shelf, WebTiles(shelf), events, SiteCollections(shelf), Reviews(state, shelf, events),
+            Ingest(settings.root / STREAMS_FOLDER, limits, announcing(events)),
         )
 
     def close(self) -> None:
@@ -66,6 +73,7 @@ def station_app(settings: StationSettings) -> FastAPI:
     @asynccontextmanager
     async def while_it_runs(_: FastAPI) -> AsyncIterator[None]:
         yield
+        await station.ingest.close()
         station.close()
 
     app = FastAPI(
@@ -77,7 +85,7 @@ def station_app(settings: StationSettings) -> FastAPI:
     for router in (
         _about_routes(station), _site_routes(station), event_routes(station.events),
         feature_routes(station.collections, station.reviews), review_routes(station.reviews, station.shelf),
-        crop_routes(station.shelf),
+        crop_routes(station.shelf), stream_routes(station.ingest),
     ):
         app.include_router(router)
     _serve_page(app)

@@ -6,17 +6,22 @@ from pathlib import Path
 
 from sorvolo.capture.live.reconnect import LiveSettings, Outages
 
-_POLL_S = 0.1
+ENDED_SUFFIX = ".ended"
+"""A file of this name beside a growing one states that nothing more is added."""
+
+_POLL_S = 0.05
 
 
 class GrowingFile:
-    """What PyAV reads from: it waits for more at the file's end, until nothing was added for `give_up_s`.
+    """What PyAV reads from: it waits for more at the file's end, until nothing was added for `give_up_s`, or until
+    a file beside it (`ENDED_SUFFIX`) states its end.
 
     There is no seeking, so the container must be one that is written front to back: MPEG-TS, fragmented MP4, MKV.
     """
 
     def __init__(self, path: Path, settings: LiveSettings, outages: Outages, stop: threading.Event) -> None:
         self._file = path.open("rb")
+        self._ended = path.with_name(path.name + ENDED_SUFFIX)
         self._settings, self._outages, self._stop = settings, outages, stop
 
     def read(self, size: int) -> bytes:
@@ -26,6 +31,8 @@ class GrowingFile:
             if data := self._file.read(size):
                 self._outages.back()
                 return data
+            if self._ended.exists():
+                return self._file.read(size)
             quiet_s = time.monotonic() - began_s
             if quiet_s > self._settings.give_up_s:
                 break

@@ -52,8 +52,16 @@ ITEMS: Mapping[int, Item] = {
     90: Item("platform_pitch_full_deg", -90, 90, 4, is_signed=True),
     91: Item("platform_roll_full_deg", -90, 90, 4, is_signed=True),
     104: Item("sensor_ellipsoid_height_extended_m", -900, 40_000, 3, is_imapb=True),
+    # ST 0601 has no tags for these: numbers that it does not use, which other receivers pass over
+    200: Item("height_above_takeoff_m", -20_000, 20_000, 4, is_signed=True),
+    201: Item("horizontal_sigma_m", 0, 10_000, 4),
+    202: Item("vertical_sigma_m", 0, 10_000, 4),
+    203: Item("tilt_sigma_deg", 0, 180, 2),
+    204: Item("heading_sigma_deg", 0, 180, 2),
+    205: Item("course_deg", 0, 360, 2),
+    206: Item("speed_m_s", 0, 1000, 4),
 }
-"""The tags that are read, by number."""
+"""The tags that are read, by number; those from 200 on are Sorvolo's own, in the flights that a station keeps."""
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,10 @@ from sorvolo.survey.flight import TELEMETRY_COLUMNS, CameraModel, Notice, Teleme
 FORMAT = "klv"
 """The name that `Telemetry.format` carries."""
 
+_OWN_TAGS = (
+    "height_above_takeoff_m", "horizontal_sigma_m", "vertical_sigma_m", "tilt_sigma_deg", "heading_sigma_deg",
+    "course_deg", "speed_m_s",
+)  # named as their columns
 _FOV_SIGMA = 0.03  # of a focal length from the field of view: operators round it, and zooms lag behind it
 _LEVEL_FROM_CAMERA = site_from_gimbal_rotation(0.0, 0.0, 0.0)
 
@@ -36,6 +40,7 @@ def columns_of(stated: LocalSet) -> dict[str, float]:
         "latitude_deg": stated["sensor_latitude_deg"], "longitude_deg": stated["sensor_longitude_deg"],
         "orthometric_height_m": stated["sensor_true_altitude_m"],
         "ellipsoidal_height_m": full_m if isfinite(full_m) else stated["sensor_ellipsoid_height_m"],
+        **{name: stated[name] for name in _OWN_TAGS},
     }
     heading, pitch, roll = stated["platform_heading_deg"], _pitch_of(stated), _roll_of(stated)
     columns |= {"body_yaw_deg": heading, "body_pitch_deg": pitch, "body_roll_deg": roll}

@@ -1,0 +1,353 @@
+"""Flights that drones send: taken in message by message, kept on the disk, acknowledged once they are there."""
+
+import asyncio
+import json
+import shutil
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Protocol
+
+from sorvolo.capture.live.growing import ENDED_SUFFIX
+from sorvolo.errors import InputError, StoreError
+from sorvolo.station.access_units import begins_decoding, has_picture
+from sorvolo.station.messages import (
+    Hello,
+    Kind,
+    Message,
+    Sample,
+    check_stream,
+    hello_from_json,
+    is_stream,
+    message_from_bytes,
+    sample_from_json,
+)
+from sorvolo.station.transport_stream import FlightFile
+from sorvolo.station.video import VideoHub
+from sorvolo.store.atomic import atomic_write_bytes
+
+REFUSED_CODE, BUSY_CODE = 4400, 4503
+"""WebSocket close codes: trying again is no use; try again later."""
+
+_HELLO_S = 10.0
+_SPACE_EVERY_S = 1.0
+_MOST_REASON_BYTES = 120  # a close frame holds 123
+
+
+@dataclass(frozen=True)
+class IngestLimits:
+    """What a station takes from drones."""
+
+    streams: int = 16  # that send at the same time
+    message_bytes: int = 8_000_000
+    most_ahead_us: int = 86_400_000_000  # of a picture's time after the one before it
+    free_bytes: int = 2_000_000_000  # of the disk, which stay free
+    sync_s: float = 0.25  # how often the disk is waited for, and what it has acknowledged
+    silent_s: float = 30.0  # a link that sends nothing for so long is closed
+
+
+class LinkClosed(Exception):
+    """The other side is gone."""
+
+
+class Link(Protocol):
+    """One connection of a drone."""
+
+    async def receive(self) -> bytes:
+        """The next binary message. Raises LinkClosed."""
+
+    async def send(self, text: str) -> None:
+        """Send an answer. Raises LinkClosed."""
+
+    async def close(self, code: int, reason: str) -> None:
+        """End the connection."""
+
+
+Announce = Callable[[str, Mapping[str, Any]], None]
+"""Called with a stream's id and its state whenever that changes."""
+
+
+class Refusal(Exception):
+    """Why a drone's link is closed. `is_final`: trying again is no use."""
+
+    def __init__(self, reason: str, *, is_final: bool = True) -> None:
+        super().__init__(reason)
+        self.code = REFUSED_CODE if is_final else BUSY_CODE
+
+
+class Ingest:
+    """All streams of a station, each a folder below `folder`. Used from one event loop."""
+
+    def __init__(
+        self, folder: Path, limits: IngestLimits = IngestLimits(), announce: Announce = lambda *_: None,
+    ) -> None:
+        self._folder, self._limits, self._announce = folder, limits, announce
+        self._flights: dict[str, Flight] = {}
+        self._links: dict[str, Link] = {}
+        self._hubs: dict[str, VideoHub] = {}
+
+    async def serve(self, stream: str, link: Link) -> None:
+        """Take one connection until it ends; why it was refused is sent to the drone."""
+        try:
+            flight = await self._greeted(stream, link)
+            try:
+                await self._take_all(stream, flight, link)
+            finally:
+                if self._links.get(stream) is link:
+                    del self._links[stream]
+                    await asyncio.to_thread(flight.close)
+                    self._announce(stream, self.state(stream))
+        except Refusal as refusal:
+            await _close(link, refusal.code, str(refusal))
+        except (InputError, StoreError) as error:
+            await _close(link, REFUSED_CODE, str(error))
+        except LinkClosed:
+            pass
+
+    def hub(self, stream: str) -> VideoHub:
+        """Where a stream's pictures are shown. Raises InputError for an impossible id."""
+        check_stream(stream)
+        if stream not in self._hubs:
+            if len(self._hubs) >= 10 * self._limits.streams:
+                raise InputError("too many streams are asked for; close some pages")
+            self._hubs[stream] = VideoHub()
+        return self._hubs[stream]
+
+    def streams(self) -> list[dict[str, Any]]:
+        """The state of every stream that was ever taken, by name."""
+        names = {each.name for each in self._folder.iterdir() if each.is_dir()} if self._folder.is_dir() else set()
+        return [self.state(name) for name in sorted(names) if is_stream(name)]
+
+    def state(self, stream: str) -> dict[str, Any]:
+        """A stream at a glance: its flights, newest last, and what the one that is being sent does."""
+        check_stream(stream)
+        flight = self._flights.get(stream)
+        found = {"stream": stream, "is_connected": stream in self._links, "flights": self._kept(stream)}
+        return found | (flight.figures() if flight is not None else {})
+
+    def newest(self, stream: str) -> Path | None:
+        """The file of the stream's newest flight, which a mission follows; None where there is none."""
+        kept = self._kept(stream)
+        return self._folder / stream / f"{kept[-1]['flight']}.ts" if kept else None
+
+    async def close(self) -> None:
+        """Close every file; the drones' links end with the server."""
+        for flight in self._flights.values():
+            await asyncio.to_thread(flight.close)
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _kept(self, stream: str) -> list[dict[str, Any]]:
+        folder = self._folder / stream
+        files = sorted(folder.glob("*.ts")) if folder.is_dir() else []
+        return [
+            {"flight": each.stem, "bytes": each.stat().st_size, "is_over": _ended(each).exists()} for each in files
+        ]
+
+    async def _greeted(self, stream: str, link: Link) -> "Flight":
+        """The flight that a drone comes with, open for writing. Raises Refusal, InputError or StoreError."""
+        check_stream(stream)
+        try:
+            first = message_from_bytes(await asyncio.wait_for(link.receive(), _HELLO_S))
+        except TimeoutError:
+            raise Refusal(f"no hello within {_HELLO_S:.0f} s", is_final=False) from None
+        if first.kind is not Kind.HELLO:
+            raise Refusal("the first message must be a hello")
+        hello = hello_from_json(first.payload)
+        self._check_space()
+        await self._make_room(stream, hello, link)
+        flight = self._flights.get(stream)
+        if flight is None or flight.hello.flight != hello.flight or not flight.is_open:
+            flight = await asyncio.to_thread(open_flight, self._folder / stream, hello)
+        self._flights[stream], self._links[stream] = flight, link
+        self.hub(stream).begin(hello)
+        await link.send(json.dumps({"type": "welcome", "seq": flight.last_seq}))
+        self._announce(stream, self.state(stream))
+        return flight
+
+    async def _make_room(self, stream: str, hello: Hello, link: Link) -> None:
+        """End an older link of the same drone. Raises Refusal where another one sends, or too many do."""
+        older = self._links.get(stream)
+        if older is None:
+            if len(self._links) >= self._limits.streams:
+                raise Refusal(f"{len(self._links)} streams are being sent, and no more are taken", is_final=False)
+            self._links[stream] = link  # so that two that come at once are not both let in
+            return
+        before = self._flights.get(stream)
+        if before is not None and before.hello.flight != hello.flight:
+            raise Refusal(f"another drone sends as {stream}; give --stream another name", is_final=False)
+        self._links[stream] = link
+        await _close(older, BUSY_CODE, "the drone opened a newer link")
+        if before is not None:
+            await asyncio.to_thread(before.close)
+
+    async def _take_all(self, stream: str, flight: "Flight", link: Link) -> None:
+        hub = self.hub(stream)
+        syncing = asyncio.create_task(self._acknowledge(flight, link))
+        space_s = 0.0
+        try:
+            while True:
+                message = await self._received(link)
+                if time.monotonic() - space_s > _SPACE_EVERY_S:
+                    space_s = time.monotonic()
+                    self._check_space()
+                if self._links.get(stream) is not link:
+                    raise LinkClosed
+                if message.kind is Kind.END:
+                    await asyncio.to_thread(flight.end)
+                    await link.send(json.dumps({"type": "ack", "seq": flight.last_seq}))
+                    await link.send(json.dumps({"type": "ended", "seq": flight.last_seq}))
+                    await link.close(1000, "the flight is over")
+                    return
+                if flight.take(message) and message.kind is Kind.VIDEO:
+                    hub.show(message)
+        finally:
+            syncing.cancel()
+
+    async def _received(self, link: Link) -> Message:
+        try:
+            data = await asyncio.wait_for(link.receive(), self._limits.silent_s)
+        except TimeoutError:
+            raise Refusal(f"nothing came for {self._limits.silent_s:.0f} s", is_final=False) from None
+        if len(data) > self._limits.message_bytes:
+            raise Refusal(f"a message of {len(data):,} bytes; {self._limits.message_bytes:,} at most are taken")
+        return message_from_bytes(data)
+
+    def _check_space(self) -> None:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(self._folder).free
+        if free < self._limits.free_bytes:
+            raise Refusal(
+                f"the station's disk is full: {free / 1e9:.2f} GB are free, and {self._limits.free_bytes / 1e9:.2f} GB "
+                "must stay so", is_final=False,
+            )
+
+    async def _acknowledge(self, flight: "Flight", link: Link) -> None:
+        """Acknowledge what the disk has, step by step."""
+        done = flight.last_seq
+        while True:
+            await asyncio.sleep(self._limits.sync_s)
+            if flight.last_seq > done:
+                done = await asyncio.to_thread(flight.sync)
+                try:
+                    await link.send(json.dumps({"type": "ack", "seq": done}))
+                except LinkClosed:
+                    return
+
+
+class Flight:
+    """One flight on the disk. `take` adds a message; `open_flight` makes it."""
+
+    def __init__(self, path: Path, hello: Hello) -> None:
+        self.path, self.hello = path, hello
+        self._file = FlightFile(path, hello.codec)
+        self.is_open = True
+        self.frames = self.samples = self.repeated = self.missing = 0
+        self.last_sample: Sample | None = None
+        self._needs_key = True
+        self._taken_s: deque[float] = deque(maxlen=90)
+        _ended(path).unlink(missing_ok=True)
+
+    @property
+    def last_seq(self) -> int:
+        """The number of the last message that was written."""
+        return self._file.last_seq
+
+    def take(self, message: Message) -> bool:
+        """Write a message; False for one that is there already. Raises Refusal for what is no video or telemetry."""
+        if message.seq <= self._file.last_seq:
+            self.repeated += 1
+            return False
+        self._check(message)
+        try:
+            self._file.append(message)
+        except OSError as error:
+            raise Refusal(f"the station cannot write ({error.strerror})", is_final=False) from error
+        self.missing += message.seq - self._file.last_seq - 1 if self._file.last_seq else 0
+        if message.kind is Kind.VIDEO:
+            self.frames += 1
+            self._taken_s.append(time.monotonic())
+        else:
+            self.samples += 1
+        return True
+
+    def sync(self) -> int:
+        """Wait until the disk has everything up to the number that is given back."""
+        seq = self._file.last_seq
+        if self.is_open:
+            self._file.sync()
+        return seq
+
+    def end(self) -> None:
+        """The flight is over: who follows the file may stop."""
+        self.close()
+        atomic_write_bytes(_ended(self.path), b"")
+
+    def close(self) -> None:
+        """Let go of the file, which the disk then has."""
+        if self.is_open:
+            self.is_open = False
+            self._file.close()
+
+    def figures(self) -> dict[str, Any]:
+        """What a crew wants to know."""
+        span_s = self._taken_s[-1] - self._taken_s[0] if len(self._taken_s) > 1 else 0.0
+        hello = self.hello
+        return {
+            "flight": self.path.stem, "name": hello.name, "codec": hello.codec, "width": hello.width,
+            "height": hello.height, "fps": hello.fps, "frames": self.frames, "samples": self.samples,
+            "repeated": self.repeated, "last_seq": self._file.last_seq, "last_pts_us": self._file.last_pts_us,
+            "frames_per_s": round((len(self._taken_s) - 1) / span_s, 2) if span_s else None,
+            "telemetry": None if self.last_sample is None else dict(self.last_sample.columns),
+        }
+
+    def _check(self, message: Message) -> None:
+        if message.kind is Kind.TELEMETRY:
+            self.last_sample = sample_from_json(message.payload)
+            return
+        if message.kind is not Kind.VIDEO:
+            raise Refusal(f"a message of the kind {message.kind} in the middle of a flight")
+        if not 0 <= message.pts_us < 2**52 or not -(2**40) < (message.dts_us or 0) < 2**52:
+            raise Refusal(f"a picture at the time {message.pts_us} us")
+        codec = self.hello.codec
+        if not has_picture(codec, message.payload):
+            raise Refusal(f"what was sent as {codec} is none: it has no pictures with start codes")
+        if message.is_key and self._needs_key:
+            if not begins_decoding(codec, message.payload):
+                raise Refusal(f"what was sent as a key frame of {codec} has no parameter sets")
+            self._needs_key = False
+
+
+def open_flight(folder: Path, hello: Hello) -> Flight:
+    """The flight that a drone states, begun or gone on with: its file is found by its id.
+
+    Raises StoreError where the file cannot be used, InputError where the drone comes back with another codec.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        found = next(iter(sorted(folder.glob(f"*_{hello.flight}.ts"))), None)
+        if found is None:
+            path = folder / f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}_{hello.flight}.ts"
+            atomic_write_bytes(path.with_suffix(".json"), hello.to_json().encode())
+            return Flight(path, hello)
+        before = hello_from_json(found.with_suffix(".json").read_bytes())
+        if before.codec != hello.codec:
+            raise InputError(f"this flight is {before.codec}, and now {hello.codec} comes; begin a new flight")
+        return Flight(found, hello)
+    except OSError as error:
+        raise StoreError(f"cannot use {folder} ({error.strerror or error}); check the disk") from error
+
+
+def _ended(path: Path) -> Path:
+    return path.with_name(path.name + ENDED_SUFFIX)
+
+
+async def _close(link: Link, code: int, reason: str) -> None:
+    try:
+        short = reason.encode()[:_MOST_REASON_BYTES].decode("utf-8", "ignore")
+        await link.close(code, short)
+    except LinkClosed:
+        pass

@@ -1,0 +1,183 @@
+"""The messages of a drone's stream: how they stand on the wire and in a spool."""
+
+import json
+import re
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from math import isfinite
+from typing import Any
+
+from sorvolo.capture.live.klv import ITEMS
+from sorvolo.errors import InputError
+from sorvolo.survey.flight import TELEMETRY_COLUMNS
+
+PROTOCOL = 1
+"""The version of the messages; both sides state theirs."""
+
+CODECS = ("h264", "hevc")
+"""The pictures that a stream may carry: what a transport stream holds and a browser plays."""
+
+_STREAM = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_HEAD = struct.Struct(">cBQqq")
+_MOST_TELEMETRY_BYTES = 16_384
+_MOST_HELLO_BYTES = 65_536
+_STATED = frozenset(item.name for item in ITEMS.values())
+
+
+def is_stream(name: str) -> bool:
+    """Whether it may be a stream's name: safe as a folder's."""
+    return _STREAM.fullmatch(name) is not None and ".." not in name
+
+
+def check_stream(stream: str) -> None:
+    """Raises InputError for a stream's id that is not safe as a folder's name."""
+    if not is_stream(stream):
+        raise InputError(
+            f"{stream[:80]!r} is no stream's name; 1 to 64 letters, digits, dots, dashes and underscores were needed"
+        )
+
+
+class Kind(StrEnum):
+    """What a message carries."""
+
+    HELLO = "H"
+    VIDEO = "V"
+    TELEMETRY = "T"
+    END = "E"
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message. `seq` increases by one for each message of a flight from 1 on; 0 for hello and end.
+
+    `pts_us` is when a picture is shown, `dts_us` when it is decoded (it differs where pictures refer to later ones),
+    both on the flight's own clock, which begins at 0 and never jumps back. Video is one access unit of H.264 or H.265
+    with start codes (Annex B); a key frame begins with its parameter sets.
+    """
+
+    kind: Kind
+    seq: int
+    pts_us: int
+    payload: bytes
+    is_key: bool = False
+    dts_us: int | None = None  # None: the same as `pts_us`
+
+    def to_bytes(self) -> bytes:
+        """The message as one binary WebSocket message: 26 bytes of head, then the payload."""
+        dts_us = self.pts_us if self.dts_us is None else self.dts_us
+        return _HEAD.pack(self.kind.encode(), int(self.is_key), self.seq, self.pts_us, dts_us) + self.payload
+
+
+def message_from_bytes(data: bytes) -> Message:
+    """The inverse of `Message.to_bytes`. Raises InputError for what is none."""
+    if len(data) < _HEAD.size:
+        raise InputError(f"a message of {len(data)} bytes; {_HEAD.size} at least were needed")
+    letter, flags, seq, pts_us, dts_us = _HEAD.unpack_from(data)
+    try:
+        kind = Kind(letter.decode("latin-1"))
+    except ValueError:
+        raise InputError(f"a message of the unknown kind {letter!r}; known are H, V, T and E") from None
+    return Message(kind, seq, pts_us, data[_HEAD.size:], bool(flags & 1), dts_us)
+
+
+@dataclass(frozen=True)
+class Hello:
+    """What a drone states about its flight when it connects, and again each time it comes back.
+
+    `flight` is the same for one flight, however often the link is lost; letters and digits. `fps` is 0 where unknown.
+    """
+
+    flight: str
+    codec: str
+    width: int
+    height: int
+    fps: float = 0.0
+    name: str = ""
+    sent_by: str = ""
+    protocol: int = PROTOCOL
+
+    def __post_init__(self) -> None:
+        if self.protocol != PROTOCOL:
+            raise InputError(
+                f"the drone speaks version {self.protocol} of the stream's protocol and the station {PROTOCOL}; "
+                "install the same version of sorvolo on both"
+            )
+        if not (8 <= len(self.flight) <= 64 and self.flight.isascii() and self.flight.isalnum()):
+            raise InputError("a flight's id has 8 to 64 letters and digits")
+        if self.codec not in CODECS:
+            raise InputError(
+                f"the pictures are {self.codec[:32]!r}; a stream carries {' or '.join(CODECS)}, so set the camera to "
+                "one of them, or convert the recording: ffmpeg -i INPUT -c:v libx264 OUTPUT.mp4"
+            )
+        if not (16 <= self.width <= 16_384 and 16 <= self.height <= 16_384 and 0 <= self.fps <= 1000):
+            raise InputError(f"pictures of {self.width} x {self.height} at {self.fps:g} a second are none")
+
+    def to_json(self) -> str:
+        """The payload of a hello message."""
+        return json.dumps(vars(self))
+
+
+def hello_from_json(text: str | bytes) -> Hello:
+    """The inverse of `Hello.to_json`; unknown keys are ignored. Raises InputError for what is none."""
+    found = _json_object(text, _MOST_HELLO_BYTES, "a hello")
+    try:
+        return Hello(
+            str(found["flight"]), str(found["codec"]), int(found["width"]), int(found["height"]),
+            float(found.get("fps") or 0.0), str(found.get("name", ""))[:200], str(found.get("sent_by", ""))[:200],
+            int(found.get("protocol", 0)),
+        )
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"a hello without a usable {error}; flight, codec, width and height were needed") from error
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One moment of telemetry. `columns` are named as survey.flight.TELEMETRY_COLUMNS, `stated` as ST 0601 has them.
+
+    `stated` holds what telemetry columns have no name for: the lens's field of view, the ground's height.
+    """
+
+    time_ns: int
+    columns: Mapping[str, float] = field(default_factory=dict)
+    stated: Mapping[str, float] = field(default_factory=dict)
+
+    def to_json(self) -> str:
+        """The payload of a telemetry message; numbers that are not known are left out."""
+        return json.dumps({
+            "time_ns": self.time_ns,
+            "columns": {name: value for name, value in self.columns.items() if isfinite(value)},
+            "stated": {name: value for name, value in self.stated.items() if isfinite(value)},
+        }, separators=(",", ":"))
+
+
+def sample_from_json(text: str | bytes) -> Sample:
+    """The inverse of `Sample.to_json`; unknown names are ignored. Raises InputError for what is none."""
+    found = _json_object(text, _MOST_TELEMETRY_BYTES, "telemetry")
+    try:
+        time_ns = int(found["time_ns"])
+        columns = _numbers(found.get("columns") or {}, TELEMETRY_COLUMNS)
+        stated = _numbers(found.get("stated") or {}, _STATED)
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
+        raise InputError(f"telemetry without a usable {error}; time_ns and columns were needed") from error
+    if not 0 <= time_ns < 2**63:
+        raise InputError(f"telemetry of the time {time_ns} ns; 0 to 2^63 was needed")
+    return Sample(time_ns, columns, stated)
+
+
+def _numbers(found: Mapping[str, Any], names: Any) -> dict[str, float]:
+    numbers = {name: float(value) for name, value in found.items() if name in names}
+    return {name: value for name, value in numbers.items() if isfinite(value)}
+
+
+def _json_object(text: str | bytes, most_bytes: int, what: str) -> Mapping[str, Any]:
+    if len(text) > most_bytes:
+        raise InputError(f"{what} of {len(text):,} bytes; {most_bytes:,} at most are taken")
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{what} that is no JSON ({error})") from error
+    if not isinstance(found, dict):
+        raise InputError(f"{what} that is no JSON object")
+    return found

@@ -1,0 +1,115 @@
+"""The routes of streams: a drone's own connection, what is known of each stream, and its pictures for browsers."""
+
+import asyncio
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Depends, Query, WebSocket
+from starlette.websockets import WebSocketDisconnect, WebSocketState
+
+from sorvolo.errors import InputError
+from sorvolo.station.events import EventLog, NewEvent
+from sorvolo.station.ingest import REFUSED_CODE, Announce, Ingest, LinkClosed
+from sorvolo.station.security import needs
+from sorvolo.station.tokens import Role
+from sorvolo.station.video import Viewer
+
+
+def stream_routes(ingest: Ingest) -> APIRouter:
+    """`/api/streams`, `/api/ingest/{stream}` and `/api/streams/{stream}/video`."""
+    router = APIRouter(tags=["streams"])
+
+    @router.get("/api/streams", dependencies=[Depends(needs(Role.VIEW))])
+    def streams() -> list[dict[str, Any]]:
+        """Every stream that was ever sent, and what those do that are being sent."""
+        return ingest.streams()
+
+    @router.get("/api/streams/{stream}", dependencies=[Depends(needs(Role.VIEW))])
+    def one_stream(stream: str) -> dict[str, Any]:
+        """One stream: its flights, and how the one goes that is being sent."""
+        return ingest.state(stream) | {"viewers": ingest.hub(stream).viewers}
+
+    @router.websocket("/api/ingest/{stream}")
+    async def take(websocket: WebSocket, stream: str, _: Annotated[object, Depends(needs(Role.OPERATE))]) -> None:
+        """A drone's connection: binary messages as station/messages.py has them, acknowledged by number."""
+        await websocket.accept()
+        await ingest.serve(stream, _SocketLink(websocket))
+
+    @router.websocket("/api/streams/{stream}/video")
+    async def show(
+        websocket: WebSocket, stream: str, _: Annotated[object, Depends(needs(Role.VIEW))],
+        mode: Annotated[Literal["annexb", "fmp4"], Query()] = "annexb",
+    ) -> None:
+        """The pictures as they came: JSON about the format first, then each picture, from the last key frame on."""
+        await websocket.accept()
+        try:
+            hub = ingest.hub(stream)
+        except InputError as error:
+            await websocket.close(REFUSED_CODE, str(error)[:120])
+            return
+        viewer = hub.join(mode)
+        sending = asyncio.create_task(_send(websocket, viewer))
+        try:
+            while True:  # what a page sends is not looked at; reading shows that it went away
+                await websocket.receive_text()
+        except (WebSocketDisconnect, KeyError, RuntimeError):
+            pass
+        finally:
+            hub.leave(viewer)
+            sending.cancel()
+
+    return router
+
+
+def announcing(events: EventLog) -> Announce:
+    """Stream states as live events; written beside the event loop, as the disk is waited for."""
+
+    def announce(stream: str, state: Mapping[str, Any]) -> None:
+        event = NewEvent("stream.state", {**state, "stream": stream})
+        asyncio.get_running_loop().run_in_executor(None, events.append, event)
+
+    return announce
+
+
+async def _send(websocket: WebSocket, viewer: Viewer) -> None:
+    try:
+        while True:
+            item = await viewer.next()
+            if isinstance(item, bytes):
+                await websocket.send_bytes(item)
+            else:
+                await websocket.send_text(item)
+    except (WebSocketDisconnect, RuntimeError):  # it went away while a picture was on its way
+        pass
+
+
+class _SocketLink:
+    """A drone's WebSocket as `ingest.Link`."""
+
+    def __init__(self, websocket: WebSocket) -> None:
+        self._websocket = websocket
+
+    async def receive(self) -> bytes:
+        """The next binary message. Raises LinkClosed."""
+        try:
+            message = await self._websocket.receive()
+        except (WebSocketDisconnect, RuntimeError) as error:
+            raise LinkClosed from error
+        if message["type"] != "websocket.receive":
+            raise LinkClosed
+        return message.get("bytes") or (message.get("text") or "").encode()
+
+    async def send(self, text: str) -> None:
+        """Send an answer. Raises LinkClosed."""
+        try:
+            await self._websocket.send_text(text)
+        except (WebSocketDisconnect, RuntimeError) as error:
+            raise LinkClosed from error
+
+    async def close(self, code: int, reason: str) -> None:
+        """End the connection."""
+        if self._websocket.application_state is not WebSocketState.DISCONNECTED:
+            try:
+                await self._websocket.close(code, reason)
+            except (WebSocketDisconnect, RuntimeError) as error:
+                raise LinkClosed from error

@@ -1,0 +1,218 @@
+"""A drone's pictures for browsers: copied as they came, never decoded, each viewer at its own pace."""
+
+import asyncio
+import json
+import struct
+from collections import deque
+from collections.abc import Mapping
+from fractions import Fraction
+from io import BytesIO
+from typing import Any, Literal
+
+import av
+
+from sorvolo.station.access_units import codec_string, is_delimiter, nal_units
+from sorvolo.station.messages import Hello, Message
+
+Mode = Literal["annexb", "fmp4"]
+
+_MOST_WAITING = 90  # pictures, three seconds
+_MOST_WAITING_BYTES = 8_000_000
+_MOST_GROUP = 900  # pictures since a key frame that are kept for new viewers
+_STAMP_BYTES = 8
+_CLOCK_HZ = 1_000_000
+_STEP_US = 33_333  # how long a picture is shown where none follows
+
+
+class VideoHub:
+    """One stream's pictures, given to any number of viewers. `begin`, `show` and `note` change it, in one event loop.
+
+    A picture is packed once for all viewers of a mode. Whoever joins begins at the last key frame.
+    """
+
+    def __init__(self) -> None:
+        self._hello: Hello | None = None
+        self._group: list[Message] = []  # since the last key frame
+        self._codec = ""
+        self._viewers: set[Viewer] = set()
+        self._fragments: Fragments | None = None
+
+    @property
+    def viewers(self) -> int:
+        """How many watch."""
+        return len(self._viewers)
+
+    @property
+    def dropped(self) -> int:
+        """How many pictures slow viewers did not get, of those that watch now."""
+        return sum(each.dropped for each in self._viewers)
+
+    def begin(self, hello: Hello) -> None:
+        """A drone came, or came back."""
+        if self._hello is None or (self._hello.flight, self._hello.codec) != (hello.flight, hello.codec):
+            self._group, self._codec, self._fragments = [], "", None
+        self._hello = hello
+
+    def show(self, message: Message) -> None:
+        """Give a picture to all viewers."""
+        if self._hello is None:
+            return
+        if message.is_key:
+            self._begin_group(message)
+        elif self._codec and len(self._group) < _MOST_GROUP:
+            self._group.append(message)
+        if not self._codec:
+            return  # no key frame yet: nobody could show it
+        packed: dict[Mode, bytes] = {}
+        for viewer in self._viewers:
+            if viewer.mode not in packed:
+                packed[viewer.mode] = self._packed(viewer.mode, message)
+            viewer.put(packed[viewer.mode], message.is_key)
+
+    def note(self, words: Mapping[str, Any]) -> None:
+        """Send all viewers a JSON message, such as the boxes of a picture."""
+        text = json.dumps(words, separators=(",", ":"))
+        for viewer in self._viewers:
+            viewer.put_text(text)
+
+    def join(self, mode: Mode) -> "Viewer":
+        """A new viewer, who first gets what the stream is, then everything from the last key frame on."""
+        viewer = Viewer(mode)
+        self._viewers.add(viewer)
+        if self._codec:
+            self._start(viewer)
+        return viewer
+
+    def leave(self, viewer: "Viewer") -> None:
+        """A viewer is gone."""
+        self._viewers.discard(viewer)
+
+    def _begin_group(self, message: Message) -> None:
+        assert self._hello is not None
+        codec = codec_string(self._hello.codec, message.payload)
+        if codec is not None and codec != self._codec:
+            self._codec, self._group = codec, []
+            self._fragments = Fragments(self._hello, message.payload)
+            for viewer in self._viewers:
+                self._start(viewer)
+        self._group = [message]
+
+    def _start(self, viewer: "Viewer") -> None:
+        hello = self._hello
+        assert hello is not None
+        viewer.put_text(json.dumps({
+            "type": "format", "codec": self._codec, "width": hello.width, "height": hello.height, "fps": hello.fps,
+            "mode": viewer.mode,
+        }))
+        if viewer.mode == "fmp4" and self._fragments is not None:
+            viewer.put(self._fragments.header, is_key=True, is_limited=False)
+        for message in self._group:
+            viewer.put(self._packed(viewer.mode, message), message.is_key, is_limited=False)
+
+    def _packed(self, mode: Mode, message: Message) -> bytes:
+        if mode == "annexb":
+            return annexb_bytes(message)
+        assert self._fragments is not None  # made with the first key frame
+        return self._fragments.fragment(message)
+
+
+class Viewer:
+    """One browser. `put` never waits: pictures that the browser has no time for are dropped to the next key frame."""
+
+    def __init__(self, mode: Mode) -> None:
+        self.mode = mode
+        self.dropped = 0
+        self._waiting: deque[bytes | str] = deque()
+        self._bytes = self._pictures = 0
+        self._needs_key = False
+        self._arrived = asyncio.Event()
+
+    def put(self, data: bytes, is_key: bool, *, is_limited: bool = True) -> None:
+        """One more picture."""
+        if not data:
+            return
+        if self._needs_key and not is_key:
+            self.dropped += 1
+            return
+        if is_limited and (self._pictures >= _MOST_WAITING or self._bytes >= _MOST_WAITING_BYTES):
+            self.dropped += self._pictures
+            self._waiting = deque(each for each in self._waiting if isinstance(each, str))
+            self._bytes = self._pictures = 0
+            if not is_key:
+                self._needs_key = True
+                self.dropped += 1
+                return
+        self._needs_key = False
+        self._waiting.append(data)
+        self._bytes += len(data)
+        self._pictures += 1
+        self._arrived.set()
+
+    def put_text(self, text: str) -> None:
+        """One more message; the oldest go where too many wait."""
+        if len(self._waiting) < 4 * _MOST_WAITING:
+            self._waiting.append(text)
+            self._arrived.set()
+
+    async def next(self) -> bytes | str:
+        """What to send now, once there is any."""
+        while (item := self.take()) is None:
+            self._arrived.clear()
+            await self._arrived.wait()
+        return item
+
+    def take(self) -> bytes | str | None:
+        """What to send now; None while there is nothing."""
+        item = self._waiting.popleft() if self._waiting else None
+        if isinstance(item, bytes):
+            self._bytes -= len(item)
+            self._pictures -= 1
+        return item
+
+
+class Fragments:
+    """Pictures as fragmented MP4, one fragment each, for a browser's MediaSource; their times are the flight's own.
+
+    The header is FFmpeg's, made from a key frame; the fragments (ISO 14496-12, 8.8) hold one picture each and depend on
+    nothing before them, so that one packing serves all viewers, wherever they begin.
+    """
+
+    def __init__(self, hello: Hello, key_frame: bytes) -> None:
+        self._codec = hello.codec
+        self._number = 0
+        sink = BytesIO()
+        options = {"movflags": "empty_moov+default_base_moof+frag_custom"}
+        with (
+            av.open(BytesIO(key_frame), format=hello.codec) as looked_at,
+            av.open(sink, "w", format="mp4", options=options) as output,
+        ):
+            stream = output.add_stream_from_template(looked_at.streams.video[0])
+            stream.time_base = Fraction(1, _CLOCK_HZ)
+            output.start_encoding()
+            self.header = sink.getvalue()
+
+    def fragment(self, message: Message) -> bytes:
+        """One picture."""
+        self._number += 1
+        dts_us = max(0, message.pts_us if message.dts_us is None else message.dts_us)
+        units = [each for each in nal_units(message.payload) if not is_delimiter(self._codec, each)]
+        data = b"".join(len(each).to_bytes(4, "big") + each for each in units)
+        flags = 0x0200_0000 if message.is_key else 0x0101_0000  # needs no other; needs one, is no place to begin
+        tfhd = _box(b"tfhd", struct.pack(">II", 0x02_0000, 1))  # offsets count from the fragment
+        tfdt = _box(b"tfdt", struct.pack(">IQ", 0x0100_0000, dts_us))
+        run = (0x0100_0F01, 1, 0, _STEP_US, len(data), flags, message.pts_us - dts_us)
+        moof = b""
+        for _ in range(2):  # the data's offset is known once the length is
+            trun = _box(b"trun", struct.pack(">IIiIIIi", *run[:2], len(moof) + 8, *run[3:]))
+            mfhd = _box(b"mfhd", struct.pack(">II", 0, self._number))
+            moof = _box(b"moof", mfhd + _box(b"traf", tfhd + tfdt + trun))
+        return moof + _box(b"mdat", data)
+
+
+def _box(name: bytes, body: bytes) -> bytes:
+    return struct.pack(">I4s", 8 + len(body), name) + body
+
+
+def annexb_bytes(message: Message) -> bytes:
+    """A picture for WebCodecs: 8 bytes of time (us), then the access unit with start codes."""
+    return message.pts_us.to_bytes(_STAMP_BYTES, "big", signed=True) + message.payload
