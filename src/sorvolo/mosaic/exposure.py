@@ -86,6 +86,10 @@ class Exposure:
         """(2,) the camera's vignette; none where nothing is known of it."""
         return self.vignettes.get(camera_id, np.zeros(2))
 
+    def updated(self, newer: "Exposure") -> "Exposure":
+        """With all that the newer one knows, and what only this one does."""
+        return Exposure({**self.gains, **newer.gains}, {**self.vignettes, **newer.vignettes}, newer.spread)
+
 
 def tie_colours(
     image_a: ImageRGB, points_a_px: PointsPx, image_b: ImageRGB, points_b_px: PointsPx

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -31,6 +32,7 @@ class PlanarSettings:
     spatial: int = 2  # further ones under the predicted view: they close loops between strips
     wanted_links: int = 4  # with fewer, pictures that refused are asked again with SIFT
     least_overlap: float = 0.2  # of a view, for a spatial neighbour
+    recent_links: int = 400  # of which colours are compared while the flight goes on
     recovery: int = 30  # keyframes tried for a frame that is lost and has no GPS
     links: LinkSettings = field(default_factory=LinkSettings)
     exposure: ExposureSettings = field(default_factory=ExposureSettings)
@@ -229,6 +231,12 @@ class PlanarMapper:
     def exposure(self) -> Exposure:
         """Gains and vignette from the colours that linked keyframes share."""
         return solve_exposure(self._colours, settings=self._settings.exposure)
+
+    def recent_exposure(self) -> Exposure:
+        """The same from the newest links alone: good enough for a map that still moves, at a price that does not grow
+        with the flight."""
+        newest = dict(islice(reversed(self._colours.items()), self._settings.recent_links))
+        return solve_exposure(newest, settings=self._settings.exposure)
 
     # ---- inside -----------------------------------------------------------------------------------------------
 

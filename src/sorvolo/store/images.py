@@ -20,6 +20,9 @@ _JPEG = [
     cv2.IMWRITE_JPEG_QUALITY, 92,
     cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
 ]
+_JPEG_STEPS = {
+    1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8,
+}
 # one filter for all rows: trying all of them on each row, as level 1 alone does here, takes twice as long
 _PNG_FAST = [
     cv2.IMWRITE_PNG_COMPRESSION, 1,
@@ -34,9 +37,12 @@ def jpeg_from_image(image: ImageRGB) -> bytes:
     return data.tobytes()
 
 
-def image_from_jpeg(data: bytes, name: str, most_px: int = MOST_KEYFRAME_PX) -> ImageRGB:
-    """Decode a JPEG; raises StoreError, naming `name`, when it is damaged or has more than `most_px` pixels."""
-    image = _decoded(data, _jpeg_pixels, cv2.IMREAD_COLOR, name, most_px)
+def image_from_jpeg(data: bytes, name: str, most_px: int = MOST_KEYFRAME_PX, step: int = 1) -> ImageRGB:
+    """Decode a JPEG, at a `step`-th (1, 2, 4, 8) of its size, rounded up.
+
+    Raises StoreError, naming `name`, when it is damaged or has more than `most_px` pixels.
+    """
+    image = _decoded(data, _jpeg_pixels, _JPEG_STEPS[step], name, most_px)
     if image is None:
         raise StoreError(f"{name} is damaged: no JPEG in its {len(data)} bytes; map its flight again")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)

@@ -1,7 +1,8 @@
-"""A flight's keyframes painted into the site's map while they still move, and once more when they stand."""
+"""A flight's keyframes painted into the site's map: coarsely while they still move, and once when they stand."""
 
 import time
 from collections.abc import Collection
+from dataclasses import dataclass
 
 from sorvolo.geometry.arrays import ImageRGB, Mask, Matrix3
 from sorvolo.geometry.camera import Camera
@@ -11,6 +12,7 @@ from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.map.known_keyframes import KnownKeyframes
 from sorvolo.mosaic.canvas import Canvas
 from sorvolo.mosaic.canvas_frame import CanvasFrame
+from sorvolo.mosaic.coarse_tiles import CoarseTiles, coarse_grid, coarseness
 from sorvolo.mosaic.exposure import Exposure
 from sorvolo.mosaic.placing import canvas_frame
 from sorvolo.mosaic.planar import PlanarMapper
@@ -26,8 +28,20 @@ _COARSE_MAP = 0.77  # times the pictures' own pixels: a coarser map does not nee
 _CACHE_BYTES = 128 * 1024 * 1024  # of earlier flights' pictures
 
 
+@dataclass(frozen=True, eq=False)
+class _Fineness:
+    """The map at a `step`-th of its pixels: its grid, and the camera of pictures so large."""
+
+    step: int
+    site_grid: SiteGrid
+    camera: Camera
+
+
 class FlightPainter:
     """Stores a flight's pictures and paints them into its site; ground that the map shows already stays as it is.
+
+    While the flight goes on, `show` paints small copies of them, enlarged: that is cheap, however often the map moves.
+    `finish` paints the pictures themselves.
 
     `native_m_per_px` is the ground sampling distance of the flight's own pictures. Keyframes have ids from
     `known.count` on, earlier flights' those before.
@@ -49,12 +63,21 @@ class FlightPainter:
             full = lens.camera
             self._stored = full.resized(max(16, round(full.width_px * shrink)), max(16, round(full.height_px * shrink)))
         self._valid: Mask | None = lens.valid(self._stored.width_px, self._stored.height_px)
-        self._canvas = self._new_canvas()
+        step = coarseness(max(self._stored.width_px, self._stored.height_px))
+        self._live = _Fineness(
+            step, coarse_grid(archive.site_grid(), step),
+            self._stored.resized(-(-self._stored.width_px // step), -(-self._stored.height_px // step)),
+        )
+        self._live_images = ImageCache(lambda each: writer.small_image(each - known.count, step), _CACHE_BYTES // 4)
+        self._live_canvas = Canvas(
+            self._live.site_grid.grid, CoarseTiles(writer.tiles, archive.site_grid().grid, step),
+            self._live_images.get, keeps_known_ground=True,
+        )
         self._frames: set[int] = set()
         self._dirty: set[int] = set()
         self._painted_at = 0
         self._paint_again_s = 0.0
-        self._shown_s = time.monotonic()
+        self._show_again_s = time.monotonic() + live_s
 
     def save(self, keyframe_id: int, image: ImageRGB) -> None:
         """Store a keyframe's picture, no larger than the map needs it."""
@@ -68,36 +91,43 @@ class FlightPainter:
         self._dirty |= set(moved)
 
     def show(self) -> int:
-        """Paint what moved and let readers see it, now and then; how many tiles were painted."""
+        """Paint small copies of what moved and let readers see it, now and then; how many tiles were painted."""
         started_s = time.monotonic()
         if len(self._frames) - self._painted_at < _PAINT_EVERY or started_s < self._paint_again_s:
             return 0
+        self._painted_at = len(self._frames)
         with self._log.stage(Stage.PAINT):
-            self.exposure = self._mapper.exposure()
-        painted = self._paint()
+            self.exposure = self.exposure.updated(self._mapper.recent_exposure())
+            painted = self._paint(self._live_canvas, self._dirty, self._live)
+        self._dirty.clear()
         self._paint_again_s = time.monotonic() + _PAINT_REST * (time.monotonic() - started_s)
-        if time.monotonic() - self._shown_s > self._live_s:
-            with self._log.stage(Stage.STORE):
-                self._writer.flush()
-                write_live_preview(self._writer.tiles, self._archive.live_preview_path)
-            self._shown_s = time.monotonic()
+        self._flush()
         return painted
 
     def finish(self) -> None:
         """Paint all keyframes where they stand in the end.
 
-        What was shown while they still moved is taken out first: when that was painted, which a clock decides, and how
-        little a frame had to move to be left as it was, must not be seen in the map.
+        What was shown while they still moved is taken out first: when that was painted, which a clock decides, must not
+        be seen in the map.
         """
         self.exposure = self._mapper.exposure()
         self._straighten()
         if self._painted_at:
             self._writer.take_back_tiles()
-            self._canvas = self._new_canvas()
-        self._dirty = set(self._frames)
-        self._paint()
+        with self._log.stage(Stage.PAINT):
+            self._paint(self._new_canvas(), self._frames, _Fineness(1, self._archive.site_grid(), self._stored))
 
     # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _flush(self) -> None:
+        """Let readers see what was painted, and the whole map small; the larger the map, the less often."""
+        started_s = time.monotonic()
+        if started_s < self._show_again_s:
+            return
+        with self._log.stage(Stage.STORE):
+            self._writer.flush()
+            write_live_preview(self._writer.tiles, self._archive.live_preview_path)
+        self._show_again_s = time.monotonic() + max(self._live_s, _PAINT_REST * (time.monotonic() - started_s))
 
     def _new_canvas(self) -> Canvas:
         site_grid = self._archive.site_grid()
@@ -124,24 +154,20 @@ class FlightPainter:
             self.images[index] = self._writer.save_image(index, lens.undistort(self._writer.image(index)))
         self._valid = lens.valid(self._stored.width_px, self._stored.height_px)
 
-    def _paint(self) -> int:
-        """Paint what moved; how many tiles were painted."""
-        self._painted_at = len(self._frames)
-        site_grid = self._archive.site_grid()
-        with self._log.stage(Stage.PAINT):
-            painted = {each: self._canvas_frame(each, site_grid) for each in sorted(self._dirty)}
-            tiles = self._canvas.paint(
-                [frame for frame in painted.values() if frame is not None],
-                forget=[each for each, frame in painted.items() if frame is None],
-            )
-            self._dirty.clear()
+    def _paint(self, canvas: Canvas, keyframe_ids: Collection[int], at: "_Fineness") -> int:
+        """Paint keyframes where they stand; how many tiles were painted."""
+        painted = {each: self._canvas_frame(each, at) for each in sorted(keyframe_ids)}
+        tiles = canvas.paint(
+            [frame for frame in painted.values() if frame is not None],
+            forget=[each for each, frame in painted.items() if frame is None],
+        )
         return len(tiles)
 
-    def _canvas_frame(self, keyframe_id: int, site_grid: SiteGrid) -> CanvasFrame | None:
+    def _canvas_frame(self, keyframe_id: int, at: "_Fineness") -> CanvasFrame | None:
         return canvas_frame(
-            keyframe_id, self._known.next_rank, self._stored,
-            site_from_image(self._mapper, keyframe_id, self._stored), site_grid, self.exposure.gains_of(keyframe_id),
-            self.exposure.vignette_of(0), self._valid,
+            keyframe_id, self._known.next_rank, at.camera, site_from_image(self._mapper, keyframe_id, at.camera),
+            at.site_grid, self.exposure.gains_of(keyframe_id), self.exposure.vignette_of(0),
+            self._valid if at.step == 1 else None,
         )
 
 

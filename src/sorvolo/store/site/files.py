@@ -127,11 +127,14 @@ class SiteFiles:
         """The path of a keyframe's image in the site folder, as the catalogue holds it."""
         return f"flights/{checked_name(flight_id, 'flight')}/keyframes/{int(run_id)}/{index:06d}.jpg"
 
-    def image(self, flight_id: str, image_path: str) -> ImageRGB:
-        """A stored keyframe; raises StoreError when it is gone, damaged, or no keyframe of this flight."""
+    def image(self, flight_id: str, image_path: str, step: int = 1) -> ImageRGB:
+        """A stored keyframe, at a `step`-th (1, 2, 4, 8) of its size.
+
+        Raises StoreError when it is gone, damaged, or no keyframe of this flight.
+        """
         name = checked_image_path(image_path, flight_id)
         try:
-            return image_from_jpeg(read_below(self.folder, name), str(self.folder / name))
+            return image_from_jpeg(read_below(self.folder, name), str(self.folder / name), step=step)
         except FileNotFoundError as error:
             raise StoreError(
                 f"the keyframe {self.folder / name} is gone; if its flight was mapped again meanwhile, list the "

@@ -101,6 +101,10 @@ class FlightWriter:
         """A keyframe saved earlier, as it will be read later; read-only. StoreError if there is none."""
         return self._cache.get(index)
 
+    def small_image(self, index: int, step: int) -> ImageRGB:
+        """A keyframe saved earlier at a `step`-th (1, 2, 4, 8) of its size, rounded up."""
+        return self._files.image(self._flight_id, self._image_path(index), step)
+
     def save_masks(self, frame_name: str, changed: ImageGray, valid: Mask, boxes: Boxes) -> None:
         """Store one view's mask and boxes (N, 4), to appear as masks/<frame>.png and in masks/boxes.json on commit.
 
