@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 TRAINS := $(VENV)/.trains
 SEEDS ?=  # of the flights that `make bench` simulates; else drawn from the commit
 
-.PHONY: demo test check bench model wheel docs
+.PHONY: demo test check bench model page-vendor wheel docs
 
 demo: $(READY)
 	$(BIN)/sorvolo demo demo-site
@@ -54,6 +54,10 @@ model: $(TRAINS)
 	  --aerial $(AERIAL)/default.onnx
 	$(BIN)/python benchmarks/pack_daylight_model.py $(DATA) --nanodet $(NANODET) --judge build/model/judge \
 	  --aerial $(AERIAL)/default.onnx
+
+# The libraries of the station's page, from npm, with their hashes and licences (needs npm; an install does not).
+page-vendor:
+	$(PYTHON) benchmarks/pack_page_libraries.py
 
 $(WRITING)/.ready: requirements-docs.lock
 	$(PYTHON) -m venv $(WRITING)

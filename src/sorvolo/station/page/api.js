@@ -1,0 +1,70 @@
+// Requests to the station: JSON in and out, every failure a Problem in words.
+
+/** What the station, or the network, answered instead: RFC 9457 fields, `status` 0 where nothing came back. */
+export class Problem extends Error {
+  constructor(status, title, detail, more = {}) {
+    super(detail || title);
+    Object.assign(this, { name: "Problem", status, title, detail, more });
+  }
+}
+
+const UNREACHABLE = "Check that the station runs and that this device is in its network. The page tries again by itself.";
+
+/** Who wants to know that a token is needed. */
+export const session = new EventTarget();
+
+/** Send a request; give the JSON of the answer (null for none). Throws Problem. */
+export async function ask(method, path, body, { signal, headers = {} } = {}) {
+  const init = { method, signal, headers: { accept: "application/json", ...headers } };
+  if (body !== undefined) {
+    init.body = JSON.stringify(body);
+    init.headers["content-type"] = "application/json";
+  }
+  const answer = await send(path, init);
+  return answer.status === 204 ? null : answer.json();
+}
+
+/** Send a request; give the answer itself. Throws Problem. */
+export async function send(path, init) {
+  let answer;
+  try {
+    answer = await fetch(path, { credentials: "same-origin", ...init });
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
+    throw new Problem(0, "The station does not answer", UNREACHABLE);
+  }
+  if (answer.ok) return answer;
+  const said = await answer.json().catch(() => ({}));
+  if (answer.status === 401) session.dispatchEvent(new Event("needed"));
+  throw new Problem(answer.status, said.title || `The station answered ${answer.status}`,
+    said.detail || "Try again; if it stays so, look at the station's own messages.", said);
+}
+
+export const get = (path, options) => ask("GET", path, undefined, options);
+export const post = (path, body = {}) => ask("POST", path, body);
+export const put = (path, body) => ask("PUT", path, body);
+export const remove = (path) => ask("DELETE", path);
+
+/** The API's address of a site, or of something below it. */
+export function siteUrl(site, ...rest) {
+  return ["/api/sites", encodeURIComponent(site), ...rest].join("/");
+}
+
+/** All features of a collection, page after page, at most `most`. A collection that the site has not gives none. */
+export async function features(site, collection, query = {}, most = 20000) {
+  const found = [];
+  const size = 1000;
+  for (let offset = 0; offset < most; offset += size) {
+    const parameters = new URLSearchParams({ ...query, limit: size, offset });
+    let page;
+    try {
+      page = await get(`${siteUrl(site, "collections", collection, "items")}?${parameters}`);
+    } catch (problem) {
+      if (problem.status === 404) return found;
+      throw problem;
+    }
+    found.push(...page.features);
+    if (page.features.length < size) break;
+  }
+  return found;
+}

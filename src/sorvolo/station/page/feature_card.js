@@ -1,0 +1,78 @@
+// The card of the object or change that is chosen: pictures, facts, verdict.
+
+import { button, el, fill } from "./dom.js";
+import { CLASSES, KINDS, OTHER_CLASS } from "./map_style.js";
+import { middleOf } from "./places.js";
+import { verdictForm } from "./verdicts.js";
+import { cropsOf, isChange } from "./site_data.js";
+import * as words from "./words.js";
+
+const SHOWN_IN = new Set(["map", "compare", "place"]); // elsewhere the map is needed whole
+
+/** The card over the map; `show(feature)`, null hides it. */
+export function featureCard(screen) {
+  const box = el("aside", { class: "card-over", hidden: true, "aria-label": "What is chosen" });
+  screen.stage.append(box);
+  return {
+    show(feature) {
+      box.hidden = !feature || !SHOWN_IN.has(screen.shown);
+      if (!box.hidden) fill(box, cardOf(screen, feature));
+    },
+  };
+}
+
+function cardOf(screen, feature) {
+  return [
+    el("div", { class: "card-head" }, badge(feature), el("h3", {}, titleOf(feature)),
+      el("button", { type: "button", class: "quiet close", "aria-label": "Close", on: { click: () => screen.data.choose(null) } }, "×")),
+    pictures(screen.data.id, feature),
+    verdictForm(screen, feature),
+    facts(feature, screen.data.detail.is_local),
+    el("div", { class: "row wrap" },
+      button("Memory of this place", () => { screen.open("place"); screen.opened.look(middleOf(feature.geometry)); }, { class: "quiet", icon: "place" }),
+      button("Zoom in", () => screen.goTo(feature), { class: "quiet", icon: "target" })),
+  ];
+}
+
+/** A feature's name in a few words. */
+export const titleOf = (feature) => (isChange(feature) ? words.changeWords(feature.properties) : feature.properties.class);
+
+/** A coloured mark of the feature's kind or class. */
+export function badge(feature) {
+  const [, colour] = isChange(feature) ? KINDS[feature.properties.kind] ?? OTHER_CLASS : CLASSES[feature.properties.class] ?? OTHER_CLASS;
+  const mark = el("span", { class: `badge ${isChange(feature) ? "square" : "round"}`, "aria-hidden": true });
+  mark.style.setProperty("--colour", colour);
+  return mark;
+}
+
+/** The pictures of a feature: before and after of a change, the best view of an object. */
+export function pictures(site, feature) {
+  const names = isChange(feature) ? ["before", "after"] : ["best view"];
+  return el("div", { class: `pictures n${names.length}` }, cropsOf(site, feature).map((src, k) =>
+    el("figure", {}, picture(src, `${titleOf(feature)}, ${names[k] ?? ""}`), el("figcaption", {}, names[k] ?? ""))));
+}
+
+/** A picture that says so where it cannot be had. */
+export function picture(src, alt) {
+  const image = el("img", { src, alt, loading: "lazy", decoding: "async" });
+  image.addEventListener("error", () => image.replaceWith(el("div", { class: "gone" }, "no picture")));
+  return image;
+}
+
+/** What is known of a feature, as a list of terms. */
+export function facts(feature, local) {
+  const values = feature.properties;
+  const rows = [
+    ["Place", words.place(middleOf(feature.geometry), { local })],
+    ["Position accuracy", values.sigma_m === undefined || values.sigma_m === null ? null : `${words.length(values.sigma_m)} (1 sigma)`],
+    ["Score", words.percent(values.score)],
+    ["Seen", values.views ? `in ${words.counted(values.views, "frame")}${values.possible_views ? ` of ${values.possible_views}` : ""}` : null],
+    ["Size", values.length_m ? (values.width_m ? `${words.length(values.length_m)} × ${words.length(values.width_m)}` : words.length(values.length_m)) : null],
+    ["Area", values.area_m2 ? words.area(values.area_m2) : null],
+    ["Speed", values.velocity_m_s ? words.speed(Math.hypot(...values.velocity_m_s)) : null],
+    ["First seen", values.first_seen ? words.time(values.first_seen) : null],
+    ["Flight", values.flight],
+    ["Id", feature.id],
+  ];
+  return el("dl", { class: "facts" }, rows.filter(([, value]) => value).map(([name, value]) => [el("dt", {}, name), el("dd", {}, value)]));
+}

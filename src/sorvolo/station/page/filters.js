@@ -1,0 +1,25 @@
+// Which objects and changes are shown: by class and kind, score, time, area and verdict.
+
+import { inRing, middleOf } from "./places.js";
+
+export const ALL = { hidden: [], minScore: 0, from: "", to: "", flight: "", verdict: "all", area: null, minArea_m2: 0 };
+
+/** The key of a feature's sort: its kind for a change, its class for an object. */
+export const sortOf = (feature) => feature.properties.kind ?? feature.properties.class ?? "other";
+
+/** The features that pass. `filters`: as ALL; `area` a ring of [lon, lat]. */
+export function passing(list, filters) {
+  return list.filter((each) => passes(each, filters));
+}
+
+function passes(feature, filters) {
+  const values = feature.properties;
+  if (filters.hidden.includes(sortOf(feature))) return false;
+  if ((values.score ?? 1) < filters.minScore) return false;
+  if (filters.flight && values.flight !== filters.flight && !(values.flights ?? []).includes(filters.flight)) return false;
+  if (filters.verdict !== "all" && (values.review ?? "none") !== filters.verdict) return false;
+  if (values.area_m2 !== undefined && values.area_m2 < filters.minArea_m2) return false;
+  if (filters.from && String(values.last_seen ?? values.first_seen ?? "") < filters.from) return false;
+  if (filters.to && String(values.first_seen ?? "") > `${filters.to}~`) return false;
+  return !filters.area || inRing(middleOf(feature.geometry), filters.area);
+}

@@ -1,0 +1,92 @@
+// The panel of the map: layers, filters by class, kind, score, time and verdict, the version shown, the base map.
+
+import { choices } from "./choices.js";
+import { button, choice, el, field, fill, tick } from "./dom.js";
+import { ALL, sortOf } from "./filters.js";
+import { badge } from "./feature_card.js";
+import { GROUPS, KINDS, CLASSES, PLACED } from "./map_style.js";
+import { chooseBaseMap } from "./base_map.js";
+import { counted, day, percent } from "./words.js";
+
+/** The panel's life: `refresh` after data changed. */
+export function layersPanel(screen, body) {
+  const { data, view } = screen;
+  const legend = el("div", {});
+  const layers = el("fieldset", { class: "ticks" }, el("legend", {}, "Layers"),
+    Object.entries(GROUPS).map(([group, [words]]) => tick(words, choices.get("layers")[group] ?? GROUPS[group][1],
+      (shown) => { view?.show(group, shown); refresh(); })));
+  const found = el("div", {});
+  fill(body, legend, found, layers, filterForm(data), versions(screen), base(screen));
+
+  function refresh() {
+    const { detail } = data;
+    fill(legend, el("p", { class: "soft" }, counted(detail.flights?.length ?? 0, "flight"), " · ",
+      detail.versions?.length ? `newest of ${day(detail.versions.at(-1).flown_at ?? detail.versions.at(-1).made_at)}` : "nothing mapped yet"),
+      whyEmpty(data));
+    fill(found, kinds(data, "changes", "Changes"), kinds(data, "objects", "Objects"), placedLegend(data));
+  }
+  refresh();
+  return { refresh };
+}
+
+function whyEmpty(data) {
+  if (data.detail.versions?.length || data.detail.is_new) return null;
+  return el("p", { class: "hint" }, "This site has no map yet. Start a mission under “Missions”.");
+}
+
+function kinds(data, name, title) {
+  const all = data.all[name];
+  if (!all.length) return null;
+  const groups = new Map();
+  for (const each of all) groups.set(sortOf(each), [...(groups.get(sortOf(each)) ?? []), each]);
+  const shown = data.shown(name).length;
+  return el("fieldset", { class: "ticks" }, el("legend", {}, shown === all.length ? `${title}: ${all.length}` : `${title}: ${shown} of ${all.length} shown`),
+    [...groups].map(([sort, list]) => {
+      const words = (KINDS[sort] ?? CLASSES[sort] ?? [sort])[0];
+      const hidden = data.filters.hidden;
+      return el("div", { class: "kind" }, badge(list[0]), tick(`${words} (${list.length})`, !hidden.includes(sort),
+        (on) => data.filter({ hidden: on ? hidden.filter((each) => each !== sort) : [...hidden, sort] })));
+    }));
+}
+
+function placedLegend(data) {
+  if (!(choices.get("layers").frames ?? false)) return null;
+  const rejected = data.detail.flights.reduce((sum, each) => sum + each.rejected, 0);
+  return el("div", { class: "ticks" }, Object.values(PLACED).map(([words, colour]) => {
+    const mark = el("span", { class: "badge line" });
+    mark.style.setProperty("--colour", colour);
+    return el("div", { class: "kind" }, mark, words);
+  }), rejected ? el("p", { class: "soft" }, `${counted(rejected, "frame")} rejected: no place, so not drawn`) : null);
+}
+
+function filterForm(data) {
+  const score = el("output", {}, percent(data.filters.minScore));
+  const slider = el("input", { type: "range", min: 0, max: 1, step: 0.05, ".value": String(data.filters.minScore),
+    on: { input: (event) => { fill(score, percent(Number(event.target.value))); data.filter({ minScore: Number(event.target.value) }); } } });
+  const least = el("input", { type: "number", min: 0, step: "any", inputmode: "decimal", ".value": data.filters.minArea_m2 || "",
+    on: { input: (event) => data.filter({ minArea_m2: Number(event.target.value) || 0 }) } });
+  const date = (name) => el("input", { type: "date", ".value": data.filters[name], on: { change: (event) => data.filter({ [name]: event.target.value }) } });
+  return el("details", { class: "filters" }, el("summary", {}, "Filter"),
+    field("Verdict", choice([["all", "all"], ["none", "not reviewed"], ["confirmed", "confirmed"], ["rejected", "rejected"]],
+      data.filters.verdict, (verdict) => data.filter({ verdict }))),
+    el("div", { class: "row" }, field("Score at least", slider), score),
+    field("Flight", choice([["", "all"], ...(data.detail.flights ?? []).map((each) => [each.id, each.id])], data.filters.flight, (flight) => data.filter({ flight }))),
+    el("div", { class: "row" }, field("Seen from", date("from")), field("until", date("to"))),
+    field("Changes of at least (m²)", least),
+    el("p", { class: "note" }, data.filters.area ? "Only what lies in the area of interest." : "Draw an area of interest under “Draw” to filter by it."),
+    button("Show everything", () => { data.filter({ ...ALL }); }, { class: "quiet" }));
+}
+
+function versions(screen) {
+  const list = screen.data.detail.versions ?? [];
+  if (list.length < 2) return null;
+  const { view } = screen;
+  return field("Version of the map", choice([...list].reverse().map((each) => [each.n, `${each.n}: ${day(each.flown_at ?? each.made_at)} (${each.flight})`]),
+    view?.version, (n) => view?.showVersion(Number(n))));
+}
+
+function base(screen) {
+  return el("details", {}, el("summary", {}, "Base map"),
+    el("p", { class: "note" }, "A PMTiles file of this device or the station, shown under the mosaic. Nothing is loaded from the network."),
+    chooseBaseMap(screen));
+}

@@ -1,0 +1,182 @@
+// The running flight: the drone on the map, its track, tiles that change, figures at a glance, zones that raise an alert.
+
+import { get } from "./api.js";
+import { choices } from "./choices.js";
+import { button, el, fill, message } from "./dom.js";
+import { inRing, middleOf } from "./places.js";
+import { titleOf } from "./feature_card.js";
+import * as words from "./words.js";
+
+const STATUS_MS = 10000;
+const RATE_WINDOW_MS = 10000;
+
+/** Follow the site's live events; `show` draws the figures anew, `close` ends it. */
+export function followLive(screen) {
+  return new Live(screen);
+}
+
+class Live {
+  constructor(screen) {
+    Object.assign(this, { screen, trail: [], places: [], progress: null, run: null, ends: [], alerted: new Set() });
+    const on = (type, listener) => {
+      const mine = ({ detail }) => { if (detail.site === screen.data.id) listener(detail.data ?? {}, detail); };
+      screen.station.events.addEventListener(type, mine);
+      this.ends.push(() => screen.station.events.removeEventListener(type, mine));
+    };
+    on("map.tiles", (data) => screen.view?.ready.then(() => this.refresh(data)));
+    on("frame.placed", (data, event) => this.placed(data, event));
+    on("run.started", (data, event) => this.started(data, event));
+    on("run.progress", (data, event) => { this.progress = data; this.run = event.run; this.show(); });
+    for (const type of ["run.finished", "run.failed", "run.stopped"]) on(type, (data, event) => this.ended(type, data, event));
+    on("object.found", ({ feature }) => this.found("objects", feature));
+    on("change.announced", ({ feature }) => this.found("changes", feature));
+    on("change.withdrawn", ({ feature, id }) => screen.data.drop("changes", feature?.id ?? id));
+    this.timer = setInterval(() => this.look(), STATUS_MS);
+    this.show();
+  }
+
+  refresh({ revision, bounds }) {
+    if (this.screen.closed || !this.screen.view) return;
+    const data = this.screen.data;
+    if (!data.detail.bounds_wgs84 && bounds) {
+      data.detail.bounds_wgs84 = bounds;
+      this.screen.view.go(bounds);
+    }
+    if (!this.screen.opened?.versions) this.screen.view.refresh(revision, bounds);
+  }
+
+  started(_, event) {
+    this.trail = [];
+    this.run = event.run;
+    this.progress = null;
+    this.show();
+  }
+
+  placed(data, event) {
+    this.run = event.run;
+    const { position } = data;
+    this.places.push(Date.now());
+    this.delay_s = data.time ? null : this.delay_s;
+    if (data.latency_s !== undefined) this.delay_s = data.latency_s;
+    this.last = data;
+    if (position) this.trail.push(position.slice(0, 2));
+    this.drawSoon();
+  }
+
+  /** Draw at most once for each picture of the screen, however many frames came. */
+  drawSoon() {
+    this.drawing ??= requestAnimationFrame(() => {
+      this.drawing = null;
+      this.draw();
+      this.show();
+    });
+  }
+
+  draw() {
+    const { view, data } = this.screen;
+    if (!view || this.screen.closed || !this.last) return;
+    view.put("drone", droneFeatures(this.last));
+    const line = this.trail.length > 1 ? [{ type: "Feature", properties: { live: true }, geometry: { type: "LineString", coordinates: this.trail } }] : [];
+    view.put("track", [...data.all.track, ...line]);
+    if (this.follows && this.last.position) view.go(this.last.position.slice(0, 2), view.map.getZoom());
+  }
+
+  found(name, feature) {
+    if (!feature) return;
+    feature.id ??= feature.properties.id;
+    this.screen.data.take(name, feature);
+    const middle = middleOf(feature.geometry);
+    for (const zone of this.screen.zones ?? []) {
+      if (zone.properties.purpose !== "alert" || this.alerted.has(feature.id) || !inRing(middle, zone.geometry.coordinates[0])) continue;
+      this.alerted.add(feature.id);
+      this.alert(zone, feature);
+    }
+  }
+
+  alert(zone, feature) {
+    message(`${zone.properties.name || "Alert zone"}: ${titleOf(feature)}`, { kind: "alert", todo: words.place(middleOf(feature.geometry)),
+      act: button("Show", () => { this.screen.data.choose(feature); this.screen.goTo(feature); }) });
+    if (choices.get("sound")) beep();
+  }
+
+  ended(type, data) {
+    this.progress = null;
+    this.run = null;
+    this.trail = [];
+    this.last = null;
+    this.screen.view?.put("drone", []);
+    this.show();
+    if (type === "run.failed") message("The mission failed", { kind: "error", todo: data.error || data.headline || "See “Missions” for why." });
+    else message(data.headline || "The mission is done");
+  }
+
+  /** Frames a second over the last seconds, as they came to this page. */
+  rate() {
+    const since = Date.now() - RATE_WINDOW_MS;
+    this.places = this.places.filter((each) => each > since);
+    return this.places.length / (RATE_WINDOW_MS / 1000);
+  }
+
+  async look() {
+    try {
+      this.screen.station.status = { ...this.screen.station.status, ...await get("/api/status") };
+    } catch { /* the connection's own sign says so */ }
+    if (!this.screen.closed) this.show();
+  }
+
+  show() {
+    const status = this.screen.station.status;
+    const figures = this.progress ?? {};
+    const total = (name) => figures[name] ?? (this.run ? undefined : this.screen.data.detail.flights?.reduce((sum, each) => sum + (each[name] ?? 0), 0));
+    const reasons = figures.reasons ?? Object.assign({}, ...(this.screen.data.detail.flights ?? []).map((each) => each.reasons));
+    const low = status.disk_floor_gb !== undefined && status.disk_free_gb < 2 * status.disk_floor_gb;
+    const rows = [
+      this.run && ["frames/s", words.number(figures.frames_per_s ?? this.rate()), "Frames placed in a second"],
+      this.run && ["latency", figures.latency_s === undefined && this.delay_s === undefined ? "–" : `${words.number(figures.latency_s ?? this.delay_s, 2)} s`, "From the drone's picture to the map"],
+      ["matched", words.number(total("matched"), 0), "Frames placed by vision"],
+      ["by GPS", words.number(total("by_gps"), 0), "Frames placed by GPS alone"],
+      ["rejected", words.number(total("rejected"), 0), Object.entries(reasons).map(([why, count]) => `${count} × ${why}`).join("\n") || "None"],
+      figures.gps_sigma_m !== undefined && ["GPS", words.length(figures.gps_sigma_m), "Standard deviation of a fix"],
+      ["memory", status.memory_mb ? words.bytes(status.memory_mb * 1e6) : "–", "Of the station's process"],
+      ["disk left", words.bytes(status.disk_free_gb * 1e9), low ? "Nearly full: free some space, or nothing new is taken in" : "Free space where the sites are"],
+    ];
+    fill(this.screen.numbers, rows.filter(Boolean).map(([name, value, why]) =>
+      el("button", { type: "button", class: `figure${name === "disk left" && low ? " low" : ""}`, title: why, on: { click: () => message(`${name}: ${value}`, { todo: why }) } },
+        el("b", {}, value), el("span", {}, name))));
+  }
+
+  close() {
+    clearInterval(this.timer);
+    cancelAnimationFrame(this.drawing);
+    for (const end of this.ends) end();
+  }
+}
+
+/** What is drawn of the drone: itself, the ground in its picture, and the lines of sight to that ground's corners. */
+function droneFeatures({ position, footprint, heading_deg: heading }) {
+  const features = [];
+  const ring = footprint?.coordinates?.[0] ?? footprint;
+  const add = (part, geometry, more = {}) => features.push({ type: "Feature", properties: { part, ...more }, geometry });
+  if (Array.isArray(ring) && ring.length > 3) {
+    const closed = String(ring[0]) === String(ring.at(-1)) ? ring : [...ring, ring[0]];
+    add("footprint", { type: "Polygon", coordinates: [closed] });
+    if (position) add("view", { type: "MultiLineString", coordinates: closed.slice(0, 4).map((corner) => [position.slice(0, 2), corner.slice(0, 2)]) });
+  }
+  if (position) add("body", { type: "Point", coordinates: position.slice(0, 2) }, { heading_deg: heading ?? 0 });
+  return features;
+}
+
+let sound = null;
+
+function beep() {
+  try {
+    sound ??= new AudioContext();
+    const tone = sound.createOscillator();
+    const loud = sound.createGain();
+    loud.gain.value = 0.12;
+    tone.frequency.value = 880;
+    tone.connect(loud).connect(sound.destination);
+    tone.start();
+    tone.stop(sound.currentTime + 0.25);
+  } catch { /* a browser without sound shows the message alone */ }
+}

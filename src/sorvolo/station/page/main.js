@@ -1,0 +1,147 @@
+// The page's beginning: who is logged in, which screen, the connection to the station.
+
+import { get, post, remove, session, Problem } from "./api.js";
+import { applyTheme, choices } from "./choices.js";
+import { button, choice, dialog, el, field, fill, message, report, tick } from "./dom.js";
+import { Events } from "./events.js";
+import { showSites } from "./sites.js";
+
+const main = document.getElementById("main");
+const title = document.getElementById("title");
+const linkState = document.getElementById("link-state");
+const numbers = document.getElementById("numbers");
+
+/** What all screens share. */
+export const station = { status: null, events: null };
+
+let screen = null;
+let turn = 0;
+
+async function begin() {
+  applyTheme();
+  document.getElementById("settings-button").addEventListener("click", showSettings);
+  choices.addEventListener("change", (event) => { if (event.detail === "theme") applyTheme(); });
+  session.addEventListener("needed", showLogin);
+  addEventListener("hashchange", () => route());
+  await enter();
+}
+
+async function enter() {
+  try {
+    station.status = await get("/api/status");
+  } catch (problem) {
+    if (problem.status === 401) return;
+    fill(main, el("div", { class: "starting" }, el("h1", {}, problem.title), el("p", {}, problem.detail)));
+    setTimeout(enter, 3000);
+    return;
+  }
+  if (!station.events) listen();
+  await route();
+}
+
+function listen() {
+  station.events = new Events(station.status.last_event ?? 0);
+  const words = { live: "live", waiting: "connecting", lost: "no connection" };
+  const show = () => {
+    const state = station.events.state;
+    linkState.className = state;
+    fill(linkState, words[state]);
+  };
+  show();
+  station.events.addEventListener("state", show);
+  station.events.addEventListener("reload", () => route());
+}
+
+/** Show the screen that the address names. */
+async function route() {
+  turn += 1;
+  const mine = turn;
+  const [, kind, id, view] = location.hash.split("/").map(decodeURIComponent);
+  screen?.close?.();
+  screen = null;
+  fill(numbers);
+  fill(title);
+  document.body.dataset.screen = kind === "site" && id ? "site" : "sites";
+  try {
+    let made;
+    if (kind === "site" && id) {
+      const { showSite } = await import("./site.js");
+      made = await showSite(main, title, numbers, station, id, view || "map");
+    } else {
+      made = await showSites(main, title, station);
+    }
+    if (mine === turn) screen = made;
+    else made?.close?.();
+  } catch (problem) {
+    if (mine !== turn) return;
+    if (!(problem instanceof Problem)) throw problem;
+    if (problem.status === 401) return;
+    fill(main, el("div", { class: "starting" }, el("h1", {}, problem.title), el("p", {}, problem.detail),
+      el("p", {}, el("a", { href: "#/" }, "All sites"), " ", button("Try again", () => route()))));
+  }
+}
+
+let loginBox = null;
+
+function showLogin() {
+  if (loginBox?.isConnected) return;
+  const input = el("input", { type: "password", autocomplete: "current-password", required: true, maxlength: 200 });
+  const note = el("p", { class: "note", role: "alert" });
+  const form = el("form", { class: "stack" },
+    el("p", {}, "This station is shared: it needs a token to know who you are. Who runs it makes one with ",
+      el("code", {}, "sorvolo token"), "."),
+    field("Token", input), note, el("button", { class: "main" }, "Log in"));
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    try {
+      await post("/api/session", { token: input.value.trim() });
+      loginBox.close();
+      await enter();
+    } catch (problem) {
+      fill(note, problem.detail);
+      input.select();
+    }
+  });
+  loginBox = dialog("Log in", form);
+  input.focus();
+}
+
+function showSettings() {
+  const set = (name) => (value) => choices.set(name, value);
+  const who = station.status;
+  dialog("Settings",
+    el("div", { class: "stack" },
+      field("Units", choice([["metric", "Metres, hectares"], ["imperial", "Feet, acres"]], choices.get("units"), set("units"))),
+      field("Coordinates", choice([["latlon", "Latitude, longitude"], ["utm", "UTM"], ["mgrs", "MGRS"]],
+        choices.get("coordinates"), set("coordinates"))),
+      field("Times", choice([["local", "This device's time zone"], ["utc", "UTC"]], choices.get("clock"), set("clock"))),
+      field("Colours", choice([["auto", "As the device"], ["light", "Light"], ["dark", "Dark"]], choices.get("theme"), set("theme"))),
+      tick("Sound when something appears in an alert zone", choices.get("sound"), set("sound")),
+      el("h3", {}, "Keys"),
+      el("dl", { class: "keys" }, [
+        ["1 … 7", "panels"], ["J / K", "next and previous in the review"], ["C / R / U", "confirm, reject, take back"],
+        ["N", "note"], ["M", "show on the map"], ["B", "blink before and after"], ["Esc", "end drawing, close"],
+      ].map(([key, words]) => [el("dt", {}, key), el("dd", {}, words)])),
+      who ? el("p", { class: "note" }, `Sorvolo ${who.version}. Logged in as ${who.name || "this machine"} (${who.role}). `,
+        who.name && who.name !== "this machine" ? button("Log out", logOut, { class: "quiet" }) : null) : null));
+}
+
+async function logOut() {
+  try {
+    await remove("/api/session");
+    location.reload();
+  } catch (problem) {
+    report(problem);
+  }
+}
+
+addEventListener("unhandledrejection", (event) => {
+  const problem = event.reason;
+  if (problem instanceof Problem) {
+    event.preventDefault();
+    if (problem.status !== 401) report(problem);
+  } else if (problem?.name === "AbortError") event.preventDefault();
+  else message("Something on this page went wrong", { kind: "error", todo: "Reload it; if it comes back, report it with what you did." });
+});
+
+begin();

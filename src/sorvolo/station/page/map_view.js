@@ -1,0 +1,184 @@
+// The map of a site: MapLibre with the mosaic's tiles, and the data of the site over it.
+
+import * as maplibre from "./vendor/maplibre-gl.mjs";
+import { siteUrl } from "./api.js";
+import { choices, isDark } from "./choices.js";
+import { GROUPS, groundColour, mapStyle, pictures } from "./map_style.js";
+
+const EARTH_M_PER_PX = 156543.034; // of a tile of 256 px at zoom 0, on the equator
+const REFRESH_MS = 300;
+const MOST_CHANGES = 500; // that are remembered of the growing map
+
+/** Whether this browser can draw the map at all. */
+export function canDraw() {
+  return Boolean(document.createElement("canvas").getContext("webgl2"));
+}
+
+/**
+ * The map in a container. `ready` is fulfilled once it can be drawn on. Events of clicks go to `onClick(place, hits)` with
+ * [lon, lat] and the features below.
+ */
+export class MapView {
+  constructor(container, site, { onClick = () => {}, onMove = () => {}, bare = false } = {}) {
+    this.site = site;
+    this.version = null;
+    this.data = {};
+    this.changes = []; // of the growing map: which bounds each revision touched
+    this.base = null; // the revision of all that none of them touched
+    this.fresh = [];
+    const { layers, ...style } = mapStyle(isDark());
+    this.groups = {};
+    for (const each of layers) if (each.group) (this.groups[each.group] ??= []).push(each.id);
+    style.layers = layers.map(({ group, ...each }) => (group && !this.isShown(group) ? { ...each, layout: { ...each.layout, visibility: "none" } } : each));
+    this.map = new maplibre.Map({
+      container, style, attributionControl: false, maxZoom: 24, dragRotate: true, fadeDuration: 0, boxZoom: false, maxTileCacheSize: 0,
+      ...(site.bounds_wgs84 ? { bounds: site.bounds_wgs84, fitBoundsOptions: { padding: 30 } } : { center: [0, 20], zoom: 1.5 }),
+      transformRequest: (url) => ({ url: this.tileAddress(url) }), canvasContextAttributes: { preserveDrawingBuffer: true },
+      locale: { "Map.Title": "Map of the site. Arrow keys move it, plus and minus zoom." },
+    });
+    this.map.on("error", (event) => { if (event.error && event.error.status !== 404) console.warn(event.error.message); });
+    if (!bare) {
+      this.map.addControl(new maplibre.NavigationControl({ visualizePitch: false }), "top-right");
+      this.scale = new maplibre.ScaleControl({ unit: choices.get("units") });
+      this.map.addControl(this.scale, "bottom-right");
+    }
+    this.map.on("click", (event) => onClick([event.lngLat.lng, event.lngLat.lat], this.hits(event.point), event));
+    this.map.on("mousemove", (event) => onMove([event.lngLat.lng, event.lngLat.lat], this.hits(event.point)));
+    this.ready = new Promise((done) => this.map.once("style.load", () => {
+      for (const [name, picture] of Object.entries(pictures())) this.map.addImage(name, picture);
+      done();
+    }));
+  }
+
+  isShown(group) {
+    return choices.get("layers")[group] ?? GROUPS[group][1];
+  }
+
+  /** Show or hide a group of layers. */
+  show(group, visible) {
+    choices.set("layers", { ...choices.get("layers"), [group]: visible });
+    for (const id of this.groups[group] ?? []) if (this.map.getLayer(id)) this.map.setLayoutProperty(id, "visibility", visible ? "visible" : "none");
+  }
+
+  /** Follow the page's colours and units. */
+  follow() {
+    this.map.setPaintProperty("ground", "background-color", groundColour(isDark()));
+    this.scale?.setUnit(choices.get("units"));
+  }
+
+  /** Put features in the place of those of a source. */
+  put(name, features) {
+    this.data[name] = features;
+    this.map.getSource(name)?.setData({ type: "FeatureCollection", features });
+  }
+
+  /** Show a version of the mosaic: a number, or `live-REVISION` of the growing map. */
+  showVersion(version) {
+    if (version === null || version === undefined || version === this.version) return;
+    this.version = version;
+    if (String(version).startsWith("live-")) this.base ??= version.slice(5);
+    this.groups.mosaic = ["mosaic"];
+    if (this.map.getLayer("mosaic")) this.map.removeLayer("mosaic");
+    if (this.map.getSource("mosaic")) this.map.removeSource("mosaic");
+    const { m_per_px: finest, bounds_wgs84: bounds } = this.site;
+    const lat = bounds ? (bounds[1] + bounds[3]) / 2 : 0;
+    const deepest = finest ? Math.ceil(Math.log2(EARTH_M_PER_PX * Math.cos(lat * Math.PI / 180) / finest)) : 22;
+    this.map.addSource("mosaic", {
+      type: "raster", tileSize: 256, minzoom: 8, maxzoom: Math.max(9, Math.min(24, deepest)),
+      tiles: [location.origin + siteUrl(this.site.id, "tiles", version, "{z}/{x}/{y}.webp")], // URL() would escape the braces
+      ...(bounds && !String(version).startsWith("live") ? { bounds } : {}),
+    });
+    this.map.addLayer({ id: "mosaic", type: "raster", source: "mosaic", paint: { "raster-fade-duration": 0, "raster-resampling": "linear" },
+      layout: { visibility: this.isShown("mosaic") ? "visible" : "none" } }, "coverage");
+  }
+
+  /** The growing map changed within bounds: only its tiles there are asked for again. */
+  refresh(revision, bounds) {
+    this.changes.push({ revision, bounds });
+    if (this.changes.length > MOST_CHANGES) this.base = this.changes.shift().revision;
+    if (!String(this.version).startsWith("live")) return this.showVersion(`live-${revision}`);
+    this.fresh.push(bounds);
+    this.timer ??= setTimeout(() => this.refreshNow(), REFRESH_MS);
+  }
+
+  refreshNow() {
+    this.timer = null;
+    const fresh = this.fresh.splice(0);
+    if (!this.map.getSource("mosaic")) return;
+    const view = this.map.getBounds();
+    const seen = [view.getWest(), view.getSouth(), view.getEast(), view.getNorth()];
+    const zoom = Math.floor(this.map.getZoom()) + 1;
+    const tiles = new Map();
+    for (const bounds of fresh) {
+      for (let z = Math.max(8, zoom - 6); z <= Math.min(24, zoom + 1); z++) {
+        for (const tile of tilesWithin(z, bounds ? meet(bounds, seen) : seen)) tiles.set(`${z}/${tile.x}/${tile.y}`, tile);
+      }
+    }
+    if (tiles.size) this.map.refreshTiles("mosaic", [...tiles.values()]);
+  }
+
+  /** A tile of the growing map by the revision that touched it last: the others stay in the browser's cache. */
+  tileAddress(url) {
+    const found = /\/tiles\/live-[0-9a-f]+\/(\d+)\/(\d+)\/(\d+)\.webp$/.exec(url);
+    if (!found) return url;
+    const [z, x, y] = found.slice(1).map(Number);
+    const last = this.changes.findLast(({ bounds }) => !bounds || tileMeets(z, x, y, bounds));
+    const revision = last?.revision ?? this.base;
+    return revision ? url.replace(/live-[0-9a-f]+/, `live-${revision}`) : url;
+  }
+
+  /** The features below a point, the uppermost first. */
+  hits(point) {
+    const layers = ["objects", "changes-fill", "changes-line", "drawings-fill", "drawings-point"].filter((id) => this.map.getLayer(id));
+    const box = [[point.x - 6, point.y - 6], [point.x + 6, point.y + 6]];
+    return this.map.queryRenderedFeatures(box, { layers });
+  }
+
+  /** Move to a [lon, lat] or to bounds. */
+  go(place, zoom = 20.5) {
+    const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    if (place.length === 4) this.map.fitBounds(place, { padding: 40, maxZoom: 21.5, animate: !still });
+    else this.map.easeTo({ center: place, zoom: Math.max(this.map.getZoom(), zoom), animate: !still, duration: 500 });
+  }
+
+  close() {
+    clearTimeout(this.timer);
+    this.map.remove();
+  }
+}
+
+/** Let two maps show the same ground, whichever is moved. Gives what ends it. */
+export function tie(one, other) {
+  let busy = false;
+  const copy = (from, to) => () => {
+    if (busy) return;
+    busy = true;
+    to.jumpTo({ center: from.getCenter(), zoom: from.getZoom(), bearing: from.getBearing(), pitch: from.getPitch() });
+    busy = false;
+  };
+  const [there, back] = [copy(one, other), copy(other, one)];
+  one.on("move", there);
+  other.on("move", back);
+  there();
+  return () => { one.off("move", there); other.off("move", back); };
+}
+
+const columnOf = (lon, z) => (lon + 180) / 360 * 2 ** z;
+const rowOf = (lat, z) => (1 - Math.asinh(Math.tan(lat * Math.PI / 180)) / Math.PI) / 2 * 2 ** z;
+
+function tileMeets(z, x, y, [west, south, east, north]) {
+  return columnOf(west, z) <= x + 1 && columnOf(east, z) >= x && rowOf(north, z) <= y + 1 && rowOf(south, z) >= y;
+}
+
+function meet(one, other) {
+  return [Math.max(one[0], other[0]), Math.max(one[1], other[1]), Math.min(one[2], other[2]), Math.min(one[3], other[3])];
+}
+
+function tilesWithin(z, [west, south, east, north]) {
+  const tiles = [];
+  if (west > east || south > north) return tiles;
+  for (let x = Math.floor(columnOf(west, z)); x <= columnOf(east, z); x++) {
+    for (let y = Math.floor(rowOf(north, z)); y <= rowOf(south, z) && tiles.length < 400; y++) tiles.push({ z, x, y });
+  }
+  return tiles;
+}

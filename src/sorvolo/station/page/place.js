@@ -1,0 +1,81 @@
+// Memory of a place: everything that ever saw a spot of ground, in order of time.
+
+import { get, siteUrl } from "./api.js";
+import { button, el, fill } from "./dom.js";
+import { picture } from "./feature_card.js";
+import * as words from "./words.js";
+
+/** The panel's life; `look(place)` asks for a [lon, lat]. */
+export function placePanel(screen, body) {
+  let turn = 0;
+  let last = screen.lastPlace ?? null;
+  const hint = el("p", { class: "hint" }, "Tap the ground on the map: every flight that saw it, in order, what changed there and who said so.");
+
+  async function look(place) {
+    turn += 1;
+    const mine = turn;
+    last = screen.lastPlace = place;
+    mark(screen, place);
+    fill(body, el("p", { class: "place-name" }, words.place(place, { local: screen.data.detail.is_local })), el("p", { class: "soft" }, "Looking through the flights…"));
+    let views;
+    try {
+      const answer = await get(`${siteUrl(screen.data.id, "place")}?lon=${place[0]}&lat=${place[1]}`);
+      views = Array.isArray(answer) ? answer : answer.views ?? answer.items ?? [];
+    } catch (problem) {
+      if (mine === turn) fill(body, el("p", { class: "hint" }, problem.status === 404 ? "No flight saw this place." : `${problem.title}. ${problem.detail}`));
+      return;
+    }
+    if (mine === turn) show(place, views);
+  }
+
+  function show(place, views) {
+    const flights = new Map();
+    for (const each of views) flights.set(each.flight, [...(flights.get(each.flight) ?? []), each]);
+    const found = unique(views.flatMap((each) => each.changes ?? []));
+    const said = unique(views.flatMap((each) => each.reviews ?? []), (each) => `${each.kind}${each.id}${each.revision}`);
+    fill(body,
+      el("div", { class: "row" }, el("p", { class: "place-name" }, words.place(place, { local: screen.data.detail.is_local })), copyButton(place)),
+      views.length ? el("p", { class: "soft" }, `${words.counted(views.length, "view")} in ${words.counted(flights.size, "flight")}, first ${words.time(views[0].time)}`)
+        : el("p", { class: "hint" }, "No flight saw this place."),
+      found.length ? el("section", {}, el("h3", {}, "What happened here"), el("ul", { class: "plain" }, found.map((each) => change(screen, each)))) : null,
+      said.length ? el("section", {}, el("h3", {}, "Reviews"), el("ul", { class: "plain" }, said.map(review))) : null,
+      [...flights].map(([flight, list]) => el("section", { class: "dates" },
+        el("h3", {}, words.day(list[0].time), el("small", {}, ` ${flight}`)),
+        el("ol", { class: "film", tabindex: 0, "aria-label": `Views of ${flight}` }, list.map((each) => view(screen, each))))));
+  }
+
+  if (last) look(last);
+  else fill(body, hint);
+  return { look, cursor: "crosshair", click(place, hits) { if (hits.some((each) => each.source === "objects")) return false; look(place); return true; },
+    close() { mark(screen, null); } };
+}
+
+function mark(screen, place) {
+  screen.view?.put("sketch", place ? [{ type: "Feature", properties: { purpose: "waypoint" }, geometry: { type: "Point", coordinates: place } }] : []);
+}
+
+function unique(list, key = (each) => each.id ?? each) {
+  return [...new Map(list.map((each) => [key(each), each])).values()];
+}
+
+function change(screen, each) {
+  const id = typeof each === "string" ? each : each.id;
+  const feature = screen.data.find(id);
+  const values = feature?.properties ?? each.properties ?? each;
+  const text = [values.first_seen ? `${words.day(values.first_seen)}: ` : "", values.kind ? words.changeWords(values) : id];
+  return el("li", {}, feature ? button(text.join(""), () => screen.data.choose(feature), { class: "link" }) : text);
+}
+
+function review(each) {
+  return el("li", {}, el("b", {}, each.verdict), ` by ${each.who}, ${words.time(each.at)}`, each.note ? ` “${each.note}”` : "");
+}
+
+function view(screen, each) {
+  const jump = each.video_s === null || each.video_s === undefined ? null
+    : button(`▶ ${words.duration(each.video_s)}`, () => screen.video.jump(each), { class: "quiet", title: "Show the video at this second" });
+  return el("li", {}, picture(each.crop_url, `Seen ${words.time(each.time)}`), el("span", {}, words.clock(each.time)), jump);
+}
+
+function copyButton(place) {
+  return button("Copy", () => navigator.clipboard?.writeText(words.place(place)), { class: "quiet", title: "Copy the coordinates" });
+}

@@ -1,0 +1,94 @@
+// The data of one site in the page: features as loaded and as live events change them, filters, what is chosen.
+
+import { features, get, siteUrl } from "./api.js";
+import { ALL, passing } from "./filters.js";
+
+const NAMES = ["objects", "changes", "frames", "track", "coverage", "pod"];
+
+/** Fires `data` (detail: the names that changed), `filters`, `chosen`. `detail` is the site as the station states it. */
+export class SiteData extends EventTarget {
+  constructor(detail) {
+    super();
+    this.detail = detail;
+    this.id = detail.id;
+    this.all = Object.fromEntries(NAMES.map((name) => [name, []]));
+    this.filters = { ...ALL };
+    this.chosen = null;
+    this.versions = null; // [from, to] of a comparison that narrows the changes
+  }
+
+  /** Load collections anew. */
+  async load(names = NAMES) {
+    await Promise.all(names.map(async (name) => { this.all[name] = await features(this.id, name); }));
+    this.changed(names);
+  }
+
+  /** Load the site's own description anew. */
+  async loadDetail() {
+    this.detail = await get(siteUrl(this.id));
+    this.changed(["detail"]);
+  }
+
+  changed(names) {
+    if (this.chosen) this.chosen = this.find(this.chosen.id) ?? this.chosen;
+    this.dispatchEvent(new CustomEvent("data", { detail: names }));
+  }
+
+  /** The objects or changes that the filters let through. */
+  shown(name) {
+    let list = this.all[name];
+    if (name === "changes" && this.versions) {
+      const [low, high] = [Math.min(...this.versions), Math.max(...this.versions)];
+      list = list.filter(({ properties: { version } }) => version === undefined || version === null || (version > low && version <= high));
+    }
+    return name === "objects" || name === "changes" ? passing(list, this.filters) : list;
+  }
+
+  filter(change) {
+    this.filters = { ...this.filters, ...change };
+    this.dispatchEvent(new Event("filters"));
+  }
+
+  find(id) {
+    return this.all.changes.find((each) => each.id === id) ?? this.all.objects.find((each) => each.id === id) ?? null;
+  }
+
+  choose(feature) {
+    this.chosen = feature;
+    this.dispatchEvent(new Event("chosen"));
+  }
+
+  /** Put a feature in, in the place of an older one of the same id. */
+  take(name, feature) {
+    const list = this.all[name];
+    const at = list.findIndex((each) => each.id === feature.id);
+    if (at < 0) list.push(feature);
+    else list[at] = { ...list[at], ...feature, properties: { ...list[at].properties, ...feature.properties } };
+    this.changed([name]);
+  }
+
+  /** Take a feature out. */
+  drop(name, id) {
+    this.all[name] = this.all[name].filter((each) => each.id !== id);
+    this.changed([name]);
+  }
+
+  /** A verdict came, ours or another's. */
+  judge({ kind, id, verdict, note, revision, who, at }) {
+    const name = kind === "change" ? "changes" : "objects";
+    const found = this.all[name].find((each) => each.id === id);
+    if (!found || (found.properties.revision ?? 0) > revision) return;
+    Object.assign(found.properties, { review: verdict === "none" ? null : verdict, note, revision, reviewer: who, reviewed_at: at });
+    this.changed([name]);
+  }
+}
+
+/** Whether a feature is a change; else it is an object. */
+export const isChange = (feature) => feature.properties.kind !== undefined;
+
+/** The addresses of a feature's pictures. */
+export function cropsOf(site, feature) {
+  if (feature.properties.crops) return feature.properties.crops;
+  const kind = isChange(feature) ? "change" : "object";
+  return (kind === "change" ? [0, 1] : [0]).map((n) => siteUrl(site, "crops", kind, encodeURIComponent(feature.id), `${n}.jpg`));
+}

@@ -1,0 +1,98 @@
+// Uploads that go on where they were cut off: the tus protocol 1.0.0, creation and resumption, in pieces.
+
+import { Problem, send } from "./api.js";
+
+const VERSION = { "tus-resumable": "1.0.0" };
+const PIECE_BYTES = 8 * 1024 * 1024;
+const TRIES = 8;
+const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+
+/**
+ * One file on its way. `send()` is fulfilled with the upload's id; `progress` is fired with the share that is there.
+ * Where the browser reloads, the same file goes on at the byte that the station has.
+ */
+export class Upload extends EventTarget {
+  constructor(file, { kind, group = "" } = {}) {
+    super();
+    Object.assign(this, { file, kind, group, sent: 0, stopped: new AbortController() });
+    this.key = `sorvolo-upload ${file.name} ${file.size} ${file.lastModified} ${kind} ${group}`;
+  }
+
+  async send() {
+    let url = recall(this.key);
+    let offset = url ? await this.offsetAt(url) : null;
+    if (offset === null) {
+      url = await this.create();
+      offset = 0;
+    }
+    for (let tries = 0; ;) {
+      this.note(offset);
+      if (offset >= this.file.size) break;
+      try {
+        offset = await this.piece(url, offset);
+        tries = 0;
+      } catch (problem) {
+        if (problem.name === "AbortError") throw problem;
+        tries += 1;
+        const isLost = ![0, 409, 423, 500, 502, 503, 504].includes(problem.status);
+        if (isLost || tries > TRIES) throw problem;
+        await pause(Math.min(500 * 2 ** tries, 15000));
+        offset = await this.offsetAt(url) ?? offset;
+      }
+    }
+    forget(this.key);
+    return decodeURIComponent(new URL(url, location.href).pathname.split("/").filter(Boolean).at(-1));
+  }
+
+  /** Stop; what is there stays for a later try. */
+  stop() {
+    this.stopped.abort();
+  }
+
+  note(offset) {
+    this.sent = offset;
+    this.dispatchEvent(new CustomEvent("progress", { detail: this.file.size ? offset / this.file.size : 1 }));
+  }
+
+  async create() {
+    const values = { filename: this.file.name, kind: this.kind, ...(this.group && { group: this.group }) };
+    const metadata = Object.entries(values).filter(([, value]) => value).map(([name, value]) => `${name} ${base64(value)}`).join(",");
+    const answer = await send("/api/uploads", { method: "POST", headers: { ...VERSION, "upload-length": String(this.file.size), "upload-metadata": metadata }, signal: this.stopped.signal });
+    const url = answer.headers.get("location");
+    if (!url) throw new Problem(500, "The upload did not begin", "The station gave it no address; look at its messages.");
+    remember(this.key, url);
+    return url;
+  }
+
+  /** The bytes that the station has; null where it does not know the upload any more. */
+  async offsetAt(url) {
+    try {
+      const answer = await send(url, { method: "HEAD", headers: VERSION, signal: this.stopped.signal });
+      return Number(answer.headers.get("upload-offset"));
+    } catch (problem) {
+      if ([403, 404, 410].includes(problem.status)) forget(this.key);
+      else if (problem.status === 0 || problem.name === "AbortError") throw problem;
+      return null;
+    }
+  }
+
+  async piece(url, offset) {
+    const body = this.file.slice(offset, offset + PIECE_BYTES);
+    const answer = await send(url, { method: "PATCH", body, signal: this.stopped.signal, headers: { ...VERSION, "upload-offset": String(offset), "content-type": "application/offset+octet-stream" } });
+    return Number(answer.headers.get("upload-offset"));
+  }
+}
+
+const base64 = (text) => btoa(String.fromCharCode(...new TextEncoder().encode(text)));
+
+function recall(key) {
+  try { return localStorage.getItem(key); } catch { return null; }
+}
+
+function remember(key, url) {
+  try { localStorage.setItem(key, url); } catch { /* without storage an upload cannot outlive the page */ }
+}
+
+function forget(key) {
+  try { localStorage.removeItem(key); } catch { /* nothing was kept */ }
+}

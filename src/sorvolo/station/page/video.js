@@ -1,0 +1,322 @@
+// The drone's video with boxes on the picture they belong to: WebCodecs where the page is secure, MediaSource otherwise.
+
+import { get } from "./api.js";
+import { choices } from "./choices.js";
+import { button, el, fill, tick } from "./dom.js";
+import { CLASSES, OTHER_CLASS } from "./map_style.js";
+import { number, percent } from "./words.js";
+
+const BOXES_WITHIN_US = 250000; // boxes further from a picture than this are not its own
+const KEPT_BOXES = 300;
+const MOST_HELD_S = 1.2;
+const STAMP_BYTES = 8;
+
+/** The pane over the map; it appears when a stream is on. `jump(view)` plays a recorded flight at a second. */
+export function videoPane(screen) {
+  return new VideoPane(screen);
+}
+
+class VideoPane {
+  constructor(screen) {
+    Object.assign(this, { screen, boxes: [], stream: null, socket: null, late_s: 0 });
+    this.canvas = el("canvas", { width: 640, height: 360 });
+    this.overlay = el("canvas", { class: "boxes", width: 640, height: 360, "aria-hidden": true });
+    this.player = el("video", { muted: true, playsinline: true, hidden: true });
+    this.delay = el("span", { class: "delay" });
+    this.name = el("b", {}, "Video");
+    this.picture = el("div", { class: "picture" }, this.canvas, this.player, this.overlay);
+    this.pane = el("aside", { class: "video", hidden: true, "aria-label": "Live video" },
+      el("header", {}, this.name, this.delay, el("button", { type: "button", class: "quiet", "aria-label": "Larger or smaller", on: { click: () => this.pane.classList.toggle("large") } }, "⤢"),
+        el("button", { type: "button", class: "quiet", "aria-label": "Close the video", on: { click: () => this.leave() } }, "×")),
+      this.picture, el("footer", {}, tick("hold for boxes", choices.get("holdForBoxes"), (on) => choices.set("holdForBoxes", on), { title: "Show each picture when its boxes are known" }), this.seen = el("span", { class: "soft" })));
+    this.opener = button("Video", () => this.open(), { class: "video-open", icon: "video" });
+    this.opener.hidden = true;
+    screen.stage.append(this.pane, this.opener);
+    const hear = (type, listener) => {
+      screen.station.events.addEventListener(type, listener);
+      return () => screen.station.events.removeEventListener(type, listener);
+    };
+    this.ends = [hear("frame.boxes", ({ detail }) => this.take(detail.data)), hear("stream.state", ({ detail }) => this.heard(detail))];
+    this.look();
+  }
+
+  /** Is a stream on for this site? */
+  async look() {
+    try {
+      const answer = await get("/api/streams");
+      const list = Array.isArray(answer) ? answer : answer.streams ?? [];
+      const mine = list.find((each) => each.site === this.screen.data.id) ?? list.find((each) => !each.site && ["live", "on", "connected"].includes(each.state ?? "live"));
+      if (mine) this.offer(mine.name ?? mine.id);
+    } catch { /* a station without streams */ }
+  }
+
+  heard({ site, data }) {
+    if (site && site !== this.screen.data.id) return;
+    const name = data.stream ?? data.name;
+    if (["ended", "lost", "off"].includes(data.state) && name === this.stream) fill(this.delay, data.state === "lost" ? "no signal" : "ended");
+    else if (name) this.offer(name);
+  }
+
+  offer(name) {
+    if (this.stream === name && !this.pane.hidden) return;
+    this.stream = name;
+    this.opener.hidden = false;
+    if (!this.wasClosed) this.open();
+  }
+
+  open() {
+    this.wasClosed = false;
+    this.pane.hidden = false;
+    this.opener.hidden = true;
+    fill(this.name, this.stream);
+    this.connect();
+  }
+
+  leave() {
+    this.wasClosed = true;
+    this.drop();
+    this.pane.hidden = true;
+    this.opener.hidden = !this.stream;
+  }
+
+  connect() {
+    this.drop();
+    this.fmp4 = !("VideoDecoder" in window);
+    const url = new URL(`/api/streams/${encodeURIComponent(this.stream)}/video${this.fmp4 ? "?mode=fmp4" : ""}`, location.href);
+    url.protocol = url.protocol.replace("http", "ws");
+    const socket = new WebSocket(url);
+    socket.binaryType = "arraybuffer";
+    this.socket = socket;
+    this.show = this.fmp4 ? new SegmentPlayer(this.player, (pts_us) => this.shown(pts_us)) : new FramePlayer(this.canvas, (pts_us) => this.shown(pts_us), () => this.hold_s());
+    this.canvas.hidden = this.fmp4;
+    this.player.hidden = !this.fmp4;
+    socket.addEventListener("message", ({ data }) => (typeof data === "string" ? this.said(JSON.parse(data)) : this.packet(data)));
+    socket.addEventListener("close", () => {
+      if (socket !== this.socket) return;
+      fill(this.delay, "no signal");
+      this.timer = setTimeout(() => this.connect(), 3000);
+    });
+  }
+
+  said(words) {
+    if (words.codec) {
+      this.format = words;
+      this.show.begin(words);
+    } else if (words.boxes) this.take(words);
+    if (words.epoch_us !== undefined) this.epoch_us = words.epoch_us;
+  }
+
+  packet(data) {
+    const pts_us = this.fmp4 ? null : Number(new DataView(data).getBigInt64(0));
+    if (pts_us !== null) this.newest = { pts_us, at: performance.now() };
+    this.show.take(this.fmp4 ? new Uint8Array(data) : new Uint8Array(data, STAMP_BYTES), pts_us);
+  }
+
+  /** How long pictures wait for their boxes: as late as boxes came lately. */
+  hold_s() {
+    return choices.get("holdForBoxes") ? Math.min(this.late_s, MOST_HELD_S) : 0;
+  }
+
+  take(data) {
+    if (!data || (data.stream && data.stream !== this.stream)) return;
+    this.boxes.push(data);
+    this.boxes.sort((one, other) => one.pts_us - other.pts_us);
+    this.boxes.splice(0, this.boxes.length - KEPT_BOXES);
+    if (this.newest) {
+      const late = (this.newest.pts_us - data.pts_us) / 1e6 + (performance.now() - this.newest.at) / 1000;
+      if (late > 0 && late < 10) this.late_s = Math.max(late, this.late_s * 0.98);
+    }
+    if (this.now_us !== undefined) this.drawBoxes(this.now_us);
+  }
+
+  /** A picture is on the screen. */
+  shown(pts_us) {
+    this.now_us = pts_us;
+    this.drawBoxes(pts_us);
+    const behind_s = this.epoch_us !== undefined ? (Date.now() * 1000 - this.epoch_us - pts_us) / 1e6
+      : this.newest ? (this.newest.pts_us - pts_us) / 1e6 + (performance.now() - this.newest.at) / 1000 : null;
+    if (behind_s !== null) fill(this.delay, `${number(Math.max(0, behind_s), 2)} s behind`);
+  }
+
+  drawBoxes(pts_us) {
+    let best = null;
+    for (const each of this.boxes) if (!best || Math.abs(each.pts_us - pts_us) < Math.abs(best.pts_us - pts_us)) best = each;
+    const near = best && Math.abs(best.pts_us - pts_us) < BOXES_WITHIN_US ? best : null;
+    const pen = this.overlay.getContext("2d");
+    const [width, height] = near?.frame_size_px ?? [this.format?.width ?? 640, this.format?.height ?? 360];
+    if (this.overlay.width !== width || this.overlay.height !== height) Object.assign(this.overlay, { width, height });
+    pen.clearRect(0, 0, width, height);
+    const boxes = near?.boxes ?? [];
+    const size = Math.max(12, width / 50);
+    pen.font = `600 ${size}px system-ui, sans-serif`;
+    pen.lineWidth = Math.max(2, width / 400);
+    for (const box of boxes) drawBox(pen, box, size);
+    fill(this.seen, boxes.length ? `${boxes.length} in the picture` : "");
+  }
+
+  /** Play the recorded flight of a place's view. */
+  jump(view) {
+    const url = view.video_url;
+    this.drop();
+    this.pane.hidden = false;
+    fill(this.name, view.flight);
+    if (!url) {
+      fill(this.delay, `second ${number(view.video_s, 1)} of ${view.flight}`);
+      return;
+    }
+    this.canvas.hidden = true;
+    this.player.hidden = false;
+    this.player.controls = true;
+    this.player.src = url;
+    this.player.addEventListener("loadedmetadata", () => { this.player.currentTime = view.video_s; this.player.play().catch(() => {}); }, { once: true });
+    fill(this.delay, "recorded");
+  }
+
+  drop() {
+    clearTimeout(this.timer);
+    const old = this.socket;
+    this.socket = null;
+    old?.close();
+    this.show?.close();
+    this.show = null;
+    this.now_us = undefined;
+    this.newest = null;
+  }
+
+  close() {
+    for (const end of this.ends) end();
+    this.drop();
+  }
+}
+
+function drawBox(pen, { class: name, score, xywh_px: [x, y, w, h] }, size) {
+  const [, colour] = CLASSES[name] ?? OTHER_CLASS;
+  pen.strokeStyle = "#10201b";
+  pen.strokeRect(x - 1, y - 1, w + 2, h + 2);
+  pen.strokeStyle = colour;
+  pen.strokeRect(x, y, w, h);
+  const text = `${name} ${percent(score)}`;
+  pen.fillStyle = colour;
+  pen.fillRect(x, y - size * 1.25, pen.measureText(text).width + size * 0.6, size * 1.25);
+  pen.fillStyle = "#10201b";
+  pen.fillText(text, x + size * 0.3, y - size * 0.3);
+}
+
+/** Access units (Annex B) decoded by WebCodecs and drawn when due. */
+class FramePlayer {
+  constructor(canvas, shown, hold_s) {
+    Object.assign(this, { canvas, shown, hold_s, waiting: [], pen: canvas.getContext("2d") });
+  }
+
+  begin({ codec, width, height }) {
+    this.decoder?.close();
+    Object.assign(this.canvas, { width, height });
+    this.needsKey = true;
+    this.config = { codec, optimizeForLatency: true };
+    this.decoder = new VideoDecoder({ output: (frame) => this.draw(frame), error: () => this.recover() });
+    this.decoder.configure(this.config);
+  }
+
+  /** Damaged data stops a decoder for good: begin anew at the next key frame. */
+  recover() {
+    if (this.closed) return;
+    this.begin({ codec: this.config.codec, width: this.canvas.width, height: this.canvas.height });
+  }
+
+  take(data, pts_us) {
+    this.waiting.push({ data, pts_us, due: performance.now() + this.hold_s() * 1000 });
+    this.feed();
+  }
+
+  feed() {
+    clearTimeout(this.timer);
+    while (this.waiting.length && this.waiting[0].due <= performance.now() + 1) {
+      const { data, pts_us } = this.waiting.shift();
+      const isKey = hasKey(data);
+      if (!this.decoder || this.decoder.state !== "configured" || (this.needsKey && !isKey)) continue;
+      this.needsKey = false;
+      this.decoder.decode(new EncodedVideoChunk({ type: isKey ? "key" : "delta", timestamp: pts_us, data }));
+    }
+    if (this.waiting.length) this.timer = setTimeout(() => this.feed(), this.waiting[0].due - performance.now());
+  }
+
+  draw(frame) {
+    if (this.canvas.width !== frame.displayWidth) Object.assign(this.canvas, { width: frame.displayWidth, height: frame.displayHeight });
+    this.pen.drawImage(frame, 0, 0);
+    const pts_us = frame.timestamp;
+    frame.close();
+    this.shown(pts_us);
+  }
+
+  close() {
+    this.closed = true;
+    clearTimeout(this.timer);
+    if (this.decoder && this.decoder.state !== "closed") this.decoder.close();
+  }
+}
+
+/** Whether an access unit holds a picture that depends on no other: H.264 NAL type 5, or H.265 types 16 to 21. */
+export function hasKey(data) {
+  for (let at = 0; at + 3 < data.length; at++) {
+    if (data[at] !== 0 || data[at + 1] !== 0 || data[at + 2] !== 1) continue;
+    const head = data[at + 3];
+    const h264 = head & 31;
+    if (h264 === 5 && (head & 128) === 0) return true;
+    const h265 = (head >> 1) & 63;
+    if (h265 >= 16 && h265 <= 21 && data[at + 4] === 1 && h264 !== 1) return true;
+    if (h264 === 1) return false;
+  }
+  return false;
+}
+
+/** Fragmented MP4 played by MediaSource, kept near its newest second. */
+class SegmentPlayer {
+  constructor(player, shown) {
+    Object.assign(this, { player, shown, queue: [] });
+  }
+
+  begin({ codec }) {
+    const type = `video/mp4; codecs="${codec}"`;
+    this.source = new MediaSource();
+    this.player.src = URL.createObjectURL(this.source);
+    this.source.addEventListener("sourceopen", () => {
+      this.buffer = this.source.addSourceBuffer(type);
+      this.buffer.addEventListener("updateend", () => this.feed());
+      this.feed();
+    }, { once: true });
+    this.player.play().catch(() => {});
+    const follow = (_, { mediaTime }) => {
+      this.shown(mediaTime * 1e6);
+      if (!this.closed) this.player.requestVideoFrameCallback?.(follow);
+    };
+    this.player.requestVideoFrameCallback?.(follow);
+  }
+
+  take(data) {
+    this.queue.push(data);
+    this.feed();
+  }
+
+  feed() {
+    if (!this.buffer || this.buffer.updating || !this.queue.length) return this.catchUp();
+    try {
+      this.buffer.appendBuffer(this.queue.shift());
+    } catch { this.queue = []; }
+  }
+
+  catchUp() {
+    const { player } = this;
+    const held = player.buffered;
+    if (!held.length) return;
+    const end = held.end(held.length - 1);
+    if (end - player.currentTime > 1 || player.currentTime < held.start(0)) player.currentTime = end - 0.1;
+    if (this.buffer && !this.buffer.updating && player.currentTime - held.start(0) > 30) this.buffer.remove(0, player.currentTime - 10);
+  }
+
+  close() {
+    this.closed = true;
+    if (this.player.src) URL.revokeObjectURL(this.player.src);
+    this.player.removeAttribute("src");
+    this.player.load();
+  }
+}

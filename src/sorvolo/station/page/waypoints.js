@@ -1,0 +1,36 @@
+// Waypoints over ground that deserves another look: holes of a measured search, ground that no comparison reached.
+
+import { area_m2, metresOfDegree } from "./places.js";
+
+const LEAST_M2 = 20; // smaller holes are not worth a flight
+const FEWEST_M = 25; // between waypoints: about the width of a frame's ground from 30 m
+const MOST = 60;
+
+/** Waypoints as features, the largest holes first; strips of points where a hole is wider than a frame. */
+export function waypointsFor(data) {
+  const holes = [
+    ...data.all.pod.filter((each) => each.properties.kind === "hole"),
+    ...data.all.coverage.filter((each) => each.properties.status === "not-compared" && ["view-rejected", "one-view", "blurred"].includes(each.properties.gap)),
+  ];
+  const rings = holes.flatMap((each) => (each.geometry.type === "MultiPolygon" ? each.geometry.coordinates : [each.geometry.coordinates]).map((rings_) => rings_[0]));
+  const large = rings.map((ring) => [ring, area_m2(ring.slice(0, -1))]).filter(([, m2]) => m2 >= LEAST_M2).sort((one, other) => other[1] - one[1]);
+  return large.flatMap(([ring]) => pointsOver(ring)).slice(0, MOST).map((coordinates, k) => ({
+    type: "Feature", id: `planned-${k + 1}`, geometry: { type: "Point", coordinates }, properties: { purpose: "waypoint", planned: true, name: `W${k + 1}` },
+  }));
+}
+
+function pointsOver(ring) {
+  const [lons, lats] = [ring.map((each) => each[0]), ring.map((each) => each[1])];
+  const [west, east, south, north] = [Math.min(...lons), Math.max(...lons), Math.min(...lats), Math.max(...lats)];
+  const [x, y] = metresOfDegree((south + north) / 2);
+  const columns = Math.max(1, Math.round((east - west) * x / FEWEST_M));
+  const rows = Math.max(1, Math.round((north - south) * y / FEWEST_M));
+  const points = [];
+  for (let row = 0; row < rows; row++) {
+    for (let k = 0; k < columns; k++) {
+      const column = row % 2 ? columns - 1 - k : k; // there and back, as a drone flies
+      points.push([west + (east - west) * (column + 0.5) / columns, south + (north - south) * (row + 0.5) / rows]);
+    }
+  }
+  return points;
+}

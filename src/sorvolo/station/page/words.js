@@ -1,0 +1,112 @@
+// Numbers, times and places in words, in the units that this browser's user chose.
+
+import { choices } from "./choices.js";
+import { mgrs, utm } from "./places.js";
+
+const FOOT_M = 0.3048;
+const MILE_M = 1609.344;
+const ACRE_M2 = 4046.8564224;
+
+const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
+
+function rounded(value, digits) {
+  return value.toLocaleString("en", { maximumFractionDigits: digits, minimumFractionDigits: 0, useGrouping: value >= 10000 });
+}
+
+/** A length; "–" where it is not known. */
+export function length(m) {
+  if (!isNumber(m)) return "–";
+  if (choices.get("units") === "imperial") {
+    return Math.abs(m) < MILE_M / 2 ? `${rounded(m / FOOT_M, m < 3 ? 1 : 0)} ft` : `${rounded(m / MILE_M, 2)} mi`;
+  }
+  return Math.abs(m) < 1000 ? `${rounded(m, Math.abs(m) < 10 ? 2 : 1)} m` : `${rounded(m / 1000, 2)} km`;
+}
+
+/** An area. */
+export function area(m2) {
+  if (!isNumber(m2)) return "–";
+  if (choices.get("units") === "imperial") {
+    return m2 < ACRE_M2 / 4 ? `${rounded(m2 / FOOT_M ** 2, 0)} ft²` : `${rounded(m2 / ACRE_M2, 2)} acres`;
+  }
+  return m2 < 10000 ? `${rounded(m2, m2 < 10 ? 2 : m2 < 100 ? 1 : 0)} m²` : `${rounded(m2 / 10000, 2)} ha`;
+}
+
+/** A speed. */
+export function speed(m_s) {
+  if (!isNumber(m_s)) return "–";
+  return choices.get("units") === "imperial" ? `${rounded(m_s / MILE_M * 3600, 1)} mph` : `${rounded(m_s, 1)} m/s`;
+}
+
+/** A share of 0 to 1 as per cent. */
+export const percent = (share) => (isNumber(share) ? `${Math.round(share * 100)} %` : "–");
+
+/** A plain number. */
+export const number = (value, digits = 1) => (isNumber(value) ? rounded(value, digits) : "–");
+
+/** Bytes of a file. */
+export function bytes(count) {
+  if (!isNumber(count)) return "–";
+  const units = ["B", "kB", "MB", "GB", "TB"];
+  const power = Math.min(units.length - 1, Math.floor(Math.log10(Math.max(1, count)) / 3));
+  return `${rounded(count / 1000 ** power, power ? 1 : 0)} ${units[power]}`;
+}
+
+/** Seconds as 1:05 or 1:02:03. */
+export function duration(seconds) {
+  if (!isNumber(seconds)) return "–";
+  const whole = Math.max(0, Math.round(seconds));
+  const two = (value) => String(value).padStart(2, "0");
+  const hours = Math.floor(whole / 3600);
+  return `${hours ? `${hours}:${two(Math.floor(whole / 60) % 60)}` : Math.floor(whole / 60)}:${two(whole % 60)}`;
+}
+
+const style = () => (choices.get("clock") === "utc" ? { timeZone: "UTC" } : {});
+const zone = () => (choices.get("clock") === "utc" ? " UTC" : "");
+
+/** A time with its day. */
+export function time(iso) {
+  const at = new Date(iso);
+  if (!iso || Number.isNaN(at.getTime())) return "–";
+  return at.toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short", ...style() }) + zone();
+}
+
+/** A time of day to the second. */
+export function clock(iso) {
+  const at = new Date(iso);
+  if (!iso || Number.isNaN(at.getTime())) return "–";
+  return at.toLocaleTimeString("en-GB", style()) + zone();
+}
+
+/** A day. */
+export function day(iso) {
+  const at = new Date(iso);
+  if (!iso || Number.isNaN(at.getTime())) return "undated";
+  return at.toLocaleDateString("en-GB", { dateStyle: "medium", ...style() });
+}
+
+/** A place as the user wants it: degrees, UTM or MGRS. */
+export function place([lon, lat], { local = false } = {}) {
+  if (local) return "no place on Earth (a site without GPS)";
+  const kind = choices.get("coordinates");
+  const degrees = `${lat.toFixed(6)}, ${lon.toFixed(6)}`;
+  if (kind === "mgrs") return mgrs(lon, lat) ?? degrees;
+  if (kind === "utm") {
+    const found = utm(lon, lat);
+    return found ? `${found.zone}${found.band} ${found.east_m.toFixed(1)} ${found.north_m.toFixed(1)}` : degrees;
+  }
+  return degrees;
+}
+
+/** "1 person", "4 people". */
+export function counted(count, one, many = `${one}s`) {
+  return `${number(count, 0)} ${count === 1 ? one : many}`;
+}
+
+/** What a change is, in a few words. */
+export function changeWords(properties) {
+  const { kind, class_before: before, class_after: after } = properties;
+  if (kind === "replaced" && before && after) return `${before} replaced by ${after}`;
+  const what = (kind === "disappeared" ? before : after) || { area: "ground", moving: "something" }[kind] || "something";
+  return { appeared: `${what} appeared`, disappeared: `${what} disappeared`, moving: `${what} moving`,
+    area: "ground changed", replaced: `${what} replaced` }[kind] || kind;
+}

@@ -1,0 +1,66 @@
+"""The page's files: libraries are what their makers packed, with licences; no third party is contacted; text stays text."""
+
+import hashlib
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+import sorvolo
+
+PAGE = Path(sorvolo.__file__).parent / "station" / "page"
+TESTS_OWN = Path(__file__).parent / "vendor"
+MOST_BYTES = 2_500_000  # of the page, cold
+OURS = sorted(each for each in PAGE.iterdir() if each.suffix in {".js", ".css", ".html", ".svg"})
+
+
+def libraries(folder: Path) -> list[dict]:
+    return json.loads((folder / "manifest.json").read_text())["libraries"]
+
+
+@pytest.mark.parametrize("folder", [PAGE / "vendor", TESTS_OWN], ids=["page", "tests"])
+def test_every_packed_file_has_its_hash_and_its_licence(folder: Path) -> None:
+    listed = {each["path"]: each for library in libraries(folder) for each in library["files"]}
+    assert set(listed) == {each.name for each in folder.iterdir() if each.is_file()} - {"manifest.json"}
+    for name, entry in listed.items():
+        data = (folder / name).read_bytes()
+        assert (len(data), hashlib.sha256(data).hexdigest()) == (entry["bytes"], entry["sha256"]), name
+    texts = {library["licence_file"] for library in libraries(folder)}
+    assert texts == {f"licences/{each.name}" for each in (folder / "licences").iterdir()}
+    for each in texts:
+        assert "copyright" in (folder / each).read_text(encoding="utf-8").lower()
+
+
+def test_the_page_ships_no_copyleft() -> None:
+    allowed = {"BSD-3-Clause", "BSD-2-Clause", "ISC", "MIT", "(MIT OR Apache-2.0)"}
+    assert {library["licence"] for library in libraries(PAGE / "vendor")} <= allowed
+
+
+def test_the_page_is_small_enough_to_come_over_a_field_radio() -> None:
+    late = {"pmtiles.js"}  # only where somebody chooses a base map
+    files = [each for each in (*OURS, *(PAGE / "vendor").glob("*.*")) if each.name not in late | {"manifest.json"}]
+    assert sum(each.stat().st_size for each in files) < MOST_BYTES
+
+
+@pytest.mark.parametrize("path", OURS, ids=lambda each: each.name)
+def test_no_address_of_others_and_no_markup_from_data(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    addresses = set(re.findall(r"https?://[\w.-]+", text))
+    assert addresses <= {"http://www.w3.org", "http://www.opengis.net"}  # names of XML vocabularies, never asked for
+    assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|srcdoc", text)
+    if path.suffix == ".html":  # the policy forbids both
+        assert not re.search(r"<style|\sstyle=|\son\w+=|<script(?![^>]*\bsrc=)", text)
+
+
+def test_every_module_that_is_imported_is_there() -> None:
+    for path in OURS:
+        for name in re.findall(r"""(?:from|import)\s*\(?["']\./([\w./-]+)["']""", path.read_text(encoding="utf-8")):
+            assert (PAGE / name).is_file(), f"{path.name} imports {name}"
+
+
+def test_every_drawing_that_is_named_is_there() -> None:
+    drawn = set(re.findall(r'<symbol id="([\w-]+)"', (PAGE / "icons.svg").read_text()))
+    text = "".join(each.read_text(encoding="utf-8") for each in OURS)
+    named = {*re.findall(r'icon: "([\w-]+)"', text), *re.findall(r'icon\("([\w-]+)"\)', text), *re.findall(r"icons\.svg#([\w-]+)", text)}
+    assert named and named <= drawn
