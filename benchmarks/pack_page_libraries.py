@@ -1,7 +1,7 @@
 """The station page's libraries, taken from npm at pinned versions: files, licences, and a manifest of their hashes.
 
-`make page-vendor` runs it and needs npm; installing and running Sorvolo does not. Nothing is built: the files are copied as
-their makers packed them.
+`make page-vendor` runs it and needs npm; installing and running Sorvolo does not. Nothing is built: the files are
+copied as their makers packed them.
 """
 
 import hashlib
@@ -31,7 +31,8 @@ STATED_LICENCES = {
     "pmtiles": ("Copyright 2021 Protomaps LLC", "BSD-3-Clause"),
     "murmurhash-js": ("Copyright (c) 2011 Gary Court", "MIT"),
 }
-BUILD_ONLY = {"@types/geojson", "minimist", "resolve-protobuf-schema", "protocol-buffers-schema"}  # not in the packed files
+# not in the packed files
+BUILD_ONLY = {"@types/geojson", "minimist", "resolve-protobuf-schema", "protocol-buffers-schema"}
 
 
 def main() -> None:
@@ -61,7 +62,8 @@ def pack(libraries: dict[str, tuple[str, dict[str, str]]], target: Path, work: P
         licence = copy_licence(name, work / path, target / "licences")
         entries.append({
             "name": name, "version": locked["version"], "licence": locked["license"], "licence_file": licence,
-            "source": f"https://www.npmjs.com/package/{name}/v/{locked['version']}", "npm_integrity": locked["integrity"],
+            "source": f"https://www.npmjs.com/package/{name}/v/{locked['version']}",
+            "npm_integrity": locked["integrity"],
             "files": [described(target / copied) for copied in files.values()],
         })
     manifest = {"made_by": "make page-vendor", "libraries": entries}
@@ -87,8 +89,8 @@ def described(path: Path) -> dict[str, object]:
 
 
 LICENCE_TEXTS = {
-    "BSD-3-Clause": """Redistribution and use in source and binary forms, with or without modification, are permitted provided that the
-following conditions are met:
+    "BSD-3-Clause": """Redistribution and use in source and binary forms, with or without modification, are permitted
+provided that the following conditions are met:
 
 1. Redistributions of source code must retain the above copyright notice, this list of conditions and the following
    disclaimer.
@@ -105,10 +107,10 @@ SERVICES; LOSS OF USE, DATA, OR PROFITS; OR BUSINESS INTERRUPTION) HOWEVER CAUSE
 WHETHER IN CONTRACT, STRICT LIABILITY, OR TORT (INCLUDING NEGLIGENCE OR OTHERWISE) ARISING IN ANY WAY OUT OF THE USE OF
 THIS SOFTWARE, EVEN IF ADVISED OF THE POSSIBILITY OF SUCH DAMAGE.
 """,
-    "MIT": """Permission is hereby granted, free of charge, to any person obtaining a copy of this software and associated
-documentation files (the "Software"), to deal in the Software without restriction, including without limitation the
-rights to use, copy, modify, merge, publish, distribute, sublicense, and/or sell copies of the Software, and to permit
-persons to whom the Software is furnished to do so, subject to the following conditions:
+    "MIT": """Permission is hereby granted, free of charge, to any person obtaining a copy of this software and
+associated documentation files (the "Software"), to deal in the Software without restriction, including without
+limitation the rights to use, copy, modify, merge, publish, distribute, sublicense, and/or sell copies of the
+Software, and to permit persons to whom the Software is furnished to do so, subject to the following conditions:
 
 The above copyright notice and this permission notice shall be included in all copies or substantial portions of the
 Software.
