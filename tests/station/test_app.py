@@ -1,5 +1,6 @@
 """The station answers: sites, versions, tiles that may be kept for ever, problems in words."""
 
+import time
 from pathlib import Path
 
 import cv2
@@ -127,6 +128,7 @@ def test_a_site_deleted_while_it_is_looked_at(client: TestClient, root: Path) ->
     with Archive.open(root / "field", write=True) as archive:
         archive.create_site(SITE)
         map_flight(archive, "new", 10, count=1)
+    time.sleep(0.15)
     assert [each["id"] for each in client.get(FIELD).json()["flights"]] == ["new"]
 
 

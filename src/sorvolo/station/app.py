@@ -19,20 +19,25 @@ from sorvolo.station.event_routes import event_routes
 from sorvolo.station.events import EventLog
 from sorvolo.station.features import feature_routes, landing_links
 from sorvolo.station.ingest import Ingest, IngestLimits
+from sorvolo.station.inputs import Inputs
+from sorvolo.station.map_watch import MapWatch
 from sorvolo.station.problems import Problem, answer_problems
 from sorvolo.station.reviews import Reviews, review_routes
+from sorvolo.station.run_routes import run_routes
+from sorvolo.station.runs import Runs
 from sorvolo.station.security import COOKIE, Doorkeeper, holder_in, needs
-from sorvolo.station.settings import StationSettings
+from sorvolo.station.settings import STREAMS_FOLDER, StationSettings
 from sorvolo.station.sites import SiteShelf, readable, site_detail
 from sorvolo.station.state import StationState
 from sorvolo.station.stream_routes import announcing, stream_routes
 from sorvolo.station.tiles import WebTiles
 from sorvolo.station.tokens import Role
+from sorvolo.station.upload_routes import upload_routes
+from sorvolo.station.uploads import Uploads
 
 PAGE_FOLDER = Path(__file__).parent / "page"
 _FOR_EVER = "public, max-age=31536000, immutable"
 _UPLOADS = "/api/uploads"
-STREAMS_FOLDER = "streams"
 """The folder below the root that keeps what drones send."""
 
 
@@ -48,20 +53,31 @@ class Station:
     collections: SiteCollections
     reviews: Reviews
     ingest: Ingest
+    uploads: Uploads
+    inputs: Inputs
+    runs: Runs
+    map_watch: MapWatch
 
     @classmethod
     def open(cls, settings: StationSettings) -> "Station":
         """Open the station's own files. Raises StoreError where they cannot be used."""
         state, shelf = StationState.open(settings.state_folder), SiteShelf(settings.root)
-        events = EventLog(state)
+        events, tiles = EventLog(state), WebTiles(shelf)
+        uploads = Uploads(settings, events)
+        reviews = Reviews(state, shelf, events)
         limits = IngestLimits(free_bytes=round(settings.free_floor_gb * 1e9))
+        ingest = Ingest(settings.root / STREAMS_FOLDER, limits, announcing(events))
+        inputs = Inputs(settings, uploads, ingest.newest)
         return cls(
-            settings, state, shelf, WebTiles(shelf), events, SiteCollections(shelf), Reviews(state, shelf, events),
-            Ingest(settings.root / STREAMS_FOLDER, limits, announcing(events)),
+            settings, state, shelf, tiles, events, SiteCollections(shelf), reviews, ingest, uploads, inputs,
+            Runs(settings, state, shelf, events, inputs), MapWatch(shelf, tiles, reviews, events),
         )
 
     def close(self) -> None:
         """Close every file."""
+        self.map_watch.close()
+        self.runs.close()
+        self.uploads.close()
         self.shelf.close()
         self.state.close()
 
@@ -72,6 +88,8 @@ def station_app(settings: StationSettings) -> FastAPI:
 
     @asynccontextmanager
     async def while_it_runs(_: FastAPI) -> AsyncIterator[None]:
+        station.runs.start_watching()
+        station.map_watch.start()
         yield
         await station.ingest.close()
         station.close()
@@ -86,6 +104,7 @@ def station_app(settings: StationSettings) -> FastAPI:
         _about_routes(station), _site_routes(station), event_routes(station.events),
         feature_routes(station.collections, station.reviews), review_routes(station.reviews, station.shelf),
         crop_routes(station.shelf), stream_routes(station.ingest),
+        crop_routes(station.shelf), upload_routes(station.uploads), run_routes(station.runs, station.inputs),
     ):
         app.include_router(router)
     _serve_page(app)

@@ -9,6 +9,9 @@ from sorvolo.errors import SettingsError
 STATE_FOLDER = "station"
 """The folder below the root that holds the station's own files: state, uploads, runs."""
 
+STREAMS_FOLDER = "streams"
+"""The folder below the root that holds what drones send, a folder for each stream."""
+
 
 @dataclass(frozen=True)
 class StationSettings:

@@ -22,6 +22,7 @@ from sorvolo.store.site.names import is_plain_name
 _DEEPEST = 2  # folders below the root: `sorvolo demo` puts its site one deeper than its folder
 _MOST_FOLDERS = 2000
 _LOOK_EVERY_S = 1.0
+_LOOK_AGAIN_S = 0.1  # for a site that was not there: it may have come since
 
 
 class SiteShelf:
@@ -39,15 +40,19 @@ class SiteShelf:
 
     def folders(self) -> dict[str, Path]:
         """The folder of each site by its id, those that are there now."""
+        return self._folders(_LOOK_EVERY_S)
+
+    def _folders(self, at_most_s: float) -> dict[str, Path]:
+        """The folders as they were found so many seconds ago at most."""
         with self._lock:
-            if time.monotonic() - self._looked_s >= _LOOK_EVERY_S:
+            if time.monotonic() - self._looked_s >= at_most_s:
                 self._found = _sites_below(self.root)
                 self._looked_s = time.monotonic()
             return dict(self._found)
 
     def folder(self, site_id: str) -> Path:
         """The folder of a site. Raises Problem (404)."""
-        folder = self.folders().get(site_id)
+        folder = self.folders().get(site_id) or self._folders(_LOOK_AGAIN_S).get(site_id)
         if folder is None:
             raise Problem(404, f"no site {site_id[:80]!r} here; /api/sites lists those there are")
         return folder

@@ -20,6 +20,7 @@ from sorvolo.geometry.arrays import (
     frozen,
 )
 from sorvolo.geometry.homography import apply_homography
+from sorvolo.survey.mosaic import FrameView
 
 
 class ViewStatus(StrEnum):
@@ -196,3 +197,4 @@ class CompareUpdate:
     views: int
     compared: int
     seconds: float
+    view: FrameView | None = None  # None: not laid on the map

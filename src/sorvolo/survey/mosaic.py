@@ -16,6 +16,7 @@ from sorvolo.geometry.arrays import (
     frozen,
 )
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.pose import Pose
 from sorvolo.survey.flight import CameraPrior
 
@@ -126,9 +127,26 @@ class PlacedFrame:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class FrameView:
+    """Where a frame was taken and what ground it shows, as far as that is known while its flight goes on.
+
+    Metres are those of the site around `frame`; `outline_m` (4, 2) is as in PlacedFrame. `time_ns` is UTC where a clock
+    has it.
+    """
+
+    time_ns: int
+    frame: LocalFrame
+    site_from_camera: Pose
+    outline_m: PointsM
+
+
 @dataclass(frozen=True)
 class MosaicUpdate:
-    """What one step of a mapping mission did: the frame, how it ended for now, and the running counts."""
+    """What one step of a mapping mission did: the frame, how it ended for now, and the running counts.
+
+    `view` is None for a frame that has no place yet.
+    """
 
     frame_name: str
     status: Status
@@ -140,3 +158,4 @@ class MosaicUpdate:
     by_vision: int
     tiles_touched: int
     seconds: float
+    view: FrameView | None = None

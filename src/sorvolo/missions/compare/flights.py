@@ -99,14 +99,16 @@ def _compare_one(
         for each in _ended(source, step_s, setup, inside, run, ahead):
             if isinstance(each, Pending):
                 outcome, announced = run.add(each)
+                view = run.view(each.posed)
                 frame: Frame | LostFrame = each.posed.frame
                 status, reason, residual_px = outcome.status, outcome.reason, outcome.residual_px
             else:
                 run.lose(each)
+                view = None
                 frame, status, reason, residual_px, announced = each, ViewStatus.LOST, each.reason, float("nan"), ()
             yield CompareUpdate(
                 frame.name, setup.utc_ns(frame.time_ns), status, reason, residual_px, announced, frame.index + 1,
-                source.frame_count, run.views, run.compared, time.monotonic() - started_s,
+                source.frame_count, run.views, run.compared, time.monotonic() - started_s, view,
             )
         run.finish(source.notices(), started_s)
 

@@ -39,7 +39,7 @@ from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.survey.coverage import CoveredGround
 from sorvolo.survey.findings import Change, ComparedView, Verdict, ViewStatus
 from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
-from sorvolo.survey.mosaic import PlacedFrame, Status
+from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
 _VIDEO_SIDE_PX, _PHOTO_SIDE_PX = 1280, 1600  # frames come faster than photos, and show a place more often
 _PHOTO_FINER = 2.0  # times a photo's and the map's own pixels, at most: the robust method looks at half of them
@@ -139,6 +139,11 @@ class CompareRun:
         with self._log.stage(Stage.REGISTER):
             self._extension.add(posed, outcome)
         return outcome, announced
+
+    def view(self, posed: PosedFrame) -> FrameView | None:
+        """What a frame that was added shows; None where it was not laid on the map, or from an unknown place."""
+        placed = self._placed[posed.frame.index]
+        return self._setup.view(posed.frame.time_ns, placed.camera, placed.site_from_camera)
 
     def finish(self, notices: Sequence[Notice], started_s: float) -> None:
         """Conclude the evidence, bring the map up to date, and make the flight part of the site.

@@ -9,7 +9,10 @@ from sorvolo.capture.source import LiveSource, Source
 from sorvolo.capture.sync import DATED_NS, Clock, Track, site_origin
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import PointsM
+from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame, utm_epsg
+from sorvolo.geometry.level_ground import footprint, is_on_ground
+from sorvolo.geometry.pose import Pose
 from sorvolo.missions.flight.base_map import FlightBase
 from sorvolo.missions.flight.control import FlightControl
 from sorvolo.missions.flight.settings import MapSettings
@@ -18,6 +21,7 @@ from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import CATALOGUE
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import CameraPrior, Frame, Notice, PosedFrame, Site
+from sorvolo.survey.mosaic import FrameView
 
 KnownGround = FlightControl | FlightBase
 """What places a map beside GPS, or without any."""
@@ -79,6 +83,15 @@ class FlightSetup:
         """UTC of the first frame; 0 where neither the frames nor the telemetry are dated."""
         first_ns = self.utc_ns(self.source.start_ns)
         return first_ns if first_ns > DATED_NS else 0
+
+    def view(self, time_ns: int, camera: Camera, site_from_camera: Pose | None) -> FrameView | None:
+        """What a frame shows that was taken from this place; None where that is not known, or no ground at all."""
+        if site_from_camera is None:
+            return None
+        outline_m = footprint(camera, site_from_camera)
+        if not is_on_ground(outline_m):
+            return None
+        return FrameView(self.utc_ns(time_ns), self.frame, site_from_camera, outline_m)
 
     def inside(self, area: Area | None) -> Callable[[PosedFrame], bool]:
         """Whether a frame was taken within the area of interest; frames of unknown place count as inside."""

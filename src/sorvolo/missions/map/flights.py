@@ -105,10 +105,12 @@ def _map_one(
         )
         for each in selected:
             status, reason, tiles = _take(run, each)
-            name = each.posed.frame.name if isinstance(each, Selected) else each.name
+            name = each.name if isinstance(each, LostFrame) else each.posed.frame.name
+            view = None if isinstance(each, LostFrame) else run.view(each.posed)
             yield MosaicUpdate(
                 name, status, reason, read, source.frame_count, run.selected,
                 max(setup.plan.expected, run.selected), run.by_vision, tiles, time.monotonic() - started_s,
+                view,
             )
         run.finish(source.notices(), started_s)
 

@@ -34,7 +34,7 @@ from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.store.site.spill import SpillFile
 from sorvolo.survey.control import ControlReport
 from sorvolo.survey.flight import Notice, PosedFrame
-from sorvolo.survey.mosaic import PlacedFrame, Status
+from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
 _WAIT_FOR_HEIGHT = 12  # keyframes held back until the height above ground is seen in them
 _OFFSET_ROUNDS = 3
@@ -111,6 +111,14 @@ class PlanarRun(FlightRun):
             return outcome.status, outcome.reason, 0
         self._painter.mark(outcome.moved | {keyframe_id})
         return outcome.status, outcome.reason, self._painter.show()
+
+    def view(self, posed: PosedFrame) -> FrameView | None:
+        """See `FlightRun.view`."""
+        keyframe_id = self._known.count + posed.frame.index
+        if keyframe_id not in self._times_ns:
+            return None
+        camera = self._refined(self._setup.source.camera.camera)
+        return self._setup.view(posed.frame.time_ns, camera, self._mapper.pose(keyframe_id))
 
     def complete(self) -> list[PlacedFrame]:
         """Solve once more, find the clock offset, paint what moved: every selected frame as it ends, in their order.

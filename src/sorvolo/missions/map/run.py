@@ -13,7 +13,7 @@ from sorvolo.missions.flight.setup import FlightSetup, new_site
 from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.survey.flight import Notice, PosedFrame
 from sorvolo.survey.map_objects import ObjectSearch
-from sorvolo.survey.mosaic import PlacedFrame, Status
+from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
 _MOST_CACHE_MB = 256  # of tiles, and of pictures: more is not used
 
@@ -69,6 +69,10 @@ class FlightRun(ABC):
     @abstractmethod
     def add(self, posed: PosedFrame) -> tuple[Status, str, int]:
         """Place one frame; what became of it, in words if not by vision, and how many tiles were painted meanwhile."""
+
+    def view(self, posed: PosedFrame) -> FrameView | None:
+        """What a frame that was added shows, as it lies now; None where this method knows no camera's place."""
+        return None
 
     @abstractmethod
     def finish(self, notices: Sequence[Notice], started_s: float) -> None:

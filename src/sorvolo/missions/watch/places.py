@@ -6,8 +6,10 @@ from dataclasses import replace
 from typing import Protocol
 
 from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.pose import Pose
 from sorvolo.missions.flight.setup import FlightSetup, new_site
 from sorvolo.survey.flight import CameraPrior, Frame, Notice, Site
+from sorvolo.survey.mosaic import FrameView
 from sorvolo.survey.objects import Detections, Track
 from sorvolo.survey.wording import counted
 from sorvolo.tracking.following import GroundFollower, PictureFollower, Taken, watched_prior
@@ -31,6 +33,9 @@ class Places(Protocol):
     @property
     def set_aside(self) -> int:
         """Detections so far of a size that their class cannot have: they have a place, but are no such thing."""
+
+    def view(self, frame: Frame) -> FrameView | None:
+        """What ground the frame shows by telemetry; None where that is not known."""
 
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
         """Place a frame's detections and give them to their tracks."""
@@ -82,6 +87,12 @@ class GroundPlaces:
     def set_aside(self) -> int:
         """See `Places.set_aside`."""
         return self._follower.impossible_size
+
+    def view(self, frame: Frame) -> FrameView | None:
+        """What ground the frame shows, taken as level."""
+        prior = self._prior(frame)
+        pose = Pose(prior.rotation, prior.position_m) if prior.knows_place else None
+        return self._setup.view(frame.time_ns, self._setup.source.camera.camera, pose)
 
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
         """Place a frame's detections on the ground and give them to their tracks."""
@@ -158,6 +169,10 @@ class ImagePlaces:
     def set_aside(self) -> int:
         """None: without metres nothing is too short."""
         return 0
+
+    def view(self, frame: Frame) -> FrameView | None:
+        """Nothing is known of the ground."""
+        return None
 
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
         """Take the camera's motion out of a frame's detections and give them to their tracks."""

@@ -22,6 +22,7 @@ from sorvolo.store.exports.detection_files import write_detections
 from sorvolo.store.exports.plain import json_bytes
 from sorvolo.store.pages.watch import watch_page
 from sorvolo.survey.flight import Frame, LostFrame, Site
+from sorvolo.survey.mosaic import FrameView
 from sorvolo.survey.objects import Detections, Sighting, Track
 from sorvolo.survey.wording import counted_list
 from sorvolo.tracking.following import Taken
@@ -36,8 +37,9 @@ class WatchUpdate:
     `detections` are all of the frame's; `sightings` those that have a place; `new` the tracks that this frame
     confirmed, `tracks` all confirmed ones that it saw. `counts` are the objects so far, by class. `latency_s` is from
     a live frame's arrival to this update, and of a recorded one how long it took. `frames_expected` is 0 for a live
-    source. Places are metres of `site`; where it is local, pixels of the first frame of their `segment`, which counts
-    from 1.
+    source. `size_px` is the frame's width and height, `clip_ns` its time after the source's first frame, `view` what
+    ground it shows by telemetry. Places are metres of `site`; where it is local, pixels of the first frame of their
+    `segment`, which counts from 1.
     """
 
     frame_name: str
@@ -55,6 +57,9 @@ class WatchUpdate:
     folder: Path
     site: Site
     segment: int
+    size_px: tuple[int, int]
+    clip_ns: int
+    view: FrameView | None
 
 
 class WatchRun:
@@ -116,7 +121,8 @@ class WatchRun:
         return WatchUpdate(
             frame.name, time_ns, found, sighted, new, seen, counts,
             latency_s, log.read, log.detected, source.frame_count, log.seconds, self._folder,
-            self._places.site, taken.segment,
+            self._places.site, taken.segment, (frame.image.shape[1], frame.image.shape[0]),
+            frame.time_ns - source.start_ns, self._places.view(frame),
         )
 
     def _hand_over(

@@ -1,0 +1,181 @@
+"""A process that looks into one upload within limits of memory and time: is it what its name says, is it no bomb?"""
+
+import json
+import re
+import resource
+import stat
+import sys
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import IO, Any
+
+_MEMORY_BYTES = 3 << 30
+_CPU_S = 600
+_MOST_PIXELS = 200_000_000  # of one picture: a 100-megapixel camera twice over
+_MOST_FILES = 20_000
+_MOST_RATIO = 200  # unpacked over packed: photos hardly shrink
+_PHOTOS = (".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".heic", ".png")
+_TEXTS = (".srt", ".csv", ".gpx", ".txt", ".nmea", ".log", ".json", ".xml", ".mrk", ".obs", ".nav", ".bin", ".rtk")
+_PICTURE_FORMATS = ("JPEG", "TIFF", "PNG")
+_CONTAINERS = {".mp4": "mov", ".mov": "mov", ".m4v": "mov", ".mkv": "matroska", ".ts": "mpegts"}
+_SIGNATURES = {".heic": ((4, b"ftyp"),), ".dng": ((0, b"II*\0"), (0, b"MM\0*"))}
+_SAFE = re.compile(r"[^\w.() -]", re.ASCII)
+
+
+class Refusal(Exception):
+    """What is wrong with the upload."""
+
+
+def look(part: Path, target: Path, most_bytes: int) -> dict[str, Any]:
+    """What an upload holds; photos are unpacked into the folder `target`. Raises Refusal."""
+    ending = target.suffix.lower()
+    if ending in _CONTAINERS:
+        return _video(part, _CONTAINERS[ending])
+    with part.open("rb") as file:
+        head = file.read(4096)
+    if head[:4] == b"PK\x03\x04":
+        return _photos(part, target, most_bytes)
+    if not ending:
+        raise Refusal("it is no zip file; pack the photos with zip")
+    if b"\0" in head:
+        raise Refusal("it is no text; telemetry and camera files are")
+    return {"kind": "text"}
+
+
+def _video(part: Path, container: str) -> dict[str, Any]:
+    import av
+
+    with part.open("rb") as file:
+        head = file.read(16)
+    if not _has_signature(head, container):
+        raise Refusal(f"its content is no {container} video, whatever its name says")
+    try:
+        # the demuxer is given: a playlist or a list of files in disguise would make FFmpeg open other things
+        with av.open(str(part), format=container, options={"protocol_whitelist": "file"}) as video:
+            if not video.streams.video:
+                raise Refusal("it has no pictures; was the upload cut off before it ended?")
+            stream = video.streams.video[0]
+            if stream.codec_context is None:  # announced by a head whose body is missing
+                raise Refusal("no picture in it can be decoded; was it cut off?")
+            width_px, height_px = stream.codec_context.width, stream.codec_context.height
+            if not 0 < width_px * height_px <= _MOST_PIXELS:
+                raise Refusal(f"its pictures have {width_px} x {height_px} pixels, at most {_MOST_PIXELS:,} are taken")
+            next(video.decode(stream))
+            seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else None
+            return {"kind": "video", "width_px": width_px, "height_px": height_px, "seconds": seconds,
+                    "codec": stream.codec_context.name}
+    except StopIteration:
+        raise Refusal("no picture in it can be decoded; was it cut off?") from None
+    except (av.FFmpegError, OSError) as error:
+        raise Refusal(f"it cannot be read as a video ({error.strerror}); was the file cut off?") from error
+
+
+def _has_signature(head: bytes, container: str) -> bool:
+    if container == "mov":
+        return head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
+    return head[:4] == b"\x1aE\xdf\xa3" if container == "matroska" else head[:1] == b"G" or head[4:5] == b"G"
+
+
+def _photos(part: Path, target: Path, most_bytes: int) -> dict[str, Any]:
+    taken: dict[str, Path] = {}
+    try:
+        with zipfile.ZipFile(part) as archive:
+            entries = list(_entries(archive, most_bytes))
+            target.mkdir(parents=True, exist_ok=True)
+            left = most_bytes
+            for entry in entries:
+                path = target / _free_name(entry.filename, taken)
+                with archive.open(entry) as packed:
+                    left -= _unpacked(packed, path, left)
+                if path.suffix.lower() in _PHOTOS:
+                    _check_picture(path)
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+        raise Refusal(f"it cannot be unpacked ({error}); was the file cut off?") from error
+    photos = sum(Path(name).suffix.lower() in _PHOTOS for name in taken)
+    if not photos:
+        raise Refusal("there is no photo in it")
+    return {"kind": "photos", "photos": photos}
+
+
+def _entries(archive: zipfile.ZipFile, most_bytes: int) -> Iterator[zipfile.ZipInfo]:
+    """The files in it that are wanted, others left out. Raises Refusal for what was made to do harm."""
+    entries = archive.infolist()
+    if len(entries) > _MOST_FILES:
+        raise Refusal(f"{len(entries)} files are in it, at most {_MOST_FILES} are taken")
+    if sum(each.file_size for each in entries) > most_bytes:
+        raise Refusal(f"unpacked it would have more than the {most_bytes / 1e9:.0f} GB that are taken")
+    for each in entries:
+        path = PurePosixPath(each.filename.replace("\\", "/"))
+        if path.is_absolute() or ".." in path.parts or re.match(r"[A-Za-z]:", each.filename):
+            raise Refusal(f"the name {each.filename[:80]!r} in it leads outside; pack the photos' folder itself")
+        mode = each.external_attr >> 16
+        if mode and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or stat.S_IFMT(mode) == 0):
+            raise Refusal(f"{each.filename[:80]!r} in it is a link or no plain file")
+        if each.flag_bits & 1:
+            raise Refusal("it is encrypted; pack it without a password")
+        if each.file_size > 1_000_000 and each.file_size > _MOST_RATIO * max(each.compress_size, 1):
+            raise Refusal(f"{each.filename[:80]!r} in it would unpack to {each.file_size / 1e6:.0f} MB: no photo does")
+        is_wanted = path.suffix.lower() in (*_PHOTOS, *_TEXTS) and not path.name.startswith(".")
+        if is_wanted and not each.is_dir() and "__MACOSX" not in path.parts:
+            yield each
+
+
+def _free_name(name: str, taken: dict[str, Path]) -> str:
+    """A name for a file in the one folder of photos; files of the same name in other folders get their folder's."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    for count in range(1, len(path.parts) + 1):
+        free = _SAFE.sub("_", "_".join(path.parts[-count:]))[-150:].lstrip(".- ") or "photo.jpg"
+        if free.lower() not in {each.lower() for each in taken}:
+            break
+    taken[free] = Path(name)
+    return free
+
+
+def _unpacked(packed: IO[bytes], path: Path, left: int) -> int:
+    """Write a file out; its bytes. What the archive announces is not trusted."""
+    count = 0
+    with path.open("xb") as file:
+        while chunk := packed.read(1 << 20):
+            count += len(chunk)
+            if count > left:
+                raise Refusal("unpacked it has more bytes than it announces")
+            file.write(chunk)
+    return count
+
+
+def _check_picture(path: Path) -> None:
+    """Raise Refusal unless the file is a picture of a size that a camera has; only its head is read."""
+    from PIL import Image, UnidentifiedImageError
+
+    with path.open("rb") as file:
+        head = file.read(12)
+    if path.suffix.lower() in _SIGNATURES:  # their decoders are the mission's; their size is bounded there
+        if not any(head[at:at + len(sign)] == sign for at, sign in _SIGNATURES[path.suffix.lower()]):
+            raise Refusal(f"{path.name} is no {path.suffix[1:].upper()} picture, whatever its name says")
+        return
+    try:
+        with Image.open(path, formats=_PICTURE_FORMATS) as picture:
+            width_px, height_px = picture.size
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise Refusal(f"{path.name} is no picture that can be read, whatever its name says") from error
+    if not 0 < width_px * height_px <= _MOST_PIXELS:
+        raise Refusal(f"{path.name} has {width_px} x {height_px} pixels, at most {_MOST_PIXELS:,} are taken")
+
+
+def main(part: str, target: str, most_bytes: str) -> None:
+    """Print one JSON object: what is wrong, or what the upload holds."""
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
+    resource.setrlimit(resource.RLIMIT_CPU, (_CPU_S, _CPU_S))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    try:
+        answer: dict[str, Any] = {"error": None, "facts": look(Path(part), Path(target), int(most_bytes))}
+    except Refusal as refusal:
+        answer = {"error": str(refusal), "facts": None}
+    except MemoryError:
+        answer = {"error": "looking into it takes more memory than a flight needs", "facts": None}
+    sys.stdout.write(json.dumps(answer))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:4])

@@ -1,0 +1,83 @@
+"""Follows the maps of all sites, whoever paints them: an event for each change that readers can see."""
+
+import sys
+import threading
+from dataclasses import dataclass
+
+from sorvolo.errors import SorvoloError
+from sorvolo.station.events import EventLog, NewEvent
+from sorvolo.station.problems import Problem
+from sorvolo.station.pyramid import Pyramid
+from sorvolo.station.reviews import Reviews
+from sorvolo.station.sites import SiteShelf, bounds_lonlat
+from sorvolo.station.tiles import WebTiles, change_mark
+
+_LOOK_EVERY_S = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A site as it was seen last."""
+
+    mark: tuple[int, ...]
+    state: Pyramid | None
+    versions: int
+
+
+class MapWatch:
+    """What the maps looked like last. Only `look` changes it; a thread calls it."""
+
+    def __init__(self, shelf: SiteShelf, tiles: WebTiles, reviews: Reviews, events: EventLog) -> None:
+        self._shelf, self._tiles, self._reviews, self._events = shelf, tiles, reviews, events
+        self._seen: dict[str, _Seen] = {}
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="maps", daemon=True)
+
+    def start(self) -> None:
+        """Follow the maps from now on."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop following."""
+        self._ending.set()
+        if self._thread.is_alive():
+            self._thread.join(5.0)
+
+    def look(self) -> None:
+        """Compare every map with how it was, and announce what changed."""
+        folders = self._shelf.folders()
+        for site_id in self._seen.keys() - folders.keys():
+            del self._seen[site_id]
+            self._events.append(NewEvent("site.gone", {}, site_id))
+        for site_id in folders:
+            try:
+                self._look_at(site_id)
+            except (Problem, SorvoloError):  # gone meanwhile, or damaged: who opens it is told why
+                self._seen.pop(site_id, None)
+
+    def _look_at(self, site_id: str) -> None:
+        archive = self._shelf.open(site_id)
+        mark, before = change_mark(archive), self._seen.get(site_id)
+        if before is not None and before.mark == mark:
+            return
+        state = self._tiles.live(site_id) if archive.has_site else None
+        versions = sum(each.complete for each in archive.versions())
+        self._seen[site_id] = _Seen(mark, state, versions)
+        if before is None:
+            return
+        if state is not None and state.keys[0] and (before.state is None or before.state.revision != state.revision):
+            changed = list(state.keys[0]) if before.state is None else state.changed_since(before.state)
+            bounds = bounds_lonlat(changed, archive.site_grid())
+            data = {"revision": state.revision, "bounds": bounds, "tiles": len(changed)}
+            self._events.append(NewEvent("map.tiles", data, site_id))
+        if versions != before.versions:
+            self._events.append(NewEvent("site.changed", {"versions": versions}, site_id))
+            self._reviews.settle(site_id)
+
+    def _watch(self) -> None:
+        while not self._ending.wait(_LOOK_EVERY_S):
+            try:
+                self.look()
+            except Exception as error:  # a full disk: told in the log, tried again
+                sys.stderr.write(f"station: maps cannot be followed: {error}\n")
+                self._ending.wait(2.0)

@@ -1,0 +1,122 @@
+"""What a mission of the station is asked to do: its options within bounds, its inputs by ids, its order on the disk."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from sorvolo.store.atomic import atomic_write_bytes
+
+ORDER_FILE, JOURNAL_FILE, LOG_FILE, LOCK_FILE = "order.json", "journal.jsonl", "log.txt", "running.lock"
+"""The files of a run's folder: what it is to do, what it did line by line, what it printed, who is at it."""
+
+LOCK_VARIABLE = "SORVOLO_RUN_LOCK"
+"""Of the environment of a run's process: the number of its lock's descriptor, which its own children must not have."""
+
+Mission = Literal["map", "compare", "watch", "search"]
+WRITES: frozenset[str] = frozenset({"map", "compare"})
+"""The missions that write into their site: one at a time."""
+
+
+_CAMERA = r"^(aov=[0-9.]{1,8}|focal_px=[0-9.]{1,10}|[A-Za-z0-9 .+-]+)$"  # a preset's name: no path
+
+
+class InputWish(BaseModel):
+    """Where a flight comes from: exactly one of an upload's id, an id of GET /api/inputs, a stream's URL, the name of a
+    stream that a drone sends here."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    upload: Annotated[str | None, Field(min_length=1, max_length=64)] = None
+    input: Annotated[str | None, Field(min_length=1, max_length=64)] = None
+    stream_url: Annotated[str | None, Field(min_length=1, max_length=2000)] = None
+    stream: Annotated[str | None, Field(min_length=1, max_length=80)] = None
+
+    @model_validator(mode="after")
+    def _one_of_them(self) -> "InputWish":
+        given = [name for name, value in self if value is not None]
+        if len(given) != 1:
+            raise ValueError(f"one of upload, input, stream_url and stream was needed, got {len(given)}")
+        return self
+
+
+class MissionOptions(BaseModel):
+    """What may be chosen from outside; everything else is as the command line's defaults."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    camera: Annotated[str | None, Field(max_length=80, pattern=_CAMERA)] = None
+    camera_file: InputWish | None = None
+    telemetry: InputWish | None = None
+    model: Annotated[str | None, Field(max_length=80, pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")] = None
+    classes: Annotated[list[Annotated[str, Field(min_length=1, max_length=60)]], Field(max_length=40)] = []
+    overlap: Annotated[float, Field(gt=0, lt=1)] = 0.7
+    m_per_px: Annotated[float | None, Field(ge=1e-3, le=100)] = None
+    views_per_second: Annotated[float, Field(ge=0.05, le=60)] = 5.0
+    votes: Annotated[int, Field(ge=1, le=8)] = 3
+    voters: Annotated[int, Field(ge=1, le=8)] = 5
+    updates_map: bool = True
+    least_score: Annotated[float | None, Field(ge=0, le=1)] = None
+    frames_per_second: Annotated[float | None, Field(ge=0.01, le=240)] = None
+    plants: Annotated[int, Field(ge=10, le=5000)] = 80
+    ground_elevation_m: Annotated[float | None, Field(ge=-1000, le=9000)] = None
+
+
+class RunWish(BaseModel):
+    """A mission to start."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    mission: Mission
+    site: str = Field(min_length=1, max_length=200)
+    input: InputWish | None = None
+    options: MissionOptions = MissionOptions()
+
+    @model_validator(mode="after")
+    def _input_where_needed(self) -> "RunWish":
+        if (self.input is None) != (self.mission == "search"):
+            raise ValueError("map, compare and watch need an input; search has none: it measures the site's flights")
+        return self
+
+
+@dataclass(frozen=True)
+class Order:
+    """What a mission's process is to do: everything resolved to paths and addresses; read by it alone.
+
+    `source` is a path or an address with its password, `stream` the name of the drone's stream behind it, if any.
+    `folder` is where a watch or a search puts its results.
+    """
+
+    run: str
+    mission: str
+    site_id: str
+    site: str
+    source: str
+    telemetry: str
+    camera: str
+    folder: str
+    stream: str
+    options: Mapping[str, Any]
+
+    def write(self, folder: Path) -> None:
+        """Put it into a run's folder, for its process's eyes. Raises StoreError on a full disk."""
+        atomic_write_bytes(folder / ORDER_FILE, json.dumps(asdict(self)).encode())
+        (folder / ORDER_FILE).chmod(0o600)
+
+    @classmethod
+    def read(cls, folder: Path) -> "Order":
+        """The order in a run's folder."""
+        return cls(**json.loads((folder / ORDER_FILE).read_bytes()))
+
+    @property
+    def choices(self) -> MissionOptions:
+        """The options, checked."""
+        return MissionOptions(**self.options)
+
+    @property
+    def classes(self) -> Sequence[str]:
+        """What is looked for; nothing: what the model usually reports."""
+        return self.choices.classes

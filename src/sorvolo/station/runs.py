@@ -1,0 +1,322 @@
+"""The station's missions: each in its own process, found again after a restart, its journal turned into events."""
+
+import contextlib
+import fcntl
+import json
+import os
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from sorvolo.station.collections import SEARCH_FOLDER
+from sorvolo.station.events import EventLog, NewEvent
+from sorvolo.station.inputs import Inputs
+from sorvolo.station.orders import JOURNAL_FILE, LOCK_FILE, LOCK_VARIABLE, LOG_FILE, WRITES, Order, RunWish
+from sorvolo.station.problems import Problem
+from sorvolo.station.settings import StationSettings
+from sorvolo.station.sites import SiteShelf
+from sorvolo.station.state import StationState, compact_json, utc_now
+from sorvolo.store.atomic import writing
+
+RUNNING, FINISHED, FAILED, STOPPED, LOST = "running", "finished", "failed", "stopped", "lost"
+"""States of a run; lost: its process ended without a word, as when the machine was switched off."""
+
+_ENDS = {"run.finished": FINISHED, "run.failed": FAILED, "run.stopped": STOPPED}
+_MOST_RUNNING = 4
+_MOST_LINE_BYTES = 4_000_000
+_MOST_LOG_BYTES = 4000
+_LOOK_EVERY_S = 0.1
+
+
+@dataclass(frozen=True)
+class Run:
+    """A mission as the page sees it. Times are RFC 3339 UTC; `input` holds no password."""
+
+    id: str
+    mission: str
+    site: str
+    state: str
+    who: str
+    started_at: str
+    ended_at: str | None = None
+    input: Mapping[str, Any] | None = None
+    options: Mapping[str, Any] | None = None
+    progress: Mapping[str, Any] | None = None
+    headline: str | None = None
+    exit_code: int | None = None
+    error: str | None = None
+    pid: int | None = None
+    stop_asked: bool = False
+
+
+class Runs:
+    """The missions of a station. Only `look` changes what is known of one that runs; a thread calls it."""
+
+    def __init__(
+        self, settings: StationSettings, state: StationState, shelf: SiteShelf, events: EventLog, inputs: Inputs
+    ) -> None:
+        self._settings, self._state, self._shelf, self._events, self._inputs = settings, state, shelf, events, inputs
+        self._folder = settings.state_folder / "runs"
+        self._lock = threading.RLock()
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="runs", daemon=True)
+
+    def start_watching(self) -> None:
+        """Follow the missions that run, those of an earlier server included."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop following; missions go on."""
+        self._ending.set()
+        if self._thread.is_alive():
+            self._thread.join(5.0)
+
+    def all(self, limit: int = 200) -> list[Run]:
+        """The newest runs first."""
+        rows = self._state.rows("SELECT record FROM runs ORDER BY made_at DESC, id LIMIT ?", (limit,))
+        return [Run(**json.loads(row["record"])) for row in rows]
+
+    def get(self, run_id: str) -> Run:
+        """A run. Raises Problem (404)."""
+        rows = self._state.rows("SELECT record FROM runs WHERE id = ?", (run_id,))
+        if not rows:
+            raise Problem(404, f"no run {run_id[:40]!r}; /api/runs lists those there are")
+        return Run(**json.loads(rows[0]["record"]))
+
+    def start(self, wish: RunWish, who: str) -> Run:
+        """Start a mission in a process of its own.
+
+        Raises Problem: 400, 404 for inputs, 409 where the site is being written or too many run, 507 without room.
+        """
+        self._demand_room()
+        with self._lock:
+            self._demand_turn(wish)
+            find = self._shelf.new_folder if wish.mission in ("map", "watch") else self._shelf.folder
+            site = find(wish.site)
+            run_id = secrets.token_hex(8)
+            folder = self._folder / run_id
+            order = self._order(wish, run_id, site, folder)
+            with writing(folder):
+                folder.mkdir(parents=True)
+            order.write(folder)
+            run = Run(
+                run_id, wish.mission, wish.site, RUNNING, who, utc_now(), input=self._inputs.shown(wish.input),
+                options=wish.options.model_dump(mode="json", exclude_defaults=True),
+            )
+            process = _spawned(folder)
+            run = replace(run, pid=process.pid)
+            self._processes[run_id] = process
+            with self._events.appending([_event("run.started", run, _public(run))]) as connection:
+                connection.execute(
+                    "INSERT INTO runs (id, made_at, site, mission, state, record) VALUES (?, ?, ?, ?, ?, ?)",
+                    (run.id, run.started_at, run.site, run.mission, run.state, compact_json(asdict(run))),
+                )
+            return run
+
+    def stop(self, run_id: str) -> Run:
+        """Ask a mission to end: a live flight is finished and kept, a recorded one is left out; asked again, at once.
+
+        Raises Problem (404, 409).
+        """
+        with self._lock:
+            run = self.get(run_id)
+            if run.state != RUNNING:
+                raise Problem(409, f"this run is {run.state} already")
+            if run.pid is not None and not _has_ended(self._folder / run.id):  # the number is still its own
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(run.pid, signal.SIGTERM)
+            asked = replace(run, stop_asked=True)
+            self._keep(asked, [])
+            return asked
+
+    def look(self) -> int:
+        """Take in what the running missions wrote since; how many still run."""
+        count = 0
+        for row in self._state.rows("SELECT record, journal_offset FROM runs WHERE state = ?", (RUNNING,)):
+            run = Run(**json.loads(row["record"]))
+            count += self._look_at(run, row["journal_offset"]).state == RUNNING
+        return count
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _watch(self) -> None:
+        while not self._ending.wait(_LOOK_EVERY_S):
+            try:
+                self.look()
+            except Exception as error:  # a full disk, a folder taken away: told in the log, tried again
+                sys.stderr.write(f"station: runs cannot be followed: {error}\n")
+                self._ending.wait(2.0)
+
+    def _look_at(self, run: Run, offset: int) -> Run:
+        folder = self._folder / run.id
+        has_ended = _has_ended(folder)  # asked first: lines written before the end are then all there
+        with self._lock:
+            run = self.get(run.id)
+            lines, end = _new_lines(folder / JOURNAL_FILE, offset)
+            events: list[NewEvent] = []
+            for line in lines:
+                run, event = _taken(run, line)
+                events.append(event)
+            if has_ended and run.state == RUNNING and not lines:
+                run = self._without_a_word(run, folder)
+                kind = "run.stopped" if run.state == STOPPED else "run.failed"
+                events.append(_event(kind, run, _public(run)))
+            if events:
+                self._keep(run, events, end)
+        if run.state != RUNNING:
+            process = self._processes.pop(run.id, None)
+            if process is not None:
+                process.wait()
+            self._shelf.forget(run.site)
+        return run
+
+    def _without_a_word(self, run: Run, folder: Path) -> Run:
+        """A run whose process ended without its last line: killed, crashed, or switched off with the machine."""
+        process = self._processes.get(run.id)
+        code = process.wait() if process is not None else None
+        if run.stop_asked:
+            return replace(run, state=STOPPED, ended_at=utc_now(), exit_code=code, headline="stopped; nothing was kept")
+        last = _tail(folder / LOG_FILE)
+        words = "its process ended without a word"
+        if code is not None and code < 0:
+            words = f"its process was killed (signal {-code}), perhaps for want of memory"
+        return replace(
+            run, state=LOST if code is None else FAILED, ended_at=utc_now(), exit_code=code,
+            error=f"{words}; the site is as it was before{': ' + last if last else ''}",
+        )
+
+    def _keep(self, run: Run, events: list[NewEvent], offset: int | None = None) -> None:
+        with self._events.appending(events) as connection:
+            connection.execute(
+                "UPDATE runs SET state = ?, record = ?, journal_offset = coalesce(?, journal_offset) WHERE id = ?",
+                (run.state, compact_json(asdict(run)), offset, run.id),
+            )
+
+    def _demand_turn(self, wish: RunWish) -> None:
+        running = [each for each in self.all() if each.state == RUNNING]
+        if len(running) >= _MOST_RUNNING:
+            raise Problem(409, f"{len(running)} missions run already; wait until one ends, or stop one")
+        for each in running:
+            if each.site == wish.site and each.mission in WRITES and wish.mission in WRITES:
+                raise Problem(
+                    409, f"the site {wish.site!r} is being written by a {each.mission} that {each.who} started; wait "
+                         "until it ends, or stop it", run=each.id,
+                )
+
+    def _demand_room(self) -> None:
+        free_gb = shutil.disk_usage(self._settings.root).free / 1e9
+        if free_gb < self._settings.free_floor_gb:
+            raise Problem(
+                507, f"{free_gb:.1f} GB are free, {self._settings.free_floor_gb:.1f} GB have to stay free; delete "
+                     "uploads or flights that are not needed any more"
+            )
+
+    def _order(self, wish: RunWish, run_id: str, site: Path, folder: Path) -> Order:
+        options = wish.options
+        given = {name: "" if each is None else self._inputs.source(each) for name, each in (
+            ("source", wish.input), ("telemetry", options.telemetry), ("camera", options.camera_file),
+        )}
+        results = site / SEARCH_FOLDER if wish.mission == "search" else folder / "results"
+        return Order(
+            run_id, wish.mission, wish.site, str(site.resolve()), given["source"], given["telemetry"],
+            given["camera"] or options.camera or "", str(results.resolve()),
+            (wish.input.stream if wish.input else None) or "", options.model_dump(mode="json"),
+        )
+
+
+def _public(run: Run) -> dict[str, Any]:
+    """A run without what is of no use to a browser."""
+    return {name: value for name, value in asdict(run).items() if name != "pid"}
+
+
+run_row = _public
+"""A run as the API gives it."""
+
+
+def _event(kind: str, run: Run, data: Mapping[str, Any]) -> NewEvent:
+    return NewEvent(kind, data, run.site, run.id)
+
+
+def _taken(run: Run, line: Mapping[str, Any]) -> tuple[Run, NewEvent]:
+    """The run after a line of its journal, and the event that the line becomes."""
+    kind, data = str(line["type"]), line["data"]
+    if kind == "run.progress":
+        run = replace(run, progress=data)
+    elif kind in _ENDS:
+        run = replace(
+            run, state=_ENDS[kind], ended_at=utc_now(), headline=data["headline"], exit_code=data["exit_code"],
+            error=data["error"],
+        )
+        return run, _event(kind, run, _public(run))
+    return run, _event(kind, run, data)
+
+
+def _spawned(folder: Path) -> "subprocess.Popen[bytes]":
+    """A process that does the order in a folder, apart from the server's own fate.
+
+    It holds the folder's lock from before its first moment on to its last: who can lock it knows that it has ended.
+    """
+    lock = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with (folder / LOG_FILE).open("ab") as log:
+            return subprocess.Popen(
+                [sys.executable, "-m", "sorvolo.station.worker", str(folder.resolve())], cwd=folder,
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, pass_fds=(lock,),
+                env={**os.environ, LOCK_VARIABLE: str(lock)},
+            )
+    finally:
+        os.close(lock)
+
+
+def _has_ended(folder: Path) -> bool:
+    """Whether a run's process is gone: nobody holds its lock."""
+    try:
+        lock = os.open(folder / LOCK_FILE, os.O_RDWR)
+    except OSError:
+        return True
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    finally:
+        os.close(lock)
+    return True
+
+
+def _new_lines(path: Path, offset: int) -> tuple[list[dict[str, Any]], int]:
+    """The whole lines of a journal from an offset on, and where they end."""
+    try:
+        with path.open("rb") as file:
+            file.seek(offset)
+            data = file.read(_MOST_LINE_BYTES)
+    except FileNotFoundError:
+        return [], offset
+    end = data.rfind(b"\n") + 1
+    lines = []
+    for text in data[:end].splitlines():
+        try:
+            line = json.loads(text)
+            if isinstance(line, dict) and isinstance(line.get("data"), dict) and "type" in line:
+                lines.append(line)
+        except ValueError:  # a line that a power cut tore
+            continue
+    return lines, offset + end
+
+
+def _tail(path: Path) -> str:
+    """The last line that a process printed."""
+    try:
+        data = path.read_bytes()[-_MOST_LOG_BYTES:]
+    except OSError:
+        return ""
+    lines = [each for each in data.decode("utf-8", "replace").splitlines() if each.strip()]
+    return lines[-1].strip()[:300] if lines else ""

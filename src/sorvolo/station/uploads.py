@@ -1,0 +1,261 @@
+"""Uploads of flights by the tus protocol (1.0): resumed after a cut, limited in size and kind, checked before use."""
+
+import base64
+import binascii
+import json
+import re
+import secrets
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import AsyncIterator, Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path, PureWindowsPath
+from typing import Any
+
+import anyio
+
+from sorvolo.station.events import EventLog, NewEvent
+from sorvolo.station.problems import Problem
+from sorvolo.station.settings import StationSettings
+from sorvolo.station.state import utc_now
+from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.site.names import is_plain_name
+
+VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".ts")
+"""Files that are taken as videos."""
+
+TEXT_ENDINGS = (".srt", ".csv", ".gpx", ".txt", ".nmea", ".log", ".xml", ".yaml", ".yml", ".json", ".geojson")
+"""Files that are taken as telemetry, cameras and areas."""
+
+_ARCHIVE_ENDINGS = (".zip",)
+_MOST_TEXT_BYTES = 256_000_000
+_MOST_UPLOADS = 1000
+_PART, _INFO, _FILES = "part", "info.json", "files"
+_CHECK_WITHIN_S = 1800.0
+_LOOK_EVERY_BYTES = 64_000_000  # written between two looks at the free space
+_ID = re.compile(r"[0-9a-f]{24}")
+
+
+@dataclass(frozen=True)
+class Upload:
+    """An upload as its info.json has it. `state`: receiving, checking, ready, refused (`why`)."""
+
+    id: str
+    name: str
+    bytes: int
+    made_at: str
+    who: str
+    state: str = "receiving"
+    why: str | None = None
+    facts: Mapping[str, Any] | None = None
+
+    @property
+    def kind(self) -> str:
+        """video | photos | text"""
+        ending = Path(self.name).suffix.lower()
+        return "video" if ending in VIDEO_ENDINGS else "photos" if ending in _ARCHIVE_ENDINGS else "text"
+
+
+class Uploads:
+    """The uploads of a station, each in a folder of its own. Threads may share it."""
+
+    def __init__(self, settings: StationSettings, events: EventLog) -> None:
+        self._settings, self._events = settings, events
+        self._folder = settings.state_folder / "uploads"
+        self._busy: set[str] = set()
+        self._lock = threading.Lock()
+        self._checking = ThreadPoolExecutor(1, thread_name_prefix="upload check")
+        for each in self.all():  # the station was stopped meanwhile
+            if each.state == "checking":
+                self._checking.submit(self._check, each)
+
+    @property
+    def most_bytes(self) -> int:
+        """The largest upload."""
+        return int(self._settings.upload_most_gb * 1e9)
+
+    def all(self) -> list[Upload]:
+        """Every upload, oldest first."""
+        found = []
+        for path in self._folder.glob(f"*/{_INFO}") if self._folder.is_dir() else ():
+            try:
+                found.append(Upload(**json.loads(path.read_bytes())))
+            except (OSError, ValueError, TypeError):  # being taken away, or broken by somebody: no upload
+                continue
+        return sorted(found, key=lambda each: (each.made_at, each.id))
+
+    def create(self, metadata: str, length: int, who: str) -> Upload:
+        """Begin an upload. Raises Problem: 400, 413 too large, 415 of no known kind, 507 without room."""
+        name = _checked_name(_metadata(metadata).get("filename", ""))
+        made = Upload(secrets.token_hex(12), name, length, utc_now(), who)
+        if not 0 < length <= self.most_bytes or (made.kind == "text" and length > _MOST_TEXT_BYTES):
+            raise Problem(413, f"{length} bytes: 1 to {self.most_bytes} are taken, of text {_MOST_TEXT_BYTES}")
+        self.demand_room(length)
+        if len(self.all()) >= _MOST_UPLOADS:
+            raise Problem(409, f"there are {_MOST_UPLOADS} uploads already; delete those that are not needed any more")
+        folder = self._folder / made.id
+        with writing(folder):
+            folder.mkdir(parents=True)
+            (folder / _PART).touch()
+        self._write(made)
+        return made
+
+    def get(self, upload_id: str) -> Upload:
+        """An upload. Raises Problem (404)."""
+        try:
+            if _ID.fullmatch(upload_id):
+                return Upload(**json.loads((self._folder / upload_id / _INFO).read_bytes()))
+        except (OSError, ValueError, TypeError):
+            pass
+        raise Problem(404, f"no upload {upload_id[:40]!r}; /api/uploads lists those there are")
+
+    def offset(self, upload: Upload) -> int:
+        """How many bytes of it are here."""
+        if upload.state != "receiving":
+            return upload.bytes
+        try:
+            return (self._folder / upload.id / _PART).stat().st_size
+        except OSError:
+            return 0
+
+    async def take(self, upload: Upload, offset: int, chunks: AsyncIterator[bytes]) -> int:
+        """Append what comes to an upload; how many bytes are here then. What came before a cut is kept.
+
+        Raises Problem: 409 for an offset that is not where it ends, 423 while another request appends, 413, 507.
+        """
+        with self._lock:
+            if upload.id in self._busy:
+                raise Problem(423, "another request is sending this upload; wait until it ends")
+            self._busy.add(upload.id)
+        try:
+            upload = self.get(upload.id)
+            if upload.state != "receiving" or offset != self.offset(upload):
+                raise Problem(409, f"the upload ends at {self.offset(upload)}, not at {offset}; ask where it ends")
+            here = await self._append(upload, offset, chunks)
+            if here == upload.bytes:
+                upload = replace(upload, state="checking")
+                self._write(upload)
+                self._checking.submit(self._check, upload)
+            return here
+        finally:
+            with self._lock:
+                self._busy.discard(upload.id)
+
+    def delete(self, upload_id: str) -> None:
+        """Take an upload away. Raises Problem (404, 423)."""
+        upload = self.get(upload_id)
+        with self._lock:
+            if upload.id in self._busy:
+                raise Problem(423, "another request is sending this upload; wait until it ends")
+        shutil.rmtree(self._folder / upload.id, ignore_errors=True)
+
+    def finished_path(self, upload_id: str) -> Path:
+        """The file, or the folder of photos, of an upload that was checked. Raises Problem (404, 409)."""
+        upload = self.get(upload_id)
+        if upload.state == "refused":
+            raise Problem(409, f"{upload.name} cannot be used: {upload.why}")
+        if upload.state != "ready":
+            raise Problem(409, f"{upload.name} is not here yet ({upload.state}); wait until it is ready")
+        return self._target(upload)
+
+    def name_of(self, upload_id: str) -> str:
+        """The name of an upload's file; its id where it is gone."""
+        try:
+            return self.get(upload_id).name
+        except Problem:
+            return upload_id
+
+    def demand_room(self, more_bytes: int) -> None:
+        """Raise Problem (507) where so many bytes more would not leave the floor of free space."""
+        free = shutil.disk_usage(self._settings.root).free
+        if free - more_bytes < self._settings.free_floor_gb * 1e9:
+            raise Problem(
+                507, f"{free / 1e9:.1f} GB are free, of which {self._settings.free_floor_gb:.1f} GB stay free; delete "
+                     "uploads or flights that are not needed any more"
+            )
+
+    def close(self) -> None:
+        """Stop checking; what was not checked is when the station starts again."""
+        self._checking.shutdown(wait=False, cancel_futures=True)
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    async def _append(self, upload: Upload, offset: int, chunks: AsyncIterator[bytes]) -> int:
+        here, looked = offset, offset
+        with writing(self._folder / upload.id):
+            async with await anyio.open_file(self._folder / upload.id / _PART, "r+b") as file:
+                await file.seek(offset)
+                async for chunk in chunks:
+                    if here + len(chunk) > upload.bytes:
+                        raise Problem(413, f"more came than the {upload.bytes} bytes that were announced")
+                    if here - looked > _LOOK_EVERY_BYTES:
+                        self.demand_room(0)
+                        looked = here
+                    await file.write(chunk)
+                    here += len(chunk)
+        return here
+
+    def _check(self, upload: Upload) -> None:
+        """Look into an upload in a process of its own, and make it ready or refuse it."""
+        folder = self._folder / upload.id
+        error, facts = checked_apart(folder / _PART, self._target(upload), self.most_bytes)
+        if error is None and upload.kind != "photos":
+            self._target(upload).parent.mkdir(exist_ok=True)
+            (folder / _PART).rename(self._target(upload))
+        else:
+            (folder / _PART).unlink(missing_ok=True)
+        if not folder.is_dir():  # deleted meanwhile
+            return
+        done = replace(upload, state="ready" if error is None else "refused", why=error, facts=facts)
+        self._write(done)
+        self._events.append(NewEvent("upload.checked", asdict(done)))
+
+    def _target(self, upload: Upload) -> Path:
+        name = Path(upload.name).stem if upload.kind == "photos" else upload.name
+        return self._folder / upload.id / _FILES / name
+
+    def _write(self, upload: Upload) -> None:
+        atomic_write_bytes(self._folder / upload.id / _INFO, json.dumps(asdict(upload)).encode())
+
+
+def checked_apart(
+    part: Path, target: Path, most_bytes: int, run: Callable[..., Any] = subprocess.run
+) -> tuple[str | None, Mapping[str, Any] | None]:
+    """What is wrong with an upload (None: nothing), and what it holds, found in a process with limits of its own."""
+    command = [sys.executable, "-m", "sorvolo.station.check_upload", str(part), str(target), str(most_bytes)]
+    try:
+        done = run(command, capture_output=True, timeout=_CHECK_WITHIN_S, stdin=subprocess.DEVNULL)
+        answer = json.loads(done.stdout)
+        return answer["error"], answer.get("facts")
+    except subprocess.TimeoutExpired:
+        return "looking into it took too long", None
+    except (ValueError, KeyError, TypeError):
+        return "looking into it took more memory or time than a flight needs, or broke the decoder", None
+
+
+def _metadata(text: str) -> dict[str, str]:
+    """tus's Upload-Metadata: names and values in base64. Raises Problem (400)."""
+    found = {}
+    for pair in filter(None, (each.strip() for each in text.split(","))):
+        key, _, value = pair.partition(" ")
+        try:
+            found[key] = base64.b64decode(value, validate=True).decode()
+        except (binascii.Error, ValueError) as error:
+            raise Problem(400, "Upload-Metadata: names with values in base64 were needed (`filename ...`)") from error
+    return found
+
+
+def _checked_name(name: str) -> str:
+    """A file's name without any folder. Raises Problem (400, 415)."""
+    bare = PureWindowsPath(name).name
+    if not is_plain_name(bare):
+        raise Problem(400, "Upload-Metadata: a `filename` of letters, digits and usual punctuation was needed")
+    if Path(bare).suffix.lower() not in (*VIDEO_ENDINGS, *TEXT_ENDINGS, *_ARCHIVE_ENDINGS):
+        raise Problem(
+            415, f"{bare[:80]}: a video ({', '.join(VIDEO_ENDINGS)}), photos as .zip, or telemetry and cameras "
+                 f"({', '.join(TEXT_ENDINGS)}) were needed"
+        )
+    return bare

@@ -1,0 +1,288 @@
+"""A mission's own process: does one order and writes what happens into a journal, line by line; needs no server."""
+
+import fcntl
+import json
+import os
+import resource
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterable, Mapping
+from contextlib import closing
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+from sorvolo.capture.live.addresses import is_live_address
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.errors import SorvoloError
+from sorvolo.geometry.pose import gimbal_angles_from_rotation
+from sorvolo.missions.compare.flights import compare_flights
+from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.search.flights import SearchOutputs, search_site
+from sorvolo.missions.search.settings import SearchSettings
+from sorvolo.missions.watch.flights import watch
+from sorvolo.missions.watch.run import WatchUpdate
+from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
+from sorvolo.station.collections import on_earth
+from sorvolo.station.orders import JOURNAL_FILE, LOCK_VARIABLE, Order
+from sorvolo.store.exports.change_files import changes_geojson
+from sorvolo.store.exports.detection_files import tracks_collection
+from sorvolo.store.exports.plain import plain_json, utc_text
+from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.change_records import stored_changes
+from sorvolo.survey.findings import CompareUpdate
+from sorvolo.survey.flight import Site
+from sorvolo.survey.mosaic import FrameView, MosaicUpdate
+from sorvolo.survey.wording import counted_list
+
+FINISHED, FAILED, STOPPED = "run.finished", "run.failed", "run.stopped"
+"""The types of a journal's last line."""
+
+_PROGRESS_EVERY_S = 0.25
+_LIVE_S = 0.5  # how often the growing map is shown: a browser waits for it
+_NICE = 5  # the server answers first
+_WRONG, _STOPPED_CODE = 1, 130
+
+
+class Journal:
+    """The lines of a run: a JSON object each, whole once it can be read. Only `add` changes it."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("ab")
+        self._progress_s = -1e9
+
+    def add(self, kind: str, data: Mapping[str, Any]) -> None:
+        """Append one line and hand it to the operating system."""
+        line = json.dumps({"type": kind, "data": plain_json(data)}, ensure_ascii=False, allow_nan=False)
+        self._file.write(line.encode() + b"\n")
+        self._file.flush()
+
+    def progress(self, data: Mapping[str, Any], *, always: bool = False) -> None:
+        """How far the run is, a few times a second at most."""
+        if always or time.monotonic() - self._progress_s >= _PROGRESS_EVERY_S:
+            self._progress_s = time.monotonic()
+            self.add("run.progress", data)
+
+
+class _Stop:
+    """The first signal ends a live source, whose flight is then finished; any other stops the mission."""
+
+    def __init__(self, is_live: bool) -> None:
+        self.until = threading.Event()
+        self._is_live = is_live
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._take)
+
+    def _take(self, _: int, __: FrameType | None) -> None:
+        if self._is_live and not self.until.is_set():
+            self.until.set()
+            return
+        raise KeyboardInterrupt
+
+
+def main(folder: Path) -> int:
+    """Do the order in a run's folder; the exit code: 0, 1 for an error that its journal states, 130 stopped."""
+    order, journal = Order.read(folder), Journal(folder / JOURNAL_FILE)
+    stop = _Stop(is_live_address(order.source))
+    try:
+        headline = _MISSIONS[order.mission](order, journal, stop.until)
+    except KeyboardInterrupt:
+        journal.add(STOPPED, {"exit_code": _STOPPED_CODE, "error": None, "headline": "stopped; nothing was kept"})
+        return _STOPPED_CODE
+    except SorvoloError as error:
+        journal.add(FAILED, {"exit_code": _WRONG, "error": str(error), "headline": None})
+        return _WRONG
+    except Exception as error:
+        words = f"{type(error).__name__}: {error}" if not isinstance(error, OSError) else f"{error.strerror or error}"
+        journal.add(FAILED, {"exit_code": _WRONG, "error": words, "headline": None})
+        raise  # the traceback goes to the run's log
+    journal.add(FINISHED, {"exit_code": 0, "error": None, "headline": headline})
+    return 0
+
+
+def _map(order: Order, journal: Journal, until: threading.Event) -> str:
+    wish, site = order.choices, Path(order.site)
+    settings = MapSettings(
+        overlap=wish.overlap, m_per_px=wish.m_per_px, model=wish.model or "default", classes=tuple(wish.classes),
+        live_s=_LIVE_S, ground_elevation_m=wish.ground_elevation_m,
+    )
+    before = _newest(site)
+    updates = map_flights(
+        [order.source], site, settings, telemetry=order.telemetry or None, camera=order.camera or None,
+        live=LiveSettings(keeps_all=True), until=until,
+    )
+    with closing(updates):
+        for update in updates:
+            _placed(journal, update.view, update.frame_name, update.status.value)
+            journal.progress(_map_progress(update))
+    return _headline(site, before)
+
+
+def _compare(order: Order, journal: Journal, until: threading.Event) -> str:
+    wish, site = order.choices, Path(order.site)
+    settings = CompareSettings(
+        views_per_second=wish.views_per_second, votes=wish.votes, voters=wish.voters, updates_map=wish.updates_map,
+        model=wish.model or "default", ground_elevation_m=wish.ground_elevation_m,
+    )
+    before, announced = _newest(site), dict[str, None]()
+    with Archive.open(site, write=False) as archive:
+        place = archive.site()
+    updates = compare_flights(
+        [order.source], site, settings, telemetry=order.telemetry or None, camera=order.camera or None,
+        live=LiveSettings(keeps_all=True), until=until,
+    )
+    with closing(updates):
+        for update in updates:
+            _placed(journal, update.view, update.frame_name, update.status.value)
+            _announce(journal, update, place, announced)
+            journal.progress(_compare_progress(update, len(announced)))
+    with Archive.open(site, write=False) as archive:
+        flights = {each.flight_id for each in archive.versions() if each.id > before}
+        kept = {each.id for each in archive.changes() if each.flight_id in flights}
+    for change_id in announced.keys() - kept:
+        journal.add("change.withdrawn", {"id": change_id, "why": "not confirmed by the whole flight"})
+    return _headline(site, before)
+
+
+def _watch(order: Order, journal: Journal, until: threading.Event) -> str:
+    wish = order.choices
+    settings = WatchSettings(
+        model=wish.model or "default", classes=tuple(wish.classes), least_score=wish.least_score,
+        frames_per_second=wish.frames_per_second, ground_elevation_m=wish.ground_elevation_m,
+    )
+    counts: Mapping[str, int] = {}
+    updates = watch(
+        order.source, settings, WatchOutputs(Path(order.folder)), telemetry=order.telemetry or None,
+        camera=order.camera or None, until=until,
+    )
+    with closing(updates):
+        for update in updates:
+            _placed(journal, update.view, update.frame_name, "watched")
+            _seen(journal, update, order.stream)
+            counts = update.counts
+            journal.progress({
+                "frames": update.frames_read, "frames_expected": update.frames_expected or None,
+                "searched": update.frames_detected, "objects": dict(counts), "seconds": update.seconds,
+                "latency_s": update.latency_s, "frames_per_second": _rate(update.frames_detected, update.seconds),
+            })
+    return f"{counted_list(counts)} found"
+
+
+def _search(order: Order, journal: Journal, _: threading.Event) -> str:
+    wish = order.choices
+    settings = SearchSettings(plants=wish.plants, classes=tuple(wish.classes), model=wish.model or "default")
+    report: Mapping[str, Any] = {}
+    with closing(search_site(Path(order.site), settings, SearchOutputs(Path(order.folder)))) as measuring:
+        for each in measuring:
+            if isinstance(each, dict):
+                report = each
+                continue
+            journal.progress({
+                "frames": each.done, "frames_expected": each.total, "found": each.found, "planted": each.planted,
+                "flight": each.flight,
+            })
+    return str((report.get("headline") or {}).get("text", "measured"))
+
+
+_MISSIONS = {"map": _map, "compare": _compare, "watch": _watch, "search": _search}
+
+
+def _placed(journal: Journal, view: FrameView | None, name: str, status: str) -> None:
+    """Write where a frame lies: its outline, its camera, which way its top points."""
+    if view is None:
+        return
+    latitudes, longitudes, _ = view.frame.wgs84_from_site(
+        np.vstack([view.outline_m, view.site_from_camera.translation_m[:2]])
+    )
+    places = np.round(np.column_stack([longitudes, latitudes]), 8).tolist()
+    heading_deg, pitch_deg, _ = gimbal_angles_from_rotation(view.site_from_camera.rotation)
+    journal.add("frame.placed", {
+        "frame": name, "status": status, "footprint": [*places[:4], places[0]], "position": places[4],
+        "height_m": round(float(view.site_from_camera.translation_m[2]), 2), "heading_deg": round(heading_deg, 1),
+        "pitch_deg": round(pitch_deg, 1), "time": utc_text(view.time_ns),
+    })
+
+
+def _announce(journal: Journal, update: CompareUpdate, site: Site, announced: dict[str, None]) -> None:
+    for change in update.announced:
+        announced[change.id] = None
+        stored = stored_changes(change.id.rpartition("-")[0], [change])
+        feature = changes_geojson(stored, on_earth(site))["features"][0]
+        journal.add("change.announced", {"feature": feature})
+
+
+def _seen(journal: Journal, update: WatchUpdate, stream: str) -> None:
+    """Write a frame's boxes, and each object that it confirmed."""
+    found = update.detections
+    boxes = [
+        {"class": name, "score": round(float(score), 3), "xywh_px": [
+            round(float(each), 1) for each in (x0, y0, x1 - x0, y1 - y0)
+        ]}
+        for name, score, (x0, y0, x1, y1) in zip(found.names, found.scores, found.boxes_px)
+    ]
+    journal.add("frame.boxes", {
+        "stream": stream or None, "frame": update.frame_name, "pts_us": update.clip_ns // 1000,
+        "time": utc_text(update.time_ns), "boxes": boxes, "frame_size_px": list(update.size_px),
+        "latency_s": round(update.latency_s, 3),
+    })
+    if not update.new:
+        return
+    for feature in tracks_collection(list(update.new), update.site, {})["features"]:
+        journal.add("object.found", {"feature": feature, "is_local": update.site.is_local})
+
+
+def _map_progress(update: MosaicUpdate) -> dict[str, Any]:
+    return {
+        "frames": update.frames_read, "frames_expected": max(update.frames_expected, update.frames_read),
+        "selected": update.keyframes, "matched": update.by_vision, "seconds": update.seconds,
+        "frames_per_second": _rate(update.frames_read, update.seconds), "reason": update.reason or None,
+    }
+
+
+def _compare_progress(update: CompareUpdate, announced: int) -> dict[str, Any]:
+    return {
+        "frames": update.frames_read, "frames_expected": max(update.frames_expected, update.frames_read),
+        "selected": update.views, "matched": update.compared, "changes": announced, "seconds": update.seconds,
+        "frames_per_second": _rate(update.frames_read, update.seconds), "reason": update.reason or None,
+    }
+
+
+def _rate(frames: int, seconds: float) -> float | None:
+    return round(frames / seconds, 2) if seconds > 0 else None
+
+
+def _newest(site: Path) -> int:
+    if not (site / "site.db").is_file():
+        return 0
+    with Archive.open(site, write=False) as archive:
+        return max((each.id for each in archive.versions() if each.complete), default=0)
+
+
+def _headline(site: Path, before: int) -> str:
+    """What the reports of the flights that came since say first."""
+    with Archive.open(site, write=False) as archive:
+        flights = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
+        reports = [archive.report(each) for each in flights]
+    heads: Iterable[Mapping[str, Any]] = (
+        (each.get("comparison") or each).get("headline") or {} for each in reports
+    )
+    return "; ".join(str(each.get("text", "")) for each in heads if each.get("text")) or "finished"
+
+
+def _begin(folder: Path) -> int:
+    """Take what a child must not have: the run's lock is open in this process alone, so that its end is seen."""
+    lock = os.environ.pop(LOCK_VARIABLE, "")
+    if lock.isdecimal():
+        fcntl.fcntl(int(lock), fcntl.F_SETFD, fcntl.FD_CLOEXEC)
+    os.nice(_NICE)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    return main(folder)
+
+
+if __name__ == "__main__":
+    sys.exit(_begin(Path(sys.argv[1])))

@@ -1,0 +1,176 @@
+"""Missions of the station: in processes of their own, found again, stopped, refused; a crash touches nothing else."""
+
+import json
+import os
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from sorvolo.missions.simulate.site import simulate_site
+from sorvolo.simulation.settings import (
+    ImagingSettings,
+    PathSettings,
+    SceneSettings,
+    SensorSettings,
+    SimulationSettings,
+)
+from sorvolo.station.app import station_app
+from sorvolo.station.settings import StationSettings
+
+FLIGHT = SimulationSettings(
+    seed=5, flights=1,
+    scene=SceneSettings(people=0, cars=1, small_objects=0, has_scenery=False),
+    path=PathSettings(height_m=20, speed_m_s=5, length_m=16, strips=1),
+    imaging=ImagingSettings(width_px=320, height_px=180, fps=5),
+    sensor=SensorSettings(noise_m=(0.05, 0.05, 0.05)),
+)
+HOST = "http://127.0.0.1:8750"
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A video of one short strip with telemetry beside it."""
+    folder = tmp_path_factory.mktemp("flown") / "flight"
+    for _ in simulate_site(folder, FLIGHT):
+        pass
+    return folder
+
+
+@pytest.fixture
+def open_station(flown: Path, tmp_path: Path) -> Iterator[Callable[[], TestClient]]:
+    """Opens a station over a folder with the flight, as often as it is asked."""
+    root = tmp_path / "root"
+    shutil.copytree(flown, root / "flown")
+    opened: list[TestClient] = []
+
+    def open_it() -> TestClient:
+        client = TestClient(station_app(StationSettings(root, free_floor_gb=0.0)), base_url=HOST)
+        opened.append(client)
+        return client.__enter__()
+
+    yield open_it
+    for each in opened:
+        each.__exit__(None, None, None)
+
+
+def wish(client: TestClient, mission: str = "map", site: str = "new", **options: Any) -> dict[str, Any]:
+    """A mission on the flight."""
+    inputs = {each["name"].rpartition("/")[2]: each["id"] for each in client.get("/api/inputs").json()}
+    video = next(identity for name, identity in inputs.items() if name.endswith(".mp4"))
+    return {
+        "mission": mission, "site": site, "input": {"input": video},
+        "options": {"camera_file": {"input": inputs["camera.xml"]}, "model": "none", **options},
+    }
+
+
+def ended(client: TestClient, run: str, within_s: float = 120.0) -> dict[str, Any]:
+    """A run once it runs no more."""
+    until = time.monotonic() + within_s
+    while time.monotonic() < until:
+        state = client.get(f"/api/runs/{run}").json()
+        if state["state"] != "running":
+            return state
+        time.sleep(0.05)
+    raise AssertionError(f"still running: {state}")
+
+
+def all_events(client: TestClient) -> list[dict[str, Any]]:
+    """Every event there ever was."""
+    log = client.app.state.station.events  # type: ignore[attr-defined]
+    found: list[dict[str, Any]] = []
+    while batch := log.after(found[-1]["seq"] if found else 0):
+        found += batch
+    return found
+
+
+def test_a_mission_outlives_its_server_and_nothing_is_lost_or_doubled(
+    open_station: Callable[[], TestClient], tmp_path: Path
+) -> None:
+    """Started by one server, finished under the next: the map is there, every journal line is one event."""
+    first = open_station()
+    started = first.post("/api/runs", json=wish(first))
+    assert started.status_code == 201, started.text
+    run = started.json()
+    assert run["state"] == "running" and "pid" not in run
+    second_mission = first.post("/api/runs", json=wish(first, "map"))
+    assert second_mission.status_code == 409 and second_mission.json()["run"] == run["id"]
+    first.__exit__(None, None, None)
+    client = open_station()
+    assert client.get(f"/api/runs/{run['id']}").json()["id"] == run["id"]
+    done = ended(client, run["id"])
+    assert done["state"] == "finished" and done["exit_code"] == 0 and "matched" in done["headline"]
+    site = client.get("/api/sites/new").json()
+    assert site["versions"][0]["n"] == 1 and site["flights"][0]["matched"] > 2
+    events = all_events(client)
+    assert [each["seq"] for each in events] == list(range(1, len(events) + 1))
+    journal = (tmp_path / "root/station/runs" / run["id"] / "journal.jsonl").read_text().splitlines()
+    types = [each["type"] for each in events if each["run"] == run["id"]]
+    assert types == ["run.started", *(json.loads(each)["type"] for each in journal)]
+    placed = [each["data"] for each in events if each["type"] == "frame.placed"]
+    assert len(placed) == site["flights"][0]["frames"]
+    west, south, east, north = site["bounds_wgs84"]
+    for each in placed:
+        assert west < each["position"][0] < east and south < each["position"][1] < north
+        assert 15 < each["height_m"] < 25 and len(each["footprint"]) == 5
+    time.sleep(0.5)
+    assert any(each["type"] == "map.tiles" and each["data"]["revision"] == site["live_revision"]
+               for each in all_events(client))
+
+
+def test_a_killed_mission_is_named_and_the_next_one_may_start(open_station: Callable[[], TestClient]) -> None:
+    """By a signal from outside, as the system does when memory is short; stopped by a person; both at the beginning."""
+    client = open_station()
+    run = client.post("/api/runs", json=wish(client)).json()
+    os.kill(client.app.state.station.runs.get(run["id"]).pid, signal.SIGKILL)  # type: ignore[attr-defined]
+    done = ended(client, run["id"])
+    assert done["state"] == "failed" and "signal 9" in done["error"]
+    run = client.post("/api/runs", json=wish(client)).json()
+    assert client.post(f"/api/runs/{run['id']}/stop").status_code == 200
+    assert ended(client, run["id"])["state"] == "stopped"
+    assert client.post(f"/api/runs/{run['id']}/stop").status_code == 409
+    assert client.get("/api/sites").json() == []
+    assert [each["state"] for each in client.get("/api/runs").json()] == ["stopped", "failed"]
+
+
+def test_a_mission_that_cannot_do_its_work_says_why(open_station: Callable[[], TestClient]) -> None:
+    """The same words as on the command line."""
+    client = open_station()
+    order = wish(client)
+    inputs = {each["name"].rpartition("/")[2]: each["id"] for each in client.get("/api/inputs").json()}
+    order["input"] = {"input": inputs["camera.xml"]}
+    done = ended(client, client.post("/api/runs", json=order).json()["id"])
+    assert done["state"] == "failed" and done["exit_code"] == 1 and "camera.xml" in done["error"]
+
+
+@pytest.mark.parametrize(("change", "status"), [
+    ({"mission": "fly"}, 422), ({"site": ""}, 422), ({"site": "../out"}, 400), ({"site": "station"}, 400),
+    ({"input": {"input": "0" * 16}}, 404), ({"input": {"upload": "../../etc/passwd"}}, 404), ({"input": None}, 422),
+    ({"input": {"path": "/etc/passwd"}}, 422), ({"input": {"input": "a", "upload": "b"}}, 422),
+    ({"options": {"camera": "/etc/passwd"}}, 422), ({"options": {"model": "../model"}}, 422),
+    ({"options": {"alert_command": "rm"}}, 422), ({"options": {"overlap": 2}}, 422),
+    ({"mission": "compare", "site": "nowhere"}, 404), ({"mission": "search"}, 422),
+    ({"input": {"stream_url": "rtsp://127.0.0.1/live"}}, 400), ({"input": {"stream": "../x"}}, 400),
+    ({"input": {"stream": "nobody"}}, 404),
+])
+def test_what_cannot_be_started_is_refused(
+    open_station: Callable[[], TestClient], change: dict[str, Any], status: int
+) -> None:
+    """In words, and no process is started."""
+    client = open_station()
+    answer = client.post("/api/runs", json={**wish(client), **change})
+    assert answer.status_code == status, answer.text
+    assert answer.json()["detail"] and client.get("/api/runs").json() == []
+
+
+def test_without_free_space_nothing_starts(flown: Path, tmp_path: Path) -> None:
+    """507, and what to do."""
+    shutil.copytree(flown, tmp_path / "root" / "flown")
+    with TestClient(station_app(StationSettings(tmp_path / "root", free_floor_gb=1e6)), base_url=HOST) as client:
+        answer = client.post("/api/runs", json=wish(client))
+        assert answer.status_code == 507 and "delete" in answer.json()["detail"]
