@@ -417,7 +417,7 @@ def _rule(name: str, decision: str, *switches: tuple[str, Any], stage: str = "ev
 
 
 _INFINITE = float("inf")
-_ANNOUNCING, _TRACKER = "evidence.announcing:AnnounceSettings", "motion.blob_tracker"
+_ANNOUNCING, _PARALLAX = "evidence.announcing:AnnounceSettings", "motion.parallax:ParallaxSettings"
 _THINGS, _EVIDENCE = "shape.shadows:ThingSettings", "evidence.evidence_map"
 _OPINIONS, _PICTURES = "pair.corroboration:CorroborationSettings", "evidence.pictures:PictureSettings"
 _RESTLESS = f"{_EVIDENCE}:RestlessSettings"
@@ -448,14 +448,12 @@ RULES: tuple[Rule, ...] = (
     _rule("outlines without tiny pieces", "before 0014", ("shape.outlines:_LEAST_PART", 0.0)),
     _rule("outlines by the majority of masks", "before 0014", (f"{_PICTURES}.least_majority", _INFINITE)),
     # what moves
-    _rule("walks against the flight, photos", "0016", (f"{_TRACKER}:_floats", _no)),
-    _rule("rigid blobs", "before 0016", (f"{_TRACKER}:_is_rigid", _no)),
-    _rule("photos: three views", "0016", (f"{_TRACKER}:ParallaxSettings.photos_apart_s", _INFINITE)),
-    _rule("lost ones known again", "before 0014", (f"{_TRACKER}:IdentitySettings.lost_for_s", 0.0)),
-    _rule("unlikely parallax", "before 0014", (f"{_TRACKER}:ParallaxSettings.unlikely", _INFINITE)),
-    _rule("steady motion", "before 0014", (f"{_TRACKER}:_is_plausible", _yes)),
-    _rule("nothing goes with the camera", "before 0014", (f"{_TRACKER}:_goes_with_camera", _no)),
-    _rule("two blobs of one thing", "before 0014", (f"{_TRACKER}:IdentitySettings.near_m", 0.0)),
+    _rule("walks against the flight, photos", "0016", ("motion.blob_tracker:floats", _no)),
+    _rule("rigid blobs", "before 0016", ("motion.blob_tracker:is_rigid", _no)),
+    _rule("photos: three views", "0016", (f"{_PARALLAX}.photos_apart_s", _INFINITE)),
+    _rule("unlikely parallax", "before 0014", (f"{_PARALLAX}.unlikely", _INFINITE)),
+    _rule("steady motion", "before 0014", ("motion.blob_tracker:_is_plausible", _yes)),
+    _rule("nothing goes with the camera", "before 0014", ("motion.blob_tracker:goes_with_camera", _no)),
     _rule("blobs without their shadows", "before 0014", ("motion.blobs:thing_of", _thing_alone)),
     _rule("blobs: no large part of the view", "before 0014", ("motion.blobs:BlobSettings.most_of_view", 1.0)),
     _rule("blobs: on known ground", "before 0014", ("motion.blobs:_is_known_around", _yes)),

@@ -8,7 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
-from sorvolo.change.motion.blob_tracker import Blob, BlobTracker, MovingSettings, TrackPoint, motion
+from sorvolo.change.motion.blob_tracker import BlobTracker, MovingSettings
+from sorvolo.change.motion.blobs import Blob
+from sorvolo.change.motion.parallax import TrackPoint, motion
 from sorvolo.errors import SettingsError
 from sorvolo.survey.findings import ChangeKind
 
@@ -69,6 +71,13 @@ def test_where_a_walker_stood_on_the_map_something_disappeared():
     walks = Thing(-2, -2, (0.5, 0.5), velocity_m_s=(0.3, 0.9))
     _, final = events(flight([stood, walks], seconds=3))
     assert sorted(each.kind for each in final) == [ChangeKind.DISAPPEARED, ChangeKind.MOVING]
+
+
+def test_a_car_faster_than_the_drone_is_one_mover():
+    announced, final = events(flight([Thing(-6, 2, (4.5, 1.8), velocity_m_s=(13, 0))], seconds=2.4, speed_m_s=9))
+    assert len(announced) == 1
+    assert [each.kind for each in final] == [ChangeKind.MOVING]
+    assert final[0].velocity_m_s == pytest.approx((13, 0), abs=0.5)
 
 
 def test_a_thing_that_stands_is_not_moving_though_its_head_slides_over_the_ground():

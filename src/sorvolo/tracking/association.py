@@ -8,12 +8,19 @@ from scipy.optimize import linear_sum_assignment
 from sorvolo.geometry.arrays import Floats, PointsM, Rows
 from sorvolo.tracking.motion import Motions
 
-_GATE = 11.8  # squared distance in sigmas, two axes: 3 in 1000 of one object's sightings lie beyond
 _NEVER = -1e6
-_SIZE_SIGMA = 0.4  # of the natural logarithm of the longer side
-_LEAST_SIZE = -3.0
-_LOOKS_WEIGHT = 4.0
-_MOST_VOTES = 24
+
+
+@dataclass(frozen=True)
+class PairSettings:
+    """How place, class, size and looks speak for a pair; likelihoods as natural logarithms."""
+
+    gate: float = 11.8  # squared distance in sigmas, two axes: 3 in 1000 of one object's sightings lie beyond
+    size_sigma: float = 0.4  # of the natural logarithm of the longer side
+    least_size: float = -3.0  # a size that fits worse counts no less: boxes are cut, bodies turn
+    looks_weight: float = 4.0  # for each unit that the cosine of the angle of two looks lacks
+    class_floor: float = 0.03  # chance of a class that a track never had
+    most_votes: int = 24  # pairs that are asked for the frame's shift
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +40,8 @@ class Pairs:
 
 
 def place_likelihoods(
-    motions: Motions, places_m: PointsM, covariances_m2: Floats, offsets_m: PointsM, offsets_m2: Floats
+    motions: Motions, places_m: PointsM, covariances_m2: Floats, offsets_m: PointsM, offsets_m2: Floats,
+    settings: PairSettings,
 ) -> Floats:
     """(tracks, sightings) log density of each sighting's place if it is that track's; very low beyond the gate.
 
@@ -46,17 +54,17 @@ def place_likelihoods(
     x, y = gaps[..., 0], gaps[..., 1]
     squared = inverse[..., 0, 0] * x * x + 2 * inverse[..., 0, 1] * x * y + inverse[..., 1, 1] * y * y
     logs = -0.5 * (squared - np.log(_determinant(inverse))) - np.log(2 * np.pi)
-    logs = np.where(squared <= _GATE, logs + np.log(motions.weights)[:, :, None], _NEVER)
+    logs = np.where(squared <= settings.gate, logs + np.log(motions.weights)[:, :, None], _NEVER)
     return np.logaddexp(logs[:, 0], logs[:, 1])
 
 
-def size_likelihoods(track_sides_m: Floats, seen_sides_m: Floats) -> Floats:
+def size_likelihoods(track_sides_m: Floats, seen_sides_m: Floats, settings: PairSettings) -> Floats:
     """(tracks, sightings) how well longer sides fit, at best 0."""
     ratio = np.log(np.maximum(seen_sides_m, 1e-3))[None] - np.log(np.maximum(track_sides_m, 1e-3))[:, None]
-    return np.maximum(-0.5 * (ratio / _SIZE_SIGMA) ** 2, _LEAST_SIZE)
+    return np.maximum(-0.5 * (ratio / settings.size_sigma) ** 2, settings.least_size)
 
 
-def looks_likelihoods(track_looks: Floats, seen_looks: Floats) -> Floats:
+def looks_likelihoods(track_looks: Floats, seen_looks: Floats, settings: PairSettings) -> Floats:
     """(tracks, sightings) how well appearance vectors fit, (tracks, D) and (sightings, D), at best 0; NaN: unknown.
 
     Vectors are histograms or embeddings of any scale; their angle counts.
@@ -64,12 +72,12 @@ def looks_likelihoods(track_looks: Floats, seen_looks: Floats) -> Floats:
     with np.errstate(invalid="ignore", divide="ignore"):
         a = track_looks / np.linalg.norm(track_looks, axis=1, keepdims=True)
         b = seen_looks / np.linalg.norm(seen_looks, axis=1, keepdims=True)
-    return np.nan_to_num(_LOOKS_WEIGHT * (a @ b.T - 1.0))
+    return np.nan_to_num(settings.looks_weight * (a @ b.T - 1.0))
 
 
-def class_likelihoods(shares: Floats, labels: Rows) -> Floats:
+def class_likelihoods(shares: Floats, labels: Rows, settings: PairSettings) -> Floats:
     """(tracks, sightings) log of how likely each sighting's class is, by the tracks' shares (tracks, classes)."""
-    return np.log(0.03 + 0.97 * shares[:, labels])
+    return np.log(settings.class_floor + (1 - settings.class_floor) * shares[:, labels])
 
 
 def assigned(gains: Floats) -> Pairs:
@@ -81,7 +89,7 @@ def assigned(gains: Floats) -> Pairs:
 
 def voted_shift(
     motions: Motions, places_m: PointsM, covariances_m2: Floats, shares: Floats, loose_m2: Floats, slow_m2: float,
-    fits: Floats, gains: Floats, new_log_density: float, reluctance: float = 0.0,
+    fits: Floats, gains: Floats, new_log_density: float, settings: PairSettings, reluctance: float = 0.0,
 ) -> PointsM:
     """(2,) the error of the frame's shift under which the pattern of its sightings fits the tracks best.
 
@@ -93,7 +101,7 @@ def voted_shift(
     rows, columns = np.nonzero((gains > 0) & (shares > 0.3)[:, None])
     if not len(rows):
         return np.zeros(2)
-    best = np.argsort(-gains[rows, columns], kind="stable")[:_MOST_VOTES]
+    best = np.argsort(-gains[rows, columns], kind="stable")[:settings.most_votes]
     tracks_m, track_m2 = motions.places_m, motions.place_covariances_m2 + loose_m2[:, None, None] * np.eye(2)
     asked = (places_m[columns[best]] - tracks_m[rows[best]]) / shares[rows[best], None]
     errors = np.concatenate([np.zeros((1, 2)), asked])

@@ -1,7 +1,7 @@
 """Sightings over time put together to objects, each counted once across frames, passes and returns."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from sorvolo.geometry.arrays import Floats, Labels, PointsM, Rows
 from sorvolo.survey.objects import Sighting, Track
 from sorvolo.tracking.association import (
     Pairs,
+    PairSettings,
     assigned,
     class_likelihoods,
     looks_likelihoods,
@@ -18,22 +19,34 @@ from sorvolo.tracking.association import (
     size_likelihoods,
     voted_shift,
 )
-from sorvolo.tracking.common_shift import CommonShift
+from sorvolo.tracking.common_shift import CommonShift, ShiftSettings
 from sorvolo.tracking.followed import Followed
 from sorvolo.tracking.joining import double_of, earlier_mover, frame_doubles, inward_m, neighbours
 from sorvolo.tracking.motion import MOVES, Motions, begun, corrected, habits_of, predicted
 
-_LEAST_OWN_SHARE = 0.02  # of a sighting's whole variance that is its own
-_UNEVEN = 0.1  # of the shared sigma: turns and tilts do not shift a whole frame evenly
-_USUAL_STEP_S = 0.2  # sightings and gaps closer in time than this count less each
-_FORGOTTEN_S = 120.0  # tentative tracks out of view
-_SURE = 6.0  # evidence beyond this does not count: what leaves must be noticed
-_PENALTY_OF_ENDED = -1.5
-_PUZZLED = 0.3  # of a frame's sure sightings: if more belong nowhere, the shift may have jumped
-_JUMP_RELUCTANCE = 5.0
-_LONG_S = 1.0
-_MOVER_VIEWS = 4  # at least, until one that moves is sure: any two sightings make a mover
-_FIRST_VIEWS = 15  # within which a mover may turn out to be one that was seen before
+
+@dataclass(frozen=True)
+class SharedErrorSettings:
+    """What is the sighting's own error and what the frame's, and when the frame's may have jumped."""
+
+    least_own_share: float = 0.02  # of a sighting's whole variance that is its own
+    uneven: float = 0.1  # of the shared sigma: turns and tilts do not shift a whole frame evenly
+    puzzled: float = 0.3  # share of a frame's sure sightings: if more belong nowhere, the shift may have jumped ...
+    jump_reluctance: float = 5.0  # ... if that explains them by so much better, a natural logarithm
+    shift: ShiftSettings = field(default_factory=ShiftSettings)
+
+
+@dataclass(frozen=True)
+class EvidenceRules:
+    """How sightings and misses become evidence (natural logarithms of odds), beside `TrackerSettings`."""
+
+    usual_step_s: float = 0.2  # sightings and gaps closer in time than this count less each
+    forgotten_s: float = 120.0  # tentative tracks out of view
+    most: float = 6.0  # evidence beyond this does not count: what leaves must be noticed
+    ended: float = -1.5  # log likelihood of a sighting where a track ended
+    long_s: float = 1.0  # two views so far apart in time are enough
+    mover_views: int = 4  # at least, until one that moves is sure: any two sightings make a mover
+    first_views: int = 15  # within which a mover may turn out to be one that was seen before
 
 
 @dataclass(frozen=True)
@@ -51,6 +64,9 @@ class TrackerSettings:
     new_per_m2: float = 5e-4  # how densely objects lie that nobody has seen yet
     neighbour_m: float = 4.0  # within which two tracks may be one object
     unit_m: float = 1.0
+    evidence: EvidenceRules = field(default_factory=EvidenceRules)
+    errors: SharedErrorSettings = field(default_factory=SharedErrorSettings)
+    pairs: PairSettings = field(default_factory=PairSettings)
 
     def __post_init__(self) -> None:
         if not 0 <= self.sure_score <= 1:
@@ -91,7 +107,7 @@ class Tracker:
 
     def __init__(self, settings: TrackerSettings | None = None, *, first_id: int = 1) -> None:
         self._settings = settings or TrackerSettings()
-        self._shift = CommonShift()
+        self._shift = CommonShift(self._settings.errors.shift)
         self._followed: list[Followed] = []
         self.next_id = first_id
         self._time_ns: int | None = None
@@ -110,7 +126,7 @@ class Tracker:
         """
         if appearance is not None and len(appearance) != len(sightings):
             raise GeometryError(f"{len(sightings)} sightings but {len(appearance)} appearance vectors")
-        seen = _Seen(sightings, appearance)
+        seen = _Seen(sightings, appearance, self._settings.errors)
         time_ns, elapsed_s = self._move_on(seen, time_ns)
         near = self._near(seen, time_ns, footprint_m)
         motions = _stacked(near, time_ns)
@@ -163,7 +179,8 @@ class Tracker:
         for row, column in zip(pairs.tracks, pairs.sightings):
             followed = near[row]
             followed.go_on(motions.only(slice(row, row + 1)), time_ns)
-            if self._record(followed, seen, int(column), min(1.0, (time_ns - followed.last_ns) / 1e9 / _USUAL_STEP_S)):
+            weight = min(1.0, (time_ns - followed.last_ns) / 1e9 / self._settings.evidence.usual_step_s)
+            if self._record(followed, seen, int(column), weight):
                 new.append(followed.id)
             ids[column] = followed.id
         return new
@@ -195,7 +212,7 @@ class Tracker:
         odds = _PairOdds(
             motions, seen.places_m - self._shift.mean_m, seen.own_m2, self._fits(near, seen),
             float(np.log(self._settings.new_per_m2 * self._settings.unit_m**2)),
-            seen.scores >= self._settings.sure_score,
+            seen.scores >= self._settings.sure_score, self._settings.pairs,
         )
         pairs = self._paired(odds, ids)
         if not len(pairs):
@@ -204,15 +221,16 @@ class Tracker:
 
     def _paired(self, odds: "_PairOdds", ids: list[int]) -> Pairs:
         """The likeliest pairs, while the frame's shift is found from their pattern."""
-        shift, own_m2 = self._shift, odds.mean_own_m2
+        shift, own_m2, rules = self._shift, odds.mean_own_m2, self._settings.errors
         shares, loose_m2 = shift.predict(ids)
         none_m = np.zeros((len(ids), 2))
         gain = odds.gains(none_m, loose_m2 + shift.jitter_m2)
         pairs = odds.assign(gain)
-        if int(odds.sure.sum()) - len(pairs) >= max(2, _PUZZLED * odds.sure.sum()):
+        is_puzzled = int(odds.sure.sum()) - len(pairs) >= max(2, rules.puzzled * odds.sure.sum())
+        if is_puzzled and self._shared_m > 0:
             jump_m2 = self._shared_m**2
             wide = odds.gains(none_m, loose_m2 + shift.jitter_m2 + jump_m2)
-            if odds.vote(np.ones(len(ids)), loose_m2 + shift.jitter_m2, jump_m2, wide, _JUMP_RELUCTANCE).any():
+            if odds.vote(np.ones(len(ids)), loose_m2 + shift.jitter_m2, jump_m2, wide, rules.jump_reluctance).any():
                 shift.loosen(jump_m2)
                 shares, loose_m2 = shift.predict(ids)
                 gain = wide
@@ -265,31 +283,32 @@ class Tracker:
         """(tracks, sightings) what beside place speaks for each pair, as logs."""
         shares = np.array([[each.scores.get(name, 0.0) for name in self._classes] for each in near])
         shares /= shares.sum(axis=1, keepdims=True)
-        fits = class_likelihoods(shares, np.array([self._classes.index(label) for label in seen.labels]))
-        fits += size_likelihoods(np.array([each.sides_m[0] for each in near]), seen.sides_m)
-        fits += np.array([_PENALTY_OF_ENDED if each.ended else 0.0 for each in near])[:, None]
+        rules = self._settings.pairs
+        fits = class_likelihoods(shares, np.array([self._classes.index(label) for label in seen.labels]), rules)
+        fits += size_likelihoods(np.array([each.sides_m[0] for each in near]), seen.sides_m, rules)
+        fits += np.array([self._settings.evidence.ended if each.ended else 0.0 for each in near])[:, None]
         if seen.looks is not None:
             unknown = np.full(seen.looks.shape[1], np.nan)
             known = np.array([unknown if each.looks is None else each.looks for each in near])
-            fits += looks_likelihoods(known, seen.looks)
+            fits += looks_likelihoods(known, seen.looks, rules)
         fits[:, list(seen.doubles)] = -np.inf
         return fits
 
     def _record(self, followed: Followed, seen: "_Seen", column: int, weight: float) -> bool:
         """Give a track its sighting; whether that confirms it."""
-        settings = self._settings
+        settings, rules = self._settings, self._settings.evidence
         if followed.is_out:
             followed.passes, followed.is_out = followed.passes + 1, False
         followed.record(seen.sightings[column], seen.looks_of(column))
         for row, stronger in seen.doubles.items():
             if stronger == column:
                 followed.vote(seen.labels[row], float(seen.scores[row]))
-        followed.evidence = min(followed.evidence + max(weight, 0.3) * _log_odds(seen.scores[column]), _SURE)
+        followed.evidence = min(followed.evidence + max(weight, 0.3) * _log_odds(seen.scores[column]), rules.most)
         followed.ended = False
-        is_long = followed.last_ns - followed.first_ns >= _LONG_S * 1e9
+        is_long = followed.last_ns - followed.first_ns >= rules.long_s * 1e9
         least_views = min(settings.least_views, 2) if is_long else settings.least_views
         if followed.moves:
-            least_views = max(least_views, _MOVER_VIEWS)
+            least_views = max(least_views, rules.mover_views)
         if followed.confirmed or followed.views < least_views or followed.evidence < settings.least_evidence:
             return False
         followed.confirmed = True
@@ -339,7 +358,8 @@ class Tracker:
                 continue
             missing.append(followed)
             if depth > 2 * sigma + followed.sides_m[0] / 2 or footprint_m is None:
-                followed.evidence -= self._settings.missed * min(1.0, max(elapsed_s, 0.02) / _USUAL_STEP_S)
+                usual_step_s = self._settings.evidence.usual_step_s
+                followed.evidence -= self._settings.missed * min(1.0, max(elapsed_s, 0.02) / usual_step_s)
                 if followed.confirmed and not followed.ended and followed.evidence < 0:
                     followed.ended = True
                     ended.append(followed.id)
@@ -360,9 +380,10 @@ class Tracker:
         """Note which tracks are out of view, and give up tentative ones that are doubtful or long unseen."""
         for followed in self._followed:
             followed.is_out |= followed.id not in near_ids and followed.last_ns < time_ns
+        oldest_ns = time_ns - self._settings.evidence.forgotten_s * 1e9
         self._keep([
             each for each in self._followed
-            if each.confirmed or (each.evidence >= 0 and time_ns - each.last_ns < _FORGOTTEN_S * 1e9)
+            if each.confirmed or (each.evidence >= 0 and each.last_ns > oldest_ns)
         ])
 
     def _join(self, now: list[Followed], missing: list[Followed]) -> dict[int, int]:
@@ -387,7 +408,7 @@ class Tracker:
     def _same_object(self, followed: Followed, by_id: Mapping[int, Followed]) -> Followed | None:
         """Another track of the same object, if there is one."""
         other = double_of(followed, by_id, self._settings.neighbour_m / self._settings.unit_m)
-        if other is None and followed.moves and followed.views <= _FIRST_VIEWS:
+        if other is None and followed.moves and followed.views <= self._settings.evidence.first_views:
             density = self._settings.new_per_m2 * self._settings.unit_m**2
             other = earlier_mover(followed, self._followed, density)
         return other
@@ -413,6 +434,7 @@ class _PairOdds:
     fits: Floats
     unseen: float
     sure: NDArray[np.bool_]
+    settings: PairSettings
 
     @property
     def mean_own_m2(self) -> Floats:
@@ -421,7 +443,7 @@ class _PairOdds:
 
     def gains(self, offsets_m: PointsM, offsets_m2: Floats) -> Floats:
         """(tracks, sightings) how much likelier pairs are than new objects, tracks off by so much, (N, 2) and (N,)."""
-        near = place_likelihoods(self.motions, self.places_m, self.own_m2, offsets_m, offsets_m2)
+        near = place_likelihoods(self.motions, self.places_m, self.own_m2, offsets_m, offsets_m2, self.settings)
         return near + self.fits - self.unseen
 
     def assign(self, gain: Floats) -> Pairs:
@@ -434,20 +456,21 @@ class _PairOdds:
     def vote(self, shares: Floats, left_m2: Floats, slow_m2: float, gain: Floats, reluctance: float) -> PointsM:
         """The shift that most pairs agree in (`voted_shift`)."""
         return voted_shift(
-            self.motions, self.places_m, self.own_m2, shares, left_m2, slow_m2, self.fits, gain, self.unseen, reluctance
+            self.motions, self.places_m, self.own_m2, shares, left_m2, slow_m2, self.fits, gain, self.unseen,
+            self.settings, reluctance,
         )
 
 
 class _Seen:
     """One frame's sightings as columns."""
 
-    def __init__(self, sightings: Sequence[Sighting], looks: Floats | None) -> None:
+    def __init__(self, sightings: Sequence[Sighting], looks: Floats | None, errors: SharedErrorSettings) -> None:
         self.sightings, self.looks = sightings, None if looks is None else np.asarray(looks, np.float64)
         self.places_m = np.array([each.position_m for each in sightings]).reshape(-1, 2)
         self.scores = np.array([each.score for each in sightings])
         self.labels = [each.label for each in sightings]
         self.sides_m = np.array([each.size_m[0] for each in sightings])
-        self.own_m2 = _own_covariances(sightings)
+        self.own_m2 = _own_covariances(sightings, errors)
         boxes_px = np.array([each.box_px for each in sightings]).reshape(-1, 4)
         self.doubles = frame_doubles(boxes_px, self.labels, self.scores)
 
@@ -475,13 +498,13 @@ def _count_meetings(now: list[Followed], missing: list[Followed], reach_m: float
         second.apart[first.id] = second.apart.get(first.id, 0) + 1
 
 
-def _own_covariances(sightings: Sequence[Sighting]) -> Floats:
+def _own_covariances(sightings: Sequence[Sighting], errors: SharedErrorSettings) -> Floats:
     """(N, 2, 2) what sightings err each for itself."""
     whole = np.array([each.covariance_m2 for each in sightings]).reshape(-1, 2, 2)
     shared = np.array([each.shared_sigma_m for each in sightings])
     values, vectors = np.linalg.eigh(whole)
-    least = np.maximum(_LEAST_OWN_SHARE * values.mean(axis=1), 1e-6)
-    own = np.maximum(values - shared[:, None] ** 2, least[:, None]) + (_UNEVEN * shared[:, None]) ** 2
+    least = np.maximum(errors.least_own_share * values.mean(axis=1), 1e-6)
+    own = np.maximum(values - shared[:, None] ** 2, least[:, None]) + (errors.uneven * shared[:, None]) ** 2
     return (vectors * own[:, None, :]) @ vectors.swapaxes(1, 2)
 
 

@@ -33,7 +33,7 @@ from sorvolo.change.evidence.cells import (
     pieces,
 )
 from sorvolo.change.evidence.pictures import PictureSettings
-from sorvolo.change.motion.blob_tracker import BlobTracker, MovingSettings, Track
+from sorvolo.change.motion.blob_tracker import BlobTracker, MovingBlobs, MovingSettings
 from sorvolo.change.motion.moving_changes import Movers
 from sorvolo.change.shape.shadows import ThingSettings, shade_share
 from sorvolo.change.shape.things import Parts
@@ -138,7 +138,7 @@ class EvidenceMap:
             return ()
         most_pictures = self._pictures_for(view)
         self._last = (view.index, view.time_ns, view.camera_m)
-        kept_view, movers = self._lay(view)
+        kept_view, moving = self._lay(view)
         evidence = self._grid.record(kept_view.laid, kept_view.counts)
         earlier = list(self._recent)
         self._recent.append(kept_view)
@@ -146,7 +146,7 @@ class EvidenceMap:
         new = {each for each in begun if self._current(each) == each}
         shown, pictures = self._update(view, kept_view, evidence.owner, new, most_pictures - len(begun))
         announced = [change for each in shown for change in self._announce(each, view.time_ns)]
-        announced += self._movers.see(view, movers, self._next_number)
+        announced += self._movers.see(view, moving, self._next_number)
         self._seeds.keep(view, kept_view, evidence, most_pictures - len(begun) - pictures)
         return tuple(announced)
 
@@ -216,7 +216,7 @@ class EvidenceMap:
         waited_s = np.inf if self._last is None else (view.time_ns - self._last[1]) * 1e-9
         return self._gathering.pictures.for_view(waited_s)
 
-    def _lay(self, view: ComparedView) -> tuple[KeptView, tuple[Track, ...]]:
+    def _lay(self, view: ComparedView) -> tuple[KeptView, MovingBlobs]:
         """The view as cells, without what moves, and what moves in it."""
         most = self._gathering.all_changed * int(np.count_nonzero(view.valid))
         may_follow = np.count_nonzero(view.changed) < most
@@ -231,7 +231,7 @@ class EvidenceMap:
             view.time_ns, laid, view.camera_m, view.site_from_image, view.changed, view.valid, residual_m,
             self._is_new_place(view),
         )
-        return kept_view, followed.movers
+        return kept_view, followed
 
     def _is_new_place(self, view: ComparedView) -> bool:
         last, least_m = self._counted_at_m, self._gathering.moved_heights * float(view.camera_m[2])

@@ -1,11 +1,11 @@
 """The moving things of a flight as they are announced: one change each, brought up to date while it is seen."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from sorvolo.change.motion.blob_tracker import Track
+from sorvolo.change.motion.blob_tracker import BlobTrack, MovingBlobs
 from sorvolo.change.motion.blobs import standing_outline_m
 from sorvolo.change.shape.outlines import measures
 from sorvolo.change.shape.patches import PatchWindow, cut, patch_of
@@ -29,11 +29,15 @@ class Movers:
         """All of them as they were seen last."""
         return tuple(self._known.values())
 
-    def see(self, view: ComparedView, tracks: Sequence[Track], next_number: Callable[[], int]) -> list[Change]:
+    def see(self, view: ComparedView, moving: MovingBlobs, next_number: Callable[[], int]) -> list[Change]:
         """Bring what moves in this view up to date; those announced first, whose ids `next_number` gives."""
         announced = []
-        for track in tracks:
-            known = self._known.get(track.mover)
+        for gone, kept in moving.merged.items():
+            twice = self._known.pop(gone, None)
+            if twice is not None:
+                self._known.setdefault(kept, twice)
+        for track in moving.movers:
+            known = self._known.get(track.number)
             if known is None:
                 change = self._change(view, track, f"{self._prefix}-{next_number()}")
                 announced.append(change)
@@ -43,10 +47,10 @@ class Movers:
                     change, first_seen_ns=known.first_seen_ns, views=max(change.views, known.views + 1),
                     announced_ns=known.announced_ns,
                 )
-            self._known[track.mover] = change
+            self._known[track.number] = change
         return announced
 
-    def _change(self, view: ComparedView, track: Track, change_id: str) -> Change:
+    def _change(self, view: ComparedView, track: BlobTrack, change_id: str) -> Change:
         """A moving thing as this view shows it."""
         m_per_px = view.m_per_px
         outline_m = standing_outline_m(view, track.last.blob)
