@@ -12,6 +12,7 @@ from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.orthophoto import OrthophotoSettings, choose_photos, paint_orthophoto, visible
 from sorvolo.heights.relief import relief_picture
 from sorvolo.heights.semiglobal import SmoothingSettings, smoothed
+from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.heights.surface import Surface, sweep_surface
 from sorvolo.heights.terrain import TerrainSettings, filled, terrain
 from sorvolo.registration.features import gray_from_rgb
@@ -37,7 +38,7 @@ def surface(survey) -> Surface:
 
     points = lattice.points_m().reshape(-1, 2)[::300]
     points = np.column_stack([points, hills_with_houses(*points.T)])
-    *shares, found = sweep_surface(lattice, views, gray, points, 0.01)
+    *shares, found = sweep_surface(lattice, views, gray, points, SmoothSigma())
     assert shares[-1] == 1.0 and np.all(np.diff(shares) > 0)
     assert isinstance(found, Surface)
     return found
@@ -190,5 +191,53 @@ def test_ground_without_texture_is_a_hole_or_unsure(survey) -> None:
     grey = np.full((240, 320), 128, np.uint8)
     places = lattice.points_m().reshape(-1, 2)[::50]
     points = np.column_stack([places, np.zeros(len(places))])
-    *_, found = sweep_surface(lattice, views, lambda number, size_m: grey, points, 0.01)
+    *_, found = sweep_surface(lattice, views, lambda number, size_m: grey, points, SmoothSigma())
     assert isinstance(found, Surface) and np.isnan(found.up_m).all()
+
+
+def kerbs_and_a_house(x, y):
+    """Level ground with a house of 6 m at the south rim of what a strip along x sees."""
+    return np.where((np.abs(x) < 4) & (y < -9), 6.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def one_strip() -> Surface:
+    """Heights of one strip along x, over lines along x too: nothing but texture between them shows the height."""
+    views, look = survey_views(strips=1, photos=5, side_px=320), texture()
+
+    def kerbs(x, y):
+        lines = (np.abs(y - 5.0) < 0.25) | (np.abs(y + 3.0) < 0.25)
+        return np.where(lines[..., None], 235.0, 0.6 * look(x, y))
+
+    pictures = [photo(view, kerbs_and_a_house, kerbs, 6.3, -0.1) for view in views]
+    gsd_m = 30 / views[0].camera.fx_px
+    lattice = Lattice.over(np.array([[-14.0, -14], [14, 10]]), SiteGrid.at(ORIGIN, gsd_m, CRS))
+
+    def gray(number: int, size_m: float):
+        picture, scale = gray_from_rgb(pictures[number]), min(1.0, gsd_m / size_m)
+        return cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+
+    points = np.array([[0.0, 0, 0], [3, 3, 0], [0, -10, 6]])
+    *_, found = sweep_surface(lattice, views, gray, points, SmoothSigma())
+    assert isinstance(found, Surface)
+    return found
+
+
+def test_an_edge_along_the_flight_is_no_evidence_of_height(one_strip: Surface) -> None:
+    """It fits itself at every height, and would pull the ground beside it up into a ramp."""
+    points = one_strip.lattice.points_m()
+    x, y = points[..., 0], points[..., 1]
+    ground = (y > -6) & (y < 7) & (np.abs(x) < 6)
+    known = ground & np.isfinite(one_strip.up_m)
+    assert known.sum() > 0.97 * ground.sum()
+    assert np.abs(one_strip.up_m[known]).max() < 0.6
+
+
+def test_a_roof_that_reaches_out_of_the_photos_is_right_or_a_hole(one_strip: Surface) -> None:
+    """The photos see less of the roof's height than of the ground's: beyond, no height is right."""
+    points = one_strip.lattice.points_m()
+    roof = (np.abs(points[..., 0]) < 2.5) & (points[..., 1] < -9.6)
+    known = roof & np.isfinite(one_strip.up_m)
+    assert 0.05 < known.sum() / roof.sum() < 0.9
+    assert np.median(np.abs(one_strip.up_m[known] - 6)) < 0.3
+    assert (np.abs(one_strip.up_m[known] - 6) > 1).mean() < 0.2

@@ -14,7 +14,7 @@ from scipy.sparse import csr_matrix
 from sorvolo.geometry.arrays import Floats, Mask, PointsM, Rows
 from sorvolo.geometry.pose import rotation_from_vector
 
-_SHARED = 2  # logarithm of the focal scale, left-over radial distortion
+_SHARED = 5  # logarithm of the focal scale, left-over distortion of third and fifth order, optical centre x and y
 _SIX = np.arange(6)
 
 
@@ -25,9 +25,11 @@ class AdjustmentSettings:
     sigma_px: float = 0.5  # of a feature's place
     robust_sigmas: float = 2.0  # where the Cauchy loss bends
     focal_sigma: float = 0.02  # relative, of the focal length that the map's flight settled on
-    radial_sigma: float = 0.02
+    radial_sigma: tuple[float, float] = (0.02, 0.02)  # of third and fifth order
+    centre_sigma: float = 0.01  # of the optical centre, in focal lengths
     attitude_sigma_deg: float = 3.0  # of the map's attitudes: they bend where the ground is not level
     iterations: int = 25
+    least_sigma_px: float = 0.1  # of a feature's place, however well all fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +37,8 @@ class Scene:
     """N cameras, P points, M observations.
 
     `rotations` (N, 3, 3) site_from_camera, `centres_m` (N, 3), `focal_px` (N,); `points_m` (P, 3); `view` and `point`
-    (M,) rows; `seen` (M, 2) undistorted points as normalised rays (x / z, y / z). `shared` (2,): a point is seen at
-    exp(shared[0]) x / z = seen (1 + shared[1] |seen|^2).
+    (M,) rows; `seen` (M, 2) undistorted points as normalised rays (x / z, y / z). `shared` (5,): a point is
+    seen at exp(shared[0]) x / z = seen (1 + shared[1] |seen|^2 + shared[2] |seen|^4) + shared[3:].
     """
 
     rotations: Floats
@@ -53,8 +55,11 @@ class Scene:
         local = self._local()
         with np.errstate(divide="ignore", invalid="ignore"):
             image = np.where(local[:, 2:] > 1e-6, local[:, :2] / local[:, 2:], np.nan)
-        lens = 1 + self.shared[1] * (self.seen**2).sum(axis=1, keepdims=True)
-        return self.focal_px[self.view, None] * (np.exp(self.shared[0]) * image - self.seen * lens)
+        return self.focal_px[self.view, None] * (np.exp(self.shared[0]) * image - self.corrected())
+
+    def corrected(self) -> Floats:
+        """(M, 2) where the points would be seen by the lens as it was found."""
+        return through_lens(self.seen, self.shared)
 
     def keeping(self, observations: Mask) -> "Scene":
         """The scene with these observations, (M,) bool, only, and the points that two of them still see."""
@@ -71,6 +76,12 @@ class Scene:
         return np.einsum("mji,mj->mi", self.rotations[self.view], offset)
 
 
+def through_lens(seen: Floats, shared: Floats) -> Floats:
+    """(M, 2) normalised rays without the left-over distortion and shift of `shared` (see Scene)."""
+    square = (seen**2).sum(axis=1, keepdims=True)
+    return seen * (1 + shared[1] * square + shared[2] * square**2) + shared[3:]
+
+
 @dataclass(frozen=True, eq=False)
 class Priors:
     """What is known of the cameras beside the pictures: fixes (N, 3) with sigmas (N, 3; inf: none), attitudes."""
@@ -85,17 +96,16 @@ class _Normal:
     """One linearisation: the cameras' system without the points, and what gives the points back."""
 
     cost: float
-    cameras: Floats  # (6 N + 2, 6 N + 2)
-    gradient: Floats  # (6 N + 2,)
-    coupling: csr_matrix  # (6 N + 2, 3 P)
+    cameras: Floats  # (6 N + 5, 6 N + 2)
+    gradient: Floats  # (6 N + 5,)
+    coupling: csr_matrix  # (6 N + 5, 3 P)
     points: Floats  # (P, 3, 3)
     point_gradient: Floats  # (P, 3)
 
 
 def triangulate(scene: Scene) -> PointsM:
     """(P, 3) the points nearest to the rays of their observations; NaN where rays are almost parallel."""
-    lens = 1 + scene.shared[1] * (scene.seen**2).sum(axis=1, keepdims=True)
-    rays = np.concatenate([scene.seen * lens / np.exp(scene.shared[0]), np.ones((len(scene.seen), 1))], axis=1)
+    rays = np.concatenate([scene.corrected() / np.exp(scene.shared[0]), np.ones((len(scene.seen), 1))], axis=1)
     rays = np.einsum("mij,mj->mi", scene.rotations[scene.view], rays)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
@@ -128,6 +138,23 @@ def adjust(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> Scene:
     return scene
 
 
+def height_deviations(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> Floats:
+    """(P,) what the heights of the points err, one sigma in m, by the error of cameras and lens.
+
+    What all heights err in common is left out: the points' mean height.
+    """
+    normal = _linearise(scene, priors, settings)
+    inverse: Floats = np.asarray(np.linalg.inv(normal.points + 1e-9 * np.eye(3)), np.float64)
+    count = len(inverse)
+    rows, columns = np.repeat(np.arange(count), 3), np.arange(3 * count)
+    up = csr_matrix((inverse[:, 2].ravel(), (rows, columns)), shape=(count, 3 * count))
+    moved = -(up @ normal.coupling.T).toarray()
+    moved -= moved.mean(axis=0)
+    system = normal.cameras - _eliminated(normal, inverse)[0].toarray()
+    half = np.linalg.solve(np.linalg.cholesky(system + 1e-9 * np.eye(len(system))), moved.T)
+    return np.asarray(np.sqrt((half**2).sum(axis=0)))
+
+
 def _linearise(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> _Normal:
     residual, by_camera, by_shared, by_point = _derivatives(scene)
     white = residual / settings.sigma_px
@@ -152,7 +179,7 @@ def _linearise(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> _N
     gradient[:-_SHARED] = -_summed(_pulls(by_camera, residual), scene.view, views).ravel()
     gradient[-_SHARED:] = -_pulls(by_shared, residual).sum(axis=0)
     cost += _add_priors(scene, priors, settings, system, gradient)
-    lens_sigma = np.array([settings.focal_sigma, settings.radial_sigma])
+    lens_sigma = np.array([settings.focal_sigma, *settings.radial_sigma, *2 * (settings.centre_sigma,)])
     system[-_SHARED:, -_SHARED:] += np.diag(1 / lens_sigma**2)
     gradient[-_SHARED:] -= scene.shared / lens_sigma**2
     cost += float(((scene.shared / lens_sigma) ** 2).sum())
@@ -164,7 +191,7 @@ def _linearise(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> _N
 
 
 def _derivatives(scene: Scene) -> tuple[Floats, Floats, Floats, Floats]:
-    """Residuals (M, 2), px, and their derivatives: camera (M, 2, 6), shared (M, 2, 2), point (M, 2, 3)."""
+    """Residuals (M, 2), px, and their derivatives: camera (M, 2, 6), shared (M, 2, 5), point (M, 2, 3)."""
     turn = scene.rotations[scene.view]
     offset = scene.points_m[scene.point] - scene.centres_m[scene.view]
     local = np.einsum("mji,mj->mi", turn, offset)
@@ -172,12 +199,14 @@ def _derivatives(scene: Scene) -> tuple[Floats, Floats, Floats, Floats]:
     image = local[:, :2] / depth
     focal = scene.focal_px[scene.view, None]
     scale, square = np.exp(scene.shared[0]), (scene.seen**2).sum(axis=1, keepdims=True)
-    residual = focal * (scale * image - scene.seen * (1 + scene.shared[1] * square))
+    residual = focal * (scale * image - scene.corrected())
     across = turn.transpose(0, 2, 1)
     by_point = (focal * scale / depth)[..., None] * (across[:, :2] - image[..., None] * across[:, 2:])
     by_turn = np.cross(by_point, offset[:, None, :])
     by_camera = np.concatenate([by_turn, -by_point], axis=2)
-    by_shared = np.stack([focal * scale * image, -focal * scene.seen * square], axis=2)
+    shift = np.broadcast_to(-focal[..., None] * np.eye(2), (len(image), 2, 2))
+    lens = np.stack([focal * scale * image, -focal * scene.seen * square, -focal * scene.seen * square**2], axis=2)
+    by_shared = np.concatenate([lens, shift], axis=2)
     return residual, by_camera, by_shared, by_point
 
 
@@ -204,7 +233,7 @@ def _add_priors(
 
 
 def _coupling(by_camera: Floats, by_shared: Floats, scene: Scene, size: int) -> csr_matrix:
-    """(6 N + 2, 3 P) how cameras, (M, 6, 3), and shared unknowns, (P, 2, 3), depend on points."""
+    """(6 N + 5, 3 P) how cameras, (M, 6, 3), and shared unknowns, (P, 5, 3), depend on points."""
     rows = [(6 * scene.view[:, None] + _SIX)[:, :, None], np.full((len(by_shared), 1, 1), size - _SHARED)
             + np.arange(_SHARED)[:, None]]
     columns = [3 * scene.point[:, None, None] + np.arange(3), 3 * np.arange(len(by_shared))[:, None, None]
@@ -217,16 +246,11 @@ def _coupling(by_camera: Floats, by_shared: Floats, scene: Scene, size: int) -> 
 
 
 def _step(normal: _Normal, damping: float) -> tuple[Floats, Floats]:
-    """The steps of the cameras and shared unknowns, (6 N + 2,), and of the points, (P, 3)."""
+    """The steps of the cameras and shared unknowns, (6 N + 5,), and of the points, (P, 3)."""
     damped = normal.points * (1 + damping * np.eye(3)) + 1e-9 * np.eye(3)
-    inverse = np.linalg.inv(damped)
-    count = len(inverse)
-    at = np.arange(3 * count).reshape(-1, 3)
-    spread = csr_matrix(
-        (inverse.ravel(), (np.repeat(at, 3, axis=1).ravel(), np.tile(at, (1, 3)).ravel())), shape=(3 * count, 3 * count)
-    )
-    through = normal.coupling @ spread
-    system = normal.cameras - (through @ normal.coupling.T).toarray()
+    inverse: Floats = np.asarray(np.linalg.inv(damped), np.float64)
+    reduced, through = _eliminated(normal, inverse)
+    system = normal.cameras - reduced.toarray()
     system[np.diag_indices_from(system)] += damping * np.diag(normal.cameras) + 1e-9
     gradient = normal.gradient - through @ normal.point_gradient.ravel()
     try:
@@ -235,6 +259,17 @@ def _step(normal: _Normal, damping: float) -> tuple[Floats, Floats]:
         cameras = np.linalg.lstsq(system, gradient, rcond=None)[0]
     points = np.einsum("pij,pj->pi", inverse, normal.point_gradient - (normal.coupling.T @ cameras).reshape(-1, 3))
     return cameras, points
+
+
+def _eliminated(normal: _Normal, inverse: Floats) -> tuple[csr_matrix, csr_matrix]:
+    """What the points, their blocks (P, 3, 3) inverted, take from the cameras' system, and the cameras through them."""
+    count = len(inverse)
+    at = np.arange(3 * count).reshape(-1, 3)
+    spread = csr_matrix(
+        (inverse.ravel(), (np.repeat(at, 3, axis=1).ravel(), np.tile(at, (1, 3)).ravel())), shape=(3 * count, 3 * count)
+    )
+    through = normal.coupling @ spread
+    return through @ normal.coupling.T, through
 
 
 def _advance(scene: Scene, cameras: Floats, points: Floats) -> Scene:

@@ -7,8 +7,10 @@ import numpy as np
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageGray, Mask, PointsM
+from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
-from sorvolo.heights.adjustment import AdjustmentSettings, Priors, Scene, adjust, triangulate
+from sorvolo.heights.adjustment import AdjustmentSettings, Priors, Scene, adjust, height_deviations, triangulate
+from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.heights.tracks import Tracks, TrackSettings, find_tracks
 from sorvolo.heights.views import View
 
@@ -27,9 +29,10 @@ class CameraSettings:
 class Cameras3D:
     """The views where they stand in 3D (those that tracks hold), and the points that they see.
 
-    `radial` is the left-over distortion to be taken out of pictures; the views' cameras have the focal length found.
+    `radial` is the left-over distortion, of third and fifth order, to be taken out of pictures; the views' cameras have
+    the focal length and the optical centre found.
     `lost` are the names of views that no track holds. `points_m` (P, 3), `residual_px` the rms of all observations at
-    the views' size, `fix_rms_m` (3,) cameras minus fixes, NaN without; `height_sigma_m` what points err in height.
+    the views' size, `fix_rms_m` (3,) cameras minus fixes, NaN without; `height_sigma` what heights err by the cameras.
     """
 
     views: tuple[View, ...]
@@ -37,10 +40,10 @@ class Cameras3D:
     points_m: PointsM
     residual_px: float
     focal_scale: float
-    radial: float
+    radial: tuple[float, float]
     fix_rms_m: Floats
     observations: int
-    height_sigma_m: float = 0.0
+    height_sigma: SmoothSigma = field(default_factory=SmoothSigma)
 
 
 def solve_cameras(
@@ -60,7 +63,7 @@ def solve_cameras(
         scene = adjust(scene, priors, settings.adjustment)
         if limit_px is not None:
             scene = scene.keeping(_fitting(scene, limit_px))
-    return _solved(views, scene, priors, held)
+    return _solved(views, scene, priors, held, settings)
 
 
 def _first(views: Sequence[View], tracks: Tracks) -> Scene:
@@ -68,7 +71,7 @@ def _first(views: Sequence[View], tracks: Tracks) -> Scene:
         np.array([each.site_from_camera.rotation for each in views]),
         np.array([each.site_from_camera.translation_m for each in views]),
         np.array([each.camera.fx_px for each in views]),
-        np.full((tracks.count, 3), np.nan), tracks.view, tracks.point, tracks.seen, np.zeros(2),
+        np.full((tracks.count, 3), np.nan), tracks.view, tracks.point, tracks.seen, np.zeros(5),
     )
     scene = replace(scene, points_m=triangulate(scene))
     known = np.asarray(np.isfinite(scene.points_m).all(axis=1))
@@ -99,10 +102,12 @@ def _priors(views: Sequence[View], settings: CameraSettings) -> Priors:
     return Priors(fixes + middle, sigmas, rotations)
 
 
-def _solved(views: Sequence[View], scene: Scene, priors: Priors, held: Mask) -> Cameras3D:
+def _solved(
+    views: Sequence[View], scene: Scene, priors: Priors, held: Mask, settings: CameraSettings
+) -> Cameras3D:
     scale = float(np.exp(scene.shared[0]))
     moved = tuple(
-        replace(view, camera=view.camera.with_focal_px(view.camera.fx_px * scale),
+        replace(view, camera=_found(view.camera, scale, scene.shared[3:]),
                 site_from_camera=Pose(scene.rotations[k], scene.centres_m[k]))
         for k, view in enumerate(views) if held[k]
     )
@@ -111,16 +116,26 @@ def _solved(views: Sequence[View], scene: Scene, priors: Priors, held: Mask) -> 
         off = (scene.centres_m - priors.fixes_m)[held]
     return Cameras3D(
         moved, tuple(view.name for k, view in enumerate(views) if not held[k]), scene.points_m,
-        float(np.sqrt(np.nanmean((residual**2).sum(axis=1)))), scale, float(scene.shared[1]),
-        np.sqrt(np.nanmean(off**2, axis=0)), len(scene.view), _height_sigma_m(scene, residual),
+        float(np.sqrt(np.nanmean((residual**2).sum(axis=1)))), scale,
+        (float(scene.shared[1]), float(scene.shared[2])),
+        np.sqrt(np.nanmean(off**2, axis=0)), len(scene.view),
+        _height_sigma(scene, priors, residual, settings.adjustment),
     )
 
 
-def _height_sigma_m(scene: Scene, residual_px: Floats) -> float:
-    """What heights err by the cameras' own error: the median residual of a view's points, as a height."""
-    depth_m = np.median(scene.centres_m[:, 2]) - np.median(scene.points_m[:, 2])
-    by_view = np.linalg.norm([
-        np.median(residual_px[scene.view == each], axis=0) for each in np.unique(scene.view)
-    ], axis=1)
-    # a typical base is half the height: an error across the base counts twice
-    return float(2 * depth_m / np.median(scene.focal_px) * np.sqrt(np.mean(by_view**2)))
+def _found(camera: Camera, scale: float, shift: Floats) -> Camera:
+    """The camera with the focal length and the optical centre found, for pictures without the left-over distortion."""
+    return replace(
+        camera.with_focal_px(camera.fx_px * scale), cx_px=float(camera.cx_px - camera.fx_px * shift[0]),
+        cy_px=float(camera.cy_px - camera.fy_px * shift[1]),
+    )
+
+
+def _height_sigma(scene: Scene, priors: Priors, residual_px: Floats, settings: AdjustmentSettings) -> SmoothSigma:
+    """What heights err by the cameras: points' covariance through that of cameras and lens, the mean height left out.
+
+    The pictures weigh as they fit (their residuals' median), which is better than the settings assume.
+    """
+    fit_px = 1.4826 * float(np.nanmedian(np.abs(residual_px)))
+    fitting = replace(settings, sigma_px=max(fit_px, settings.least_sigma_px))
+    return SmoothSigma.fitted(scene.points_m[:, :2], height_deviations(scene, priors, fitting))

@@ -20,7 +20,7 @@ def camera_figures(solved: Cameras3D) -> Mapping[str, Any]:
         "observations": solved.observations, "residual_rms_px": solved.residual_px,
         "focal_px": solved.views[0].camera.fx_px, "focal_scale": solved.focal_scale, "radial": solved.radial,
         "fix_rms_m": {axis: float(each) for axis, each in zip(("east", "north", "up"), solved.fix_rms_m)},
-        "height_sigma_m": solved.height_sigma_m,
+        "optical_centre_px": [solved.views[0].camera.cx_px, solved.views[0].camera.cy_px],
         "places": [
             {"frame": view.name, "east_m": float(e), "north_m": float(n), "up_m": float(u),
              "rotation": view.site_from_camera.rotation.ravel()}

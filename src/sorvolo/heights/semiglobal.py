@@ -9,10 +9,12 @@ from sorvolo.geometry.arrays import Floats32
 
 @dataclass(frozen=True)
 class SmoothingSettings:
-    """What a change of height between neighbours costs, in units of the matching cost (0 to 1)."""
+    """What heights cost beside their matching cost (0 to 1), in its units."""
 
-    one_level: float = 0.1
-    more_levels: float = 1.2
+    one_level: float = 0.1  # a change of height between neighbours
+    more_levels: float = 0.9
+    unseen: float = 0.75  # a height at which fewer than two photos see the cell: about as a match by chance
+    temperature: float = 0.04  # of a path's total cost, by which a height is e times less likely: fits sigma to errors
 
 
 def smoothed(cost: Floats32, settings: SmoothingSettings) -> Floats32:

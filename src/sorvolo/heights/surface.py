@@ -8,8 +8,13 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, PointsM
 from sorvolo.heights.lattice import Lattice
+from sorvolo.heights.semiglobal import SmoothingSettings
+from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.heights.sweep import Bounds, SweepSettings, Swept, sweep
 from sorvolo.heights.views import View
+
+# a crown is few coarse cells wide
+_NARROW = SweepSettings(window_cells=(3, 7), smoothing=SmoothingSettings(more_levels=0.6))
 
 
 @dataclass(frozen=True)
@@ -17,12 +22,13 @@ class SurfaceSettings:
     """How the height model is made, and how its sigma follows from what the sweep saw."""
 
     sweep: SweepSettings = field(default_factory=SweepSettings)
-    coarser: int = 4  # cells of the first sweep, in those of the model
+    coarse: SweepSettings = field(default_factory=lambda: _NARROW)  # to find what heights a tile has
+    coarser: int = 2  # cells of the first sweep, in those of the model
     tile_cells: int = 320
     tile_share: float = 0.3  # of a photo's ground: a tile is seen whole by the photos that are compared on it
-    apron_cells: int = 20  # beyond a tile, so that neighbouring tiles agree
+    apron_cells: int = 12  # beyond a tile, so that neighbouring tiles agree
     margin_cells: float = 12.0  # heights searched above and below what the first sweep found, in cells
-    match_cells: float = 0.25  # sigma of a match where photos agree perfectly, in cells of parallax
+    match_cells: float = 0.12  # sigma of a match where photos agree perfectly, in cells of parallax
     relief_share: float = 0.25  # of the heights' spread around a cell: at an edge it is not known which is right
 
 
@@ -45,12 +51,12 @@ class Surface:
 
 def sweep_surface(
     lattice: Lattice, views: Sequence[View], pictures: Callable[[int, float], ImageGray], points_m: PointsM,
-    camera_sigma_m: float, settings: SurfaceSettings = SurfaceSettings(),
+    camera_sigma: SmoothSigma, settings: SurfaceSettings = SurfaceSettings(),
 ) -> Iterator[Surface | float]:
     """Yields the share of tiles done, 0 to 1, and in the end the surface.
 
     `pictures(i, size_m)` is view i's gray picture whose pixels cover about `size_m` of ground; `points_m` (P, 3) are
-    points in space that bound the heights to look for; `camera_sigma_m` is what the cameras err in common.
+    points in space that bound the heights to look for; `camera_sigma` is what heights err by the cameras.
     """
     heights_m = np.array([view.site_from_camera.translation_m[2] for view in views])
     everywhere = _bounds(points_m, float(np.median(heights_m)))
@@ -66,7 +72,7 @@ def sweep_surface(
         if bounds is not None:
             swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, settings.sweep)
             found = _calmed(swept)
-            sigma = _sigma_m(swept, found, lattice.cell_m, camera_sigma_m, settings)
+            sigma = _sigma_m(swept, found, window, camera_sigma, settings)
             inner = slice(apron, -apron), slice(apron, -apron)
             up_m[y0:y1, x0:x1], sigma_m[y0:y1, x0:x1] = found[inner], sigma[inner]
             covered[y0:y1, x0:x1] = swept.seen_by[inner] >= 2
@@ -87,10 +93,10 @@ def _coarse(
     settings: SurfaceSettings,
 ) -> Floats32:
     up_m = np.full(lattice.shape, np.nan, np.float32)
-    apron = settings.apron_cells // 2
+    apron = settings.apron_cells
     for x0, y0, x1, y1 in lattice.windows(_tile_cells(lattice.cell_m, views, settings)):
         window = lattice.window(x0 - apron, y0 - apron, x1 + apron, y1 + apron)
-        swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, settings.sweep)
+        swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, settings.coarse)
         up_m[y0:y1, x0:x1] = _calmed(swept)[apron:-apron, apron:-apron]
     return up_m
 
@@ -127,13 +133,14 @@ def _calmed(swept: Swept) -> Floats32:
 
 
 def _sigma_m(
-    swept: Swept, up_m: Floats32, cell_m: float, camera_sigma_m: float, settings: SurfaceSettings
+    swept: Swept, up_m: Floats32, lattice: Lattice, camera_sigma: SmoothSigma, settings: SurfaceSettings
 ) -> Floats32:
-    """(H, W) one sigma of the heights: of the match, of an edge nearby, and of the cameras."""
+    """(H, W) one sigma of the heights: of the match, of other likely heights, of an edge nearby, of the cameras."""
     likeness = np.sqrt(np.clip(swept.score, 0.01, 1))
-    match = settings.match_cells * cell_m / np.maximum(swept.spread, 0.02) / likeness
+    match = settings.match_cells * lattice.cell_m / np.maximum(swept.spread, 0.02) / likeness
     relief = settings.relief_share * _relief(up_m)
-    sigma = np.sqrt(match**2 + relief**2 + camera_sigma_m**2).astype(np.float32)
+    other = np.nan_to_num(swept.deviation_m)
+    sigma = np.sqrt(match**2 + relief**2 + other**2 + camera_sigma.on(lattice) ** 2).astype(np.float32)
     sigma[~np.isfinite(up_m)] = np.nan
     return sigma
 

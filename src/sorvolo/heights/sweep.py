@@ -4,18 +4,21 @@ Collins 1996, with the photos compared pair by pair (normalised cross-correlatio
 and one that cannot see a place does not decide about it.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Matrix3
+from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Matrix3, PointsM
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.semiglobal import SmoothingSettings, smoothed
 from sorvolo.heights.views import View, inside
 
 _MORE = 3  # views beyond the wanted ones
+_ANGLES = 16  # directions in a picture that are told apart, over half a turn
+_ANGLE_RAD = np.pi / _ANGLES
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,8 @@ class SweepSettings:
 
     views: int = 4  # laid over each other at a time
     window_cells: tuple[int, int] = (5, 15)  # sides of the patches that are compared: detail, and what is sure
+    contrast_px: int = 9  # side of the surroundings that a pixel's gray is measured against
+    pair_share: float = 0.5  # of the pairs of photos that see a cell: the others may be hidden from it
     noise_levels: float = 3.0  # gray levels; texture below it decides nothing
     level_px: float = 0.8  # parallax between two planes, of the two photos farthest apart
     most_levels: int = 160
@@ -43,12 +48,14 @@ class Bounds:
 @dataclass(frozen=True, eq=False)
 class Swept:
     """Heights of a window of cells, (H, W) each: `up_m` NaN where nothing agrees, the agreement (0 to 1), how many
-    photos see the cell, and the tangent of the angle between the two of them farthest apart."""
+    photos see the cell, the tangent of the angle between the two of them farthest apart, and how far from the height
+    those lie that are likely too."""
 
     up_m: Floats32
     score: Floats32
     seen_by: Floats32
     spread: Floats32
+    deviation_m: Floats32
 
 
 def sweep(
@@ -57,30 +64,32 @@ def sweep(
 ) -> Swept:
     """The heights within bounds of a lattice's cells.
 
-    `pictures(i)` is view i's gray picture, uint8, of any size; it should have about a cell's detail. A cell that fewer
-    than two photos see when it lies at the usual height is a hole: two photos see more of the depth than of the ground,
-    so that at their rim every match is too low.
+    `pictures(i)` is view i's gray picture, uint8, of any size; it should have about a cell's detail. Which photos
+    see a cell depends on its height: where fewer than two see the height that fits best, the cell is a hole.
     """
     low_m, high_m = bounds.low_m, bounds.high_m
     chosen = choose_views(lattice, views, bounds.usual_m, settings.views)
     shape = lattice.shape
     if len(chosen) < 2:
         nothing = np.full(shape, np.nan, np.float32)
-        return Swept(nothing, *(np.full(shape, each, np.float32) for each in (0.0, len(chosen), 0.0)))
+        return Swept(nothing, *(np.full(shape, each, np.float32) for each in (0.0, len(chosen), 0.0, np.nan)))
     spreads = _spreads(lattice, [views[k] for k in chosen], bounds.usual_m)
     finest_m = settings.level_px * lattice.cell_m / max(float(spreads.max()), 0.05)
     level_m = max(finest_m, (high_m - low_m) / (settings.most_levels - 1))
     levels = low_m + level_m * np.arange(int(np.ceil((high_m - low_m) / level_m)) + 1)
-    laid = [_Laid(views[k], pictures(k), lattice) for k in chosen]
+    eyes_m = np.array([views[k].site_from_camera.translation_m for k in chosen])
+    laid = [_Laid(views[k], pictures(k), lattice, bounds, eyes_m, settings) for k in chosen]
     agreement = np.empty((shape[0], len(levels), shape[1]), np.float32)
     for number, up_m in enumerate(levels):
-        agreement[:, number] = _agreement([each.at(float(up_m)) for each in laid], settings)
-    seen = [_whole(each.at(bounds.usual_m), min(settings.window_cells)) for each in laid]
+        agreement[:, number] = _agreement(laid, float(up_m), settings)
+    seen = [np.broadcast_to(each.whole(bounds.usual_m, min(settings.window_cells)), shape) for each in laid]
     seen_by = np.sum(seen, axis=0).astype(np.float32)
-    total = smoothed(1 - agreement, settings.smoothing)
+    cost = np.where(np.isnan(agreement), np.float32(settings.smoothing.unseen), 1 - agreement)
+    total = smoothed(cost, settings.smoothing)
     up_m, score = _best(total, agreement, levels)
-    up_m[(score < settings.least_score) | (seen_by < 2)] = np.nan
-    return Swept(up_m, score, seen_by, _widest(seen, spreads))
+    deviation = _deviation(total, up_m, levels, settings)
+    up_m[~(score >= settings.least_score)] = np.nan  # no two photos see the height that fits, or they do not agree
+    return Swept(up_m, score, seen_by, _widest(seen, spreads), deviation)
 
 
 def choose_views(lattice: Lattice, views: Sequence[View], up_m: float, count: int) -> list[int]:
@@ -134,63 +143,158 @@ def _widest(seen: Sequence[Mask], spreads: Floats) -> Floats32:
 
 
 class _Laid:
-    """A photo that is laid on level planes over a lattice."""
+    """A photo that is laid on level planes over a lattice: of each pixel how it differs from its surroundings."""
 
-    def __init__(self, view: View, picture: ImageGray, lattice: Lattice) -> None:
-        # black is what lies outside of the photo
-        self._picture = np.maximum(picture, 1)
-        self._size = lattice.width, lattice.height
+    def __init__(
+        self, view: View, picture: ImageGray, lattice: Lattice, bounds: Bounds, others_m: PointsM,
+        settings: SweepSettings,
+    ) -> None:
+        self._shape = lattice.shape
         camera = view.camera.resized(picture.shape[1], picture.shape[0])
         turn = view.site_from_camera.rotation.T
         project = camera.matrix @ np.column_stack([turn, -turn @ view.site_from_camera.translation_m])
         self._level = project[:, :2] @ lattice.site_from_cells[:2] + np.outer(project[:, 3], [0, 0, 1])
         self._up = np.outer(project[:, 2], [0, 0, 1])
+        right, bottom = lattice.width - 1, lattice.height - 1
+        self._corners = np.array([[0, right, 0, right], [0, 0, bottom, bottom], [1.0, 1, 1, 1]])
+        self._size = picture.shape[1], picture.shape[0]
+        piece = self._crop_to(picture, bounds, settings)
+        angles = self._angles(others_m - view.site_from_camera.translation_m, lattice, bounds.usual_m)
+        self.channels, which = np.unique(angles, return_inverse=True)
+        self._contrast = np.dstack([_contrast(piece, each * _ANGLE_RAD, settings) for each in self.channels])
+        self.channel = which.tolist()
+        self._px_per_cell = lattice.cell_m * camera.fx_px / max(
+            float(view.site_from_camera.translation_m[2]) - bounds.usual_m, 1e-3)
 
-    def at(self, up_m: float) -> Floats32:
-        """(H, W) float32 the photo on the plane at a height; 0 outside of it."""
-        picture_from_cells: Matrix3 = self._level + up_m * self._up
-        return cv2.warpPerspective(
-            self._picture, picture_from_cells, self._size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        ).astype(np.float32)
+    def at(self, up_m: float) -> list[Floats32]:
+        """The photo on the plane at a height, (H, W) float32, for each of the others; 0 outside of it."""
+        there = self._from_picture @ self._picture_from_cells(up_m)
+        laid = [
+            channel for first in range(0, len(self.channels), 4)
+            for channel in cv2.split(cv2.warpPerspective(
+                self._contrast[..., first:first + 4], there, self._shape[::-1],
+                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            ))
+        ]
+        return [laid[each] for each in self.channel]
+
+    def whole(self, up_m: float, side: int) -> Mask:
+        """Where a patch lies in the photo as a whole when the ground is at a height: (H, W), or (1, 1) if it is alike.
+
+        Beyond its border it would see the border, not the ground.
+        """
+        inset = 0.5 * (side * self._px_per_cell + self._apron)
+        (w, h), (x, y, z) = self._size, self._picture_from_cells(up_m)
+        # inside is to one side of four lines, for where the picture's depth is positive
+        lines = np.array([x - inset * z, (w - 1 - inset) * z - x, y - inset * z, (h - 1 - inset) * z - y])
+        inside = lines @ self._corners >= 0
+        if inside.all():
+            return np.ones((1, 1), bool)
+        if not inside.any(axis=1).all():
+            return np.zeros((1, 1), bool)
+        known = np.ones(self._shape, bool)
+        columns, rows = np.arange(self._shape[1]), np.arange(self._shape[0])[:, None]
+        for line in lines[~inside.all(axis=1)]:
+            known &= line[0] * columns + (line[1] * rows + line[2]) >= 0
+        return known
+
+    def _picture_from_cells(self, up_m: float) -> Matrix3:
+        return np.asarray(self._level + up_m * self._up)
+
+    def _crop_to(self, picture: ImageGray, bounds: Bounds, settings: SweepSettings) -> Floats32:
+        """Keep of the picture what the cells see at all heights."""
+        apron = self._apron = settings.contrast_px
+        low, high = np.zeros(2, int), np.array(self._size)
+        seen = [self._picture_from_cells(each) @ self._corners for each in (bounds.low_m, bounds.high_m)]
+        ends = np.concatenate(seen, axis=1)
+        if (ends[2] > 1e-6).all():
+            places = (ends[:2] / ends[2]).T
+            low = np.clip(np.floor(places.min(axis=0)) - apron, 0, high - 1).astype(int)
+            high = np.clip(np.ceil(places.max(axis=0)) + apron + 1, low + 1, high).astype(int)
+        self._from_picture = np.array([[1.0, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1]])
+        return picture[low[1]:high[1], low[0]:high[0]].astype(np.float32)
+
+    def _angles(self, away_m: PointsM, lattice: Lattice, up_m: float) -> Floats:
+        """(N,) in which direction of the picture, in steps, things move with their height against other photos."""
+        cells_from_site = np.linalg.inv(lattice.site_from_cells)[:2, :2]
+        middle = np.array([(lattice.width - 1) / 2, (lattice.height - 1) / 2])
+        ends = np.concatenate([[middle], middle + _unit(away_m[:, :2] @ cells_from_site.T)])
+        seen = np.column_stack([ends, np.ones(len(ends))]) @ self._picture_from_cells(up_m).T
+        places = seen[:, :2] / np.maximum(np.abs(seen[:, 2:]), 1e-9)
+        moved = places[1:] - places[0]
+        return np.asarray(np.rint(np.arctan2(moved[:, 1], moved[:, 0]) / _ANGLE_RAD) % _ANGLES)
 
 
-def _agreement(laid: list[Floats32], settings: SweepSettings) -> Floats32:
-    """(H, W) how well the photos agree, 0 to 1: the mean over pairs and over the sizes of patches that they have."""
-    total, pairs = np.zeros_like(laid[0]), np.zeros_like(laid[0])
-    patches = [_Patches(laid, side, settings.noise_levels) for side in settings.window_cells]
-    for i in range(len(laid)):
-        for j in range(i):
-            product = laid[i] * laid[j]
-            for each in patches:
-                total += each.likeness(product, i, j)
-                pairs += each.known[i] * each.known[j]
-    return np.asarray(total / np.maximum(pairs, 1), np.float32)
+def _unit(vectors: Floats) -> Floats:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9)
 
 
-class _Patches:
-    """Means and spreads of the patches of one size in each of the photos, where they lie in it as a whole."""
+def _contrast(picture: Floats32, angle_rad: float, settings: SweepSettings) -> Floats32:
+    """(H, W) how a picture's gray differs from its mean along a line, over how much it does so around.
 
-    def __init__(self, laid: list[Floats32], side: int, noise_levels: float) -> None:
-        self._side = side, side
-        self.known = [_whole(each, side).astype(np.float32) for each in laid]
-        self._means = [cv2.boxFilter(each, -1, self._side) for each in laid]
-        self._weights = []
-        for each, mean, there in zip(laid, self._means, self.known):
-            spread = cv2.sqrBoxFilter(each, -1, self._side) - mean * mean
-            self._weights.append(there / np.sqrt(np.maximum(spread, 0) + np.float32(noise_levels**2)))
-
-    def likeness(self, product: Floats32, i: int, j: int) -> Floats32:
-        """(H, W) the correlation of two photos' patches, 0 where they do not agree or are not known."""
-        likeness = np.asarray(cv2.boxFilter(product, -1, self._side), np.float32)
-        likeness -= self._means[i] * self._means[j]
-        likeness *= self._weights[i]
-        likeness *= self._weights[j]
-        return np.maximum(likeness, 0, out=likeness)
+    Along the line between two photos, for an edge along that line fits itself at every height.
+    """
+    side = settings.contrast_px
+    way = np.linspace(-(side // 2), side // 2, 4 * side)
+    line = np.zeros((side, side), np.float32)
+    x, y = way * np.cos(angle_rad) + side // 2, way * np.sin(angle_rad) + side // 2
+    for ax, wx in ((np.floor(x), 1 - x % 1), (np.floor(x) + 1, x % 1)):
+        for ay, wy in ((np.floor(y), 1 - y % 1), (np.floor(y) + 1, y % 1)):
+            np.add.at(line, (np.minimum(ay, side - 1).astype(int), np.minimum(ax, side - 1).astype(int)), wx * wy)
+    away = picture - cv2.filter2D(picture, -1, line / line.sum())
+    spread = cv2.sqrBoxFilter(away, -1, (side, side))
+    return np.asarray(away / np.sqrt(spread + np.float32(settings.noise_levels**2)), np.float32)
 
 
-def _whole(laid: Floats32, side: int) -> Mask:
-    """(H, W) where a patch lies in the photo as a whole: beyond its border it would see the border, not the ground."""
-    return cv2.erode((laid > 0).view(np.uint8), np.ones((side, side), np.uint8)) > 0
+def _agreement(laid: Sequence[_Laid], up_m: float, settings: SweepSettings) -> Floats32:
+    """(H, W) how well the photos agree at a height, 0 to 1; NaN where fewer than two see it.
+
+    The mean over the better half of the pairs that see a cell, for a photo from which something hides it agrees with
+    none (Kang, Szeliski and Chai 2001).
+    """
+    pictures = [each.at(up_m) for each in laid]
+    known = [[each.whole(up_m, side) for each in laid] for side in settings.window_cells]
+    scores = []
+    for i, j in itertools.combinations(range(len(laid)), 2):
+        both = [seen[i] & seen[j] for seen in known]
+        if any(each.any() for each in both):
+            scores.append(_likeness(pictures[i][j] * pictures[j][i], both, settings))
+    if not scores:
+        return np.full(pictures[0][0].shape, np.nan, np.float32)
+    return _better_mean(scores, settings.pair_share)
+
+
+def _likeness(product: Floats32, both: Sequence[Mask], settings: SweepSettings) -> Floats32:
+    """(H, W) how alike patches are in two photos, the mean over those of their sizes that both see; -1 for none."""
+    total, count = np.zeros_like(product), np.zeros((1, 1), np.float32)
+    for side, seen in zip(settings.window_cells, both):
+        alike = np.asarray(cv2.boxFilter(product, -1, (side, side)), np.float32)
+        np.maximum(alike, 0, out=alike)
+        if not seen.all():
+            alike *= seen
+        total += alike
+        count = count + seen.astype(np.float32)
+    if (count == len(settings.window_cells)).all():
+        total /= len(settings.window_cells)
+        return total
+    return np.where(count > 0, total / np.maximum(count, 1), np.float32(-1))
+
+
+def _better_mean(scores: list[Floats32], share: float) -> Floats32:
+    """(H, W) the mean over the best `share` of the scores that are known (not -1); NaN where none is."""
+    counted = np.zeros(scores[0].shape, np.float32)
+    for each in scores:
+        counted += each >= 0
+    wanted = np.ceil(counted * share)
+    total, lower = np.zeros_like(counted), np.empty_like(counted)
+    for rank in range(int(np.ceil(len(scores) * share))):
+        for k in range(len(scores) - 1 - rank):  # the largest of those left moves to their end
+            np.minimum(scores[k], scores[k + 1], out=lower)
+            np.maximum(scores[k], scores[k + 1], out=scores[k + 1])
+            scores[k], lower = lower, scores[k]
+        total += scores[len(scores) - 1 - rank] * (rank < wanted)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(counted > 0, total / np.maximum(wanted, 1), np.float32(np.nan)), np.float32)
 
 
 def _best(total: Floats32, agreement: Floats32, levels: Floats32) -> tuple[Floats32, Floats32]:
@@ -208,3 +312,10 @@ def _best(total: Floats32, agreement: Floats32, levels: Floats32) -> tuple[Float
     is_edge = best != around
     up_m[is_edge] = levels[best[is_edge]]
     return up_m.astype(np.float32), score
+
+
+def _deviation(total: Floats32, up_m: Floats32, levels: Floats32, settings: SweepSettings) -> Floats32:
+    """(H, W) the root mean square distance of the other levels from a height, each by its probability."""
+    chance = np.exp((total.min(axis=1, keepdims=True) - total) / (8 * settings.smoothing.temperature))
+    away = levels[None, :, None].astype(np.float32) - up_m[:, None]
+    return np.asarray(np.sqrt((chance * away**2).sum(axis=1) / chance.sum(axis=1)), np.float32)

@@ -70,18 +70,20 @@ class Undistorter:
         return None if mask.all() else mask
 
 
-def refined_camera(camera: Camera, focal_scale: float, radial: float) -> Camera:
+def refined_camera(camera: Camera, focal_scale: float, radial: float, fifth: float = 0.0) -> Camera:
     """The camera with the focal length and the left-over radial distortion that a flight found.
 
+    ideal = seen (1 + radial r^2 + fifth r^4) / focal_scale.
     The five coefficients are fitted so that every pixel's ray is the one that the flight's solution gives it.
     """
     result = camera.with_focal_px(camera.fx_px * focal_scale)
-    if radial == 0.0 and (focal_scale == 1.0 or not camera.is_distorted):
+    if radial == fifth == 0.0 and (focal_scale == 1.0 or not camera.is_distorted):
         return result
     x, y = np.meshgrid(np.linspace(-0.5, camera.width_px - 0.5, 25), np.linspace(-0.5, camera.height_px - 0.5, 25))
     pixels = np.column_stack([x.ravel(), y.ravel()])
     seen = camera.rays_from_pixels(pixels)[:, :2]
-    ray = seen * (1 + radial * (seen**2).sum(axis=1, keepdims=True)) / focal_scale
+    square = (seen**2).sum(axis=1, keepdims=True)
+    ray = seen * (1 + radial * square + fifth * square**2) / focal_scale
     distorted = (pixels - [result.cx_px, result.cy_px]) / [result.fx_px, result.fy_px]
     u, v = ray.T
     r2 = u * u + v * v

@@ -19,9 +19,11 @@ _SMALL_BYTES = 128 * 1024 * 1024  # of gray ones for the sweep
 class FlightPictures:
     """Loads, corrects and keeps the pictures used last; numbers count the keyframes given."""
 
-    def __init__(self, archive: Archive, keyframes: Sequence[StoredKeyframe], radial: float = 0.0) -> None:
+    def __init__(
+        self, archive: Archive, keyframes: Sequence[StoredKeyframe], radial: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
         self._archive, self._keyframes = archive, keyframes
-        self._lens = Undistorter(refined_camera(keyframes[0].camera, 1.0, radial)) if radial else None
+        self._lens = Undistorter(refined_camera(keyframes[0].camera, 1.0, *radial)) if any(radial) else None
         self._large = ImageCache(self._load, _LARGE_BYTES)
         self._small: dict[int, ImageCache] = {}
 

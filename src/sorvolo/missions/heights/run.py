@@ -120,7 +120,7 @@ def _sweep(
         return pictures.gray_of_size(solved.views[number], number, size_m)
 
     for each in sweep_surface(
-        lattice, solved.views, gray, solved.points_m, solved.height_sigma_m, settings.surface
+        lattice, solved.views, gray, solved.points_m, solved.height_sigma, settings.surface
     ):
         if isinstance(each, Surface):
             pictures.forget_small()
