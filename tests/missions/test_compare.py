@@ -22,12 +22,14 @@ from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.geodesy import Geodetic
+from sorvolo.geometry.homography import apply_homography
 from sorvolo.missions.compare.flights import _begun, compare_flights
 from sorvolo.missions.evaluate.changes import evaluate_changes
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.flight.setup import _check_place, prepare
 from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.map.known_keyframes import KnownKeyframes
 from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.mosaic.selection import every
 from sorvolo.simulation.settings import (
@@ -432,8 +434,11 @@ def test_a_frame_that_does_not_fit_is_recorded_with_its_residual(flown, site):
     assert (placed.reason, placed.residual_px) == ("its points fit the map badly", 3.5)
 
 
-def test_ground_beside_the_map_extends_it(flown, tmp_path):
-    """The map is made of the frames over the western half alone; the second flight goes over all of it."""
+def test_ground_beside_the_map_extends_it(flown, tmp_path, monkeypatch):
+    """The map is made of the frames over the western half alone; the second flight goes over all of it.
+
+    As across dates, its features join none of the map's keyframes: where its views lie on the map places it.
+    """
     frames = json.loads((flown / "truth" / "frames.geojson").read_text())["features"]
     first = np.array([
         [each["properties"]["camera_longitude_deg"], each["properties"]["camera_latitude_deg"]]
@@ -449,6 +454,15 @@ def test_ground_beside_the_map_extends_it(flown, tmp_path):
         pass
     with Archive.open(tmp_path / "site", write=False) as archive:
         before = dict(archive.tiles())
+    laid, placed = {}, ViewMaker.placed
+
+    def noted(*arguments):
+        frame = placed(*arguments)
+        laid[frame.index] = frame
+        return frame
+
+    monkeypatch.setattr(ViewMaker, "placed", noted)
+    monkeypatch.setattr(KnownKeyframes, "for_graph", lambda _: [])
     compare(flown, tmp_path / "site")
     with Archive.open(tmp_path / "site", write=False) as archive:
         after = dict(archive.tiles())
@@ -461,6 +475,16 @@ def test_ground_beside_the_map_extends_it(flown, tmp_path):
     with Archive.open(tmp_path / "site", write=False) as archive:
         grown_m2 = (area["after"] - area["before"]) * archive.site().m_per_px ** 2
     assert extension["frames"] > 2 and extension["shown_as_well"] > 0
+    with Archive.open(tmp_path / "site", write=False) as archive:
+        extending = [each for each in archive.keyframes() if each.flight_id == "flight2"]
+    corners = np.array([[0, 0], [640, 0], [640, 360], [0, 360]], float)
+    apart_m = [
+        float(np.linalg.norm(np.subtract(*(
+            apply_homography(frame.site_from_image, corners) for frame in (each, laid[each.index])
+        )), axis=1).max())
+        for each in extending if laid[each.index].status is Status.VISION
+    ]
+    assert apart_m and max(apart_m) < 0.2
     assert extension["area_m2"] == pytest.approx(grown_m2, rel=1e-6)
     assert not any("have no place" in warning for warning in printed["warnings"])
     views = printed["comparison"]["views"]

@@ -33,6 +33,13 @@ class FoundFrame:
     site_from_image: Matrix3
     residual_m: float
 
+    @classmethod
+    def of(cls, keyframe_id: int, camera: Camera, site_from_image: Matrix3, residual_px: float) -> "FoundFrame":
+        """The frame with its misfit given in pixels of `camera`, by how large the one in its middle is."""
+        pixel = np.array([[camera.cx_px, camera.cy_px], [camera.cx_px + 1, camera.cy_px]])
+        m_per_px = float(np.linalg.norm(np.diff(apply_homography(site_from_image, pixel), axis=0)))
+        return cls(keyframe_id, camera, site_from_image, residual_px * m_per_px)
+
 
 @dataclass(frozen=True)
 class BaseReport:

@@ -61,6 +61,8 @@ class MapExtension:
         if self._run is None:
             self._run = PlanarRun(self._setup, self._archive, self._settings.mapping, writer=self._writer)
         self._run.add(posed)
+        if outcome.site_from_image is not None:
+            self._run.note_found(posed.frame.index, outcome.site_from_image, outcome.residual_px)
 
     def complete(self) -> Sequence[PlacedFrame]:
         """Place the frames for good and paint them; those that extend the map."""

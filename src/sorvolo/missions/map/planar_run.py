@@ -6,7 +6,7 @@ from types import TracebackType
 
 from sorvolo.capture.sync import OffsetEstimate
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.level_ground import footprint, is_on_ground
 from sorvolo.missions.flight.control import FlightControl
@@ -19,7 +19,7 @@ from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.map.known_keyframes import KnownKeyframes
 from sorvolo.missions.map.painting import FlightPainter, site_from_image
 from sorvolo.missions.map.run import FlightRun
-from sorvolo.mosaic.base_ties import BaseReport
+from sorvolo.mosaic.base_ties import BaseReport, FoundFrame, tie_to_base
 from sorvolo.mosaic.exposure import Exposure
 from sorvolo.mosaic.keyframes import Keyframes
 from sorvolo.mosaic.placing import map_m_per_px, sees_horizon
@@ -68,6 +68,7 @@ class PlanarRun(FlightRun):
         self._offset: OffsetEstimate | None = None
         self._control: ControlReport | None = None
         self._base: BaseReport | None = None
+        self._found: dict[int, FoundFrame] = {}  # by keyframe, where the site's own map shows its ground
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -119,6 +120,15 @@ class PlanarRun(FlightRun):
             return None
         camera = self._refined(self._setup.source.camera.camera)
         return self._setup.view(posed.frame.time_ns, camera, self._mapper.pose(keyframe_id))
+
+    def note_found(self, index: int, site_from_image: Matrix3, residual_px: float) -> None:
+        """Where the site's map shows a frame's ground: (3, 3) of its full undistorted picture, and how well that fits.
+
+        `complete` ties the flight to it, for across dates its features may join none of the map's keyframes.
+        """
+        keyframe_id, camera = self._known.count + index, self._lens.camera
+        if keyframe_id in self._times_ns:
+            self._found[keyframe_id] = FoundFrame.of(keyframe_id, camera, site_from_image, residual_px)
 
     def complete(self) -> list[PlacedFrame]:
         """Solve once more, find the clock offset, paint what moved: every selected frame as it ends, in their order.
@@ -205,12 +215,15 @@ class PlanarRun(FlightRun):
         return refined_camera(camera, self._mapper.focal_scale, self._mapper.radial)
 
     def _tie_to_ground(self) -> None:
-        """Bring the map to its control points or its base map, where it has any."""
+        """Bring the map to its control points or its base map, or where the site's own map shows its frames."""
         ground = self._setup.known_ground
         if isinstance(ground, FlightControl):
             endings = self._log.endings
             keyframe_of = {endings[each - self._known.count].name: each for each in self._mapper.placed()}
             self._control = ground.tie(self._mapper, keyframe_of, self._setup.frame)
+        elif ground is None and self._found:
+            m_per_px = self._archive.site_grid().grid.m_per_px
+            tie_to_base(self._mapper, list(self._found.values()), self._lens.camera, m_per_px, is_datum=False)
         elif ground is not None:
             self._base = ground.tie(self._mapper, self._picture, self._lens.camera, self._setup.frame)
 
