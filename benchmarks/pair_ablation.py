@@ -18,7 +18,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from change_ablation import PAIR_RULES, Rule, seed_of, switched_off
+from change_ablation import seed_of
+from change_rules import PAIR_RULES, Rule, switched_off
 from change_suites import SUITES, Ground, Pair, grounds, pairs
 from provenance import commit, machine
 from simulated_pairs import GROUNDS, simulated_pairs

@@ -69,7 +69,7 @@ HEIGHT_M = 116.6  # 960 px of 62 degrees then see 0.146 m each
 RIGHT_M = 2.0
 _APRON_PX = 700  # grey around the orthophoto: photos that show any of it are left out
 _EDGE_M = 4.0  # nor do photos show the orthophoto's rim
-_DAYS_NS = 6 * 86400 * 10**9
+LATER_NS = 6 * 86400 * 10**9
 _LEAST_OVERLAP, _MOST_TIMES, _LEAST_COVERED, _FALSE_SHARE = 0.25, 10.0, 0.4, 0.5
 _CELL_M = 0.25  # overlaps are counted in cells of this side
 
@@ -130,7 +130,7 @@ def score(pair: Pair, attitude: str, truth: dict[str, Any], options: argparse.Na
     mapped = options.keep / f"photos_{earlier}_{2 * options.seed}_known"
     flown = options.keep / f"photos_{later}_{2 * options.seed + 1}_{attitude}"
     shown = write_photos(first, mapped, size_px, "known", 0)
-    seen = write_photos(second, flown, size_px, attitude, _DAYS_NS)
+    seen = write_photos(second, flown, size_px, attitude, LATER_NS)
     base = options.keep / f"map_{earlier}_{2 * options.seed}"
     if not (base / "mosaic.tif").is_file():
         shutil.rmtree(base, ignore_errors=True)
@@ -256,13 +256,24 @@ def placed_right(
 def found(
     events: Path, frame: LocalFrame, map_from_true: np.ndarray, truth: dict[str, Any], size_px: tuple[int, int]
 ) -> dict[str, Any]:
-    """Events against the polygons."""
+    """The events of a file against the polygons."""
+    rings_m = {
+        feature["properties"]["id"]: frame.ground_from_lonlat(np.array(feature["geometry"]["coordinates"][0])[:, :2])
+        for feature in json.loads(events.read_text())["features"]
+    }
+    return found_among(rings_m, frame, map_from_true, truth, size_px)
+
+
+def found_among(
+    rings_m: dict[str, np.ndarray], frame: LocalFrame, map_from_true: np.ndarray, truth: dict[str, Any],
+    size_px: tuple[int, int],
+) -> dict[str, Any]:
+    """Events, the outlines (N, 2) in the site's metres by id, against the polygons."""
     true_from_map = np.linalg.inv(map_from_true)
     reported = []
-    for feature in json.loads(events.read_text())["features"]:
-        ring_m = frame.ground_from_lonlat(np.array(feature["geometry"]["coordinates"][0])[:, :2])
-        ring_m = moved_frame(apply_homography(true_from_map, ring_m), frame, LocalFrame(simulation_origin()))
-        reported.append((feature["properties"], drawn(pixels(ring_m, size_px), size_px)))
+    for name, ring_m in rings_m.items():
+        there_m = moved_frame(apply_homography(true_from_map, ring_m), frame, LocalFrame(simulation_origin()))
+        reported.append((name, drawn(pixels(there_m, size_px), size_px)))
     everywhere = np.any([mask for _, mask in reported], axis=0) if reported else np.zeros(drawn_shape(size_px), bool)
     hits, covered, touching = {}, {}, set()
     for name, each in truth["changes"].items():
@@ -279,7 +290,7 @@ def found(
                 for overlap, size in zip(overlaps, sizes)
             )
     quiet = np.any([drawn(np.array(ring, float), size_px) for ring in truth["unchanged"].values()], axis=0)
-    false = [record["id"] for record, mask in reported if (mask & quiet).sum() >= _FALSE_SHARE * max(1, mask.sum())]
+    false = [name for name, mask in reported if (mask & quiet).sum() >= _FALSE_SHARE * max(1, mask.sum())]
     by_kind = {
         kind: f"{sum(hits[name] for name in names)} of {len(names)}"
         for kind in ("appeared", "disappeared", "replaced", "area")
