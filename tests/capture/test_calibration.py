@@ -379,6 +379,8 @@ def test_a_real_phantom_3_photo_is_recognised():
     ("M3T", 4000, 3000, 4.4, "Mavic 3T"), ("M3T", 640, 512, 9.1, "Mavic 3T thermal"),
     ("M3T", 640, 512, math.nan, "Mavic 3T thermal"), ("M3T", 1920, 1080, math.nan, "Mavic 3T"),
     ("M3M", 5280, 3956, 12.29, "Mavic 3E"), ("M3M", 2592, 1944, 4.34, "Mavic 3M multispectral"),
+    ("XT709", 8000, 6000, 4.74, "Autel EVO II Dual 640T"), ("XT709", 640, 512, 13.0, "Autel EVO II Dual 640T thermal"),
+    ("ANAFI Ai", 8000, 6000, 4.4, "Parrot ANAFI Ai"),
     ("ZH20T", 640, 512, 13.5, "Zenmuse H20T thermal"), ("M4T", 8064, 6048, 6.72, "Matrice 4T"),
 ])
 def test_a_drones_cameras_are_distinguished(model, width_px, height_px, focal_mm, name):
@@ -387,10 +389,12 @@ def test_a_drones_cameras_are_distinguished(model, width_px, height_px, focal_mm
 
 
 @pytest.mark.parametrize(("name", "fov_deg"), [
-    # the fields of view across the diagonal that DJI's pages state; lenses that bend differ by some degrees
+    # the fields of view across the diagonal that the makers state; lenses that bend differ by some degrees
     ("Mavic 3T", 84), ("Mavic 3T thermal", 61), ("Matrice 30", 84), ("Zenmuse H30", 82.1), ("Air 3", 82),
     ("Air 3 tele", 35), ("Zenmuse H20T thermal", 40.6), ("Zenmuse H30T thermal", 45.2), ("Matrice 4E", 84),
     ("Matrice 4T", 82), ("Matrice 4T thermal", 45), ("Mavic 3M multispectral", 73.9),
+    ("Autel EVO II", 79), ("Autel EVO Nano", 84), ("Autel EVO Nano Plus", 85), ("Autel EVO Max 4T", 85),
+    ("Autel EVO Max 4T thermal", 61),
 ])
 def test_presets_see_as_much_as_their_makers_state(name, fov_deg):
     (preset,) = find_presets(name)

@@ -78,6 +78,14 @@ CAMERA_PRESETS = (
     CameraPreset(
         "Skydio X10 narrow", ("VT300-Z_50", "VT300-L_50", "V100-L_50"), 7.213, 5.44, 9.88, 9248, 6944
     ),
+    # focal lengths from the data sheets' angles of view or lengths at 35 mm, which agree to 3 %
+    CameraPreset("Autel EVO II", ("XT701",), 6.4, 4.8, 4.74, 8000, 6000, 0.06),
+    CameraPreset("Autel EVO II Pro", ("XT705", "XL705"), 12.75, 8.5, 10.57, 5472, 3648, 0.05),
+    CameraPreset("Autel EVO II Dual 640T", ("XT709",), 6.4, 4.8, 4.74, 8000, 6000, 0.06),
+    CameraPreset("Autel EVO Nano", ("XT724",), 6.4, 4.8, 4.36, 8000, 6000, 0.06),
+    CameraPreset("Autel EVO Nano Plus", ("XL724",), 9.8, 7.35, 6.6, 8192, 6144, 0.06),
+    CameraPreset("Autel EVO Max 4T", (), 9.8, 7.35, 6.6, 8192, 6144, 0.06),
+    CameraPreset("Parrot ANAFI Ai", ("AnafiAi",), 6.4, 4.8, 4.4, 8000, 6000, 0.06),
     # lenses far from a pinhole: a calibration is worth much more than the preset
     CameraPreset("Parrot ANAFI", ("Anafi", "AnafiUSA", "AnafiThermal"), 5.985, 4.498, 4.0, 5344, 4016, 0.05),
     CameraPreset("GoPro HERO4", ("HERO4 Black", "HERO4 Silver"), 6.17, 4.63, 2.92, 4000, 3000, 0.1),
@@ -89,6 +97,8 @@ CAMERA_PRESETS = (
     CameraPreset("Matrice 4T thermal", ("M4T", "M4TD"), 7.68, 6.144, 12.05, 640, 512, 0.05),
     CameraPreset("Zenmuse H20T thermal", ("ZH20T",), 7.68, 6.144, 13.5, 640, 512, 0.04),
     CameraPreset("Skydio X10 thermal", ("VT300-Z_40", "VT300-L_40"), 7.68, 6.144, 13.6, 640, 512, 0.03),
+    CameraPreset("Autel EVO II Dual 640T thermal", ("XT709", "XL709"), 7.68, 6.144, 13.0, 640, 512, 0.05),
+    CameraPreset("Autel EVO Max 4T thermal", (), 7.68, 6.144, 9.1, 640, 512, 0.05),
     CameraPreset("Zenmuse H30T thermal", ("H30T",), 15.36, 12.288, 24.0, 1280, 1024, 0.04),
 )
 
