@@ -89,6 +89,18 @@ def all_events(client: TestClient) -> list[dict[str, Any]]:
     return found
 
 
+def look_at_place(client: TestClient, longitude: float, latitude: float) -> None:
+    """The memory of a place leads to pictures of it, and into the video."""
+    rows = client.get("/api/sites/new/place", params={"lon": longitude, "lat": latitude}).json()
+    assert rows == sorted(rows, key=lambda each: each["time"]) and rows
+    assert all(each["flight"] == "flight1" and 0 <= each["video_s"] < 10 for each in rows)
+    assert client.get(rows[0]["crop_url"]).content[:2] == b"\xff\xd8"
+    of_video = rows[0]["crop_url"].replace("/frame/", "/video/")
+    assert client.get(of_video).content[:2] == b"\xff\xd8"
+    part = client.get(rows[0]["video_url"], headers={"range": "bytes=4-7"})
+    assert part.status_code == 206 and part.content == b"ftyp"
+
+
 def test_a_mission_outlives_its_server_and_nothing_is_lost_or_doubled(
     open_station: Callable[[], TestClient], tmp_path: Path
 ) -> None:
@@ -118,6 +130,7 @@ def test_a_mission_outlives_its_server_and_nothing_is_lost_or_doubled(
     for each in placed:
         assert west < each["position"][0] < east and south < each["position"][1] < north
         assert 15 < each["height_m"] < 25 and len(each["footprint"]) == 5
+    look_at_place(client, *site["center_wgs84"])
     time.sleep(0.5)
     assert any(each["type"] == "map.tiles" and each["data"]["revision"] == site["live_revision"]
                for each in all_events(client))

@@ -18,9 +18,11 @@ from sorvolo.station.crops import crop_routes
 from sorvolo.station.event_routes import event_routes
 from sorvolo.station.events import EventLog
 from sorvolo.station.features import feature_routes, landing_links
+from sorvolo.station.flight_videos import FlightVideos, video_routes
 from sorvolo.station.ingest import Ingest, IngestLimits
 from sorvolo.station.inputs import Inputs
 from sorvolo.station.map_watch import MapWatch
+from sorvolo.station.place import place_routes
 from sorvolo.station.problems import Problem, answer_problems
 from sorvolo.station.reviews import Reviews, review_routes
 from sorvolo.station.run_routes import run_routes
@@ -57,6 +59,7 @@ class Station:
     inputs: Inputs
     runs: Runs
     map_watch: MapWatch
+    videos: FlightVideos
 
     @classmethod
     def open(cls, settings: StationSettings) -> "Station":
@@ -70,7 +73,7 @@ class Station:
         inputs = Inputs(settings, uploads, ingest.newest)
         return cls(
             settings, state, shelf, tiles, events, SiteCollections(shelf), reviews, ingest, uploads, inputs,
-            Runs(settings, state, shelf, events, inputs), MapWatch(shelf, tiles, reviews, events),
+            Runs(settings, state, shelf, events, inputs), MapWatch(shelf, tiles, reviews, events), FlightVideos(inputs),
         )
 
     def close(self) -> None:
@@ -105,6 +108,8 @@ def station_app(settings: StationSettings) -> FastAPI:
         feature_routes(station.collections, station.reviews), review_routes(station.reviews, station.shelf),
         crop_routes(station.shelf), stream_routes(station.ingest),
         crop_routes(station.shelf), upload_routes(station.uploads), run_routes(station.runs, station.inputs),
+        place_routes(station.shelf, station.collections, station.reviews, station.videos),
+        video_routes(station.shelf, station.collections, station.videos),
     ):
         app.include_router(router)
     _serve_page(app)

@@ -7,7 +7,6 @@ import numpy as np
 from fastapi import APIRouter, Depends, Response
 
 from sorvolo.geometry.arrays import ImageRGB, PointsM
-from sorvolo.geometry.homography import apply_homography
 from sorvolo.station.problems import Problem
 from sorvolo.station.security import needs
 from sorvolo.station.sites import SiteShelf
@@ -19,7 +18,9 @@ from sorvolo.store.nofollow import read_below
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
 
-CROP_PX = 320
+CROP_PX, CROP_M = 320, 10.0
+"""How large a picture of a place is, and how much ground it shows."""
+
 _KEPT = "private, max-age=86400"
 _CUTTING = threading.Semaphore(2)  # key frames decoded at once: a strip asks for dozens
 
@@ -67,12 +68,12 @@ def keyframe(archive: Archive, flight: str, index: int) -> StoredKeyframe:
     return found[0]
 
 
-def cut(archive: Archive, frame: StoredKeyframe, place_m: PointsM, side_m: float | None = None) -> ImageRGB:
-    """(320, 320, 3) of the ground around a place, north up, as the key frame shows it; grey where it does not.
+def cut(archive: Archive, frame: StoredKeyframe, place_m: PointsM) -> ImageRGB:
+    """(320, 320, 3) of 10 m of ground around a place, north up, as the key frame shows it; grey where it does not.
 
-    Without `side_m` as wide as keeps the key frame's own resolution, at most 12 m. Raises StoreError.
+    Raises StoreError where its picture is gone.
     """
-    m_per_px = (side_m or min(12.0, CROP_PX * _m_per_px(frame, place_m))) / CROP_PX
+    m_per_px = CROP_M / CROP_PX
     site_from_crop = np.array([
         [m_per_px, 0, place_m[0] - m_per_px * (CROP_PX - 1) / 2],
         [0, -m_per_px, place_m[1] + m_per_px * (CROP_PX - 1) / 2],
@@ -84,14 +85,6 @@ def cut(archive: Archive, frame: StoredKeyframe, place_m: PointsM, side_m: float
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         cropped = cv2.warpPerspective(image, image_from_crop, (CROP_PX, CROP_PX), flags=flags, borderValue=(127,) * 3)
     return np.asarray(cropped, np.uint8)
-
-
-def _m_per_px(frame: StoredKeyframe, place_m: PointsM) -> float:
-    """The ground that a pixel covers at a place."""
-    image_from_site = np.linalg.inv(frame.site_from_image)
-    ends_px = apply_homography(image_from_site, place_m + np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]]))
-    steps_px = np.hypot(*(ends_px[1:] - ends_px[0]).T)
-    return float(0.5 / max(steps_px.mean(), 1e-6))
 
 
 def _read(archive: Archive, file: str) -> bytes:

@@ -54,6 +54,10 @@ class Inputs:
                 self._looked_s = time.monotonic()
             return sorted(self._found.values(), key=lambda each: each.name)
 
+    def videos(self) -> list[Path]:
+        """The videos below the root, those that were uploaded included."""
+        return [each.path for each in self.all() if each.kind == "video"] + self._uploads.videos()
+
     def source(self, wish: InputWish) -> str:
         """The path or address that a mission opens. Raises Problem (400, 404)."""
         if wish.upload is not None:

@@ -161,6 +161,10 @@ class Uploads:
             raise Problem(409, f"{upload.name} is not here yet ({upload.state}); wait until it is ready")
         return self._target(upload)
 
+    def videos(self) -> list[Path]:
+        """The files of all uploads that are videos and ready."""
+        return [self._target(each) for each in self.all() if each.state == "ready" and each.kind == "video"]
+
     def name_of(self, upload_id: str) -> str:
         """The name of an upload's file; its id where it is gone."""
         try:

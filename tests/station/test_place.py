@@ -1,0 +1,63 @@
+"""The memory of a place: who saw it, when, what was found there; pictures cut from key frames and from videos."""
+
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from fake_changes import fake_change
+from fake_flights import frame, image
+from starlette.testclient import TestClient
+
+from sorvolo.station.cut_video import frame_of
+from sorvolo.store.site.archive import Archive
+
+
+def test_every_flight_that_saw_a_place_is_remembered_in_order(client: TestClient, root: Path) -> None:
+    """With the changes that were found there and what people said of them."""
+    with Archive.open(root / "field", write=True) as archive, archive.begin_flight("c", "c", {}) as writer:
+        paths = {0: writer.save_image(0, image(0))}
+        writer.commit([frame(0)], paths, {}, "", changes=[fake_change(1, "c", east_m=0.0, north_m=5.0)])
+    change = client.get("/api/sites/field/collections/changes/items/c-1").json()
+    longitude, latitude = np.mean(change["geometry"]["coordinates"][0][:-1], axis=0)
+    client.post("/api/sites/field/reviews", json={
+        "kind": "change", "id": "c-1", "verdict": "confirmed", "revision": 0, "note": "a shed"})
+    rows = client.get("/api/sites/field/place", params={"lon": longitude, "lat": latitude}).json()
+    assert {each["flight"] for each in rows} == {"a", "b", "c"}
+    assert [each["time"] for each in rows] == sorted(each["time"] for each in rows)
+    for each in rows:
+        assert ("c-1" in {one["id"] for one in each["changes"]}) == (each["flight"] == "c")
+        assert [one["verdict"] for one in each["reviews"]] == (["confirmed"] if each["flight"] == "c" else [])
+        picture = client.get(each["crop_url"])
+        assert picture.status_code == 200
+        assert cv2.imdecode(np.frombuffer(picture.content, np.uint8), 1).shape == (320, 320, 3)
+    few = client.get("/api/sites/field/place", params={"lon": longitude, "lat": latitude, "most_per_flight": 1}).json()
+    assert len(few) == 3
+
+
+@pytest.mark.parametrize("query", ["lon=0&lat=0", "lon=-170&lat=80"])
+def test_nobody_saw_other_places(client: TestClient, query: str) -> None:
+    """An empty list."""
+    assert client.get(f"/api/sites/field/place?{query}").json() == []
+
+
+@pytest.mark.parametrize("query", ["lon=0", "lat=91&lon=0", "lat=a&lon=0", "lat=nan&lon=0"])
+def test_what_is_no_place(client: TestClient, query: str) -> None:
+    """422 in words."""
+    assert client.get(f"/api/sites/field/place?{query}").status_code == 422
+
+
+def test_the_frame_of_a_number_is_that_frame(tmp_path: Path) -> None:
+    """In the middle of a group of pictures, too."""
+    path = tmp_path / "v.mp4"
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for number in range(20):
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((48, 64, 3), 12 * number, np.uint8))))
+        file.mux(stream.encode())
+    for number in (0, 7, 13, 19):
+        assert abs(float(frame_of(str(path), number).mean()) - 12 * number) < 4, number
+    with pytest.raises(ValueError, match="no frame"):
+        frame_of(str(path), 400)
