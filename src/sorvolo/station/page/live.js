@@ -9,6 +9,7 @@ import * as words from "./words.js";
 
 const STATUS_MS = 10000;
 const RATE_WINDOW_MS = 10000;
+const LONGEST_DELAY_S = 600; // more is a recording, or a clock that is wrong
 
 /** Follow the site's live events; `show` draws the figures anew, `close` ends it. */
 export function followLive(screen) {
@@ -17,7 +18,7 @@ export function followLive(screen) {
 
 class Live {
   constructor(screen) {
-    Object.assign(this, { screen, trail: [], places: [], progress: null, run: null, ends: [], alerted: new Set() });
+    Object.assign(this, { screen, trail: [], places: [], progress: null, run: null, ends: [], alerted: new Set(), statuses: {}, reasons: {} });
     const on = (type, listener) => {
       const mine = ({ detail }) => { if (detail.site === screen.data.id) listener(detail.data ?? {}, detail); };
       screen.station.events.addEventListener(type, mine);
@@ -26,7 +27,7 @@ class Live {
     on("map.tiles", (data) => screen.view?.ready.then(() => this.refresh(data)));
     on("frame.placed", (data, event) => this.placed(data, event));
     on("run.started", (data, event) => this.started(data, event));
-    on("run.progress", (data, event) => { this.progress = data; this.run = event.run; this.show(); });
+    on("run.progress", (data, event) => this.progressed(data, event));
     for (const type of ["run.finished", "run.failed", "run.stopped"]) on(type, (data, event) => this.ended(type, data, event));
     on("object.found", ({ feature }) => this.found("objects", feature));
     on("change.announced", ({ feature }) => this.found("changes", feature));
@@ -46,9 +47,14 @@ class Live {
   }
 
   started(_, event) {
-    this.trail = [];
+    Object.assign(this, { trail: [], run: event.run, progress: null, statuses: {}, reasons: {} });
+    this.show();
+  }
+
+  progressed(data, event) {
     this.run = event.run;
-    this.progress = null;
+    this.progress = data;
+    if (data.reason) this.reasons[data.reason] = (this.reasons[data.reason] ?? 0) + 1;
     this.show();
   }
 
@@ -56,8 +62,9 @@ class Live {
     this.run = event.run;
     const { position } = data;
     this.places.push(Date.now());
-    this.delay_s = data.time ? null : this.delay_s;
-    if (data.latency_s !== undefined) this.delay_s = data.latency_s;
+    this.statuses[data.status] = (this.statuses[data.status] ?? 0) + 1;
+    const delay_s = (new Date(event.at) - new Date(data.time)) / 1000;
+    this.delay_s = Math.abs(delay_s) < LONGEST_DELAY_S ? delay_s : undefined; // a recorded flight has none
     this.last = data;
     if (position) this.trail.push(position.slice(0, 2));
     this.drawSoon();
@@ -110,6 +117,23 @@ class Live {
     else message(data.headline || "The mission is done");
   }
 
+  /** Figures of the mission that runs. */
+  ofRun() {
+    const { matched, selected, frames_per_second: rate, latency_s: delay_s } = this.progress ?? {};
+    const by_gps = this.statuses["gps-only"] ?? 0;
+    return { matched, by_gps, rejected: selected === undefined ? undefined : Math.max(0, selected - matched - by_gps), reasons: this.reasons,
+      rate: rate ?? this.rate(), delay_s: delay_s ?? this.delay_s };
+  }
+
+  /** Figures of all flights of the site. */
+  ofSite() {
+    const flights = this.screen.data.detail.flights ?? [];
+    const sum = (name) => flights.reduce((total, each) => total + each[name], 0);
+    const reasons = {};
+    for (const each of flights) for (const [why, count] of Object.entries(each.reasons)) reasons[why] = (reasons[why] ?? 0) + count;
+    return { matched: sum("matched"), by_gps: sum("by_gps"), rejected: sum("rejected"), reasons };
+  }
+
   /** Frames a second over the last seconds, as they came to this page. */
   rate() {
     const since = Date.now() - RATE_WINDOW_MS;
@@ -126,17 +150,14 @@ class Live {
 
   show() {
     const status = this.screen.station.status;
-    const figures = this.progress ?? {};
-    const total = (name) => figures[name] ?? (this.run ? undefined : this.screen.data.detail.flights?.reduce((sum, each) => sum + (each[name] ?? 0), 0));
-    const reasons = figures.reasons ?? Object.assign({}, ...(this.screen.data.detail.flights ?? []).map((each) => each.reasons));
+    const figures = this.run ? this.ofRun() : this.ofSite();
     const low = status.disk_floor_gb !== undefined && status.disk_free_gb < 2 * status.disk_floor_gb;
     const rows = [
-      this.run && ["frames/s", words.number(figures.frames_per_s ?? this.rate()), "Frames placed in a second"],
-      this.run && ["latency", figures.latency_s === undefined && this.delay_s === undefined ? "–" : `${words.number(figures.latency_s ?? this.delay_s, 2)} s`, "From the drone's picture to the map"],
-      ["matched", words.number(total("matched"), 0), "Frames placed by vision"],
-      ["by GPS", words.number(total("by_gps"), 0), "Frames placed by GPS alone"],
-      ["rejected", words.number(total("rejected"), 0), Object.entries(reasons).map(([why, count]) => `${count} × ${why}`).join("\n") || "None"],
-      figures.gps_sigma_m !== undefined && ["GPS", words.length(figures.gps_sigma_m), "Standard deviation of a fix"],
+      this.run && ["frames/s", words.number(figures.rate), "Frames that the mission takes in a second"],
+      this.run && ["latency", figures.delay_s === undefined ? "–" : `${words.number(figures.delay_s, 2)} s`, "From the drone's picture to its place on the map"],
+      ["matched", words.number(figures.matched, 0), "Frames placed by vision"],
+      ["by GPS", words.number(figures.by_gps, 0), "Frames placed by GPS alone"],
+      ["rejected", words.number(figures.rejected, 0), Object.entries(figures.reasons).map(([why, count]) => `${count} × ${why}`).join("\n") || "None"],
       ["memory", status.memory_mb ? words.bytes(status.memory_mb * 1e6) : "–", "Of the station's process"],
       ["disk left", words.bytes(status.disk_free_gb * 1e9), low ? "Nearly full: free some space, or nothing new is taken in" : "Free space where the sites are"],
     ];

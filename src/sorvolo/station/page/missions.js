@@ -1,15 +1,16 @@
 // Missions: started on an upload or a stream, watched, stopped; and what became of earlier ones.
 
-import { get, post } from "./api.js";
+import { get, post, Problem } from "./api.js";
 import { button, choice, el, field, fill, message, report } from "./dom.js";
 import { Upload } from "./upload.js";
-import { bytes, clock, duration, time } from "./words.js";
+import { bytes, duration, time } from "./words.js";
+import { zipOfFiles } from "./zip.js";
 
 const KINDS = {
   map: ["Map", "A first map, or more of it, from a flight."], compare: ["Compare", "A later flight over the same ground: what changed."],
   watch: ["Watch", "People, cars and small objects in a video, counted and placed."], search: ["Search", "How probable it is that somebody would have been found."],
 };
-const RUNNING = new Set(["queued", "running"]);
+const MOST_ZIP_BYTES = 4e9;
 
 /** The panel's life. */
 export function missionsPanel(screen, body) {
@@ -22,7 +23,7 @@ class Missions {
     this.list = el("div", { class: "runs" });
     this.may = screen.station.status.role === "operate";
     fill(body, this.may ? this.form() : el("p", { class: "note" }, "Your token may look and review, not start missions."), this.uploadList = el("div", {}), el("h3", {}, "Missions here"), this.list);
-    const types = ["run.queued", "run.started", "run.finished", "run.failed", "run.stopped", "run.lost"];
+    const types = ["run.started", "run.finished", "run.failed", "run.stopped"];
     const again = () => this.load();
     const progress = ({ detail }) => {
       const run = this.runs.find((each) => each.id === detail.run);
@@ -38,81 +39,88 @@ class Missions {
   }
 
   form() {
-    const isFirst = !this.screen.data.detail.versions?.length;
-    this.mission = isFirst ? "map" : "compare";
+    this.mission = this.screen.data.detail.versions?.length ? "compare" : "map";
     this.from = "upload";
     const note = el("p", { class: "note" }, KINDS[this.mission][1]);
     const files = el("input", { type: "file", multiple: true, "aria-label": "Files of the flight" });
-    const url = el("input", { type: "url", placeholder: "rtsp://…, udp://…", autocomplete: "off" });
+    const url = el("input", { type: "text", inputmode: "url", placeholder: "rtsp://…, udp://…", autocomplete: "off" });
+    const camera = el("input", { type: "text", maxlength: 80, placeholder: "found by itself", pattern: "(aov=[0-9.]+|focal_px=[0-9.]+|[A-Za-z0-9 .+\\-]+)" });
     const ready = el("div", {});
     const input = el("div", {});
+    const from = field("From", choice([["upload", "Files of this device"], ["stream", "A stream's address"], ["ready", "What the station has"]], this.from, (value) => { this.from = value; show(); }));
     const show = () => {
-      fill(input, { upload: [field("Files of the flight", files, "The video and its telemetry (SRT, CSV, GPX …), or all photos."),], stream: field("Stream's address", url, "RTSP, RTMP or MPEG-TS over UDP; the station allows networks that it was told."), ready }[this.from]);
+      from.hidden = input.hidden = this.mission === "search";
+      fill(input, { upload: field("Files of the flight", files, "The video, and its telemetry (SRT, CSV, GPX …) if it is not inside; or all photos."),
+        stream: field("Stream's address", url, "RTSP, RTMP or MPEG-TS over UDP, from networks that the station allows."), ready }[this.from]);
     };
-    show();
-    this.loadReady(ready);
     const start = el("button", { class: "main" }, "Start");
     const form = el("form", { class: "stack start", on: { submit: async (event) => {
       event.preventDefault();
       start.disabled = true;
       try {
-        await this.start({ files: [...files.files], url: url.value.trim(), ready: ready.querySelector("select")?.value });
+        await this.start({ files: [...files.files], url: url.value.trim(), camera: camera.value.trim(), ...chosen(ready) });
         files.value = "";
       } catch (problem) { report(problem); } finally { start.disabled = false; }
     } } },
     el("h3", {}, "Start a mission"),
-    field("Mission", choice(Object.entries(KINDS).map(([key, [words]]) => [key, words]), this.mission, (mission) => { this.mission = mission; fill(note, KINDS[mission][1]); })), note,
-    field("From", choice([["upload", "Files of this device"], ["stream", "A stream's address"], ["ready", "What the station has"]], this.from, (from) => { this.from = from; show(); })),
-    input, start);
+    field("Mission", choice(Object.entries(KINDS).map(([key, [words]]) => [key, words]), this.mission, (mission) => { this.mission = mission; fill(note, KINDS[mission][1]); show(); })), note,
+    from, input, el("details", {}, el("summary", {}, "Camera"), field("Camera", camera, "A model such as “DJI Mavic 2 Pro”, or aov=78; only where the flight's files do not name it.")), start);
+    show();
+    this.loadReady(ready);
     return form;
   }
 
-  /** Streams of drones that are on, and flights that lie beside the sites. */
+  /** Streams of drones, and flights that lie beside the sites. */
   async loadReady(box) {
-    const [streams, inputs] = await Promise.all([get("/api/streams").catch(() => []), get("/api/inputs").catch(() => [])]);
-    const rows = (Array.isArray(streams) ? streams : streams.streams ?? []).map((each) => [JSON.stringify({ stream: each.name ?? each.id }), `Stream ${each.name ?? each.id}${each.state ? ` (${each.state})` : ""}`]);
-    rows.push(...(Array.isArray(inputs) ? inputs : inputs.inputs ?? []).map((each) => [JSON.stringify({ input: each.id }), `${each.name ?? each.id}${each.bytes ? ` (${bytes(each.bytes)})` : ""}`]));
-    fill(box, rows.length ? field("What the station has", choice(rows, rows[0][0], () => {})) : el("p", { class: "hint" }, "No drone streams here now, and no flight lies in the station's folder."));
+    const [streams, inputs] = await Promise.all([get("/api/streams"), get("/api/inputs")]);
+    const rows = streams.filter((each) => each.flights.length).map((each) => [JSON.stringify({ stream: each.stream }), `Stream ${each.stream}${each.is_connected ? " (on)" : ""}`]);
+    const texts = inputs.filter((each) => each.kind.startsWith("telemetry"));
+    rows.push(...inputs.filter((each) => !texts.includes(each)).map((each) => [JSON.stringify({ input: each.id }), `${each.name} (${bytes(each.megabytes * 1e6)})`]));
+    if (!rows.length) return fill(box, el("p", { class: "hint" }, "No drone sent a stream yet, and no flight lies in the station's folder."));
+    return fill(box, field("What the station has", choice(rows, rows[0][0], () => {}, { name: "input" })),
+      texts.length ? field("Telemetry", choice([["", "found by itself"], ...texts.map((each) => [each.id, each.name])], "", () => {}, { name: "telemetry" })) : null);
   }
 
-  async start({ files, url, ready }) {
-    let input;
-    if (this.from === "upload") {
-      if (!files.length) return message("Choose the files of the flight first");
-      input = { upload: await this.upload(files) };
-    } else if (this.from === "stream") {
-      if (!url) return message("Give the stream's address first");
-      input = { stream_url: url };
-    } else {
-      if (!ready) return message("The station has no flight or stream; choose files of this device");
-      input = JSON.parse(ready);
-    }
-    const run = await post("/api/runs", { mission: this.mission, site: this.screen.data.id, input, options: {} });
-    message(`${KINDS[this.mission][0]} started`, { todo: run.id ? `Mission ${run.id}` : "" });
+  async start(wish) {
+    const options = wish.camera ? { camera: wish.camera } : {};
+    const input = this.mission === "search" ? null : await this.input(wish, options);
+    if (input === undefined) return undefined;
+    await post("/api/runs", { mission: this.mission, site: this.screen.data.id, options, ...(input && { input }) });
+    message(`${KINDS[this.mission][0]} started`);
     return this.load();
   }
 
-  /** Send all files; gives the id of the one upload, or of each where there are several. */
-  async upload(files) {
-    const ids = [];
-    const group = files.length > 1 ? crypto.randomUUID?.() ?? String(Date.now()) : "";
-    for (const file of files) {
-      const upload = new Upload(file, { kind: kindOf(file.name), group });
-      const bar = el("progress", { max: 1, value: 0, "aria-label": file.name });
-      const row = el("div", { class: "upload" }, el("span", {}, `${file.name} (${bytes(file.size)})`), bar, button("Stop", () => upload.stop(), { class: "quiet" }));
-      this.uploadList.append(row);
-      upload.addEventListener("progress", ({ detail }) => { bar.value = detail; });
-      try {
-        ids.push(await upload.send());
-      } finally { row.remove(); }
+  /** What the mission flies; undefined where a person has to choose first. Puts telemetry into the options. */
+  async input(wish, options) {
+    if (this.from === "stream") return wish.url ? { stream_url: wish.url } : void message("Give the stream's address first");
+    if (this.from === "ready") {
+      if (wish.telemetry) options.telemetry = { input: wish.telemetry };
+      return wish.input ? JSON.parse(wish.input) : void message("The station has no flight or stream; choose files of this device");
     }
-    return ids.length === 1 ? ids[0] : ids;
+    const kinds = grouped(wish.files);
+    const [videos, photos, archives, texts] = ["video", "photo", "archive", "text"].map((kind) => kinds.get(kind) ?? []);
+    const flights = [...videos, ...archives, ...(photos.length ? [photos] : [])];
+    if (flights.length !== 1) return void message(flights.length ? "Choose one flight: one video, or photos" : "Choose the files of the flight first");
+    if (texts.length > 1) return void message("Choose one telemetry file");
+    if (texts.length) options.telemetry = { upload: await this.upload(texts[0]) };
+    return { upload: await this.upload(Array.isArray(flights[0]) ? await photosAsOne(photos) : flights[0]) };
+  }
+
+  /** Send a file; gives the upload's id. */
+  async upload(file) {
+    const upload = new Upload(file);
+    const bar = el("progress", { max: 1, value: 0, "aria-label": file.name });
+    const row = el("div", { class: "upload" }, el("span", {}, `${file.name} (${bytes(file.size)})`), bar, button("Stop", () => upload.stop(), { class: "quiet" }));
+    this.uploadList.append(row);
+    upload.addEventListener("progress", ({ detail }) => { bar.value = detail; });
+    try {
+      return await upload.send();
+    } finally { row.remove(); }
   }
 
   async load() {
     try {
-      const runs = await get("/api/runs");
-      this.runs = (Array.isArray(runs) ? runs : runs.runs ?? []).filter((each) => !each.site || each.site === this.screen.data.id);
+      this.runs = await get(`/api/runs?site=${encodeURIComponent(this.screen.data.id)}`);
       this.show();
     } catch (problem) {
       fill(this.list, el("p", { class: "hint" }, problem.detail));
@@ -124,16 +132,17 @@ class Missions {
   }
 
   row(run) {
-    const running = RUNNING.has(run.state);
-    const share = run.progress?.share ?? (run.progress?.total ? run.progress.frames / run.progress.total : null);
+    const running = run.state === "running";
+    const { frames, frames_expected: expected } = run.progress ?? {};
     return el("article", { class: `run ${run.state}` },
-      el("header", {}, el("b", {}, KINDS[run.mission]?.[0] ?? run.mission), el("span", { class: "state" }, run.state), el("span", { class: "soft" }, run.started_at ? time(run.started_at) : "")),
-      running ? el("progress", { ...(share === null ? {} : { value: share, max: 1 }), "aria-label": "Progress" }) : null,
-      run.progress?.text || run.progress?.words ? el("p", {}, run.progress.text ?? run.progress.words) : running && run.progress?.frames ? el("p", {}, `${run.progress.frames} frames`) : null,
+      el("header", {}, el("b", {}, KINDS[run.mission]?.[0] ?? run.mission), el("span", { class: "state" }, run.stop_asked && running ? "stopping" : run.state), el("span", { class: "soft" }, `${time(run.started_at)}${run.who ? `, ${run.who}` : ""}`)),
+      run.input?.name || run.input?.stream || run.input?.stream_url ? el("p", { class: "soft" }, run.input.name ?? run.input.stream ?? run.input.stream_url) : null,
+      running ? el("progress", { ...(expected ? { value: Math.min(frames, expected), max: expected } : {}), "aria-label": "Progress" }) : null,
+      running && frames ? el("p", {}, expected ? `frame ${frames} of ${expected}` : `${frames} frames`) : null,
       run.headline ? el("p", {}, run.headline) : null,
       run.error ? el("p", { class: "error" }, run.error) : null,
-      run.started_at && run.finished_at ? el("p", { class: "soft" }, `until ${clock(run.finished_at)}, ${duration((new Date(run.finished_at) - new Date(run.started_at)) / 1000)}`) : null,
-      running && this.may ? button("Stop", () => this.stop(run), { class: "quiet" }) : null);
+      run.ended_at ? el("p", { class: "soft" }, `took ${duration((new Date(run.ended_at) - new Date(run.started_at)) / 1000)}`) : null,
+      running && this.may ? button(run.stop_asked ? "Stop at once" : "Stop", () => this.stop(run), { class: "quiet" }) : null);
   }
 
   async stop(run) {
@@ -149,8 +158,26 @@ class Missions {
 /** What a file is to the station, by its name's ending. */
 export function kindOf(name) {
   const ending = name.toLowerCase().split(".").at(-1);
-  if (["mp4", "mov", "mkv", "ts", "avi", "m4v"].includes(ending)) return "video";
-  if (["jpg", "jpeg", "tif", "tiff", "dng", "heic", "png"].includes(ending)) return "photo";
-  if (ending === "zip") return "archive";
-  return "telemetry";
+  if (["mp4", "mov", "mkv", "ts", "m4v"].includes(ending)) return "video";
+  if (["jpg", "jpeg", "tif", "tiff", "dng", "heic"].includes(ending)) return "photo";
+  return ending === "zip" ? "archive" : "text";
+}
+
+function grouped(files) {
+  const groups = new Map();
+  for (const each of files) groups.set(kindOf(each.name), [...(groups.get(kindOf(each.name)) ?? []), each]);
+  return groups;
+}
+
+/** Photos as one zip file, always the same of the same photos, so that an upload goes on where it was cut. */
+async function photosAsOne(photos) {
+  const list = [...photos].sort((one, other) => one.name.localeCompare(other.name));
+  const size = list.reduce((sum, each) => sum + each.size, 0);
+  if (size > MOST_ZIP_BYTES || list.length > 65000) throw new Problem(413, "Too many photos for one upload", "More than 4 GB were chosen: pack them as a .zip (64 bit) and choose that, or copy the folder to the station.");
+  const name = `${list[0].name.replace(/\.[^.]*$/, "")}-${list.length}-photos.zip`;
+  return new File([await zipOfFiles(list)], name, { lastModified: Math.max(...list.map((each) => each.lastModified)) });
+}
+
+function chosen(box) {
+  return Object.fromEntries([...box.querySelectorAll("select")].map((each) => [each.name, each.value]));
 }

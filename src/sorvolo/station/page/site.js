@@ -75,7 +75,8 @@ class SiteScreen {
     this.hear(this.data, "chosen", () => this.drawChosen());
     this.hear(choices, "change", (event) => { this.view?.follow(); if (event.detail !== "layers") this.redraw(); });
     this.hear(matchMedia("(prefers-color-scheme: dark)"), "change", () => this.view?.follow());
-    for (const type of ["run.finished", "run.stopped", "run.failed"]) this.hear(this.station.events, type, (event) => this.reload(event.detail));
+    for (const type of ["site.changed", "run.finished", "run.stopped", "run.failed"]) this.hear(this.station.events, type, (event) => this.reload(event.detail));
+    this.hear(this.station.events, "site.gone", ({ detail }) => { if (detail.site === this.data.id) this.gone(); });
     this.hear(this.station.events, "review.changed", ({ detail }) => { if (detail.site === this.data.id) this.data.judge(detail.data); });
     this.open(view);
     this.load();
@@ -109,10 +110,14 @@ class SiteScreen {
         if (!this.opened?.versions) this.view.showVersion(`live-${this.data.detail.live_revision}`);
       }
     } catch (problem) {
-      if (problem.status === 404 || problem.status === 410) {
-        message("This site is gone", { kind: "error", todo: "Somebody deleted it. The list of sites shows the others." });
-      } else throw problem;
+      if (problem.status === 410) this.gone();
+      else if (problem.status !== 404) throw problem;
     }
+  }
+
+  gone() {
+    message("This site is gone", { kind: "error", todo: "Somebody deleted it. The list of sites shows the others." });
+    location.hash = "#/";
   }
 
   /** Open a panel by its name. */

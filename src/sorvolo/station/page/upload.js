@@ -12,10 +12,10 @@ const pause = (ms) => new Promise((done) => setTimeout(done, ms));
  * Where the browser reloads, the same file goes on at the byte that the station has.
  */
 export class Upload extends EventTarget {
-  constructor(file, { kind, group = "" } = {}) {
+  constructor(file) {
     super();
-    Object.assign(this, { file, kind, group, sent: 0, stopped: new AbortController() });
-    this.key = `sorvolo-upload ${file.name} ${file.size} ${file.lastModified} ${kind} ${group}`;
+    Object.assign(this, { file, sent: 0, stopped: new AbortController() });
+    this.key = `sorvolo-upload ${file.name} ${file.size} ${file.lastModified}`;
   }
 
   async send() {
@@ -41,7 +41,17 @@ export class Upload extends EventTarget {
       }
     }
     forget(this.key);
-    return decodeURIComponent(new URL(url, location.href).pathname.split("/").filter(Boolean).at(-1));
+    return this.checked(url);
+  }
+
+  /** Wait until the station looked into the file; the upload's id. Throws Problem where it refuses it. */
+  async checked(url) {
+    for (;;) {
+      const { id, state, why } = await (await send(url, { signal: this.stopped.signal })).json();
+      if (state === "refused") throw new Problem(415, `${this.file.name} cannot be used`, why);
+      if (state === "ready") return id;
+      await pause(300);
+    }
   }
 
   /** Stop; what is there stays for a later try. */
@@ -55,8 +65,7 @@ export class Upload extends EventTarget {
   }
 
   async create() {
-    const values = { filename: this.file.name, kind: this.kind, ...(this.group && { group: this.group }) };
-    const metadata = Object.entries(values).filter(([, value]) => value).map(([name, value]) => `${name} ${base64(value)}`).join(",");
+    const metadata = `filename ${base64(this.file.name)}`;
     const answer = await send("/api/uploads", { method: "POST", headers: { ...VERSION, "upload-length": String(this.file.size), "upload-metadata": metadata }, signal: this.stopped.signal });
     const url = answer.headers.get("location");
     if (!url) throw new Problem(500, "The upload did not begin", "The station gave it no address; look at its messages.");

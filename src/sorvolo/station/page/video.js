@@ -36,25 +36,22 @@ class VideoPane {
       screen.station.events.addEventListener(type, listener);
       return () => screen.station.events.removeEventListener(type, listener);
     };
-    this.ends = [hear("frame.boxes", ({ detail }) => this.take(detail.data)), hear("stream.state", ({ detail }) => this.heard(detail))];
+    this.ends = [hear("frame.boxes", ({ detail }) => { if (detail.data.stream === this.stream) this.take(detail.data); }), hear("stream.state", ({ detail }) => this.heard(detail))];
     this.look();
   }
 
-  /** Is a stream on for this site? */
+  /** Is a stream on? */
   async look() {
     try {
-      const answer = await get("/api/streams");
-      const list = Array.isArray(answer) ? answer : answer.streams ?? [];
-      const mine = list.find((each) => each.site === this.screen.data.id) ?? list.find((each) => !each.site && ["live", "on", "connected"].includes(each.state ?? "live"));
-      if (mine) this.offer(mine.name ?? mine.id);
-    } catch { /* a station without streams */ }
+      const list = await get("/api/streams");
+      const on = list.find((each) => each.is_connected) ?? null;
+      if (on) this.offer(on.stream);
+    } catch { /* the connection's own sign says so */ }
   }
 
-  heard({ site, data }) {
-    if (site && site !== this.screen.data.id) return;
-    const name = data.stream ?? data.name;
-    if (["ended", "lost", "off"].includes(data.state) && name === this.stream) fill(this.delay, data.state === "lost" ? "no signal" : "ended");
-    else if (name) this.offer(name);
+  heard({ data }) {
+    if (data.is_connected) this.offer(data.stream);
+    else if (data.stream === this.stream) fill(this.delay, data.flights?.at(-1)?.is_over ? "ended" : "no signal");
   }
 
   offer(name) {
@@ -99,11 +96,11 @@ class VideoPane {
   }
 
   said(words) {
-    if (words.codec) {
+    if (words.type === "format") {
       this.format = words;
+      if (words.epoch_us !== undefined) this.epoch_us = words.epoch_us;
       this.show.begin(words);
-    } else if (words.boxes) this.take(words);
-    if (words.epoch_us !== undefined) this.epoch_us = words.epoch_us;
+    } else if (words.type === "boxes") this.take(words);
   }
 
   packet(data) {
@@ -118,7 +115,6 @@ class VideoPane {
   }
 
   take(data) {
-    if (!data || (data.stream && data.stream !== this.stream)) return;
     this.boxes.push(data);
     this.boxes.sort((one, other) => one.pts_us - other.pts_us);
     this.boxes.splice(0, this.boxes.length - KEPT_BOXES);

@@ -1,4 +1,4 @@
-// A zip file with stored (not compressed) members: enough for a KMZ.
+// Zip files with stored (not compressed) members: for a KMZ, and photos sent as one upload.
 
 const TABLE = Uint32Array.from({ length: 256 }, (_, byte) => {
   let value = byte;
@@ -13,7 +13,7 @@ export function crc32(bytes) {
   return (value ^ 0xffffffff) >>> 0;
 }
 
-function record(signature, fields, ...tail) {
+function record(signature, fields) {
   const size = 4 + fields.reduce((sum, [width]) => sum + width, 0);
   const view = new DataView(new ArrayBuffer(size));
   view.setUint32(0, signature, true);
@@ -23,27 +23,40 @@ function record(signature, fields, ...tail) {
     else view.setUint32(at, value, true);
     at += width;
   }
-  return [new Uint8Array(view.buffer), ...tail];
+  return new Uint8Array(view.buffer);
 }
 
-/** A Blob of a zip file of `{name: Uint8Array}`; names are plain ASCII. */
+/** A Blob of a zip file of `{name: Uint8Array}`. */
 export function zip(members, type = "application/zip") {
+  return packed(Object.entries(members).map(([name, data]) => ({ name, crc: crc32(data), size: data.length, data })), type);
+}
+
+/** A Blob of a zip file of files; they are read once for their checksums and stay where they are. */
+export async function zipOfFiles(files) {
+  const members = [];
+  for (const file of files) {
+    const crc = crc32(new Uint8Array(await file.arrayBuffer()));
+    members.push({ name: file.name, crc, size: file.size, data: file });
+  }
+  return packed(members, "application/zip");
+}
+
+const UTF8_NAMES = 0x0800;
+
+function packed(members, type) {
   const parts = [];
   const directory = [];
-  let offset = 0;
-  let directorySize = 0;
-  for (const [name, data] of Object.entries(members)) {
+  let [offset, directorySize] = [0, 0];
+  for (const { name, crc, size, data } of members) {
     const label = new TextEncoder().encode(name);
-    const crc = crc32(data);
-    const common = [[2, 20], [2, 0], [2, 0], [2, 0], [2, 0x21], [4, crc], [4, data.length], [4, data.length], [2, label.length], [2, 0]];
-    const local = record(0x04034b50, common, label, data);
-    const central = record(0x02014b50, [[2, 20], ...common, [2, 0], [2, 0], [2, 0], [4, 0], [4, offset]], label);
-    parts.push(...local);
-    directory.push(...central);
-    offset += local.reduce((sum, each) => sum + each.length, 0);
-    directorySize += central.reduce((sum, each) => sum + each.length, 0);
+    const common = [[2, 20], [2, UTF8_NAMES], [2, 0], [2, 0], [2, 0x21], [4, crc], [4, size], [4, size], [2, label.length], [2, 0]];
+    const head = record(0x04034b50, common);
+    const entry = record(0x02014b50, [[2, 20], ...common, [2, 0], [2, 0], [2, 0], [4, 0], [4, offset]]);
+    parts.push(head, label, data);
+    directory.push(entry, label);
+    offset += head.length + label.length + size;
+    directorySize += entry.length + label.length;
   }
-  const count = Object.keys(members).length;
-  const end = record(0x06054b50, [[2, 0], [2, 0], [2, count], [2, count], [4, directorySize], [4, offset], [2, 0]]);
-  return new Blob([...parts, ...directory, ...end], { type });
+  const end = record(0x06054b50, [[2, 0], [2, 0], [2, members.length], [2, members.length], [4, directorySize], [4, offset], [2, 0]]);
+  return new Blob([...parts, ...directory, end], { type });
 }
