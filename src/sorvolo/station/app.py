@@ -15,8 +15,10 @@ from starlette.staticfiles import StaticFiles
 from sorvolo import __version__
 from sorvolo.station.collections import SiteCollections
 from sorvolo.station.crops import crop_routes
+from sorvolo.station.drawings import Drawings, drawing_routes
 from sorvolo.station.event_routes import event_routes
 from sorvolo.station.events import EventLog
+from sorvolo.station.exports import export_routes
 from sorvolo.station.features import feature_routes, landing_links
 from sorvolo.station.flight_videos import FlightVideos, video_routes
 from sorvolo.station.ingest import Ingest, IngestLimits
@@ -107,9 +109,11 @@ def station_app(settings: StationSettings) -> FastAPI:
         _about_routes(station), _site_routes(station), event_routes(station.events),
         feature_routes(station.collections, station.reviews), review_routes(station.reviews, station.shelf),
         crop_routes(station.shelf), stream_routes(station.ingest),
-        crop_routes(station.shelf), upload_routes(station.uploads), run_routes(station.runs, station.inputs),
+        upload_routes(station.uploads), run_routes(station.runs, station.inputs),
         place_routes(station.shelf, station.collections, station.reviews, station.videos),
         video_routes(station.shelf, station.collections, station.videos),
+        drawing_routes(Drawings(settings, station.shelf, station.events)),
+        export_routes(station.shelf, station.collections),
     ):
         app.include_router(router)
     _serve_page(app)

@@ -4,6 +4,7 @@ import errno
 import os
 import stat
 from pathlib import Path, PurePosixPath
+from typing import BinaryIO
 
 from sorvolo.errors import StoreError
 
@@ -17,27 +18,19 @@ def read_below(folder: Path, relative: str, most_bytes: int = _MOST_BYTES) -> by
     The folder itself may be one. Raises FileNotFoundError when there is no such file, and StoreError for a link, for
     anything but a plain file, and for one of more than `most_bytes`.
     """
-    path = folder / relative
-    parts = PurePosixPath(relative).parts
-    if not parts or ".." in parts or parts[0] == "/":
-        raise StoreError(f"{relative!r} is no path below {folder}; the site is damaged or was made to do harm")
-    try:
-        descriptor = _descend(folder, parts)
-    except FileNotFoundError as error:
-        raise FileNotFoundError(error.errno, error.strerror, str(path)) from error
-    except OSError as error:
-        if error.errno in _LINK_ERRORS:
-            raise _refused(path) from error
-        raise StoreError(f"cannot read {path} ({error.strerror}); check the disk and its permissions") from error
-    with os.fdopen(descriptor, "rb") as file:
-        about = os.fstat(descriptor)
-        if not stat.S_ISREG(about.st_mode):
-            raise _refused(path)
-        if about.st_size > most_bytes:
+    with open_below(folder, relative) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most_bytes:
             raise StoreError(
-                f"{path} has {about.st_size / 1e6:.0f} MB, at most {most_bytes / 1e6:.0f} MB were expected; map again"
+                f"{folder / relative} has {size / 1e6:.0f} MB, at most {most_bytes / 1e6:.0f} MB were expected; "
+                "map again"
             )
         return file.read()
+
+
+def open_below(folder: Path, relative: str) -> BinaryIO:
+    """The file `relative` below the folder, opened to be read piece by piece; raises as `read_below`."""
+    return os.fdopen(_descriptor_below(folder, relative), "rb")
 
 
 def refuse_links(folder: Path, *, skipped: frozenset[str] = frozenset()) -> None:
@@ -53,6 +46,25 @@ def refuse_links(folder: Path, *, skipped: frozenset[str] = frozenset()) -> None
                     waiting.append(Path(entry.path))
             elif not entry.is_file(follow_symlinks=False):
                 raise _refused(Path(entry.path))
+
+
+def _descriptor_below(folder: Path, relative: str) -> int:
+    path = folder / relative
+    parts = PurePosixPath(relative).parts
+    if not parts or ".." in parts or parts[0] == "/":
+        raise StoreError(f"{relative!r} is no path below {folder}; the site is damaged or was made to do harm")
+    try:
+        descriptor = _descend(folder, parts)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(error.errno, error.strerror, str(path)) from error
+    except OSError as error:
+        if error.errno in _LINK_ERRORS:
+            raise _refused(path) from error
+        raise StoreError(f"cannot read {path} ({error.strerror}); check the disk and its permissions") from error
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise _refused(path)
+    return descriptor
 
 
 def _descend(folder: Path, parts: tuple[str, ...]) -> int:

@@ -1,0 +1,165 @@
+"""Files of a site for other programs: what missions wrote, a GeoPackage of what the map shows, height profiles."""
+
+import math
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+from urllib.parse import quote
+
+from fastapi import APIRouter, Depends, Query, Response
+from fastapi.responses import StreamingResponse
+
+from sorvolo.errors import InputError
+from sorvolo.missions.heights.measure import measure_profile
+from sorvolo.station.collections import TITLES, SiteCollections
+from sorvolo.station.problems import Problem
+from sorvolo.station.security import needs
+from sorvolo.station.sites import SiteShelf
+from sorvolo.station.tokens import Role
+from sorvolo.store.exports.geopackage import write_geopackage
+from sorvolo.store.nofollow import open_below
+from sorvolo.store.site.archive import Archive
+
+_OF_SITE: Mapping[str, str] = {
+    "mosaic.tif": "Map, Cloud Optimized GeoTIFF", "mosaic.kmz": "Map for Google Earth",
+    "preview.png": "Map, small picture",
+    "objects.geojson": "Objects, GeoJSON", "objects.kml": "Objects, KML", "objects.gpx": "Objects, GPX",
+    "search/search.html": "Search: probability of detection, one file",
+    "search/pod.tif": "Probability of detection, GeoTIFF",
+    "search/pod.geojson": "Probability of detection, GeoJSON",
+}
+_OF_FLIGHT: Mapping[str, str] = {
+    "report.html": "report, one file", "report.json": "report, JSON", "changes.html": "changes, one file",
+    "changes.geojson": "changes, GeoJSON", "changes.kml": "changes, KML", "changes.gpx": "changes, GPX",
+    "coverage.geojson": "ground compared, GeoJSON", "frames.geojson": "frames, GeoJSON",
+    "orthophoto.tif": "true orthophoto, GeoTIFF", "heights.tif": "surface heights, GeoTIFF",
+    "terrain.tif": "bare ground, GeoTIFF",
+}
+_GEOPACKAGE = "site.gpkg"
+_PIECE_BYTES = 1 << 20
+_MOST_PROFILE_PLACES, _MOST_PROFILE_POINTS = 50, 2000
+
+
+@dataclass(frozen=True)
+class ExportFile:
+    """A file that a browser may have; `id` names it, `path` lies below the site."""
+
+    id: str
+    path: str
+    title: str
+
+
+def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
+    """What can be taken away, each by its id; a profile of heights."""
+    router = APIRouter(prefix="/api/sites/{site}", tags=["exports"], dependencies=[Depends(needs(Role.VIEW))])
+
+    @router.get("/exports")
+    def listed(site: str) -> list[dict[str, Any]]:
+        """The files of a site that are there."""
+        archive = shelf.open(site)
+        rows = [_row(site, each, size) for each in export_files(archive) if (size := _size(archive, each)) is not None]
+        if archive.has_site:
+            package = ExportFile(_GEOPACKAGE, "", "Objects, changes, frames and coverage, GeoPackage")
+            rows.insert(min(2, len(rows)), _row(site, package, None))
+        return rows
+
+    @router.get("/exports/{export_id}", response_class=StreamingResponse)
+    def one(site: str, export_id: str) -> Response:
+        """One of them, to be kept."""
+        archive = shelf.open(site)
+        if export_id == _GEOPACKAGE:
+            return _geopackage(site, archive, collections)
+        found = next((each for each in export_files(archive) if each.id == export_id), None)
+        try:
+            file = open_below(archive.folder, found.path) if found is not None else None
+        except FileNotFoundError:
+            file = None
+        if found is None or file is None:
+            raise Problem(404, f"no file {export_id[:80]!r} of this site; its list of exports names those there are")
+        return _download(file, f"{_plain_name(site)}-{found.id}")
+
+    @router.get("/profile")
+    def profile(
+        site: str, line: str = Query(max_length=4000), step_m: float = Query(0, ge=0, le=1000),
+    ) -> dict[str, Any]:
+        """Heights along a line, `LON,LAT;LON,LAT;...`; 404 where the site has no heights."""
+        return _profile(shelf.open(site).folder, line, step_m)
+
+    return router
+
+
+def export_files(archive: Archive) -> list[ExportFile]:
+    """Everything that could be there, the site's own files first, then those of each flight, the newest first."""
+    files = [ExportFile(path.rpartition("/")[2], path, title) for path, title in _OF_SITE.items()]
+    for flight in reversed(archive.flights()) if archive.has_site else ():
+        files += [
+            ExportFile(f"{flight.id}-{name}", f"flights/{flight.id}/{name}", f"{flight.id}: {title}")
+            for name, title in _OF_FLIGHT.items()
+        ]
+    return files
+
+
+def _size(archive: Archive, file: ExportFile) -> int | None:
+    try:
+        with open_below(archive.folder, file.path) as opened:
+            return os.fstat(opened.fileno()).st_size
+    except FileNotFoundError:
+        return None
+
+
+def _row(site: str, file: ExportFile, size: int | None) -> dict[str, Any]:
+    url = f"/api/sites/{quote(site, safe='')}/exports/{quote(file.id, safe='')}"
+    return {"id": file.id, "title": file.title, "bytes": size, "url": url, "name": f"{_plain_name(site)}-{file.id}"}
+
+
+def _plain_name(site: str) -> str:
+    return "".join(each if each.isalnum() or each in "-_." else "-" for each in site)
+
+
+def _download(file: BinaryIO, name: str) -> StreamingResponse:
+    headers = {
+        "content-disposition": f"attachment; filename*=UTF-8''{quote(name)}",
+        "content-length": str(os.fstat(file.fileno()).st_size), "cache-control": "no-cache",
+    }
+    return StreamingResponse(_pieces(file), media_type="application/octet-stream", headers=headers)
+
+
+def _pieces(file: BinaryIO) -> Iterator[bytes]:
+    with file:
+        while piece := file.read(_PIECE_BYTES):
+            yield piece
+
+
+def _geopackage(site: str, archive: Archive, collections: SiteCollections) -> StreamingResponse:
+    if not archive.has_site:
+        raise Problem(404, "this site has no map yet, so nothing for a GeoPackage")
+    layers = {name: collections.get(site, name).features for name in TITLES}
+    with tempfile.TemporaryDirectory(prefix="sorvolo-") as folder:
+        path = Path(folder) / _GEOPACKAGE
+        write_geopackage(path, layers)
+        return _download(path.open("rb"), f"{_plain_name(site)}.gpkg")  # open: it outlives its folder
+
+
+def _profile(folder: Path, line: str, step_m: float) -> dict[str, Any]:
+    places = [each.split(",") for each in line.split(";") if each]
+    if not 2 <= len(places) <= _MOST_PROFILE_PLACES or any(len(each) != 2 for each in places):
+        raise Problem(400, f"line={line[:80]}: 2 to {_MOST_PROFILE_PLACES} places LON,LAT;LON,LAT;... were needed")
+    try:
+        points = measure_profile(folder, [f"{lat},{lon}" for lon, lat in places], step_m=step_m)
+    except InputError as error:
+        raise Problem(404 if "heights" in str(error) else 400, str(error)) from error
+    points = points[:: max(1, math.ceil(len(points) / _MOST_PROFILE_POINTS))]
+    known = [each.sigma_m for each in points if math.isfinite(each.sigma_m)]
+    return {
+        "distance_m": [each.way_m for each in points],
+        "height_m": [_number(each.surface_m) for each in points],
+        "ground_m": [_number(each.ground_m) for each in points],
+        "sigma_m": sum(known) / len(known) if known else None,
+    }
+
+
+def _number(value: float) -> float | None:
+    return round(value, 3) if math.isfinite(value) else None

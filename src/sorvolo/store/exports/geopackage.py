@@ -1,0 +1,119 @@
+"""Layers of features as a GeoPackage (OGC 12-128r19): one SQLite file that QGIS and others open."""
+
+import json
+import sqlite3
+import struct
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import shapely
+from shapely.geometry import shape
+from shapely.geometry.base import BaseGeometry
+
+from sorvolo.store.atomic import atomic_path
+
+Feature = Mapping[str, Any]
+
+_APPLICATION = 0x47504B47  # "GPKG"
+_VERSION = 10300
+_WGS84 = 4326
+_WGS84_WKT = (
+    'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
+    'UNIT["degree",0.0174532925199433],AUTHORITY["EPSG","4326"]]'
+)
+_TABLES = """
+CREATE TABLE gpkg_spatial_ref_sys (srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY, organization TEXT NOT NULL,
+  organization_coordsys_id INTEGER NOT NULL, definition TEXT NOT NULL, description TEXT);
+CREATE TABLE gpkg_contents (table_name TEXT NOT NULL PRIMARY KEY, data_type TEXT NOT NULL, identifier TEXT UNIQUE,
+  description TEXT DEFAULT '', last_change DATETIME NOT NULL, min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE,
+  srs_id INTEGER REFERENCES gpkg_spatial_ref_sys(srs_id));
+CREATE TABLE gpkg_geometry_columns (table_name TEXT NOT NULL PRIMARY KEY REFERENCES gpkg_contents(table_name),
+  column_name TEXT NOT NULL, geometry_type_name TEXT NOT NULL, srs_id INTEGER NOT NULL, z TINYINT NOT NULL,
+  m TINYINT NOT NULL);
+"""
+
+
+def write_geopackage(path: Path, layers: Mapping[str, Sequence[Feature]]) -> None:
+    """Write a layer for each name that has features; GeoJSON features in WGS84. Raises StoreError on a full disk."""
+    with atomic_path(path) as temporary, closing(sqlite3.connect(temporary, isolation_level=None)) as file:
+        file.execute(f"PRAGMA application_id = {_APPLICATION}")
+        file.execute(f"PRAGMA user_version = {_VERSION}")
+        file.executescript(_TABLES)
+        file.execute("BEGIN")
+        file.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, '')", [
+            ("Undefined cartesian", -1, "NONE", -1, "undefined"), ("Undefined geographic", 0, "NONE", 0, "undefined"),
+            ("WGS 84", _WGS84, "EPSG", _WGS84, _WGS84_WKT),
+        ])
+        for name, features in layers.items():
+            if features:
+                _write_layer(file, name, features)
+        file.execute("COMMIT")
+
+
+def _write_layer(file: sqlite3.Connection, name: str, features: Sequence[Feature]) -> None:
+    shapes = _alike([shapely.force_2d(shape(each["geometry"])) for each in features])
+    kind = shapes[0].geom_type.upper() if len({each.geom_type for each in shapes}) == 1 else "GEOMETRY"
+    columns = _columns(features)
+    declared = "".join(f", {_quoted(column)} {sql}" for column, sql in columns.items())
+    file.execute(f"CREATE TABLE {_quoted(name)} (fid INTEGER PRIMARY KEY AUTOINCREMENT, geom {kind}{declared})")
+    marks = ", ".join("?" * (len(columns) + 1))
+    names = ", ".join(["geom", *(_quoted(each) for each in columns)])
+    file.executemany(f"INSERT INTO {_quoted(name)} ({names}) VALUES ({marks})", [
+        (_blob(geometry), *(_plain(each["properties"].get(column)) for column in columns))
+        for geometry, each in zip(shapes, features, strict=True)
+    ])
+    bounds = shapely.total_bounds(shapes)
+    now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.000Z")
+    file.execute(
+        "INSERT INTO gpkg_contents VALUES (?, 'features', ?, '', ?, ?, ?, ?, ?, ?)",
+        (name, name, now, *(float(each) for each in bounds), _WGS84),
+    )
+    file.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)", (name, kind, _WGS84))
+
+
+def _alike(shapes: Sequence[BaseGeometry]) -> list[BaseGeometry]:
+    """Polygons beside multipolygons become multipolygons: a layer of one kind opens in every program."""
+    if {each.geom_type for each in shapes} == {"Polygon", "MultiPolygon"}:
+        return [shapely.MultiPolygon([each]) if each.geom_type == "Polygon" else each for each in shapes]
+    return list(shapes)
+
+
+def _columns(features: Sequence[Feature]) -> dict[str, str]:
+    """The columns of all features' properties with their SQL types; names that differ in case alone are one to SQL."""
+    found: dict[str, set[str]] = {}
+    spelled: dict[str, str] = {}
+    for each in features:
+        for name, value in each["properties"].items():
+            if name.lower() not in ("fid", "geom"):
+                kinds = found.setdefault(spelled.setdefault(name.lower(), name), set())
+                if value is not None:
+                    kinds.add(_sql_type(value))
+    return {name: _common_type(kinds) for name, kinds in found.items()}
+
+
+def _sql_type(value: object) -> str:
+    if isinstance(value, bool):
+        return "BOOLEAN"
+    return "INTEGER" if isinstance(value, int) else "REAL" if isinstance(value, float) else "TEXT"
+
+
+def _common_type(kinds: set[str]) -> str:
+    if len(kinds) == 1:
+        return next(iter(kinds))
+    return "REAL" if kinds == {"INTEGER", "REAL"} else "TEXT"
+
+
+def _plain(value: object) -> object:
+    return json.dumps(value) if isinstance(value, list | dict | tuple) else value
+
+
+def _blob(geometry: BaseGeometry) -> bytes:
+    """A geometry as GeoPackages hold it: magic, version, flags (little-endian, no envelope), EPSG code, ISO WKB."""
+    return struct.pack("<2sBBi", b"GP", 0, 1, _WGS84) + bytes(shapely.to_wkb(geometry, byte_order=1, flavor="iso"))
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"'

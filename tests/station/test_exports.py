@@ -1,0 +1,68 @@
+"""Files that a browser may take away: those of the site, by id; a GeoPackage; heights along a line."""
+
+import sqlite3
+from pathlib import Path
+
+from starlette.testclient import TestClient
+
+from sorvolo.store.exports.geopackage import write_geopackage
+
+URL = "/api/sites/field/exports"
+
+
+def test_listed_files_can_be_taken_and_nothing_else(client: TestClient, root: Path) -> None:
+    (root / "field" / "mosaic.tif").write_bytes(b"II*\0 a map")
+    listed = {each["id"]: each for each in client.get(URL).json()}
+    assert listed["mosaic.tif"]["bytes"] == 10
+    answer = client.get(listed["mosaic.tif"]["url"])
+    assert answer.content == b"II*\0 a map"
+    assert answer.headers["content-disposition"].startswith("attachment; filename*=UTF-8''field-mosaic.tif")
+    for wrong in ("site.db", "..%2Fstation%2Fstation.db", "pod.tif"):
+        assert client.get(f"{URL}/{wrong}").status_code == 404
+
+
+def test_a_link_in_a_files_place_is_refused(client: TestClient, root: Path) -> None:
+    secret = root / "secret"
+    secret.write_text("hidden")
+    (root / "field" / "objects.kml").symlink_to(secret)
+    answer = client.get(f"{URL}/objects.kml")
+    assert answer.status_code == 409
+    assert "hidden" not in answer.text
+
+
+def test_geopackage_holds_what_the_map_shows(client: TestClient, tmp_path: Path) -> None:
+    answer = client.get(f"{URL}/site.gpkg")
+    assert answer.status_code == 200
+    path = tmp_path / "site.gpkg"
+    path.write_bytes(answer.content)
+    features = client.get("/api/sites/field/collections/changes/items").json()["features"]
+    with sqlite3.connect(path) as file:
+        assert file.execute("PRAGMA application_id").fetchone()[0] == 0x47504B47
+        rows = file.execute("SELECT id, kind FROM changes ORDER BY fid").fetchall()
+        query = "SELECT geometry_type_name, srs_id FROM gpkg_geometry_columns WHERE table_name = 'changes'"
+        kind, srs = file.execute(query).fetchone()
+    assert rows == [(each["id"], each["properties"]["kind"]) for each in features]
+    assert (kind, srs) == ("POLYGON", 4326)
+
+
+def test_geopackage_mixes_polygons_and_odd_names(tmp_path: Path) -> None:
+    ring = [[0, 0], [1, 0], [1, 1], [0, 0]]
+    features = [
+        {"geometry": {"type": "Polygon", "coordinates": [ring]},
+         "properties": {'a"b': 1, "A": None, "list": [1], "fid": 7}},
+        {"geometry": {"type": "MultiPolygon", "coordinates": [[ring]]},
+         "properties": {'a"b': 2.5, "a": "x", "yes": True}},
+    ]
+    write_geopackage(tmp_path / "x.gpkg", {"some": features, "none": []})
+    with sqlite3.connect(tmp_path / "x.gpkg") as file:
+        rows = file.execute('SELECT "a""b", list, yes FROM some').fetchall()
+        kind = file.execute("SELECT geometry_type_name FROM gpkg_geometry_columns").fetchall()
+    assert rows == [(1.0, "[1]", None), (2.5, None, 1)]
+    assert kind == [("MULTIPOLYGON",)]
+
+
+def test_profile_of_a_site_without_heights(client: TestClient) -> None:
+    answer = client.get("/api/sites/field/profile?line=12,41;12.001,41")
+    assert answer.status_code == 404
+    assert "sorvolo heights" in answer.json()["detail"]
+    assert client.get("/api/sites/field/profile?line=12,41").status_code == 400
