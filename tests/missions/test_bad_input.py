@@ -437,6 +437,11 @@ def undisturbed(photographed: Path, tmp_path_factory: pytest.TempPathFactory) ->
     return folder.with_name("site")
 
 
+def is_the_same(path: Path) -> bool:
+    """Whether the file of a site holds nothing of when, and how quickly, it was made."""
+    return path.is_file() and not path.name.startswith(("site.", "report."))
+
+
 @pytest.mark.parametrize("sign", ["site.db", "flights/*/keyframes/*/000004.jpg", "tiles/*/*", "mosaic.tif"])
 def test_kill_at_any_moment_and_the_same_command_again(
     photos: Path, photographed: Path, undisturbed: Path, tmp_path: Path, sign: str
@@ -454,13 +459,10 @@ def test_kill_at_any_moment_and_the_same_command_again(
         assert len(archive.keyframes()) in (0, 12)
     mapped(site, photos, "--camera", camera)
     again, expected = (
-        json.loads(next(folder.glob("flights/*/frames.geojson")).read_text())["features"]
+        {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if is_the_same(path)}
         for folder in (site, undisturbed)
     )
-    assert [each["properties"]["frame"] for each in again] == [each["properties"]["frame"] for each in expected]
-    for one, other in zip(again, expected, strict=True):
-        moved_deg = np.subtract(one["geometry"]["coordinates"], other["geometry"]["coordinates"])
-        assert np.abs(moved_deg).max() < 1e-6
+    assert again == expected
     assert not list(site.rglob(".tmp-*"))
     with Archive.open(site, write=False) as archive:
         assert len(archive.flights()) == 1 and len(archive.keyframes()) == 12

@@ -33,6 +33,8 @@ from sorvolo.survey.wording import counted, counted_list
 if TYPE_CHECKING:
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.flight.settings import MapSettings
+    from sorvolo.missions.map.flights import AlreadyMapped
+    from sorvolo.survey.mosaic import MosaicUpdate
 
 _MOST_REASONS = 6
 TO_CHECK = 3
@@ -95,6 +97,9 @@ Memory = Annotated[
     typer.Option(help="Memory for pictures that are needed again, MB. Without it: a quarter of the machine's."),
 ]
 
+Again = Annotated[
+    bool, typer.Option("--again", help="Map a flight anew that is in the map already, or of which a run was stopped.")
+]
 WithHeights = Annotated[
     bool, typer.Option("--heights/--flat", help="Also make heights and a true orthophoto of each flight.")
 ]
@@ -124,6 +129,7 @@ def map_command(
     memory: Memory = None,
     give_up: GiveUp = 30.0,
     heights: WithHeights = False,
+    again: Again = False,
     as_json: AsJson = False,
 ) -> None:
     """Make a geo-referenced map of one or more flights, or extend the map in the site folder.
@@ -152,7 +158,7 @@ def map_command(
     )
     reports = map_and_read_reports(
         inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area,
-        live=LiveSettings(keeps_all=True, give_up_s=give_up), control=gcp, base=base,
+        live=LiveSettings(keeps_all=True, give_up_s=give_up), control=gcp, base=base, again=again,
     )
     _print(reports, site, with_heights=heights, as_json=as_json)
     if any(each["headline"]["quality"] != "map" for each in reports):
@@ -176,9 +182,9 @@ def _print(reports: Sequence[Mapping[str, Any]], site: Path, *, with_heights: bo
 def map_and_read_reports(
     inputs: Sequence[Path | str], site: Path, settings: "MapSettings", *, telemetry: Path | str | None = None,
     camera: str | None = None, area: Path | None = None,
-    live: "LiveSettings | None" = None, control: Path | None = None, base: Path | None = None,
+    live: "LiveSettings | None" = None, control: Path | None = None, base: Path | None = None, again: bool = False,
 ) -> list[dict[str, Any]]:
-    """Map with progress on stderr; the reports of the mapped flights, in order."""
+    """Map with progress on stderr; the reports of the flights, in order, and of those that were mapped already."""
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.map.flights import map_flights
     from sorvolo.store.site.archive import Archive
@@ -187,13 +193,22 @@ def map_and_read_reports(
     with ended_by_signal(inputs) as until:
         mapping = map_flights(
             inputs, site, settings, telemetry=telemetry, camera=camera, area=area,
-            live=live or LiveSettings(keeps_all=True), until=until, control=control, base=base,
+            live=live or LiveSettings(keeps_all=True), until=until, control=control, base=base, again=again,
         )
+        known: list[AlreadyMapped] = []
+
+        def noted() -> Iterator["MosaicUpdate"]:
+            known.extend((yield from mapping))
+
         # closed even when the bar is stopped: then the site is as it was
-        with closing(mapping) as updates:
-            show_progress(updates, Console(stderr=True))
+        with closing(mapping):
+            show_progress(noted(), Console(stderr=True))
+    for each in known:
+        day = each.mapped_utc[:16].replace("T", " ")
+        typer.echo(f"{each.flight} is mapped already ({day} UTC); --again maps it anew", err=True)
     with Archive.open(site, write=False) as archive:
         mapped = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
+        mapped += [each.flight for each in known]
         return [read_json(archive.flight_folder(flight_id) / "report.json") for flight_id in mapped]
 
 

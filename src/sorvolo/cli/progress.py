@@ -64,13 +64,20 @@ class ProgressReport:
 
 def show_progress(updates: Iterable["MosaicUpdate"], console: Console) -> int:
     """Take all updates of a mapping, showing each flight's progress; return how many there were."""
-    count, flight, before = 0, 1, None
+    count, flight, before, resumed = 0, 1, None, 0
     with ProgressReport(console) as progress:
         progress.show("opening")
         for update in updates:
             count += 1
             if before is not None and update.keyframes <= before.keyframes:
                 flight += 1
+            if update.is_resumed:
+                resumed = update.keyframes
+            elif resumed:
+                console.print(
+                    f"going on after {counted(resumed, 'frame')} of a run that was stopped", highlight=False
+                )
+                resumed = 0
             before = update
             task = "mapping, frame" if flight == 1 else f"mapping flight {flight}, frame"
             expected = max(update.frames_expected, update.frames_read)

@@ -70,7 +70,8 @@ def floats(values: Any) -> Floats:
 
 
 def frozen(array: Any, dtype: Any = np.float64) -> Any:
-    """Copy `array` as a read-only array of `dtype`, for a record's field."""
-    copy = np.array(array, dtype=dtype)
+    """Copy `array` as a read-only array of `dtype`, for a record's field; in C order, which a file gives back, too:
+    the order of numbers in memory decides the last bit of sums over them."""
+    copy = np.array(array, dtype=dtype, order="C")
     copy.setflags(write=False)
     return copy

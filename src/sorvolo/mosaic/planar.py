@@ -62,6 +62,22 @@ class Outcome:
 
 
 @dataclass(frozen=True, eq=False)
+class Registered:
+    """A keyframe and what ties it to the others, before it is one of them: all that placing it needs.
+
+    `guess` is where it stands by that, None nowhere; `reason` is what failed. `met` are the keyframes of the known map
+    that were tried, in the order in which they were first met.
+    """
+
+    keyframe: Keyframe
+    thumbnail: ImageRGB
+    links: tuple[Link, ...]
+    guess: Pose | None
+    reason: str
+    met: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class _Refusal:
     reason: str
     prediction: LinkPrediction | None
@@ -102,22 +118,43 @@ class PlanarMapper:
         self._known_centres_m = np.array([each.site_from_camera.translation_m for each in known]).reshape(-1, 3)
         self._colours: dict[tuple[int, int], ColourPairs] = {}
         self._failures: dict[int, str] = {}
+        self._met: list[int] = []  # of the known map, in the order in which they were loaded
 
     def add(self, keyframe_id: int, camera: Camera, image: ImageRGB, prior: CameraPrior) -> Outcome:
         """Place an undistorted picture, (H, W, 3), of the distortion-free `camera` (at the picture's size)."""
+        return self.place(self.register(keyframe_id, camera, image, prior))
+
+    def register(self, keyframe_id: int, camera: Camera, image: ImageRGB, prior: CameraPrior) -> Registered:
+        """Tie an undistorted picture to the map as it is; `place` is what adds it."""
         keyframe = self._keyframe(keyframe_id, camera, image, prior)
+        before = len(self._met)
         links, guess, reason = self._tie(keyframe)
-        if guess is None:
-            self._failures[keyframe_id] = reason
-            return Outcome(Status.REJECTED, reason, frozenset())
-        self._keyframes.add(keyframe, _thumbnail(image))
-        moved = self._graph.add(keyframe_id, keyframe.camera, prior, links, guess)
-        self._own.append(keyframe_id)
-        for each in links:
+        return Registered(keyframe, _thumbnail(image), tuple(links), guess, reason, tuple(self._met[before:]))
+
+    def can_place(self, new: Registered) -> bool:
+        """Whether all that a registered picture was tied to is there: else it is of another flight."""
+        others = {each.old_id for each in new.links}
+        return (
+            new.keyframe.id not in self._graph and self._known.keys() >= set(new.met)
+            and all(each in self._graph or each in new.met for each in others)
+        )
+
+    def place(self, new: Registered) -> Outcome:
+        """Add a registered picture to the map."""
+        for known in new.met:
+            self._picture(known)
+        keyframe = new.keyframe
+        if new.guess is None:
+            self._failures[keyframe.id] = new.reason
+            return Outcome(Status.REJECTED, new.reason, frozenset())
+        self._keyframes.add(keyframe, new.thumbnail)
+        moved = self._graph.add(keyframe.id, keyframe.camera, keyframe.prior, new.links, new.guess)
+        self._own.append(keyframe.id)
+        for each in new.links:
             self._tie_colours(each)
-        status = Status.VISION if links or len(self._own) == 1 else Status.GPS_ONLY
-        self._failures[keyframe_id] = "" if links else reason
-        return Outcome(status, reason if status is Status.GPS_ONLY else "", moved)
+        status = Status.VISION if new.links or len(self._own) == 1 else Status.GPS_ONLY
+        self._failures[keyframe.id] = "" if new.links else new.reason
+        return Outcome(status, new.reason if status is Status.GPS_ONLY else "", moved)
 
     def settle(self) -> frozenset[int]:
         """Solve the whole flight once more; the keyframes that moved."""
@@ -402,6 +439,7 @@ class PlanarMapper:
             image = known.image()
             self._keyframes.add(self._keyframe(other, known.camera, image, unknown), _thumbnail(image))
             self._graph.add_known(other, self._keyframes.camera(other), known.site_from_camera)
+            self._met.append(other)
         return self._keyframes.keyframe(other)
 
     def _tie_colours(self, each: Link) -> None:

@@ -1,7 +1,7 @@
 """Which frames become keyframes: enough overlap by eq. 3.17, sharp enough, inside the area of interest."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from sorvolo.survey.flight import LostFrame, PosedFrame
 _SMALL_PX = 256
 _UNTIMED_STEP_S = 0.2  # candidates of a video without telemetry, or live: five a second, the pictures decide
 _LIVE_SPEED_M_S = 5.0  # at least: a flight that has just begun does not show yet how fast it will be
+_USUAL = 25  # frames that show how sharp the flight's usually are
 _COARSE_PX = 64  # at which a sensor's noise averages out and ground still shows itself
 
 
@@ -46,11 +47,22 @@ class FramePlan:
 
 
 @dataclass(frozen=True, eq=False)
+class SelectionMemory:
+    """What the choice of the next keyframe depends on: the texture (h, w) of the last one, and how sharp the latest of
+    the `count` frames were that came before."""
+
+    last: ImageGray | None = None
+    usual: tuple[float, ...] = ()
+    count: int = 0
+
+
+@dataclass(frozen=True, eq=False)
 class Selected:
-    """A selected frame; `reason` is empty, or why it cannot be used after all."""
+    """A selected frame; `reason` is empty, or why it cannot be used after all. `memory` is what to go on with."""
 
     posed: PosedFrame
     reason: str
+    memory: SelectionMemory
 
 
 def interval_s(camera: Camera, height_m: float, speed_m_s: float, overlap: float) -> float:
@@ -104,16 +116,15 @@ def evenly(count: int, most: int) -> list[int]:
 
 def select_keyframes(
     frames: Iterable[PosedFrame | LostFrame], settings: SelectionSettings, *, keep_all: bool,
-    inside: Callable[[PosedFrame], bool],
+    inside: Callable[[PosedFrame], bool], memory: SelectionMemory = SelectionMemory(),
 ) -> Iterator[Selected | LostFrame]:
     """The frames that the map needs, in order; lost ones pass through.
 
     `inside` is True for frames in the area of interest (UAV_path, eq. 3.1); the others are dropped. `keep_all`: photos,
     each of which was meant. The shift since the last keyframe is measured in the pictures by phase correlation of
-    small copies, so it needs no telemetry; where that fails (a turn, water) each candidate is taken.
+    small copies, so it needs no telemetry; where that fails (a turn, water) each candidate is taken. `memory` is that
+    of the last frame selected, to go on after it.
     """
-    last: ImageGray | None = None
-    usual: list[float] = []
     for each in frames:
         if isinstance(each, LostFrame):
             yield each
@@ -122,16 +133,16 @@ def select_keyframes(
             continue
         gray = small_gray(each.frame.image)
         clarity = sharpness(gray)
-        typical = float(np.median(usual[-25:])) if usual else clarity
+        typical = float(np.median(memory.usual)) if memory.usual else clarity
         texture = normalise_contrast(gray)
-        overlap = 0.0 if last is None or keep_all else _overlap(last, texture)
-        usual.append(clarity)
-        reason = _reason_if_selected(overlap, clarity, typical, len(usual), settings)
+        overlap = 0.0 if memory.last is None or keep_all else _overlap(memory.last, texture)
+        memory = SelectionMemory(memory.last, (*memory.usual, clarity)[-_USUAL:], memory.count + 1)
+        reason = _reason_if_selected(overlap, clarity, typical, memory.count, settings)
         if reason is None:
             continue
         if not reason:
-            last = texture
-        yield Selected(each, reason)
+            memory = replace(memory, last=texture)
+        yield Selected(each, reason, memory)
 
 
 class StretchSelection:

@@ -68,8 +68,8 @@ class Link:
     sigma_px: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "new_px", frozen(self.new_px))
-        object.__setattr__(self, "old_px", frozen(self.old_px))
+        for name in ("new_px", "old_px", "new_from_old"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
         if self.new_px.shape != self.old_px.shape:
             raise GeometryError("a link needs as many points on both sides")
 
@@ -159,3 +159,5 @@ class MosaicUpdate:
     tiles_touched: int
     seconds: float
     view: FrameView | None = None
+    is_resumed: bool = False
+    """Whether the frame was taken over from a run of the same command that was killed."""

@@ -46,8 +46,8 @@ def open_detector(model: str) -> Detects | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """What the detector found in one frame, the crops (JPEG) around the surest, and how long it took."""
+class FrameDetections:
+    """What the detector found in the frame `index`, the crops (JPEG) around the surest, and how long it took."""
 
     index: int
     found: Detections
@@ -68,8 +68,9 @@ class ObjectFinder:
         self._detector, self._camera = detector, camera
         self._classes = tuple(classes) or detector.info.usual_classes
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="detector")
-        self._waiting: deque[Future[_Seen]] = deque()
-        self._seen: dict[int, _Seen] = {}
+        self._waiting: deque[Future[FrameDetections]] = deque()
+        self._seen: dict[int, FrameDetections] = {}
+        self._news: list[FrameDetections] = []
         self._sightings: tuple[Sighting, ...] = ()
 
     def close(self) -> None:
@@ -99,6 +100,20 @@ class ObjectFinder:
         self._waiting.append(self._thread.submit(self._look, posed.frame, m_per_px))
         self._take(_AHEAD)
 
+    def news(self) -> list[FrameDetections]:
+        """What was found since this was asked last, in the frames' order."""
+        self._take(_AHEAD)
+        news, self._news = self._news, []
+        return news
+
+    def take_over(self, seen: FrameDetections) -> None:
+        """Take what an earlier process found in a frame."""
+        self._seen[seen.index] = seen
+
+    def has_seen(self, index: int) -> bool:
+        """Whether the frame of this index was searched."""
+        return index in self._seen
+
     def conclude(self, placed: Sequence[PlacedFrame], flight_id: str, *, has_metres: bool) -> ObjectSearch:
         """Lay all detections on the ground by the frames' final places, and report each object once."""
         self._take(0)
@@ -123,13 +138,14 @@ class ObjectFinder:
         while self._waiting and (len(self._waiting) > left or self._waiting[0].done()):
             seen = self._waiting.popleft().result()
             self._seen[seen.index] = seen
+            self._news.append(seen)
 
-    def _look(self, frame: Frame, m_per_px: float | None) -> _Seen:
+    def _look(self, frame: Frame, m_per_px: float | None) -> FrameDetections:
         started_s = time.monotonic()
         found = self._detector.detect(frame.image, tiles="auto", m_per_px=m_per_px, classes=self._classes)
         surest = found.surest(_MOST_CROPS)
         crops = tuple(_crop(frame.image, box) for box in surest.boxes_px)
-        return _Seen(frame.index, surest, crops, time.monotonic() - started_s)
+        return FrameDetections(frame.index, surest, crops, time.monotonic() - started_s)
 
 
 def search_summary(search: ObjectSearch | None, seconds: float, why_not: str = "") -> dict[str, Any]:

@@ -86,9 +86,14 @@ def build_report(
         "notices": [asdict(each) for each in (*source.telemetry.notices, *setup.notices, *notices)],
         "warnings": flight_warnings(placed, figures, setup, log, agreement, graph),
         "settings": asdict(settings),
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}},
+        "versions": software(),
         "track": [track_row(each) for each in placed],
     }
+
+
+def software() -> dict[str, str]:
+    """The versions of what computes a map, by name."""
+    return {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}}
 
 
 def _headline(

@@ -102,11 +102,12 @@ class FlightSetup:
 
 def prepare(
     source: Source, settings: MapSettings, site: Site | None, *, telemetry_named: bool, finds_itself: bool = False,
-    ground_m: PointsM | None = None, known_ground: KnownGround | None = None,
+    ground_m: PointsM | None = None, known_ground: KnownGround | None = None, founds_site: bool = False,
 ) -> FlightSetup:
     """Tie clocks, lay the flight into the site frame and foresee its keyframes.
 
-    `ground_m` (N, 2) are places all over the ground that the site shows, see `known_ground_m`. `finds_itself`: the
+    `founds_site`: the site shows this flight alone, which is laid as if there were no site, to the last bit. `ground_m`
+    (N, 2) are places all over the ground that the site shows, see `known_ground_m`. `finds_itself`: the
     flight's frames are looked for in the site's map, so that they need no GPS. `known_ground` are its control points or
     its base map, which place a flight without GPS. Raises InputError when the flight is of
     another place than the site, or the telemetry of another flight.
@@ -122,7 +123,8 @@ def prepare(
             f"the site {site.name} has no geo-reference, but the flight {source.name} has GPS: map it into a new site "
             "folder"
         )
-    setup = _with_gps(source, settings, site, telemetry_named, ground_m)
+    laid = None if site is None else _laid(site, source, founds_site=founds_site)
+    setup = _with_gps(source, settings, site, laid, telemetry_named, ground_m)
     return setup if known_ground is None else _with_known_ground(setup, known_ground)
 
 
@@ -196,12 +198,24 @@ def _without_gps(
     )
 
 
+def _laid(site: Site, source: Source, *, founds_site: bool) -> Geodetic:
+    """The origin of the frame in which a flight is laid: the site's.
+
+    The flight that made the site was laid before the ground's height was known; the metres of a degree depend on it in
+    the fifth digit, which is 0.1 mm between frames.
+    """
+    first = site_origin(source.telemetry) if founds_site else None
+    place = (site.origin.latitude_deg, site.origin.longitude_deg)
+    return first if first is not None and (first.latitude_deg, first.longitude_deg) == place else site.origin
+
+
 def _with_gps(
-    source: Source, settings: MapSettings, site: Site | None, telemetry_named: bool, ground_m: PointsM | None
+    source: Source, settings: MapSettings, site: Site | None, laid: Geodetic | None, telemetry_named: bool,
+    ground_m: PointsM | None,
 ) -> FlightSetup:
-    """A flight in the site's frame; without a site, in one around its first fix."""
+    """A flight in the frame around `laid`, the site's; without a site, in one around its first fix."""
     samples = source.telemetry
-    origin = site.origin if site is not None else site_origin(samples)
+    origin = laid or site_origin(samples)
     assert origin is not None  # there are fixes
     frame = LocalFrame(origin)
     wishes = TelemetryWishes(settings.offset_s, settings.ground_elevation_m, telemetry_named)
@@ -266,6 +280,11 @@ def repeated(archive: Archive, flight: str, done: str) -> tuple[Notice, ...]:
         f"{flight} is in this site already (version {made[-1]}): it was {done} again, and the new version replaces "
         "what it had made",
     ),)
+
+
+def founds_site(archive: Archive, flight: str) -> bool:
+    """Whether the site shows this flight alone."""
+    return {each.flight_id for each in archive.versions() if each.complete} == {flight}
 
 
 def known_ground_m(archive: Archive) -> PointsM | None:

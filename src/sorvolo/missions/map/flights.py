@@ -3,12 +3,12 @@
 import threading
 import time
 from collections.abc import Generator, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sorvolo.capture.areas import read_area
 from sorvolo.capture.live.reconnect import LiveSettings
-from sorvolo.capture.source import Source, opened_sources
+from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.errors import SettingsError
 from sorvolo.missions.flight.base_map import open_base
 from sorvolo.missions.flight.control import open_control
@@ -16,16 +16,33 @@ from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.glimpses import refuse_without_texture
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.settings import MapSettings
-from sorvolo.missions.flight.setup import KnownGround, known_flights, known_ground_m, prepare, repeated
+from sorvolo.missions.flight.setup import (
+    FlightSetup,
+    KnownGround,
+    founds_site,
+    known_flights,
+    known_ground_m,
+    prepare,
+    repeated,
+)
+from sorvolo.missions.map.journal import Earlier, MapJournal, Step, map_request, run_key
 from sorvolo.missions.map.planar_run import PlanarRun
-from sorvolo.missions.map.run import FlightRun
+from sorvolo.missions.map.run import REQUEST, FlightRun
 from sorvolo.missions.map.thesis_run import ThesisRun
 from sorvolo.mosaic.control import ControlSettings
-from sorvolo.mosaic.selection import Selected, SelectionSettings, every, select_keyframes
+from sorvolo.mosaic.selection import SelectionSettings, every, select_keyframes
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
 from sorvolo.survey.mosaic import MosaicUpdate, Status
+
+
+@dataclass(frozen=True)
+class AlreadyMapped:
+    """A flight that the site has, as it was asked for, and when it was mapped: ISO 8601 UTC."""
+
+    flight: str
+    mapped_utc: str
 
 
 def map_flights(
@@ -33,8 +50,8 @@ def map_flights(
     telemetry: Path | str | None = None, camera: Path | str | None = None, area: Path | None = None,
     detector: Detects | None = None, live: LiveSettings = LiveSettings(keeps_all=True),  # noqa: B008 (frozen)
     until: threading.Event | None = None, control: Path | None = None,
-    base: Path | None = None,
-) -> Generator[MosaicUpdate]:
+    base: Path | None = None, again: bool = False,
+) -> Generator[MosaicUpdate, None, tuple[AlreadyMapped, ...]]:
     """Map one or more flights into the site folder, yielding an update for each selected frame.
 
     `inputs` are videos, folders of photos, photos, or live sources (see `open_sources`); `telemetry` a file of the
@@ -44,6 +61,8 @@ def map_flights(
     (gcp_list.txt), `base` a GeoTIFF or a site folder whose map shows its ground, to which it is tied. A live
     flight is read, by the settings `live`, until it ends or `until` is set; then its map is finished like any other's.
     Nothing of a flight is part of the site until its last update was yielded.
+    A run that was killed goes on where it was when the same is asked for again. A flight that the site has already, by
+    the same files, settings and version of the program, is left out and returned, unless `again` is given.
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being mapped is left out, those before it are in.
     """
@@ -56,8 +75,28 @@ def map_flights(
     opened = opened_sources(inputs, telemetry, camera, known_flights(site), live=live, until=until)
     with opened as sources, Archive.open(site, write=True) as archive:
         ground = _known_ground(control, base, sources, settings)
+        known = []
         for source in sources:
-            yield from _map_one(source, archive, settings, wanted, looks, ground, telemetry_named=telemetry is not None)
+            setup = prepare(
+                source, settings, archive.site() if archive.has_site else None, telemetry_named=telemetry is not None,
+                ground_m=known_ground_m(archive), known_ground=ground, founds_site=founds_site(archive, source.name),
+            )
+            request = map_request(setup, settings, wanted, looks)
+            if not again and (mapped := _already_mapped(archive, source, request)):
+                known.append(mapped)
+                continue
+            yield from _map_one(setup, archive, settings, wanted, looks, request)
+        return tuple(known)
+
+
+def _already_mapped(archive: Archive, source: Source, request: str) -> AlreadyMapped | None:
+    """The flight as the site has it, if that is what is asked for; a live flight is another each time."""
+    if isinstance(source, LiveSource):
+        return None
+    return next((
+        AlreadyMapped(each.id, each.finished_utc) for each in archive.flights()
+        if each.id == source.name and each.status == "complete" and each.settings.get(REQUEST) == request
+    ), None)
 
 
 def _known_ground(
@@ -76,50 +115,77 @@ def _known_ground(
 
 
 def _map_one(
-    source: Source, archive: Archive, settings: MapSettings, area: Area | None, detector: Detects | None,
-    ground: KnownGround | None, *, telemetry_named: bool,
+    setup: FlightSetup, archive: Archive, settings: MapSettings, area: Area | None, detector: Detects | None,
+    request: str,
 ) -> Generator[MosaicUpdate]:
-    started_s = time.monotonic()
-    setup = prepare(
-        source, settings, archive.site() if archive.has_site else None, telemetry_named=telemetry_named,
-        ground_m=known_ground_m(archive), known_ground=ground,
-    )
+    started_s, source = time.monotonic(), setup.source
     refuse_without_texture(source)
     setup = replace(setup, notices=(*setup.notices, *repeated(archive, source.name, "mapped")))
-    make = ThesisRun if settings.method == "thesis" else PlanarRun
     finder = None if detector is None else ObjectFinder(detector, source.camera.camera, settings.classes)
-    with make(setup, archive, settings, finder=finder) as run:
-        read = 0
+    with _begun(setup, archive, settings, finder, request) as run:
 
-        def posed() -> Iterator[PosedFrame | LostFrame]:
-            nonlocal read
-            for each in source.frames(every(setup.plan.step_s)):
-                read = each.index + 1
-                yield PosedFrame(each, setup.prior(each, first=read == 1)) if isinstance(each, Frame) else each
+        def update(frame: Step | LostFrame | Frame, ended: tuple[Status, str, int], read: int) -> MosaicUpdate:
+            view = None if isinstance(frame, LostFrame) else run.view(frame.index, frame.time_ns)
+            return MosaicUpdate(
+                frame.name, ended[0], ended[1], read, source.frame_count, run.selected,
+                max(setup.plan.expected, run.selected), run.by_vision, ended[2], time.monotonic() - started_s, view,
+                isinstance(frame, Step),
+            )
 
+        before = Earlier()
+        for step, ended in run.take_over():
+            before.take(step)
+            yield update(step, ended, step.index + 1)
+        before.search(run.is_unsearched)
+        reader = _Reader(setup, before)
         selection = SelectionSettings(overlap=settings.overlap, least_overlap=min(0.5, settings.overlap))
         selected = select_keyframes(
-            posed(), selection,
+            reader.posed(run), selection,
             keep_all=source.kind == "photos" or (settings.method == "thesis" and setup.track is not None),
-            inside=setup.inside(area),
+            inside=setup.inside(area), memory=before.memory,
         )
         for each in selected:
-            status, reason, tiles = _take(run, each)
-            name = each.name if isinstance(each, LostFrame) else each.posed.frame.name
-            view = None if isinstance(each, LostFrame) else run.view(each.posed)
-            yield MosaicUpdate(
-                name, status, reason, read, source.frame_count, run.selected,
-                max(setup.plan.expected, run.selected), run.by_vision, tiles, time.monotonic() - started_s,
-                view,
-            )
+            ended = run.take(each)
+            yield update(each if isinstance(each, LostFrame) else each.posed.frame, ended, reader.read)
         run.finish(source.notices(), started_s)
 
 
-def _take(run: FlightRun, each: Selected | LostFrame) -> tuple[Status, str, int]:
-    if isinstance(each, LostFrame):
-        return run.lose(each.index, each.name, each.time_ns, each.reason)
-    if each.reason:
-        frame = each.posed.frame
-        return run.lose(frame.index, frame.name, frame.time_ns, each.reason)
-    run.look(each.posed)
-    return run.add(each.posed)
+def _begun(
+    setup: FlightSetup, archive: Archive, settings: MapSettings, finder: ObjectFinder | None, request: str
+) -> FlightRun:
+    """The run of one flight; a recorded one notes how far it is, and goes on where a killed one was."""
+    if settings.method == "thesis":
+        return ThesisRun(setup, archive, settings, finder, request)
+    journal = None
+    if not isinstance(setup.source, LiveSource):
+        journal = MapJournal(archive.journal(setup.source.name, run_key(setup, archive, request)))
+    return PlanarRun(setup, archive, settings, finder=finder, journal=journal, request=request)
+
+
+class _Reader:
+    """Reads a flight's frames after those of a killed run; of these only the ones that are needed again."""
+
+    def __init__(self, setup: FlightSetup, before: Earlier) -> None:
+        self._setup, self._before = setup, before
+        self._is_candidate = every(setup.plan.step_s)
+        self.read = 0
+
+    def posed(self, run: FlightRun) -> Iterator[PosedFrame | LostFrame]:
+        """The frames to select from."""
+        for each in self._setup.source.frames(self._is_wanted):
+            is_new = each.index > self._before.last
+            if is_new:
+                self.read = each.index + 1
+            if isinstance(each, LostFrame):
+                if is_new:
+                    yield each
+                continue
+            posed = PosedFrame(each, self._setup.prior(each, first=each.index == 0))
+            if is_new:
+                yield posed
+            else:
+                run.look(posed)
+
+    def _is_wanted(self, index: int, time_ns: int) -> bool:
+        is_candidate = self._is_candidate(index, time_ns)
+        return is_candidate and (index > self._before.last or index in self._before.needed)

@@ -9,6 +9,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.missions.flight.log import FlightLog, Stage
+from sorvolo.missions.map.journal import StoredPicture
 from sorvolo.missions.map.known_keyframes import KnownKeyframes
 from sorvolo.mosaic.canvas import Canvas
 from sorvolo.mosaic.canvas_frame import CanvasFrame
@@ -85,6 +86,14 @@ class FlightPainter:
         small = at_size(image, self._stored.width_px, self._stored.height_px)
         self.images[index] = self._writer.save_image(index, small)
 
+    def take_over(self, keyframe_id: int, picture: StoredPicture) -> bool:
+        """Take a keyframe's picture as stored that a killed run left; whether it is there as it was."""
+        index = keyframe_id - self._known.count
+        path = self._writer.take_over_image(index, picture.size_px, picture.sha256)
+        if path is not None:
+            self.images[index] = path
+        return path is not None
+
     def mark(self, moved: Collection[int]) -> None:
         """These keyframes are new or moved: they are to be painted."""
         self._frames |= set(moved)
@@ -151,6 +160,7 @@ class FlightPainter:
             return
         for keyframe_id in sorted(self._frames):
             index = keyframe_id - self._known.count
+            self._writer.keep_original(index)
             self.images[index] = self._writer.save_image(index, lens.undistort(self._writer.image(index)))
         self._valid = lens.valid(self._stored.width_px, self._stored.height_px)
 

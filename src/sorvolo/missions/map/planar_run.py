@@ -16,6 +16,7 @@ from sorvolo.missions.flight.memory import memory_budget_bytes
 from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.missions.map.journal import MapJournal, Step, StoredPicture, Taken
 from sorvolo.missions.map.known_keyframes import KnownKeyframes
 from sorvolo.missions.map.painting import FlightPainter, site_from_image
 from sorvolo.missions.map.run import FlightRun
@@ -23,7 +24,7 @@ from sorvolo.mosaic.base_ties import BaseReport, FoundFrame, tie_to_base
 from sorvolo.mosaic.exposure import Exposure
 from sorvolo.mosaic.keyframes import Keyframes
 from sorvolo.mosaic.placing import map_m_per_px, sees_horizon
-from sorvolo.mosaic.planar import PlanarMapper
+from sorvolo.mosaic.planar import PlanarMapper, Registered
 from sorvolo.mosaic.pose_graph import PoseGraphSettings
 from sorvolo.registration.lens import Undistorter, refined_camera
 from sorvolo.store.exports.control_files import control_documents
@@ -33,7 +34,7 @@ from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.store.site.spill import SpillFile
 from sorvolo.survey.control import ControlReport
-from sorvolo.survey.flight import Notice, PosedFrame
+from sorvolo.survey.flight import Frame, Notice, PosedFrame
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
 _WAIT_FOR_HEIGHT = 12  # keyframes held back until the height above ground is seen in them
@@ -47,9 +48,9 @@ class PlanarRun(FlightRun):
 
     def __init__(
         self, setup: FlightSetup, archive: Archive, settings: MapSettings, writer: FlightWriter | None = None,
-        finder: ObjectFinder | None = None,
+        finder: ObjectFinder | None = None, journal: MapJournal | None = None, request: str = "",
     ) -> None:
-        super().__init__(setup, archive, settings, writer, finder)
+        super().__init__(setup, archive, settings, writer, finder, journal, request)
         model = setup.source.camera
         self._lens = Undistorter(model.camera)
         self._known = KnownKeyframes.of(archive, setup.source.name)
@@ -99,27 +100,39 @@ class PlanarRun(FlightRun):
             return self.lose(frame.index, frame.name, frame.time_ns, _HORIZON)
         with self._log.stage(Stage.UNDISTORT):
             image = self._lens.undistort(frame.image)
-        keyframe_id = self._known.count + frame.index
         with self._log.stage(Stage.REGISTER):
-            outcome = self._mapper.add(keyframe_id, self._lens.camera, image, posed.prior)
-        self._log.end(frame.index, frame.name, frame.time_ns, outcome.status, outcome.reason)
-        if outcome.status is Status.REJECTED:
-            return outcome.status, outcome.reason, 0
-        self._times_ns[keyframe_id] = frame.time_ns
-        with self._log.stage(Stage.STORE):
-            self._keep(keyframe_id, image)
-        if self._painter is None:
-            return outcome.status, outcome.reason, 0
-        self._painter.mark(outcome.moved | {keyframe_id})
-        return outcome.status, outcome.reason, self._painter.show()
+            registered = self._mapper.register(
+                self._known.count + frame.index, self._lens.camera, image, posed.prior
+            )
+        has_place = self._painter is not None
+        picture = jpeg_from_image(image) if self._setup.is_placed_late and not has_place else image
+        ended = self._take(frame, registered, picture)
+        if has_place and ended[0] is not Status.REJECTED:
+            self._taken = Taken(registered, StoredPicture(*self.begin().stored(frame.index)))
+            return *ended, self._started_painter().show()
+        self._taken = Taken(registered, b"" if ended[0] is Status.REJECTED else picture)
+        return *ended, 0
 
-    def view(self, posed: PosedFrame) -> FrameView | None:
+    def again(self, step: Step) -> tuple[Status, str, int] | None:
+        """See `FlightRun.again`."""
+        if step.taken is None:
+            return super().again(step)
+        registered, picture = step.taken.registered, step.taken.picture
+        if registered.keyframe.id != self._known.count + step.index or not self._mapper.can_place(registered):
+            return None
+        if not isinstance(picture, StoredPicture):
+            return *self._take(step, registered, picture), 0
+        if self._painter is None or not self._painter.take_over(registered.keyframe.id, picture):
+            return None
+        return *self._take(step, registered, None), 0
+
+    def view(self, index: int, time_ns: int) -> FrameView | None:
         """See `FlightRun.view`."""
-        keyframe_id = self._known.count + posed.frame.index
+        keyframe_id = self._known.count + index
         if keyframe_id not in self._times_ns:
             return None
         camera = self._refined(self._setup.source.camera.camera)
-        return self._setup.view(posed.frame.time_ns, camera, self._mapper.pose(keyframe_id))
+        return self._setup.view(time_ns, camera, self._mapper.pose(keyframe_id))
 
     def note_found(self, index: int, site_from_image: Matrix3, residual_px: float) -> None:
         """Where the site's map shows a frame's ground: (3, 3) of its full undistorted picture, and how well that fits.
@@ -177,14 +190,31 @@ class PlanarRun(FlightRun):
     def _exposure(self) -> Exposure:
         return Exposure({}, {}, 0.0) if self._painter is None else self._painter.exposure
 
-    def _keep(self, keyframe_id: int, image: ImageRGB) -> None:
+    def _take(
+        self, frame: Frame | Step, registered: Registered, picture: ImageRGB | bytes | None
+    ) -> tuple[Status, str]:
+        """Place a registered frame and keep its picture, if it has not been kept before; what became of it."""
+        with self._log.stage(Stage.REGISTER):
+            outcome = self._mapper.place(registered)
+        self._log.end(frame.index, frame.name, frame.time_ns, outcome.status, outcome.reason)
+        if outcome.status is Status.REJECTED:
+            return outcome.status, outcome.reason
+        keyframe_id = registered.keyframe.id
+        self._times_ns[keyframe_id] = frame.time_ns
+        with self._log.stage(Stage.STORE):
+            if picture is not None:
+                self._keep(keyframe_id, picture)
         if self._painter is not None:
-            self._painter.save(keyframe_id, image)
+            self._painter.mark(outcome.moved | {keyframe_id})
+        return outcome.status, outcome.reason
+
+    def _keep(self, keyframe_id: int, picture: ImageRGB | bytes) -> None:
+        if self._painter is not None:
+            self._painter.save(keyframe_id, image_from_jpeg(picture, "") if isinstance(picture, bytes) else picture)
             return
+        self._held[keyframe_id] = picture
         if self._setup.is_placed_late:
-            self._held[keyframe_id] = jpeg_from_image(image)
             return
-        self._held[keyframe_id] = image
         telemetry = self._setup.telemetry
         known = telemetry is None or telemetry.knows_ground
         if self._archive.has_site or (known and len(self._held) >= 2) or len(self._held) >= _WAIT_FOR_HEIGHT:

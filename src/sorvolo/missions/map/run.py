@@ -1,20 +1,24 @@
 """What the methods' runs share: a flight on its way into a site, its log and its writer."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from types import TracebackType
 from typing import Any, Self
 
 from sorvolo.missions.flight.log import FlightLog, Stage
-from sorvolo.missions.flight.map_objects import ObjectFinder, search_summary, why_not_searched
+from sorvolo.missions.flight.map_objects import FrameDetections, ObjectFinder, search_summary, why_not_searched
 from sorvolo.missions.flight.memory import memory_budget_bytes
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, new_site
+from sorvolo.missions.map.journal import MapJournal, Step, Taken
+from sorvolo.mosaic.selection import Selected
 from sorvolo.store.site.archive import Archive, FlightWriter
-from sorvolo.survey.flight import Notice, PosedFrame
+from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
 from sorvolo.survey.map_objects import ObjectSearch
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
+REQUEST = "request"
+"""Of a run's settings in the catalogue: what was asked for."""
 _MOST_CACHE_MB = 256  # of tiles, and of pictures: more is not used
 
 
@@ -22,17 +26,21 @@ class FlightRun(ABC):
     """A flight on its way into a site. A context manager: leaving without `finish` leaves the site as it was.
 
     `writer` is one that was begun before for this flight; whoever began it ends it. `finder` looks for objects in the
-    frames; None: nobody does.
+    frames; None: nobody does. `journal` notes what becomes of each frame; None: a kill loses it. `request` is what is
+    asked for, see `map_request`.
     """
 
     def __init__(
         self, setup: FlightSetup, archive: Archive, settings: MapSettings, writer: FlightWriter | None = None,
-        finder: ObjectFinder | None = None,
+        finder: ObjectFinder | None = None, journal: MapJournal | None = None, request: str = "",
     ) -> None:
+        self._request = request
         self._setup, self._archive, self._settings, self._finder = setup, archive, settings, finder
         self._log = FlightLog()
         self._writer = writer
         self._began_writer = False
+        self._journal = journal
+        self._taken: Taken | None = None  # the frame that `add` registered last
 
     def __enter__(self) -> Self:
         return self
@@ -44,6 +52,8 @@ class FlightRun(ABC):
             self._finder.close()
         if self._writer is not None and self._began_writer:
             self._writer.__exit__(kind, error, trace)
+        if self._journal is not None:
+            self._journal.file.remove()
 
     @property
     def selected(self) -> int:
@@ -66,12 +76,52 @@ class FlightRun(ABC):
             with self._log.stage(Stage.DETECT):
                 self._finder.look(posed)
 
+    def take(self, each: Selected | LostFrame) -> tuple[Status, str, int]:
+        """Take one selected frame, or one that the source lost; see `add`."""
+        self._taken = None
+        lost = each if isinstance(each, LostFrame) else each.posed.frame
+        if each.reason:
+            ended = self.lose(lost.index, lost.name, lost.time_ns, each.reason)
+        else:
+            assert isinstance(each, Selected)
+            self.look(each.posed)
+            ended = self.add(each.posed)
+        if self._journal is not None:
+            memory = each.memory if isinstance(each, Selected) else None
+            reason = ended[1] if self._taken is None else ""
+            is_searched = not each.reason and self._finder is not None
+            self._journal.keep(Step(lost.index, lost.name, lost.time_ns, reason, memory, self._taken, is_searched))
+            self._keep_detections()
+        return ended
+
+    def take_over(self) -> Iterator[tuple[Step, tuple[Status, str, int]]]:
+        """What a killed run had done, done again without its pictures: each step, and how it ended."""
+        if self._journal is None:
+            return
+        for each in self._journal.earlier():
+            if isinstance(each, FrameDetections):
+                if self._finder is not None:
+                    self._finder.take_over(each)
+                continue
+            ended = self.again(each)
+            if ended is None:
+                return
+            yield each, ended
+
+    def again(self, step: Step) -> tuple[Status, str, int] | None:
+        """Take a frame as a killed run took it; None where its picture is not there any more."""
+        return self.lose(step.index, step.name, step.time_ns, step.reason)
+
+    def is_unsearched(self, index: int) -> bool:
+        """Whether the detector has not looked at the frame of this index."""
+        return self._finder is not None and not self._finder.has_seen(index)
+
     @abstractmethod
     def add(self, posed: PosedFrame) -> tuple[Status, str, int]:
         """Place one frame; what became of it, in words if not by vision, and how many tiles were painted meanwhile."""
 
-    def view(self, posed: PosedFrame) -> FrameView | None:
-        """What a frame that was added shows, as it lies now; None where this method knows no camera's place."""
+    def view(self, index: int, time_ns: int) -> FrameView | None:
+        """What the frame of this index and time shows, as it lies now; None where the camera's place is not known."""
         return None
 
     @abstractmethod
@@ -96,6 +146,11 @@ class FlightRun(ABC):
         seconds = 0.0 if self._finder is None else self._finder.seconds
         return search_summary(search, seconds, why_not_searched(self._settings.model))
 
+    def _keep_detections(self) -> None:
+        if self._finder is not None and self._journal is not None:
+            for seen in self._finder.news():
+                self._journal.keep_detections(seen)
+
     @property
     def _detector_notices(self) -> tuple[Notice, ...]:
         return () if self._finder is None else self._finder.notices
@@ -110,8 +165,11 @@ class FlightRun(ABC):
         """The writer, begun when it is first asked for."""
         if self._writer is None:
             source = self._setup.source
-            settings: dict[str, Any] = {"method": self._settings.method, **vars(self._settings)}
+            settings: dict[str, Any] = {**vars(self._settings), REQUEST: self._request}
             cache_mb = min(_MOST_CACHE_MB, int(memory_budget_bytes(self._settings.memory_mb) / 1e6) // 8)
-            self._writer = self._archive.begin_flight(source.name, source.fingerprint, settings, cache_mb=cache_mb)
+            journal = None if self._journal is None else self._journal.file
+            self._writer = self._archive.begin_flight(
+                source.name, source.fingerprint, settings, cache_mb=cache_mb, journal=journal
+            )
             self._began_writer = True
         return self._writer

@@ -27,9 +27,10 @@ class ThesisRun(FlightRun):
     """A flight mapped as the thesis does: all of it stitched first, then anchored to its fixes."""
 
     def __init__(
-        self, setup: FlightSetup, archive: Archive, settings: MapSettings, finder: ObjectFinder | None = None
+        self, setup: FlightSetup, archive: Archive, settings: MapSettings, finder: ObjectFinder | None = None,
+        request: str = "",
     ) -> None:
-        super().__init__(setup, archive, settings, finder=finder)
+        super().__init__(setup, archive, settings, finder=finder, request=request)
         self._lens = Undistorter(setup.source.camera.camera)
         full = self._lens.camera
         scale = min(1.0, settings.thesis.side_px / max(full.width_px, full.height_px))

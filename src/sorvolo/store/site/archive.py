@@ -17,10 +17,11 @@ from sorvolo.store.site.catalogue import FlightEntry, StoredKeyframe, TileDiffer
 from sorvolo.store.site.change_records import StoredChange, StoredReview
 from sorvolo.store.site.files import HeightFile, SiteFiles
 from sorvolo.store.site.flight_writer import FlightWriter
+from sorvolo.store.site.journal import RunJournal
 from sorvolo.store.site.names import is_plain_name
 from sorvolo.store.site.object_records import StoredObject, StoredSearch
 from sorvolo.store.site.tiles import GrowingTiles, TileView
-from sorvolo.store.site.upkeep import forget_unfinished, repair
+from sorvolo.store.site.upkeep import forget_journals, forget_unfinished, remove_unused, repair
 from sorvolo.survey.findings import Verdict
 from sorvolo.survey.flight import Site
 
@@ -251,6 +252,20 @@ class Archive:
             version = records.newest_version(connection, complete=False) or records.newest_version(connection)
         return self._files.tiles(version)
 
+    def journal(self, flight_id: str, key: str) -> RunJournal:
+        """The journal of a run that is about to begin, with what a killed one of this `key` left in it.
+
+        `key` is the same for the same run over the same map. Journals of other runs are deleted, and their pictures.
+        """
+        self._require_writable()
+        path = self._files.journal_path(flight_id)
+        with self._files.catalogue.reading() as connection:
+            newest = records.newest_version(connection)
+        journal = RunJournal(path, key, newest)
+        forget_journals(self._files, kept=path if journal.is_begun else None)
+        remove_unused(self._files)
+        return journal
+
     def begin_flight(
         self,
         flight_id: str,
@@ -258,12 +273,13 @@ class Archive:
         settings: Mapping[str, Any],
         *,
         cache_mb: int = 256,
+        journal: RunJournal | None = None,
     ) -> FlightWriter:
         """Start to map a flight; a flight mapped before keeps its rank, and stays readable until the commit.
 
-        `settings["method"]`, if any, is listed with the flight. Images and tiles are kept in memory up to
-        `cache_mb` each. Raises SettingsError for an id that is no folder name, StoreError when there is no
-        site or another flight is being mapped.
+        `settings["method"]`, if any, is listed with the flight. `journal` is the run's, which ends with it. Images and
+        tiles are kept in memory up to `cache_mb` each. Raises SettingsError for an id that is no folder name,
+        StoreError when there is no site or another flight is being mapped.
         """
         self._require_writable()
         if self._writer is not None and self._writer.is_open:
@@ -271,6 +287,8 @@ class Archive:
         if not is_plain_name(flight_id):
             raise SettingsError(f"{flight_id!r} cannot name a flight's folder; choose letters and digits")
         grid = self.site_grid().grid
+        if journal is None:
+            forget_journals(self._files)
         with self._files.catalogue.changing() as connection:
             run_id, version_id = records.begin_run(
                 connection, flight_id, fingerprint, str(settings.get("method", "")), plain_json(settings)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Row, Table, delete, func, insert, literal, select, update
+from sqlalchemy import ColumnElement, Connection, Row, Table, delete, func, insert, literal, select, update
 from sqlalchemy.exc import DBAPIError
 
 from sorvolo.errors import GeometryError, StoreError
@@ -413,14 +413,23 @@ def drop_unfinished(connection: Connection) -> None:
     A site is forgotten as well when no flight was ever committed to it: its place, its ground sampling distance and
     its height are those of a run that was stopped, perhaps before it began, and need not suit the next one.
     """
-    connection.execute(delete(schema.versions).where(schema.versions.c.complete.is_(False)))
-    connection.execute(delete(schema.runs).where(schema.runs.c.status == "mapping"))
+    _drop(connection, schema.versions, schema.versions.c.complete.is_(False))
+    _drop(connection, schema.runs, schema.runs.c.status == "mapping")
     if newest_version(connection) == 0:
         connection.execute(delete(schema.site))
     connection.execute(delete(schema.flights).where(
         schema.flights.c.id.not_in(select(schema.runs.c.flight_id)),
         schema.flights.c.id.not_in(select(schema.versions.c.flight_id)),
     ))
+
+
+def _drop(connection: Connection, table: Table, unfinished: ColumnElement[bool]) -> None:
+    """Delete these rows, the newest; their numbers, which nothing names any more, are given again: a run that was
+    killed and the one that goes on end with the same."""
+    first = connection.execute(select(func.min(table.c.id)).where(unfinished)).scalar()
+    if first is not None:
+        connection.execute(delete(table).where(unfinished))
+        connection.exec_driver_sql("UPDATE sqlite_sequence SET seq = ? WHERE name = ?", (first - 1, table.name))
 
 
 def owe_documents(connection: Connection, flight_ids: Collection[str]) -> None:

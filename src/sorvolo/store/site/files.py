@@ -26,6 +26,9 @@ CATALOGUE = "site.db"
 STAGED = "staged"
 """The folder of a flight in which its next run collects pictures until it is committed."""
 
+JOURNAL = "run.journal"
+"""The file of a flight's folder from which a killed run goes on."""
+
 _LOCK = "site.lock"
 _MOST_REPORT_BYTES = 256_000_000  # of a report.json: an hour's track takes a hundredth
 
@@ -118,6 +121,10 @@ class SiteFiles:
     def height_path(self, flight_id: str, file: HeightFile) -> Path:
         """Where a file of a flight's heights lies, whether it is there or not."""
         return self.flight_folder(flight_id) / file
+
+    def journal_path(self, flight_id: str) -> Path:
+        """Where a run notes how far it is, until it is committed."""
+        return self.flight_folder(flight_id) / JOURNAL
 
     def staged_folder(self, flight_id: str, run_id: int) -> Path:
         """Where a run collects pictures until it is committed."""

@@ -1,5 +1,6 @@
 """A flight on its way into a site: what is saved while it lasts, and the commit that makes it whole."""
 
+import hashlib
 import shutil
 from collections.abc import Mapping, MutableMapping, Sequence
 from pathlib import Path
@@ -11,12 +12,13 @@ import numpy as np
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import Boxes, ImageGray, ImageRGB, ImageRGBA, Mask
 from sorvolo.geometry.grid import TileIndex
-from sorvolo.store.atomic import atomic_write_bytes, sync_file, writing
+from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes, sync_file, writing
 from sorvolo.store.exports.change_files import BOXES_FILE, boxes_json, crop_files, mask_name, write_view_masks
 from sorvolo.store.exports.frame_files import frames_geojson
 from sorvolo.store.exports.object_files import CROPS, object_crops
 from sorvolo.store.exports.plain import features_name, geojson_bytes, json_bytes
 from sorvolo.store.images import ImageCache, jpeg_from_image
+from sorvolo.store.nofollow import read_below
 from sorvolo.store.rasters.geotiff import parse_crs
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
@@ -24,7 +26,7 @@ from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.store.site.derived import STAGED_FOLDERS
 from sorvolo.store.site.files import SiteFiles
 from sorvolo.store.site.tiles import GrowingTiles
-from sorvolo.store.site.upkeep import forget_unfinished, remove_unused, repair
+from sorvolo.store.site.upkeep import forget_journals, forget_unfinished, remove_unused, repair
 from sorvolo.survey.findings import Change
 from sorvolo.survey.map_objects import ObjectSearch
 from sorvolo.survey.mosaic import PlacedFrame, Status
@@ -51,6 +53,7 @@ class FlightWriter:
         self._files, self._growing = files, tiles
         self._flight_id, self._run_id, self._version_id = flight_id, run_id, version_id
         self._sizes: dict[str, tuple[int, int]] = {}  # path of each saved image: width, height
+        self._sha256: dict[int, str] = {}  # of each saved image, by frame index
         self._cache = ImageCache(
             lambda index: files.image(flight_id, self._image_path(index)), cache_bytes
         )
@@ -68,6 +71,7 @@ class FlightWriter:
         self._is_open = False
         try:
             # files that no reader can see go first: on a full disk, forgetting the run needs their space
+            forget_journals(self._files)
             shutil.rmtree((self._files.folder / self._image_path(0)).parent, ignore_errors=True)
             shutil.rmtree(self._staged, ignore_errors=True)
             remove_unused(self._files)
@@ -92,10 +96,45 @@ class FlightWriter:
         path = self._files.folder / relative
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-        atomic_write_bytes(path, jpeg_from_image(image), durable=False)
+        data = jpeg_from_image(image)
+        atomic_write_bytes(path, data, durable=False)
         self._cache.forget(index)
         self._sizes[relative] = (image.shape[1], image.shape[0])
+        self._sha256[index] = hashlib.sha256(data).hexdigest()
         return relative
+
+    def stored(self, index: int) -> tuple[tuple[int, int], str]:
+        """Size (width, height) and SHA-256 of a picture that this run has stored."""
+        return self._sizes[self._image_path(index)], self._sha256[index]
+
+    def keep_original(self, index: int) -> None:
+        """Keep a stored picture as it is until the commit, so that a run that goes on after a kill finds it."""
+        data = read_below(self._files.folder, self._image_path(index))
+        atomic_write_bytes(self._original(index), data, durable=False)
+
+    def take_over_image(self, index: int, size_px: tuple[int, int], sha256: str) -> str | None:
+        """Take a picture (width, height) as stored that a killed run left; its path, or None where it is not there.
+
+        It is there when its bytes are; the original, where it was kept, takes its place again.
+        """
+        relative = self._image_path(index)
+        if self._original(index).is_file():
+            with writing(self._files.folder / relative):
+                self._original(index).replace(self._files.folder / relative)
+        try:
+            found = hashlib.sha256(read_below(self._files.folder, relative)).hexdigest()
+        except FileNotFoundError:
+            return None
+        if found != sha256:
+            return None
+        self._sizes[relative] = size_px
+        self._sha256[index] = sha256
+        return relative
+
+    def _original(self, index: int) -> Path:
+        """What is removed with the files that killed processes leave, once the run is over."""
+        path = self._files.folder / self._image_path(index)
+        return path.with_name(f"{TEMPORARY_PREFIX}original-{path.name}")
 
     def image(self, index: int) -> ImageRGB:
         """A keyframe saved earlier, as it will be read later; read-only. StoreError if there is none."""
@@ -179,6 +218,7 @@ class FlightWriter:
             if search is not None:
                 object_records.add_search(connection, self._run_id, search)
         self._is_open = False
+        forget_journals(self._files)
         repair(self._files)
         remove_unused(self._files)
         return self._version_id

@@ -16,7 +16,8 @@ from sorvolo.store.site.derived import (
     write_object_files,
     write_site_objects,
 )
-from sorvolo.store.site.files import STAGED, SiteFiles
+from sorvolo.store.site.files import JOURNAL, STAGED, SiteFiles
+from sorvolo.store.site.journal import is_journal_after
 
 
 def repair(files: SiteFiles) -> None:
@@ -45,9 +46,17 @@ def _newest(files: SiteFiles) -> VersionEntry | None:
 
 
 def forget_unfinished(files: SiteFiles) -> None:
-    """Drop runs that never committed, then every file that nothing refers to any more."""
+    """Drop runs that never committed, then every file that nothing refers to any more.
+
+    The journal of a run that was killed stays, and its pictures, as long as the map is the one that it began over.
+    """
     with files.catalogue.changing() as connection:
         records.drop_unfinished(connection)
+        newest = records.newest_version(connection)
+    for flight in files.flight_folders():
+        journal = flight / JOURNAL
+        if journal.is_file() and not is_journal_after(journal, newest):
+            journal.unlink()
     remove_unused(files)
 
 
@@ -56,12 +65,20 @@ def remove_unused(files: SiteFiles) -> None:
     with files.catalogue.reading() as connection:
         runs, used = records.run_ids(connection), records.used_hashes(connection)
     flights = files.flight_folders()
-    remove_leftovers([files.folder, *flights, *(images for each in flights for images in each.glob("keyframes/*"))])
+    over = [each for each in flights if not (each / JOURNAL).exists()]  # else a run that was killed goes on
+    remove_leftovers([files.folder, *flights, *(images for each in over for images in each.glob("keyframes/*"))])
     files.blobs.remove_leftovers()
     files.blobs.remove(files.blobs.stored() - used)
     files.live_preview_path.unlink(missing_ok=True)
-    for flight in flights:
+    for flight in over:
         _remove_unused_pictures(flight, {str(run_id) for run_id in runs.get(flight.name, set())})
+
+
+def forget_journals(files: SiteFiles, kept: Path | None = None) -> None:
+    """Delete the journals of runs that were killed, all but `kept`, which goes on: the site becomes another one."""
+    for flight in files.flight_folders():
+        if flight / JOURNAL != kept:
+            (flight / JOURNAL).unlink(missing_ok=True)
 
 
 def _remove_unused_pictures(flight: Path, known_runs: set[str]) -> None:

@@ -1,0 +1,134 @@
+"""How often a run that is killed at a random moment, and started again, ends with the bytes of one that was not.
+
+    python benchmarks/resume_kills.py --kills 20 --seed 1 --command map
+
+Two small simulated flights; `map` makes the map of the first, `compare` compares the second with it. Each round starts
+the command in a process of its own, kills it (SIGKILL) after a share of the undisturbed run's time that is drawn from
+0 to 1, and runs the same command again to its end. All files of the site are compared with those of the undisturbed
+run, byte by byte, but for the catalogue (`site.db`, which holds when a run was made) and what a report says of the time
+and the memory that it took (docs/formats.md).
+"""
+
+import argparse
+import json
+import random
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from provenance import commit, machine
+from sorvolo.missions.simulate.site import simulate_site
+from sorvolo.simulation.presets import preset
+from sorvolo.simulation.settings import SimulationSettings
+
+EFFORT = ("seconds", "cpu_s", "registration_cpu_s_per_keyframe", "peak_memory_mb")
+"""Of report.json: what a run took."""
+TIMED = {"report.html", "changes.html"}
+"""Pages that show it."""
+
+
+def simulated(width_px: int) -> SimulationSettings:
+    """Two flights over one small site, the second with changes."""
+    demo = preset("demo")
+    imaging = replace(demo.imaging, width_px=width_px, height_px=width_px * 9 // 16, fps=6)
+    return replace(demo, path=replace(demo.path, length_m=40, strips=2, strip_spacing_m=6), imaging=imaging)
+
+
+def content(site: Path) -> dict[str, bytes]:
+    """The site's files by name, as they are to be compared."""
+    found = {}
+    for path in sorted(site.rglob("*")):
+        if not path.is_file() or path.name.startswith("site.") or path.name in TIMED:
+            continue
+        data = path.read_bytes()
+        if path.name == "report.json":
+            report = json.loads(data)
+            data = json.dumps({key: value for key, value in report.items() if key not in EFFORT}).encode()
+        found[str(path.relative_to(site))] = data
+    return found
+
+
+def run(command: list[str], kill_s: float | None = None) -> tuple[float, str]:
+    """Run it, or kill it after so many seconds: how long it ran, and what it printed."""
+    started_s = time.monotonic()
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            _, printed = process.communicate(timeout=kill_s)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            _, printed = process.communicate()
+        else:
+            if process.returncode not in (0, 3):
+                raise SystemExit(printed)
+    return time.monotonic() - started_s, printed
+
+
+def rounds(options: argparse.Namespace, folder: Path) -> dict[str, object]:
+    """The undisturbed run, then the killed ones."""
+    for _ in simulate_site(folder / "flown", simulated(options.width)):
+        pass
+    sorvolo = [sys.executable, "-m", "sorvolo"]
+    shared = ["--camera", str(folder / "flown" / "camera.xml"), "--model", options.model]
+
+    def command(name: str, site: Path) -> list[str]:
+        flight = folder / "flown" / ("flight1" if name == "map" else "flight2")
+        return [*sorvolo, name, str(flight), "--site", str(site), *shared]
+
+    base = folder / "base" / "site"
+    base.parent.mkdir()
+    if options.command == "compare":
+        run(command("map", base))
+    sites = [folder / name / "site" for name in ("undisturbed", "killed")]
+    for each in sites:
+        each.parent.mkdir()
+    if base.is_dir():
+        shutil.copytree(base, sites[0])
+    whole_s, _ = run(command(options.command, sites[0]))
+    wanted = content(sites[0])
+    draw, rows = random.Random(options.seed), []
+    for number in range(options.kills):
+        shutil.rmtree(sites[1], ignore_errors=True)
+        if base.is_dir():
+            shutil.copytree(base, sites[1])
+        kill_s = draw.random() * whole_s
+        run(command(options.command, sites[1]), kill_s)
+        again_s, printed = run(command(options.command, sites[1]))
+        found = content(sites[1])
+        differing = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
+        resumed = re.search(r"going on after (\d+) frame", printed)
+        rows.append({
+            "kill_s": round(kill_s, 2), "again_s": round(again_s, 2), "same": not differing,
+            "frames_taken_over": int(resumed[1]) if resumed else 0, "differing": differing[:10],
+        })
+        print(number + 1, rows[-1], flush=True)
+    return {
+        "command": options.command, "seed": options.seed, "width_px": options.width, "model": options.model,
+        "undisturbed_s": round(whole_s, 2), "kills": len(rows), "same": sum(bool(each["same"]) for each in rows),
+        "resumed": sum(bool(each["frames_taken_over"]) for each in rows), "rounds": rows,
+    }
+
+
+def main() -> None:
+    """Write results/resume_kills_COMMAND.json."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--command", choices=("map", "compare"), default="map")
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--width", type=int, default=480)
+    parser.add_argument("--model", default="none")
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        result = rounds(options, Path(folder))
+    out = options.out or Path(__file__).parent / "results" / f"resume_kills_{options.command}.json"
+    out.write_text(json.dumps({"machine": machine(), "commit": commit(), **result}, indent=1) + "\n")
+    print(f"{result['same']} of {result['kills']} with the same bytes, {result['resumed']} went on; {out}")
+
+
+if __name__ == "__main__":
+    main()

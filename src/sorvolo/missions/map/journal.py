@@ -1,0 +1,248 @@
+"""What a mapping has done with each frame so far, in its journal: a killed run goes on after the last one."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import sorvolo
+from sorvolo.capture.photos import PhotoSource
+from sorvolo.capture.video import VideoSource
+from sorvolo.errors import SorvoloError
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.pose import Pose
+from sorvolo.missions.flight.control import FlightControl
+from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.map_objects import FrameDetections
+from sorvolo.missions.flight.report import software
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.mosaic.planar import Registered
+from sorvolo.mosaic.selection import SelectionMemory
+from sorvolo.store.images import array_from_bytes
+from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.journal import Entry, RunJournal, content_sha256
+from sorvolo.survey.area import Area
+from sorvolo.survey.flight import CameraPrior
+from sorvolo.survey.mosaic import Features, Keyframe, Link
+from sorvolo.survey.objects import Detections
+
+_PRIOR = ("position_m", "position_sigma_m", "rotation", "attitude_sigma_deg", "velocity_m_s")
+_LINK = ("new_px", "old_px", "new_from_old")
+
+
+@dataclass(frozen=True)
+class StoredPicture:
+    """A keyframe's picture in the site: its size (width, height) and its SHA-256."""
+
+    size_px: tuple[int, int]
+    sha256: str
+
+
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """A frame that was registered, and its picture: in the site, or as it waits for its place (bytes: JPEG)."""
+
+    registered: Registered
+    picture: StoredPicture | ImageRGB | bytes
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One frame as the mapping took it: `taken`, or why it cannot be used.
+
+    `memory` is that of the selection after it; None for a frame that the source lost. `is_searched`: a detector was to
+    look at it.
+    """
+
+    index: int
+    name: str
+    time_ns: int
+    reason: str
+    memory: SelectionMemory | None
+    taken: Taken | None
+    is_searched: bool
+
+
+class Earlier:
+    """The frames that a killed run took: where to go on in the input, and what of it to read again."""
+
+    def __init__(self) -> None:
+        self.last = -1
+        """The index of the last frame taken."""
+        self.memory = SelectionMemory()
+        self.needed: set[int] = set()
+        """Frames to read again: the source counts those that it lost, and a detector looks at the last ones."""
+        self._searched: list[int] = []
+
+    def take(self, step: Step) -> None:
+        """Take the next of its frames."""
+        self.last = max(self.last, step.index)
+        if step.memory is None:
+            self.needed.add(step.index)
+        else:
+            self.memory = step.memory
+        if step.is_searched:
+            self._searched.append(step.index)
+
+    def search(self, is_unsearched: Callable[[int], bool]) -> None:
+        """Have those frames searched again whose detections are not known."""
+        self.needed |= {index for index in self._searched if is_unsearched(index)}
+
+
+class MapJournal:
+    """A mapping's steps and detections, in a journal of the site."""
+
+    def __init__(self, journal: RunJournal) -> None:
+        self.file = journal
+
+    def keep(self, step: Step) -> None:
+        """Note a frame. Raises StoreError when the disk is full."""
+        values: dict[str, Any] = {
+            "index": step.index, "name": step.name, "time_ns": step.time_ns, "reason": step.reason,
+            "searched": step.is_searched,
+        }
+        arrays: dict[str, Any] = {}
+        if step.memory is not None:
+            values["selection"] = {"usual": step.memory.usual, "count": step.memory.count}
+            if step.memory.last is not None:
+                arrays["last"] = step.memory.last
+        if step.taken is not None:
+            _put_taken(step.taken, values, arrays)
+        self.file.append(Entry("step", values, arrays))
+
+    def keep_detections(self, seen: FrameDetections) -> None:
+        """Note what was detected in a frame."""
+        self.file.append(Entry("seen", {
+            "index": seen.index, "classes": seen.found.classes, "seconds": seen.seconds,
+            "crops": [len(each) for each in seen.crops],
+        }, {
+            "boxes_px": seen.found.boxes_px, "scores": seen.found.scores, "labels": seen.found.labels,
+            "jpegs": array_from_bytes(b"".join(seen.crops)),
+        }))
+
+    def earlier(self) -> Iterator[Step | FrameDetections]:
+        """What a killed run did, in order; it ends where an entry is not as one was written."""
+        for entry in self.file.entries():
+            try:
+                read = _step(entry) if entry.kind == "step" else _seen(entry)
+            except (KeyError, TypeError, ValueError, SorvoloError):
+                return  # a damaged entry: what comes after it is done again
+            yield read
+
+
+def map_request(setup: FlightSetup, settings: MapSettings, area: Area | None, detector: Detects | None) -> str:
+    """What is asked for, as one number: the same command over the same files by the same version gives the same."""
+    files = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in _files(setup)]
+    return content_sha256(
+        sorvolo.__version__, software(), setup.source.fingerprint, files, setup.source.camera, setup.source.telemetry,
+        replace(settings, live_s=0.0, memory_mb=None), area, None if detector is None else detector.info,
+    )
+
+
+def run_key(setup: FlightSetup, archive: Archive, request: str) -> str:
+    """What is asked for, and of which site: the same only where the very same work is to be done."""
+    site = archive.site() if archive.has_site else None
+    versions = [(each.id, each.run_id, each.flight_id) for each in archive.versions() if each.complete]
+    return content_sha256(request, setup.plan, setup.frame.origin, site, versions)
+
+
+def _files(setup: FlightSetup) -> list[Path]:
+    """The files that a recorded flight is made from."""
+    source, ground = setup.source, setup.known_ground
+    found: list[Path] = []
+    if ground is not None:
+        found.append(ground.file.path if isinstance(ground, FlightControl) else ground.base.path)
+    if isinstance(source, PhotoSource):
+        return [*found, *(each.path for each in source.album.photos)]
+    return [*found, source.info.path] if isinstance(source, VideoSource) else found
+
+
+def _put_taken(taken: Taken, values: dict[str, Any], arrays: dict[str, Any]) -> None:
+    new = taken.registered
+    keyframe, features = new.keyframe, new.keyframe.features
+    values["keyframe"] = {
+        "id": keyframe.id, "camera": _camera_values(keyframe.camera), "features": features.kind, "met": new.met,
+        "source": keyframe.prior.source, "reason": new.reason, "placed": new.guess is not None,
+        "links": [{"old_id": each.old_id, "sigma_px": each.sigma_px} for each in new.links],
+    }
+    arrays |= {
+        "gray": keyframe.gray, "points_px": features.points_px, "descriptors": features.descriptors,
+        "thumbnail": new.thumbnail, "distortion": keyframe.camera.distortion,
+        **{name: getattr(keyframe.prior, name) for name in _PRIOR},
+        **{f"{name}_{number}": getattr(each, name) for number, each in enumerate(new.links) for name in _LINK},
+    }
+    if new.guess is not None:
+        arrays |= {"guess_rotation": new.guess.rotation, "guess_m": new.guess.translation_m}
+    if isinstance(taken.picture, StoredPicture):
+        values["stored"] = {"size_px": taken.picture.size_px, "sha256": taken.picture.sha256}
+    elif isinstance(taken.picture, bytes):
+        arrays["jpeg"] = array_from_bytes(taken.picture)
+    else:
+        arrays["picture"] = taken.picture
+
+
+def _camera_values(camera: Camera) -> dict[str, Any]:
+    return {each.name: getattr(camera, each.name) for each in fields(camera) if each.name != "distortion"}
+
+
+def _step(entry: Entry) -> Step:
+    values, arrays = entry.values, entry.arrays
+    memory = None
+    if "selection" in values:
+        kept = values["selection"]
+        memory = SelectionMemory(arrays.get("last"), tuple(float(each) for each in kept["usual"]), int(kept["count"]))
+    return Step(
+        int(values["index"]), str(values["name"]), int(values["time_ns"]), str(values["reason"]), memory,
+        _taken(entry) if "keyframe" in values else None, bool(values["searched"]),
+    )
+
+
+def _taken(entry: Entry) -> Taken:
+    arrays, kept = entry.arrays, entry.values["keyframe"]
+    keyframe_id = int(kept["id"])
+    camera = Camera(**kept["camera"], distortion=arrays["distortion"])
+    prior = CameraPrior(**{name: arrays[name] for name in _PRIOR}, source=str(kept["source"]))
+    features = Features(str(kept["features"]), arrays["points_px"], arrays["descriptors"])
+    _check_picture(arrays["gray"], (camera.height_px, camera.width_px))
+    links = tuple(
+        Link(
+            keyframe_id, int(each["old_id"]), **{name: arrays[f"{name}_{number}"] for name in _LINK},
+            sigma_px=float(each["sigma_px"]),
+        )
+        for number, each in enumerate(kept["links"])
+    )
+    guess = Pose(arrays["guess_rotation"], arrays["guess_m"]) if kept["placed"] else None
+    registered = Registered(
+        Keyframe(keyframe_id, camera, arrays["gray"], features, prior), arrays["thumbnail"], links, guess,
+        str(kept["reason"]), tuple(int(each) for each in kept["met"]),
+    )
+    return Taken(registered, _picture(entry))
+
+
+def _picture(entry: Entry) -> StoredPicture | ImageRGB | bytes:
+    stored = entry.values.get("stored")
+    if stored is not None:
+        width_px, height_px = stored["size_px"]
+        return StoredPicture((int(width_px), int(height_px)), str(stored["sha256"]))
+    if "jpeg" in entry.arrays:
+        return bytes(entry.arrays["jpeg"])
+    return entry.arrays["picture"]
+
+
+def _seen(entry: Entry) -> FrameDetections:
+    arrays, values = entry.arrays, entry.values
+    found = Detections(
+        arrays["boxes_px"], arrays["scores"], arrays["labels"], tuple(str(each) for each in values["classes"])
+    )
+    jpegs, crops, at = bytes(arrays["jpegs"]), [], 0
+    for length in values["crops"]:
+        crops.append(jpegs[at : at + int(length)])
+        at += int(length)
+    return FrameDetections(int(values["index"]), found, tuple(crops), float(values["seconds"]))
+
+
+def _check_picture(gray: Any, size: tuple[int, int]) -> None:
+    if gray.shape != size:
+        raise ValueError(f"a picture of {gray.shape} where {size} were needed")

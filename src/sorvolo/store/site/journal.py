@@ -1,0 +1,208 @@
+"""A run's journal: what it knows of each frame so far, appended as it comes, to go on from after a kill."""
+
+import hashlib
+import json
+import math
+import os
+import struct
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
+from io import BufferedRandom
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.store.atomic import writing
+
+_MAGIC = b"sorvolo journal 1\n"
+_HEAD = struct.Struct("<QI")  # an entry's bytes, and their CRC-32
+_TEXT = struct.Struct("<I")  # bytes of an entry's JSON
+_MOST_BYTES = 1 << 30  # of one entry: a picture of 20 megapixels takes a sixteenth
+_TYPES = {"<f8": np.float64, "<f4": np.float32, "<i8": np.int64, "<i4": np.int32, "|u1": np.uint8, "|b1": np.bool_}
+_MOST_DIMENSIONS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """One entry: values as JSON holds them (NaN and infinities, too), and arrays by name, none of objects."""
+
+    kind: str
+    values: Mapping[str, Any]
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=lambda: MappingProxyType({}))
+
+
+class RunJournal:
+    """The journal of one run at `path`. `append` adds an entry; `entries` are those that are whole, once.
+
+    `key` says of what run it is, `after` over which version of the map (0: none). A file with others, or a damaged one,
+    counts as empty. Nothing is written before
+    the first `append`, which cuts off what comes after the last entry that was taken. An entry is whole after a kill
+    or is not there; after a power cut those that the disk had not got are dropped. Files are data only: no entry can
+    make this program run anything, or take more memory than the file is long.
+    """
+
+    def __init__(self, path: Path, key: str, after: int) -> None:
+        self._path, self._run = path, {"key": key, "after": after}
+        self._file: BufferedRandom | None = None
+        self._end = 0
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether an earlier process began the file for this very run."""
+        if not self._path.is_file():
+            return False
+        with open(self._path, "rb", opener=_no_link) as file:
+            return _read_run(file) == self._run
+
+    def entries(self) -> Iterator[Entry]:
+        """The entries of an earlier process, in order. An entry counts as taken when the next one is asked for."""
+        if not self._path.is_file():
+            return
+        with open(self._path, "rb", opener=_no_link) as file:
+            if _read_run(file) != self._run:
+                return
+            self._end = file.tell()
+            while (entry := _read(file)) is not None:
+                end = file.tell()
+                yield entry
+                self._end = end
+
+    def append(self, entry: Entry) -> None:
+        """Add an entry. Raises StoreError when the disk is full."""
+        with writing(self._path):
+            file = self._file or self._begun()
+            file.write(_packed(entry))
+            file.flush()
+
+    def close(self) -> None:
+        """Let go of the file, which stays."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def remove(self) -> None:
+        """The run is over: nothing is left to go on from."""
+        self.close()
+        self._path.unlink(missing_ok=True)
+        folder = self._path.parent
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+
+    def _begun(self) -> BufferedRandom:
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        file = os.fdopen(_no_link(str(self._path), os.O_RDWR | os.O_CREAT), "r+b")
+        file.truncate(self._end)
+        file.seek(self._end)
+        if self._end == 0:
+            file.write(_MAGIC + _packed(Entry("run", self._run)))
+        self._file = file
+        return file
+
+
+def content_sha256(*values: Any) -> str:
+    """One number for records, arrays and plain values, the same whenever all of them are.
+
+    Raises TypeError for anything else, such as an open file.
+    """
+    digest = hashlib.sha256()
+    _feed(digest, values)
+    return digest.hexdigest()
+
+
+def _feed(digest: "hashlib._Hash", value: Any) -> None:
+    if isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype.str}{value.shape}".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+        return
+    if value is None or isinstance(value, bool | int | float | str | Path):
+        digest.update(f"{type(value).__name__}:{value!r};".encode())
+        return
+    parts = _parts(value)
+    digest.update(f"[{len(parts)}".encode())
+    for each in parts:
+        _feed(digest, each)
+
+
+def _parts(value: Any) -> Sequence[Any]:
+    if is_dataclass(value) and not isinstance(value, type):
+        return [type(value).__name__, *(getattr(value, each.name) for each in fields(value))]
+    if isinstance(value, Mapping):
+        return sorted(value.items())
+    if isinstance(value, list | tuple):
+        return value
+    raise TypeError(f"a {type(value).__name__} has no content that could be compared")
+
+
+def is_journal_after(path: Path, version: int) -> bool:
+    """Whether the file is the journal of a run over this version of the map: another one's is of no use any more."""
+    with open(path, "rb", opener=_no_link) as file:
+        return _read_run(file).get("after") == version
+
+
+def _read_run(file: Any) -> Mapping[str, Any]:
+    """Of what run the journal is; empty where it is no journal."""
+    first = _read(file) if file.read(len(_MAGIC)) == _MAGIC else None
+    return {} if first is None or first.kind != "run" else first.values
+
+
+def _no_link(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+
+
+def _packed(entry: Entry) -> bytes:
+    arrays = {name: np.ascontiguousarray(array) for name, array in entry.arrays.items()}
+    if unknown := {array.dtype.str for array in arrays.values()} - _TYPES.keys():
+        raise TypeError(f"a journal holds no arrays of {sorted(unknown)}")
+    head = {
+        "kind": entry.kind, "values": dict(entry.values),
+        "arrays": [[name, array.dtype.str, list(array.shape)] for name, array in arrays.items()],
+    }
+    text = json.dumps(head).encode()
+    body = b"".join([_TEXT.pack(len(text)), text, *(array.tobytes() for array in arrays.values())])
+    return _HEAD.pack(len(body), zlib.crc32(body)) + body
+
+
+def _read(file: Any) -> Entry | None:
+    """The next entry; None at the end, which is where anything is not as it was written."""
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        return None
+    size, checksum = _HEAD.unpack(head)
+    if size > _MOST_BYTES or size > os.fstat(file.fileno()).st_size - file.tell():
+        return None
+    body = file.read(size)
+    if len(body) < size or zlib.crc32(body) != checksum:
+        return None
+    try:
+        return _unpacked(body)
+    except (struct.error, ValueError, TypeError, KeyError, RecursionError):  # whole, but no Sorvolo wrote it
+        return None
+
+
+def _unpacked(body: bytes) -> Entry:
+    (length,) = _TEXT.unpack_from(body)
+    at = _TEXT.size + length
+    head = json.loads(body[_TEXT.size : at])
+    arrays = {}
+    for name, kind, shape in head["arrays"]:
+        count = _count(shape)
+        dtype = np.dtype(_TYPES[kind])
+        if count * dtype.itemsize > len(body) - at:
+            raise ValueError(f"{name} is longer than its entry")
+        array = np.frombuffer(body, dtype, count, at).reshape(shape)
+        arrays[str(name)] = array
+        at += array.nbytes
+    if not isinstance(head["kind"], str) or not isinstance(head["values"], dict):
+        raise TypeError("an entry has a kind and values")
+    return Entry(head["kind"], head["values"], arrays)
+
+
+def _count(shape: Any) -> int:
+    whole = isinstance(shape, list) and len(shape) <= _MOST_DIMENSIONS and all(type(each) is int for each in shape)
+    if not whole or any(each < 0 for each in shape):
+        raise ValueError(f"no array has the shape {shape!r}")
+    return math.prod(shape)
