@@ -12,12 +12,13 @@ from rich.console import Console
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson
+from sorvolo.cli.watch import Cot, CotAuthority, CotCertificate
 from sorvolo.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
     from sorvolo.station.settings import StationSettings
 
-_NEEDED = ("fastapi", "uvicorn", "websockets", "titiler.core")
+_NEEDED = ("fastapi", "uvicorn", "websockets", "titiler.core", "prometheus_client", "paho.mqtt")
 
 Root = Annotated[Path, typer.Argument(help="Folder that holds the sites; a site folder itself will do.")]
 Host = Annotated[
@@ -35,6 +36,16 @@ StreamFrom = Annotated[
 FreeFloor = Annotated[float, typer.Option(help="Disk space to leave free, GB: below it nothing new is taken in.")]
 UploadMost = Annotated[float, typer.Option(help="Largest upload, GB.")]
 Opens = Annotated[bool, typer.Option("--open", help="Open the page in a browser.")]
+Webhooks = Annotated[
+    list[str] | None,
+    typer.Option("--webhook", help="Web address to post new objects and changes to. Can be repeated."),
+]
+WebhookSecret = Annotated[
+    str, typer.Option(envvar="SORVOLO_WEBHOOK_SECRET", help="Signs what is posted (HMAC).", show_default="not signed")
+]
+Mqtt = Annotated[str, typer.Option(help="MQTT broker: mqtt://HOST[:PORT][/PREFIX] or mqtts://USER:PASSWORD@HOST.")]
+MqttAuthority = Annotated[Path | None, typer.Option(help="For mqtts://: the authority of the broker, PEM.")]
+LogJson = Annotated[bool, typer.Option("--log-json", help="Log each request and fault as a line of JSON on stderr.")]
 TokenName = Annotated[str, typer.Argument(help="Who it is for, such as a person's name.", show_default="list tokens")]
 TokenRole = Annotated[str, typer.Option(help="view, review (also judge), or operate (also run missions).")]
 Days = Annotated[float | None, typer.Option(help="Days until it expires.", show_default="never")]
@@ -44,7 +55,9 @@ Revoke = Annotated[bool, typer.Option("--revoke", help="Make the token of this n
 def serve(
     root: Root, host: Host = "127.0.0.1", port: Port = 8750, tls_cert: Certificate = None, tls_key: Key = None,
     insecure_lan: InsecureLan = False, name: Names = None, stream_from: StreamFrom = None, free_floor: FreeFloor = 2.0,
-    upload_most: UploadMost = 64.0, open_page: Opens = False,
+    upload_most: UploadMost = 64.0, open_page: Opens = False, webhook: Webhooks = None,
+    webhook_secret: WebhookSecret = "", mqtt: Mqtt = "", mqtt_ca: MqttAuthority = None, cot: Cot = "",
+    cot_ca: CotAuthority = None, cot_cert: CotCertificate = None, log_json: LogJson = False,
 ) -> None:
     """Serve a folder of sites to browsers: the map while it grows, changes, objects, and what to do with them.
 
@@ -53,8 +66,12 @@ def serve(
     Example: sorvolo serve demo-site --open
 
     Example: sorvolo serve maps --host 0.0.0.0 --tls-cert cert.pem --tls-key key.pem
+
+    Example: sorvolo serve maps --mqtt mqtt://192.168.1.5 --cot udp://239.2.3.1:6969
     """
     demand_extra()
+    from sorvolo.missions.watch.cot_sender import CotTls
+    from sorvolo.station.outward import OutwardSettings
     from sorvolo.station.server import run_station
     from sorvolo.station.settings import StationSettings
 
@@ -63,6 +80,9 @@ def serve(
         root, host, port, tls_cert, tls_key, insecure_lan, tuple(name or ()), tuple(stream_from or ()), free_floor,
         upload_most,
     )
+    receivers = OutwardSettings(
+        tuple(webhook or ()), webhook_secret, mqtt, mqtt_ca, cot, CotTls(cot_ca, cot_cert)
+    )
     console = Console(stderr=True)
 
     def announce() -> None:
@@ -70,7 +90,7 @@ def serve(
         if open_page:
             webbrowser.open(settings.address)
 
-    run_station(settings, announce)
+    run_station(settings, announce, receivers, logs_json=log_json)
 
 
 def token(

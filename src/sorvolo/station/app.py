@@ -1,5 +1,6 @@
 """The station as one web application: its parts joined, its routes, the page."""
 
+import asyncio
 import os
 import shutil
 from collections.abc import AsyncIterator
@@ -23,7 +24,10 @@ from sorvolo.station.features import feature_routes, landing_links
 from sorvolo.station.flight_videos import FlightVideos, video_routes
 from sorvolo.station.ingest import Ingest, IngestLimits
 from sorvolo.station.inputs import Inputs
+from sorvolo.station.logs import Observer
 from sorvolo.station.map_watch import MapWatch
+from sorvolo.station.metrics import StationMetrics, metrics_routes
+from sorvolo.station.outward import Outward, OutwardSettings
 from sorvolo.station.place import place_routes
 from sorvolo.station.problems import Problem, answer_problems
 from sorvolo.station.reviews import Reviews, review_routes
@@ -87,15 +91,22 @@ class Station:
         self.state.close()
 
 
-def station_app(settings: StationSettings) -> FastAPI:
-    """The application that serves the sites below the settings' root. Raises StoreError as `Station.open`."""
+def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardSettings()) -> FastAPI:  # noqa: B008
+    """The application that serves the sites below the settings' root, and passes events on to the receivers.
+
+    Raises StoreError as `Station.open`, InputError as `Outward`.
+    """
     station = Station.open(settings)
+    outward = Outward(receivers, station.events, station.ingest, settings.state_folder)
+    metrics = StationMetrics(settings.root, station.ingest, station.events, outward.figures)
 
     @asynccontextmanager
     async def while_it_runs(_: FastAPI) -> AsyncIterator[None]:
         station.runs.start_watching()
         station.map_watch.start()
+        outward.start()
         yield
+        await asyncio.to_thread(outward.close)
         await station.ingest.close()
         station.close()
 
@@ -108,7 +119,7 @@ def station_app(settings: StationSettings) -> FastAPI:
     for router in (
         _about_routes(station), _site_routes(station), event_routes(station.events),
         feature_routes(station.collections, station.reviews), review_routes(station.reviews, station.shelf),
-        crop_routes(station.shelf), stream_routes(station.ingest),
+        crop_routes(station.shelf), stream_routes(station.ingest), metrics_routes(metrics),
         upload_routes(station.uploads), run_routes(station.runs, station.inputs),
         place_routes(station.shelf, station.collections, station.reviews, station.videos),
         video_routes(station.shelf, station.collections, station.videos),
@@ -118,6 +129,7 @@ def station_app(settings: StationSettings) -> FastAPI:
         app.include_router(router)
     _serve_page(app)
     app.add_middleware(Doorkeeper, settings=settings, state=station.state, upload_path=_UPLOADS)
+    app.add_middleware(Observer, count=metrics.count)  # outermost: what the doorkeeper refuses counts, too
     return app
 
 

@@ -128,6 +128,11 @@ class Ingest:
         found = {"stream": stream, "is_connected": stream in self._links, "flights": self._kept(stream)}
         return found | (flight.figures() if flight is not None else {})
 
+    def samples(self) -> dict[str, Sample]:
+        """The newest telemetry of each drone that sends now, by stream. Safe to use from other threads."""
+        found = {stream: self._flights[stream].last_sample for stream in list(self._links) if stream in self._flights}
+        return {stream: sample for stream, sample in found.items() if sample is not None}
+
     def newest(self, stream: str) -> Path | None:
         """The file of the stream's newest flight, which a mission follows; None where there is none."""
         kept = self._kept(stream)

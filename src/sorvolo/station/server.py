@@ -8,25 +8,34 @@ import uvicorn
 
 from sorvolo.errors import SettingsError
 from sorvolo.station.app import Station, station_app
+from sorvolo.station.logs import log_as_json
+from sorvolo.station.outward import OutwardSettings
 from sorvolo.station.settings import StationSettings, check_exposure
 from sorvolo.station.tokens import has_tokens
 
 _MOST_MESSAGE_BYTES = 16_000_000  # of one WebSocket message: a key frame of 4K video takes a tenth
 
 
-def run_station(settings: StationSettings, announce: Callable[[], None]) -> None:
+def run_station(
+    settings: StationSettings, announce: Callable[[], None],
+    receivers: OutwardSettings = OutwardSettings(),  # noqa: B008 (frozen)
+    *, logs_json: bool = False,
+) -> None:
     """Serve until Ctrl-C or SIGTERM; `announce` is called once it listens.
 
     Raises SettingsError where others could reach it unprotected or the port is taken, StoreError as `Station.open`.
     """
-    app = station_app(settings)
+    if logs_json:
+        log_as_json()
+    app = station_app(settings, receivers)
     station: Station = app.state.station
     try:
         check_exposure(settings, has_tokens=has_tokens(station.state))
         config = uvicorn.Config(
             app, settings.host, settings.port, log_level="warning", access_log=False, server_header=False,
-            ws="websockets-sansio", ws_max_size=_MOST_MESSAGE_BYTES, proxy_headers=False, timeout_graceful_shutdown=2,
-            ssl_certfile=settings.tls_cert, ssl_keyfile=settings.tls_key, h11_max_incomplete_event_size=64_000,
+            log_config=None, ws="websockets-sansio", ws_max_size=_MOST_MESSAGE_BYTES, proxy_headers=False,
+            timeout_graceful_shutdown=2, ssl_certfile=settings.tls_cert, ssl_keyfile=settings.tls_key,
+            h11_max_incomplete_event_size=64_000,
         )
         server = _Announcing(config, announce)
         logging.getLogger("uvicorn.error").setLevel(logging.ERROR)

@@ -134,12 +134,13 @@ class Spool:
         was not; where there is none, to the newest key frame, which is sent, late as it is: the view goes on with it.
         """
         with self._lock:
-            stale = next((each for each in self._waiting if each.is_video), None)
-            if stale is None or stale.taken_ns >= before_ns:
+            first = self._first_picture()
+            if first is None or first.taken_ns >= before_ns:
                 return
-            keys = [each for each in self._waiting if each.is_key]
-            fresh = next((each for each in keys if each.taken_ns >= before_ns), keys[-1] if keys else None)
-            self._drop(self.last_seq + 1 if fresh is None else fresh.seq, "late")
+            keys = [(each.taken_ns, each.seq) for each in self._waiting if each.is_key]
+            newest = [seq for _, seq in keys[-1:]]
+            fresh = [seq for taken_ns, seq in keys if taken_ns >= before_ns]
+            self._drop((fresh or newest or [self.last_seq + 1])[0], "late")
 
     @property
     def is_empty(self) -> bool:
@@ -207,12 +208,15 @@ class Spool:
 
     def _drop_oldest(self) -> bool:
         """Drop the oldest waiting pictures to the next key frame; whether there were any."""
-        first = next((each for each in self._waiting if each.is_video), None)
+        first = self._first_picture()
         if first is None:
             return False
         until = next((each.seq for each in self._waiting if each.is_key and each.seq > first.seq), self.last_seq + 1)
         self._drop(until, "overflow")
         return True
+
+    def _first_picture(self) -> _Stored | None:
+        return next((each for each in self._waiting if each.is_video), None)
 
     def _drop(self, until_seq: int, reason: _Reason) -> None:
         """Drop the waiting pictures before a number."""

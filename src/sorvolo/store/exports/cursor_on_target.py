@@ -1,6 +1,8 @@
-"""Tracks as Cursor on Target events, version 2.0."""
+"""Tracks, drones and places as Cursor on Target events, version 2.0."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from math import isfinite, nan
 from types import MappingProxyType
 from xml.etree.ElementTree import Element, SubElement, tostring
 
@@ -15,6 +17,9 @@ COT_TYPES: Mapping[str, str] = MappingProxyType({
     "person": "a-u-G", "car": "a-u-G-E-V-C", "small object": "b-m-p-s-m",
 })
 """The event type of each class: unknown on the ground, unknown civilian vehicle, a spot on the map."""
+
+DRONE_TYPE = "a-f-A-M-H-Q"
+"""The event type of one's own drone: friendly, in the air, military by the standard's branch, rotary wing, unmanned."""
 
 _OTHER_TYPE = "a-u-G"
 _UNKNOWN_M = "9999999.0"  # what the schema wants where a height or an error is not known
@@ -36,11 +41,7 @@ def cot_event(
     be geo-referenced.
     """
     longitude, latitude = (float(each[0]) for each in longitude_latitude(track.position_m[None], site))
-    now = _milliseconds(now_ns)
-    event = Element("event", {
-        "version": "2.0", "uid": uid, "type": cot_type(track.label, types), "how": "m-g",
-        "time": now, "start": now, "stale": _milliseconds(now_ns + round(stale_s * 1e9)),
-    })
+    event = _event(uid, cot_type(track.label, types), now_ns, stale_s)
     error_m = float(np.sqrt(np.linalg.eigvalsh(track.covariance_m2)[-1]))
     SubElement(event, "point", {
         "lat": f"{latitude:.7f}", "lon": f"{(longitude + 180) % 360 - 180:.7f}",
@@ -48,7 +49,7 @@ def cot_event(
         "ce": f"{error_m:.1f}", "le": _UNKNOWN_M,
     })
     detail = SubElement(event, "detail")
-    label = "".join(letter for letter in track.label if letter.isprintable())  # another's model may name anything
+    label = _printable(track.label)
     SubElement(detail, "contact", {"callsign": f"{label} {track.id}"})
     east, north = track.velocity_m_s
     if track.moving:
@@ -61,13 +62,87 @@ def cot_event(
     return bytes(tostring(event, encoding="utf-8"))
 
 
+@dataclass(frozen=True)
+class DroneView:
+    """Where a drone is and what its camera looks at; NaN where unknown.
+
+    `height_m` is above the ellipsoid; course and azimuth clockwise from north; elevation from the horizon (-90 straight
+    down); the fields of view across and down the picture; `range_m` to the ground in the picture's middle.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float = nan
+    course_deg: float = nan
+    speed_m_s: float = nan
+    azimuth_deg: float = nan
+    elevation_deg: float = nan
+    across_deg: float = nan
+    down_deg: float = nan
+    range_m: float = nan
+    error_m: float = nan
+
+
+def cot_drone(view: DroneView, *, uid: str, callsign: str, now_ns: int, stale_s: float) -> bytes:
+    """A drone as one event, with its camera's field of view in `<sensor>` where azimuth and angle are known: ATAK and
+    WinTAK draw it on the ground."""
+    event = _event(uid, DRONE_TYPE, now_ns, stale_s)
+    SubElement(event, "point", {
+        "lat": f"{view.latitude_deg:.7f}", "lon": f"{(view.longitude_deg + 180) % 360 - 180:.7f}",
+        "hae": _known(view.height_m, ".1f"), "ce": _known(view.error_m, ".1f"), "le": _UNKNOWN_M,
+    })
+    detail = SubElement(event, "detail")
+    SubElement(detail, "contact", {"callsign": _printable(callsign)})
+    if isfinite(view.course_deg):
+        speed = f"{view.speed_m_s:.1f}" if isfinite(view.speed_m_s) else "0.0"
+        SubElement(detail, "track", {"course": f"{view.course_deg % 360:.0f}", "speed": speed})
+    if isfinite(view.azimuth_deg) and isfinite(view.across_deg):
+        down_deg = view.down_deg if isfinite(view.down_deg) else view.across_deg
+        SubElement(detail, "sensor", {
+            "version": "0.6", "type": "r-e", "model": "Sorvolo", "azimuth": f"{view.azimuth_deg % 360:.1f}",
+            "elevation": f"{view.elevation_deg if isfinite(view.elevation_deg) else -90.0:.1f}", "roll": "0.0",
+            "fov": f"{view.across_deg:.1f}", "vfov": f"{down_deg:.1f}",
+            "range": f"{view.range_m if isfinite(view.range_m) else 100.0:.0f}", "north": "0",
+            "fovRed": "1.0", "fovGreen": "1.0", "fovBlue": "0.0", "fovAlpha": "0.3",
+        })
+    return bytes(tostring(event, encoding="utf-8"))
+
+
+def cot_spot(
+    longitude_deg: float, latitude_deg: float, *, uid: str, kind: str, callsign: str, words: str, error_m: float,
+    now_ns: int, stale_s: float,
+) -> bytes:
+    """Something at a place as one event of the type `kind`; `words` are its remarks."""
+    event = _event(uid, kind, now_ns, stale_s)
+    SubElement(event, "point", {
+        "lat": f"{latitude_deg:.7f}", "lon": f"{(longitude_deg + 180) % 360 - 180:.7f}", "hae": _UNKNOWN_M,
+        "ce": _known(error_m, ".1f"), "le": _UNKNOWN_M,
+    })
+    detail = SubElement(event, "detail")
+    SubElement(detail, "contact", {"callsign": _printable(callsign)})
+    SubElement(detail, "remarks").text = _printable(words)
+    return bytes(tostring(event, encoding="utf-8"))
+
+
+def _event(uid: str, kind: str, now_ns: int, stale_s: float) -> Element:
+    now = _milliseconds(now_ns)
+    return Element("event", {
+        "version": "2.0", "uid": uid, "type": kind, "how": "m-g", "time": now, "start": now,
+        "stale": _milliseconds(now_ns + round(stale_s * 1e9)),
+    })
+
+
+def _known(value: float, form: str) -> str:
+    return format(value, form) if isfinite(value) else _UNKNOWN_M
+
+
+def _printable(text: str) -> str:
+    return "".join(letter for letter in text if letter.isprintable())  # another's model may name anything
+
+
 def cot_removal(uid: str, *, type_: str, now_ns: int) -> bytes:
     """The event that takes another one, of this `uid` and type, off everyone's map: it turned out to be none."""
-    now = _milliseconds(now_ns)
-    event = Element("event", {
-        "version": "2.0", "uid": f"{uid}.removed", "type": "t-x-d-d", "how": "m-g", "time": now, "start": now,
-        "stale": _milliseconds(now_ns + 60_000_000_000),
-    })
+    event = _event(f"{uid}.removed", "t-x-d-d", now_ns, 60.0)
     SubElement(event, "point", {"lat": "0", "lon": "0", "hae": _UNKNOWN_M, "ce": _UNKNOWN_M, "le": _UNKNOWN_M})
     detail = SubElement(event, "detail")
     SubElement(detail, "link", {"uid": uid, "relation": "p-p", "type": type_})

@@ -1,0 +1,102 @@
+"""`/metrics` in Prometheus' text format: streams, sites, events, requests, receivers, memory and disk."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from fastapi import APIRouter, Depends, Response
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.exposition import CONTENT_TYPE_LATEST
+from prometheus_client.registry import Collector
+
+from sorvolo.station.events import EventLog
+from sorvolo.station.ingest import Ingest
+from sorvolo.station.relays import RelayFigures
+from sorvolo.station.security import needs
+from sorvolo.station.tokens import Role
+
+_SECONDS = (0.005, 0.01, 0.03, 0.06, 0.1, 0.3, 1.0, 3.0, 10.0)
+
+Relays = Callable[[], Sequence[RelayFigures]]
+
+
+class StationMetrics:
+    """The figures of one station, in a registry of its own. `count` adds a request."""
+
+    def __init__(self, root: Path, ingest: Ingest, events: EventLog, relays: Relays = lambda: ()) -> None:
+        self.registry = CollectorRegistry()
+        self._requests = Counter(
+            "sorvolo_http_requests", "Requests answered", ("route", "method", "status"), registry=self.registry
+        )
+        self._seconds = Histogram(
+            "sorvolo_http_request_seconds", "Time to answer a request", ("route",), registry=self.registry,
+            buckets=_SECONDS,
+        )
+        self.registry.register(_StationCollector(root, ingest, events, relays))
+
+    def count(self, route: str, method: str, status: int, seconds: float) -> None:
+        """A request was answered; `route` is the route's pattern, so that ids make no new series."""
+        self._requests.labels(route, method, str(status)).inc()
+        self._seconds.labels(route).observe(seconds)
+
+
+def metrics_routes(metrics: StationMetrics) -> APIRouter:
+    """`/metrics`, for whoever may view the station."""
+    router = APIRouter(tags=["station"])
+
+    @router.get("/metrics", dependencies=[Depends(needs(Role.VIEW))], response_class=Response)
+    def show_metrics() -> Response:
+        """All figures in Prometheus' text format."""
+        return Response(generate_latest(metrics.registry), media_type=CONTENT_TYPE_LATEST)
+
+    return router
+
+
+class _StationCollector(Collector):
+    """Reads the figures when they are asked for."""
+
+    def __init__(self, root: Path, ingest: Ingest, events: EventLog, relays: Relays) -> None:
+        self._root, self._ingest, self._events, self._relays = root, ingest, events, relays
+
+    def collect(self) -> Iterator[Metric]:
+        """See `prometheus_client.registry.Collector`."""
+        yield GaugeMetricFamily("sorvolo_disk_free_bytes", "Free disk space", shutil.disk_usage(self._root).free)
+        if (memory := _memory_bytes()) is not None:
+            yield GaugeMetricFamily("sorvolo_memory_bytes", "Resident memory of the station's process", memory)
+        yield CounterMetricFamily("sorvolo_events", "Events so far", self._events.last)
+        yield from self._of_streams()
+        yield from self._of_relays()
+
+    def _of_streams(self) -> Iterator[Metric]:
+        connected = GaugeMetricFamily("sorvolo_stream_connected", "Whether the drone sends", labels=["stream"])
+        frames = CounterMetricFamily("sorvolo_stream_frames", "Pictures taken from a drone", labels=["stream"])
+        rate = GaugeMetricFamily("sorvolo_stream_frames_per_second", "Pictures a second", labels=["stream"])
+        size = GaugeMetricFamily("sorvolo_stream_kept_bytes", "What is kept of a stream", labels=["stream"])
+        viewers = GaugeMetricFamily("sorvolo_stream_viewers", "Browsers that watch", labels=["stream"])
+        for state in self._ingest.streams():
+            label = [state["stream"]]
+            connected.add_metric(label, float(state["is_connected"]))
+            frames.add_metric(label, state.get("frames", 0))
+            rate.add_metric(label, (state.get("frames_per_s") or 0.0) if state["is_connected"] else 0.0)
+            size.add_metric(label, sum(each["bytes"] for each in state["flights"]))
+            viewers.add_metric(label, self._ingest.hub(state["stream"]).viewers)
+        yield from (connected, frames, rate, size, viewers)
+
+    def _of_relays(self) -> Iterator[Metric]:
+        delivered = CounterMetricFamily("sorvolo_relay_delivered", "Events a receiver took", labels=["receiver"])
+        lost = CounterMetricFamily("sorvolo_relay_lost", "Events a receiver refused, or too old", labels=["receiver"])
+        waiting = GaugeMetricFamily("sorvolo_relay_waiting", "Events not looked at yet", labels=["receiver"])
+        for each in self._relays():
+            delivered.add_metric([each.name], each.delivered)
+            lost.add_metric([each.name], each.lost)
+            waiting.add_metric([each.name], each.waiting)
+        yield from (delivered, lost, waiting)
+
+
+def _memory_bytes() -> int | None:
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        return None
