@@ -8,7 +8,7 @@ from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.survey.objects import Sighting, Track
 from sorvolo.tracking.motion import MOVES, Motions
 
-_MOST_PATH = 400
+_MOST_PATH = 400  # places of a track, which bounds its memory
 
 
 @dataclass(eq=False)

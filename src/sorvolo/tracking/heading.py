@@ -7,13 +7,27 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, PointsPx
 
-_WINDOW_S = 20.0
-_LEAST_M = 6.0  # of way, rms: less is within the fixes' own errors
-_LEAST_SIGMA_DEG = 4.0
-_STRETCH_S, _LEAST_WAY_M = 2.0, 15.0  # over which a compass is checked
-_GAIN_PER_S, _LEARNS_S = 0.3, 15.0  # of what is seen, and how long: later the way back over the map moves the shift
-_MOST_DEG, _BROKEN_S = 15.0, 10.0
-_STEPS_PER_ERROR = 8.0  # neighbouring fixes, and neighbouring frames' tilts, err alike
+
+@dataclass(frozen=True)
+class HeadingSettings:
+    """When the pictures' way gives a heading."""
+
+    window_s: float = 20.0  # of the way that is laid on the fixes
+    least_m: float = 6.0  # of way, rms: less is within the fixes' own errors
+    least_sigma_deg: float = 4.0
+    steps_per_error: float = 8.0  # neighbouring fixes, and neighbouring frames' tilts, err alike
+
+
+@dataclass(frozen=True)
+class CompassSettings:
+    """How a compass is checked."""
+
+    stretch_s: float = 2.0  # of the way that one check looks back
+    least_way_m: float = 15.0  # a shorter one counts less: the fixes wander
+    gain_per_s: float = 0.3  # of what is seen
+    learns_s: float = 15.0  # after that the way back over the map moves the shift
+    most_deg: float = 15.0
+    broken_s: float = 10.0  # a gap in time after which it begins anew
 
 
 @dataclass(frozen=True)
@@ -32,7 +46,8 @@ class HeadingFromMotion:
     (Procrustes in the plane, as complex numbers: real part right or east, imaginary part up or north).
     """
 
-    def __init__(self) -> None:
+    def __init__(self, settings: HeadingSettings = HeadingSettings()) -> None:
+        self._settings = settings
         self._turned_rad = 0.0  # clockwise since the first picture
         self._points: deque[tuple[float, complex, complex]] = deque()
 
@@ -46,28 +61,29 @@ class HeadingFromMotion:
         self._turned_rad = float(np.arctan2(down, right))
         x, y = outline_px.mean(axis=0)
         self._points.append((time_s, complex(x, -y), complex(place_m[0], place_m[1])))
-        while time_s - self._points[0][0] > _WINDOW_S:
+        while time_s - self._points[0][0] > self._settings.window_s:
             self._points.popleft()
-        return self._told()
+        return self._known()
 
     def lose(self) -> None:
         """The pictures' way is broken (a cut, a frame that fits nothing): begin anew."""
         self._points.clear()
 
-    def _told(self) -> Heading:
+    def _known(self) -> Heading:
         seen = np.array([point[1] for point in self._points])
         fixes = np.array([point[2] for point in self._points])
         seen, fixes = seen - seen.mean(), fixes - fixes.mean()
         spread_px = float(np.sqrt(np.mean(np.abs(seen) ** 2)))
-        if len(seen) < 5 or float(np.sqrt(np.mean(np.abs(fixes) ** 2))) < _LEAST_M or spread_px <= 0:
+        if len(seen) < 5 or float(np.sqrt(np.mean(np.abs(fixes) ** 2))) < self._settings.least_m or spread_px <= 0:
             return Heading(0.0, float("inf"))
         turn = np.vdot(seen, fixes) / np.vdot(seen, seen).real
         reach_m = abs(turn) * spread_px
         miss_m = float(np.sqrt(np.mean(np.abs(fixes - turn * seen) ** 2)))
-        count = max(1.0, len(seen) / _STEPS_PER_ERROR)
+        count = max(1.0, len(seen) / self._settings.steps_per_error)
         sigma_deg = float(np.degrees(np.arctan2(miss_m, reach_m * np.sqrt(count))))
         heading_deg = float(np.degrees(-np.angle(turn) + self._turned_rad)) % 360
-        return Heading(heading_deg, max(sigma_deg, _LEAST_SIGMA_DEG) if reach_m > 2 * miss_m else float("inf"))
+        sigma_deg = max(sigma_deg, self._settings.least_sigma_deg)
+        return Heading(heading_deg, sigma_deg if reach_m > 2 * miss_m else float("inf"))
 
 
 class CompassError:
@@ -79,7 +95,8 @@ class CompassError:
     and less: on the way back over a map that was begun with the wrong heading the shift shows nothing of the compass.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, settings: CompassSettings = CompassSettings()) -> None:
+        self._settings = settings
         self.clockwise_deg, self._learnt_s = 0.0, 0.0
         self._points: deque[tuple[float, Floats, Floats]] = deque()
 
@@ -88,20 +105,20 @@ class CompassError:
 
         Returns by how much the compass reads too far clockwise, as known by now, in degrees.
         """
-        if self._points and not 0 <= time_s - self._points[-1][0] < _BROKEN_S:
+        if self._points and not 0 <= time_s - self._points[-1][0] < self._settings.broken_s:
             self._points.clear()
         self._points.append((time_s, camera_m, shift_m.copy()))
         _, camera_before_m, shift_before_m = self._points[0]
         way_m, slip_m = camera_m - camera_before_m, shift_m - shift_before_m
-        if time_s - self._points[0][0] < _STRETCH_S:
+        if time_s - self._points[0][0] < self._settings.stretch_s:
             return self.clockwise_deg
         self._points.popleft()
-        way_m2 = float(way_m @ way_m)
+        way_m2, rules = float(way_m @ way_m), self._settings
         # against the fixes' own wander a short way shows little
-        seen_rad = float(way_m[0] * slip_m[1] - way_m[1] * slip_m[0]) / (way_m2 + _LEAST_WAY_M**2)
+        seen_rad = float(way_m[0] * slip_m[1] - way_m[1] * slip_m[0]) / (way_m2 + rules.least_way_m**2)
         frame_s = time_s - self._points[-2][0] if len(self._points) > 1 else 0.0
-        gain = _GAIN_PER_S * min(frame_s, 1.0) * float(np.exp(-self._learnt_s / _LEARNS_S))
-        self._learnt_s += frame_s * way_m2 / (way_m2 + _LEAST_WAY_M**2)
+        gain = rules.gain_per_s * min(frame_s, 1.0) * float(np.exp(-self._learnt_s / rules.learns_s))
+        self._learnt_s += frame_s * way_m2 / (way_m2 + rules.least_way_m**2)
         change_deg = gain * float(np.degrees(seen_rad))
-        self.clockwise_deg = float(np.clip(self.clockwise_deg + change_deg, -_MOST_DEG, _MOST_DEG))
+        self.clockwise_deg = float(np.clip(self.clockwise_deg + change_deg, -rules.most_deg, rules.most_deg))
         return self.clockwise_deg

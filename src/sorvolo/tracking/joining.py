@@ -1,6 +1,7 @@
 """When two tracks, or two boxes of one frame, are one object."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,19 +11,29 @@ from sorvolo.survey.objects import Detections
 from sorvolo.tracking.followed import Followed
 from sorvolo.tracking.motion import MOVES, log_density, predicted
 
-_SAME_BOX = 0.6  # overlap of two boxes from which they show one object, whatever their classes
-_LEAST_NESTED = 0.5  # overlap of boxes of two classes, one within the other, from which they show one object
 WITHIN = 0.9
 """Share of the smaller of two boxes of a class that lies in the other from which on they show one object: of 174 such
 pairs in validation pictures 4 were two."""
-_FRAMES_APART = 5  # of two neighbours of which each frame sees one
-_OVERLAP, _FRAMES_OVERLAPPING = 0.5, 2  # nearer than this share of their longer sides two bodies have no room: fewer do
-_TOGETHER_SHARE = 0.15  # of frames with one of them: what is seen together more often is two objects
-_LEAST_CLASS_FIT = 0.1
-_LEAST_VIEWS = 4  # of a mover whose velocity is to be trusted
 
 
-def frame_doubles(boxes_px: BoxesPx | Floats, labels: Sequence[str], scores: Floats) -> dict[int, int]:
+@dataclass(frozen=True)
+class JoiningSettings:
+    """When two boxes of a frame, or two tracks, are one object."""
+
+    same_box: float = 0.6  # overlap of two boxes from which they show one object, whatever their classes
+    least_nested: float = 0.5  # overlap of boxes of two classes, one within the other, from which they show one object
+    within: float = WITHIN
+    frames_apart: int = 5  # of two neighbours of which each frame sees one
+    overlap: float = 0.5  # nearer than this share of their longer sides two bodies have no room: ...
+    frames_overlapping: int = 2  # ... fewer frames do
+    together_share: float = 0.15  # of frames with one of them: what is seen together more often is two objects
+    least_class_fit: float = 0.1  # 0 to 1, how alike the classes of two tracks are
+    least_views: int = 4  # of a mover whose velocity is to be trusted
+
+
+def frame_doubles(
+    boxes_px: BoxesPx | Floats, labels: Sequence[str], scores: Floats, settings: JoiningSettings = JoiningSettings()
+) -> dict[int, int]:
     """Rows whose box shows what a stronger row shows: weaker row to stronger row; (N, 4), N and N of one frame.
 
     It overlaps that box, or lies within it or around it: of the same class always, of another one if it is not much
@@ -32,9 +43,9 @@ def frame_doubles(boxes_px: BoxesPx | Floats, labels: Sequence[str], scores: Flo
         return {}
     boxes, names = np.asarray(boxes_px, np.float64), np.array(labels)
     overlap = iou_matrix(boxes, boxes)
-    is_nested = nesting_matrix(boxes, boxes) > WITHIN
-    is_alike = (names[:, None] == names[None]) | (overlap > _LEAST_NESTED)
-    same = (overlap > _SAME_BOX) | (is_nested & is_alike)
+    is_nested = nesting_matrix(boxes, boxes) > settings.within
+    is_alike = (names[:, None] == names[None]) | (overlap > settings.least_nested)
+    same = (overlap > settings.same_box) | (is_nested & is_alike)
     doubles: dict[int, int] = {}
     order = np.argsort(-np.asarray(scores, np.float64), kind="stable")
     for place, row in enumerate(order):
@@ -43,7 +54,6 @@ def frame_doubles(boxes_px: BoxesPx | Floats, labels: Sequence[str], scores: Flo
                 doubles[int(row)] = int(stronger)
                 break
     return doubles
-
 
 
 def without_doubles(found: Detections) -> tuple[Detections, list[int]]:
@@ -77,31 +87,35 @@ def neighbours(
             yield first[row], second[column]
 
 
-def double_of(followed: Followed, by_id: Mapping[int, Followed], reach_m: float) -> Followed | None:
+def double_of(
+    followed: Followed, by_id: Mapping[int, Followed], reach_m: float, settings: JoiningSettings = JoiningSettings()
+) -> Followed | None:
     """The track of the same object that ran beside this one: frames see one of both, never both.
 
     Of another class it must lie where there is no room for two: the detector takes it now for this, now for that.
     """
     for neighbour, frames in followed.apart.items():
         other = by_id.get(neighbour)
-        if other is None or followed.together.get(neighbour, 0) > _TOGETHER_SHARE * frames:
+        if other is None or followed.together.get(neighbour, 0) > settings.together_share * frames:
             continue
         apart_m = float(np.linalg.norm(other.place_m - followed.place_m))
-        overlaps = apart_m < _OVERLAP * min(followed.sides_m[0], other.sides_m[0])
-        if frames < (_FRAMES_OVERLAPPING if overlaps else _FRAMES_APART):
+        overlaps = apart_m < settings.overlap * min(followed.sides_m[0], other.sides_m[0])
+        if frames < (settings.frames_overlapping if overlaps else settings.frames_apart):
             continue
-        is_alike = _class_fit(followed, other) > _LEAST_CLASS_FIT
-        if apart_m < reach_m and (is_alike or (overlaps and frames >= _FRAMES_APART)):
+        is_alike = _class_fit(followed, other) > settings.least_class_fit
+        if apart_m < reach_m and (is_alike or (overlaps and frames >= settings.frames_apart)):
             return other
     return None
 
 
-def earlier_mover(followed: Followed, others: Sequence[Followed], new_per_m2: float) -> Followed | None:
+def earlier_mover(
+    followed: Followed, others: Sequence[Followed], new_per_m2: float, settings: JoiningSettings = JoiningSettings()
+) -> Followed | None:
     """The moving track, out of sight since before this one began, whose prediction this one continues best.
 
     None where it is more likely something new: by the density of places and velocities of unseen movers.
     """
-    if followed.views < _LEAST_VIEWS:
+    if followed.views < settings.least_views:
         return None
     best, most = None, 0.0
     state, spread = followed.motion.means[0, MOVES], followed.motion.covariances[0, MOVES]

@@ -12,7 +12,7 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats, PointsM, Rows
 
 STANDS, MOVES = 0, 1
-_LEAST_WEIGHT = 1e-4
+_LEAST_WEIGHT = 1e-4  # of a model: below it, it never came back
 _EYE = np.eye(2)
 
 
@@ -23,6 +23,15 @@ class Habits:
     speed_m_s: float
     unsteadiness: float
     moving_share: float
+    sway_m: float = 0.05  # per root second: people shift their weight, maps of neighbouring strips do not fit
+
+
+@dataclass(frozen=True)
+class TurnSettings:
+    """How often objects start and stop."""
+
+    starts_every_s: float = 60.0  # of one whose class moves half of the time; seldom movers start more seldom
+    stops_every_s: float = 60.0
 
 
 HABITS = {
@@ -30,8 +39,6 @@ HABITS = {
 }
 OTHER_HABITS = Habits(3.0, 0.3, 0.2)
 
-_SWAY_M = 0.05  # per root second: people shift their weight, maps of neighbouring strips do not fit
-_STARTS_EVERY_S, _STOPS_EVERY_S = 60.0, 60.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +75,8 @@ class Motions:
 
 def habits_of(label: str, unit_m: float) -> Floats:
     """(4,) a class's habits where one unit of the place is `unit_m` metres: its Habits, and how far it sways."""
-    habits = HABITS.get(label, OTHER_HABITS)
-    return np.array([habits.speed_m_s / unit_m, habits.unsteadiness / unit_m, habits.moving_share, _SWAY_M / unit_m])
+    usual = HABITS.get(label, OTHER_HABITS)
+    return np.array([usual.speed_m_s / unit_m, usual.unsteadiness / unit_m, usual.moving_share, usual.sway_m / unit_m])
 
 
 def begun(places_m: PointsM, covariances_m2: Floats, habits: Floats) -> Motions:
@@ -83,13 +90,13 @@ def begun(places_m: PointsM, covariances_m2: Floats, habits: Floats) -> Motions:
     return Motions(means, covariances, np.column_stack([1 - habits[:, 2], habits[:, 2]]), habits)
 
 
-def predicted(motions: Motions, elapsed_s: Floats) -> Motions:
+def predicted(motions: Motions, elapsed_s: Floats, settings: TurnSettings = TurnSettings()) -> Motions:
     """The same objects (N,) seconds later: models mixed as objects start and stop, then each moved on."""
     if not len(motions):
         return motions
     share = motions.habits[:, 2]
-    starts = (1 - np.exp(-elapsed_s / _STARTS_EVERY_S)) * np.minimum(2 * share, 1.0)
-    stops = 1 - np.exp(-elapsed_s / _STOPS_EVERY_S)
+    starts = (1 - np.exp(-elapsed_s / settings.starts_every_s)) * np.minimum(2 * share, 1.0)
+    stops = 1 - np.exp(-elapsed_s / settings.stops_every_s)
     turns = np.empty((len(motions), 2, 2))  # from, to
     turns[:, STANDS, STANDS], turns[:, STANDS, MOVES] = 1 - starts, starts
     turns[:, MOVES, STANDS], turns[:, MOVES, MOVES] = stops, 1 - stops

@@ -21,7 +21,7 @@ from sorvolo.tracking.association import (
 )
 from sorvolo.tracking.common_shift import CommonShift, ShiftSettings
 from sorvolo.tracking.followed import Followed
-from sorvolo.tracking.joining import double_of, earlier_mover, frame_doubles, inward_m, neighbours
+from sorvolo.tracking.joining import JoiningSettings, double_of, earlier_mover, frame_doubles, inward_m, neighbours
 from sorvolo.tracking.motion import MOVES, Motions, begun, corrected, habits_of, predicted
 
 
@@ -67,6 +67,7 @@ class TrackerSettings:
     evidence: EvidenceRules = field(default_factory=EvidenceRules)
     errors: SharedErrorSettings = field(default_factory=SharedErrorSettings)
     pairs: PairSettings = field(default_factory=PairSettings)
+    joining: JoiningSettings = field(default_factory=JoiningSettings)
 
     def __post_init__(self) -> None:
         if not 0 <= self.sure_score <= 1:
@@ -126,7 +127,7 @@ class Tracker:
         """
         if appearance is not None and len(appearance) != len(sightings):
             raise GeometryError(f"{len(sightings)} sightings but {len(appearance)} appearance vectors")
-        seen = _Seen(sightings, appearance, self._settings.errors)
+        seen = _Seen(sightings, appearance, self._settings)
         time_ns, elapsed_s = self._move_on(seen, time_ns)
         near = self._near(seen, time_ns, footprint_m)
         motions = _stacked(near, time_ns)
@@ -407,10 +408,10 @@ class Tracker:
 
     def _same_object(self, followed: Followed, by_id: Mapping[int, Followed]) -> Followed | None:
         """Another track of the same object, if there is one."""
-        other = double_of(followed, by_id, self._settings.neighbour_m / self._settings.unit_m)
+        other = double_of(followed, by_id, self._settings.neighbour_m / self._settings.unit_m, self._settings.joining)
         if other is None and followed.moves and followed.views <= self._settings.evidence.first_views:
             density = self._settings.new_per_m2 * self._settings.unit_m**2
-            other = earlier_mover(followed, self._followed, density)
+            other = earlier_mover(followed, self._followed, density, self._settings.joining)
         return other
 
     def _keep(self, kept: list[Followed]) -> None:
@@ -464,15 +465,15 @@ class _PairOdds:
 class _Seen:
     """One frame's sightings as columns."""
 
-    def __init__(self, sightings: Sequence[Sighting], looks: Floats | None, errors: SharedErrorSettings) -> None:
+    def __init__(self, sightings: Sequence[Sighting], looks: Floats | None, settings: TrackerSettings) -> None:
         self.sightings, self.looks = sightings, None if looks is None else np.asarray(looks, np.float64)
         self.places_m = np.array([each.position_m for each in sightings]).reshape(-1, 2)
         self.scores = np.array([each.score for each in sightings])
         self.labels = [each.label for each in sightings]
         self.sides_m = np.array([each.size_m[0] for each in sightings])
-        self.own_m2 = _own_covariances(sightings, errors)
+        self.own_m2 = _own_covariances(sightings, settings.errors)
         boxes_px = np.array([each.box_px for each in sightings]).reshape(-1, 4)
-        self.doubles = frame_doubles(boxes_px, self.labels, self.scores)
+        self.doubles = frame_doubles(boxes_px, self.labels, self.scores, settings.joining)
 
     def looks_of(self, row: int) -> Floats | None:
         """An appearance vector, if there is one."""

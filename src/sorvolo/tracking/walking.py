@@ -8,16 +8,22 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats, TimesNs
 from sorvolo.tracking.laying import LaidSighting
 
-_MOST_M_S = {"person": 4.0, "car": 20.0}  # a runner; a car in town
+_MOST_M_S = {"person": 4.0, "car": 20.0}  # a runner; a car in town; what is neither walks
 _OTHER_M_S = 4.0
-_LEAST_M_S = 0.25  # slower is a place badly known
-_LONGEST_GAP_S = 6.0
-_LEAST_VIEWS = 3  # two sightings lie on a straight line whatever they are: these must be whole and sure
-_SURE = 0.5
-_AGAIN_S = 60.0  # what walks on as it did is known again after so long
-_SWERVE = 0.35  # of the way that it goes meanwhile
-_MOST_OFF = 3.0  # sigmas, rms, from even motion along a line
-_WOBBLE_M_S2 = 0.4  # how much walkers turn and change their pace
+
+
+@dataclass(frozen=True)
+class WalkSettings:
+    """Which sightings one walk explains."""
+
+    least_m_s: float = 0.25  # slower is a place badly known
+    longest_gap_s: float = 6.0  # between two sightings of a way
+    least_views: int = 3  # two sightings lie on a straight line whatever they are: these must be whole and ...
+    sure_score: float = 0.5  # ... of this score
+    again_s: float = 60.0  # what walks on as it did is known again after so long ...
+    swerve: float = 0.35  # ... within so much of the way that it goes meanwhile
+    most_off: float = 3.0  # sigmas, rms, from even motion along a line
+    wobble_m_s2: float = 0.4  # how much walkers turn and change their pace
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +37,7 @@ class Walk:
     possible_views: int
 
 
-def walks(laid: Sequence[LaidSighting]) -> list[Walk]:
+def walks(laid: Sequence[LaidSighting], settings: WalkSettings = WalkSettings()) -> list[Walk]:
     """The walks among these sightings, none of which stands; each sighting is in one walk at most.
 
     A walk needs three sightings of one class on an even way, or two sure ones, no faster than its class moves and fast
@@ -44,9 +50,9 @@ def walks(laid: Sequence[LaidSighting]) -> list[Walk]:
     for at, first in enumerate(order):
         for second in order[at + 1:]:
             gap_s = times_s[second] - times_s[first]
-            if gap_s > _LONGEST_GAP_S:
+            if gap_s > settings.longest_gap_s:
                 break
-            found = _followed(int(first), int(second), laid, times_s, order)
+            found = _followed(int(first), int(second), laid, times_s, order, settings)
             if found is not None:
                 candidates.append(found)
     candidates.sort(key=lambda found: (-len(found[0]), found[1]))
@@ -56,11 +62,12 @@ def walks(laid: Sequence[LaidSighting]) -> list[Walk]:
         if taken.isdisjoint(members):
             taken.update(members)
             result.append(members)
-    return [_walk(members, laid, times_s) for members in _joined(result, laid, times_s)]
+    return [_walk(members, laid, times_s) for members in _joined(result, laid, times_s, settings)]
 
 
 def _followed(
-    first: int, second: int, laid: Sequence[LaidSighting], times_s: Floats, order: TimesNs
+    first: int, second: int, laid: Sequence[LaidSighting], times_s: Floats, order: TimesNs,
+    settings: WalkSettings,
 ) -> tuple[list[int], float] | None:
     """The sightings on the way that two begin, and how far they lie off it, rms in sigmas; None where it is no way."""
     one, two = laid[first].sighting, laid[second].sighting
@@ -69,36 +76,40 @@ def _followed(
     if one.label != two.label or gap_s <= 0:
         return None
     speed_m_s = float(np.hypot(*(two.position_m - one.position_m))) / gap_s
-    if not _LEAST_M_S <= speed_m_s <= fastest_m_s:
+    if not settings.least_m_s <= speed_m_s <= fastest_m_s:
         return None
-    members = _prolonged([first, second], laid, times_s, order)
-    if len(members) < _LEAST_VIEWS:
-        is_sure = all(laid[k].sighting.score >= _SURE and not laid[k].is_cut for k in members)
+    members = _prolonged([first, second], laid, times_s, order, settings)
+    if len(members) < settings.least_views:
+        is_sure = all(laid[k].sighting.score >= settings.sure_score and not laid[k].is_cut for k in members)
         return (members, 0.0) if is_sure else None
     _, velocity_m_s, _ = _line(members, laid, times_s, float(times_s[members[-1]]))
-    off = _off(members, laid, times_s)
-    if off > _MOST_OFF or not _LEAST_M_S <= np.hypot(*velocity_m_s) <= fastest_m_s:
+    off = _off(members, laid, times_s, settings.wobble_m_s2)
+    if off > settings.most_off or not settings.least_m_s <= np.hypot(*velocity_m_s) <= fastest_m_s:
         return None
     return members, off
 
 
-def _prolonged(way: list[int], laid: Sequence[LaidSighting], times_s: Floats, order: TimesNs) -> list[int]:
+def _prolonged(
+    way: list[int], laid: Sequence[LaidSighting], times_s: Floats, order: TimesNs, settings: WalkSettings
+) -> list[int]:
     """A way with the later sightings of its class that lie on it."""
     members, label = list(way), laid[way[0]].sighting.label
     for k in order[np.searchsorted(times_s[order], times_s[way[-1]], side="right"):]:
         after_s = float(times_s[k] - times_s[members[-1]])
-        if after_s > _LONGEST_GAP_S:
+        if after_s > settings.longest_gap_s:
             break
         if after_s <= 0 or laid[k].sighting.label != label:
             continue
         expected_m, _, spread = _line(members, laid, times_s, float(times_s[k]))
-        sigma_m = np.hypot(np.hypot(spread, _sigma_m(laid[k])), 0.5 * _WOBBLE_M_S2 * after_s**2)
-        if np.hypot(*(laid[k].sighting.position_m - expected_m)) < _MOST_OFF * sigma_m:
+        sigma_m = np.hypot(np.hypot(spread, _sigma_m(laid[k])), 0.5 * settings.wobble_m_s2 * after_s**2)
+        if np.hypot(*(laid[k].sighting.position_m - expected_m)) < settings.most_off * sigma_m:
             members.append(int(k))
     return members
 
 
-def _joined(found: list[list[int]], laid: Sequence[LaidSighting], times_s: Floats) -> list[list[int]]:
+def _joined(
+    found: list[list[int]], laid: Sequence[LaidSighting], times_s: Floats, settings: WalkSettings
+) -> list[list[int]]:
     """The same walks, those in one that show one walker out of view for a while."""
     rest = sorted(found, key=lambda members: times_s[members[0]])
     result: list[list[int]] = []
@@ -108,14 +119,14 @@ def _joined(found: list[list[int]], laid: Sequence[LaidSighting], times_s: Float
         for earlier in result:
             gap_s = begins_s - float(times_s[earlier[-1]])
             one, other = laid[earlier[-1]].sighting, laid[later[0]].sighting
-            if one.label != other.label or not 0 < gap_s <= _AGAIN_S:
+            if one.label != other.label or not 0 < gap_s <= settings.again_s:
                 continue
             expected_m, before_m_s, spread = _line(earlier, laid, times_s, begins_s)
             _, after_m_s, _ = _line(later, laid, times_s, begins_s)
             speed_m_s = float(np.hypot(*before_m_s))
             apart_m = float(np.hypot(*(other.position_m - expected_m)))
             turned_m_s = float(np.hypot(*(after_m_s - before_m_s)))
-            reach_m = 1.0 + min(2 * spread, 3.0) + _SWERVE * speed_m_s * gap_s
+            reach_m = 1.0 + min(2 * spread, 3.0) + settings.swerve * speed_m_s * gap_s
             if apart_m <= reach_m and turned_m_s <= max(speed_m_s, 0.5):
                 best, best_m = (earlier, apart_m) if apart_m < best_m else (best, best_m)
         if best is None:
@@ -139,13 +150,13 @@ def _line(
     return solution[0], solution[1], float(np.sqrt(max(covariance[0, 0], 0.0)))
 
 
-def _off(members: Sequence[int], laid: Sequence[LaidSighting], times_s: Floats) -> float:
+def _off(members: Sequence[int], laid: Sequence[LaidSighting], times_s: Floats, wobble_m_s2: float) -> float:
     """How far the sightings lie from even motion through their neighbours in time, rms in sigmas."""
     squares = []
     for before, k, after in zip(members, members[1:], members[2:]):
         share = (times_s[k] - times_s[before]) / (times_s[after] - times_s[before])
         expected_m = (1 - share) * laid[before].sighting.position_m + share * laid[after].sighting.position_m
-        wobble_m = 0.5 * _WOBBLE_M_S2 * (times_s[after] - times_s[before]) ** 2 / 4
+        wobble_m = 0.5 * wobble_m_s2 * (times_s[after] - times_s[before]) ** 2 / 4
         sigma_m = np.hypot(1.5 * _sigma_m(laid[k]), wobble_m)
         squares.append(float(((laid[k].sighting.position_m - expected_m) ** 2).sum()) / sigma_m**2 / 2)
     return float(np.sqrt(np.mean(squares)))
