@@ -1,6 +1,6 @@
 """The camera's own motion taken out of pictures that nothing places: sightings in a first picture's pixels."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -9,19 +9,37 @@ from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, PointsPx
 from sorvolo.survey.flight import Frame
 from sorvolo.survey.objects import Detections, Sighting
 
-_WIDTH_PX = 480  # of the pictures in which motion is looked for
-_POINTS, _LEAST_POINTS = 180, 90
-_LEAST_INLIERS, _LEAST_INLIER_SHARE = 12, 0.35
-_FIT_PX = 1.5  # in the small picture
-_THERE_AND_BACK_PX = 0.7
-_FAILURES = 4  # pictures in a row after which the way is lost
-_CUT_LIKENESS = 0.2  # of small thumbnails: less is another scene
-_THUMBNAIL_PX = (32, 18)
-_BOX_SIGMA, _LEAST_SIGMA_PX = 0.08, 1.0  # of a box's side
-_DRIFT_SHARE = 0.004  # of the way gone over the ground, as one goes from points to new points
-_GUESS_SHARE = 0.3  # of a step that was guessed
-_WINDOW_PX, _LEVELS = (17, 17), 4
 _UNTIL = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.03)
+
+
+@dataclass(frozen=True)
+class FlowSettings:
+    """How points are followed, in the small pictures."""
+
+    width_px: int = 480  # of the pictures in which motion is looked for
+    points: int = 180  # that are followed, ...
+    least_points: int = 90  # ... new ones where fewer are left
+    window_px: tuple[int, int] = (17, 17)
+    levels: int = 4  # of smaller pictures, for longer steps
+    there_and_back_px: float = 0.7  # points that miss by more on the way back are left out
+    fit_px: float = 1.5  # a point that agrees lies so near
+    least_inliers: int = 12  # points that must agree ...
+    least_inlier_share: float = 0.35  # ... and of all
+
+
+@dataclass(frozen=True)
+class ImageMotionSettings:
+    """When the way is lost, and how far it may have drifted."""
+
+    failures: int = 4  # pictures in a row after which the way is lost
+    cut_likeness: float = 0.2  # of small thumbnails: less is another scene
+    thumbnail_px: tuple[int, int] = (32, 18)
+    box_sigma: float = 0.08  # of a box's middle, in shares of its side
+    least_sigma_px: float = 1.0
+    drift_share: float = 0.004  # of the way gone over the ground, as one goes from points to new points
+    guess_share: float = 0.3  # of a step that was guessed
+    flow: FlowSettings = field(default_factory=FlowSettings)
+
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +61,8 @@ class ImageMotion:
     picture its places are counted in: they have nothing to do with those of the segments before.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, settings: ImageMotionSettings = ImageMotionSettings()) -> None:
+        self._settings = settings
         self.segments, self.guessed = 1, 0
         self._last: _View | None = None
         self._first_from_image = np.eye(2, 3)
@@ -62,12 +81,12 @@ class ImageMotion:
             [-0.5, -0.5], [width_px - 0.5, -0.5], [width_px - 0.5, height_px - 0.5], [-0.5, height_px - 0.5],
         ]))
         scale = float(np.sqrt(abs(np.linalg.det(self._first_from_image[:, :2]))))
-        drift_px = _DRIFT_SHARE * self._way_px + self._guessed_px
+        drift_px = self._settings.drift_share * self._way_px + self._guessed_px
         boxes = found.boxes_px.astype(np.float64)
         places = _moved(self._first_from_image, (boxes[:, :2] + boxes[:, 2:]) / 2 - 0.5)
         sides = (boxes[:, 2:] - boxes[:, :2]) * scale
         turn = self._first_from_image[:, :2] / max(scale, 1e-9)
-        own = np.maximum(_BOX_SIGMA * sides, _LEAST_SIGMA_PX * scale) ** 2
+        own = np.maximum(self._settings.box_sigma * sides, self._settings.least_sigma_px * scale) ** 2
         return [
             Sighting(
                 frame.index, frame.name, time_ns, label, float(found.scores[row]), found.boxes_px[row], places[row],
@@ -78,19 +97,20 @@ class ImageMotion:
 
     def _follow(self, image: ImageRGB, boxes_px: Floats) -> None:
         """Find where a picture lies."""
-        shrink = min(1.0, _WIDTH_PX / image.shape[1])
+        flow = self._settings.flow
+        shrink = min(1.0, flow.width_px / image.shape[1])
         gray = _small_gray(image, shrink)
-        thumbnail = cv2.resize(gray, _THUMBNAIL_PX, interpolation=cv2.INTER_AREA).astype(np.float64)
+        thumbnail = cv2.resize(gray, self._settings.thumbnail_px, interpolation=cv2.INTER_AREA).astype(np.float64)
         if self._last is None or self._last.gray.shape != gray.shape:
             if self._last is not None:
                 self._begin_segment()
             self._look_anew(gray, thumbnail, boxes_px, shrink, np.zeros((0, 2)), np.zeros((0, 2)))
             return
-        here, places = _followed(self._last, gray)
-        first_from_small, inliers = _similarity(here, places)
+        here, places = _followed(self._last, gray, flow)
+        first_from_small, inliers = _similarity(here, places, flow)
         if first_from_small is None:
-            here, places = _followed(self._last, gray, _whole_step(self._last.gray, gray))
-            first_from_small, inliers = _similarity(here, places)
+            here, places = _followed(self._last, gray, flow, _whole_step(self._last.gray, gray))
+            first_from_small, inliers = _similarity(here, places, flow)
         if first_from_small is None:
             self._lose(gray, thumbnail, boxes_px, shrink)
             return
@@ -109,7 +129,8 @@ class ImageMotion:
         """A picture whose motion is not found: a guess, or another segment."""
         assert self._last is not None
         self._failures += 1
-        if self._failures >= _FAILURES or _likeness(self._last.thumbnail, thumbnail) < _CUT_LIKENESS:
+        is_cut = _likeness(self._last.thumbnail, thumbnail) < self._settings.cut_likeness
+        if self._failures >= self._settings.failures or is_cut:
             self._begin_segment()
             self._look_anew(gray, thumbnail, boxes_px, shrink, np.zeros((0, 2)), np.zeros((0, 2)))
             return
@@ -117,7 +138,8 @@ class ImageMotion:
         before = self._first_from_image
         self._first_from_image = _composed(before, self._step)
         gone = self._first_from_image[:, 2] - before[:, 2]
-        self._guessed_px += _GUESS_SHARE * float(np.hypot(*gone)) + 2.0  # the points of the last good picture stay
+        # the points of the last good picture stay
+        self._guessed_px += self._settings.guess_share * float(np.hypot(*gone)) + 2.0
 
     def _begin_segment(self) -> None:
         self.segments += 1
@@ -128,13 +150,14 @@ class ImageMotion:
         self, gray: ImageGray, thumbnail: Floats, boxes_px: Floats, shrink: float, here: PointsPx, places: PointsPx
     ) -> None:
         """Keep a picture's points, new ones where there are few, none on objects."""
-        if len(here) < _LEAST_POINTS:
+        flow = self._settings.flow
+        if len(here) < flow.least_points:
             free = np.full(gray.shape, 255, np.uint8)
             for left, top, right, bottom in np.clip(boxes_px * shrink, 0, None).astype(int):
                 free[max(top - 2, 0):bottom + 3, max(left - 2, 0):right + 3] = 0
             for x, y in here.astype(int):
                 cv2.circle(free, (int(x), int(y)), 8, 0, -1)
-            corners = cv2.goodFeaturesToTrack(gray, _POINTS - len(here), 0.01, 8, mask=free)
+            corners = cv2.goodFeaturesToTrack(gray, flow.points - len(here), 0.01, 8, mask=free)
             if corners is not None:
                 fresh = np.asarray(corners.reshape(-1, 2), np.float64)
                 first_from_small = _composed(self._first_from_image, _inverse(_small_from_full(shrink)))
@@ -154,21 +177,25 @@ def _small_from_full(shrink: float) -> Floats:
     return np.array([[shrink, 0, 0.5 * shrink - 0.5], [0, shrink, 0.5 * shrink - 0.5]])
 
 
-def _followed(last: _View, gray: ImageGray, step_px: Floats | None = None) -> tuple[PointsPx, PointsPx]:
+def _followed(
+    last: _View, gray: ImageGray, settings: FlowSettings, step_px: Floats | None = None
+) -> tuple[PointsPx, PointsPx]:
     """Points found again, (M, 2), and their places; those that lead elsewhere on the way back are left out."""
-    if len(last.points_px) < _LEAST_INLIERS:
+    if len(last.points_px) < settings.least_inliers:
         return np.zeros((0, 2)), np.zeros((0, 2))
     start = last.points_px.astype(np.float32).reshape(-1, 1, 2)
     step = np.zeros(2, np.float32) if step_px is None else step_px.astype(np.float32)
     flags = cv2.OPTFLOW_USE_INITIAL_FLOW
     end, there, _ = cv2.calcOpticalFlowPyrLK(
-        last.gray, gray, start, start + step, winSize=_WINDOW_PX, maxLevel=_LEVELS, criteria=_UNTIL, flags=flags
+        last.gray, gray, start, start + step, winSize=settings.window_px, maxLevel=settings.levels, criteria=_UNTIL,
+        flags=flags,
     )
     back, again, _ = cv2.calcOpticalFlowPyrLK(
-        gray, last.gray, end, end - step, winSize=_WINDOW_PX, maxLevel=_LEVELS, criteria=_UNTIL, flags=flags
+        gray, last.gray, end, end - step, winSize=settings.window_px, maxLevel=settings.levels, criteria=_UNTIL,
+        flags=flags,
     )
     miss = np.linalg.norm((back - start).reshape(-1, 2), axis=1)
-    good = (there.ravel() == 1) & (again.ravel() == 1) & (miss < _THERE_AND_BACK_PX)
+    good = (there.ravel() == 1) & (again.ravel() == 1) & (miss < settings.there_and_back_px)
     return end.reshape(-1, 2)[good].astype(np.float64), last.places_px[good]
 
 
@@ -179,22 +206,22 @@ def _whole_step(last: ImageGray, gray: ImageGray) -> Floats:
     return np.array([x, y])
 
 
-def _similarity(here: PointsPx, places: PointsPx) -> tuple[Floats | None, Floats]:
+def _similarity(here: PointsPx, places: PointsPx, settings: FlowSettings) -> tuple[Floats | None, Floats]:
     """(2, 3) first picture from small picture by most points, and which (N,) they are; None where too few agree."""
     nothing = np.zeros(len(here), bool)
-    if len(here) < _LEAST_INLIERS:
+    if len(here) < settings.least_inliers:
         return None, nothing
     origin = places.mean(axis=0)  # a long way leads to large numbers
     spread = np.ptp(places, axis=0).max() / max(np.ptp(here, axis=0).max(), 1e-9)
     cv2.setRNGSeed(1)
     fit, kept = cv2.estimateAffinePartial2D(
-        here, places - origin, method=cv2.RANSAC, ransacReprojThreshold=_FIT_PX * max(spread, 1e-3), maxIters=500,
-        confidence=0.999, refineIters=10,
+        here, places - origin, method=cv2.RANSAC, ransacReprojThreshold=settings.fit_px * max(spread, 1e-3),
+        maxIters=500, confidence=0.999, refineIters=10,
     )
     if fit is None:
         return None, nothing
     inliers = kept.ravel().astype(bool)
-    enough = max(_LEAST_INLIERS, _LEAST_INLIER_SHARE * len(here))
+    enough = max(settings.least_inliers, settings.least_inlier_share * len(here))
     if inliers.sum() < enough or not np.isfinite(fit).all():
         return None, nothing
     fit[:, 2] += origin

@@ -19,20 +19,41 @@ from sorvolo.survey.objects import TYPICAL_SIZE_M
 from sorvolo.tracking.joining import WITHIN
 from sorvolo.tracking.laying import LaidSighting, shows, usual_height_m
 from sorvolo.tracking.plausible import usual_length_m
-from sorvolo.tracking.walking import Walk, walks
+from sorvolo.tracking.walking import Walk, WalkSettings, walks
 
-_GATE = 9.2  # squared distance in sigmas, two axes: 99 in 100 sightings of one object lie nearer
-_OTHER_CLASS = 4.0  # added for a sighting of another class: rather another object, yet classes are mistaken
-_DRIFT_M = 0.12  # by which frames of one map lie beside each other where they were not linked
-_SAME_BOX = 0.55  # overlap of two boxes of one frame from which they show one object, whatever their classes
-_SHARED_FRAMES = 0.25  # of the fewer views: what is seen twice in more frames than these is two objects
-_LEAST_SHARE = 0.3  # of the frames that show its place: what fewer saw does not stand there
-_LEAST_CUT_SHARE = 0.7  # of both, where those that saw it all cut it and the others would show it whole
-_SURE = 0.8  # score from which one sighting alone is reported, where no more than two frames show the place
-_TOP = 0.85  # of a body's height: tops are narrower than feet
-_HEIGHT_SIGMA = 0.3  # of a class's usual height
 _TURNS = np.radians(np.arange(0.0, 180.0, 5.0))
-_SIZE_SIGMA = 0.3  # of a class's usual sides
+
+
+@dataclass(frozen=True)
+class MatchSettings:
+    """Which sightings of several frames are one object that stands."""
+
+    gate: float = 9.2  # squared distance in sigmas, two axes: 99 in 100 sightings of one object lie nearer
+    other_class: float = 4.0  # added for a sighting of another class: rather another object, yet classes are mistaken
+    drift_m: float = 0.12  # by which frames of one map lie beside each other where they were not linked
+    same_box: float = 0.55  # overlap of two boxes of one frame from which they show one object, whatever their classes
+    shared_frames: float = 0.25  # of the fewer views: what is seen twice in more frames than these is two objects
+
+
+@dataclass(frozen=True)
+class BodySettings:
+    """What is known of a class's bodies beside their usual sizes, in shares of these."""
+
+    top: float = 0.85  # of a body's height: tops are narrower than feet
+    height_sigma: float = 0.3
+    size_sigma: float = 0.3
+
+
+@dataclass(frozen=True)
+class StandingSettings:
+    """When enough frames saw an object where it stands."""
+
+    least_share: float = 0.3  # of the frames that show its place: what fewer saw does not stand there
+    least_cut_share: float = 0.7  # of both, where those that saw it all cut it and the others would show it whole
+    sure_score: float = 0.8  # from which one sighting alone is reported, where no more than two frames show the place
+    matches: MatchSettings = field(default_factory=MatchSettings)
+    bodies: BodySettings = field(default_factory=BodySettings)
+    walks: WalkSettings = field(default_factory=WalkSettings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +91,9 @@ class Fused:
     dropped: int
 
 
-def fuse(laid: Sequence[LaidSighting], frames: Sequence[PlacedFrame]) -> Fused:
+def fuse(
+    laid: Sequence[LaidSighting], frames: Sequence[PlacedFrame], settings: StandingSettings = StandingSettings()
+) -> Fused:
     """The objects that the sightings of these frames show, each once, the surest first.
 
     What too few of the frames saw that show its place is dropped, unless several such sightings lie on the way of
@@ -78,22 +101,24 @@ def fuse(laid: Sequence[LaidSighting], frames: Sequence[PlacedFrame]) -> Fused:
     """
     if not laid:
         return Fused((), 0)
-    groups = _merged(_gathered(laid), laid)
+    groups = _merged(_gathered(laid, settings.matches), laid, settings.matches)
     counts = _possible_views(groups, laid, frames)
     standing, left = [], []
     for group, possible in zip(groups, counts):
-        if _stands(group, possible, laid):
+        if _stands(group, possible, laid, settings):
             standing.append((group, possible))
         else:
             left += group
-    moving = walks([laid[k] for k in left])
-    objects = [_standing(group, laid, possible) for group, possible in standing]
+    moving = walks([laid[k] for k in left], settings.walks)
+    objects = [_standing(group, laid, possible, settings) for group, possible in standing]
     objects += [_moving([left[k] for k in walk.members], walk, laid) for walk in moving]
     used = sum(len(each.members) for each in objects)
     return Fused(tuple(sorted(objects, key=lambda each: -each.score)), len(laid) - used)
 
 
-def without_twins(laid: Sequence[LaidSighting]) -> list[list[int]]:
+def without_twins(
+    laid: Sequence[LaidSighting], settings: MatchSettings = MatchSettings()
+) -> list[list[int]]:
     """The sightings of one frame, those together that are one object, the surest first.
 
     They are boxes of several classes on one place, or of one class, one within the other.
@@ -106,7 +131,7 @@ def without_twins(laid: Sequence[LaidSighting]) -> list[list[int]]:
         for group in groups:
             first = group[0]
             if laid[first].sighting.label != laid[k].sighting.label:
-                is_same = overlap[first, k] > _SAME_BOX
+                is_same = overlap[first, k] > settings.same_box
             else:
                 is_same = nesting[first, k] > WITHIN
             if is_same:
@@ -117,7 +142,9 @@ def without_twins(laid: Sequence[LaidSighting]) -> list[list[int]]:
     return groups
 
 
-def fitted_size_m(laid: Sequence[LaidSighting], label: str, height_m: float) -> Floats:
+def fitted_size_m(
+    laid: Sequence[LaidSighting], label: str, height_m: float, settings: BodySettings = BodySettings()
+) -> Floats:
     """(2,) the longer and the shorter side of a box on the ground that has the sightings' sides.
 
     A body of length l, width w, turned by a, spans |l cos a| + |w sin a| along an axis, and its height times the lean
@@ -130,10 +157,10 @@ def fitted_size_m(laid: Sequence[LaidSighting], label: str, height_m: float) -> 
     usual_m = np.array(TYPICAL_SIZE_M[label][:2])
     axes = np.array([each.axes for each in whole]).reshape(-1, 2)
     leans = np.repeat(np.array([each.lean for each in whole]), 2, axis=0)
-    spans_m = np.maximum(sides_m.ravel() - _TOP * height_m * np.abs((axes * leans).sum(axis=1)), 0.05)
+    spans_m = np.maximum(sides_m.ravel() - settings.top * height_m * np.abs((axes * leans).sum(axis=1)), 0.05)
     angle = np.arctan2(axes[:, 1], axes[:, 0])
     weight = 1.0 / (0.05 + 0.08 * spans_m)
-    prior = 1.0 / (_SIZE_SIGMA * usual_m)
+    prior = 1.0 / (settings.size_sigma * usual_m)
     best, best_cost = usual_m, np.inf
     for turn in _TURNS:
         matrix = np.abs(np.column_stack([np.cos(angle - turn), np.sin(angle - turn)]))
@@ -191,14 +218,16 @@ class _Gathering:
             self.label_scores[name] = self.label_scores.get(name, 0.0) + score
 
 
-def _gathered(laid: Sequence[LaidSighting]) -> list[_Gathering]:
+def _gathered(laid: Sequence[LaidSighting], settings: MatchSettings) -> list[_Gathering]:
     """Sightings frame by frame, each to the nearest object so far, no two of a frame to the same."""
     objects: list[_Gathering] = []
     places_m = np.zeros((0, 2))
     for inside in _by_frame(laid):
-        new = [_begin([inside[k] for k in group], laid) for group in without_twins([laid[k] for k in inside])]
-        costs = _costs(new, objects, places_m, laid)
-        matched = {row: column for row, column in zip(*linear_sum_assignment(costs)) if costs[row, column] < _GATE}
+        groups = without_twins([laid[k] for k in inside], settings)
+        new = [_begin([inside[k] for k in group], laid) for group in groups]
+        costs = _costs(new, objects, places_m, laid, settings)
+        rows, columns = linear_sum_assignment(costs)
+        matched = {row: column for row, column in zip(rows, columns) if costs[row, column] < settings.gate}
         for row, begun in enumerate(new):
             if row in matched:
                 objects[matched[row]].take(begun)
@@ -209,13 +238,14 @@ def _gathered(laid: Sequence[LaidSighting]) -> list[_Gathering]:
 
 
 def _costs(
-    new: Sequence[_Gathering], objects: Sequence[_Gathering], places_m: PointsM, laid: Sequence[LaidSighting]
+    new: Sequence[_Gathering], objects: Sequence[_Gathering], places_m: PointsM, laid: Sequence[LaidSighting],
+    settings: MatchSettings,
 ) -> Floats:
     """(new, objects) squared distances in sigmas, at most the gate; `places_m` (objects, 2) are the objects' places."""
-    costs = np.full((len(new), len(objects)), _GATE)
+    costs = np.full((len(new), len(objects)), settings.gate)
     for row, begun in enumerate(new):
         for column in np.flatnonzero(np.hypot(*(places_m - begun.place_m).T) < _reach_m(begun, laid)):
-            costs[row, column] = min(_GATE, _distance(begun, objects[int(column)]))
+            costs[row, column] = min(settings.gate, _distance(begun, objects[int(column)], settings))
     return costs
 
 
@@ -243,20 +273,22 @@ def _reach_m(each: _Gathering, laid: Sequence[LaidSighting]) -> float:
     return max(3.0, 2.0 * float(laid[each.members[0]].sighting.size_m[0]), 6.0 * laid[each.members[0]].own_sigma_m)
 
 
-def _distance(one: _Gathering, other: _Gathering) -> float:
+def _distance(one: _Gathering, other: _Gathering, settings: MatchSettings) -> float:
     """Squared, in sigmas; more between classes."""
     apart_m = one.place_m - other.place_m
-    spread = one.covariance + other.covariance + _DRIFT_M**2 * np.eye(2)
-    penalty = 0.0 if one.label == other.label else _OTHER_CLASS
+    spread = one.covariance + other.covariance + settings.drift_m**2 * np.eye(2)
+    penalty = 0.0 if one.label == other.label else settings.other_class
     return float(apart_m @ np.linalg.solve(spread, apart_m)) + penalty
 
 
-def _merged(objects: list[_Gathering], laid: Sequence[LaidSighting]) -> list[list[int]]:
+def _merged(
+    objects: list[_Gathering], laid: Sequence[LaidSighting], settings: MatchSettings
+) -> list[list[int]]:
     """What is near enough to be one object and was never, or hardly, seen beside itself; the nearest pairs first."""
     alive = dict(enumerate(objects))
     frames = {k: _frames_of(each.members, laid) for k, each in alive.items()}
     while True:
-        pairs = _near_pairs(alive, frames, laid)
+        pairs = _near_pairs(alive, frames, laid, settings)
         if not pairs:
             return [sorted(each.members, key=lambda k: laid[k].sighting.time_ns) for each in alive.values()]
         taken: set[int] = set()
@@ -268,7 +300,8 @@ def _merged(objects: list[_Gathering], laid: Sequence[LaidSighting]) -> list[lis
 
 
 def _near_pairs(
-    alive: dict[int, _Gathering], frames: dict[int, set[int]], laid: Sequence[LaidSighting]
+    alive: dict[int, _Gathering], frames: dict[int, set[int]], laid: Sequence[LaidSighting],
+    settings: MatchSettings,
 ) -> list[tuple[float, int, int]]:
     keys = list(alive)
     places_m = np.array([alive[key].place_m for key in keys])
@@ -277,8 +310,9 @@ def _near_pairs(
         near = np.flatnonzero(np.hypot(*(places_m[row + 1:] - places_m[row]).T) < _reach_m(alive[one], laid))
         for other in (keys[row + 1 + int(k)] for k in near):
             shared = len(frames[one] & frames[other])
-            distance = _distance(alive[one], alive[other])
-            if distance < _GATE and shared <= _SHARED_FRAMES * min(len(frames[one]), len(frames[other])):
+            distance = _distance(alive[one], alive[other], settings)
+            most = settings.shared_frames * min(len(frames[one]), len(frames[other]))
+            if distance < settings.gate and shared <= most:
                 pairs.append((distance, one, other))
     return pairs
 
@@ -320,14 +354,16 @@ def _open_m(group: Sequence[LaidSighting]) -> float:
     return float(np.sqrt(min(np.trace(each.beyond_m2) for each in group) / 2))
 
 
-def _stands(group: Sequence[int], possible: int, laid: Sequence[LaidSighting]) -> bool:
+def _stands(
+    group: Sequence[int], possible: int, laid: Sequence[LaidSighting], settings: StandingSettings
+) -> bool:
     """Whether enough of the frames that show the place saw it there."""
     views = len(_frames_of(group, laid))
     if views < possible and _open_m([laid[k] for k in group]) > 0:
-        return views >= _LEAST_CUT_SHARE * possible
+        return views >= settings.least_cut_share * possible
     if views == 1:
-        return possible <= 2 and laid[group[0]].sighting.score >= _SURE
-    return views >= _LEAST_SHARE * possible
+        return possible <= 2 and laid[group[0]].sighting.score >= settings.sure_score
+    return views >= settings.least_share * possible
 
 
 def _named(members: Sequence[int], laid: Sequence[LaidSighting]) -> tuple[str, float, dict[str, float]]:
@@ -342,16 +378,18 @@ def _named(members: Sequence[int], laid: Sequence[LaidSighting]) -> tuple[str, f
     return label, float(np.mean(scores[label])), shares
 
 
-def _standing(members: Sequence[int], laid: Sequence[LaidSighting], possible: int) -> Standing:
+def _standing(
+    members: Sequence[int], laid: Sequence[LaidSighting], possible: int, settings: StandingSettings
+) -> Standing:
     """One object that stands, from all its sightings."""
     label, score, shares = _named(members, laid)
     chosen = [laid[k] for k in members]
     whole = [each for each in chosen if not each.is_cut] or chosen
     has_metres = any(each.middle_up_m for each in chosen)
     usual_up_m = usual_height_m(label) / 2 if has_metres else 0.0
-    answer, covariance = _place_and_rise(whole, usual_up_m)
+    answer, covariance = _place_and_rise(whole, usual_up_m, settings)
     height_m = 2 * max(usual_up_m + float(answer[2]), 0.0)
-    size_m = fitted_size_m(chosen, label, height_m) if has_metres else _median_sides(chosen)
+    size_m = fitted_size_m(chosen, label, height_m, settings.bodies) if has_metres else _median_sides(chosen)
     if all(each.is_cut for each in whole):  # no frame shows it whole: how long it is nobody saw
         size_m = np.full(2, np.nan)
     return Standing(
@@ -360,7 +398,9 @@ def _standing(members: Sequence[int], laid: Sequence[LaidSighting], possible: in
     )
 
 
-def _place_and_rise(whole: Sequence[LaidSighting], usual_up_m: float) -> tuple[Floats, Floats]:
+def _place_and_rise(
+    whole: Sequence[LaidSighting], usual_up_m: float, settings: StandingSettings
+) -> tuple[Floats, Floats]:
     """(3,) place and how far its middle lies above the usual height, by least squares, and the place's covariance.
 
     What was seen from several sides shows how high its middle lies.
@@ -368,10 +408,10 @@ def _place_and_rise(whole: Sequence[LaidSighting], usual_up_m: float) -> tuple[F
     rows, right = [], []
     for each in whole:
         place_m = each.sighting.position_m + each.lean * (usual_up_m - each.middle_up_m)
-        weight = 1.0 / float(np.hypot(each.own_sigma_m, _DRIFT_M))
+        weight = 1.0 / float(np.hypot(each.own_sigma_m, settings.matches.drift_m))
         rows.append(np.column_stack([np.eye(2), -each.lean]) * weight)
         right.append(place_m * weight)
-    rows.append(np.array([[0.0, 0.0, 1.0 / max(_HEIGHT_SIGMA * usual_up_m, 1e-3)]]))
+    rows.append(np.array([[0.0, 0.0, 1.0 / max(settings.bodies.height_sigma * usual_up_m, 1e-3)]]))
     right.append(np.zeros(1))
     normal = (matrix := np.concatenate(rows)).T @ matrix
     answer = np.asarray(np.linalg.solve(normal, matrix.T @ np.concatenate(right)), np.float64)
