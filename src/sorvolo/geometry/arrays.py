@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 Floats: TypeAlias = NDArray[np.float64]
 """Any float64 array; the docstring gives its shape."""
 
+Floats16: TypeAlias = NDArray[np.float16]
+"""Any float16 array: what is kept to a thousandth; the docstring gives its shape."""
+
 Floats32: TypeAlias = NDArray[np.float32]
 """Any float32 array; the docstring gives its shape."""
 

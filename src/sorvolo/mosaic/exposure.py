@@ -6,7 +6,7 @@ undoes its exposure: what two frames a and b show of the same ground agrees when
 V(r_a) = log I_b + log g_b - log V(r_b). That is linear in log g, a2 and a4.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,10 +15,11 @@ from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import splu
 
 from sorvolo.errors import GeometryError, SettingsError
-from sorvolo.geometry.arrays import Floats, ImageRGB, Mask, PointsPx, Rows, frozen
+from sorvolo.geometry.arrays import Floats, Floats16, Floats32, ImageRGB, Mask, PointsPx, Rows, frozen
 
 _SHRINK = 4
 _ITERATIONS = 8
+_LINKS_AT_ONCE = 512
 _SIGMA_FROM_MEDIAN = 1.126  # of the root mean square of three normal numbers
 
 
@@ -41,16 +42,19 @@ class ExposureSettings:
 
 @dataclass(frozen=True, eq=False)
 class ColourPairs:
-    """The same ground in two images: mean colours, (N, 3) each, and squared radii (corner = 1), (N,) each."""
+    """The same ground in two images: mean colours, (N, 3) each, and squared radii (corner = 1), (N,) each.
 
-    colours_a: Floats
-    colours_b: Floats
-    radius2_a: Floats
-    radius2_b: Floats
+    Kept to a thousandth, which is a thirtieth of what colours scatter: a long flight has a million of them.
+    """
+
+    colours_a: Floats16
+    colours_b: Floats16
+    radius2_a: Floats16
+    radius2_b: Floats16
 
     def __post_init__(self) -> None:
         for name in ("colours_a", "colours_b", "radius2_a", "radius2_b"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+            object.__setattr__(self, name, frozen(getattr(self, name), np.float16))
         if self.colours_a.shape != self.colours_b.shape or self.colours_a.shape[1:] != (3,):
             raise GeometryError("colour pairs need (N, 3) on both sides")
         if not len(self.colours_a) == len(self.radius2_a) == len(self.radius2_b):
@@ -168,14 +172,23 @@ class _Unknowns:
 class _Equations:
     """Colour pairs as equations, those of a link beside each other, L links of up to P pairs.
 
-    `columns` (L, 6) of their unknowns, `factors` (L, P, 6), log-colour `difference` (L, P, 3); `exists` (L, P) is
+    `columns` (L, 6) of their unknowns, squared radii (L, P), log-colour `difference` (L, P, 3); `exists` (L, P) is
     False where a link has fewer pairs.
     """
 
     columns: Rows
-    factors: Floats
-    difference: Floats
+    radius2_a: Floats32
+    radius2_b: Floats32
+    difference: Floats32
     exists: Mask
+
+    def batches(self) -> "Iterator[tuple[slice, Floats]]":
+        """Some links after the others, and the factors (l, P, 6) of their unknowns: those of all would be large."""
+        for first in range(0, len(self.columns), _LINKS_AT_ONCE):
+            some = slice(first, first + _LINKS_AT_ONCE)
+            a, b = self.radius2_a[some].astype(np.float64), self.radius2_b[some].astype(np.float64)
+            one = np.ones_like(a)
+            yield some, np.stack([one, -one, -a, -(a**2), b, b**2], axis=-1)
 
 
 def _unknowns(ids: Sequence[int], camera_of: Mapping[int, int]) -> _Unknowns:
@@ -194,14 +207,13 @@ def _equations(
     slots = np.arange(counts.max())
     exists = slots < counts[:, None]
     rows = np.where(exists, slots, 0) + (np.cumsum(counts) - counts)[:, None]  # (L, P) of all pairs in a row
-    radius2_a = np.concatenate([each.radius2_a for each in chosen])[rows]
-    radius2_b = np.concatenate([each.radius2_b for each in chosen])[rows]
-    colours_a = np.concatenate([each.colours_a for each in chosen])[rows]
-    colours_b = np.concatenate([each.colours_b for each in chosen])[rows]
-    one = np.ones_like(radius2_a)
-    factors = np.stack([one, -one, -radius2_a, -(radius2_a**2), radius2_b, radius2_b**2], axis=-1)
+    radius2_a, radius2_b, colours_a, colours_b = (
+        np.concatenate([getattr(each, name) for each in chosen]).astype(np.float32)
+        for name in ("radius2_a", "radius2_b", "colours_a", "colours_b")
+    )
     difference = np.log(np.maximum(colours_a, 1.0)) - np.log(np.maximum(colours_b, 1.0))
-    return _Equations(np.array([_columns_of(each, unknowns) for each in links]), factors, difference, exists)
+    columns = np.array([_columns_of(each, unknowns) for each in links])
+    return _Equations(columns, radius2_a[rows], radius2_b[rows], difference[rows], exists)
 
 
 def _columns_of(link: tuple[int, int], unknowns: _Unknowns) -> list[int]:
@@ -219,8 +231,10 @@ def _robust_solution(
     prior = np.repeat([settings.gain_sigma**-2, settings.vignette_sigma**-2], [frames, 2 * len(unknowns.lens)])
     solution, typical = np.zeros((len(prior), 3)), 0.0
     for _ in range(_ITERATIONS):
-        fitted = equations.factors @ solution[equations.columns]  # (L, P, 3)
-        length = np.linalg.norm(equations.difference + fitted, axis=-1) / np.sqrt(3)
+        length = np.concatenate([
+            np.linalg.norm(equations.difference[some] + factors @ solution[equations.columns[some]], axis=-1)
+            for some, factors in equations.batches()
+        ]) / np.sqrt(3)
         typical = float(np.median(length[equations.exists]))
         spread = max(settings.colour_sigma, _SIGMA_FROM_MEDIAN * typical)
         weight = equations.exists / (1 + (length / spread) ** 2) / spread**2
@@ -234,12 +248,13 @@ def _solve(equations: _Equations, weight: Floats, prior: Floats, frames: int) ->
     Frames share equations only with the frames that they overlap: the matrix is sparse, and so is its solution's cost.
     """
     columns, count = equations.columns, len(prior)
-    weighted = np.swapaxes(equations.factors * weight[..., None], 1, 2)  # (L, 6, P)
-    blocks, sides = weighted @ equations.factors, -(weighted @ equations.difference)
+    blocks, right = np.zeros((len(columns), 6, 6)), np.zeros((count, 3))
+    for some, factors in equations.batches():
+        weighted = np.swapaxes(factors * weight[some, :, None], 1, 2)  # (l, 6, P)
+        blocks[some] = weighted @ factors
+        np.add.at(right, columns[some], -(weighted @ equations.difference[some]))
     rows, others = np.broadcast_arrays(columns[:, :, None], columns[:, None, :])
     normal = csc_array((blocks.ravel(), (rows.ravel(), others.ravel())), shape=(count, count)) + diags_array(prior)
-    right = np.zeros((count, 3))
-    np.add.at(right, columns, sides)
     # gains per channel eliminated for the vignette of their mean, then put back with that vignette
     normal = normal.tocsc()
     mean = _solved(normal, right.mean(axis=1))

@@ -390,11 +390,13 @@ class PlanarMapper:
         """The keyframes to try: those before, and the ones of other strips that lie most under the view."""
         ids = [*self._own, *self._known]
         overlap = self._overlaps(new, guess)
-        chosen = [each for each in previous if each not in tried and overlap[ids.index(each)] > 0.1]
-        order = [ids[k] for k in np.argsort(-overlap, kind="stable") if overlap[k] > self._settings.least_overlap]
+        count = len(self._own)  # the keyframes before are the last of the flight's own
+        chosen = [each for k, each in enumerate(previous, 1) if each not in tried and overlap[count - k] > 0.1]
+        under = np.flatnonzero(overlap > self._settings.least_overlap)
         limit = len(chosen) + self._settings.spatial + (0 if linked else 3)
         near = {*tried, *previous}
-        for each in order:
+        for k in under[np.argsort(-overlap[under], kind="stable")].tolist():
+            each = ids[k]
             if len(chosen) >= limit:
                 break
             if each not in near:

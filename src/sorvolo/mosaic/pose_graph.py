@@ -168,11 +168,11 @@ class PoseGraph:
 
     def centres_m(self, keyframe_ids: Sequence[int]) -> PointsM:
         """(N, 3) camera positions."""
-        return self._rows.centres_m[[self._ids[each] for each in keyframe_ids]].reshape(-1, 3)
+        return self._rows.centres_m[self._at(keyframe_ids)].reshape(-1, 3)
 
     def axes(self, keyframe_ids: Sequence[int]) -> PointsM:
         """(N, 3) unit vectors that the cameras look along."""
-        return self._rows.rotations[[self._ids[each] for each in keyframe_ids], :, 2].reshape(-1, 3)
+        return self._rows.rotations[self._at(keyframe_ids), :, 2].reshape(-1, 3)
 
     def ids(self) -> list[int]:
         """All keyframes in the order of their coming."""
@@ -350,6 +350,10 @@ class PoseGraph:
             each, (old, self._nodes[old].camera), (new, self._nodes[new].camera),
             max(self._settings.sigma_px, each.sigma_px),
         )
+
+    def _at(self, keyframe_ids: Sequence[int]) -> Rows:
+        """(N,) the keyframes' node indices."""
+        return np.fromiter(map(self._ids.__getitem__, keyframe_ids), int, len(keyframe_ids))
 
     def _own(self) -> NDArray[np.bool_]:
         return self._rows.own

@@ -2,7 +2,8 @@
 
 import threading
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from sorvolo.missions.flight.control import open_control
 from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.glimpses import refuse_without_texture
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
+from sorvolo.missions.flight.reading import read_ahead
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import (
     FlightSetup,
@@ -35,6 +37,8 @@ from sorvolo.store.site.archive import Archive
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
 from sorvolo.survey.mosaic import MosaicUpdate, Status
+
+_AHEAD = 2  # decoded frames that wait to be placed
 
 
 @dataclass(frozen=True)
@@ -172,7 +176,7 @@ class _Reader:
 
     def posed(self, run: FlightRun) -> Iterator[PosedFrame | LostFrame]:
         """The frames to select from."""
-        for each in self._setup.source.frames(self._is_wanted):
+        for each in _read(self._setup.source, self._is_wanted):
             is_new = each.index > self._before.last
             if is_new:
                 self.read = each.index + 1
@@ -189,3 +193,12 @@ class _Reader:
     def _is_wanted(self, index: int, time_ns: int) -> bool:
         is_candidate = self._is_candidate(index, time_ns)
         return is_candidate and (index > self._before.last or index in self._before.needed)
+
+
+def _read(source: Source, wanted: Callable[[int, int], bool]) -> Generator[Frame | LostFrame]:
+    """The wanted frames; those of a recorded flight are decoded while those before them are placed."""
+    if isinstance(source, LiveSource):
+        yield from source.frames(wanted)
+    else:
+        with closing(read_ahead(source.frames(wanted), _AHEAD)) as frames:
+            yield from frames

@@ -24,6 +24,7 @@ from sorvolo.store.images import ImageCache
 from sorvolo.store.site.archive import Archive, FlightWriter
 
 _PAINT_EVERY = 8  # keyframes painted together: tiles that several touch are rendered once
+_PAINT_AT_ONCE = 24  # at most, the newest first: a solve may move a hundred
 _PAINT_REST = 4  # times as long as a painting took: showing a map that still moves must not hold up the flight
 _COARSE_MAP = 0.77  # times the pictures' own pixels: a coarser map does not need every pixel of them
 _CACHE_BYTES = 128 * 1024 * 1024  # of earlier flights' pictures
@@ -107,8 +108,9 @@ class FlightPainter:
         self._painted_at = len(self._frames)
         with self._log.stage(Stage.PAINT):
             self.exposure = self.exposure.updated(self._mapper.recent_exposure())
-            painted = self._paint(self._live_canvas, self._dirty, self._live)
-        self._dirty.clear()
+            newest = sorted(self._dirty)[-_PAINT_AT_ONCE:]
+            painted = self._paint(self._live_canvas, newest, self._live)
+        self._dirty.difference_update(newest)
         self._paint_again_s = time.monotonic() + _PAINT_REST * (time.monotonic() - started_s)
         self._flush()
         return painted

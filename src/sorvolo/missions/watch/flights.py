@@ -1,10 +1,9 @@
 """Mode 2: people, cars and small objects found while the drone flies, or in what it brought home; no map is needed."""
 
-import queue
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Callable, Generator
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from sorvolo.capture.source import LiveSource, Source, open_sources
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.reading import read_ahead
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
 from sorvolo.missions.watch.cot_sender import check_host, cot_place
@@ -153,42 +153,6 @@ def _arrivals(
         with closing(read_ahead(source.frames(wanted), _AHEAD)) as frames:
             for each in frames:
                 yield time.monotonic(), each
-
-
-def read_ahead(frames: Iterator[Frame | LostFrame], most: int) -> Generator[Frame | LostFrame]:
-    """The frames, read in a thread of their own, at most so many before they are asked for.
-
-    What the reading raises is raised here.
-    """
-    waiting: queue.Queue[Frame | LostFrame | BaseException | None] = queue.Queue(most)
-    is_over = threading.Event()
-
-    def put(item: Frame | LostFrame | BaseException | None) -> None:
-        while not is_over.is_set():
-            with suppress(queue.Full):
-                waiting.put(item, timeout=0.2)
-                return
-
-    def read() -> None:
-        try:
-            for each in frames:
-                put(each)
-                if is_over.is_set():
-                    return
-            put(None)
-        except BaseException as error:  # raised anew where the frames are taken
-            put(error)
-
-    thread = threading.Thread(target=read, name="decoding", daemon=True)
-    thread.start()
-    try:
-        while (item := waiting.get()) is not None:
-            if isinstance(item, BaseException):
-                raise item
-            yield item
-    finally:
-        is_over.set()
-        thread.join()
 
 
 def _wanted(source: Source, settings: WatchSettings) -> Callable[[int, int], bool]:

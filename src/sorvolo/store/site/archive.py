@@ -294,6 +294,7 @@ class Archive:
                 connection, flight_id, fingerprint, str(settings.get("method", "")), plain_json(settings)
             )
             base = records.tile_hashes(connection, version_id)
+        self._files.blobs.cache_bytes = min(self._files.blobs.cache_bytes, cache_mb * _MEGABYTE)
         tiles = GrowingTiles(self._files.blobs, base, grid.tile_px, cache_mb * _MEGABYTE)
         self._writer = FlightWriter(self._files, flight_id, run_id, version_id, tiles, cache_mb * _MEGABYTE)
         return self._writer

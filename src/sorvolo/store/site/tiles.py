@@ -27,6 +27,7 @@ class TileBlobs:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        self.cache_bytes = _CACHE_BYTES
         self._unsynced: set[str] = set()
         self._read: OrderedDict[str, ImageRGBA] = OrderedDict()
         self._read_bytes = 0
@@ -64,7 +65,7 @@ class TileBlobs:
             self._forget(sha256)
             self._read[sha256] = tile
             self._read_bytes += tile.nbytes
-            while self._read_bytes > _CACHE_BYTES:
+            while self._read_bytes > self.cache_bytes:
                 self._forget(next(iter(self._read)))
         return tile
 

@@ -1,0 +1,44 @@
+"""A source's frames read beside the work on those before them."""
+
+import queue
+import threading
+from collections.abc import Generator, Iterator
+from contextlib import suppress
+
+from sorvolo.survey.flight import Frame, LostFrame
+
+
+def read_ahead(frames: Iterator[Frame | LostFrame], most: int) -> Generator[Frame | LostFrame]:
+    """The frames, read in a thread of their own, at most so many before they are asked for.
+
+    What the reading raises is raised here.
+    """
+    waiting: queue.Queue[Frame | LostFrame | BaseException | None] = queue.Queue(most)
+    is_over = threading.Event()
+
+    def put(item: Frame | LostFrame | BaseException | None) -> None:
+        while not is_over.is_set():
+            with suppress(queue.Full):
+                waiting.put(item, timeout=0.2)
+                return
+
+    def read() -> None:
+        try:
+            for each in frames:
+                put(each)
+                if is_over.is_set():
+                    return
+            put(None)
+        except BaseException as error:  # raised anew where the frames are taken
+            put(error)
+
+    thread = threading.Thread(target=read, name="decoding", daemon=True)
+    thread.start()
+    try:
+        while (item := waiting.get()) is not None:
+            if isinstance(item, BaseException):
+                raise item
+            yield item
+    finally:
+        is_over.set()
+        thread.join()
