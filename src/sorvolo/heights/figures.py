@@ -1,6 +1,7 @@
 """What a report says of a flight's heights: figures, and what a user should know before using them."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,14 @@ from sorvolo.geometry.arrays import Mask
 from sorvolo.heights.cameras import Cameras3D
 from sorvolo.heights.surface import Surface
 
-_OBLIQUE_DEG = 25.0
-_FEW_STRIPS = 0.08  # how wide a path is, as a share of its length, below which it is one strip
+
+@dataclass(frozen=True)
+class WarningSettings:
+    """What of a flight makes its heights weak."""
+
+    oblique_deg: float = 25.0  # off the vertical, the median photo
+    one_strip: float = 0.08  # how wide a path is, as a share of its length, below which it is one strip
+    most_holes: float = 0.1  # share of the ground that two photos see
 
 
 def camera_figures(solved: Cameras3D) -> Mapping[str, Any]:
@@ -45,7 +52,7 @@ def surface_figures(surface: Surface, shows_ground: Mask) -> Mapping[str, Any]:
     }
 
 
-def camera_warnings(solved: Cameras3D) -> list[str]:
+def camera_warnings(solved: Cameras3D, settings: WarningSettings = WarningSettings()) -> list[str]:
     """What in the flight makes its heights weak."""
     said = []
     if solved.lost:
@@ -55,13 +62,13 @@ def camera_warnings(solved: Cameras3D) -> list[str]:
         )
     places = np.array([view.site_from_camera.translation_m for view in solved.views])
     spread = np.linalg.svd(places[:, :2] - places[:, :2].mean(axis=0), compute_uv=False)
-    if spread[1] < _FEW_STRIPS * spread[0]:
+    if spread[1] < settings.one_strip * spread[0]:
         said.append(
             "the photos lie along one strip: the tilt of the ground across it is known from the drone's attitude "
             "alone (about 3 degrees); fly at least two strips, or one across, for heights"
         )
     tilt = np.degrees(np.arccos(np.clip([-view.site_from_camera.rotation[2, 2] for view in solved.views], -1, 1)))
-    if np.median(tilt) > _OBLIQUE_DEG:
+    if np.median(tilt) > settings.oblique_deg:
         said.append(
             f"the photos look {np.median(tilt):.0f} degrees off the vertical: walls and what lies behind things have "
             "heights of their surroundings"
@@ -71,11 +78,11 @@ def camera_warnings(solved: Cameras3D) -> list[str]:
     return said
 
 
-def surface_warnings(surface: Surface) -> list[str]:
+def surface_warnings(surface: Surface, settings: WarningSettings = WarningSettings()) -> list[str]:
     """What in the height model is weak."""
     covered = max(int(surface.covered.sum()), 1)
     holes = 1 - np.isfinite(surface.up_m).sum() / covered
-    if holes > 0.1:
+    if holes > settings.most_holes:
         return [
             f"{holes:.0%} of the ground that two photos see has no height: water, bare ground without texture, or "
             "things that move"

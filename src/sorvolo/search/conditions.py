@@ -13,13 +13,20 @@ from sorvolo.geometry.pose import Pose
 CONDITIONS = ("resolution", "views", "single view", "blur", "texture", "light", "slant", "trees")
 """What a probability of detection is explained by: the columns of `Conditions.columns`."""
 
-_LOOK_M = 0.25  # pixels of the small picture on which ground is judged
-_WINDOW = 5  # of them: 1.25 m, about a person and what is around
-_GREEN = 0.05  # excess green, (2 g - r - b) / (r + g + b), of plants
-_ROUGH = 0.2  # rms of lightness over its mean within 1.25 m: crowns are rough, lawns are not
-_CROWN_M = 1.5  # over which a crown must be so
 _CROWN_SHARE = 0.5  # of the views of a cell: crowns lean apart, ground does not
 _FARTHEST = 3.0  # tangent of the angle from straight down: beyond it nothing is measured
+
+
+@dataclass(frozen=True)
+class LookSettings:
+    """How ground is judged on a small picture."""
+
+    look_m: float = 0.25  # along its pixels
+    window: int = 5  # of them: 1.25 m, about a person and what is around
+    green: float = 0.05  # excess green, (2 g - r - b) / (r + g + b), of plants ...
+    plants: float = 0.6  # ... in this share of what is around
+    rough: float = 0.2  # rms of lightness over its mean within 1.25 m: crowns are rough, lawns are not
+    crown_m: float = 1.5  # over which a crown must be so
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,20 +82,23 @@ class Conditions:
         return np.exp(self.columns[:, CONDITIONS.index("resolution")])
 
 
-def look_at(image: ImageRGB, camera: Camera, site_from_camera: Pose, blur_px: float) -> FrameLook:
+def look_at(
+    image: ImageRGB, camera: Camera, site_from_camera: Pose, blur_px: float, settings: LookSettings = LookSettings()
+) -> FrameLook:
     """The small maps of a frame (H, W, 3)."""
     m_per_px = max(float(site_from_camera.translation_m[2]), 1.0) / camera.fx_px
-    scale = max(1.0, _LOOK_M / m_per_px)
+    look_m = settings.look_m
+    scale = max(1.0, look_m / m_per_px)
     size = max(8, round(camera.width_px / scale)), max(8, round(camera.height_px / scale))
     small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
     lightness = small.mean(axis=2)
-    around = max(3, 2 * round(_WINDOW * _LOOK_M / max(m_per_px, _LOOK_M) / 2) + 1)
+    around = max(3, 2 * round(settings.window * look_m / max(m_per_px, look_m) / 2) + 1)
     mean = cv2.blur(lightness, (around, around))
     texture = np.sqrt(np.maximum(cv2.blur(lightness**2, (around, around)) - mean**2, 0))
     green = (2 * small[..., 1] - small[..., 0] - small[..., 2]) / np.maximum(small.sum(axis=2), 1)
-    wide = max(3, 2 * round(_CROWN_M / max(m_per_px, _LOOK_M) / 2) + 1)
-    is_plant = cv2.blur((green > _GREEN).astype(np.float32), (wide, wide)) > 0.6
-    is_rough = cv2.blur(texture / np.maximum(mean, 8), (wide, wide)) > _ROUGH
+    wide = max(3, 2 * round(settings.crown_m / max(m_per_px, look_m) / 2) + 1)
+    is_plant = cv2.blur((green > settings.green).astype(np.float32), (wide, wide)) > settings.plants
+    is_rough = cv2.blur(texture / np.maximum(mean, 8), (wide, wide)) > settings.rough
     return FrameLook(
         camera, site_from_camera, blur_px, camera.width_px / size[0], lightness, texture / np.maximum(mean, 8),
         np.asarray(is_plant & is_rough, bool),

@@ -1,6 +1,7 @@
 """Ground where little would have been found, and why."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -17,9 +18,14 @@ Holes = NDArray[np.uint8]
 POD_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 """The classes of probability that polygons are drawn of."""
 
-_DARK = 45.0  # grey levels: below, people and ground are alike in most pictures
-_BLURRED_SHARE = 0.25  # of a body's longest side: blurred so far along, it is a smear
-_LEAST_PULL = 0.35  # of log odds: a smaller one is no reason
+
+@dataclass(frozen=True)
+class HoleSettings:
+    """When a condition is the reason of a hole."""
+
+    dark: float = 45.0  # grey levels: below, people and ground are alike in most pictures
+    blurred_share: float = 0.25  # of a body's longest side: blurred so far along, it is a smear
+    least_pull: float = 0.35  # of log odds: a smaller one is no reason
 
 
 class Reason(StrEnum):
@@ -53,7 +59,7 @@ _BY_CONDITION = {
 
 def hole_reasons(
     cells: Cells, seen: Conditions, chances: Chances, recall: Recall | None, *, enough: float, needed_m_per_px: float,
-    length_m: float,
+    length_m: float, settings: HoleSettings = HoleSettings(),
 ) -> Holes:
     """(N,) the number in REASONS of why each wanted cell has less than `enough` of a chance; 0 where it has it.
 
@@ -67,23 +73,25 @@ def hole_reasons(
     with np.errstate(invalid="ignore"):
         rules: list[tuple[Reason, Mask]] = [
             (Reason.NOT_SEEN, ~seen.seen), (Reason.TREES, seen.under_trees),
-            (Reason.COARSE, seen.m_per_px() > needed_m_per_px), (Reason.BLUR, blur_m > _BLURRED_SHARE * length_m),
-            (Reason.DARK, light < _DARK),
+            (Reason.COARSE, seen.m_per_px() > needed_m_per_px),
+            (Reason.BLUR, blur_m > settings.blurred_share * length_m), (Reason.DARK, light < settings.dark),
         ]
-    worst = _worst_condition(seen.columns, recall)
+    worst = _worst_condition(seen.columns, recall, settings.least_pull)
     for reason, holds in (*rules, *worst):
         numbers[poor & holds & (numbers == 0)] = REASONS.index(reason)
     return numbers
 
 
-def _worst_condition(columns: Floats, recall: Recall | None) -> list[tuple[Reason, Mask]]:
+def _worst_condition(
+    columns: Floats, recall: Recall | None, least_pull: float
+) -> list[tuple[Reason, Mask]]:
     """The condition that lowers the chance of each cell most, by reasons; the detector where none does."""
     everything = np.ones(len(columns), bool)
     if recall is None:
         return [(Reason.DETECTOR, everything)]
     pulls = np.nan_to_num(recall.pulls(columns))
     is_lowest = pulls.argmin(axis=1)
-    is_strong = pulls.min(axis=1) < -_LEAST_PULL
+    is_strong = pulls.min(axis=1) < -least_pull
     found = [(_BY_CONDITION[name], is_strong & (is_lowest == k)) for k, name in enumerate(CONDITIONS)]
     return [*found, (Reason.DETECTOR, everything)]
 

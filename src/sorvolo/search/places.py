@@ -9,10 +9,16 @@ from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.search.cells import Cells
 from sorvolo.search.conditions import Conditions
 
-_ROOM_M = {"person": 4.0, "car": 10.0, "small object": 3.0}
+_ROOM_M = {"person": 4.0, "car": 10.0, "small object": 3.0}  # around one that is planted, across
 _OTHER_ROOM_M = 5.0
-_TRIES = 40
-_MOST_ROUNDS = 40
+
+
+@dataclass(frozen=True)
+class PlaceSettings:
+    """How long places are searched for."""
+
+    tries: int = 40  # cells for one plant, until there is no room for it in a round
+    most_rounds: int = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +31,7 @@ class PlantPlace:
 
 def plant_places(
     cells: Cells, seen: Conditions, labels: Sequence[str], plants: int, *, keep_off_m: Sequence[Floats], free_m: float,
-    rng: np.random.Generator, usable: Mask,
+    rng: np.random.Generator, usable: Mask, settings: PlaceSettings = PlaceSettings(),
 ) -> list[list[PlantPlace]]:
     """Rounds of places: so many of each class in all, those of a round so far apart that all stand at once.
 
@@ -37,11 +43,11 @@ def plant_places(
         return []
     left, taken_m = dict.fromkeys(labels, plants), np.reshape(keep_off_m, (-1, 2))
     rounds: list[list[PlantPlace]] = []
-    while any(left.values()) and len(rounds) < _MOST_ROUNDS:
+    while any(left.values()) and len(rounds) < settings.most_rounds:
         placed: list[PlantPlace] = []
         for label in sorted(left, key=lambda name: -_room_m(name)):
             for _ in range(left[label]):
-                place_m = _free_place(cells, chances, label, placed, taken_m, free_m, rng)
+                place_m = _free_place(cells, chances, label, placed, taken_m, free_m, rng, settings.tries)
                 if place_m is None:
                     break
                 placed.append(PlantPlace(label, place_m))
@@ -70,9 +76,9 @@ def _chances(seen: Conditions, usable: Mask) -> Floats:
 
 def _free_place(
     cells: Cells, chances: Floats, label: str, placed: Sequence[PlantPlace], keep_off_m: PointsM, free_m: float,
-    rng: np.random.Generator,
+    rng: np.random.Generator, tries: int,
 ) -> Floats | None:
-    for index in rng.choice(len(chances), _TRIES, p=chances / chances.sum()):
+    for index in rng.choice(len(chances), tries, p=chances / chances.sum()):
         place_m = cells.centres_m[index] + rng.uniform(-0.5, 0.5, 2) * cells.cell_m
         if len(keep_off_m) and np.hypot(*(keep_off_m - place_m).T).min() < max(free_m, _room_m(label) / 2 + 1.0):
             continue

@@ -7,18 +7,26 @@ from the weights' own (Laplace's approximation).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Mask, frozen
 
-_SLOPE_SIGMA, _CHANCE_SIGMA = 0.5, 2.5  # before any plant: of a weight for one standard deviation, of the log odds
-_FARTHEST = 2.5  # standard deviations: beyond what plants covered, nothing is extrapolated
-_DRAWS = 400
-_STEPS = 40
-_Z90 = 1.6449
+_Z90 = 1.6449  # of a normal distribution: 90 % lie within
+
+
+@dataclass(frozen=True)
+class RecallSettings:
+    """What is held for likely before any plant, and how the regression is computed."""
+
+    slope_sigma: float = 0.5  # of a weight, for one standard deviation of its condition
+    chance_sigma: float = 2.5  # of the log odds
+    farthest: float = 2.5  # standard deviations: beyond what plants covered, nothing is extrapolated
+    least_spread: float = 0.05  # of a condition: what hardly varies explains nothing
+    draws: int = 400  # of the weights, for the interval
+    steps: int = 40  # of Newton's method, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +39,7 @@ class Recall:
     covariance: Floats
     plants: int
     found: int
+    settings: RecallSettings = field(default_factory=RecallSettings)
 
     def __post_init__(self) -> None:
         for name in ("middle", "spread", "weights", "covariance"):
@@ -41,7 +50,7 @@ class Recall:
         rows = self._rows(columns)
         known = np.isfinite(rows).all(axis=1)
         rng = np.random.default_rng(1)
-        drawn = rng.multivariate_normal(self.weights, self.covariance, _DRAWS, method="cholesky")
+        drawn = rng.multivariate_normal(self.weights, self.covariance, self.settings.draws, method="cholesky")
         mean, low, high = (np.full(len(rows), np.nan) for _ in range(3))
         for part in np.array_split(np.flatnonzero(known), max(1, int(known.sum()) // 5000)):
             chances = _logistic(rows[part] @ drawn.T)
@@ -54,7 +63,8 @@ class Recall:
         return self._rows(columns)[:, 1:] * self.weights[1:]
 
     def _rows(self, columns: Floats) -> Floats:
-        scaled = np.clip((columns - self.middle) / self.spread, -_FARTHEST, _FARTHEST)
+        farthest = self.settings.farthest
+        scaled = np.clip((columns - self.middle) / self.spread, -farthest, farthest)
         return np.column_stack([np.ones(len(scaled)), scaled])
 
 
@@ -71,16 +81,16 @@ class Chances:
             object.__setattr__(self, name, frozen(getattr(self, name)))
 
 
-def fit_recall(columns: Floats, found: Mask) -> Recall:
+def fit_recall(columns: Floats, found: Mask, settings: RecallSettings = RecallSettings()) -> Recall:
     """The regression of which plants were found, (N,), on the conditions of their places, (N, K); N at least 1."""
     middle = columns.mean(axis=0)
-    spread = np.maximum(columns.std(axis=0), 0.05)
-    scaled = np.clip((columns - middle) / spread, -_FARTHEST, _FARTHEST)
+    spread = np.maximum(columns.std(axis=0), settings.least_spread)
+    scaled = np.clip((columns - middle) / spread, -settings.farthest, settings.farthest)
     rows = np.column_stack([np.ones(len(scaled)), scaled])
-    prior = np.diag([1 / _CHANCE_SIGMA**2] + [1 / _SLOPE_SIGMA**2] * columns.shape[1])
+    prior = np.diag([1 / settings.chance_sigma**2] + [1 / settings.slope_sigma**2] * columns.shape[1])
     right = found.astype(np.float64)
     weights = np.zeros(rows.shape[1])
-    for _ in range(_STEPS):
+    for _ in range(settings.steps):
         chances = _logistic(rows @ weights)
         curvature = (rows * (chances * (1 - chances))[:, None]).T @ rows + prior
         step = np.linalg.solve(curvature, rows.T @ (right - chances) - prior @ weights)
@@ -89,7 +99,7 @@ def fit_recall(columns: Floats, found: Mask) -> Recall:
             break
     chances = _logistic(rows @ weights)
     curvature = (rows * (chances * (1 - chances))[:, None]).T @ rows + prior
-    return Recall(middle, spread, weights, np.linalg.inv(curvature), len(found), int(found.sum()))
+    return Recall(middle, spread, weights, np.linalg.inv(curvature), len(found), int(found.sum()), settings)
 
 
 def map_chances(recall: Recall | None, columns: Floats, hidden: Mask) -> Chances:

@@ -13,11 +13,17 @@ from sorvolo.survey.objects import TYPICAL_SIZE_M, Detections, Sighting
 from sorvolo.tracking.cut_boxes import beyond_edges, cut_edges
 from sorvolo.tracking.plausible import TOO_SHORT_CUT_PX, impossible_size
 
-_BOX_SIGMA = 0.06  # of a box's middle, in shares of its side
-_LEAST_SIGMA_PX = 1.0
-_LEAST_SIGMA_M = 0.03
-_ASIDE = 0.4  # of what a cut box's middle may be off outwards: along the edge, where a slanting body's corner shows
-_FARTHEST = 6.0  # times the height: beyond it, a pixel's error is many metres
+
+@dataclass(frozen=True)
+class LayingSettings:
+    """How well a detection's place on a map is known."""
+
+    box_sigma: float = 0.06  # of a box's middle, in shares of its side
+    least_sigma_px: float = 1.0
+    least_sigma_m: float = 0.03
+    height_sigma: float = 0.15  # of a class's usual height, along the lean
+    aside: float = 0.4  # of what a cut box is off outwards: along the edge, where a slanting body's corner shows
+    farthest: float = 6.0  # times the height: beyond it, a pixel's error is many metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +52,9 @@ class LaidSighting:
         return bool(np.any(self.beyond_m2))
 
 
-def lay_on_ground(seen: Detections, frame: PlacedFrame, *, has_metres: bool = True) -> list[LaidSighting | None]:
+def lay_on_ground(
+    seen: Detections, frame: PlacedFrame, *, has_metres: bool = True, settings: LayingSettings = LayingSettings()
+) -> list[LaidSighting | None]:
     """Where each detection of a frame stands on level ground, None where that is at the horizon or unknown.
 
     None as well for what is of a size that its class cannot have (`plausible`).
@@ -60,7 +68,9 @@ def lay_on_ground(seen: Detections, frame: PlacedFrame, *, has_metres: bool = Tr
     cut = cut_edges(
         np.asarray(seen.boxes_px, np.float64), frame.camera.width_px, frame.camera.height_px, TOO_SHORT_CUT_PX
     )
-    return [_laid(seen, k, cut[k:k + 1], frame, pose, has_metres=has_metres) for k in range(len(seen))]
+    return [
+        _laid(seen, k, cut[k:k + 1], frame, pose, settings, has_metres=has_metres) for k in range(len(seen))
+    ]
 
 
 def shows(frame: PlacedFrame, places_m: PointsM, up_m: Floats, reach_m: Floats) -> Mask:
@@ -95,7 +105,7 @@ def usual_height_m(name: str) -> float:
 
 
 def _laid(
-    seen: Detections, k: int, cut: Mask, frame: PlacedFrame, pose: Pose, *, has_metres: bool
+    seen: Detections, k: int, cut: Mask, frame: PlacedFrame, pose: Pose, settings: LayingSettings, *, has_metres: bool
 ) -> LaidSighting | None:
     """Detection `k` on the ground, None where it has no place; `cut` (1, 4) are the edges that cut it."""
     name = seen.names[k]
@@ -111,16 +121,16 @@ def _laid(
     spans_m = np.array([around_m[2] - around_m[1], around_m[4] - around_m[3]])
     sides_m = np.hypot(*spans_m.T)
     is_impossible = has_metres and bool(impossible_size((name,), sides_m[None], cut)[0])
-    if float(np.hypot(*lean)) > _FARTHEST or is_impossible:
+    if float(np.hypot(*lean)) > settings.farthest or is_impossible:
         return None
     m_per_px = float(np.sqrt(np.prod(sides_m) / max(np.prod(box_px[0, 2:] - box_px[0, :2]), 1e-6)))
     axes = spans_m / np.maximum(sides_m, 1e-9)[:, None]
     outward_m, beyond_m2 = (each[0] for each in beyond_edges(
         (name,), cut, axes[None], sides_m[None], has_metres=has_metres
     ))
-    beyond_m2 = beyond_m2 + _ASIDE**2 * np.trace(beyond_m2) * np.eye(2)
-    own_sigma_m = _own_sigma_m(sides_m, m_per_px, frame)
-    usual_sigma_m = 0.15 * height_m * lean
+    beyond_m2 = beyond_m2 + settings.aside**2 * np.trace(beyond_m2) * np.eye(2)
+    own_sigma_m = _own_sigma_m(sides_m, m_per_px, frame, settings)
+    usual_sigma_m = settings.height_sigma * height_m * lean
     sighting = Sighting(
         frame.index, frame.name, frame.time_ns, name, float(seen.scores[k]), seen.boxes_px[k],
         place_m + outward_m, own_sigma_m**2 * np.eye(2) + np.outer(usual_sigma_m, usual_sigma_m) + beyond_m2,
@@ -130,12 +140,12 @@ def _laid(
     return LaidSighting(sighting, up_m, lean, own_sigma_m, axes, sides_m, beyond_m2)
 
 
-def _own_sigma_m(sides_m: Floats, m_per_px: float, frame: PlacedFrame) -> float:
+def _own_sigma_m(sides_m: Floats, m_per_px: float, frame: PlacedFrame, settings: LayingSettings) -> float:
     side_m = float(sides_m.mean())
     pose_m = frame.residual_px * m_per_px if np.isfinite(frame.residual_px) else 0.0
     if frame.status is Status.GPS_ONLY and np.isfinite(frame.sigma_m):
         pose_m = frame.sigma_m
-    parts = [_LEAST_SIGMA_M, _LEAST_SIGMA_PX * m_per_px, _BOX_SIGMA * side_m, pose_m]
+    parts = [settings.least_sigma_m, settings.least_sigma_px * m_per_px, settings.box_sigma * side_m, pose_m]
     return float(np.sqrt(np.sum(np.square(parts))))
 
 

@@ -21,9 +21,6 @@ GroundHeight = Callable[[PointsM], Floats]
 IMPOSSIBLE_SIZE = "of a size that its class cannot have"
 """The words for what could be placed, and is set aside: it is not what the detector took it for."""
 
-_OTHER_HEIGHT_M = 1.0  # of a class that nothing is known of
-_GROUND_STEPS = 12
-_GROUND_SETTLED_M = 0.3
 
 
 @dataclass(frozen=True)
@@ -36,6 +33,9 @@ class LocateSettings:
     ground_sigma_m: float = 0.0  # of the ground's height, beside what is in the camera's own height
     most_sigma_m: float = 50.0  # a place known no better is none
     farthest_m: float = 5000.0  # along the ground
+    other_height_m: float = 1.0  # of a class that nothing is known of
+    ground_steps: int = 12  # with which a ray's end is searched on a height model ...
+    ground_settled_m: float = 0.3  # ... which must move it by no more in the end
 
     def __post_init__(self) -> None:
         if min(self.box_sigma_share, self.least_box_sigma_px, self.height_sigma_share, self.ground_sigma_m) < 0:
@@ -65,9 +65,9 @@ def locate(
     sides_px = boxes[:, 2:] - boxes[:, :2]
     rays, slopes = _rays_with_slopes(camera, (boxes[:, :2] + boxes[:, 2:]) / 2 - 0.5)
     heights_m = np.array([
-        TYPICAL_SIZE_M[name][2] if name in TYPICAL_SIZE_M else _OTHER_HEIGHT_M for name in found.names
+        TYPICAL_SIZE_M[name][2] if name in TYPICAL_SIZE_M else settings.other_height_m for name in found.names
     ])
-    ends = _ray_ends(rays, prior, heights_m, ground_height_m)
+    ends = _ray_ends(rays, prior, heights_m, ground_height_m, settings)
     along = ends.along(prior)
     shared = _shared_covariances(ends, along, rays, prior, focal_sigma, settings)
     per_px = along @ slopes  # (N, 2, 2) metres on the ground per pixel
@@ -124,10 +124,11 @@ class _RayEnds:
 
 
 def _ray_ends(
-    rays: PointsM, prior: CameraPrior, heights_m: Floats, ground_height_m: float | GroundHeight
+    rays: PointsM, prior: CameraPrior, heights_m: Floats, ground_height_m: float | GroundHeight,
+    settings: LocateSettings,
 ) -> _RayEnds:
     rays_site = rays @ prior.rotation.T
-    reach, plane_m = _reach(rays_site, prior.position_m, heights_m / 2, ground_height_m)
+    reach, plane_m = _reach(rays_site, prior.position_m, heights_m / 2, ground_height_m, settings)
     is_known, is_downward = np.isfinite(plane_m), rays_site[:, 2] < 0
     meets = is_downward & is_known & (reach > 0)
     reach = np.where(meets, reach, 1.0)
@@ -203,7 +204,8 @@ def _rays_with_slopes(camera: Camera, middles_px: PointsPx) -> tuple[PointsM, Fl
 
 
 def _reach(
-    rays_site: PointsM, camera_m: Floats, above_ground_m: Floats, ground_height_m: float | GroundHeight
+    rays_site: PointsM, camera_m: Floats, above_ground_m: Floats, ground_height_m: float | GroundHeight,
+    settings: LocateSettings,
 ) -> tuple[Floats, Floats]:
     """(N,) how many rays' lengths lead to the plane of each object, and that plane's height; NaN where it is unknown.
 
@@ -215,14 +217,14 @@ def _reach(
             return (plane_m - camera_m[2]) / rays_site[:, 2], plane_m
         plane_m = ground_height_m(np.repeat(camera_m[None, :2], len(rays_site), axis=0)) + above_ground_m
         change = np.zeros(len(rays_site))
-        for _ in range(_GROUND_STEPS):
+        for _ in range(settings.ground_steps):
             reach = (plane_m - camera_m[2]) / rays_site[:, 2]
             places_m = camera_m[:2] + np.nan_to_num(reach)[:, None] * np.nan_to_num(rays_site[:, :2])
             higher = ground_height_m(places_m) + above_ground_m
             change = np.abs(higher - plane_m)
             # half steps settle on slopes towards the camera as well, where full ones would swing about
             plane_m = plane_m + 0.5 * (higher - plane_m)
-        plane_m = np.where(change <= _GROUND_SETTLED_M, plane_m, np.nan)
+        plane_m = np.where(change <= settings.ground_settled_m, plane_m, np.nan)
         return (plane_m - camera_m[2]) / rays_site[:, 2], plane_m
 
 

@@ -1,6 +1,7 @@
 """Whether a detection's size on the ground is one that its class can have."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,9 +11,14 @@ from sorvolo.survey.objects import TYPICAL_SIZE_M
 TOO_SHORT_CUT_PX = 3.0
 """Pieces of cars at the picture's edge end up to so far from it: nearer, their length means nothing."""
 
-_LEAST_LENGTH = 0.4  # of a class's usual length: what is shorter is none, however sure the detector is
-_MOST_WIDTH = 2.5  # times a class's largest dimension: what is wider is none; trucks are as wide as cars are long
-_SCALE_SIGMAS = 2.0  # by which heights may be off before something is called too short or too wide
+
+@dataclass(frozen=True)
+class SizeSettings:
+    """Which sizes a class may have."""
+
+    least_length: float = 0.4  # of its usual length: what is shorter is none, however sure the detector is
+    most_width: float = 2.5  # times its largest dimension: what is wider is none; trucks are as wide as cars are long
+    scale_sigmas: float = 2.0  # by which heights may be off before something is called too short or too wide
 
 
 def usual_length_m(name: str) -> float:
@@ -20,17 +26,20 @@ def usual_length_m(name: str) -> float:
     return TYPICAL_SIZE_M[name][0] if name in TYPICAL_SIZE_M else 0.0
 
 
-def impossible_size(names: Sequence[str], sides_m: Floats, cut: Mask, scale_sigma: float | Floats = 0.0) -> Mask:
+def impossible_size(
+    names: Sequence[str], sides_m: Floats, cut: Mask, scale_sigma: float | Floats = 0.0,
+    settings: SizeSettings = SizeSettings(),
+) -> Mask:
     """(N,) bool: what is far too short or far too wide for its class, as a window or a lawn is for a car.
 
     `sides_m` (N, 2) are the box's sides on the ground, known to the relative error `scale_sigma`, one or (N,); `cut`
     (N, 4) as `cut_edges` gives it with `TOO_SHORT_CUT_PX`: what the picture's edge cuts may look too short, not too
     wide. Seen aslant, a standing person's box is long on the ground, but not wide: the shorter side is compared.
     """
-    longest_m = sides_m.max(axis=1, initial=0.0) * (1.0 + _SCALE_SIGMAS * scale_sigma)
+    longest_m = sides_m.max(axis=1, initial=0.0) * (1.0 + settings.scale_sigmas * scale_sigma)
     usual_m = np.array([usual_length_m(name) for name in names])
-    short = ~cut.any(axis=1) & (longest_m < _LEAST_LENGTH * usual_m)
-    shortest_m = sides_m.min(axis=1, initial=np.inf) * np.maximum(0.0, 1.0 - _SCALE_SIGMAS * scale_sigma)
+    short = ~cut.any(axis=1) & (longest_m < settings.least_length * usual_m)
+    shortest_m = sides_m.min(axis=1, initial=np.inf) * np.maximum(0.0, 1.0 - settings.scale_sigmas * scale_sigma)
     largest_m = np.array([max(TYPICAL_SIZE_M.get(name, (np.inf,))) for name in names])
-    wide: Mask = shortest_m > _MOST_WIDTH * largest_m
+    wide: Mask = shortest_m > settings.most_width * largest_m
     return np.asarray(short | wide, bool)
