@@ -1,6 +1,7 @@
 """A mapping that was killed goes on where it was, and ends with the bytes of one that was not."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -9,12 +10,16 @@ import numpy as np
 import pytest
 from truth_detector import TruthDetector
 
+from sorvolo.cli.main import main
+from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.mosaic.planar import PlanarMapper
 from sorvolo.store.site.flight_writer import FlightWriter
-from sorvolo.survey.mosaic import MosaicUpdate
+from sorvolo.survey.flight import PosedFrame
+from sorvolo.survey.mosaic import MosaicUpdate, Status
 from sorvolo.survey.objects import Detections
 
 _EFFORT = ("seconds", "cpu_s", "registration_cpu_s_per_keyframe", "peak_memory_mb")
@@ -28,6 +33,13 @@ class Seeing(TruthDetector):
         """One box."""
         x = 40 + float(image.mean()) % 100
         return Detections(np.array([[x, 60, x + 60, 100]]), np.array([0.9]), np.array([1]), self.classes)
+
+
+class Stopping(PlanarRun):
+    """Stops when the first frame comes."""
+
+    def add(self, posed: PosedFrame) -> tuple[Status, str, int]:
+        raise InputError("the work began")
 
 
 def content(site: Path) -> dict[str, bytes]:
@@ -138,3 +150,22 @@ def test_another_command_begins_anew(whole: tuple[Path, ...], filmed: Path, tmp_
     assert left and not set(site.glob("flights/*/keyframes/*/*"))
     updates.close()
     assert not list(site.glob("flights/*"))
+
+
+@pytest.mark.parametrize(
+    ("free", "expected"), [(1_000_000_000, ""), (20_000_000, "may become full"), (5_000_000, "free some")]
+)
+def test_a_disk_too_full_is_announced_before_the_work_begins(
+    filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], free: int,
+    expected: str,
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(2 * free, free, free))  # type: ignore[attr-defined]
+    video, site = filmed / "flight1" / "flight1.mp4", tmp_path / "site"
+    register = "sorvolo.missions.map.flights.PlanarRun"
+    monkeypatch.setattr(register, Stopping)
+    assert main(["map", str(video), "--site", str(site), "--camera", "aov=70", "--model", "none"]) == 1
+    printed = capsys.readouterr().err
+    if expected:
+        figures = rf"has {free // 1_000_000} MB free, and the map of flight1 needs about \d+ MB "
+        assert re.search(rf"{figures}.*{expected}", printed)
+    assert ("the work began" in printed) == (expected != "free some")

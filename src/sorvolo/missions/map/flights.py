@@ -14,6 +14,7 @@ from sorvolo.errors import SettingsError
 from sorvolo.missions.flight.base_map import open_base
 from sorvolo.missions.flight.control import open_control
 from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.disk import check_room
 from sorvolo.missions.flight.glimpses import refuse_without_texture
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.reading import read_ahead
@@ -124,6 +125,7 @@ def _map_one(
 ) -> Generator[MosaicUpdate]:
     started_s, source = time.monotonic(), setup.source
     refuse_without_texture(source)
+    check_room(setup, archive.folder, archive.site().m_per_px if archive.has_site else settings.m_per_px)
     setup = replace(setup, notices=(*setup.notices, *repeated(archive, source.name, "mapped")))
     finder = None if detector is None else ObjectFinder(detector, source.camera.camera, settings.classes)
     with _begun(setup, archive, settings, finder, request) as run:
