@@ -64,5 +64,6 @@ def decided(kept: Path) -> tuple[list[Change], int]:
     """The changes that the evidence ends with, and how many more would have been announced meanwhile."""
     evidence: Gatherer = pickle.loads(kept.read_bytes())
     evidence.under(EvidenceSettings())
-    final = [without_shadow(each) for each in evidence.conclude()]
+    settings = EvidenceSettings().things
+    final = [without_shadow(each, settings) for each in evidence.conclude()]
     return final, evidence.withdrawn()

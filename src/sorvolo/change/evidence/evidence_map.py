@@ -56,8 +56,7 @@ class RestlessSettings:
     """Which ground around a change shows how restless it is there (before 0014)."""
 
     around_m: float = 5.0  # a crown's width
-    apart_m: float = 0.5  # nearer lies the change's own rim ...
-    lean: float = 0.2  # ... and within so many of its lengths what leans with it
+    apart_m: float = 0.5  # nearer lies the change's own rim
     changed_itself: float = 0.5  # of its views: ground that more of them flag is changed itself, not restless
 
 
@@ -521,12 +520,11 @@ def restlessness(
     much comes and goes, views agree by chance. What really came or left stands out on calm ground. `own` (rows,
     columns) are the change's cells in `window`. Where no other ground was seen twice, nothing is known: 0.
     """
-    apart_m = max(settings.apart_m, settings.lean * max(window.shape) * cell_m)
-    reach = int(np.ceil((apart_m + settings.around_m) / cell_m))
+    reach = int(np.ceil((settings.apart_m + settings.around_m) / cell_m))
     evidence = grid.read(window.grown(reach))
     free = cv2.copyMakeBorder((~own).view(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=1)
     away_m = cv2.distanceTransform(free, cv2.DIST_L2, 5) * cell_m
-    around = (away_m > apart_m) & (away_m <= apart_m + settings.around_m) & (evidence.seen >= 2)
+    around = (away_m > settings.apart_m) & (away_m <= settings.apart_m + settings.around_m) & (evidence.seen >= 2)
     seen, changed = evidence.seen[around].astype(float), evidence.changed[around]
     if not seen.size:
         return 0.0

@@ -33,7 +33,7 @@ class ExtentSettings:
     blurred: float = 0.2  # of the largest difference within 5 px: what differs less is a thing's blurred rim
     pooled_px: int = 9  # window of medians, in which a thing of the ground's own colour stands out as a whole, if ...
     edge: float = 0.2  # ... just outside at most this part is left of what differs along the inside of its outline ...
-    more: float = 0.3  # ... and it is larger by this part than what stands out alone: less is a rim of light (0026)
+    more: float = 0.3  # ... and it is larger by this part than what stands out alone: less is a rim of light (0027)
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,11 +25,9 @@ class ThingSettings:
     least_piece: float = 0.15  # of the largest lit piece: smaller ones are specks of the shadow's rim
     apart_m: float = 0.5  # things so far from each other are two ...
     least_m2: float = 0.035  # 0018: ... if each is as large as a football at least ...
-    solid: float = 0.45  # 0018: ... fills so much of its hull, for specks of a dark thing scatter ...
-    compact: float = 0.8  # ... and the change does not fill so much of its hull, ...
-    car_m: tuple[float, float] = (1.2, 6.0)  # ... as wide and as long as one dark car with bright parts
-    neck_m: float = 0.25  # 0016: pieces that hang together by less, one having come where the other left, ...
-    gap_m: float = 0.4  # 0016: ... or lie so far apart are not one
+    solid: float = 0.45  # 0018: ... fills so much of its hull, for specks of a dark thing scatter, ...
+    car_m: tuple[float, float] = (1.2, 6.0)  # ... and all is not as wide and as long as one dark car with bright parts
+    gap_m: float = 0.4  # 0016: pieces that lie so far apart are not one
 
 
 def without_shadow(change: Change, settings: ThingSettings = ThingSettings()) -> Change:
@@ -94,11 +92,9 @@ def things_of(
 
 
 def _groups(patch: Patch, changed: Mask, settings: ThingSettings) -> list[tuple[Mask, ChangeKind]]:
-    """The pieces of a change that lie apart, or where one came and the other left hang together by a neck, with their
-    kinds; nothing where it is but one piece. What is all shadow is no piece of its own."""
-    side = 2 * round(settings.neck_m / 2 / patch.m_per_px) + 1
-    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    count, labels = cv2.connectedComponents(cv2.morphologyEx(changed.view(np.uint8), cv2.MORPH_OPEN, disk))
+    """The pieces of a change that lie apart, with their kinds; nothing where it is but one piece. What is all shadow is
+    no piece of its own."""
+    count, labels = cv2.connectedComponents(changed.view(np.uint8))
     if count < 3 or _may_be_a_car(changed, patch.m_per_px, settings):
         return []
     bare_m2 = np.bincount(labels[~_is_dark(patch)], minlength=count) * patch.m_per_px**2
@@ -177,6 +173,5 @@ def _joined(mask: Mask, m_per_px: float, apart_m: float) -> NDArray[np.int32]:
 def _may_be_a_car(changed: Mask, m_per_px: float, settings: ThingSettings) -> bool:
     hull = cv2.convexHull(cv2.findNonZero(changed.view(np.uint8)))
     short_m, long_m = sorted(float(each) * m_per_px for each in cv2.minAreaRect(hull)[1])
-    is_compact = np.count_nonzero(changed) >= settings.compact * cv2.contourArea(hull)
     narrowest_m, longest_m = settings.car_m
-    return short_m >= narrowest_m and long_m <= longest_m and bool(is_compact)
+    return short_m >= narrowest_m and long_m <= longest_m
