@@ -79,7 +79,8 @@ class Station:
         inputs = Inputs(settings, uploads, ingest.newest)
         return cls(
             settings, state, shelf, tiles, events, SiteCollections(shelf), reviews, ingest, uploads, inputs,
-            Runs(settings, state, shelf, events, inputs), MapWatch(shelf, tiles, reviews, events), FlightVideos(inputs),
+            Runs(settings, state, shelf, events, inputs, ingest.show_boxes), MapWatch(shelf, tiles, reviews, events),
+            FlightVideos(inputs),
         )
 
     def close(self) -> None:

@@ -88,9 +88,11 @@ class Ingest:
         self._flights: dict[str, Flight] = {}
         self._links: dict[str, Link] = {}
         self._hubs: dict[str, VideoHub] = {}
+        self._loop: asyncio.AbstractEventLoop | None = None  # in which drones and viewers are served
 
     async def serve(self, stream: str, link: Link) -> None:
         """Take one connection until it ends; why it was refused is sent to the drone."""
+        self._loop = asyncio.get_running_loop()
         try:
             flight = await self._greeted(stream, link)
             try:
@@ -137,6 +139,21 @@ class Ingest:
         """The file of the stream's newest flight, which a mission follows; None where there is none."""
         kept = self._kept(stream)
         return self._folder / stream / f"{kept[-1]['flight']}.ts" if kept else None
+
+    def show_boxes(self, found: Mapping[str, Any]) -> None:
+        """Give a mission's detections in one frame to whoever watches the stream; from any thread.
+
+        A mission counts `pts_us` from the flight's first picture, the pictures' own times from the flight's zero.
+        """
+        stream = str(found.get("stream") or "")
+        flight, hub, loop = self._flights.get(stream), self._hubs.get(stream), self._loop
+        if flight is None or hub is None or loop is None or flight.first_pts_us < 0 or not hub.viewers:
+            return
+        words = {**found, "type": "boxes", "pts_us": flight.first_pts_us + int(found["pts_us"])}
+        try:
+            loop.call_soon_threadsafe(hub.note, words)
+        except RuntimeError:  # the loop was closed: nobody watches any more
+            pass
 
     async def close(self) -> None:
         """Close every file; the drones' links end with the server."""
@@ -255,6 +272,11 @@ class Flight:
         self._needs_key = True
         self._taken_s: deque[float] = deque(maxlen=90)
         _ended(path).unlink(missing_ok=True)
+
+    @property
+    def first_pts_us(self) -> int:
+        """When the flight's first picture is shown; -1 before it came."""
+        return self._file.first_pts_us
 
     @property
     def last_seq(self) -> int:

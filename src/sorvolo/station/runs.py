@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,16 @@ from typing import Any
 from sorvolo.station.collections import SEARCH_FOLDER
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.inputs import Inputs
-from sorvolo.station.orders import JOURNAL_FILE, LOCK_FILE, LOCK_VARIABLE, LOG_FILE, WRITES, Order, RunWish
+from sorvolo.station.orders import (
+    BOXES,
+    JOURNAL_FILE,
+    LOCK_FILE,
+    LOCK_VARIABLE,
+    LOG_FILE,
+    WRITES,
+    Order,
+    RunWish,
+)
 from sorvolo.station.problems import Problem
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.sites import SiteShelf
@@ -60,8 +69,10 @@ class Runs:
     """The missions of a station. Only `look` changes what is known of one that runs; a thread calls it."""
 
     def __init__(
-        self, settings: StationSettings, state: StationState, shelf: SiteShelf, events: EventLog, inputs: Inputs
+        self, settings: StationSettings, state: StationState, shelf: SiteShelf, events: EventLog, inputs: Inputs,
+        show_boxes: Callable[[Mapping[str, Any]], None] = lambda _: None,
     ) -> None:
+        self._show_boxes = show_boxes
         self._settings, self._state, self._shelf, self._events, self._inputs = settings, state, shelf, events, inputs
         self._folder = settings.state_folder / "runs"
         self._lock = threading.RLock()
@@ -163,13 +174,16 @@ class Runs:
             lines, end = _new_lines(folder / JOURNAL_FILE, offset)
             events: list[NewEvent] = []
             for line in lines:
+                if line["type"] == BOXES:  # ten a second: shown with the video, not kept
+                    self._show_boxes(line["data"])
+                    continue
                 run, event = _taken(run, line)
                 events.append(event)
             if has_ended and run.state == RUNNING and not lines:
                 run = self._without_a_word(run, folder)
                 kind = "run.stopped" if run.state == STOPPED else "run.failed"
                 events.append(_event(kind, run, _public(run)))
-            if events:
+            if events or lines:
                 self._keep(run, events, end)
         if run.state != RUNNING:
             process = self._processes.pop(run.id, None)

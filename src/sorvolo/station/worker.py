@@ -29,7 +29,7 @@ from sorvolo.missions.watch.flights import watch
 from sorvolo.missions.watch.run import WatchUpdate
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.station.collections import on_earth
-from sorvolo.station.orders import JOURNAL_FILE, LOCK_VARIABLE, Order
+from sorvolo.station.orders import BOXES, JOURNAL_FILE, LOCK_VARIABLE, Order
 from sorvolo.store.exports.change_files import changes_geojson
 from sorvolo.store.exports.detection_files import tracks_collection
 from sorvolo.store.exports.plain import plain_json, utc_text
@@ -45,6 +45,7 @@ FINISHED, FAILED, STOPPED = "run.finished", "run.failed", "run.stopped"
 
 _PROGRESS_EVERY_S = 0.25
 _LIVE_S = 0.5  # how often the growing map is shown: a browser waits for it
+_DRONE_AWAY_S = 900.0
 _NICE = 5  # the server answers first
 _WRONG, _STOPPED_CODE = 1, 130
 
@@ -114,7 +115,7 @@ def _map(order: Order, journal: Journal, until: threading.Event) -> str:
     before = _newest(site)
     updates = map_flights(
         [order.source], site, settings, telemetry=order.telemetry or None, camera=order.camera or None,
-        live=LiveSettings(keeps_all=True), until=until,
+        live=_live(order, keeps_all=True), until=until,
     )
     with closing(updates):
         for update in updates:
@@ -134,7 +135,7 @@ def _compare(order: Order, journal: Journal, until: threading.Event) -> str:
         place = archive.site()
     updates = compare_flights(
         [order.source], site, settings, telemetry=order.telemetry or None, camera=order.camera or None,
-        live=LiveSettings(keeps_all=True), until=until,
+        live=_live(order, keeps_all=True), until=until,
     )
     with closing(updates):
         for update in updates:
@@ -158,7 +159,7 @@ def _watch(order: Order, journal: Journal, until: threading.Event) -> str:
     counts: Mapping[str, int] = {}
     updates = watch(
         order.source, settings, WatchOutputs(Path(order.folder)), telemetry=order.telemetry or None,
-        camera=order.camera or None, until=until,
+        camera=order.camera or None, live=_live(order), until=until,
     )
     with closing(updates):
         for update in updates:
@@ -190,6 +191,11 @@ def _search(order: Order, journal: Journal, _: threading.Event) -> str:
 
 
 _MISSIONS = {"map": _map, "compare": _compare, "watch": _watch, "search": _search}
+
+
+def _live(order: Order, *, keeps_all: bool = False) -> LiveSettings:
+    """How a live source is read: a drone that sends to this station comes back, and states when its flight is over."""
+    return LiveSettings(keeps_all=keeps_all, **({"give_up_s": _DRONE_AWAY_S} if order.stream else {}))
 
 
 def _placed(journal: Journal, view: FrameView | None, name: str, status: str) -> None:
@@ -225,7 +231,7 @@ def _seen(journal: Journal, update: WatchUpdate, stream: str) -> None:
         ]}
         for name, score, (x0, y0, x1, y1) in zip(found.names, found.scores, found.boxes_px)
     ]
-    journal.add("frame.boxes", {
+    journal.add(BOXES, {
         "stream": stream or None, "frame": update.frame_name, "pts_us": update.clip_ns // 1000,
         "time": utc_text(update.time_ns), "boxes": boxes, "frame_size_px": list(update.size_px),
         "latency_s": round(update.latency_s, 3),

@@ -1,0 +1,138 @@
+"""A flight streamed to a station whose missions read it while it grows, though the station is restarted meanwhile."""
+
+import asyncio
+import json
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+from test_runs import FLIGHT
+from websockets.asyncio.client import connect
+
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.missions.simulate.site import simulate_site
+from sorvolo.station.app import station_app
+from sorvolo.station.client import StreamClient, StreamSettings, stream_url
+from sorvolo.station.footage import open_footage
+from sorvolo.station.settings import StationSettings
+from sorvolo.station.spool import Spool
+
+
+class Station:
+    """A station at a port of its own, which may be ended and started again."""
+
+    def __init__(self, root: Path) -> None:
+        self._root, self._port = root, 0
+        self.start()
+
+    def start(self) -> None:
+        app = station_app(StationSettings(self._root, free_floor_gb=0.0))
+        self._server = uvicorn.Server(uvicorn.Config(
+            app, "127.0.0.1", self._port, log_level="critical", ws="websockets-sansio", timeout_graceful_shutdown=0,
+        ))
+        self._thread = threading.Thread(target=self._server.run, daemon=True)
+        self._thread.start()
+        while not self._server.started:
+            assert self._thread.is_alive()
+            time.sleep(0.02)
+        self._port = self._server.servers[0].sockets[0].getsockname()[1]
+
+    def stop(self) -> None:
+        self._server.should_exit = self._server.force_exit = True
+        self._thread.join(10)
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self._port}"
+
+    def ask(self, path: str, body: Any = None) -> Any:
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(f"{self.url}{path}", data, {"Content-Type": "application/json"})
+        with urllib.request.urlopen(request, timeout=10) as answer:
+            return json.loads(answer.read())
+
+    def ended(self, run: str) -> dict[str, Any]:
+        until_s = time.monotonic() + 60
+        while (state := self.ask(f"/api/runs/{run}"))["state"] == "running":
+            assert time.monotonic() < until_s, state
+            time.sleep(0.1)
+        return dict(state)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("flown")
+    for _ in simulate_site(folder, FLIGHT):
+        pass
+    return folder / "flight1" / "flight1.mp4"
+
+
+@pytest.fixture
+def station(tmp_path: Path) -> Iterator[Station]:
+    (tmp_path / "root").mkdir()
+    made = Station(tmp_path / "root")
+    yield made
+    made.stop()
+
+
+def sending(flown: Path, station: Station, spool: Path, speed: float) -> StreamClient:
+    stop = threading.Event()
+    footage = open_footage(str(flown), None, str(flown.parent.parent / "camera.xml"), LiveSettings(), stop)
+    settings = StreamSettings(speed=speed)
+    return StreamClient(footage, Spool(spool, 50_000_000), stream_url(station.url, "scout"), "", settings, stop)
+
+
+def begun(station: Station) -> None:
+    """Wait until a stream is there to be read."""
+    while not any(each["flights"] for each in station.ask("/api/streams")):
+        time.sleep(0.05)
+
+
+def test_a_map_of_a_stream_outlives_a_restarted_station(station: Station, flown: Path, tmp_path: Path) -> None:
+    drone = sending(flown, station, tmp_path / "spool", speed=0.8)
+    flying = threading.Thread(target=drone.run)
+    flying.start()
+    begun(station)
+    run = station.ask("/api/runs", {
+        "mission": "map", "site": "new", "input": {"stream": "scout"}, "options": {"model": "none"},
+    })
+    time.sleep(0.7)
+    station.stop()
+    time.sleep(0.3)
+    station.start()
+    flying.join(30)
+    assert drone.is_complete and drone.report.outages == 1 and drone.report.late == drone.report.overflowed == 0
+    done = station.ended(run["id"])
+    assert done["state"] == "finished", done
+    (flight,) = station.ask("/api/sites/new")["flights"]
+    assert flight["matched"] == flight["frames"] >= 3 and flight["rejected"] == 0
+
+
+def test_boxes_reach_a_viewer_with_the_time_of_their_picture(station: Station, flown: Path, tmp_path: Path) -> None:
+    async def watch() -> tuple[list[int], list[dict[str, Any]]]:
+        pictures, boxes = [], []
+        async with connect(f"{station.url.replace('http', 'ws')}/api/streams/scout/video") as socket:
+            flying.start()
+            until_s = time.monotonic() + 30
+            while time.monotonic() < until_s and not boxes:
+                item = await asyncio.wait_for(socket.recv(), 30)
+                if isinstance(item, str):
+                    boxes += [words for words in [json.loads(item)] if words["type"] == "boxes"]
+                    continue
+                pictures.append(int.from_bytes(item[:8], "big"))
+                if len(pictures) == 2:
+                    await asyncio.to_thread(station.ask, "/api/runs", {
+                        "mission": "watch", "site": "new", "input": {"stream": "scout"}, "options": {},
+                    })
+        return pictures, boxes
+
+    flying = threading.Thread(target=sending(flown, station, tmp_path / "spool", speed=0.3).run)
+    pictures, boxes = asyncio.run(watch())
+    flying.join(30)
+    assert boxes and {each["pts_us"] for each in boxes} <= set(pictures)
+    assert boxes[0]["frame_size_px"] == [320, 180]
