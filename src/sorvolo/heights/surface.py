@@ -75,7 +75,7 @@ def sweep_surface(
             sigma = _sigma_m(swept, found, window, camera_sigma, settings)
             inner = slice(apron, -apron), slice(apron, -apron)
             up_m[y0:y1, x0:x1], sigma_m[y0:y1, x0:x1] = found[inner], sigma[inner]
-            covered[y0:y1, x0:x1] = swept.seen_by[inner] >= 2
+            covered[y0:y1, x0:x1] = (swept.seen_by[inner] >= 2) | np.isfinite(found[inner])
         yield (number + 1) / len(tiles)
     yield Surface(lattice, up_m, sigma_m, covered)
 

@@ -84,8 +84,7 @@ def sweep(
         agreement[:, number] = _agreement(laid, float(up_m), settings)
     seen = [np.broadcast_to(each.whole(bounds.usual_m, min(settings.window_cells)), shape) for each in laid]
     seen_by = np.sum(seen, axis=0).astype(np.float32)
-    cost = np.where(np.isnan(agreement), np.float32(settings.smoothing.unseen), 1 - agreement)
-    total = smoothed(cost, settings.smoothing)
+    total = smoothed(_cost(agreement, settings.smoothing), settings.smoothing)
     up_m, score = _best(total, agreement, levels)
     deviation = _deviation(total, up_m, levels, settings)
     up_m[~(score >= settings.least_score)] = np.nan  # no two photos see the height that fits, or they do not agree
@@ -295,6 +294,23 @@ def _better_mean(scores: list[Floats32], share: float) -> Floats32:
         total += scores[len(scores) - 1 - rank] * (rank < wanted)
     with np.errstate(invalid="ignore"):
         return np.asarray(np.where(counted > 0, total / np.maximum(wanted, 1), np.float32(np.nan)), np.float32)
+
+
+def _cost(agreement: Floats32, settings: SmoothingSettings) -> Floats32:
+    """(H, D, W) what heights cost by their agreement; one that is not seen (NaN) as much as a cell's chance matches.
+
+    How well photos agree by chance depends on the ground's texture: it is taken from the cell's other heights.
+    """
+    unseen = np.isnan(agreement)
+    cost: Floats32 = np.asarray(1 - agreement, np.float32)
+    if not unseen.any():
+        return cost
+    cost[unseen] = 0
+    seen = np.maximum((~unseen).sum(axis=1), 1).astype(np.float32)
+    mean = cost.sum(axis=1) / seen
+    scatter = np.sqrt(np.maximum((cost**2).sum(axis=1) / seen - mean**2, 0))
+    chance = np.clip(mean - np.float32(settings.unseen_sigmas) * scatter, 0, 1)
+    return np.where(unseen, chance[:, None], cost)
 
 
 def _best(total: Floats32, agreement: Floats32, levels: Floats32) -> tuple[Floats32, Floats32]:
