@@ -29,7 +29,7 @@ from sorvolo.station.map_watch import MapWatch
 from sorvolo.station.metrics import StationMetrics, metrics_routes
 from sorvolo.station.outward import Outward, OutwardSettings
 from sorvolo.station.place import place_routes
-from sorvolo.station.problems import Problem, answer_problems
+from sorvolo.station.problems import PROBLEM_ANSWERS, Problem, answer_problems
 from sorvolo.station.reviews import Reviews, review_routes
 from sorvolo.station.run_routes import run_routes
 from sorvolo.station.runs import Runs
@@ -113,6 +113,7 @@ def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardS
 
     app = FastAPI(
         title="Sorvolo station", version=__version__, lifespan=while_it_runs, docs_url=None, redoc_url=None,
+        responses=PROBLEM_ANSWERS,
         description="Maps from small drones while they fly, what changed, what was found.",
     )
     app.state.station = station
@@ -159,7 +160,7 @@ def _about_routes(station: Station) -> APIRouter:
         answer.set_cookie(COOKIE, token, httponly=True, samesite="strict", secure=station.settings.is_secure, path="/")
         return answer
 
-    @router.delete("/api/session")
+    @router.delete("/api/session", status_code=204)
     def log_out() -> Response:
         """Forget the cookie."""
         answer = Response(status_code=204)
@@ -184,17 +185,24 @@ def _site_routes(station: Station) -> APIRouter:
         revision = station.tiles.live(site).revision if detail["versions"] or detail["bounds_wgs84"] else None
         return {**detail, "live_revision": revision, "links": landing_links(f"/api/sites/{site}")}
 
-    @router.get("/{site}/tiles/{version}/{z}/{x}/{y}.webp", response_class=Response)
+    @router.get("/{site}/tiles/{version}/{z}/{x}/{y}.webp", response_class=Response, responses=_picture("webp"))
     def tile_webp(site: str, version: str, z: int, x: int, y: int) -> Response:
         """A Web Mercator tile, 256 px; `version` is a number, `live-REVISION` or `live`. 204 where the map is not."""
         return _tile(station, site, version, (z, x, y), ".webp")
 
-    @router.get("/{site}/tiles/{version}/{z}/{x}/{y}.png", response_class=Response)
+    @router.get("/{site}/tiles/{version}/{z}/{x}/{y}.png", response_class=Response, responses=_picture("png"))
     def tile_png(site: str, version: str, z: int, x: int, y: int) -> Response:
         """The same as PNG, for programs that read no WebP."""
         return _tile(station, site, version, (z, x, y), ".png")
 
     return router
+
+
+def _picture(kind: str) -> dict[int | str, dict[str, Any]]:
+    """How a tile's answers are described."""
+    return {
+        200: {"description": "The tile", "content": {f"image/{kind}": {}}}, 204: {"description": "Nothing of the map"},
+    }
 
 
 def _tile(station: Station, site: str, version: str, place: tuple[int, int, int], ending: str) -> Response:

@@ -25,11 +25,17 @@ _KEPT = "private, max-age=86400"
 _CUTTING = threading.Semaphore(2)  # key frames decoded at once: a strip asks for dozens
 
 
+class JpegResponse(Response):
+    """A picture as JPEG."""
+
+    media_type = "image/jpeg"
+
+
 def crop_routes(shelf: SiteShelf) -> APIRouter:
     """Pictures by the id of what they show; never by a path."""
     router = APIRouter(prefix="/api/sites/{site}/crops", tags=["crops"], dependencies=[Depends(needs(Role.VIEW))])
 
-    @router.get("/change/{change_id}/{n}.jpg", response_class=Response)
+    @router.get("/change/{change_id}/{n}.jpg", response_class=JpegResponse)
     def of_change(site: str, change_id: str, n: int) -> Response:
         """A change: 0 before, 1 after."""
         archive = shelf.open(site)
@@ -40,7 +46,7 @@ def crop_routes(shelf: SiteShelf) -> APIRouter:
         rgba = rgba_from_png(_read(archive, file), file)
         return _jpeg(np.where(rgba[..., 3:] > 0, rgba[..., :3], 127).astype(np.uint8))
 
-    @router.get("/object/{object_id}/{n}.jpg", response_class=Response)
+    @router.get("/object/{object_id}/{n}.jpg", response_class=JpegResponse)
     def of_object(site: str, object_id: str, n: int) -> Response:
         """An object as its best frame shows it."""
         archive = shelf.open(site)
@@ -48,9 +54,9 @@ def crop_routes(shelf: SiteShelf) -> APIRouter:
         if found is None or n != 0:
             raise Problem(404, "no such picture: 0 is the best one, of an object that the site has")
         data = _read(archive, f"flights/{found.flight_id}/{CROPS}/{crop_name(found.thing.id)}")
-        return Response(data, media_type="image/jpeg", headers={"cache-control": _KEPT})
+        return JpegResponse(data, headers={"cache-control": _KEPT})
 
-    @router.get("/frame/{flight}/{index}/{east_mm}/{north_mm}.jpg", response_class=Response)
+    @router.get("/frame/{flight}/{index}/{east_mm}/{north_mm}.jpg", response_class=JpegResponse)
     def of_frame(site: str, flight: str, index: int, east_mm: int, north_mm: int) -> Response:
         """The ground around a place (site millimetres), north up, cut from a key frame."""
         archive = shelf.open(site)
@@ -95,4 +101,4 @@ def _read(archive: Archive, file: str) -> bytes:
 
 
 def _jpeg(image: ImageRGB) -> Response:
-    return Response(jpeg_from_image(image), media_type="image/jpeg", headers={"cache-control": _KEPT})
+    return JpegResponse(jpeg_from_image(image), headers={"cache-control": _KEPT})

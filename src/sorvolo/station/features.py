@@ -24,6 +24,12 @@ Limit = Query(1000, ge=1, le=_MOST, description="Features at most.")
 Offset = Query(0, ge=0, le=10**9)
 
 
+class GeoJsonResponse(JSONResponse):
+    """A feature, or a page of them."""
+
+    media_type = _GEOJSON
+
+
 def landing_links(base: str) -> list[dict[str, str]]:
     """The links of a site's landing page."""
     return [
@@ -58,7 +64,7 @@ def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
         """One collection: its extent and links."""
         return _about(name, collections.get(site, name), f"/api/sites/{site}")
 
-    @router.get("/collections/{name}/items")
+    @router.get("/collections/{name}/items", response_class=GeoJsonResponse)
     def items(
         request: Request, site: str, name: str, bbox: str = Query("", max_length=200),
         datetime: str = Query("", max_length=100), limit: int = Limit, offset: int = Offset,
@@ -73,15 +79,15 @@ def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
         kept = _filtered(features, _interval(datetime), _words(labels), min_score, _words(flight), _words(review))
         if name == "changes":
             kept = [each for each in kept if _between(each["properties"], from_version, to_version)]
-        return JSONResponse(_page(request, kept, limit, offset), media_type=_GEOJSON)
+        return GeoJsonResponse(_page(request, kept, limit, offset))
 
-    @router.get("/collections/{name}/items/{feature_id}")
+    @router.get("/collections/{name}/items/{feature_id}", response_class=GeoJsonResponse)
     def one_item(site: str, name: str, feature_id: str) -> JSONResponse:
         """One feature."""
         found = [each for each in collections.get(site, name).features if str(each["id"]) == feature_id]
         if not found:
             raise Problem(404, f"{name} has no feature {feature_id[:80]!r}")
-        return JSONResponse(_reviewed(found, name, site, reviews)[0], media_type=_GEOJSON)
+        return GeoJsonResponse(_reviewed(found, name, site, reviews)[0])
 
     return router
 

@@ -14,7 +14,7 @@ from fastapi import APIRouter, Depends, Response
 from fastapi.responses import FileResponse
 
 from sorvolo.station.collections import SiteCollections
-from sorvolo.station.crops import CROP_M, CROP_PX
+from sorvolo.station.crops import CROP_M, CROP_PX, JpegResponse
 from sorvolo.station.inputs import Inputs
 from sorvolo.station.problems import Problem
 from sorvolo.station.pyramid import BytesCache
@@ -36,6 +36,8 @@ class FlightVideos:
 
     def find(self, archive: Archive, flight: str) -> Path | None:
         """The flight's video; None where it was no video, is gone, or two inputs have its name."""
+        if flight not in {each.id for each in archive.flights()}:
+            return None
         names = archive.report(flight).get("inputs")
         if not isinstance(names, list) or len(names) != 1:
             return None
@@ -53,7 +55,7 @@ def video_routes(shelf: SiteShelf, collections: SiteCollections, videos: FlightV
         """The video that the flight was made of, as it is; ranges are answered, so that a browser can jump."""
         return FileResponse(_demanded(shelf.open(site), flight, videos), headers={"cache-control": "private"})
 
-    @router.get("/crops/video/{flight}/{frame}/{east_mm}/{north_mm}.jpg", response_class=Response)
+    @router.get("/crops/video/{flight}/{frame}/{east_mm}/{north_mm}.jpg", response_class=JpegResponse)
     def crop(site: str, flight: str, frame: int, east_mm: int, north_mm: int) -> Response:
         """The ground around a place (site millimetres), north up, from a frame of the flight's video."""
         archive = shelf.open(site)
@@ -67,7 +69,7 @@ def video_routes(shelf: SiteShelf, collections: SiteCollections, videos: FlightV
         place_m = np.array([east_mm, north_mm]) / 1000
         key = (str(path), path.stat().st_mtime_ns, frame, east_mm, north_mm)
         data = cache.get(key, lambda: _cut(path, frame, _crop_corners(ring, place_m)))
-        return Response(data, media_type="image/jpeg", headers={"cache-control": "private, max-age=86400"})
+        return JpegResponse(data, headers={"cache-control": "private, max-age=86400"})
 
     return router
 

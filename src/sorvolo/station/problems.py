@@ -1,6 +1,7 @@
 """Errors as HTTP answers: RFC 9457 problem documents that state what was found, what was needed, what to do."""
 
 from collections.abc import Mapping
+from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -14,6 +15,16 @@ _TITLES = {
     409: "Conflict", 410: "Gone", 413: "Too large", 415: "Unknown kind", 421: "Misdirected request",
     422: "Invalid request", 429: "Too many attempts", 500: "Error in the station", 507: "Disk full",
 }
+_KIND = "application/problem+json"
+_SCHEMA = {
+    "type": "object", "required": ["title", "status", "detail"],
+    "properties": {"title": {"type": "string"}, "status": {"type": "integer"}, "detail": {"type": "string"}},
+}
+PROBLEM_ANSWERS: dict[int | str, dict[str, Any]] = {
+    status: {"description": "What was found, needed, to do (RFC 9457)", "content": {_KIND: {"schema": _SCHEMA}}}
+    for status in (422, "4XX", "5XX")
+}
+"""How the API's description announces problem documents."""
 
 
 class Problem(Exception):
@@ -31,7 +42,7 @@ def problem_answer(
 ) -> JSONResponse:
     """The problem document of a status."""
     body = {"title": _TITLES.get(status, "Error"), "status": status, "detail": detail, **(more or {})}
-    return JSONResponse(body, status, dict(headers or {}), media_type="application/problem+json")
+    return JSONResponse(body, status, dict(headers or {}), media_type=_KIND)
 
 
 def status_of(error: SorvoloError) -> int:

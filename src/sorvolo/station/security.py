@@ -9,6 +9,7 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import urlsplit
 
+from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -214,7 +215,7 @@ def _limited(connection: HTTPConnection, receive: Receive) -> Receive:
         message = await receive()
         taken += len(message.get("body", b""))
         if taken > _MOST_BODY_BYTES:
-            raise too_large
+            raise HTTPException(413, too_large.detail)  # what FastAPI passes on as it is while it reads a body
         return message
 
     return receiving

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import socket
 from collections.abc import Callable
 
 import uvicorn
@@ -31,6 +32,7 @@ def run_station(
     station: Station = app.state.station
     try:
         check_exposure(settings, has_tokens=has_tokens(station.state))
+        listening = _listening(settings)
         config = uvicorn.Config(
             app, settings.host, settings.port, log_level="warning", access_log=False, server_header=False,
             log_config=None, ws="websockets-sansio", ws_max_size=_MOST_MESSAGE_BYTES, proxy_headers=False,
@@ -39,14 +41,22 @@ def run_station(
         )
         server = _Announcing(config, announce)
         logging.getLogger("uvicorn.error").setLevel(logging.ERROR)
-        asyncio.run(server.serve())
-        if not server.started:
-            raise SettingsError(
-                f"cannot listen at {settings.host}:{settings.port}: another program does, or the address is not this "
-                "machine's; choose another --port or --host"
-            )
+        with listening:
+            asyncio.run(server.serve([listening]))
     finally:
         station.close()
+
+
+def _listening(settings: StationSettings) -> socket.socket:
+    """The socket to listen at. Raises SettingsError where it cannot be had."""
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    try:
+        return socket.create_server((settings.host, settings.port), family=family, backlog=256)
+    except OSError as error:
+        raise SettingsError(
+            f"cannot listen at {settings.host}:{settings.port} ({error.strerror}): another program does, or the "
+            "address is not this machine's; choose another --port or --host"
+        ) from error
 
 
 class _Announcing(uvicorn.Server):
@@ -56,8 +66,8 @@ class _Announcing(uvicorn.Server):
         super().__init__(config)
         self._announce = announce
 
-    async def startup(self, sockets: list[object] | None = None) -> None:  # type: ignore[override]
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Listen, then announce it."""
-        await super().startup(sockets)  # type: ignore[arg-type]
+        await super().startup(sockets)
         if self.started:
             self._announce()

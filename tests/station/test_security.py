@@ -1,0 +1,325 @@
+"""Tests that try to get in: forged hosts and origins, guessed tokens, paths, links, streams of the own network."""
+
+import socket
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from starlette.testclient import TestClient, WebSocketDenialResponse
+from starlette.websockets import WebSocketDisconnect
+from typer.testing import CliRunner
+
+from sorvolo.cli.main import app as command
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.station.app import station_app
+from sorvolo.station.problems import Problem
+from sorvolo.station.settings import StationSettings, check_exposure
+from sorvolo.station.state import StationState
+from sorvolo.station.stream_addresses import checked_stream
+from sorvolo.station.tokens import Guesses, Role, holder_of, list_tokens, make_token, revoke_token
+
+HOST = "http://127.0.0.1:8750"
+SOCKET = "ws://127.0.0.1:8750/api/events"
+
+
+@pytest.fixture
+def state(tmp_path: Path) -> Iterator[StationState]:
+    """A station's memory."""
+    with closing(StationState.open(tmp_path / "station")) as state:
+        yield state
+
+
+def guarded(root: Path, role: str = "view", host: str = "127.0.0.1") -> tuple[TestClient, str]:
+    """A station with one token, and the token."""
+    with closing(StationState.open(root / "station")) as state:
+        token = make_token(state, "Ada", role)
+    settings = StationSettings(root, host, insecure_lan=True)
+    return TestClient(station_app(settings), base_url=HOST, client=("192.0.2.7", 4000)), token
+
+
+def refused(client: TestClient, address: str, **headers: str) -> int:
+    """The status with which a WebSocket is refused; 0 where it is not."""
+    try:
+        with client.websocket_connect(address, headers=headers):
+            return 0
+    except WebSocketDenialResponse as denial:
+        return denial.status_code
+    except WebSocketDisconnect as end:
+        return end.code
+
+
+# ---- hosts and origins --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "localhost.evil.example:8750", "", "[::2]"])
+def test_a_forged_host_is_refused(client: TestClient, host: str) -> None:
+    """A page whose name was pointed to this machine (DNS rebinding) sends its own name."""
+    assert client.get("/api/status", headers={"host": host}).status_code == 421
+    assert refused(client, SOCKET, host=host) in (421, 4421)
+
+
+@pytest.mark.parametrize("host", ["localhost:8750", "127.0.0.1", "[::1]:8750", "LOCALHOST"])
+def test_this_machines_names_are_right(client: TestClient, host: str) -> None:
+    """However they are written."""
+    assert client.get("/api/status", headers={"host": host}).status_code == 200
+
+
+def test_names_are_known_on_other_addresses_too(root: Path) -> None:
+    """An address cannot be pointed elsewhere; a name has to be given with --name."""
+    with closing(StationState.open(root / "station")) as state:
+        token = make_token(state, "Ada", "view")
+    settings = StationSettings(root, "0.0.0.0", insecure_lan=True, names=("field.example",))
+    with TestClient(station_app(settings), base_url=HOST) as client:
+        client.headers["authorization"] = f"Bearer {token}"
+        for host, status in (("field.example:8750", 200), ("192.168.7.9:8750", 200), ("evil.example", 421)):
+            assert client.get("/api/status", headers={"host": host}).status_code == status, host
+
+
+@pytest.mark.parametrize("origin", [
+    "http://evil.example", "https://127.0.0.1:8750", "http://127.0.0.1:9999", "http://localhost:8750", "null",
+])
+def test_pages_of_other_sites_change_nothing(client: TestClient, origin: str) -> None:
+    """Nor do they open a WebSocket."""
+    body = {"kind": "change", "id": "b-1", "verdict": "confirmed", "revision": 0}
+    assert client.post("/api/sites/field/reviews", json=body, headers={"origin": origin}).status_code == 403
+    assert client.delete("/api/session", headers={"origin": origin}).status_code == 403
+    assert refused(client, SOCKET, origin=origin) in (403, 4403)
+    own = client.post("/api/sites/field/reviews", json=body, headers={"origin": HOST})
+    assert own.status_code == 201
+
+
+def test_requests_that_browsers_mark_as_cross_site(client: TestClient) -> None:
+    """A form of another page that names no origin."""
+    assert client.post("/api/runs", json={}, headers={"sec-fetch-site": "cross-site"}).status_code == 403
+    assert refused(client, SOCKET, **{"sec-fetch-site": "cross-site"}) in (403, 4403)
+    assert refused(client, SOCKET) == 0
+
+
+def test_headers_that_keep_a_page_to_its_own(client: TestClient) -> None:
+    """No third party, no framing, no guessing of kinds; what is private is not kept by caches."""
+    headers = client.get("/api/sites").headers
+    policy = headers["content-security-policy"]
+    assert "default-src 'none'" in policy and "frame-ancestors 'none'" in policy and "http" not in policy
+    assert headers["x-content-type-options"] == "nosniff" and headers["cache-control"] == "no-store"
+    assert "access-control-allow-origin" not in headers
+    assert "access-control-allow-origin" not in client.get("/api/sites", headers={"origin": "http://evil.example"}).headers
+
+
+# ---- tokens -------------------------------------------------------------------------------------------------------
+
+
+def test_tokens_are_hashes_with_roles(state: StationState) -> None:
+    """Only their holder has the secret; a revoked or expired one is nobody's."""
+    token = make_token(state, "Ada", "review")
+    assert token.rpartition("_")[2].encode() not in state.path.read_bytes()
+    holder = holder_of(state, token)
+    assert holder is not None and (holder.name, holder.role) == ("Ada", Role.REVIEW)
+    other = token.replace("sorvolo", "other")
+    for wrong in (token[:-1], token + "x", "", "sorvolo__", "x" * 500, other, "sorvolo_%_'"):
+        assert holder_of(state, wrong) is None, wrong
+    old = make_token(state, "Old", "operate", days=1e-9)
+    assert holder_of(state, old) is None
+    revoke_token(state, "Ada")
+    assert holder_of(state, token) is None and [each.name for each in list_tokens(state)] == ["Old"]
+    with pytest.raises(InputError, match="already"):
+        make_token(state, "Old", "view")
+    with pytest.raises(SettingsError, match="role"):
+        make_token(state, "New", "admin")
+
+
+def test_without_a_token_nothing_is_shown_once_there_is_one(root: Path) -> None:
+    """Also on this machine; the page itself and the way to log in are open."""
+    client, token = guarded(root)
+    with client:
+        tile = "/api/sites/field/tiles/1/18/1/1.webp"
+        for path in ("/api/status", "/api/sites", "/openapi.json", tile, "/api/events"):
+            answer = client.get(path)
+            assert answer.status_code == 401 and answer.headers["www-authenticate"] == "Bearer", path
+        assert refused(client, SOCKET) in (401, 4401)
+        assert client.get("/").status_code in (200, 404)
+        assert client.post("/api/session", json={"token": token}).status_code == 200
+        cookie = client.cookies.get("sorvolo_session")
+        assert cookie == token and client.get("/api/status").json()["role"] == "view"
+        client.cookies.clear()
+        shown = client.get("/api/status", headers={"authorization": f"Bearer {token}"})
+        assert shown.json()["name"] == "Ada"
+
+
+def test_the_cookie_is_out_of_reach_of_scripts_and_other_sites(root: Path) -> None:
+    """HttpOnly, SameSite=Strict."""
+    client, token = guarded(root)
+    with client:
+        cookie = client.post("/api/session", json={"token": token}).headers["set-cookie"]
+        assert "HttpOnly" in cookie and "samesite=strict" in cookie.lower()
+
+
+@pytest.mark.parametrize(("role", "allowed"), [("view", {"view"}), ("review", {"view", "review"})])
+def test_roles(root: Path, role: str, allowed: set[str]) -> None:
+    """Who may look cannot judge, who may judge cannot run."""
+    client, token = guarded(root, role)
+    with client:
+        client.headers["authorization"] = f"Bearer {token}"
+        review = {"kind": "change", "id": "b-1", "verdict": "confirmed", "revision": 0}
+        statuses = {
+            "view": client.get("/api/sites").status_code,
+            "review": client.post("/api/sites/field/reviews", json=review).status_code,
+            "operate": client.post("/api/runs", json={
+                "mission": "search", "site": "nowhere"}).status_code,
+        }
+        assert {name for name, status in statuses.items() if status != 403} == allowed
+        assert client.get("/api/uploads").status_code == 403
+        assert refused(client, SOCKET.replace("events", "ingest/drone")) in (403, 4403)
+
+
+def test_guessing_is_slowed_down(root: Path) -> None:
+    """After some wrong tokens not even a right one is looked at for a while; other addresses are not held up."""
+    client, token = guarded(root)
+    with client:
+        wrong = {"authorization": "Bearer sorvolo_000000000000_guess"}
+        statuses = [client.get("/api/sites", headers=wrong).status_code for _ in range(7)]
+        assert statuses[:5] == [401] * 5 and 429 in statuses[5:]
+        waiting = client.get("/api/sites", headers={"authorization": f"Bearer {token}"})
+        assert waiting.status_code == 429 and int(waiting.headers["retry-after"]) >= 1
+        assert refused(client, SOCKET, **wrong) in (429, 4429)
+
+
+def test_each_wrong_token_doubles_the_wait() -> None:
+    """Up to minutes; a right one forgives."""
+    now = [0.0]
+    guesses = Guesses(clock=lambda: now[0])
+    waits = []
+    for _ in range(20):
+        now[0] += guesses.wait_s("a")
+        guesses.note("a", right=False)
+        waits.append(guesses.wait_s("a"))
+    assert waits[:4] == [0.0] * 4 and waits[4:8] == [1.0, 2.0, 4.0, 8.0] and waits[-1] == 300.0
+    assert guesses.wait_s("b") == 0.0
+    guesses.note("a", right=True)
+    assert guesses.wait_s("a") == 0.0
+
+
+# ---- where it listens ---------------------------------------------------------------------------------------------
+
+
+def test_others_reach_it_only_with_tokens_and_tls(tmp_path: Path) -> None:
+    """Or with a word that says that the network is trusted."""
+    check_exposure(StationSettings(tmp_path), has_tokens=False)
+    check_exposure(StationSettings(tmp_path, "localhost"), has_tokens=False)
+    with pytest.raises(SettingsError, match="sorvolo token"):
+        check_exposure(StationSettings(tmp_path, "0.0.0.0", insecure_lan=True), has_tokens=False)
+    with pytest.raises(SettingsError, match="--tls-cert"):
+        check_exposure(StationSettings(tmp_path, "192.168.1.5"), has_tokens=True)
+    check_exposure(StationSettings(tmp_path, "0.0.0.0", insecure_lan=True), has_tokens=True)
+    certificate = tmp_path / "cert.pem"
+    certificate.write_text("")
+    check_exposure(StationSettings(tmp_path, "::", tls_cert=certificate, tls_key=certificate), has_tokens=True)
+    with pytest.raises(SettingsError, match="belong together"):
+        StationSettings(tmp_path, tls_cert=certificate)
+
+
+def test_the_command_refuses_in_one_line(tmp_path: Path) -> None:
+    """Not after it has listened already."""
+    result = CliRunner().invoke(command, ["serve", str(tmp_path), "--host", "0.0.0.0"])
+    assert isinstance(result.exception, SettingsError) and "sorvolo token" in str(result.exception)
+    made = CliRunner().invoke(command, ["token", str(tmp_path), "Ada", "--role", "operate"])
+    assert made.exit_code == 0 and made.output.startswith("sorvolo_")
+    result = CliRunner().invoke(command, ["serve", str(tmp_path), "--host", "0.0.0.0"])
+    assert "--insecure-lan" in str(result.exception)
+    listed = CliRunner().invoke(command, ["token", str(tmp_path)])
+    assert "Ada" in listed.output and made.output.strip() not in listed.output
+    with closing(socket.socket()) as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        result = CliRunner().invoke(command, ["serve", str(tmp_path), "--port", str(taken.getsockname()[1])])
+        assert "another program" in str(result.exception)
+
+
+# ---- paths and links ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", [
+    "/page/../app.py", "/page/..%2fapp.py", "/page/%2e%2e/state.py", "/page//etc/passwd", "/page/..\\app.py",
+    "/api/sites/..%2f..%2fetc", "/api/sites/%2e%2e", "/api/sites/..", "/api/sites/field%2f..%2f..",
+    "/api/sites/field/crops/change/..%2f..%2fsite.db/0.jpg", "/api/sites/field/flights/..%2f..%2f/video",
+    "/api/sites/field/flights/..%5c..%5csite.db/video", "/api/runs/..%2fstation.db", "/api/uploads/..%2fstation.db",
+    "/api/sites/field/tiles/..%2f1/18/1/1.webp", "/api/sites/station/tiles/1/18/1/1.webp", "/station/station.db",
+    "/api/streams/..%2f..",
+])
+def test_no_path_leads_outside(client: TestClient, path: str) -> None:
+    """Names are looked up, never followed."""
+    answer = client.get(path)
+    assert answer.status_code in (400, 404, 405), path
+    assert b"root:" not in answer.content and b"SQLite" not in answer.content and b"import" not in answer.content
+
+
+def test_links_in_a_site_are_not_followed(root: Path, tmp_path: Path) -> None:
+    """A stranger's site with a link in it is refused as a whole, and so is a picture that became a link."""
+    secret = tmp_path / "secret.jpg"
+    secret.write_bytes(b"\xff\xd8 secret")
+    with TestClient(station_app(StationSettings(root)), base_url=HOST) as client:
+        crop = "/api/sites/field/crops/change/b-1/0.jpg"
+        assert client.get(crop).status_code == 200
+        picture = root / "field/flights/b/changes/b-1-before.png"
+        picture.unlink()
+        picture.symlink_to(secret)
+        answer = client.get(crop)
+        assert answer.status_code == 409 and b"secret" not in answer.content
+    with TestClient(station_app(StationSettings(root)), base_url=HOST) as client:
+        assert client.get("/api/sites/field").status_code == 409
+        assert "link" in client.get("/api/sites").json()[0]["error"]
+
+
+def test_a_large_request_is_refused(client: TestClient) -> None:
+    """Announced, or in pieces of unknown length."""
+    large = b'{"note": "' + b"x" * 1_500_000 + b'"}'
+    assert client.post("/api/sites/field/reviews", content=large).status_code == 413
+    assert client.post("/api/sites/field/reviews", content=(large[i:i + 99_999] for i in range(0, len(large), 99_999))
+                       ).status_code == 413
+    assert client.post("/api/runs", content=large[:100], headers={"content-length": "-5"}).status_code in (400, 413)
+
+
+# ---- streams ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("url", [
+    "rtsp://127.0.0.1/live", "rtsp://localhost:554/live", "rtsp://[::1]/live", "rtsp://10.0.0.5/live",
+    "rtsp://192.168.1.1/", "rtsp://169.254.169.254/latest", "rtsp://[fe80::1]/x", "rtsp://[::ffff:127.0.0.1]/x",
+    "rtsp://0.0.0.0/x", "rtsp://224.0.0.1/x", "rtmp://[fd00::1]/live", "rtsp://2130706433/x", "rtsp://[2002:7f00:1::]/x",
+    "http://example.com/x.m3u8", "https://example.com/x", "file:///etc/passwd", "tcp://8.8.8.8:80", "concat:/etc/x",
+    "follow:/etc/passwd", "webcam:0", "/etc/passwd", "udp://:80", "udp://:5600?localaddr=10.0.0.1", "rtsp://8.8.8.8\r\nx",
+    "rtsp:///x", "srt://8.8.8.8:9000?mode=listener", "rtsp://8.8.8.8:99999/x",
+])
+def test_streams_of_the_own_network_are_not_called(url: str) -> None:
+    """Nor other schemes, nor files in disguise."""
+    with pytest.raises(Problem) as problem:
+        checked_stream(url, ())
+    assert problem.value.status == 400
+
+
+def test_a_stream_that_may_be_called_is_called_where_it_was_checked() -> None:
+    """The name is asked for once: an answer that changes afterwards changes nothing."""
+    answers = iter([["203.0.113.9"], ["127.0.0.1"]])
+    with pytest.raises(Problem):  # a documentation network is no public one
+        checked_stream("rtsp://cam.example/live", (), lambda _, __: next(answers))
+    assert checked_stream("rtsp://me:pw@cam.example:8554/live?x=1", (), lambda _, __: ["93.184.216.34"]) == (
+        "rtsp://me:pw@93.184.216.34:8554/live?x=1")
+    with pytest.raises(Problem):
+        checked_stream("rtsp://cam.example/live", (), lambda _, __: ["93.184.216.34", "10.0.0.1"])
+    assert checked_stream("rtsp://192.168.1.10/live", ("192.168.1.0/24",)) == "rtsp://192.168.1.10/live"
+    with pytest.raises(Problem):
+        checked_stream("rtsp://192.168.2.10/live", ("192.168.1.0/24",))
+    assert checked_stream("udp://:5600", ()) == "udp://:5600"
+
+
+def test_a_streams_password_is_shown_to_nobody(client: TestClient, root: Path) -> None:
+    """Not in the run, its events, its errors; on the disk for the mission's eyes alone."""
+    run = client.post("/api/runs", json={
+        "mission": "watch", "site": "field", "input": {"stream_url": "rtsp://me:secretword@127.0.0.1/live"}})
+    assert run.status_code == 400 and "secretword" not in run.text
+    inputs = client.app.state.station.inputs  # type: ignore[attr-defined]
+    from sorvolo.station.orders import InputWish
+
+    shown = inputs.shown(InputWish(stream_url="rtsp://me:secretword@93.184.216.34/live?token=secretword"))
+    assert shown == {"stream_url": "rtsp://93.184.216.34/live"}
+    assert (root / "station").stat().st_mode & 0o077 == 0
