@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterable, Mapping
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -195,7 +196,8 @@ _MISSIONS = {"map": _map, "compare": _compare, "watch": _watch, "search": _searc
 
 def _live(order: Order, *, keeps_all: bool = False) -> LiveSettings:
     """How a live source is read: a drone that sends to this station comes back, and states when its flight is over."""
-    return LiveSettings(keeps_all=keeps_all, **({"give_up_s": _DRONE_AWAY_S} if order.stream else {}))
+    settings = LiveSettings(keeps_all=keeps_all)
+    return replace(settings, give_up_s=_DRONE_AWAY_S) if order.stream else settings
 
 
 def _placed(journal: Journal, view: FrameView | None, name: str, status: str) -> None:
