@@ -12,7 +12,7 @@ demo: $(READY)
 	$(BIN)/sorvolo demo demo-site
 
 test: check $(TRAINS)
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: $(TRAINS)
 	$(BIN)/ruff check

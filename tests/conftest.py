@@ -9,6 +9,11 @@ from hypothesis import settings
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# beside other workers of the suite, a second thread of the same sum only waits; read before any library starts threads
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 # how long an example takes depends on what else the machine does: no test is judged by it. Continuous integration (CI
 # is set) draws the same examples every time, others new ones.
 settings.register_profile("anywhere", deadline=None)

@@ -24,6 +24,8 @@ class PlaceSettings:
     least_share: float = 0.08  # of the pairs; chance leaves a hundredth
     turn_deg: float = 30.0  # learned features bear half of it
     step: float = 1.35  # from scale to scale, of which they bear half as well
+    least_side_px: int = 64  # of the picture at such a scale: less shows too little
+    most_side_px: int = 4000  # more takes minutes
 
 
 def find_place(
@@ -40,7 +42,9 @@ def find_place(
         return found
     old = _known_only(learned_features(_even(*ground), 6000), ground[1])
     best: tuple[int, Matrix3] | None = None
-    for turned_from_picture, size in _turns(picture[0].shape, scales, settings):
+    # a larger picture would lie beside the ground with more of itself than may disagree
+    most_px = min(settings.most_side_px, max(ground[0].shape) / settings.least_share**0.5)
+    for turned_from_picture, size in _turns(picture[0].shape, scales, most_px, settings):
         gray = cv2.warpPerspective(_even(*picture), turned_from_picture, size, flags=cv2.INTER_AREA)
         known = cv2.warpPerspective(picture[1].astype(np.uint8), turned_from_picture, size) > 0
         new = _known_only(learned_features(gray, 3000), known)  # type: ignore[arg-type]
@@ -81,9 +85,9 @@ def _agreed(
 
 
 def _turns(
-    shape: tuple[int, ...], scales: Sequence[float], settings: PlaceSettings
+    shape: tuple[int, ...], scales: Sequence[float], most_px: float, settings: PlaceSettings
 ) -> Iterator[tuple[Matrix3, tuple[int, int]]]:
-    """turned_from_picture and the turned picture's width and height, for each scale and heading."""
+    """turned_from_picture and the turned picture's width and height, for each scale and heading of a useful size."""
     height, width = shape[:2]
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
     for scale in scales:
@@ -94,7 +98,7 @@ def _turns(
             matrix = np.eye(3)
             matrix[:2, :2], matrix[:2, 2] = linear, -low
             size = np.ceil(high - low).astype(int)
-            if size.min() >= 64 and size.max() <= 4000:
+            if size.min() >= settings.least_side_px and size.max() <= most_px:
                 yield matrix, (int(size[0]), int(size[1]))
 
 
