@@ -6,6 +6,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from sorvolo.change.relief import Relief
 from sorvolo.geometry.arrays import ImageBGR, ImageRGB, ImageRGBA, Mask, Matrix3, PointsM, Vector3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, pose_from_homography
@@ -26,12 +27,15 @@ class EarlierPictures:
     """The pictures of earlier flights, seen from where a later frame was taken.
 
     The map shows each piece of ground as one of them saw it, often from quite another side: a tree or a wall then leans
-    another way, and looks changed. `load` gives a picture by its place in `pictures`, (h, w, 4), with its alpha as
-    `with_known_pixels` sets it.
+    another way, and looks changed. With `relief` what stands on the ground is rendered from where the later frame was
+    taken; what the earlier camera did not see is then not known. `load` gives a picture by its place in `pictures`,
+    (h, w, 4), with its alpha as `with_known_pixels` sets it.
     """
 
-    def __init__(self, pictures: Sequence[EarlierPicture], load: Callable[[int], ImageRGBA]) -> None:
-        self._pictures, self._load = pictures, load
+    def __init__(
+        self, pictures: Sequence[EarlierPicture], load: Callable[[int], ImageRGBA], relief: Relief | None = None
+    ) -> None:
+        self._pictures, self._load, self._relief = pictures, load, relief
         places = []
         for each in pictures:
             pose = each.site_from_camera or pose_from_homography(each.site_from_image, each.camera)
@@ -46,19 +50,38 @@ class EarlierPictures:
         for index in self._nearest(camera_m, most):
             keyframe = self._pictures[index]
             picture = self._load(index)
-            image_from_picture = np.linalg.inv(site_from_image) @ keyframe.site_from_image
+            site_from_picture = keyframe.site_from_image
+            image_from_picture = np.linalg.inv(site_from_image) @ site_from_picture
             centre = image_from_picture @ np.array([keyframe.camera.cx_px, keyframe.camera.cy_px, 1.0])
             scale = _scale(image_from_picture, (keyframe.camera.cx_px, keyframe.camera.cy_px))
             while scale < 0.6:  # a mere interpolation would skip pixels
                 picture = _known_inside(np.asarray(cv2.pyrDown(picture), np.uint8))
-                image_from_picture = image_from_picture @ np.array([[2.0, 0, 0.0], [0, 2.0, 0.0], [0, 0, 1.0]])
+                site_from_picture = site_from_picture @ np.diag([2.0, 2.0, 1.0])
                 scale *= 2
             if centre[2] == 0:
                 continue
-            size = width_px, height_px
-            seen = cv2.warpPerspective(picture, image_from_picture, size, flags=cv2.INTER_LINEAR)
+            seen = self._rendered(
+                picture, site_from_picture, self._cameras_m[index], site_from_image, camera_m, (width_px, height_px)
+            )
             bgr = np.asarray(cv2.cvtColor(seen, cv2.COLOR_RGBA2BGR), np.uint8)
             yield bgr, np.asarray(cv2.extractChannel(seen, 3) == 255)
+
+    def _rendered(
+        self, picture: ImageRGBA, site_from_picture: Matrix3, earlier_m: Vector3, site_from_image: Matrix3,
+        camera_m: Vector3, size: tuple[int, int],
+    ) -> ImageRGBA:
+        """A picture in an image's pixels, (h, w, 4): over what stands on the ground where that is known."""
+        picture_from_site: Matrix3 = np.asarray(np.linalg.inv(site_from_picture), np.float64)
+        way = None if self._relief is None else self._relief.way(
+            site_from_image, camera_m, picture_from_site, earlier_m, size
+        )
+        if way is None:
+            image_from_picture = np.linalg.inv(site_from_image) @ site_from_picture
+            return np.asarray(cv2.warpPerspective(picture, image_from_picture, size, flags=cv2.INTER_LINEAR), np.uint8)
+        x, y, sees = way
+        seen = np.asarray(cv2.remap(picture, x, y, cv2.INTER_LINEAR), np.uint8)
+        seen[~sees] = 0
+        return seen
 
     def _nearest(self, camera_m: Vector3, most: int) -> list[int]:
         """The nearest picture and then the nearest ones that lie on the other sides of the camera."""

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Floats, Floats32, Mask, PointsM
+from sorvolo.geometry.arrays import Floats, Floats32, Mask, Matrix3, PointsM
 from sorvolo.geometry.polygons import points_inside
 from sorvolo.heights.lattice import Lattice
 
@@ -59,6 +59,18 @@ class HeightField:
             for band in (self.up_m, self.sigma_m)
         )
         return heights[: len(points_m)].astype(np.float64), sigmas[: len(points_m)].astype(np.float64)
+
+
+def standing(surface: HeightField, ground: HeightField) -> tuple[Floats32, Matrix3]:
+    """(H, W) what stands on the bare ground, m above it, 0 in holes, and the map from site metres to its cells.
+
+    What lies within two sigma of the ground is ground.
+    """
+    above_m = surface.up_m - ground.up_m
+    with np.errstate(invalid="ignore"):
+        stands = above_m > 2 * surface.sigma_m
+    cells_from_site: Matrix3 = np.asarray(np.linalg.inv(surface.lattice.site_from_cells), np.float64)
+    return np.where(stands, above_m, 0).astype(np.float32), cells_from_site
 
 
 def along(points_m: PointsM, step_m: float) -> tuple[PointsM, Floats]:

@@ -14,12 +14,14 @@ from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
 from sorvolo.change.map_update import paint_changes
 from sorvolo.change.pair.thesis import thesis_steps
 from sorvolo.change.reference import ReferenceMap
+from sorvolo.change.relief import Relief
 from sorvolo.change.shape.outlines import KnownPlace
 from sorvolo.change.shape.reported import reported
 from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome, as_bgr
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Mask
 from sorvolo.geometry.summary import median_of_known
+from sorvolo.heights.field import standing
 from sorvolo.missions.compare.extension import MapExtension
 from sorvolo.missions.compare.objects import ComparisonObjects
 from sorvolo.missions.compare.report import ViewCounts, comparison_summary, comparison_warnings
@@ -29,6 +31,7 @@ from sorvolo.missions.flight.map_objects import crops_of
 from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.missions.heights.measure import flight_with_heights, read_field
 from sorvolo.store.exports.change_files import write_pictures
 from sorvolo.store.exports.coverage_files import COVERAGE, coverage_geojson
 from sorvolo.store.exports.map_pictures import picture
@@ -36,6 +39,7 @@ from sorvolo.store.exports.plain import features_name, geojson_bytes
 from sorvolo.store.images import ImageCache
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
+from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.coverage import CoveredGround
 from sorvolo.survey.findings import Change, ComparedView, Verdict, ViewStatus
 from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
@@ -243,6 +247,7 @@ class CompareRun:
             is_local=self._archive.site().is_local,
         )
         comparison["candidates"] = None if self._evidence is None else self._evidence.outcomes()
+        comparison["heights_of"] = flight_with_heights(self._archive, but=self._setup.source.name)
         comparison["extension"] = {
             "frames": len(self._extension.frames), "shown_as_well": shown_as_well,
             "area_m2": self._extension.grown_m2(self._base_version),
@@ -267,11 +272,17 @@ def _view_maker(setup: FlightSetup, archive: Archive, settings: CompareSettings,
 
 
 def _earlier_pictures(archive: Archive, superseded: str) -> EarlierPictures:
-    """The keyframes of earlier flights; not those of a flight that the map does not show any more."""
+    """The keyframes of earlier flights, rendered over the newest heights; not those of a flight that the map does not
+    show any more."""
     keyframes = [
         each for each in archive.keyframes() if each.flight_id != superseded and each.status is Status.VISION
     ]
+    tall = flight_with_heights(archive, but=superseded)
+    relief = None if tall is None else Relief(
+        *standing(read_field(archive, tall, HeightFile.SURFACE), read_field(archive, tall, HeightFile.GROUND))
+    )
     images = ImageCache(lambda index: with_known_pixels(archive.image(keyframes[index])), _CACHE_BYTES)
     return EarlierPictures(
-        [EarlierPicture(each.camera, each.site_from_image, each.site_from_camera) for each in keyframes], images.get
+        [EarlierPicture(each.camera, each.site_from_image, each.site_from_camera) for each in keyframes], images.get,
+        relief,
     )

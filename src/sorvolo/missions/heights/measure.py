@@ -116,6 +116,18 @@ def read_field(archive: Archive, flight_id: str, file: HeightFile) -> HeightFiel
     return HeightField(Lattice.at(site_grid, read.first, columns, rows), read.bands[0], read.bands[-1])
 
 
+def flight_with_heights(archive: Archive, but: str) -> str | None:
+    """The newest flight, `but` one, that has heights of its present map; None where there is none."""
+    for version in reversed(archive.versions()):
+        flight_id = version.flight_id
+        keyframes = archive.keyframes(flight_id)
+        if flight_id == but or not keyframes or not archive.height_path(flight_id, HeightFile.REPORT).exists():
+            continue
+        if _report(archive, flight_id)["run"] == run_of(keyframes):
+            return flight_id
+    return None
+
+
 def _report(archive: Archive, flight_id: str) -> Mapping[str, Any]:
     folder = archive.flight_folder(flight_id)
     try:
