@@ -9,7 +9,7 @@ from sorvolo.geometry.homography import apply_homography, fit_similarity, site_f
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.mosaic.keyframes import Keyframes
-from sorvolo.mosaic.planar import KnownKeyframe, PlanarMapper
+from sorvolo.mosaic.planar import KnownKeyframe, PlanarMapper, PlanarSettings
 from sorvolo.mosaic.pose_graph import PoseGraphSettings
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Status
@@ -99,6 +99,19 @@ def test_a_flight_is_placed_by_vision(has_gps):
     assert max(mapper.residuals_px(CAMERA).values()) < 0.5
     assert np.isfinite(mapper.path_m()).all()
     assert len(mapper.exposure().gains) == 12
+    assert mapper.recent_exposure().gains.keys() == mapper.exposure().gains.keys()
+
+
+def test_while_a_flight_goes_on_gains_come_from_its_newest_links():
+    rng, poses = np.random.default_rng(2), flown(2)[:6]
+    mapper = PlanarMapper(PoseGraphSettings(), PlanarSettings(recent_links=2))
+    for k, pose in enumerate(poses):
+        mapper.add(k, CAMERA, seen(pose, seed=k), measured(pose, rng))
+    recent = mapper.recent_exposure()
+    assert 5 in recent.gains
+    assert 0 not in recent.gains
+    assert len(mapper.exposure().updated(recent).gains) == 6
+    assert (mapper.exposure().updated(recent).gains_of(5) == recent.gains_of(5)).all()
 
 
 def test_a_flight_with_next_to_no_memory_is_placed_as_with_plenty():
