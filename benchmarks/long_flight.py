@@ -70,7 +70,6 @@ def fly(source: "DrawnFlight", site: Path, settings: MapSettings, minutes: float
     until_s = time.monotonic() + 60 * minutes
     add_s: list[float] = []
     resident_mb: list[float] = []
-    marks = []
     with Archive.open(site, write=True) as archive:
         setup = prepare(source, settings, None, telemetry_named=False)
         with PlanarRun(setup, archive, settings) as run:
@@ -82,10 +81,7 @@ def fly(source: "DrawnFlight", site: Path, settings: MapSettings, minutes: float
                 resident_mb.append(now_mb())
                 if len(add_s) % 250 == 0:
                     print(len(add_s), f"{np.mean(add_s[-250:]) * 1e3:.1f} ms", f"{now_mb():.0f} MB", file=sys.stderr)
-                if len(add_s) - 50 in MARKS:
-                    marks.append(mark_at(len(add_s) - 50, add_s, resident_mb))
-            if len(add_s) in MARKS:
-                marks.append(mark_at(len(add_s), add_s, resident_mb))
+            marks = [mark_at(each, add_s, resident_mb) for each in MARKS if each <= len(add_s)]
             growing_mb, started_s = peak_mb(), time.process_time()
             placed = run.complete()
             finish_s = time.process_time() - started_s
@@ -109,8 +105,7 @@ def mark_at(count: int, add_s: list[float], resident_mb: list[float]) -> dict[st
     around = np.array(add_s[max(0, count - 50):count + 50]) * 1e3
     return {
         "keyframe": count, "median_ms": float(np.median(around)), "mean_ms": float(np.mean(around)),
-        "largest_ms": float(np.max(around)), "resident_mb": float(np.mean(resident_mb[-50:])),
-        "peak_mb": peak_mb(),
+        "largest_ms": float(np.max(around)), "resident_mb": float(np.mean(resident_mb[max(0, count - 50):count])),
     }
 
 
