@@ -102,7 +102,7 @@ class Draw {
     fill(this.live,
       el("p", { class: "measure" }, closed ? words.area(area_m2(points)) : words.length(length_m(points)),
         closed ? el("small", {}, ` around ${words.length(length_m([...points, points[0]]))}`) : null),
-      el("div", { class: "row" }, button("Done", () => this.finish(), { class: "main" }),
+      el("div", { class: "row wrap" }, button("Done", () => this.finish(), { class: "main" }),
         button("Remove last point", () => { this.points.pop(); this.pointer = null; this.sketch(); }, { class: "quiet" }), button("Cancel", () => this.take(null), { class: "quiet" })));
   }
 

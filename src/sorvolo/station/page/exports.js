@@ -32,6 +32,7 @@ export function exportPanel(screen, body) {
   }
 
   async function load() {
+    fill(files, el("p", { class: "soft" }, "Looking…"));
     try {
       const list = await get(siteUrl(screen.data.id, "exports"));
       fill(files, list.length ? el("ul", { class: "plain files" }, list.map((each) => el("li", {},
@@ -108,9 +109,9 @@ export function kml(name, features) {
   return `<?xml version="1.0" encoding="UTF-8"?>\n${new XMLSerializer().serializeToString(doc)}`;
 }
 
-function print(screen) {
+async function print(screen) {
   const features = shownFeatures(screen);
-  const picture = screen.view ? el("img", { alt: "The map", src: screen.view.map.getCanvas().toDataURL("image/png") }) : null;
+  const picture = screen.view ? el("img", { alt: "The map", src: await screen.view.picture() }) : null;
   const sheet = el("section", { class: "sheet" }, el("h1", {}, screen.data.detail.name), el("p", {}, new Date().toLocaleString("en-GB")), picture,
     el("table", {}, el("thead", {}, el("tr", {}, ["Id", "What", "Place", "Score", "Verdict", "Note"].map((each) => el("th", {}, each)))),
       el("tbody", {}, features.map((each) => el("tr", {}, [each.id, each.properties.name ?? titleOf(each), place(middleOf(each.geometry), { local: screen.data.detail.is_local }), each.properties.score ? Math.round(each.properties.score * 100) : "",

@@ -25,7 +25,7 @@ function cardOf(screen, feature) {
   return [
     el("div", { class: "card-head" }, badge(feature), el("h3", {}, titleOf(feature)),
       el("button", { type: "button", class: "quiet close", "aria-label": "Close", on: { click: () => screen.data.choose(null) } }, "×")),
-    pictures(screen.data.id, feature),
+    pictures(feature),
     verdictForm(screen, feature),
     facts(feature, screen.data.detail.is_local),
     el("div", { class: "row wrap" },
@@ -46,9 +46,11 @@ export function badge(feature) {
 }
 
 /** The pictures of a feature: before and after of a change, the best view of an object. */
-export function pictures(site, feature) {
+export function pictures(feature) {
   const names = isChange(feature) ? ["before", "after"] : ["best view"];
-  return el("div", { class: `pictures n${names.length}` }, cropsOf(site, feature).map((src, k) =>
+  const crops = cropsOf(feature);
+  if (!crops.length) return el("p", { class: "hint" }, "Pictures come when the mission has ended.");
+  return el("div", { class: `pictures n${names.length}` }, crops.map((src, k) =>
     el("figure", {}, picture(src, `${titleOf(feature)}, ${names[k] ?? ""}`), el("figcaption", {}, names[k] ?? ""))));
 }
 

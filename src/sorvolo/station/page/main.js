@@ -56,9 +56,12 @@ function listen() {
 async function route() {
   turn += 1;
   const mine = turn;
-  const [, kind, id, view] = location.hash.split("/").map(decodeURIComponent);
+  const [path, query] = location.hash.split("?");
+  const [, kind, id, view] = path.split("/").map(decodeURIComponent);
+  const at = (new URLSearchParams(query).get("at") ?? "").split(",").map(Number); // a link to a place
   screen?.close?.();
   screen = null;
+  for (const each of document.querySelectorAll("dialog")) if (each !== loginBox) each.close();
   fill(numbers);
   fill(title);
   document.body.dataset.screen = kind === "site" && id ? "site" : "sites";
@@ -66,7 +69,7 @@ async function route() {
     let made;
     if (kind === "site" && id) {
       const { showSite } = await import("./site.js");
-      made = await showSite(main, title, numbers, station, id, view || "map");
+      made = await showSite(main, title, numbers, station, id, view || "map", at.length === 2 && at.every(Number.isFinite) ? at : null);
     } else {
       made = await showSites(main, title, station);
     }

@@ -33,7 +33,7 @@ export class MapView {
     this.map = new maplibre.Map({
       container, style, attributionControl: false, maxZoom: 24, dragRotate: true, fadeDuration: 0, boxZoom: false, maxTileCacheSize: 0,
       ...(site.bounds_wgs84 ? { bounds: site.bounds_wgs84, fitBoundsOptions: { padding: 30 } } : { center: [0, 20], zoom: 1.5 }),
-      transformRequest: (url) => ({ url: this.tileAddress(url) }), canvasContextAttributes: { preserveDrawingBuffer: true },
+      transformRequest: (url) => ({ url: this.tileAddress(url) }),
       locale: { "Map.Title": "Map of the site. Arrow keys move it, plus and minus zoom." },
     });
     this.map.on("error", (event) => { if (event.error && event.error.status !== 404) console.warn(event.error.message); });
@@ -132,6 +132,14 @@ export class MapView {
     const layers = ["objects", "changes-fill", "changes-line", "drawings-fill", "drawings-point"].filter((id) => this.map.getLayer(id));
     const box = [[point.x - 6, point.y - 6], [point.x + 6, point.y + 6]];
     return this.map.queryRenderedFeatures(box, { layers });
+  }
+
+  /** The map as a picture, PNG in a data URL: taken while it is drawn, since nothing keeps it afterwards. */
+  picture() {
+    return new Promise((done) => {
+      this.map.once("render", () => done(this.map.getCanvas().toDataURL("image/png")));
+      this.map.triggerRepaint();
+    });
   }
 
   /** Move to a [lon, lat] or to bounds. */

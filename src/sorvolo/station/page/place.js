@@ -8,36 +8,41 @@ import * as words from "./words.js";
 /** The panel's life; `look(place)` asks for a [lon, lat]. */
 export function placePanel(screen, body) {
   let turn = 0;
+  let shown = null;
+  let drawn = ""; // what of the page's state the list was last drawn with
   let last = screen.lastPlace ?? null;
   const hint = el("p", { class: "hint" }, "Tap the ground on the map: every flight that saw it, in order, what changed there and who said so.");
 
   async function look(place) {
     turn += 1;
     const mine = turn;
+    shown = null;
     last = screen.lastPlace = place;
+    history.replaceState(null, "", `#/site/${encodeURIComponent(screen.data.id)}/place?at=${place.map((each) => each.toFixed(7)).join(",")}`);
     mark(screen, place);
     fill(body, el("p", { class: "place-name" }, words.place(place, { local: screen.data.detail.is_local })), el("p", { class: "soft" }, "Looking through the flights…"));
     let views;
     try {
-      const answer = await get(`${siteUrl(screen.data.id, "place")}?lon=${place[0]}&lat=${place[1]}`);
-      views = Array.isArray(answer) ? answer : answer.views ?? answer.items ?? [];
+      views = await get(`${siteUrl(screen.data.id, "place")}?lon=${place[0]}&lat=${place[1]}`);
     } catch (problem) {
-      if (mine === turn) fill(body, el("p", { class: "hint" }, problem.status === 404 ? "No flight saw this place." : `${problem.title}. ${problem.detail}`));
+      if (mine === turn) fill(body, el("p", { class: "hint" }, `${problem.title}. ${problem.detail}`));
       return;
     }
-    if (mine === turn) show(place, views);
+    if (mine !== turn) return;
+    shown = views;
+    show(place, views);
   }
 
   function show(place, views) {
     const flights = new Map();
     for (const each of views) flights.set(each.flight, [...(flights.get(each.flight) ?? []), each]);
-    const found = unique(views.flatMap((each) => each.changes ?? []));
-    const said = unique(views.flatMap((each) => each.reviews ?? []), (each) => `${each.kind}${each.id}${each.revision}`);
+    const found = unique(views.flatMap((each) => [...each.changes, ...each.objects]));
+    const said = unique(views.flatMap((each) => each.reviews), (each) => `${each.id} ${each.at}`);
     fill(body,
       el("div", { class: "row" }, el("p", { class: "place-name" }, words.place(place, { local: screen.data.detail.is_local })), copyButton(place)),
       views.length ? el("p", { class: "soft" }, `${words.counted(views.length, "view")} in ${words.counted(flights.size, "flight")}, first ${words.time(views[0].time)}`)
         : el("p", { class: "hint" }, "No flight saw this place."),
-      found.length ? el("section", {}, el("h3", {}, "What happened here"), el("ul", { class: "plain" }, found.map((each) => change(screen, each)))) : null,
+      found.length ? el("section", {}, el("h3", {}, "What was found here"), el("ul", { class: "plain" }, found.map((each) => change(screen, each)))) : null,
       said.length ? el("section", {}, el("h3", {}, "Reviews"), el("ul", { class: "plain" }, said.map(review))) : null,
       [...flights].map(([flight, list]) => el("section", { class: "dates" },
         el("h3", {}, words.day(list[0].time), el("small", {}, ` ${flight}`)),
@@ -46,7 +51,16 @@ export function placePanel(screen, body) {
 
   if (last) look(last);
   else fill(body, hint);
-  return { look, cursor: "crosshair", click(place, hits) { if (hits.some((each) => each.source === "objects")) return false; look(place); return true; },
+  return { look, refresh() {
+      const now = `${words.place(last ?? [0, 0])} ${screen.data.all.changes.length} ${screen.data.all.objects.length}`;
+      if (shown && now !== drawn) show(last, shown);
+      drawn = now;
+    }, cursor: "crosshair", click(place, hits) {
+      if (hits.some((each) => each.source === "objects")) return false;
+      screen.data.choose(null);
+      look(place);
+      return true;
+    },
     close() { mark(screen, null); } };
 }
 
@@ -58,12 +72,12 @@ function unique(list, key = (each) => each.id ?? each) {
   return [...new Map(list.map((each) => [key(each), each])).values()];
 }
 
+/** A change or an object of the place's list. `each`: as the station's memory states it. */
 function change(screen, each) {
-  const id = typeof each === "string" ? each : each.id;
-  const feature = screen.data.find(id);
-  const values = feature?.properties ?? each.properties ?? each;
-  const text = [values.first_seen ? `${words.day(values.first_seen)}: ` : "", values.kind ? words.changeWords(values) : id];
-  return el("li", {}, feature ? button(text.join(""), () => screen.data.choose(feature), { class: "link" }) : text);
+  const feature = screen.data.find(each.id);
+  const what = each.type === "change" ? words.changeWords(feature?.properties ?? each) : `${each.class} found`;
+  const text = `${words.day(each.first_seen)}: ${what}`;
+  return el("li", {}, feature ? button(text, () => screen.data.choose(feature), { class: "link" }) : text, ` (${each.id})`);
 }
 
 function review(each) {
@@ -71,9 +85,9 @@ function review(each) {
 }
 
 function view(screen, each) {
-  const jump = each.video_s === null || each.video_s === undefined ? null
+  const jump = each.video_s === null || !each.video_url ? null
     : button(`▶ ${words.duration(each.video_s)}`, () => screen.video.jump(each), { class: "quiet", title: "Show the video at this second" });
-  return el("li", {}, picture(each.crop_url, `Seen ${words.time(each.time)}`), el("span", {}, words.clock(each.time)), jump);
+  return el("li", {}, each.crop_url ? picture(each.crop_url, `Seen ${words.time(each.time)}`) : el("div", { class: "gone" }, "no picture kept"), el("span", {}, words.clock(each.time)), jump);
 }
 
 function copyButton(place) {

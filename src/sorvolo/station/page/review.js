@@ -53,7 +53,7 @@ class Review {
       el("div", { class: "segments", role: "group", "aria-label": "What to review" }, ["changes", "objects"].map((what) =>
         el("button", { type: "button", "aria-pressed": String(what === this.what), on: { click: () => { this.what = what; this.at = null; this.refresh(); } } },
           `${what === "changes" ? "Changes" : "Objects"} (${this.screen.data.shown(what).length})`))),
-      el("div", { class: "row" }, choice(Object.entries(ORDERS).map(([key, [words]]) => [key, words]), this.order,
+      el("div", { class: "review-order" }, choice(Object.entries(ORDERS).map(([key, [words]]) => [key, words]), this.order,
         (order) => { this.order = order; this.refresh(); }, { "aria-label": "Order" }),
         tick("only open ones", this.open, (open) => { this.open = open; this.refresh(); })),
       all.length ? el("div", { class: "progress" }, el("progress", { max: all.length, value: done, "aria-label": "Reviewed" }), el("span", {}, `${done} of ${all.length} reviewed`)) : null,
@@ -64,7 +64,7 @@ class Review {
     const chosen = feature.id === this.at;
     const words = { confirmed: "check", rejected: "cross" }[feature.properties.review];
     return el("li", {}, el("button", { type: "button", "aria-current": chosen ? "true" : null, data: { id: feature.id }, class: feature.properties.review ?? "open", on: { click: () => this.choose(feature.id) } },
-      picture(cropsOf(this.screen.data.id, feature).at(-1), ""),
+      cropsOf(feature).length ? picture(cropsOf(feature).at(-1), "") : el("div", { class: "gone" }, "no picture yet"),
       el("span", { class: "name" }, badge(feature), titleOf(feature)),
       words ? el("span", { class: "mark" }, icon(words), el("span", { class: "sr" }, feature.properties.review)) : null));
   }
@@ -78,7 +78,7 @@ class Review {
     }
     this.drawn = this.at;
     const feature = list[at];
-    this.pictures = pictures(this.screen.data.id, feature);
+    this.pictures = pictures(feature);
     fill(this.big,
       el("div", { class: "gallery-head" }, badge(feature), el("h3", {}, titleOf(feature)), el("span", { class: "soft" }, `${at + 1} of ${list.length}`),
         button("Previous", () => this.step(-1), { class: "quiet", "aria-keyshortcuts": "K" }), button("Next", () => this.step(1), { class: "quiet", "aria-keyshortcuts": "J" })),

@@ -26,12 +26,12 @@ const PANELS = [
 ];
 
 /** Show a site; gives what closes it. */
-export async function showSite(main, title, numbers, station, id, view) {
+export async function showSite(main, title, numbers, station, id, view, at = null) {
   const detail = await get(siteUrl(id)).catch((problem) => {
     if (problem.status === 404 && view === "missions") return notMadeYet(id);
     throw problem;
   });
-  return new SiteScreen(main, title, numbers, station, new SiteData(detail), view);
+  return new SiteScreen(main, title, numbers, station, new SiteData(detail), view, at);
 }
 
 function notMadeYet(id) {
@@ -39,8 +39,8 @@ function notMadeYet(id) {
 }
 
 class SiteScreen {
-  constructor(main, title, numbers, station, data, view) {
-    Object.assign(this, { station, data, numbers, ends: [] });
+  constructor(main, title, numbers, station, data, view, at) {
+    Object.assign(this, { station, data, numbers, ends: [], lastPlace: at });
     this.stage = el("section", { class: "stage", "aria-label": "Map" });
     this.panel = el("section", { class: "panel", id: "panel", tabindex: -1 });
     this.canvas = el("div", { class: "map-canvas" });
@@ -92,6 +92,7 @@ class SiteScreen {
       await this.view.ready;
       const { live_revision: live, versions } = this.data.detail;
       this.view.showVersion(live ? `live-${live}` : versions.at(-1)?.n);
+      if (this.lastPlace) this.view.go(this.lastPlace);
     }
     if (!this.data.detail.is_new) await this.data.load();
     if (this.closed) return;

@@ -86,9 +86,5 @@ export class SiteData extends EventTarget {
 /** Whether a feature is a change; else it is an object. */
 export const isChange = (feature) => feature.properties.kind !== undefined;
 
-/** The addresses of a feature's pictures. */
-export function cropsOf(site, feature) {
-  if (feature.properties.crops) return feature.properties.crops;
-  const kind = isChange(feature) ? "change" : "object";
-  return (kind === "change" ? [0, 1] : [0]).map((n) => siteUrl(site, "crops", kind, encodeURIComponent(feature.id), `${n}.jpg`));
-}
+/** The addresses of a feature's pictures: none while the mission that announced it runs. */
+export const cropsOf = (feature) => feature.properties.crops ?? [];

@@ -1,0 +1,92 @@
+"""A real Chromium before a real station: what the tests of the page share. Skips by name where either is missing."""
+
+import json
+import shutil
+import threading
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+
+from sorvolo.station.app import station_app
+from sorvolo.station.settings import StationSettings
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or ""
+FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+    "--disable-background-networking", "--disable-component-update", "--mute-audio",
+)
+WAIT_MS = 20_000
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """Debian's Chromium without a window."""
+    if not CHROMIUM:
+        pytest.skip("no Chromium on this machine (Debian: apt-get install chromium)")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+        yield browser
+        browser.close()
+
+
+class Served:
+    """A station at a port of its own, in a thread; `station` is its record."""
+
+    def __init__(self, root: Path) -> None:
+        app = station_app(StationSettings(root))
+        self.station = app.state.station
+        config = uvicorn.Config(app, "127.0.0.1", 0, log_level="error", ws="websockets-sansio", ws_max_size=16_000_000)
+        self.server = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self.server.run, daemon=True)
+
+    def __enter__(self) -> "Served":
+        self._thread.start()
+        while not self.server.started:
+            assert self._thread.is_alive()
+        self.port = self.server.servers[0].sockets[0].getsockname()[1]
+        self.url = f"http://127.0.0.1:{self.port}"
+        return self
+
+    def ask(self, path: str, method: str = "GET", body: object = None) -> Any:
+        """The JSON that the station answers to somebody else's program. Raises HTTPError."""
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(self.url + path, data, {"content-type": "application/json"}, method=method)
+        with urllib.request.urlopen(request) as answer:
+            return json.load(answer)
+
+    def __exit__(self, *_: object) -> None:
+        self.server.should_exit = True
+        self._thread.join(10)
+
+
+class Watched:
+    """A page that notes what must not happen: errors in the console, requests to anybody else."""
+
+    def __init__(self, context: Any, url: str) -> None:
+        self.page = context.new_page()
+        self.page.set_default_timeout(WAIT_MS)
+        self.faults: list[str] = []
+        self.bytes = 0
+        self._url = url
+        self.page.on("console", self._heard)
+        self.page.on("pageerror", lambda error: self.faults.append(f"uncaught: {error}"))
+        self.page.on("request", self._asked)
+        self.page.on("response", self._answered)
+
+    def _heard(self, message: Any) -> None:
+        if message.type in ("error", "warning") and "GPU stall" not in message.text:
+            self.faults.append(f"{message.type}: {message.text} {message.location.get('url', '')}")
+
+    def _asked(self, request: Any) -> None:
+        if not request.url.startswith((self._url, "blob:", "data:", self._url.replace("http", "ws"))):
+            self.faults.append(f"asked a third party: {request.url}")
+
+    def _answered(self, response: Any) -> None:
+        self.bytes += int(response.headers.get("content-length", 0))

@@ -1,0 +1,402 @@
+"""The page in a real Chromium before a real station: what a crew does with it, and what must never happen."""
+
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra `station` is not installed")
+pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+
+import numpy as np
+from browsers import Served, Watched, chromium
+from playwright.sync_api import expect
+from stream_flights import write_track, write_video
+from test_stream_messages import units
+from websockets.sync.client import connect
+
+from sorvolo.station.events import NewEvent
+from sorvolo.station.messages import Hello, Kind, Message
+from sorvolo.station.tokens import make_token
+from sorvolo.store.exports.change_files import crop_names
+from sorvolo.store.images import png_from_rgba
+
+AXE = (Path(__file__).parent / "vendor" / "axe.min.js").read_text(encoding="utf-8")
+MOST_BYTES = 2_500_000  # of the page, cold
+PANELS = ("map", "review", "compare", "place", "draw", "missions", "export")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def served(made_site: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    root = tmp_path_factory.mktemp("served")
+    shutil.copytree(made_site, root / "field")
+    crops = root / "field" / "flights" / "b" / "changes"
+    crops.mkdir(exist_ok=True)
+    for number in range(4):
+        for name in crop_names(f"b-{number}"):
+            (crops / name).write_bytes(png_from_rgba(np.full((32, 32, 4), 90 + 20 * number, np.uint8)))
+    with Served(root) as station:
+        yield station
+
+
+@pytest.fixture(scope="module")
+def crew(browser: Any, served: Served) -> Iterator[Watched]:
+    context = browser.new_context(viewport={"width": 1000, "height": 640}, accept_downloads=True)
+    yield Watched(context, served.url)
+    context.close()
+
+
+@pytest.fixture
+def opened(crew: Watched, served: Served) -> Iterator[Watched]:
+    """The site's screen; nothing wrong may have been noted at the end."""
+    crew.faults.clear()
+    crew.page.goto(f"{served.url}/#/")
+    crew.page.locator(".card").wait_for()
+    show(crew, served)
+    yield crew
+    crew.page.unroute_all()
+    assert crew.faults == []
+
+
+def show(watched: Watched, served: Served, panel: str = "map") -> None:
+    watched.page.goto(f"{served.url}/#/site/field/{panel}")
+    watched.page.locator(".figure", has_text="matched").wait_for()
+    watched.page.locator(".maplibregl-canvas").first.wait_for()
+
+
+def changes(served: Served) -> list[dict[str, Any]]:
+    return served.ask("/api/sites/field/collections/changes/items")["features"]
+
+
+def announce(served: Served, kind: str, data: dict[str, Any]) -> None:
+    served.station.events.append(NewEvent(kind, data, "field", "run-1"))
+
+
+def test_a_cold_page_is_small_and_lists_the_sites(browser: Any, served: Served) -> None:
+    context = browser.new_context()
+    watched = Watched(context, served.url)
+    watched.page.goto(served.url)
+    watched.page.locator(".card a").click()
+    watched.page.get_by_text("Changes: 4").wait_for()
+    assert watched.page.title() == "field – Sorvolo"
+    assert 1_500_000 < watched.bytes < MOST_BYTES
+    assert watched.faults == []
+    context.close()
+
+
+def test_an_empty_station_leads_to_a_first_flight(browser: Any, tmp_path: Path) -> None:
+    with Served(tmp_path) as empty:
+        watched = Watched(browser.new_context(), empty.url)
+        watched.page.goto(empty.url)
+        watched.page.get_by_text("sorvolo demo").wait_for()
+        watched.page.get_by_label("Name of a new site").fill("meadow")
+        watched.page.get_by_role("button", name="New site").click()
+        watched.page.get_by_text("Start a mission").wait_for()
+        assert watched.page.get_by_role("combobox", name="Mission").input_value() == "map"
+        watched.page.context.close()
+
+
+def test_changes_are_judged_with_the_keyboard_and_others_see_it(
+    browser: Any, served: Served, opened: Watched
+) -> None:
+    other = Watched(browser.new_context(), served.url)
+    show(other, served, "review")
+    page = opened.page
+    page.keyboard.press("2")
+    first = page.locator(".strip [aria-current]").get_attribute("data-id")
+    page.keyboard.press("n")
+    page.keyboard.type("seen on foot")
+    page.keyboard.press("Enter")
+    page.locator(".gallery .said", has_text="seen on foot").wait_for()
+    page.keyboard.press("c")
+    other.page.locator(f".strip button.confirmed[data-id='{first}']").wait_for()
+    page.locator(f".strip [aria-current]:not([data-id='{first}'])").wait_for()  # the next one is up
+    page.keyboard.press("k")
+    page.keyboard.press("u")
+    other.page.locator(f".strip button.open[data-id='{first}']").wait_for()
+    kept = next(each["properties"] for each in changes(served) if each["id"] == first)
+    assert (kept["review"], kept["note"], kept["revision"]) == ("none", "seen on foot", 3)
+    assert other.faults == []
+    other.page.context.close()
+
+
+def test_a_verdict_that_came_first_is_shown_and_not_overwritten(browser: Any, served: Served) -> None:
+    context = browser.new_context()
+    watched = Watched(context, served.url)
+    watched.page.route_web_socket(re.compile("/api/events"), lambda _: None)  # a page that hears nothing
+    show(watched, served, "review")
+    watched.page.locator(".gallery h3").wait_for()
+    chosen = watched.page.locator(".strip [aria-current]").get_attribute("data-id")
+    now = next(each["properties"]["revision"] for each in changes(served) if each["id"] == chosen)
+    theirs = {"kind": "change", "id": chosen, "verdict": "confirmed", "note": "my car", "revision": now}
+    served.ask("/api/sites/field/reviews", "POST", theirs)
+    watched.page.keyboard.press("r")
+    watched.page.locator(".message.warning", has_text="was quicker: confirmed, “my car”").wait_for()
+    assert next(each["properties"]["review"] for each in changes(served) if each["id"] == chosen) == "confirmed"
+    watched.page.keyboard.press("r")  # seen, and still meant
+    watched.page.locator(f".strip button.rejected[data-id='{chosen}']").wait_for()
+    assert [each for each in watched.faults if "409" not in each] == []
+    context.close()
+
+
+def test_before_and_after_are_swiped_and_blinked(opened: Watched) -> None:
+    page = opened.page
+    page.keyboard.press("3")
+    page.locator(".before-map .maplibregl-canvas").wait_for()
+    edge = page.get_by_label("Swipe between before and after")
+    edge.fill("20")
+    assert "80%" in page.locator(".before-map").evaluate("each => each.style.clipPath")
+    box = page.locator(".swipe-edge").bounding_box()
+    page.mouse.move(box["x"] + 17, box["y"] + 200)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 217, box["y"] + 200)
+    page.mouse.up()
+    assert float(edge.input_value()) > 40
+    page.keyboard.press("b")
+    for names in ("Before", "After"):
+        page.locator(".swipe-names", has_text=names).wait_for()
+    page.locator(".timeline .mark").first.click()
+    assert page.get_by_role("combobox", name="After").input_value() == "1"
+    page.get_by_text("0 changes").wait_for()
+    page.keyboard.press("1")
+    assert page.locator(".before-map").count() == 0
+
+
+def test_a_flight_is_followed_live(served: Served, opened: Watched) -> None:
+    page = opened.page
+    lon, lat = changes(served)[0]["geometry"]["coordinates"][0][0]
+    ring = [[lon - 1e-4, lat - 1e-4], [lon + 1e-4, lat - 1e-4], [lon + 1e-4, lat + 1e-4], [lon - 1e-4, lat - 1e-4]]
+    zone = {"type": "Feature", "id": "z", "geometry": {"type": "Polygon", "coordinates": [ring]},
+            "properties": {"purpose": "alert", "name": "Camp"}}
+    served.ask("/api/sites/field/drawings", "PUT", {"revision": 0, "features": [zone]})
+    page.locator("[data-panel=draw]").click()
+    page.locator(".drawn input[aria-label=Name]").wait_for()
+    announce(served, "run.started", {"id": "run-1"})
+    announce(served, "frame.placed", {
+        "status": "vision", "footprint": ring, "position": [lon, lat], "height_m": 40, "heading_deg": 10,
+        "time": "2024-05-01T10:00:00Z",
+    })
+    announce(served, "run.progress", {"frames": 9, "selected": 5, "matched": 3, "frames_per_second": 7.5})
+    page.locator(".figure", has_text="frames/s").get_by_text("7.5").wait_for()
+    page.locator(".figure", has_text="rejected").get_by_text("2").wait_for()
+    with page.expect_request(re.compile("/tiles/live-abc123/")):
+        around = [lon - 1e-3, lat - 1e-3, lon + 1e-3, lat + 1e-3]
+        announce(served, "map.tiles", {"revision": "abc123", "bounds": around})
+    hostile = "<img src=x onerror=window.pwned=1>"
+    announce(served, "object.found", {"feature": {
+        "type": "Feature", "id": "o1", "geometry": {"type": "Point", "coordinates": [lon + 5e-5, lat - 5e-5]},
+        "properties": {"id": "o1", "class": hostile, "score": 0.9},
+    }})
+    alert = page.locator(".message.alert", has_text="Camp")
+    alert.wait_for()
+    assert hostile in alert.inner_text()
+    alert.get_by_role("button", name="Show").click()
+    page.locator("[data-panel=map]").click()
+    page.locator(".card-over h3", has_text="onerror").wait_for()
+    page.wait_for_timeout(100)
+    assert page.evaluate("window.pwned") is None
+    announce(served, "run.finished", {"headline": "all done"})
+    page.locator(".message", has_text="all done").wait_for()
+
+
+def test_a_page_that_slept_asks_from_its_last_event_and_gets_each_once(browser: Any, served: Served) -> None:
+    context = browser.new_context()
+    watched = Watched(context, served.url)
+    sockets: list[Any] = []
+
+    def passed_on(socket: Any) -> None:
+        sockets.append(socket)
+        socket.connect_to_server()
+
+    watched.page.route_web_socket(re.compile("/api/events"), passed_on)
+    show(watched, served)
+    watched.page.locator("#link-state.live").wait_for()
+    announce(served, "run.failed", {"error": "the lens is wet"})
+    watched.page.locator(".message", has_text="the lens is wet").wait_for()
+    last = served.station.events.last
+    sockets[0].close()
+    announce(served, "run.failed", {"error": "the battery is empty"})
+    watched.page.locator(".message", has_text="the battery is empty").wait_for()
+    watched.page.wait_for_timeout(300)
+    assert watched.page.locator(".message", has_text="the battery is empty").count() == 1
+    assert sockets[1].url.endswith(f"after={last}")
+    assert watched.faults == []
+    context.close()
+
+
+def test_a_place_is_remembered(served: Served, opened: Watched) -> None:
+    page = opened.page
+    frame = served.ask("/api/sites/field/collections/frames/items")["features"][1]["geometry"]["coordinates"][0]
+    lon, lat = np.mean(frame[:4], axis=0)
+    page.goto(f"{served.url}/#/site/field/place?at={lon},{lat}")  # a link that somebody sent
+    page.locator(".film li").first.wait_for()
+    page.get_by_text("in 2 flights").wait_for()
+    box = page.locator(".map-canvas").bounding_box()
+    before = page.locator(".place-name").inner_text()
+    page.mouse.click(box["x"] + box["width"] / 2 + 30, box["y"] + box["height"] / 2)
+    expect(page.locator(".place-name")).not_to_have_text(before)
+    page.locator("#settings-button").click()
+    page.get_by_label("Coordinates").select_option("mgrs")
+    page.get_by_role("button", name="Close", exact=True).click()
+    expect(page.locator(".place-name")).to_have_text(re.compile(r"^33T[A-Z]{2} \d{5} \d{5}$"))
+
+
+def test_what_is_drawn_is_measured_and_shared(browser: Any, served: Served, opened: Watched) -> None:
+    page = opened.page
+    page.keyboard.press("5")
+    page.locator("[data-tool=interest]").click()
+    box = page.locator(".map-canvas").bounding_box()
+    for x, y in ((0.35, 0.35), (0.65, 0.35), (0.65, 0.65), (0.35, 0.65)):
+        page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+        page.wait_for_timeout(350)  # two quick clicks would be a double click
+    assert re.search(r"\d+(\.\d+)? m²", page.locator(".measure").inner_text())
+    page.keyboard.press("Enter")
+    page.locator(".drawn li").first.wait_for()
+    kept = served.ask("/api/sites/field/drawings")["features"]
+    assert "interest" in {each["properties"]["purpose"] for each in kept}
+    other = Watched(browser.new_context(), served.url)
+    show(other, served, "draw")
+    other.page.locator(".drawn li").first.wait_for()
+    assert other.faults == []
+    other.page.context.close()
+
+
+def test_what_is_shown_can_be_taken_away(opened: Watched, tmp_path: Path) -> None:
+    page = opened.page
+    page.keyboard.press("7")
+    page.locator(".files a", has_text="GeoPackage").wait_for()
+    taken = {}
+    for name in ("GeoJSON", "CSV", "KMZ"):
+        with page.expect_download() as download:
+            page.get_by_role("button", name=name).click()
+        taken[name] = Path(shutil.copy(download.value.path(), tmp_path / name))
+    features = json.loads(taken["GeoJSON"].read_text())["features"]
+    assert sum("kind" in each["properties"] for each in features) == 4
+    rows = taken["CSV"].read_text().splitlines()
+    assert rows[0].startswith("id,what,kind,class")
+    assert sum(row.startswith("b-") for row in rows) == 4
+    shutil.unpack_archive(taken["KMZ"], tmp_path / "kmz", "zip")
+    assert (tmp_path / "kmz" / "doc.kml").read_text().count("<Placemark>") == len(features)
+
+
+def test_an_upload_goes_on_after_a_cut_and_starts_a_mission(
+    opened: Watched, served: Served, tmp_path: Path
+) -> None:
+    page = opened.page
+    video, track = write_video(tmp_path / "f.mp4", seconds=1), write_track(tmp_path / "f.csv", seconds=1)
+    cuts = []
+
+    def cut_once(route: Any) -> None:
+        if cuts or route.request.method != "PATCH":
+            route.continue_()
+        else:
+            cuts.append(route.request.url)
+            route.abort()
+
+    wishes = []
+
+    def take(route: Any) -> None:
+        if route.request.method != "POST":
+            return route.continue_()
+        wishes.append(route.request.post_data_json)
+        return route.fulfill(status=201, content_type="application/json", body='{"id": "r"}')
+
+    page.route(re.compile(r"/api/uploads/\w+$"), cut_once)
+    page.route(re.compile(r"/api/runs"), take)
+    page.keyboard.press("6")
+    page.get_by_label("Files of the flight").first.set_input_files([str(video), str(track)])
+    page.get_by_role("button", name="Start").click()
+    page.locator(".message", has_text="started").wait_for()
+    (wish,) = wishes
+    assert (wish["mission"], wish["site"]) == ("compare", "field")
+    states = {each["id"]: (each["name"], each["state"]) for each in served.ask("/api/uploads")}
+    assert states[wish["input"]["upload"]] == ("f.mp4", "ready")
+    assert states[wish["options"]["telemetry"]["upload"]] == ("f.csv", "ready")
+    assert cuts
+    opened.faults[:] = [each for each in opened.faults if "ERR_FAILED" not in each]  # the cut itself
+
+
+def test_the_drone_s_video_is_shown_with_boxes(served: Served, opened: Watched, tmp_path: Path) -> None:
+    page = opened.page
+    messages = units(write_video(tmp_path / "v.mp4"), "h264")
+    hello = Message(Kind.HELLO, 0, 0, Hello("a" * 16, "h264", 160, 120, 10.0).to_json().encode())
+    with connect(f"{served.url.replace('http', 'ws')}/api/ingest/scout") as drone:
+        drone.send(hello.to_bytes())
+        drone.recv()
+        for each in messages:
+            drone.send(each.to_bytes())
+        page.locator("aside.video").wait_for()
+        expect(page.locator(".delay")).to_have_text(re.compile("behind"))
+        grey = page.locator("aside.video canvas").first.evaluate(
+            "each => Math.min(...each.getContext('2d').getImageData(5, 5, 1, 1).data)"
+        )
+        assert grey > 30  # a picture of the flight, not an empty canvas
+        last_us = max(each.pts_us for each in messages if each.kind is Kind.VIDEO)
+        announce(served, "frame.boxes", {
+            "stream": "scout", "pts_us": last_us, "frame_size_px": [160, 120],
+            "boxes": [{"class": "person", "score": 0.8, "xywh_px": [40, 40, 20, 30]}],
+        })
+        page.locator("aside.video footer", has_text="1 in the picture").wait_for()
+        drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
+    page.locator(".delay", has_text="ended").wait_for()
+
+
+def test_a_station_with_tokens_asks_who_comes(browser: Any, made_site: Path, tmp_path: Path) -> None:
+    shutil.copytree(made_site, tmp_path / "field")
+    with Served(tmp_path) as station:
+        token = make_token(station.station.state, "Ann", "view")
+        watched = Watched(browser.new_context(), station.url)
+        page = watched.page
+        page.goto(station.url)
+        page.get_by_label("Token").fill("wrong")
+        page.get_by_role("button", name="Log in").click()
+        page.get_by_role("alert").get_by_text("not known here").wait_for()
+        page.get_by_label("Token").fill(token)
+        page.get_by_role("button", name="Log in").click()
+        page.locator(".card a").click()
+        page.locator("[data-panel=missions]").click()
+        page.get_by_text("not start missions").wait_for()
+        assert [each for each in watched.faults if "401" not in each] == []
+        page.context.close()
+
+
+def test_everybody_can_use_it(browser: Any, served: Served) -> None:
+    """axe-core finds nothing serious on any screen, light and dark; a phone shows no part beside its edge."""
+    context = browser.new_context(viewport={"width": 390, "height": 780}, reduced_motion="reduce")
+    watched = Watched(context, served.url)
+    watched.page.goto(served.url)
+    watched.page.locator(".card").wait_for()
+    watched.page.evaluate(AXE)
+    found = {"sites": serious(watched.page)}
+    show(watched, served)
+    for panel in PANELS:
+        watched.page.locator(f"[data-panel={panel}]").first.click()
+        watched.page.wait_for_timeout(150)
+        found[panel] = serious(watched.page)
+        watched.page.emulate_media(color_scheme="dark")
+        found[f"{panel}, dark"] = serious(watched.page, rules=["color-contrast"])
+        watched.page.emulate_media(color_scheme="light")
+        assert watched.page.evaluate("document.documentElement.scrollWidth") <= 390, panel
+    watched.page.locator("#settings-button").click()
+    found["settings"] = serious(watched.page)
+    assert {name: each for name, each in found.items() if each} == {}
+    context.close()
+
+
+def serious(page: Any, rules: list[str] | None = None) -> list[str]:
+    only = {"runOnly": {"type": "rule", "values": rules}} if rules else {}
+    result = page.evaluate("only => axe.run(document, {resultTypes: ['violations'], ...only})", only)
+    return [
+        f"{each['id']}: {each['nodes'][0]['html'][:160]} {each['nodes'][0].get('failureSummary', '')[:200]}"
+        for each in result["violations"] if each["impact"] in ("serious", "critical")
+    ]
