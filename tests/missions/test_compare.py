@@ -90,9 +90,11 @@ def compared(flown: Path, mapped: Path, tmp_path_factory: pytest.TempPathFactory
     return site, compare(flown, site, CompareSettings(model="none", writes_masks=True))
 
 
-def compare(flown: Path, site: Path, settings: CompareSettings | None = None) -> list[CompareUpdate]:
+def compare(
+    flown: Path, site: Path, settings: CompareSettings | None = None, *, again: bool = False
+) -> list[CompareUpdate]:
     wanted = settings or CompareSettings(model="none")
-    return list(compare_flights([flown / "flight2"], site, wanted, camera=flown / "camera.xml"))
+    return list(compare_flights([flown / "flight2"], site, wanted, camera=flown / "camera.xml", again=again))
 
 
 def features(site: Path, flight: str = "flight2") -> list[dict]:
@@ -182,7 +184,9 @@ def test_the_map_is_painted_where_the_ground_changed_and_nowhere_else(compared, 
 def test_the_same_flight_again_gives_the_same_and_doubles_nothing(compared, flown, tmp_path):
     shutil.copytree(compared[0], tmp_path / "again")
     first = files(compared[0] / "flights" / "flight2" / "changes")
-    compare(flown, tmp_path / "again", CompareSettings(model="none", writes_masks=True))
+    settings = CompareSettings(model="none", writes_masks=True)
+    assert compare(flown, tmp_path / "again", settings) == []
+    compare(flown, tmp_path / "again", settings, again=True)
     assert files(tmp_path / "again" / "flights" / "flight2" / "changes") == first
     assert features(tmp_path / "again") == features(compared[0])
     with Archive.open(tmp_path / "again", write=False) as archive:

@@ -1,7 +1,7 @@
 """`sorvolo compare`: a later flight against the map; each change is printed as it is announced."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from enum import StrEnum
 from pathlib import Path
@@ -15,6 +15,7 @@ from rich.table import Table
 
 from sorvolo.cli.map import TO_CHECK, ended_by_signal
 from sorvolo.cli.options import (
+    Again,
     Area,
     AsJson,
     Camera,
@@ -27,11 +28,20 @@ from sorvolo.cli.options import (
 )
 from sorvolo.cli.places import place_heading, place_words
 from sorvolo.cli.progress import ProgressReport, rate_words
-from sorvolo.cli.shown import newest_version, read_json, show_notices_and_warnings, show_path, site_of, unit_of
+from sorvolo.cli.shown import (
+    newest_version,
+    read_json,
+    show_done,
+    show_notices_and_warnings,
+    show_path,
+    site_of,
+    unit_of,
+)
 from sorvolo.survey.wording import area_text, counted, plural
 
 if TYPE_CHECKING:
     from sorvolo.capture.live.reconnect import LiveSettings
+    from sorvolo.missions.flight.request import AlreadyDone
     from sorvolo.missions.flight.settings import CompareSettings
     from sorvolo.survey.findings import Change, CompareUpdate
 
@@ -96,6 +106,7 @@ def compare(
     model: NamingModel = "default",
     give_up: GiveUp = 30.0,
     coordinates: PlaceFormatOption = PlaceFormat.LATLON,
+    again: Again = False,
     as_json: AsJson = False,
 ) -> None:
     """Find what appeared, disappeared, was replaced or moves since the map was made, and update the map.
@@ -117,7 +128,7 @@ def compare(
     )
     results = compare_and_read_results(
         inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area, steps=steps,
-        live=LiveSettings(keeps_all=True, give_up_s=give_up), form=coordinates,
+        live=LiveSettings(keeps_all=True, give_up_s=give_up), form=coordinates, again=again,
     )
     if as_json:
         typer.echo(json.dumps({"site": str(site), "flights": results}, indent=1))
@@ -130,7 +141,7 @@ def compare(
 def compare_and_read_results(
     inputs: Sequence[Path | str], site: Path, settings: "CompareSettings", *, telemetry: Path | str | None = None,
     camera: str | None = None, area: Path | None = None, steps: Path | None = None,
-    live: "LiveSettings | None" = None, form: PlaceFormat = PlaceFormat.LATLON,
+    live: "LiveSettings | None" = None, form: PlaceFormat = PlaceFormat.LATLON, again: bool = False,
 ) -> list[dict[str, Any]]:
     """Compare with progress and announcements on stderr; report and changes of each flight, in order."""
     from sorvolo.capture.live.reconnect import LiveSettings
@@ -141,13 +152,20 @@ def compare_and_read_results(
     with ended_by_signal(inputs) as until:
         comparing = compare_flights(
             inputs, site, settings, telemetry=telemetry, camera=camera, area=area, steps=steps,
-            live=live or LiveSettings(keeps_all=True), until=until,
+            live=live or LiveSettings(keeps_all=True), until=until, again=again,
         )
+        known: list[AlreadyDone] = []
+
+        def noted() -> "Iterator[CompareUpdate]":
+            known.extend((yield from comparing))
+
         # closed even when the bar is stopped: then the site is as it was
-        with closing(comparing) as updates:
-            announced = _show_progress(updates, site, Console(stderr=True), form)
+        with closing(comparing):
+            announced = _show_progress(noted(), site, Console(stderr=True), form)
+    show_done(known, "compared")
     with Archive.open(site, write=False) as archive:
         compared = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
+        compared += [each.flight for each in known]
         return [_result(archive.flight_folder(flight_id), announced) for flight_id in compared]
 
 

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from sorvolo.cli.heights import make_and_read, show_heights
 from sorvolo.cli.options import (
+    Again,
     Area,
     AsJson,
     Camera,
@@ -27,13 +28,13 @@ from sorvolo.cli.options import (
     names,
 )
 from sorvolo.cli.progress import show_progress
-from sorvolo.cli.shown import newest_version, read_json, show_notices_and_warnings, show_path
+from sorvolo.cli.shown import newest_version, read_json, show_done, show_notices_and_warnings, show_path
 from sorvolo.survey.wording import counted, counted_list
 
 if TYPE_CHECKING:
     from sorvolo.capture.live.reconnect import LiveSettings
+    from sorvolo.missions.flight.request import AlreadyDone
     from sorvolo.missions.flight.settings import MapSettings
-    from sorvolo.missions.map.flights import AlreadyMapped
     from sorvolo.survey.mosaic import MosaicUpdate
 
 _MOST_REASONS = 6
@@ -97,9 +98,6 @@ Memory = Annotated[
     typer.Option(help="Memory for pictures that are needed again, MB. Without it: a quarter of the machine's."),
 ]
 
-Again = Annotated[
-    bool, typer.Option("--again", help="Map a flight anew that is in the map already, or of which a run was stopped.")
-]
 WithHeights = Annotated[
     bool, typer.Option("--heights/--flat", help="Also make heights and a true orthophoto of each flight.")
 ]
@@ -195,7 +193,7 @@ def map_and_read_reports(
             inputs, site, settings, telemetry=telemetry, camera=camera, area=area,
             live=live or LiveSettings(keeps_all=True), until=until, control=control, base=base, again=again,
         )
-        known: list[AlreadyMapped] = []
+        known: list[AlreadyDone] = []
 
         def noted() -> Iterator["MosaicUpdate"]:
             known.extend((yield from mapping))
@@ -203,9 +201,7 @@ def map_and_read_reports(
         # closed even when the bar is stopped: then the site is as it was
         with closing(mapping):
             show_progress(noted(), Console(stderr=True))
-    for each in known:
-        day = each.mapped_utc[:16].replace("T", " ")
-        typer.echo(f"{each.flight} is mapped already ({day} UTC); --again maps it anew", err=True)
+    show_done(known, "mapped")
     with Archive.open(site, write=False) as archive:
         mapped = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
         mapped += [each.flight for each in known]

@@ -11,6 +11,9 @@ from sorvolo.errors import SettingsError
 Camera = Annotated[
     str, typer.Option(help="Camera: a calibration file, a drone's name such as 'Mavic 2 Pro', or aov=DEGREES.")
 ]
+Again = Annotated[
+    bool, typer.Option("--again", help="Do it anew, though the site has the flight already or a run was stopped.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
 AsJsonSteps = Annotated[bool, typer.Option("--json", help="Print one JSON object per step.")]
 GroupPattern = Annotated[

@@ -1,16 +1,18 @@
 """What several commands print and read: files, notices, warnings, and where a site stands."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import typer
 from rich.console import Console
 from rich.markup import escape
 
 from sorvolo.errors import StoreError
 
 if TYPE_CHECKING:
+    from sorvolo.missions.flight.request import AlreadyDone
     from sorvolo.survey.flight import Site
 
 
@@ -58,3 +60,10 @@ def site_of(folder: Path) -> "Site":
 def unit_of(site: "Site") -> str:
     """Metres, or the units of a map that has none."""
     return "units" if site.is_local else "m"
+
+
+def show_done(flights: "Sequence[AlreadyDone]", done: str) -> None:
+    """Print on stderr which flights the site has already: "mapped" or "compared"."""
+    for each in flights:
+        moment = each.done_utc[:16].replace("T", " ")
+        typer.echo(f"{each.flight} is {done} already ({moment} UTC); --again does it anew", err=True)

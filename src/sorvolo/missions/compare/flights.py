@@ -16,6 +16,7 @@ from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.headline import MapQuality
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.map_objects import open_detector
+from sorvolo.missions.flight.request import AlreadyDone, already_done, request_of
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup, known_flights, known_ground_m, prepare, repeated
 from sorvolo.mosaic.selection import every
@@ -33,13 +34,15 @@ def compare_flights(
     telemetry: Path | str | None = None, camera: Path | str | None = None, area: Path | None = None,
     steps: Path | None = None, detector: Detects | None = None,
     live: LiveSettings = LiveSettings(keeps_all=True), until: threading.Event | None = None,  # noqa: B008 (frozen)
-) -> Generator[CompareUpdate]:
+    again: bool = False,
+) -> Generator[CompareUpdate, None, tuple[AlreadyDone, ...]]:
     """Compare one or more later flights with the map in the site folder, yielding an update for each frame compared.
 
     `inputs`, `telemetry`, `camera`, `area`, `detector`, `live` and `until` are those of `map_flights`. An update
     carries the changes that its frame announced. `steps` is a folder for the intermediate pictures of method thesis
     (its Figure 3.14). The flights' findings and the new version of the map are part of the site when a flight's last
     update was yielded.
+    A flight that was compared already, as it is asked for, is left out and returned, unless `again` is given.
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being compared is left out, those before it are in.
     """
@@ -59,10 +62,21 @@ def compare_flights(
         better_camera=lambda guess: known_camera(guess, archive),
     )
     with Archive.open(site, write=True) as archive, opened as sources, single_threaded_opencv():
+        known = []
         for source in sources:
-            yield from _compare_one(
-                source, archive, settings, wanted, steps, looks, telemetry_named=telemetry is not None
+            setup = prepare(
+                source, settings.mapping, archive.site(), telemetry_named=telemetry is not None, finds_itself=True,
+                ground_m=known_ground_m(archive),
             )
+            base, is_newest = _base_version(archive, source)
+            reviews = [(each.change_id, each.verdict.value) for each in archive.reviews()]
+            request = request_of(setup, settings, wanted, looks, base, reviews, steps)
+            if not again and (compared := already_done(archive, setup, request)):
+                known.append(compared)
+                continue
+            own = settings if is_newest else replace(settings, updates_map=False)  # what later flights painted stays
+            yield from _compare_one(setup, archive, own, wanted, steps, looks, base, request)
+        return tuple(known)
 
 
 def _refuse_contradictory(archive: Archive, site: Path) -> None:
@@ -77,21 +91,14 @@ def _refuse_contradictory(archive: Archive, site: Path) -> None:
 
 
 def _compare_one(
-    source: Source, archive: Archive, settings: CompareSettings, area: Area | None, steps: Path | None,
-    detector: Detects | None, *, telemetry_named: bool,
+    setup: FlightSetup, archive: Archive, settings: CompareSettings, area: Area | None, steps: Path | None,
+    detector: Detects | None, base: int, request: str,
 ) -> Generator[CompareUpdate]:
-    started_s = time.monotonic()
-    setup = prepare(
-        source, settings.mapping, archive.site(), telemetry_named=telemetry_named, finds_itself=True,
-        ground_m=known_ground_m(archive),
-    )
+    started_s, source = time.monotonic(), setup.source
     setup = replace(setup, notices=(*setup.notices, *repeated(archive, source.name, "compared")))
     inside = setup.inside(area)
     step_s = 0.0 if source.kind == "photos" else 1.0 / settings.views_per_second
-    base, is_newest = _base_version(archive, source)
-    if not is_newest:
-        settings = replace(settings, updates_map=False)  # what later flights painted stays
-    with CompareRun(setup, archive, settings, base, steps, detector) as run:
+    with CompareRun(setup, archive, settings, base, steps, detector, request) as run:
 
         def ahead() -> int:  # a live view's changes are announced at once, unless the next view waits already
             return 0 if isinstance(source, LiveSource) and not source.is_behind else _AHEAD

@@ -29,6 +29,7 @@ from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.map_objects import crops_of
 from sorvolo.missions.flight.report import FlightResult, build_report
+from sorvolo.missions.flight.request import REQUEST
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.heights.measure import flight_with_heights, read_field
@@ -69,13 +70,14 @@ class CompareRun:
 
     def __init__(
         self, setup: FlightSetup, archive: Archive, settings: CompareSettings, base_version: int, steps: Path | None,
-        detector: Detects | None = None,
+        detector: Detects | None = None, request: str = "",
     ) -> None:
         self._setup, self._archive, self._settings, self._steps = setup, archive, settings, steps
         self._base_version = base_version
         source = setup.source
         self._writer: FlightWriter = archive.begin_flight(
-            source.name, source.fingerprint, {**vars(settings), "method": f"compare-{settings.method}"}
+            source.name, source.fingerprint,
+            {**vars(settings), "method": f"compare-{settings.method}", REQUEST: request},
         )
         self._views = _view_maker(setup, archive, settings, base_version)
         self._evidence: EvidenceMap | None = None

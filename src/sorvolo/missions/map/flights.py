@@ -4,7 +4,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from sorvolo.capture.areas import read_area
@@ -18,6 +18,7 @@ from sorvolo.missions.flight.disk import check_room
 from sorvolo.missions.flight.glimpses import refuse_without_texture
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.reading import read_ahead
+from sorvolo.missions.flight.request import AlreadyDone, already_done, request_of
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import (
     FlightSetup,
@@ -28,9 +29,9 @@ from sorvolo.missions.flight.setup import (
     prepare,
     repeated,
 )
-from sorvolo.missions.map.journal import Earlier, MapJournal, Step, map_request, run_key
+from sorvolo.missions.map.journal import Earlier, MapJournal, Step, run_key
 from sorvolo.missions.map.planar_run import PlanarRun
-from sorvolo.missions.map.run import REQUEST, FlightRun
+from sorvolo.missions.map.run import FlightRun
 from sorvolo.missions.map.thesis_run import ThesisRun
 from sorvolo.mosaic.control import ControlSettings
 from sorvolo.mosaic.selection import SelectionSettings, every, select_keyframes
@@ -42,21 +43,13 @@ from sorvolo.survey.mosaic import MosaicUpdate, Status
 _AHEAD = 2  # decoded frames that wait to be placed
 
 
-@dataclass(frozen=True)
-class AlreadyMapped:
-    """A flight that the site has, as it was asked for, and when it was mapped: ISO 8601 UTC."""
-
-    flight: str
-    mapped_utc: str
-
-
 def map_flights(
     inputs: Sequence[Path | str], site: Path, settings: MapSettings = MapSettings(), *,  # noqa: B008 (frozen)
     telemetry: Path | str | None = None, camera: Path | str | None = None, area: Path | None = None,
     detector: Detects | None = None, live: LiveSettings = LiveSettings(keeps_all=True),  # noqa: B008 (frozen)
     until: threading.Event | None = None, control: Path | None = None,
     base: Path | None = None, again: bool = False,
-) -> Generator[MosaicUpdate, None, tuple[AlreadyMapped, ...]]:
+) -> Generator[MosaicUpdate, None, tuple[AlreadyDone, ...]]:
     """Map one or more flights into the site folder, yielding an update for each selected frame.
 
     `inputs` are videos, folders of photos, photos, or live sources (see `open_sources`); `telemetry` a file of the
@@ -86,22 +79,12 @@ def map_flights(
                 source, settings, archive.site() if archive.has_site else None, telemetry_named=telemetry is not None,
                 ground_m=known_ground_m(archive), known_ground=ground, founds_site=founds_site(archive, source.name),
             )
-            request = map_request(setup, settings, wanted, looks)
-            if not again and (mapped := _already_mapped(archive, source, request)):
+            request = request_of(setup, replace(settings, live_s=0.0, memory_mb=None), wanted, looks)
+            if not again and (mapped := already_done(archive, setup, request)):
                 known.append(mapped)
                 continue
             yield from _map_one(setup, archive, settings, wanted, looks, request)
         return tuple(known)
-
-
-def _already_mapped(archive: Archive, source: Source, request: str) -> AlreadyMapped | None:
-    """The flight as the site has it, if that is what is asked for; a live flight is another each time."""
-    if isinstance(source, LiveSource):
-        return None
-    return next((
-        AlreadyMapped(each.id, each.finished_utc) for each in archive.flights()
-        if each.id == source.name and each.status == "complete" and each.settings.get(REQUEST) == request
-    ), None)
 
 
 def _known_ground(

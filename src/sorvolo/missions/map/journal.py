@@ -1,29 +1,20 @@
 """What a mapping has done with each frame so far, in its journal: a killed run goes on after the last one."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
-from pathlib import Path
+from dataclasses import dataclass, fields
 from typing import Any
 
-import sorvolo
-from sorvolo.capture.photos import PhotoSource
-from sorvolo.capture.video import VideoSource
 from sorvolo.errors import SorvoloError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
-from sorvolo.missions.flight.control import FlightControl
-from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.map_objects import FrameDetections
-from sorvolo.missions.flight.report import software
-from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.planar import Registered
 from sorvolo.mosaic.selection import SelectionMemory
 from sorvolo.store.images import array_from_bytes
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.journal import Entry, RunJournal, content_sha256
-from sorvolo.survey.area import Area
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Features, Keyframe, Link
 from sorvolo.survey.objects import Detections
@@ -132,31 +123,11 @@ class MapJournal:
             yield read
 
 
-def map_request(setup: FlightSetup, settings: MapSettings, area: Area | None, detector: Detects | None) -> str:
-    """What is asked for, as one number: the same command over the same files by the same version gives the same."""
-    files = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in _files(setup)]
-    return content_sha256(
-        sorvolo.__version__, software(), setup.source.fingerprint, files, setup.source.camera, setup.source.telemetry,
-        replace(settings, live_s=0.0, memory_mb=None), area, None if detector is None else detector.info,
-    )
-
-
 def run_key(setup: FlightSetup, archive: Archive, request: str) -> str:
     """What is asked for, and of which site: the same only where the very same work is to be done."""
     site = archive.site() if archive.has_site else None
     versions = [(each.id, each.run_id, each.flight_id) for each in archive.versions() if each.complete]
     return content_sha256(request, setup.plan, setup.frame.origin, site, versions)
-
-
-def _files(setup: FlightSetup) -> list[Path]:
-    """The files that a recorded flight is made from."""
-    source, ground = setup.source, setup.known_ground
-    found: list[Path] = []
-    if ground is not None:
-        found.append(ground.file.path if isinstance(ground, FlightControl) else ground.base.path)
-    if isinstance(source, PhotoSource):
-        return [*found, *(each.path for each in source.album.photos)]
-    return [*found, source.info.path] if isinstance(source, VideoSource) else found
 
 
 def _put_taken(taken: Taken, values: dict[str, Any], arrays: dict[str, Any]) -> None:

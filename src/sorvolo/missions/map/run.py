@@ -8,6 +8,7 @@ from typing import Any, Self
 from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.map_objects import FrameDetections, ObjectFinder, search_summary, why_not_searched
 from sorvolo.missions.flight.memory import memory_budget_bytes
+from sorvolo.missions.flight.request import REQUEST
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, new_site
 from sorvolo.missions.map.journal import MapJournal, Step, Taken
@@ -17,8 +18,6 @@ from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
 from sorvolo.survey.map_objects import ObjectSearch
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
-REQUEST = "request"
-"""Of a run's settings in the catalogue: what was asked for."""
 _MOST_CACHE_MB = 256  # of tiles, and of pictures: more is not used
 
 
@@ -27,7 +26,7 @@ class FlightRun(ABC):
 
     `writer` is one that was begun before for this flight; whoever began it ends it. `finder` looks for objects in the
     frames; None: nobody does. `journal` notes what becomes of each frame; None: a kill loses it. `request` is what is
-    asked for, see `map_request`.
+    asked for, see `request_of`.
     """
 
     def __init__(

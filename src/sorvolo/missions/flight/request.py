@@ -1,0 +1,63 @@
+"""What is asked for of a flight, as one number: by it a site knows what it has, and a run what it goes on with."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import sorvolo
+from sorvolo.capture.photos import PhotoSource
+from sorvolo.capture.source import LiveSource
+from sorvolo.capture.video import VideoSource
+from sorvolo.missions.flight.control import FlightControl
+from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.report import software
+from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.journal import content_sha256
+from sorvolo.survey.area import Area
+
+REQUEST = "request"
+"""Of a run's settings in the catalogue: what was asked for."""
+
+
+@dataclass(frozen=True)
+class AlreadyDone:
+    """A flight that the site has, as it was asked for, and when it was made part of it: ISO 8601 UTC."""
+
+    flight: str
+    done_utc: str
+
+
+def request_of(
+    setup: FlightSetup, settings: Any, area: Area | None, detector: Detects | None, *more: Any
+) -> str:
+    """What is asked for: the same command over the same files by the same version of the program gives the same.
+
+    `settings` is the mission's record, `more` what else the result depends on: records, arrays and plain values.
+    """
+    files = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in _files(setup)]
+    return content_sha256(
+        sorvolo.__version__, software(), setup.source.fingerprint, files, setup.source.camera, setup.source.telemetry,
+        settings, area, None if detector is None else detector.info, more,
+    )
+
+
+def already_done(archive: Archive, setup: FlightSetup, request: str) -> AlreadyDone | None:
+    """The flight as the site has it, if that is what is asked for; a live flight is another each time."""
+    if isinstance(setup.source, LiveSource):
+        return None
+    return next((
+        AlreadyDone(each.id, each.finished_utc) for each in archive.flights()
+        if each.id == setup.source.name and each.status == "complete" and each.settings.get(REQUEST) == request
+    ), None)
+
+
+def _files(setup: FlightSetup) -> list[Path]:
+    """The files that a recorded flight is made from."""
+    source, ground = setup.source, setup.known_ground
+    found: list[Path] = []
+    if ground is not None:
+        found.append(ground.file.path if isinstance(ground, FlightControl) else ground.base.path)
+    if isinstance(source, PhotoSource):
+        return [*found, *(each.path for each in source.album.photos)]
+    return [*found, source.info.path] if isinstance(source, VideoSource) else found
