@@ -23,7 +23,7 @@ from sorvolo.store.exports.map_pictures import write_live_preview
 from sorvolo.store.images import ImageCache
 from sorvolo.store.site.archive import Archive, FlightWriter
 
-_PAINT_EVERY = 8  # keyframes painted together: tiles that several touch are rendered once
+_PAINT_EVERY = 8  # keyframes painted together: tiles that several touch are rendered once; not where somebody waits
 _PAINT_AT_ONCE = 24  # at most, the newest first: a solve may move a hundred
 _PAINT_REST = 4  # times as long as a painting took: showing a map that still moves must not hold up the flight
 _COARSE_MAP = 0.77  # times the pictures' own pixels: a coarser map does not need every pixel of them
@@ -54,7 +54,7 @@ class FlightPainter:
         native_m_per_px: float, log: FlightLog, live_s: float,
     ) -> None:
         self._writer, self._archive, self._mapper, self._known, self._log = writer, archive, mapper, known, log
-        self._live_s = live_s
+        self._live_s, self._paint_every = live_s, _PAINT_EVERY if live_s >= 1 else 1
         self.images: dict[int, str] = {}
         """Where each frame's picture is stored, by frame index: what `FlightWriter.commit` wants."""
         self.exposure = Exposure({}, {}, 0.0)
@@ -103,7 +103,7 @@ class FlightPainter:
     def show(self) -> int:
         """Paint small copies of what moved and let readers see it, now and then; how many tiles were painted."""
         started_s = time.monotonic()
-        if len(self._frames) - self._painted_at < _PAINT_EVERY or started_s < self._paint_again_s:
+        if len(self._frames) - self._painted_at < self._paint_every or started_s < self._paint_again_s:
             return 0
         self._painted_at = len(self._frames)
         with self._log.stage(Stage.PAINT):

@@ -1,0 +1,313 @@
+"""How long a streamed frame takes to the map, to its boxes and to the browsers, and what many viewers cost.
+
+python benchmarks/station.py [--size 1920x1080] [--fps 30] [--seconds 20] [--viewers 20] [--only map] [--flight FOLDER]
+
+A simulated flight is streamed in real time over loopback to a station in a process of its own, three times: with a map
+mission, with a watch, and with a map mission and many viewers. Times run from the moment at which the client takes a
+picture (the camera's own delay is not in it) to
+
+- the tile that shows the frame's centre, fetched and whole, after the station announced that it changed;
+- the frame's boxes, received beside the video;
+- the picture itself, received by a viewer.
+
+A browser's decoding and drawing is not in them. The load of the machine is written beside the figures.
+"""
+
+import argparse
+import asyncio
+import json
+import math
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed
+
+from provenance import commit, machine
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.missions.simulate.site import simulate_site
+from sorvolo.simulation.settings import (
+    ImagingSettings,
+    OutputSettings,
+    PathSettings,
+    SceneSettings,
+    SimulationSettings,
+)
+from sorvolo.station.client import StreamClient, StreamSettings, stream_url
+from sorvolo.station.footage import open_footage
+from sorvolo.station.messages import Kind, sample_from_json
+from sorvolo.station.spool import Spool
+
+RESULTS = Path(__file__).parent / "results" / "station.json"
+_ZOOM = 21
+_STREAM = "scout"
+
+
+@dataclass
+class Seen:
+    """What one streamed flight showed: when each picture was taken, by its time, and what came of it when."""
+
+    taken_s: dict[int, float] = field(default_factory=dict)
+    zero_ns: int = 0  # UTC of the flight's zero
+    pictures: list[tuple[float, float]] = field(default_factory=list)  # taken, delay
+    boxes: list[tuple[float, float]] = field(default_factory=list)
+    map: list[tuple[float, float]] = field(default_factory=list)
+    tiles_s: list[float] = field(default_factory=list)
+    placed: dict[int, tuple[float, float]] = field(default_factory=dict)  # frames that wait for the map
+
+
+class TimedSpool(Spool):
+    """A spool that notes when each picture was taken."""
+
+    def __init__(self, folder: Path, seen: Seen) -> None:
+        super().__init__(folder, 2_000_000_000)
+        self._seen = seen
+
+    def append(self, kind: Kind, pts_us: int, payload: bytes, **more: Any) -> None:
+        """See `Spool`."""
+        if kind is Kind.VIDEO:
+            self._seen.taken_s[pts_us] = time.time()
+        elif not self._seen.zero_ns:
+            self._seen.zero_ns = sample_from_json(payload).time_ns - 1000 * pts_us
+        super().append(kind, pts_us, payload, **more)
+
+
+def main() -> None:
+    """Stream the flight three times and write the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--size", default="1920x1080")
+    parser.add_argument("--fps", type=float, default=30.0)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--viewers", type=int, default=20)
+    parser.add_argument("--model", default="default")
+    parser.add_argument("--only", choices=("", "map", "watch", "viewers"), default="")
+    parser.add_argument("--flight", type=Path, help="simulated before, or where to keep it")
+    parser.add_argument("--output", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        flight = simulated(options.flight or Path(scratch) / "flight", options)
+        load = os.getloadavg()[0]
+        plan = {"map": ("map", 1), "watch": ("watch", 1), "viewers": ("map", options.viewers)}
+        runs = {
+            name: streamed(flight, Path(scratch) / name, mission, viewers, options)
+            for name, (mission, viewers) in plan.items() if options.only in ("", name)
+        }
+    result = {
+        "benchmark": "station", "machine": machine(), "commit": commit(), "size": options.size, "fps": options.fps,
+        "seconds": options.seconds, "model": options.model, "load_before": round(load, 2),
+        "load_after": round(os.getloadavg()[0], 2), **runs,
+    }
+    options.output.parent.mkdir(exist_ok=True)
+    options.output.write_text(json.dumps(result, indent=1) + "\n")
+    print(json.dumps(result, indent=1))
+
+
+def simulated(folder: Path, options: Any) -> Path:
+    """The flight's folder, made unless it is there: one strip at 8 m/s, 40 m up, with things to find."""
+    if not (folder / "flight1" / "flight1.mp4").is_file():
+        width, height = map(int, options.size.split("x"))
+        settings = SimulationSettings(
+            seed=7, flights=1, scene=SceneSettings(people=8, cars=8, small_objects=4),
+            path=PathSettings(height_m=40, speed_m_s=8, length_m=8 * options.seconds, strips=1),
+            imaging=ImagingSettings(width_px=width, height_px=height, fps=options.fps),
+            output=OutputSettings(truth_step=1_000_000),
+        )
+        for _ in simulate_site(folder, settings):
+            pass
+    return folder
+
+
+def streamed(flight: Path, scratch: Path, mission: str, viewers: int, options: Any) -> dict[str, Any]:
+    """One flight with a mission and viewers; delays, s, and what it cost."""
+    root = scratch / "root"
+    root.mkdir(parents=True)
+    seen = Seen()
+    with station(root) as (url, pid):
+        stop = threading.Event()
+        footage = open_footage(
+            str(flight / "flight1" / "flight1.mp4"), None, str(flight / "camera.xml"), LiveSettings(), stop
+        )
+        client = StreamClient(
+            footage, TimedSpool(scratch / "spool", seen), stream_url(url, _STREAM), "", StreamSettings(), stop
+        )
+        flying = threading.Thread(target=client.run)
+        before_s = cpu_s(pid)
+        run = asyncio.run(followed(url, seen, flying, mission, viewers, options))
+        flying.join()
+        report = client.report
+        station_s = cpu_s(pid) - before_s
+    return {
+        "mission": mission, "viewers": viewers, "frames": report.frames, "dropped": report.late + report.overflowed,
+        "station_cpu_s": round(station_s, 2), "mission_progress": run.get("progress"), "mission_state": run["state"],
+        "frame_to_disk": figures(list(report.delays_s)), "frame_to_viewer": delays(seen.pictures),
+        "frame_to_map_tile": delays(seen.map), "frame_to_map_tile_running": delays(running(seen.map)),
+        "tile_fetch": figures(seen.tiles_s),
+        "frame_to_boxes": delays(seen.boxes), "frame_to_boxes_running": delays(running(seen.boxes)),
+    }
+
+
+async def followed(
+    url: str, seen: Seen, flying: threading.Thread, mission: str, viewers: int, options: Any
+) -> dict[str, Any]:
+    """Start the flight and the mission, listen until both are over; the mission's last state."""
+    listening = [asyncio.create_task(viewed(url, seen)) for _ in range(viewers)]
+    listening.append(asyncio.create_task(heard(url, seen)))
+    flying.start()
+    while not any(each["flights"] for each in await ask(url, "/api/streams")):
+        await asyncio.sleep(0.1)
+    wish = {"mission": mission, "site": "field", "input": {"stream": _STREAM}, "options": {"model": options.model}}
+    run = await ask(url, "/api/runs", wish)
+    while (run := await ask(url, f"/api/runs/{run['id']}"))["state"] == "running":
+        await asyncio.sleep(0.5)
+    await asyncio.sleep(0.5)
+    for each in listening:
+        each.cancel()
+    await asyncio.gather(*listening, return_exceptions=True)
+    return dict(run)
+
+
+async def viewed(url: str, seen: Seen) -> None:
+    """A viewer: when each picture and each frame's boxes came."""
+    with suppress(ConnectionClosed):
+        async with connect(f"ws{url[4:]}/api/streams/{_STREAM}/video", max_size=20_000_000, compression=None) as link:
+            async for item in link:
+                if isinstance(item, bytes):
+                    note(seen.pictures, seen.taken_s.get(int.from_bytes(item[:8], "big", signed=True)))
+                elif (words := json.loads(item))["type"] == "boxes":
+                    note(seen.boxes, seen.taken_s.get(words["pts_us"]))
+
+
+async def heard(url: str, seen: Seen) -> None:
+    """Live events: frames that are placed, tiles that change."""
+    fetching: set[asyncio.Task[None]] = set()
+    with suppress(ConnectionClosed):
+        async with connect(f"ws{url[4:]}/api/events?after=0", max_size=20_000_000) as link:
+            async for text in link:
+                event = json.loads(text)
+                if event["type"] == "frame.placed":
+                    remember(seen, event["data"])
+                elif event["type"] == "map.tiles" and seen.placed:
+                    task = asyncio.create_task(fetched(url, seen, event))
+                    fetching.add(task)
+                    task.add_done_callback(fetching.discard)
+
+
+def remember(seen: Seen, placed: dict[str, Any]) -> None:
+    """A frame was placed by pictures: it waits for the map to show it."""
+    if placed["status"] == "vision":
+        moment_us = (round(datetime.fromisoformat(placed["time"]).timestamp() * 1e9) - seen.zero_ns) // 1000
+        nearest = min(seen.taken_s, key=lambda each: abs(each - moment_us), default=None)
+        if nearest is not None:
+            corners = np.array(placed["footprint"][:4])
+            seen.placed[nearest] = (float(corners[:, 0].mean()), float(corners[:, 1].mean()))
+
+
+async def fetched(url: str, seen: Seen, event: dict[str, Any]) -> None:
+    """Fetch the tile of each frame that waits and lies within what changed, until it has pixels."""
+    west, south, east, north = event["data"]["bounds"]
+    for pts_us, (longitude, latitude) in list(seen.placed.items()):
+        if west <= longitude <= east and south <= latitude <= north and seen.placed.pop(pts_us, None):
+            x, y = tile_of(longitude, latitude)
+            path = f"/api/sites/{event['site']}/tiles/live-{event['data']['revision']}/{_ZOOM}/{x}/{y}.webp"
+            began_s = time.time()
+            status, _ = await asyncio.to_thread(get, url, path)
+            if status == 200:
+                seen.tiles_s.append(time.time() - began_s)
+                note(seen.map, seen.taken_s[pts_us])
+
+
+def note(found: list[tuple[float, float]], taken_s: float | None) -> None:
+    """One more delay until now."""
+    if taken_s is not None:
+        found.append((taken_s, time.time() - taken_s))
+
+
+def delays(found: list[tuple[float, float]]) -> dict[str, Any]:
+    """The figures of all delays."""
+    return figures([delay_s for _, delay_s in found])
+
+
+def running(found: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Those of pictures taken once the mission ran: it starts while the drone flies, and has what came before to do."""
+    began_s = min((taken_s + delay_s for taken_s, delay_s in found), default=0.0)
+    return [each for each in found if each[0] > began_s]
+
+
+def tile_of(longitude_deg: float, latitude_deg: float) -> tuple[int, int]:
+    """The Web Mercator tile that shows a place (OpenStreetMap's formula)."""
+    y = (1 - math.asinh(math.tan(math.radians(latitude_deg))) / math.pi) / 2
+    return int((longitude_deg + 180) / 360 * 2**_ZOOM), int(y * 2**_ZOOM)
+
+
+def figures(delays_s: list[float]) -> dict[str, Any]:
+    """Median, 95th percentile and largest, s."""
+    if not delays_s:
+        return {"count": 0}
+    values = np.array(delays_s)
+    return {
+        "count": len(values), "median_s": round(float(np.median(values)), 3),
+        "p95_s": round(float(np.percentile(values, 95)), 3), "max_s": round(float(values.max()), 3),
+    }
+
+
+@contextmanager
+def station(root: Path) -> Iterator[tuple[str, int]]:
+    """A station in a process of its own: its address and process."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sorvolo", "serve", str(root), "--port", str(port), "--free-floor", "0"],
+        stderr=subprocess.DEVNULL,
+    )
+    url = f"http://127.0.0.1:{port}"
+    try:
+        until_s = time.monotonic() + 60
+        while True:
+            with suppress(OSError):
+                get(url, "/api/status")
+                break
+            if time.monotonic() > until_s or process.poll() is not None:
+                raise RuntimeError("the station does not start")
+            time.sleep(0.2)
+        yield url, process.pid
+    finally:
+        process.terminate()
+        process.wait(20)
+
+
+async def ask(url: str, path: str, body: Any = None) -> Any:
+    """A JSON answer."""
+    _, data = await asyncio.to_thread(get, url, path, body)
+    return json.loads(data)
+
+
+def get(url: str, path: str, body: Any = None) -> tuple[int, bytes]:
+    """The status and the body of an answer."""
+    data = None if body is None else json.dumps(body).encode()
+    request = urllib.request.Request(url + path, data, {"Content-Type": "application/json"})
+    with urllib.request.urlopen(request, timeout=30) as answer:
+        return answer.status, answer.read()
+
+
+def cpu_s(pid: int) -> float:
+    """The processor time that a process has used, without its children."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+if __name__ == "__main__":
+    main()
