@@ -2,6 +2,7 @@
 
 import sqlite3
 from pathlib import Path
+from xml.etree.ElementTree import fromstring
 
 from starlette.testclient import TestClient
 
@@ -41,8 +42,14 @@ def test_geopackage_holds_what_the_map_shows(client: TestClient, tmp_path: Path)
         rows = file.execute("SELECT id, kind FROM changes ORDER BY fid").fetchall()
         query = "SELECT geometry_type_name, srs_id FROM gpkg_geometry_columns WHERE table_name = 'changes'"
         kind, srs = file.execute(query).fetchone()
+        (qml,) = file.execute("SELECT styleQML FROM layer_styles WHERE f_table_name = 'changes'").fetchone()
     assert rows == [(each["id"], each["properties"]["kind"]) for each in features]
     assert (kind, srs) == ("POLYGON", 4326)
+    renderer = fromstring(qml).find("renderer-v2")
+    assert renderer is not None and renderer.get("attr") == "kind"
+    categories = {each.get("value"): each.get("symbol") for each in renderer.iter("category")}
+    drawn = {each.get("name") for each in renderer.iter("symbol")}
+    assert {row[1] for row in rows} <= set(categories) and set(categories.values()) == drawn
 
 
 def test_geopackage_mixes_polygons_and_odd_names(tmp_path: Path) -> None:

@@ -48,12 +48,14 @@ def decoded(data: bytes) -> list[int]:
 @pytest.mark.parametrize("mode", ["annexb", "fmp4"])
 def test_a_new_viewer_begins_at_the_last_key_frame(pictures: list[Message], mode: Mode) -> None:
     hub = hub_with(pictures[:15])
+    hub.epoch_us = 7
     viewer = hub.join(mode)
     for each in pictures[15:]:
         hub.show(each)
     first, *rest = taken(viewer)
     assert json.loads(str(first)) == {
         "type": "format", "codec": "avc1.4d400a", "width": 160, "height": 120, "fps": 10.0, "mode": mode,
+        "epoch_us": 7,
     }
     expected = pictures[10:]
     if mode == "annexb":

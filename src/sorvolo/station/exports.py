@@ -20,6 +20,7 @@ from sorvolo.station.security import needs
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.tokens import Role
 from sorvolo.store.exports.geopackage import write_geopackage
+from sorvolo.store.exports.qgis_styles import LAYER_STYLES, qml_of
 from sorvolo.store.nofollow import open_below
 from sorvolo.store.site.archive import Archive
 
@@ -139,7 +140,7 @@ def _geopackage(site: str, archive: Archive, collections: SiteCollections) -> St
     layers = {name: collections.get(site, name).features for name in TITLES}
     with tempfile.TemporaryDirectory(prefix="sorvolo-") as folder:
         path = Path(folder) / _GEOPACKAGE
-        write_geopackage(path, layers)
+        write_geopackage(path, layers, {name: qml_of(style) for name, style in LAYER_STYLES.items()})
         return _download(path.open("rb"), f"{_plain_name(site)}.gpkg")  # open: it outlives its folder
 
 

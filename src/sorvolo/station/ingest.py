@@ -34,6 +34,7 @@ REFUSED_CODE, BUSY_CODE = 4400, 4503
 
 _HELLO_S = 10.0
 _SPACE_EVERY_S = 1.0
+_LIVE_NS = 60_000_000_000  # telemetry that is so old was recorded
 _MOST_REASON_BYTES = 120  # a close frame holds 123
 
 
@@ -226,6 +227,8 @@ class Ingest:
                     return
                 if flight.take(message) and message.kind is Kind.VIDEO:
                     hub.show(message)
+                elif flight.last_sample is not None and hub.epoch_us is None:
+                    hub.epoch_us = _epoch_us(flight.last_sample.time_ns, message.pts_us)
         finally:
             syncing.cancel()
 
@@ -366,6 +369,12 @@ def open_flight(folder: Path, hello: Hello) -> Flight:
         return Flight(found, hello)
     except OSError as error:
         raise StoreError(f"cannot use {folder} ({error.strerror or error}); check the disk") from error
+
+
+def _epoch_us(time_ns: int, pts_us: int) -> int | None:
+    """UTC of a flight's zero; None for one that was recorded, whose delay nobody can state."""
+    is_now = abs(time.time_ns() - time_ns) < _LIVE_NS
+    return time_ns // 1000 - pts_us if is_now else None
 
 
 def _ended(path: Path) -> Path:

@@ -34,6 +34,7 @@ class VideoHub:
         self._hello: Hello | None = None
         self._group: list[Message] = []  # since the last key frame
         self._codec = ""
+        self.epoch_us: int | None = None  # UTC of the flight's zero, where the drone flies now
         self._viewers: set[Viewer] = set()
         self._fragments: Fragments | None = None
 
@@ -50,7 +51,7 @@ class VideoHub:
     def begin(self, hello: Hello) -> None:
         """A drone came, or came back."""
         if self._hello is None or (self._hello.flight, self._hello.codec) != (hello.flight, hello.codec):
-            self._group, self._codec, self._fragments = [], "", None
+            self._group, self._codec, self._fragments, self.epoch_us = [], "", None, None
         self._hello = hello
 
     def show(self, message: Message) -> None:
@@ -100,10 +101,11 @@ class VideoHub:
     def _start(self, viewer: "Viewer") -> None:
         hello = self._hello
         assert hello is not None
-        viewer.put_text(json.dumps({
+        words: dict[str, Any] = {
             "type": "format", "codec": self._codec, "width": hello.width, "height": hello.height, "fps": hello.fps,
             "mode": viewer.mode,
-        }))
+        }
+        viewer.put_text(json.dumps(words if self.epoch_us is None else words | {"epoch_us": self.epoch_us}))
         if viewer.mode == "fmp4" and self._fragments is not None:
             viewer.put(self._fragments.header, is_key=True, is_limited=False)
         for message in self._group:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import shapely
@@ -24,6 +25,11 @@ _WGS84_WKT = (
     'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
     'UNIT["degree",0.0174532925199433],AUTHORITY["EPSG","4326"]]'
 )
+_STYLES_TABLE = """
+CREATE TABLE layer_styles (id INTEGER PRIMARY KEY AUTOINCREMENT, f_table_catalog TEXT(256), f_table_schema TEXT(256),
+  f_table_name TEXT(256), f_geometry_column TEXT(256), styleName TEXT(30), styleQML TEXT, styleSLD TEXT,
+  useAsDefault BOOLEAN, description TEXT, owner TEXT(30), ui TEXT(30), update_time DATETIME)
+"""
 _TABLES = """
 CREATE TABLE gpkg_spatial_ref_sys (srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY, organization TEXT NOT NULL,
   organization_coordsys_id INTEGER NOT NULL, definition TEXT NOT NULL, description TEXT);
@@ -36,8 +42,13 @@ CREATE TABLE gpkg_geometry_columns (table_name TEXT NOT NULL PRIMARY KEY REFEREN
 """
 
 
-def write_geopackage(path: Path, layers: Mapping[str, Sequence[Feature]]) -> None:
-    """Write a layer for each name that has features; GeoJSON features in WGS84. Raises StoreError on a full disk."""
+def write_geopackage(
+    path: Path, layers: Mapping[str, Sequence[Feature]], styles: Mapping[str, str] = MappingProxyType({})
+) -> None:
+    """Write a layer for each name that has features; GeoJSON features in WGS84.
+
+    `styles` are QML documents by layer, which QGIS takes as the layers' own. Raises StoreError on a full disk.
+    """
     with atomic_path(path) as temporary, closing(sqlite3.connect(temporary, isolation_level=None)) as file:
         file.execute(f"PRAGMA application_id = {_APPLICATION}")
         file.execute(f"PRAGMA user_version = {_VERSION}")
@@ -50,6 +61,7 @@ def write_geopackage(path: Path, layers: Mapping[str, Sequence[Feature]]) -> Non
         for name, features in layers.items():
             if features:
                 _write_layer(file, name, features)
+        _write_styles(file, {name: qml for name, qml in styles.items() if layers.get(name)})
         file.execute("COMMIT")
 
 
@@ -72,6 +84,22 @@ def _write_layer(file: sqlite3.Connection, name: str, features: Sequence[Feature
         (name, name, now, *(float(each) for each in bounds), _WGS84),
     )
     file.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)", (name, kind, _WGS84))
+
+
+def _write_styles(file: sqlite3.Connection, styles: Mapping[str, str]) -> None:
+    """The table in which QGIS keeps styles; registered, so that programs do not take it for a damaged layer."""
+    if not styles:
+        return
+    now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.000Z")
+    file.execute(_STYLES_TABLE)
+    file.executemany(
+        "INSERT INTO layer_styles VALUES (NULL, '', '', ?, 'geom', 'sorvolo', ?, '', 1, 'Sorvolo', '', NULL, ?)",
+        [(name, qml, now) for name, qml in styles.items()],
+    )
+    file.execute(
+        "INSERT INTO gpkg_contents VALUES (?, 'attributes', ?, '', ?, NULL, NULL, NULL, NULL, 0)",
+        ("layer_styles", "layer_styles", now),
+    )
 
 
 def _alike(shapes: Sequence[BaseGeometry]) -> list[BaseGeometry]:
