@@ -14,6 +14,7 @@ from fastapi.responses import FileResponse, JSONResponse
 from starlette.staticfiles import StaticFiles
 
 from sorvolo import __version__
+from sorvolo.station.cogs import answer_raster_errors, cog_routes
 from sorvolo.station.collections import SiteCollections
 from sorvolo.station.crops import crop_routes
 from sorvolo.station.drawings import Drawings, drawing_routes
@@ -36,12 +37,14 @@ from sorvolo.station.runs import Runs
 from sorvolo.station.security import COOKIE, Doorkeeper, holder_in, needs
 from sorvolo.station.settings import STREAMS_FOLDER, StationSettings
 from sorvolo.station.sites import SiteShelf, readable, site_detail
+from sorvolo.station.stac import stac_routes
 from sorvolo.station.state import StationState
 from sorvolo.station.stream_routes import announcing, stream_routes
 from sorvolo.station.tiles import WebTiles
 from sorvolo.station.tokens import Role
 from sorvolo.station.upload_routes import upload_routes
 from sorvolo.station.uploads import Uploads
+from sorvolo.station.wmts import wmts_routes
 
 PAGE_FOLDER = Path(__file__).parent / "page"
 _FOR_EVER = "public, max-age=31536000, immutable"
@@ -118,6 +121,7 @@ def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardS
     )
     app.state.station = station
     answer_problems(app)
+    answer_raster_errors(app)
     for router in (
         _about_routes(station), _site_routes(station), event_routes(station.events),
         feature_routes(station.collections, station.reviews), review_routes(station.reviews, station.shelf),
@@ -127,6 +131,7 @@ def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardS
         video_routes(station.shelf, station.collections, station.videos),
         drawing_routes(Drawings(settings, station.shelf, station.events)),
         export_routes(station.shelf, station.collections),
+        wmts_routes(station.shelf), stac_routes(station.shelf), *cog_routes(station.shelf),
     ):
         app.include_router(router)
     _serve_page(app)
