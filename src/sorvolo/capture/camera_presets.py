@@ -78,7 +78,7 @@ CAMERA_PRESETS = (
     CameraPreset(
         "Skydio X10 narrow", ("VT300-Z_50", "VT300-L_50", "V100-L_50"), 7.213, 5.44, 9.88, 9248, 6944
     ),
-    # focal lengths from the data sheets' angles of view or lengths at 35 mm, which agree to 3 %
+    # unverified, from memory (docs/formats-in.md): focal lengths that an angle of view or a length at 35 mm gives
     CameraPreset("Autel EVO II", ("XT701",), 6.4, 4.8, 4.74, 8000, 6000, 0.06),
     CameraPreset("Autel EVO II Pro", ("XT705", "XL705"), 12.75, 8.5, 10.57, 5472, 3648, 0.05),
     CameraPreset("Autel EVO II Dual 640T", ("XT709",), 6.4, 4.8, 4.74, 8000, 6000, 0.06),
