@@ -43,7 +43,10 @@ Webhooks = Annotated[
 WebhookSecret = Annotated[
     str, typer.Option(envvar="SORVOLO_WEBHOOK_SECRET", help="Signs what is posted (HMAC).", show_default="not signed")
 ]
-Mqtt = Annotated[str, typer.Option(help="MQTT broker: mqtt://HOST[:PORT][/PREFIX] or mqtts://USER:PASSWORD@HOST.")]
+Mqtt = Annotated[
+    str,
+    typer.Option(help="MQTT broker: mqtt://HOST:PORT/PREFIX (port, prefix optional), mqtts://USER:PASSWORD@HOST."),
+]
 MqttAuthority = Annotated[Path | None, typer.Option(help="For mqtts://: the authority of the broker, PEM.")]
 LogJson = Annotated[bool, typer.Option("--log-json", help="Log each request and fault as a line of JSON on stderr.")]
 TokenName = Annotated[str, typer.Argument(help="Who it is for, such as a person's name.", show_default="list tokens")]

@@ -64,10 +64,6 @@ def map_flights(
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being mapped is left out, those before it are in.
     """
-    if control is not None and base is not None:
-        raise SettingsError("a map is tied to control points (--gcp) or to a base map (--base), not to both")
-    if settings.checks and control is None:
-        raise SettingsError("check points (--check) are of a control point file: give it with --gcp")
     wanted = None if area is None else read_area(area)
     looks = open_detector(settings.model) if detector is None else detector
     opened = opened_sources(inputs, telemetry, camera, known_flights(site), live=live, until=until)
@@ -90,6 +86,10 @@ def map_flights(
 def _known_ground(
     control: Path | None, base: Path | None, sources: Sequence[Source], settings: MapSettings
 ) -> KnownGround | None:
+    if control is not None and base is not None:
+        raise SettingsError("a map is tied to control points (--gcp) or to a base map (--base), not to both")
+    if settings.checks and control is None:
+        raise SettingsError("check points (--check) are of a control point file: give it with --gcp")
     if control is None and base is None:
         return None
     if settings.method != "planar":
