@@ -121,7 +121,7 @@ class Compare {
 
   named(before = this.mode === "before") {
     const name = (n) => { const found = this.versions.find((each) => each.n === n); return day(found.flown_at ?? found.made_at); };
-    const one = (words, n) => el("span", {}, `${words}: ${name(n)} (v${n})`);
+    const one = (words, n) => el("span", {}, `${words}: ${name(n)}`, el("small", {}, ` (v${n})`));
     fill(this.names, this.mode === "swipe" ? [one("Before", this.before), one("After", this.after)] : before ? one("Before", this.before) : one("After", this.after));
   }
 

@@ -14,14 +14,15 @@ const TOOLS = {
   waypoint: ["Waypoint", "point", "Tap the place to fly to."],
 };
 
-/** Load a site's shared drawings; where the station keeps none, this browser does. */
+/** Load a site's shared drawings. */
 export async function loadDrawings(screen) {
+  screen.zones ??= [];
+  if (screen.data.detail.is_new) return;
   try {
     const kept = await get(siteUrl(screen.data.id, "drawings"));
     Object.assign(screen, { zones: kept.features, zonesRevision: kept.revision });
   } catch (problem) {
     if (!(problem instanceof Problem)) throw problem;
-    screen.zones ??= [];
   }
   screen.view?.ready.then(() => screen.view.put("drawings", screen.zones));
 }

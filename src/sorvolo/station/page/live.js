@@ -9,6 +9,7 @@ import * as words from "./words.js";
 
 const STATUS_MS = 10000;
 const RATE_WINDOW_MS = 10000;
+const PLACED_FOR_MS = 3000; // a frame's place counts for so long before telemetry alone is shown
 const LONGEST_DELAY_S = 600; // more is a recording, or a clock that is wrong
 
 /** Follow the site's live events; `show` draws the figures anew, `close` ends it. */
@@ -67,7 +68,19 @@ class Live {
     this.delay_s = Math.abs(delay_s) < LONGEST_DELAY_S ? delay_s : undefined; // a recorded flight has none
     this.last = data;
     if (position) this.trail.push(position.slice(0, 2));
+    const { view, data: site } = this.screen;
+    if (position && view && !site.detail.bounds_wgs84 && this.trail.length === 1) view.go(position.slice(0, 2), 18);
     this.drawSoon();
+  }
+
+  /** What a streaming drone states of itself; a mission places it better. */
+  heard(telemetry) {
+    this.telemetry = telemetry;
+    const { latitude_deg: lat, longitude_deg: lon, camera_yaw_deg: camera, body_yaw_deg: body } = telemetry ?? {};
+    if (lat !== undefined && Date.now() - (this.places.at(-1) ?? 0) > PLACED_FOR_MS) {
+      this.last = { position: [lon, lat], heading_deg: body ?? camera ?? 0 };
+      this.drawSoon();
+    } else this.show();
   }
 
   /** Draw at most once for each picture of the screen, however many frames came. */
@@ -157,6 +170,7 @@ class Live {
       this.run && ["latency", figures.delay_s === undefined ? "–" : `${words.number(figures.delay_s, 2)} s`, "From the drone's picture to its place on the map"],
       ["matched", words.number(figures.matched, 0), "Frames placed by vision"],
       ["by GPS", words.number(figures.by_gps, 0), "Frames placed by GPS alone"],
+      this.telemetry && ["GPS", this.telemetry.horizontal_sigma_m === undefined ? "on" : words.length(this.telemetry.horizontal_sigma_m), gpsWords(this.telemetry)],
       ["rejected", words.number(figures.rejected, 0), Object.entries(figures.reasons).map(([why, count]) => `${count} × ${why}`).join("\n") || "None"],
       ["memory", status.memory_mb ? words.bytes(status.memory_mb * 1e6) : "–", "Of the station's process"],
       ["disk left", words.bytes(status.disk_free_gb * 1e9), low ? "Nearly full: free some space, or nothing new is taken in" : "Free space where the sites are"],
@@ -185,6 +199,11 @@ function droneFeatures({ position, footprint, heading_deg: heading }) {
   }
   if (position) add("body", { type: "Point", coordinates: position.slice(0, 2) }, { heading_deg: heading ?? 0 });
   return features;
+}
+
+function gpsWords({ horizontal_sigma_m: sigma, speed_m_s: speed, height_above_takeoff_m: height }) {
+  return [sigma === undefined ? "The drone states no accuracy" : `Standard deviation of a fix ${words.length(sigma)}`,
+    speed === undefined ? null : `speed ${words.speed(speed)}`, height === undefined ? null : `${words.length(height)} above take-off`].filter(Boolean).join("\n");
 }
 
 let sound = null;

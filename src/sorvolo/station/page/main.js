@@ -17,7 +17,10 @@ export const station = { status: null, events: null };
 let screen = null;
 let turn = 0;
 
+const siteScreen = () => import("./site.js");
+
 async function begin() {
+  if (location.hash.startsWith("#/site/")) siteScreen(); // beside the first question to the station
   applyTheme();
   document.getElementById("settings-button").addEventListener("click", showSettings);
   choices.addEventListener("change", (event) => { if (event.detail === "theme") applyTheme(); });
@@ -68,7 +71,7 @@ async function route() {
   try {
     let made;
     if (kind === "site" && id) {
-      const { showSite } = await import("./site.js");
+      const { showSite } = await siteScreen();
       made = await showSite(main, title, numbers, station, id, view || "map", at.length === 2 && at.every(Number.isFinite) ? at : null);
     } else {
       made = await showSites(main, title, station);

@@ -4,7 +4,7 @@ import { get, siteUrl } from "./api.js";
 import { choices } from "./choices.js";
 import { el, fill, icon, message } from "./dom.js";
 import { comparePanel } from "./compare.js";
-import { drawPanel } from "./draw.js";
+import { drawPanel, loadDrawings } from "./draw.js";
 import { exportPanel } from "./exports.js";
 import { layersPanel } from "./layers.js";
 import { followLive } from "./live.js";
@@ -27,10 +27,8 @@ const PANELS = [
 
 /** Show a site; gives what closes it. */
 export async function showSite(main, title, numbers, station, id, view, at = null) {
-  const detail = await get(siteUrl(id)).catch((problem) => {
-    if (problem.status === 404 && view === "missions") return notMadeYet(id);
-    throw problem;
-  });
+  const isNew = view === "missions" && !(await get("/api/sites")).some((each) => each.id === id);
+  const detail = isNew ? notMadeYet(id) : await get(siteUrl(id));
   return new SiteScreen(main, title, numbers, station, new SiteData(detail), view, at);
 }
 
@@ -68,6 +66,7 @@ class SiteScreen {
     this.card = featureCard(this);
     this.live = followLive(this);
     this.video = videoPane(this);
+    loadDrawings(this); // alert zones count on every panel
     this.onKey = (event) => this.key(event);
     addEventListener("keydown", this.onKey);
     this.hear(this.data, "data", (event) => this.draw(event.detail));
@@ -88,15 +87,16 @@ class SiteScreen {
   }
 
   async load() {
-    if (this.view) {
-      await this.view.ready;
-      const { live_revision: live, versions } = this.data.detail;
+    const { live_revision: live, versions, is_new: isNew } = this.data.detail;
+    const drawn = this.view?.ready.then(() => {
+      if (this.closed) return;
       this.view.showVersion(live ? `live-${live}` : versions.at(-1)?.n);
       if (this.lastPlace) this.view.go(this.lastPlace);
-    }
-    if (!this.data.detail.is_new) await this.data.load();
-    if (this.closed) return;
-    this.opened?.refresh?.();
+    });
+    if (!isNew) await this.data.load(["changes", "objects", "track"]);
+    await drawn;
+    if (!isNew) await this.data.load(["coverage", "frames", "pod"]); // mostly not shown at first
+    if (!this.closed) this.opened?.refresh?.();
   }
 
   async reload({ site }) {

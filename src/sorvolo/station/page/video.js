@@ -10,6 +10,7 @@ const BOXES_WITHIN_US = 250000; // boxes further from a picture than this are no
 const KEPT_BOXES = 300;
 const MOST_HELD_S = 1.2;
 const STAMP_BYTES = 8;
+const STATE_MS = 1000;
 
 /** The pane over the map; it appears when a stream is on. `jump(view)` plays a recorded flight at a second. */
 export function videoPane(screen) {
@@ -87,12 +88,21 @@ class VideoPane {
     this.show = this.fmp4 ? new SegmentPlayer(this.player, (pts_us) => this.shown(pts_us)) : new FramePlayer(this.canvas, (pts_us) => this.shown(pts_us), () => this.hold_s());
     this.canvas.hidden = this.fmp4;
     this.player.hidden = !this.fmp4;
+    this.poll = setInterval(() => this.ask(), STATE_MS);
     socket.addEventListener("message", ({ data }) => (typeof data === "string" ? this.said(JSON.parse(data)) : this.packet(data)));
     socket.addEventListener("close", () => {
       if (socket !== this.socket) return;
       fill(this.delay, "no signal");
       this.timer = setTimeout(() => this.connect(), 3000);
     });
+  }
+
+  /** Where the drone is, by its own telemetry. */
+  async ask() {
+    try {
+      const state = await get(`/api/streams/${encodeURIComponent(this.stream)}`);
+      if (state.is_connected) this.screen.live.heard(state.telemetry);
+    } catch { /* the connection's own sign says so */ }
   }
 
   said(words) {
@@ -170,6 +180,7 @@ class VideoPane {
 
   drop() {
     clearTimeout(this.timer);
+    clearInterval(this.poll);
     const old = this.socket;
     this.socket = null;
     old?.close();
