@@ -143,6 +143,12 @@ class Spool:
             self._drop((fresh or newest or [self.last_seq + 1])[0], "late")
 
     @property
+    def oldest_ns(self) -> int | None:
+        """When the oldest waiting message was taken (UTC); None where none waits."""
+        with self._lock:
+            return self._waiting[0].taken_ns if self._waiting else None
+
+    @property
     def is_empty(self) -> bool:
         """Whether everything was acknowledged or dropped."""
         with self._lock:
