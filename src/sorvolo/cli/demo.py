@@ -68,8 +68,9 @@ def demo(
                 f"Checked against the truth: {events.found} of {events.must_find} changes found, "
                 f"{counted(events.false, 'false change')} reported."
             )
-    console.print("Next, review the changes, or map a flight of your own:")
+    console.print("Next, see both flights in a browser, review the changes, or map a flight of your own:")
     for command in (
+        f"sorvolo serve {folder} --open",
         f"sorvolo review {site}",
         f"sorvolo history {site}",
         "sorvolo map MY_VIDEO.MP4 --site my-site",
