@@ -50,9 +50,15 @@ def run_station(
 def _listening(settings: StationSettings) -> socket.socket:
     """The socket to listen at. Raises SettingsError where it cannot be had."""
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    # the protocol is named: asyncio sends small answers at once (TCP_NODELAY) only where it is
+    listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
-        return socket.create_server((settings.host, settings.port), family=family, backlog=256)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind((settings.host, settings.port))
+        listening.listen(256)
+        return listening
     except OSError as error:
+        listening.close()
         raise SettingsError(
             f"cannot listen at {settings.host}:{settings.port} ({error.strerror}): another program does, or the "
             "address is not this machine's; choose another --port or --host"
