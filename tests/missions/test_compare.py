@@ -28,6 +28,7 @@ from sorvolo.missions.evaluate.changes import evaluate_changes
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.flight.setup import _check_place, prepare
+from sorvolo.missions.heights.flight_views import run_of
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.map.known_keyframes import KnownKeyframes
 from sorvolo.missions.simulate.site import simulate_site
@@ -42,6 +43,7 @@ from sorvolo.simulation.settings import (
     SimulationSettings,
 )
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.findings import CompareUpdate, Verdict, ViewStatus
 from sorvolo.survey.flight import Frame, PosedFrame
 from sorvolo.survey.mosaic import Status
@@ -196,6 +198,18 @@ def test_the_same_flight_again_gives_the_same_and_doubles_nothing(compared, flow
         once = dict(archive.tiles())
     assert once.keys() == again.keys()
     assert all(np.array_equal(once[index], again[index]) for index in once)
+
+
+def test_heights_made_since_are_a_reason_to_compare_again(compared, flown, tmp_path):
+    site, settings = tmp_path / "higher", CompareSettings(model="none", writes_masks=True)
+    shutil.copytree(compared[0], site)
+    assert compare(flown, site, settings) == []
+    with Archive.open(site, write=False) as archive:
+        run = run_of(archive.keyframes("flight1"))
+        report = archive.height_path("flight1", HeightFile.REPORT)
+    report.write_text(json.dumps({"run": run, "cell_m": 0.2}))
+    with pytest.raises(InputError, match=r"heights\.tif"):  # it is missing, which only a comparison notices
+        compare(flown, site, settings)
 
 
 def test_stopping_half_way_leaves_the_site_as_it_was(flown, site):

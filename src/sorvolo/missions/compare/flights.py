@@ -19,6 +19,7 @@ from sorvolo.missions.flight.map_objects import open_detector
 from sorvolo.missions.flight.request import AlreadyDone, already_done, request_of
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup, known_flights, known_ground_m, prepare, repeated
+from sorvolo.missions.heights.measure import heights_stamp
 from sorvolo.mosaic.selection import every
 from sorvolo.registration.opencv_threads import single_threaded_opencv
 from sorvolo.store.site.archive import Archive
@@ -70,7 +71,8 @@ def compare_flights(
             )
             base, is_newest = _base_version(archive, source)
             reviews = [(each.change_id, each.verdict.value) for each in archive.reviews()]
-            request = request_of(setup, settings, wanted, looks, base, reviews, steps)
+            heights = heights_stamp(archive, but=source.name)
+            request = request_of(setup, settings, wanted, looks, base, reviews, heights, steps)
             if not again and (compared := already_done(archive, setup, request)):
                 known.append(compared)
                 continue

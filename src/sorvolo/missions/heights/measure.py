@@ -128,6 +128,14 @@ def flight_with_heights(archive: Archive, but: str) -> str | None:
     return None
 
 
+def heights_stamp(archive: Archive, but: str) -> tuple[str, int] | None:
+    """Of which flight, `but` one, the newest heights are, and when they were written (ns); None without heights."""
+    flight_id = flight_with_heights(archive, but)
+    if flight_id is None:
+        return None
+    return flight_id, archive.height_path(flight_id, HeightFile.REPORT).stat().st_mtime_ns
+
+
 def _report(archive: Archive, flight_id: str) -> Mapping[str, Any]:
     folder = archive.flight_folder(flight_id)
     try:
