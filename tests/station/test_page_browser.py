@@ -3,7 +3,9 @@
 import json
 import re
 import shutil
+import struct
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +16,19 @@ pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
 import numpy as np
 from browsers import Served, Watched, chromium
+from PIL import Image
 from playwright.sync_api import expect
+from pyproj import Geod
 from stream_flights import write_track, write_video
 from test_stream_messages import units
 from websockets.sync.client import connect
 
+from sorvolo.geometry.coordinates import Coordinates, place_text
 from sorvolo.station.events import NewEvent
 from sorvolo.station.messages import Hello, Kind, Message
 from sorvolo.station.tokens import make_token
 from sorvolo.store.exports.change_files import crop_names
-from sorvolo.store.images import png_from_rgba
+from sorvolo.store.images import jpeg_from_image, png_from_rgba
 
 AXE = (Path(__file__).parent / "vendor" / "axe.min.js").read_text(encoding="utf-8")
 MOST_BYTES = 2_500_000  # of the page, cold
@@ -248,7 +253,7 @@ def test_a_place_is_remembered(served: Served, opened: Watched) -> None:
     page.locator("#settings-button").click()
     page.get_by_label("Coordinates").select_option("mgrs")
     page.get_by_role("button", name="Close", exact=True).click()
-    expect(page.locator(".place-name")).to_have_text(re.compile(r"^33T[A-Z]{2} \d{5} \d{5}$"))
+    expect(page.locator(".place-name")).to_have_text(re.compile(r"^33T [A-Z]{2} \d{5} \d{5}$"))
 
 
 def test_what_is_drawn_is_measured_and_shared(browser: Any, served: Served, opened: Watched) -> None:
@@ -349,6 +354,130 @@ def test_the_drone_s_video_is_shown_with_boxes(served: Served, opened: Watched, 
         page.locator("aside.video footer", has_text="1 in the picture").wait_for()
         drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
     page.locator(".delay", has_text="ended").wait_for()
+
+
+def test_without_webcodecs_the_video_plays_as_fragments(browser: Any, served: Served, tmp_path: Path) -> None:
+    context = browser.new_context()
+    context.add_init_script("delete window.VideoDecoder")
+    watched = Watched(context, served.url)
+    show(watched, served)
+    messages = units(write_video(tmp_path / "v.mp4"), "h264")
+    hello = Message(Kind.HELLO, 0, 0, Hello("b" * 16, "h264", 160, 120, 10.0).to_json().encode())
+    with connect(f"{served.url.replace('http', 'ws')}/api/ingest/second") as drone:
+        drone.send(hello.to_bytes())
+        drone.recv()
+        for each in messages:
+            drone.send(each.to_bytes())
+        video = watched.page.locator("aside.video video")
+        video.wait_for()
+        expect(watched.page.locator("aside.video header b")).to_have_text("second")
+        for _ in range(100):
+            if video.evaluate("each => each.videoWidth === 160 && each.readyState >= 2"):
+                break
+            watched.page.wait_for_timeout(100)
+        else:
+            raise AssertionError("no picture was played")
+        expect(watched.page.locator(".delay")).to_have_text(re.compile("behind"))
+    assert watched.faults == []
+    context.close()
+
+
+def test_photos_go_up_as_one_file(opened: Watched, served: Served, tmp_path: Path) -> None:
+    page = opened.page
+    photos = [tmp_path / f"DJI_000{number}.jpg" for number in (2, 1, 3)]
+    for each in photos:
+        each.write_bytes(jpeg_from_image(np.full((48, 64, 3), 120, np.uint8)))
+    page.route(re.compile(r"/api/runs$"), lambda route: route.fulfill(
+        status=201, content_type="application/json", body='{"id": "r"}'
+    ))
+    page.keyboard.press("6")
+    page.get_by_label("Files of the flight").first.set_input_files([str(each) for each in photos])
+    page.get_by_role("button", name="Start").click()
+    page.locator(".message", has_text="started").wait_for()
+    (upload,) = [each for each in served.ask("/api/uploads") if each["kind"] == "photos"]
+    assert (upload["name"], upload["state"]) == ("DJI_0001-3-photos.zip", "ready")
+
+
+def test_heights_along_a_line_and_the_printed_sheet(opened: Watched) -> None:
+    page = opened.page
+    heights = {"distance_m": [0, 10, 20, 30], "height_m": [101.5, None, 104, 103], "ground_m": [], "sigma_m": 0.2}
+    page.route(re.compile("/profile"), lambda route: route.fulfill(json=heights))
+    page.keyboard.press("5")
+    page.locator("[data-tool=profile]").click()
+    box = page.locator(".map-canvas").bounding_box()
+    for x in (0.4, 0.6):
+        page.mouse.click(box["x"] + x * box["width"], box["y"] + 0.5 * box["height"])
+        page.wait_for_timeout(350)
+    page.get_by_role("button", name="Done").click()
+    page.locator(".profile figcaption", has_text="Difference 2.5 m, accuracy of a height 0.2 m").wait_for()
+    page.evaluate("""() => {
+      window.print = () => { document.body.dataset.printed = document.querySelector('.sheet').textContent; };
+    }""")
+    page.keyboard.press("7")
+    page.get_by_role("button", name="Print").click()
+    page.locator("body[data-printed]").wait_for(state="attached")
+    assert "b-3" in page.locator("body").get_attribute("data-printed")
+    assert page.locator(".sheet img").evaluate("each => each.naturalWidth") > 500
+    page.evaluate("dispatchEvent(new Event('afterprint'))")
+
+
+def test_a_base_map_comes_from_a_file(opened: Watched, tmp_path: Path) -> None:
+    page = opened.page
+    page.get_by_text("Base map", exact=True).click()
+    red = png_from_rgba(np.full((256, 256, 4), (255, 0, 0, 255), np.uint8))
+    (tmp_path / "base.pmtiles").write_bytes(pmtiles_of(red))
+    page.get_by_label("Base map file").set_input_files(str(tmp_path / "base.pmtiles"))
+    for _ in range(100):
+        page.mouse.move(5, 5)
+        shot = Image.open(BytesIO(page.locator(".map-canvas").screenshot())).convert("RGB")
+        if shot.getpixel((30, shot.height - 60)) == (255, 0, 0):
+            break
+        page.wait_for_timeout(100)
+    else:
+        raise AssertionError("the base map is not shown")
+    broken = {"name": "x.pmtiles", "mimeType": "", "buffer": b"no map"}
+    page.get_by_label("Base map file").set_input_files(files=[broken])
+    page.locator(".message.error", has_text="cannot be read").wait_for()
+
+
+def pmtiles_of(tile: bytes) -> bytes:
+    """A PMTiles archive (version 3) of one PNG tile, that of zoom 0: the header, the root directory, metadata, data."""
+    directory = bytes([1, 0, 1]) + varint(len(tile)) + bytes([1])  # one entry: tile 0, run 1, its length, offset 0
+    meta = b"{}"
+    start = 127 + len(directory)
+    sections = [127, len(directory), start, len(meta), 0, 0, start + len(meta), len(tile), 1, 1, 1]
+    kinds = bytes([1, 1, 1, 2, 0, 0])  # clustered; not compressed; PNG; zooms 0 to 0
+    box = struct.pack("<iiii", -1_800_000_000, -850_000_000, 1_800_000_000, 850_000_000)
+    middle = bytes([0]) + struct.pack("<ii", 0, 0)
+    header = b"PMTiles" + bytes([3]) + struct.pack("<11Q", *sections) + kinds + box + middle
+    assert len(header) == 127
+    return header + directory + meta + tile
+
+
+def varint(value: int) -> bytes:
+    found = bytearray()
+    while value >= 128:
+        found.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*found, value])
+
+
+def test_coordinates_are_those_of_the_command_line(opened: Watched) -> None:
+    places = [
+        (12.6037, 41.8923), (5.3, 60.4), (16.0, 78.2), (-70.6, -33.4), (179.99, -16.5), (-0.001, 51.5), (8.5, 0.0001),
+    ]
+    found = opened.page.evaluate("""async places => {
+      const {distance_m} = await import('/page/places.js');
+      const {place} = await import('/page/words.js');
+      const {choices} = await import('/page/choices.js');
+      const written = kind => { choices.set('coordinates', kind); return places.map(each => place(each)); };
+      const far = places.map(([lon, lat]) => distance_m([lon, lat], [lon + 1e-3, lat + 1e-3]));
+      return {utm: written('utm'), mgrs: written('mgrs'), latlon: written('latlon'), far};
+    }""", places)
+    for system in Coordinates:
+        assert found[system.value] == [place_text(lat, lon, system) for lon, lat in places]
+    true_m = [Geod(ellps="WGS84").inv(lon, lat, lon + 1e-3, lat + 1e-3)[2] for lon, lat in places]
+    assert found["far"] == pytest.approx(true_m, rel=1e-5)
 
 
 def test_a_station_with_tokens_asks_who_comes(browser: Any, made_site: Path, tmp_path: Path) -> None:

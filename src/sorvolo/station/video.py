@@ -21,7 +21,7 @@ _MOST_WAITING_BYTES = 8_000_000
 _MOST_GROUP = 900  # pictures since a key frame that are kept for new viewers
 _STAMP_BYTES = 8
 _CLOCK_HZ = 1_000_000
-_STEP_US = 33_333  # how long a picture is shown where none follows
+_STEP_US = 33_333  # how long a picture is shown where nobody states the rate
 
 
 class VideoHub:
@@ -182,6 +182,7 @@ class Fragments:
     def __init__(self, hello: Hello, key_frame: bytes) -> None:
         self._codec = hello.codec
         self._number = 0
+        self._step_us = round(_CLOCK_HZ / hello.fps) if hello.fps > 0 else _STEP_US
         sink = BytesIO()
         options = {"movflags": "empty_moov+default_base_moof+frag_custom"}
         with (
@@ -202,7 +203,7 @@ class Fragments:
         flags = 0x0200_0000 if message.is_key else 0x0101_0000  # needs no other; needs one, is no place to begin
         tfhd = _box(b"tfhd", struct.pack(">II", 0x02_0000, 1))  # offsets count from the fragment
         tfdt = _box(b"tfdt", struct.pack(">IQ", 0x0100_0000, dts_us))
-        run = (0x0100_0F01, 1, 0, _STEP_US, len(data), flags, message.pts_us - dts_us)
+        run = (0x0100_0F01, 1, 0, self._step_us, len(data), flags, message.pts_us - dts_us)
         moof = b""
         for _ in range(2):  # the data's offset is known once the length is
             trun = _box(b"trun", struct.pack(">IIiIIIi", *run[:2], len(moof) + 8, *run[3:]))

@@ -24,7 +24,7 @@ export function utmZone(lon, lat) {
 
 /** {zone, band, east_m, north_m} of a place; null beyond 80 south and 84 north, where UTM ends. */
 export function utm(lon, lat) {
-  if (!(lat >= -80 && lat <= 84)) return null;
+  if (!(lat >= -80 && lat < 84)) return null;
   const zone = utmZone(lon, lat);
   const dlon = (lon - (zone * 6 - 183)) * RAD;
   const e = Math.sqrt(E2);
@@ -43,7 +43,7 @@ export function utm(lon, lat) {
   return { zone, band, east_m: 500000 + 0.9996 * RADIUS * x, north_m: (lat < 0 ? 1e7 : 0) + 0.9996 * RADIUS * y };
 }
 
-/** The MGRS reference of a place to one metre, as 33TTF 82041 25113; null beyond UTM. */
+/** The MGRS reference of a place to one metre, as 33T TG 92645 41872; null beyond UTM. */
 export function mgrs(lon, lat) {
   const found = utm(lon, lat);
   if (!found) return null;
@@ -53,7 +53,7 @@ export function mgrs(lon, lat) {
   const column = columns[Math.floor(east_m / 1e5) - 1];
   const row = rows[(Math.floor(north_m / 1e5) + (zone % 2 ? 0 : 5)) % 20];
   const digits = (value) => String(Math.floor(value) % 100000).padStart(5, "0");
-  return `${zone}${band}${column}${row} ${digits(east_m)} ${digits(north_m)}`;
+  return `${zone}${band} ${column}${row} ${digits(east_m)} ${digits(north_m)}`;
 }
 
 /** Metres of a degree of longitude and of latitude at a latitude. */

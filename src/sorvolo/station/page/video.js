@@ -22,7 +22,7 @@ class VideoPane {
     Object.assign(this, { screen, boxes: [], stream: null, socket: null, late_s: 0 });
     this.canvas = el("canvas", { width: 640, height: 360 });
     this.overlay = el("canvas", { class: "boxes", width: 640, height: 360, "aria-hidden": true });
-    this.player = el("video", { muted: true, playsinline: true, hidden: true });
+    this.player = el("video", { ".muted": true, playsinline: true, hidden: true });
     this.delay = el("span", { class: "delay" });
     this.name = el("b", {}, "Video");
     this.picture = el("div", { class: "picture" }, this.canvas, this.player, this.overlay);
@@ -85,7 +85,7 @@ class VideoPane {
     const socket = new WebSocket(url);
     socket.binaryType = "arraybuffer";
     this.socket = socket;
-    this.show = this.fmp4 ? new SegmentPlayer(this.player, (pts_us) => this.shown(pts_us)) : new FramePlayer(this.canvas, (pts_us) => this.shown(pts_us), () => this.hold_s());
+    this.show = this.fmp4 ? new SegmentPlayer(this.player, (pts_us) => this.shown(pts_us), (pts_us) => { this.newest = { pts_us, at: performance.now() }; }) : new FramePlayer(this.canvas, (pts_us) => this.shown(pts_us), () => this.hold_s());
     this.canvas.hidden = this.fmp4;
     this.player.hidden = !this.fmp4;
     this.poll = setInterval(() => this.ask(), STATE_MS);
@@ -278,8 +278,8 @@ export function hasKey(data) {
 
 /** Fragmented MP4 played by MediaSource, kept near its newest second. */
 class SegmentPlayer {
-  constructor(player, shown) {
-    Object.assign(this, { player, shown, queue: [] });
+  constructor(player, shown, appended) {
+    Object.assign(this, { player, shown, appended, queue: [] });
   }
 
   begin({ codec }) {
@@ -288,7 +288,11 @@ class SegmentPlayer {
     this.player.src = URL.createObjectURL(this.source);
     this.source.addEventListener("sourceopen", () => {
       this.buffer = this.source.addSourceBuffer(type);
-      this.buffer.addEventListener("updateend", () => this.feed());
+      this.buffer.addEventListener("updateend", () => {
+        const held = this.buffer.buffered;
+        if (held.length) this.appended(held.end(held.length - 1) * 1e6);
+        this.feed();
+      });
       this.feed();
     }, { once: true });
     this.player.play().catch(() => {});
@@ -316,7 +320,8 @@ class SegmentPlayer {
     const held = player.buffered;
     if (!held.length) return;
     const end = held.end(held.length - 1);
-    if (end - player.currentTime > 1 || player.currentTime < held.start(0)) player.currentTime = end - 0.1;
+    const isHeld = [...Array(held.length).keys()].some((k) => held.start(k) <= player.currentTime && player.currentTime <= held.end(k));
+    if (end - player.currentTime > 1 || !isHeld) player.currentTime = Math.max(held.start(held.length - 1), end - 0.1); // in a gap it would stay
     if (this.buffer && !this.buffer.updating && player.currentTime - held.start(0) > 30) this.buffer.remove(0, player.currentTime - 10);
   }
 

@@ -84,6 +84,8 @@ export function day(iso) {
   return at.toLocaleDateString("en-GB", { dateStyle: "medium", ...style() });
 }
 
+const metres = (value, digits) => String(Math.round(value)).padStart(digits, "0");
+
 /** A place as the user wants it: degrees, UTM or MGRS. */
 export function place([lon, lat], { local = false } = {}) {
   if (local) return "no place on Earth (a site without GPS)";
@@ -92,7 +94,7 @@ export function place([lon, lat], { local = false } = {}) {
   if (kind === "mgrs") return mgrs(lon, lat) ?? degrees;
   if (kind === "utm") {
     const found = utm(lon, lat);
-    return found ? `${found.zone}${found.band} ${found.east_m.toFixed(1)} ${found.north_m.toFixed(1)}` : degrees;
+    return found ? `${found.zone}${found.band} ${metres(found.east_m, 6)} ${metres(found.north_m, 7)}` : degrees;
   }
   return degrees;
 }
