@@ -15,6 +15,8 @@ from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.site.tiles import TileView
 
 _MOST_LEVELS = 24
+_AROUND_ORIGIN = {(-1, -1), (0, -1), (-1, 0), (0, 0)}  # what four tiles that meet at the origin become for ever
+_COARSE_LEVEL = 2  # from which a tile is made of 16 others
 
 
 Key = TypeVar("Key")
@@ -60,11 +62,14 @@ class Pyramid:
     """The tiles of one state of a map at halved resolutions. Level 0 is the map's own.
 
     Pictures are known by the hashes of what they are made of: where the map did not change, one made for an earlier
-    state is used again from `cache`.
+    state is used again from `cache`. `coarse` may give tiles of higher levels without reading what they are made of.
     """
 
-    def __init__(self, tiles: TileView, tile_px: int, cache: BytesCache[str, ImageRGBA]) -> None:
-        self._tiles, self._cache, self.tile_px = tiles, cache, tile_px
+    def __init__(
+        self, tiles: TileView, tile_px: int, cache: BytesCache[str, ImageRGBA],
+        coarse: Callable[[int, TileIndex], ImageRGBA | None] = lambda _, __: None,
+    ) -> None:
+        self._tiles, self._cache, self._coarse, self.tile_px = tiles, cache, coarse, tile_px
 
     @cached_property
     def revision(self) -> str:
@@ -76,7 +81,7 @@ class Pyramid:
     def keys(self) -> list[Mapping[TileIndex, str]]:
         """For each level the tiles there are, and what names the content of each."""
         levels: list[Mapping[TileIndex, str]] = [dict(self._tiles.hashes)]
-        while len(levels[-1]) > 1 and len(levels) < _MOST_LEVELS:
+        while not levels[-1].keys() <= _AROUND_ORIGIN and len(levels) < _MOST_LEVELS:
             parts: dict[TileIndex, list[str]] = {}
             for (column, row), key in sorted(levels[-1].items()):
                 parts.setdefault((column // 2, row // 2), []).append(f"{column % 2}{row % 2}{key}")
@@ -111,6 +116,9 @@ class Pyramid:
         return self._cache.get(key, lambda: self._halved(level, index))
 
     def _halved(self, level: int, index: TileIndex) -> ImageRGBA:
+        given = self._coarse(level, index) if level >= _COARSE_LEVEL else None
+        if given is not None:
+            return given
         half = self.tile_px // 2
         result = np.zeros((self.tile_px, self.tile_px, 4), np.uint8)
         for right in (0, 1):

@@ -9,6 +9,7 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, ImageRGBA
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.station.map_overview import MapOverview
 from sorvolo.station.problems import Problem
 from sorvolo.station.pyramid import BytesCache, Pyramid
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
@@ -75,7 +76,10 @@ class WebTiles:
             if known is not None and known[0] == (id(archive), mark):
                 return known[1]
         tiles = archive.live_tiles() if name == "live" else archive.tiles(int(name))
-        made = Pyramid(tiles, archive.site_grid().grid.tile_px, self._pictures)
+        grid = archive.site_grid().grid
+        made = Pyramid(tiles, grid.tile_px, self._pictures)
+        if _is_exported(archive, name):
+            made = Pyramid(tiles, grid.tile_px, self._pictures, MapOverview(archive.mosaic_path, grid).tile)
         with self._lock:
             if len(self._states) > 200:
                 self._states.clear()
@@ -93,6 +97,14 @@ def change_mark(archive: Archive) -> tuple[int, ...]:
             continue
         mark += [about.st_size, about.st_mtime_ns]
     return tuple(mark)
+
+
+def _is_exported(archive: Archive, name: str) -> bool:
+    """Whether a state, a version's number or `live`, is the one that the map's GeoTIFF shows."""
+    versions = archive.versions()
+    newest = max((each.id for each in versions if each.complete), default=0)
+    shown = newest if name == "live" and all(each.complete for each in versions) else name
+    return str(shown) == str(newest) and newest == archive.exported_version
 
 
 def render(state: Pyramid, site_grid: SiteGrid, z: int, x: int, y: int, ending: str = ".webp") -> bytes:

@@ -136,6 +136,12 @@ class Archive:
         """Every state of the map, oldest first, the one being made included."""
         return self._files.versions()
 
+    @property
+    def exported_version(self) -> int:
+        """The version that mosaic.tif and the other files of the map show; 0 for none."""
+        with self._files.catalogue.reading() as connection:
+            return records.derived_version(connection)
+
     def version_at(self, moment: datetime) -> VersionEntry:
         """The newest version of flights flown by a moment, taken as UTC when it names no time zone.
 
