@@ -1,6 +1,7 @@
 """A station's side of streaming alone, over a real socket: what `sorvolo serve` joins into its application."""
 
 import asyncio
+import ssl
 import threading
 from http import HTTPStatus
 from pathlib import Path
@@ -46,8 +47,10 @@ class SocketLink:
 class StreamServer:
     """Runs in a thread; `kill` cuts all links as a crash does, and `start` begins anew at the same port."""
 
-    def __init__(self, folder: Path, *, limits: IngestLimits = _LIMITS, pause_s: float = 0.0) -> None:
-        self.folder, self._limits, self._pause_s = folder, limits, pause_s
+    def __init__(
+        self, folder: Path, *, limits: IngestLimits = _LIMITS, pause_s: float = 0.0, tls: ssl.SSLContext | None = None
+    ) -> None:
+        self.folder, self._limits, self._pause_s, self._tls = folder, limits, pause_s, tls
         self.port = 0
         self.states: list[Any] = []
 
@@ -72,7 +75,7 @@ class StreamServer:
 
     @property
     def url(self) -> str:
-        return f"http://127.0.0.1:{self.port}"
+        return f"{'http' if self._tls is None else 'https'}://127.0.0.1:{self.port}"
 
     def _run(self, ready: threading.Event) -> None:
         asyncio.set_event_loop(self._loop)
@@ -97,7 +100,9 @@ class StreamServer:
             return None
 
         self._sockets: set[Any] = set()
-        self._server = await serve(talk, "127.0.0.1", self.port, process_request=check, max_size=20_000_000)
+        self._server = await serve(
+            talk, "127.0.0.1", self.port, process_request=check, max_size=20_000_000, ssl=self._tls
+        )
         self.port = next(iter(self._server.sockets)).getsockname()[1]
         ready.set()
 

@@ -1,5 +1,8 @@
 """Streaming through what happens in the field: cut links, slow links, wrong tokens, wrong pictures, clocks set anew."""
 
+import shutil
+import ssl
+import subprocess
 import threading
 import time
 from itertools import pairwise
@@ -12,7 +15,7 @@ from stream_server import TOKEN, StreamServer
 
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import open_sources
-from sorvolo.errors import InputError
+from sorvolo.errors import InputError, SettingsError
 from sorvolo.station.client import StreamClient, StreamReport, StreamSettings, stream_url
 from sorvolo.station.footage import open_footage
 from sorvolo.station.ingest import IngestLimits
@@ -135,6 +138,25 @@ def test_a_wrong_token_is_no_outage(flight: Path, tmp_path: Path) -> None:
         with pytest.raises(InputError, match="refuses the token"):
             client(flight, server, tmp_path / "spool", token="guess").run()
         assert not (tmp_path / "streams").exists()
+
+
+def test_tls_with_an_authority_of_one_s_own(flight: Path, tmp_path: Path) -> None:
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not installed")
+    key, certificate = tmp_path / "key.pem", tmp_path / "cert.pem"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=station", "-addext",
+         "subjectAltName=IP:127.0.0.1", "-keyout", str(key), "-out", str(certificate)], check=True, capture_output=True,
+    )
+    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    tls.load_cert_chain(certificate, key)
+    with StreamServer(tmp_path / "streams", tls=tls) as server:
+        with pytest.raises(InputError, match=r"certificate is not trusted .* give its authority as --ca"):
+            client(flight, server, tmp_path / "spool1").run()
+        trusting = StreamSettings(speed=0, authority=certificate)
+        assert client(flight, server, tmp_path / "spool2", settings=trusting).run().frames == 30
+        with pytest.raises(SettingsError, match="no usable certificate"):
+            client(flight, server, tmp_path / "spool3", settings=StreamSettings(authority=flight)).run()
 
 
 def test_pictures_that_no_browser_plays_are_refused_at_once(tmp_path: Path) -> None:

@@ -288,6 +288,8 @@ class Flight:
 
     def take(self, message: Message) -> bool:
         """Write a message; False for one that is there already. Raises Refusal for what is no video or telemetry."""
+        if message.kind not in (Kind.VIDEO, Kind.TELEMETRY):
+            raise Refusal(f"a message of the kind {message.kind} in the middle of a flight")
         if message.seq <= self._file.last_seq:
             self.repeated += 1
             return False
@@ -338,8 +340,6 @@ class Flight:
         if message.kind is Kind.TELEMETRY:
             self.last_sample = sample_from_json(message.payload)
             return
-        if message.kind is not Kind.VIDEO:
-            raise Refusal(f"a message of the kind {message.kind} in the middle of a flight")
         if not 0 <= message.pts_us < 2**52 or not -(2**40) < (message.dts_us or 0) < 2**52:
             raise Refusal(f"a picture at the time {message.pts_us} us")
         codec = self.hello.codec

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import logging
 import struct
 from collections import deque
 from collections.abc import Mapping
@@ -13,6 +14,8 @@ import av
 
 from sorvolo.station.access_units import codec_string, is_delimiter, nal_units
 from sorvolo.station.messages import Hello, Message
+
+_LOG = logging.getLogger("sorvolo.station.video")
 
 Mode = Literal["annexb", "fmp4"]
 
@@ -93,7 +96,7 @@ class VideoHub:
         codec = codec_string(self._hello.codec, message.payload)
         if codec is not None and codec != self._codec:
             self._codec, self._group = codec, []
-            self._fragments = Fragments(self._hello, message.payload)
+            self._fragments = _fragments_of(self._hello, message.payload)
             for viewer in self._viewers:
                 self._start(viewer)
         self._group = [message]
@@ -114,8 +117,16 @@ class VideoHub:
     def _packed(self, mode: Mode, message: Message) -> bytes:
         if mode == "annexb":
             return annexb_bytes(message)
-        assert self._fragments is not None  # made with the first key frame
-        return self._fragments.fragment(message)
+        return b"" if self._fragments is None else self._fragments.fragment(message)
+
+
+def _fragments_of(hello: Hello, key_frame: bytes) -> "Fragments | None":
+    """Fragments that begin with a key frame; None where FFmpeg makes no header of its parameter sets."""
+    try:
+        return Fragments(hello, key_frame)
+    except (av.FFmpegError, ValueError, IndexError) as error:
+        _LOG.warning("no fragmented MP4 of this stream: %s", error)
+        return None
 
 
 class Viewer:
