@@ -37,7 +37,7 @@ class VideoPane {
       screen.station.events.addEventListener(type, listener);
       return () => screen.station.events.removeEventListener(type, listener);
     };
-    this.ends = [hear("frame.boxes", ({ detail }) => { if (detail.data.stream === this.stream) this.take(detail.data); }), hear("stream.state", ({ detail }) => this.heard(detail))];
+    this.ends = [hear("stream.state", ({ detail }) => this.heard(detail))];
     this.look();
   }
 
