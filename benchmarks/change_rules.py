@@ -118,7 +118,7 @@ RULES: tuple[Rule, ...] = (
     _decision("kinds: signs of the other date", "before 0014", ("shape.kinds:_OTHER", np.zeros(6))),
     _decision("outlines by the majority of masks", "before 0014", (f"{_PICTURES}.least_majority", _INFINITE)),
     _decision("outlines without shadows", "before 0014", ("shape.shadows:thing_of", _thing_alone)),
-    _decision("outlines without a shadow's specks", "before 0014", (f"{_THINGS}.least_piece", 0.0)),
+    _decision("outlines without a shadow's specks", "before 0014", (f"{_THINGS}.least_piece", 1e-9)),
     _decision("outlines: hardly anything lit is all dark", "before 0014", (f"{_THINGS}.least_share", 0.0)),
     # how views are gathered
     _rule("leaning neighbours", "0015", (f"{_EVIDENCE}:PassingSettings.share", 0.0)),
