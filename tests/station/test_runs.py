@@ -187,3 +187,6 @@ def test_without_free_space_nothing_starts(flown: Path, tmp_path: Path) -> None:
     with TestClient(station_app(StationSettings(tmp_path / "root", free_floor_gb=1e6)), base_url=HOST) as client:
         answer = client.post("/api/runs", json=wish(client))
         assert answer.status_code == 507 and "delete" in answer.json()["detail"]
+        client.app.state.station.runs.look_at_disk()  # type: ignore[attr-defined]
+        (low,) = [each for each in all_events(client) if each["type"] == "station.disk"]
+        assert low["data"]["is_low"] and low["data"]["floor_gb"] == 1e6

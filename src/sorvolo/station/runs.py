@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import itertools
 import json
 import os
 import secrets
@@ -42,6 +43,7 @@ _MOST_RUNNING = 4
 _MOST_LINE_BYTES = 4_000_000
 _MOST_LOG_BYTES = 4000
 _LOOK_EVERY_S = 0.1
+_DISK_EVERY = 50  # looks between two at the disk
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,7 @@ class Runs:
         self._folder = settings.state_folder / "runs"
         self._lock = threading.RLock()
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._is_low = False
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="runs", daemon=True)
 
@@ -156,11 +159,25 @@ class Runs:
             count += self._look_at(run, row["journal_offset"]).state == RUNNING
         return count
 
+    def look_at_disk(self) -> None:
+        """Announce once that the free space fell below the floor, and once that it is above it again."""
+        free_gb = shutil.disk_usage(self._settings.root).free / 1e9
+        is_low = free_gb < self._settings.free_floor_gb
+        if is_low != self._is_low:
+            self._is_low = is_low
+            floor_gb = self._settings.free_floor_gb
+            data = {"is_low": is_low, "free_gb": round(free_gb, 2), "floor_gb": floor_gb}
+            self._events.append(NewEvent("station.disk", data))
+
     # ---- inside -----------------------------------------------------------------------------------------------
 
     def _watch(self) -> None:
-        while not self._ending.wait(_LOOK_EVERY_S):
+        for count in itertools.count():
+            if self._ending.wait(_LOOK_EVERY_S):
+                return
             try:
+                if count % _DISK_EVERY == 0:
+                    self.look_at_disk()
                 self.look()
             except Exception as error:  # a full disk, a folder taken away: told in the log, tried again
                 sys.stderr.write(f"station: runs cannot be followed: {error}\n")
