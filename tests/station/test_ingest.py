@@ -72,6 +72,16 @@ def test_what_may_pass_later_is_not_refused_for_good(tmp_path: Path) -> None:
     assert drone.closed is not None and drone.closed[0] == BUSY_CODE
 
 
+def test_names_that_were_asked_for_once_are_forgotten(tmp_path: Path) -> None:
+    """Whoever asks for many streams fills no memory, and keeps no drone out."""
+    ingest = Ingest(tmp_path)
+    watched = ingest.hub("watched")
+    watched.join("annexb")
+    for number in range(1000):
+        ingest.hub(f"x{number}")
+    assert ingest.hub("watched") is watched and len(ingest._hubs) == 2
+
+
 def test_a_flight_comes_back_with_its_own_pictures_alone(tmp_path: Path) -> None:
     served(tmp_path / "streams", HELLO, picture())
     other = Message(Kind.HELLO, 0, 0, Hello("a" * 16, "hevc", 160, 120).to_json().encode()).to_bytes()

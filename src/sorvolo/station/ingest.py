@@ -111,13 +111,19 @@ class Ingest:
             pass
 
     def hub(self, stream: str) -> VideoHub:
-        """Where a stream's pictures are shown. Raises InputError for an impossible id."""
+        """Where a stream's pictures are shown, whether a drone sends it yet or not. Raises InputError for an
+        impossible id."""
         check_stream(stream)
         if stream not in self._hubs:
-            if len(self._hubs) >= 10 * self._limits.streams:
-                raise InputError("too many streams are asked for; close some pages")
+            for name in [name for name, hub in self._hubs.items() if not hub.viewers and name not in self._links]:
+                del self._hubs[name]  # asked for once, perhaps by a name that never was
             self._hubs[stream] = VideoHub()
         return self._hubs[stream]
+
+    def viewers(self, stream: str) -> int:
+        """How many watch a stream. Safe to use from other threads."""
+        hub = self._hubs.get(stream)
+        return 0 if hub is None else hub.viewers
 
     def streams(self) -> list[dict[str, Any]]:
         """The state of every stream that was ever taken, by name."""

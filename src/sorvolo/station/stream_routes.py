@@ -27,7 +27,7 @@ def stream_routes(ingest: Ingest) -> APIRouter:
     @router.get("/api/streams/{stream}", dependencies=[Depends(needs(Role.VIEW))])
     def one_stream(stream: str) -> dict[str, Any]:
         """One stream: its flights, and how the one goes that is being sent."""
-        return ingest.state(stream) | {"viewers": ingest.hub(stream).viewers}
+        return ingest.state(stream) | {"viewers": ingest.viewers(stream)}
 
     @router.websocket("/api/ingest/{stream}")
     async def take(websocket: WebSocket, stream: str, _: Annotated[object, Depends(needs(Role.OPERATE))]) -> None:
