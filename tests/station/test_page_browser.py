@@ -206,6 +206,7 @@ def test_a_flight_is_followed_live(served: Served, opened: Watched) -> None:
     alert.wait_for()
     assert hostile in alert.inner_text()
     alert.get_by_role("button", name="Show").click()
+    announce(served, "site.changed", {"versions": 2})  # everything is loaded anew; what the watch found stays
     page.locator("[data-panel=map]").click()
     page.locator(".card-over h3", has_text="onerror").wait_for()
     page.wait_for_timeout(100)

@@ -14,7 +14,7 @@ export function layersPanel(screen, body) {
   const legend = el("div", {});
   const layers = el("fieldset", { class: "ticks" }, el("legend", {}, "Layers"),
     Object.entries(GROUPS).map(([group, [words]]) => tick(words, choices.get("layers")[group] ?? GROUPS[group][1],
-      (shown) => { view?.show(group, shown); refresh(); })));
+      (shown) => { view?.show(group, shown); refresh(); })), tick("Follow the drone", screen.live.follows, (on) => { screen.live.follows = on; }));
   const found = el("div", {});
   fill(body, legend, found, layers, filterForm(data), versions(screen), base(screen));
 

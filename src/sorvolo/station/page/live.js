@@ -19,7 +19,7 @@ export function followLive(screen) {
 
 class Live {
   constructor(screen) {
-    Object.assign(this, { screen, trail: [], places: [], progress: null, run: null, ends: [], alerted: new Set(), statuses: {}, reasons: {} });
+    Object.assign(this, { screen, trail: [], places: [], progress: null, run: null, ends: [], alerted: new Set(), statuses: {}, reasons: {}, follows: false });
     const on = (type, listener) => {
       const mine = ({ detail }) => { if (detail.site === screen.data.id) listener(detail.data ?? {}, detail); };
       screen.station.events.addEventListener(type, mine);
@@ -30,7 +30,7 @@ class Live {
     on("run.started", (data, event) => this.started(data, event));
     on("run.progress", (data, event) => this.progressed(data, event));
     for (const type of ["run.finished", "run.failed", "run.stopped"]) on(type, (data, event) => this.ended(type, data, event));
-    on("object.found", ({ feature }) => this.found("objects", feature));
+    on("object.found", ({ feature }, event) => this.found("objects", watched(feature, event.run)));
     on("change.announced", ({ feature }) => this.found("changes", feature));
     on("change.withdrawn", ({ feature, id }) => screen.data.drop("changes", feature?.id ?? id));
     this.timer = setInterval(() => this.look(), STATUS_MS);
@@ -185,6 +185,13 @@ class Live {
     cancelAnimationFrame(this.drawing);
     for (const end of this.ends) end();
   }
+}
+
+/** An object that a watch reported: it stands on no map, so its id is the mission's own. */
+function watched(feature, run) {
+  if (!feature?.geometry) return null;
+  const id = `${run}:${feature.id ?? feature.properties.id}`;
+  return { ...feature, id, properties: { ...feature.properties, id, watched: true } };
 }
 
 /** What is drawn of the drone: itself, the ground in its picture, and the lines of sight to that ground's corners. */

@@ -33,8 +33,13 @@ class Review {
     this.refresh();
   }
 
+  /** What can be judged: a watch's objects stand on no map. */
+  shown(what = this.what) {
+    return this.screen.data.shown(what).filter((each) => !each.properties.watched);
+  }
+
   list() {
-    const shown = this.screen.data.shown(this.what).filter((each) => !this.open || !each.properties.review || each.id === this.at);
+    const shown = this.shown().filter((each) => !this.open || !each.properties.review || each.id === this.at);
     return [...shown].sort(ORDERS[this.order][1]);
   }
 
@@ -47,12 +52,12 @@ class Review {
   }
 
   showHead(list) {
-    const all = this.screen.data.shown(this.what);
+    const all = this.shown();
     const done = all.filter((each) => each.properties.review).length;
     fill(this.head,
       el("div", { class: "segments", role: "group", "aria-label": "What to review" }, ["changes", "objects"].map((what) =>
         el("button", { type: "button", "aria-pressed": String(what === this.what), on: { click: () => { this.what = what; this.at = null; this.refresh(); } } },
-          `${what === "changes" ? "Changes" : "Objects"} (${this.screen.data.shown(what).length})`))),
+          `${what === "changes" ? "Changes" : "Objects"} (${this.shown(what).length})`))),
       el("div", { class: "review-order" }, choice(Object.entries(ORDERS).map(([key, [words]]) => [key, words]), this.order,
         (order) => { this.order = order; this.refresh(); }, { "aria-label": "Order" }),
         tick("only open ones", this.open, (open) => { this.open = open; this.refresh(); })),

@@ -19,7 +19,11 @@ export class SiteData extends EventTarget {
 
   /** Load collections anew. */
   async load(names = NAMES) {
-    await Promise.all(names.map(async (name) => { this.all[name] = await features(this.id, name); }));
+    await Promise.all(names.map(async (name) => {
+      const kept = await features(this.id, name);
+      const watched = this.all[name].filter((each) => each.properties.watched && !kept.some(({ id }) => id === each.id));
+      this.all[name] = [...kept, ...watched]; // what a watch found is on no map, and would be gone
+    }));
     this.changed(names);
   }
 

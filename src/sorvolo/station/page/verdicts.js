@@ -40,6 +40,7 @@ export function verdictLine(feature) {
 
 /** Buttons and a note for a feature. */
 export function verdictForm(screen, feature, { keys = false } = {}) {
+  if (feature.properties.watched) return el("p", { class: "note" }, "Reported by a watch. Verdicts are given on what a map or a comparison holds.");
   const may = screen.station.status.role !== "view";
   const line = el("div", {}, verdictLine(feature));
   if (!may) return el("div", {}, line, el("p", { class: "note" }, "Your token may look, not review."));

@@ -8,7 +8,8 @@ import { number, percent } from "./words.js";
 
 const BOXES_WITHIN_US = 250000; // boxes further from a picture than this are not its own
 const KEPT_BOXES = 300;
-const MOST_HELD_S = 1.2;
+const OLD_BOXES_US = 4000000; // a slow detector's last boxes are shown, faintly, for so long
+const MOST_HELD_S = 4;
 const STAMP_BYTES = 8;
 const STATE_MS = 1000;
 
@@ -147,7 +148,8 @@ class VideoPane {
   drawBoxes(pts_us) {
     let best = null;
     for (const each of this.boxes) if (!best || Math.abs(each.pts_us - pts_us) < Math.abs(best.pts_us - pts_us)) best = each;
-    const near = best && Math.abs(best.pts_us - pts_us) < BOXES_WITHIN_US ? best : null;
+    const isOwn = best && Math.abs(best.pts_us - pts_us) < BOXES_WITHIN_US;
+    const near = isOwn || (best && best.pts_us < pts_us && pts_us - best.pts_us < OLD_BOXES_US) ? best : null;
     const pen = this.overlay.getContext("2d");
     const [width, height] = near?.frame_size_px ?? [this.format?.width ?? 640, this.format?.height ?? 360];
     if (this.overlay.width !== width || this.overlay.height !== height) Object.assign(this.overlay, { width, height });
@@ -156,8 +158,11 @@ class VideoPane {
     const size = Math.max(12, width / 50);
     pen.font = `600 ${size}px system-ui, sans-serif`;
     pen.lineWidth = Math.max(2, width / 400);
+    pen.globalAlpha = isOwn ? 1 : 0.45;
+    pen.setLineDash(isOwn ? [] : [size / 2, size / 3]);
     for (const box of boxes) drawBox(pen, box, size);
-    fill(this.seen, boxes.length ? `${boxes.length} in the picture` : "");
+    const ago_s = near ? (pts_us - near.pts_us) / 1e6 : 0;
+    fill(this.seen, boxes.length ? `${boxes.length} in the picture${isOwn ? "" : ` ${number(ago_s, 1)} s ago`}` : "");
   }
 
   /** Play the recorded flight of a place's view. */
