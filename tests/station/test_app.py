@@ -1,7 +1,9 @@
 """The station answers: sites, versions, tiles that may be kept for ever, problems in words."""
 
 import time
+import tracemalloc
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -10,7 +12,10 @@ from fake_flights import LOCAL_SITE, SITE, map_flight
 from starlette.testclient import TestClient
 
 from sorvolo.station.app import station_app
+from sorvolo.station.pyramid import BytesCache, Pyramid
 from sorvolo.station.settings import StationSettings
+from sorvolo.station.sites import bounds_lonlat
+from sorvolo.station.tiles import render
 from sorvolo.store.site.archive import Archive
 
 FIELD = "/api/sites/field"
@@ -142,3 +147,26 @@ def test_a_local_site_is_shown_without_a_place_on_earth(root: Path) -> None:
         assert site["is_local"]
         place = tile_of(*site["center_wgs84"], 17)
         assert client.get(f"/api/sites/pond/tiles/1/{place}.png").status_code == 200
+
+
+class _OneTile(dict[tuple[int, int], np.ndarray]):
+    """The tiles of a map of one tile, away from the site's origin."""
+
+    hashes: ClassVar = {(1, 1): "a" * 64}
+
+
+def test_a_small_map_is_shown_from_afar_without_gathering_the_country(tmp_path: Path) -> None:
+    """A web tile of kilometres over one tile of the map took gigabytes: it was gathered at the map's own resolution."""
+    with Archive.open(tmp_path / "site", write=True) as archive:
+        archive.create_site(SITE)
+        grid = archive.site_grid()
+    picture = np.full((512, 512, 4), 200, np.uint8)
+    state = Pyramid(_OneTile({(1, 1): picture}), 512, BytesCache(10**8, lambda each: each.nbytes))  # type: ignore[arg-type]
+    west, south, east, north = bounds_lonlat(state.corner_tiles, grid) or [0.0] * 4
+    z, x, y = (int(each) for each in tile_of((west + east) / 2, (south + north) / 2, 16).split("/"))
+    tracemalloc.start()
+    try:
+        assert pixels(render(state, grid, z, x, y, ".png"))[..., 3].any()
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+    finally:
+        tracemalloc.stop()

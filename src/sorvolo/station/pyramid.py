@@ -15,7 +15,6 @@ from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.site.tiles import TileView
 
 _MOST_LEVELS = 24
-_AROUND_ORIGIN = {(-1, -1), (0, -1), (-1, 0), (0, 0)}  # what four tiles that meet at the origin become for ever
 _COARSE_LEVEL = 2  # from which a tile is made of 16 others
 
 
@@ -79,9 +78,13 @@ class Pyramid:
 
     @cached_property
     def keys(self) -> list[Mapping[TileIndex, str]]:
-        """For each level the tiles there are, and what names the content of each."""
+        """For each level the tiles there are, and what names the content of each.
+
+        The levels go on where one tile is left: a web tile of a whole country over a map of one tile would else be
+        gathered at the map's own resolution, in gigabytes.
+        """
         levels: list[Mapping[TileIndex, str]] = [dict(self._tiles.hashes)]
-        while not levels[-1].keys() <= _AROUND_ORIGIN and len(levels) < _MOST_LEVELS:
+        while levels[-1] and len(levels) < _MOST_LEVELS:
             parts: dict[TileIndex, list[str]] = {}
             for (column, row), key in sorted(levels[-1].items()):
                 parts.setdefault((column // 2, row // 2), []).append(f"{column % 2}{row % 2}{key}")
