@@ -79,6 +79,12 @@ def test_heights_along_a_line() -> None:
     assert np.isnan(ramp.at(np.array([[100.0, 0]]))[0]).all()
 
 
+def test_a_line_around_the_earth_is_refused() -> None:
+    """Its points would take all memory: whoever may look at a station may ask for a profile."""
+    with pytest.raises(InputError, match="shorter line"):
+        along(np.array([[-2e7, 0.0], [2e7, 0.0]]), 0.001)
+
+
 def test_contours_of_a_cone_are_closed_circles() -> None:
     cone = field(GRID, lambda x, y: 5 - np.hypot(x, y) / 2, sigma_m=0.0)
     smooth = HeightField(cone.lattice, (5 - np.hypot(*np.moveaxis(cone.lattice.points_m(), 2, 0)) / 2).astype(

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sorvolo.errors import GeometryError
+from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.arrays import Floats, Floats32, Mask, Matrix3, PointsM
 from sorvolo.geometry.polygons import points_inside
 from sorvolo.heights.lattice import Lattice
+
+_MOST_POINTS = 200_000  # of a line: ten kilometres in steps of 5 cm
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +76,16 @@ def standing(surface: HeightField, ground: HeightField) -> tuple[Floats32, Matri
 
 
 def along(points_m: PointsM, step_m: float) -> tuple[PointsM, Floats]:
-    """(M, 2) points every `step_m` along a line through `points_m`, (N, 2), and their way from its start, (M,), m."""
+    """(M, 2) points every `step_m` along a line through `points_m`, (N, 2), and their way from its start, (M,), m.
+
+    Raises InputError for a line of more than 200,000 points.
+    """
     lengths = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
     ways = np.concatenate([[0.0], np.cumsum(lengths)])
+    if not ways[-1] <= _MOST_POINTS * step_m:
+        raise InputError(
+            f"a line of {ways[-1] / 1000:,.1f} km in steps of {step_m:g} m; at most {_MOST_POINTS:,} points are taken: "
+            "draw a shorter line, or give a longer step"
+        )
     wanted = np.append(np.arange(0.0, ways[-1], step_m), ways[-1])
     return np.column_stack([np.interp(wanted, ways, points_m[:, axis]) for axis in (0, 1)]), wanted
