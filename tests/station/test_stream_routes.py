@@ -2,6 +2,7 @@
 
 import json
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -61,6 +62,44 @@ def test_a_stream_s_name_reaches_no_other_folder(client: TestClient, root: Path,
         drone.receive_json()
     assert not (root / "streams").exists()
     assert client.get(f"/api/streams/{name}").status_code in (400, 404)
+
+
+def test_a_refused_link_leaves_its_name_free(client: TestClient) -> None:
+    """A link that was refused after its hello counted for ever: the drone's next flight was held up by it."""
+
+    def answer(flight: str, codec: str) -> dict[str, object]:
+        hello = Hello(flight * 16, codec, 160, 120, 10.0).to_json().encode()
+        with client.websocket_connect(f"{WS}/api/ingest/scout") as drone:
+            drone.send_bytes(Message(Kind.HELLO, 0, 0, hello).to_bytes())
+            return dict(drone.receive_json())
+
+    def wait_until_gone() -> None:
+        until_s = time.monotonic() + 5
+        while client.get("/api/streams/scout").json()["is_connected"]:
+            assert time.monotonic() < until_s, "the link counts for ever"
+            time.sleep(0.02)
+
+    assert answer("a", "h264")["type"] == "welcome"
+    wait_until_gone()
+    with pytest.raises(WebSocketDisconnect) as refused:
+        answer("a", "hevc")
+    assert "begin a new flight" in refused.value.reason
+    wait_until_gone()
+    assert answer("b", "h264")["type"] == "welcome"
+
+
+def test_who_only_looks_keeps_no_drone_away(client: TestClient) -> None:
+    """Asking for streams that nobody sends takes nothing that a drone needs."""
+    for number in range(200):
+        assert client.get(f"/api/streams/x{number}").json()["viewers"] == 0
+    with (
+        client.websocket_connect(f"{WS}/api/streams/early/video"),
+        client.websocket_connect(f"{WS}/api/ingest/scout") as drone,
+    ):
+        drone.send_bytes(HELLO)
+        assert drone.receive_json()["type"] == "welcome"
+        assert client.get("/api/streams/early").json()["viewers"] == 1
+    assert client.get("/metrics").status_code == 200
 
 
 def test_only_operators_send_and_whoever_sees_the_station_sees_the_video(root: Path) -> None:

@@ -95,14 +95,10 @@ class Ingest:
         """Take one connection until it ends; why it was refused is sent to the drone."""
         self._loop = asyncio.get_running_loop()
         try:
-            flight = await self._greeted(stream, link)
             try:
-                await self._take_all(stream, flight, link)
+                await self._take_all(stream, await self._greeted(stream, link), link)
             finally:
-                if self._links.get(stream) is link:
-                    del self._links[stream]
-                    await asyncio.to_thread(flight.close)
-                    self._announce(stream, self.state(stream))
+                await self._let_go(stream, link)
         except Refusal as refusal:
             await _close(link, refusal.code, str(refusal))
         except (InputError, StoreError) as error:
@@ -168,6 +164,19 @@ class Ingest:
             await asyncio.to_thread(flight.close)
 
     # ---- inside -----------------------------------------------------------------------------------------------
+
+    async def _let_go(self, stream: str, link: Link) -> None:
+        """A link has ended, also one that was refused: where it is still the stream's own, the stream is free again."""
+        if self._links.get(stream) is not link:
+            return
+        flight = self._flights.get(stream)
+        try:
+            if flight is not None:
+                await asyncio.to_thread(flight.close)  # first: a link that comes meanwhile must not go on with this file
+        finally:
+            if self._links.get(stream) is link:
+                del self._links[stream]
+                self._announce(stream, self.state(stream))
 
     def _kept(self, stream: str) -> list[dict[str, Any]]:
         folder = self._folder / stream
