@@ -96,6 +96,16 @@ def test_a_slow_viewer_is_dropped_forward_to_a_key_frame_and_others_are_not(pict
     assert rest[0] in keys
 
 
+def test_who_joins_long_after_a_key_frame_waits_for_the_next(pictures: list[Message]) -> None:
+    """What is kept for new viewers is bounded; pictures without those that they need are not shown."""
+    hub = hub_with([pictures[0], *pictures[1:10] * 101])
+    viewer = hub.join("annexb")
+    hub.show(pictures[1])
+    assert [isinstance(each, str) for each in taken(viewer)] == [True]
+    hub.show(pictures[10])
+    assert taken(viewer) == [annexb_bytes(pictures[10])]
+
+
 def test_boxes_come_between_the_pictures(pictures: list[Message]) -> None:
     hub = hub_with(pictures[:1])
     viewer = hub.join("annexb")

@@ -21,7 +21,7 @@ Mode = Literal["annexb", "fmp4"]
 
 _MOST_WAITING = 90  # pictures, three seconds
 _MOST_WAITING_BYTES = 8_000_000
-_MOST_GROUP = 900  # pictures since a key frame that are kept for new viewers
+_MOST_GROUP, _MOST_GROUP_BYTES = 900, 64_000_000  # pictures since a key frame that are kept for new viewers
 _STAMP_BYTES = 8
 _CLOCK_HZ = 1_000_000
 _STEP_US = 33_333  # how long a picture is shown where nobody states the rate
@@ -35,7 +35,8 @@ class VideoHub:
 
     def __init__(self) -> None:
         self._hello: Hello | None = None
-        self._group: list[Message] = []  # since the last key frame
+        self._group: list[Message] = []  # since the last key frame; none where they became too many
+        self._group_bytes = 0
         self._codec = ""
         self.epoch_us: int | None = None  # UTC of the flight's zero, where the drone flies now
         self._viewers: set[Viewer] = set()
@@ -63,8 +64,8 @@ class VideoHub:
             return
         if message.is_key:
             self._begin_group(message)
-        elif self._codec and len(self._group) < _MOST_GROUP:
-            self._group.append(message)
+        elif self._codec and self._group:
+            self._add_to_group(message)
         if not self._codec:
             return  # no key frame yet: nobody could show it
         packed: dict[Mode, bytes] = {}
@@ -100,6 +101,15 @@ class VideoHub:
             for viewer in self._viewers:
                 self._start(viewer)
         self._group = [message]
+        self._group_bytes = len(message.payload)
+
+    def _add_to_group(self, message: Message) -> None:
+        """Keep a picture for new viewers; where there are too many, new viewers wait for the next key frame."""
+        self._group_bytes += len(message.payload)
+        if len(self._group) >= _MOST_GROUP or self._group_bytes > _MOST_GROUP_BYTES:
+            self._group = []
+        else:
+            self._group.append(message)
 
     def _start(self, viewer: "Viewer") -> None:
         hello = self._hello
@@ -113,6 +123,8 @@ class VideoHub:
             viewer.put(self._fragments.header, is_key=True, is_limited=False)
         for message in self._group:
             viewer.put(self._packed(viewer.mode, message), message.is_key, is_limited=False)
+        if not self._group:
+            viewer.wait_for_key()
 
     def _packed(self, mode: Mode, message: Message) -> bytes:
         if mode == "annexb":
@@ -160,6 +172,10 @@ class Viewer:
         self._bytes += len(data)
         self._pictures += 1
         self._arrived.set()
+
+    def wait_for_key(self) -> None:
+        """Drop pictures until one comes that needs no other."""
+        self._needs_key = True
 
     def put_text(self, text: str) -> None:
         """One more message; the oldest go where too many wait."""
