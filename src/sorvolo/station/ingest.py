@@ -172,7 +172,7 @@ class Ingest:
         flight = self._flights.get(stream)
         try:
             if flight is not None:
-                await asyncio.to_thread(flight.close)  # first: a link that comes meanwhile must not go on with this file
+                await asyncio.to_thread(flight.close)  # first: a link that comes meanwhile must not use this file
         finally:
             if self._links.get(stream) is link:
                 del self._links[stream]
