@@ -13,7 +13,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,14 +21,6 @@ from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.errors import SorvoloError
 from sorvolo.geometry.pose import gimbal_angles_from_rotation
-from sorvolo.missions.compare.flights import compare_flights
-from sorvolo.missions.flight.settings import CompareSettings, MapSettings
-from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.search.flights import SearchOutputs, search_site
-from sorvolo.missions.search.settings import SearchSettings
-from sorvolo.missions.watch.flights import watch
-from sorvolo.missions.watch.run import WatchUpdate
-from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.station.collections import on_earth
 from sorvolo.station.orders import BOXES, JOURNAL_FILE, LOCK_VARIABLE, Order
 from sorvolo.store.exports.change_files import changes_geojson
@@ -40,6 +32,9 @@ from sorvolo.survey.findings import CompareUpdate
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import FrameView, MosaicUpdate
 from sorvolo.survey.wording import counted_list
+
+if TYPE_CHECKING:
+    from sorvolo.missions.watch.run import WatchUpdate
 
 FINISHED, FAILED, STOPPED = "run.finished", "run.failed", "run.stopped"
 """The types of a journal's last line."""
@@ -108,6 +103,9 @@ def main(folder: Path) -> int:
 
 
 def _map(order: Order, journal: Journal, until: threading.Event) -> str:
+    from sorvolo.missions.flight.settings import MapSettings
+    from sorvolo.missions.map.flights import map_flights
+
     wish, site = order.choices, Path(order.site)
     settings = MapSettings(
         overlap=wish.overlap, m_per_px=wish.m_per_px, model=wish.model or "default", classes=tuple(wish.classes),
@@ -126,6 +124,9 @@ def _map(order: Order, journal: Journal, until: threading.Event) -> str:
 
 
 def _compare(order: Order, journal: Journal, until: threading.Event) -> str:
+    from sorvolo.missions.compare.flights import compare_flights
+    from sorvolo.missions.flight.settings import CompareSettings
+
     wish, site = order.choices, Path(order.site)
     settings = CompareSettings(
         views_per_second=wish.views_per_second, votes=wish.votes, voters=wish.voters, updates_map=wish.updates_map,
@@ -152,6 +153,9 @@ def _compare(order: Order, journal: Journal, until: threading.Event) -> str:
 
 
 def _watch(order: Order, journal: Journal, until: threading.Event) -> str:
+    from sorvolo.missions.watch.flights import watch
+    from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
+
     wish = order.choices
     settings = WatchSettings(
         model=wish.model or "default", classes=tuple(wish.classes), least_score=wish.least_score,
@@ -176,6 +180,9 @@ def _watch(order: Order, journal: Journal, until: threading.Event) -> str:
 
 
 def _search(order: Order, journal: Journal, _: threading.Event) -> str:
+    from sorvolo.missions.search.flights import SearchOutputs, search_site
+    from sorvolo.missions.search.settings import SearchSettings
+
     wish = order.choices
     settings = SearchSettings(plants=wish.plants, classes=tuple(wish.classes), model=wish.model or "default")
     report: Mapping[str, Any] = {}
@@ -224,7 +231,7 @@ def _announce(journal: Journal, update: CompareUpdate, site: Site, announced: di
         journal.add("change.announced", {"feature": feature})
 
 
-def _seen(journal: Journal, update: WatchUpdate, stream: str) -> None:
+def _seen(journal: Journal, update: "WatchUpdate", stream: str) -> None:
     """Write a frame's boxes, and each object that it confirmed."""
     found = update.detections
     boxes = [
