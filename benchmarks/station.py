@@ -10,6 +10,8 @@ picture (the camera's own delay is not in it) to
 - the frame's boxes, received beside the video;
 - the picture itself, received by a viewer.
 
+Then the flight is sent ten times, as fast as the link takes it: the station's memory and open files after each.
+
 A browser's decoding and drawing is not in them. The load of the machine is written beside the figures.
 """
 
@@ -54,6 +56,7 @@ from sorvolo.station.spool import Spool
 RESULTS = Path(__file__).parent / "results" / "station.json"
 _ZOOM = 21
 _STREAM = "scout"
+_FLIGHTS = 10
 
 
 @dataclass
@@ -93,7 +96,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--viewers", type=int, default=20)
     parser.add_argument("--model", default="default")
-    parser.add_argument("--only", choices=("", "map", "watch", "viewers"), default="")
+    parser.add_argument("--only", choices=("", "map", "watch", "viewers", "soak"), default="")
     parser.add_argument("--flight", type=Path, help="simulated before, or where to keep it")
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
@@ -105,6 +108,8 @@ def main() -> None:
             name: streamed(flight, Path(scratch) / name, mission, viewers, options)
             for name, (mission, viewers) in plan.items() if options.only in ("", name)
         }
+        if options.only in ("", "soak"):
+            runs["soak"] = repeated(flight, Path(scratch) / "soak")
     result = {
         "benchmark": "station", "machine": machine(), "commit": commit(), "size": options.size, "fps": options.fps,
         "seconds": options.seconds, "model": options.model, "load_before": round(load, 2),
@@ -156,6 +161,27 @@ def streamed(flight: Path, scratch: Path, mission: str, viewers: int, options: A
         "frame_to_map_tile": delays(seen.map), "frame_to_map_tile_running": delays(running(seen.map)),
         "tile_fetch": figures(seen.tiles_s),
         "frame_to_boxes": delays(seen.boxes), "frame_to_boxes_running": delays(running(seen.boxes)),
+    }
+
+
+def repeated(flight: Path, scratch: Path) -> dict[str, Any]:
+    """The flight sent ten times, one after another; memory, MB, and open files of the station after each."""
+    (scratch / "root").mkdir(parents=True)
+    memory_mb, files, frames = [], [], 0
+    began_s = time.monotonic()
+    with station(scratch / "root") as (url, pid):
+        for number in range(_FLIGHTS):
+            stop = threading.Event()
+            footage = open_footage(str(flight / "flight1" / "flight1.mp4"), None, None, LiveSettings(), stop)
+            spool = Spool(scratch / f"spool{number}", 2_000_000_000)
+            settings = StreamSettings(speed=0, latency_s=math.inf)
+            frames += StreamClient(footage, spool, stream_url(url, _STREAM), "", settings, stop).run().frames
+            pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+            memory_mb.append(round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 1))
+            files.append(len(os.listdir(f"/proc/{pid}/fd")))
+    return {
+        "flights": _FLIGHTS, "frames": frames, "seconds": round(time.monotonic() - began_s, 1), "memory_mb": memory_mb,
+        "open_files": files,
     }
 
 
