@@ -56,7 +56,7 @@ def served(made_site: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
 
 @pytest.fixture(scope="module")
 def crew(browser: Any, served: Served) -> Iterator[Watched]:
-    context = browser.new_context(viewport={"width": 1000, "height": 640}, accept_downloads=True)
+    context = browser.new_context(viewport={"width": 900, "height": 600}, accept_downloads=True)
     yield Watched(context, served.url)
     context.close()
 
@@ -67,6 +67,7 @@ def opened(crew: Watched, served: Served) -> Iterator[Watched]:
     crew.faults.clear()
     crew.page.goto(f"{served.url}/#/")
     crew.page.locator(".card").wait_for()
+    crew.page.evaluate("document.getElementById('messages').replaceChildren()")
     show(crew, served)
     yield crew
     crew.page.unroute_all()
@@ -183,7 +184,8 @@ def test_a_flight_is_followed_live(served: Served, opened: Watched) -> None:
     ring = [[lon - 1e-4, lat - 1e-4], [lon + 1e-4, lat - 1e-4], [lon + 1e-4, lat + 1e-4], [lon - 1e-4, lat - 1e-4]]
     zone = {"type": "Feature", "id": "z", "geometry": {"type": "Polygon", "coordinates": [ring]},
             "properties": {"purpose": "alert", "name": "Camp"}}
-    served.ask("/api/sites/field/drawings", "PUT", {"revision": 0, "features": [zone]})
+    now = served.ask("/api/sites/field/drawings")["revision"]
+    served.ask("/api/sites/field/drawings", "PUT", {"revision": now, "features": [zone]})
     page.locator("[data-panel=draw]").click()
     page.locator(".drawn input[aria-label=Name]").wait_for()
     announce(served, "run.started", {"id": "run-1"})
