@@ -420,7 +420,9 @@ def test_heights_along_a_line_and_the_printed_sheet(opened: Watched) -> None:
     page.keyboard.press("7")
     page.get_by_role("button", name="Print").click()
     page.locator("body[data-printed]").wait_for(state="attached")
-    assert "b-3" in page.locator("body").get_attribute("data-printed")
+    printed = page.locator("body").get_attribute("data-printed")
+    assert "b-3" in printed
+    assert re.search(r"the picture is [\d.]+ (m|km) wide, north up, its middle at 46\.\d+, 13\.\d+", printed)
     assert page.locator(".sheet img").evaluate("each => each.naturalWidth") > 500
     page.evaluate("dispatchEvent(new Event('afterprint'))")
 

@@ -4,7 +4,8 @@ import { get, siteUrl } from "./api.js";
 import { button, el, fill, report } from "./dom.js";
 import { titleOf } from "./feature_card.js";
 import { middleOf } from "./places.js";
-import { bytes, counted, place } from "./words.js";
+import { siteName } from "./sites.js";
+import { bytes, counted, length, place, time } from "./words.js";
 import { zip } from "./zip.js";
 
 const COLUMNS = ["id", "what", "kind", "class", "score", "latitude", "longitude", "coordinates", "sigma_m", "length_m", "area_m2", "first_seen", "last_seen", "flight", "review", "reviewer", "note"];
@@ -64,6 +65,12 @@ function download(blob, name) {
   setTimeout(() => URL.revokeObjectURL(url), 10000);
 }
 
+function extentWords(screen) {
+  const { middle, width_m: width, bearing_deg: bearing } = screen.view.extent();
+  const up = Math.abs(bearing) < 0.5 ? "north up" : `up is ${Math.round((bearing + 360) % 360)}° from north`;
+  return `the picture is ${length(width)} wide, ${up}, its middle at ${place(middle, { local: screen.data.detail.is_local })}`;
+}
+
 /** Features as GeoJSON text, one a line. */
 export function geojson(features) {
   const lines = features.map(({ type, id, geometry, properties: { crops, ...properties } }) => JSON.stringify({ type, id, geometry, properties }));
@@ -112,7 +119,7 @@ export function kml(name, features) {
 async function print(screen) {
   const features = shownFeatures(screen);
   const picture = screen.view ? el("img", { alt: "The map", src: await screen.view.picture() }) : null;
-  const sheet = el("section", { class: "sheet" }, el("h1", {}, screen.data.detail.name), el("p", {}, new Date().toLocaleString("en-GB")), picture,
+  const sheet = el("section", { class: "sheet" }, el("h1", {}, siteName(screen.data.detail)), el("p", {}, `${time(new Date().toISOString())}${screen.view ? ` · ${extentWords(screen)}` : ""}`), picture,
     el("table", {}, el("thead", {}, el("tr", {}, ["Id", "What", "Place", "Score", "Verdict", "Note"].map((each) => el("th", {}, each)))),
       el("tbody", {}, features.map((each) => el("tr", {}, [each.id, each.properties.name ?? titleOf(each), place(middleOf(each.geometry), { local: screen.data.detail.is_local }), each.properties.score ? Math.round(each.properties.score * 100) : "",
         each.properties.review ?? "", each.properties.note ?? ""].map((value) => el("td", {}, String(value))))))));

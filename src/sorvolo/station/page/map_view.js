@@ -4,6 +4,7 @@ import * as maplibre from "./vendor/maplibre-gl.mjs";
 import { siteUrl } from "./api.js";
 import { choices, isDark } from "./choices.js";
 import { GROUPS, groundColour, mapStyle, pictures } from "./map_style.js";
+import { distance_m } from "./places.js";
 
 const EARTH_M_PER_PX = 156543.034; // of a tile of 256 px at zoom 0, on the equator
 const REFRESH_MS = 300;
@@ -140,6 +141,14 @@ export class MapView {
       this.map.once("render", () => done(this.map.getCanvas().toDataURL("image/png")));
       this.map.triggerRepaint();
     });
+  }
+
+  /** How wide the ground on the screen is in its middle, m, and where that middle is. */
+  extent() {
+    const { lng, lat } = this.map.getCenter();
+    const row = this.map.getContainer().clientHeight / 2;
+    const [west, east] = [0, this.map.getContainer().clientWidth].map((column) => this.map.unproject([column, row]).toArray());
+    return { middle: [lng, lat], width_m: distance_m(west, east), bearing_deg: this.map.getBearing() };
   }
 
   /** Move to a [lon, lat] or to bounds. */
