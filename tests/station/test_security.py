@@ -14,6 +14,7 @@ from sorvolo.cli.main import app as command
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.station.app import station_app
 from sorvolo.station.problems import Problem
+from sorvolo.station.security import address_group
 from sorvolo.station.settings import StationSettings, check_exposure
 from sorvolo.station.state import StationState
 from sorvolo.station.stream_addresses import checked_stream
@@ -173,15 +174,32 @@ def test_roles(root: Path, role: str, allowed: set[str]) -> None:
 
 
 def test_guessing_is_slowed_down(root: Path) -> None:
-    """After some wrong tokens not even a right one is looked at for a while; other addresses are not held up."""
+    """After some wrong secrets of a token not even the right one is looked at for a while."""
     client, token = guarded(root)
     with client:
-        wrong = {"authorization": "Bearer sorvolo_000000000000_guess"}
+        wrong = {"authorization": f"Bearer {token[:-1]}"}
         statuses = [client.get("/api/sites", headers=wrong).status_code for _ in range(7)]
         assert statuses[:5] == [401] * 5 and 429 in statuses[5:]
         waiting = client.get("/api/sites", headers={"authorization": f"Bearer {token}"})
         assert waiting.status_code == 429 and int(waiting.headers["retry-after"]) >= 1
         assert refused(client, SOCKET, **wrong) in (429, 4429)
+
+
+def test_who_guesses_keeps_nobody_else_out(root: Path) -> None:
+    """A crew shares one address: one of them with an old token must not hold up the others, nor its own next login."""
+    client, token = guarded(root)
+    with client:
+        old = {"authorization": "Bearer sorvolo_000000000000_old", "cookie": "sorvolo_session=sorvolo_000000000000_old"}
+        assert [client.get("/api/sites", headers=old).status_code for _ in range(7)][-1] == 429
+        assert client.get("/api/sites", headers={"authorization": f"Bearer {token}"}).status_code == 200
+        assert client.get("/", headers=old).status_code == 200
+        assert client.post("/api/session", json={"token": token}, headers=old).status_code == 200
+
+
+def test_a_network_of_ipv6_addresses_guesses_as_one() -> None:
+    """Whoever has one address of it has 2^64."""
+    assert address_group("2001:db8::1") == address_group("2001:db8::ffff:2") != address_group("2001:db8:0:1::1")
+    assert address_group("192.0.2.1") != address_group("192.0.2.2") and address_group("testclient") == "testclient"
 
 
 def test_each_wrong_token_doubles_the_wait() -> None:

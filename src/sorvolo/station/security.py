@@ -16,7 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from sorvolo.station.problems import Problem, problem_answer
 from sorvolo.station.settings import StationSettings, is_loopback
 from sorvolo.station.state import StationState
-from sorvolo.station.tokens import Guesses, Holder, Role, has_tokens, holder_of
+from sorvolo.station.tokens import Guesses, Holder, Role, has_tokens, holder_of, known_id_of
 
 COOKIE = "sorvolo_session"
 _MOST_BODY_BYTES = 1_000_000
@@ -70,33 +70,47 @@ class Doorkeeper:
             if self._settings.is_loopback:
                 return Holder("this machine", Role.OPERATE)
             raise Problem(401, "this station has no token any more; make one with `sorvolo token`")
-        token = sent_token(connection)
-        address = connection.client.host if connection.client else ""
-        if token:
-            if holder := await self.look_at(token, address):
-                return holder
-            if not _ANYBODY.fullmatch(connection.scope["path"]):
-                raise Problem(
-                    401, "this token is not known here, or has expired; ask who runs the station for another",
-                    headers={"WWW-Authenticate": "Bearer"},
-                )
-        if _ANYBODY.fullmatch(connection.scope["path"]):
+        if _ANYBODY.fullmatch(connection.scope["path"]):  # not looked at: an old cookie must not keep its owner out
             return Holder("", Role.VIEW)
-        raise Problem(
-            401, "a token is needed: send it as `Authorization: Bearer TOKEN`, or log in on the page",
-            headers={"WWW-Authenticate": "Bearer"},
-        )
+        token = sent_token(connection)
+        if not token:
+            raise Problem(
+                401, "a token is needed: send it as `Authorization: Bearer TOKEN`, or log in on the page",
+                headers={"WWW-Authenticate": "Bearer"},
+            )
+        holder = await self.look_at(token, connection.client.host if connection.client else "")
+        if holder is None:
+            raise Problem(
+                401, "this token is not known here, or has expired; ask who runs the station for another",
+                headers={"WWW-Authenticate": "Bearer"},
+            )
+        return holder
 
     async def look_at(self, token: str, address: str) -> Holder | None:
-        """Whose token it is. Raises Problem (429) where the address sent too many wrong ones."""
-        if (wait_s := self._guesses.wait_s(address)) > 0:
+        """Whose token it is. Raises Problem (429) where the address sent too many wrong ones.
+
+        Guesses at a token that there is count for its id alone, so that nobody behind the same address can keep the
+        holders of other tokens out: ids are random, and only a token's holder knows its own.
+        """
+        known_id = await asyncio.to_thread(known_id_of, self._state, token)
+        source = f"{address_group(address)} {known_id}"
+        if (wait_s := self._guesses.wait_s(source)) > 0:
             raise Problem(
                 429, f"too many wrong tokens came from {address}; wait {wait_s:.0f} s and try again",
                 headers={"Retry-After": str(int(wait_s) + 1)},
             )
         holder = await asyncio.to_thread(holder_of, self._state, token)
-        self._guesses.note(address, right=holder is not None)
+        self._guesses.note(source, right=holder is not None)
         return holder
+
+
+def address_group(address: str) -> str:
+    """What counts as one address for guesses: an IPv6 network of 64 bits is one machine's, or one household's."""
+    try:
+        found = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    return address if found.version == 4 else str(ipaddress.ip_network((found, 64), strict=False))
 
 
 def sent_token(connection: HTTPConnection) -> str:

@@ -82,7 +82,7 @@ def revoke_token(state: StationState, name: str) -> None:
     with state.changing() as connection:
         gone = connection.execute("DELETE FROM tokens WHERE name = ?", (name,)).rowcount
     if not gone:
-        raise InputError(f"there is no token named {name!r}; --list shows those there are")
+        raise InputError(f"there is no token named {name!r}; `sorvolo token ROOT` lists those there are")
 
 
 def list_tokens(state: StationState) -> list[TokenEntry]:
@@ -96,11 +96,16 @@ def has_tokens(state: StationState) -> bool:
     return bool(state.rows("SELECT 1 FROM tokens LIMIT 1"))
 
 
+def known_id_of(state: StationState, token: str) -> str:
+    """The id in a token, where there is a token of that id (whatever its secret); else ""."""
+    token_id = _parts(token)[1]
+    return token_id if state.rows("SELECT 1 FROM tokens WHERE id = ?", (token_id,)) else ""
+
+
 def holder_of(state: StationState, token: str) -> Holder | None:
     """Whose token this is; None where it is nobody's, or has expired."""
-    prefix, _, rest = token.partition("_")
-    token_id, _, secret = rest.partition("_")
-    rows = state.rows("SELECT name, role, hash, expires_at FROM tokens WHERE id = ?", (token_id[:64],))
+    prefix, token_id, secret = _parts(token)
+    rows = state.rows("SELECT name, role, hash, expires_at FROM tokens WHERE id = ?", (token_id,))
     # compared whether the id is known or not: the time taken must not give away which ids there are
     same = hmac.compare_digest(_hash(secret), rows[0]["hash"] if rows else _NO_HASH)
     if not (rows and same and prefix == _PREFIX):
@@ -112,7 +117,7 @@ def holder_of(state: StationState, token: str) -> Holder | None:
 
 
 class Guesses:
-    """Wrong tokens by the address that sent them: after a few, each costs twice the wait of the one before."""
+    """Wrong tokens by their source, an address: after a few, each costs twice the wait of the one before."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -135,6 +140,13 @@ class Guesses:
             self._wrong[address] = (count + 1, self._clock() + wait_s)
             while len(self._wrong) > _MOST_ADDRESSES:
                 self._wrong.popitem(last=False)
+
+
+def _parts(token: str) -> tuple[str, str, str]:
+    """A token's prefix, id and secret; "" for what is missing."""
+    prefix, _, rest = token.partition("_")
+    token_id, _, secret = rest.partition("_")
+    return prefix, token_id[:64], secret
 
 
 def _hash(secret: str) -> str:
