@@ -1,10 +1,15 @@
 """Uploads by tus: resumed, limited, looked into apart; what is cut off, of a wrong kind or a bomb is refused."""
 
+import asyncio
 import base64
 import io
 import os
+import shutil
+import sys
+import threading
 import time
 import zipfile
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +19,12 @@ import pytest
 from PIL import Image
 from starlette.testclient import TestClient
 
-from sorvolo.station import check_upload
+from sorvolo.station import check_upload, uploads
 from sorvolo.station.app import station_app
 from sorvolo.station.check_upload import Refusal, look
+from sorvolo.station.problems import Problem
 from sorvolo.station.settings import StationSettings
+from sorvolo.station.uploads import Child
 
 HEADERS = {"Tus-Resumable": "1.0.0"}
 GIGA = 10**9
@@ -87,10 +94,10 @@ def test_a_flight_comes_in_pieces_and_is_ready(client: TestClient, tmp_path: Pat
     assert send(client, address, 1000, data[1000:]).status_code == 204
     done = checked(client, address)
     assert done["state"] == "ready" and done["name"] == "DJI_0001.MP4" and done["facts"]["width_px"] == 64
-    uploads = client.app.state.station.uploads  # type: ignore[attr-defined]
-    assert uploads.finished_path(done["id"]).read_bytes() == data
+    here = client.app.state.station.uploads  # type: ignore[attr-defined]
+    assert here.finished_path(done["id"]).read_bytes() == data
     assert client.delete(address).status_code == 204 and client.get(address).status_code == 404
-    assert not list(uploads._folder.glob("*"))
+    assert not list(here._folder.glob("*"))
 
 
 def test_a_cut_off_video_is_refused_and_cannot_be_flown(client: TestClient, tmp_path: Path) -> None:
@@ -129,6 +136,55 @@ def test_the_floor_of_free_space_holds(root: Path) -> None:
     with TestClient(station_app(StationSettings(root, free_floor_gb=1e6)), base_url="http://127.0.0.1:8750") as client:
         answer = begin(client, "a.mp4", 10)
         assert answer.status_code == 507 and "free" in answer.json()["detail"]
+
+
+def test_the_floor_holds_for_every_piece_and_for_what_is_unpacked(
+    client: TestClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk may fill between two pieces of a few megabytes, which alone are never looked at."""
+    address = begin(client, "a.srt", 5).headers["location"]
+    part = packed(tmp_path / "part", {"a.jpg": photo()})
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=GIGA))
+    assert send(client, address, 0, b"1").status_code == 507
+    with pytest.raises(Refusal, match="are there; delete"):
+        look(part, tmp_path / "photos", GIGA, 2 * GIGA)
+    assert not (tmp_path / "photos").exists()
+
+
+def test_a_link_that_fell_silent_holds_up_nobody(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A radio link ends without a word: the next request goes on where the first one was left."""
+    monkeypatch.setattr(uploads, "_SILENT_S", 0.05)
+    address = begin(client, "a.srt", 5).headers["location"]
+    here = client.app.state.station.uploads  # type: ignore[attr-defined]
+
+    async def chunks() -> AsyncIterator[bytes]:
+        yield b"12"
+        await asyncio.sleep(60)
+
+    with pytest.raises(Problem, match="nothing came"):
+        asyncio.run(here.take(here.get(address.rpartition("/")[2]), 0, chunks()))
+    assert send(client, address, 2, b"345").status_code == 204
+
+
+def test_a_station_that_ends_while_it_looks_into_an_upload_looks_again(root: Path) -> None:
+    """Ctrl-C reaches the whole terminal: the upload was refused, and its bytes were gone."""
+    with TestClient(station_app(StationSettings(root)), base_url="http://127.0.0.1:8750") as client:
+        client.app.state.station.uploads._child.end()  # type: ignore[attr-defined]
+        address = begin(client, "a.srt", 5).headers["location"]
+        assert send(client, address, 0, b"12345").status_code == 204
+    with TestClient(station_app(StationSettings(root)), base_url="http://127.0.0.1:8750") as client:
+        assert checked(client, address)["state"] == "ready"
+
+
+def test_the_process_that_looks_is_out_of_the_terminals_reach_and_ends_with_the_station() -> None:
+    """In a session of its own; killed at the end, so that the station need not wait for it."""
+    child = Child()
+    assert child.run([sys.executable, "-c", "import os; print(os.getsid(0) == os.getpid())"], 30) == b"True\n"
+    threading.Timer(0.2, child.end).start()
+    began_s = time.monotonic()
+    assert child.run([sys.executable, "-c", "import time; time.sleep(60)"], 60) == b""
+    assert time.monotonic() - began_s < 20 and child.run(["true"], 1) == b""
 
 
 def test_photos_are_unpacked_into_one_folder(tmp_path: Path) -> None:

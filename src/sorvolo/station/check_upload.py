@@ -3,6 +3,7 @@
 import json
 import re
 import resource
+import shutil
 import stat
 import sys
 import zipfile
@@ -27,7 +28,7 @@ class Refusal(Exception):
     """What is wrong with the upload."""
 
 
-def look(part: Path, target: Path, most_bytes: int) -> dict[str, Any]:
+def look(part: Path, target: Path, most_bytes: int, keep_free_bytes: int = 0) -> dict[str, Any]:
     """What an upload holds; photos are unpacked into the folder `target`. Raises Refusal."""
     ending = target.suffix.lower()
     if ending in _CONTAINERS:
@@ -35,7 +36,7 @@ def look(part: Path, target: Path, most_bytes: int) -> dict[str, Any]:
     with part.open("rb") as file:
         head = file.read(4096)
     if head[:4] == b"PK\x03\x04":
-        return _photos(part, target, most_bytes)
+        return _photos(part, target, most_bytes, keep_free_bytes)
     if not ending:
         raise Refusal("it is no zip file; pack the photos with zip")
     if b"\0" in head:
@@ -77,11 +78,12 @@ def _has_signature(head: bytes, container: str) -> bool:
     return head[:4] == b"\x1aE\xdf\xa3" if container == "matroska" else head[:1] == b"G" or head[4:5] == b"G"
 
 
-def _photos(part: Path, target: Path, most_bytes: int) -> dict[str, Any]:
+def _photos(part: Path, target: Path, most_bytes: int, keep_free_bytes: int) -> dict[str, Any]:
     taken: dict[str, Path] = {}
     try:
         with zipfile.ZipFile(part) as archive:
             entries = list(_entries(archive, most_bytes))
+            _demand_room(part, sum(each.file_size for each in entries) + keep_free_bytes)
             target.mkdir(parents=True, exist_ok=True)
             left = most_bytes
             for entry in entries:
@@ -92,10 +94,21 @@ def _photos(part: Path, target: Path, most_bytes: int) -> dict[str, Any]:
                     _check_picture(path)
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
         raise Refusal(f"it cannot be unpacked ({error}); was the file cut off?") from error
+    except OSError as error:
+        raise Refusal(f"it cannot be unpacked here ({error.strerror}); check the station's disk") from error
     photos = sum(Path(name).suffix.lower() in _PHOTOS for name in taken)
     if not photos:
         raise Refusal("there is no photo in it")
     return {"kind": "photos", "photos": photos}
+
+
+def _demand_room(part: Path, wanted_bytes: int) -> None:
+    free_bytes = shutil.disk_usage(part.parent).free
+    if wanted_bytes > free_bytes:
+        raise Refusal(
+            f"unpacked it needs {wanted_bytes / 1e9:.1f} GB with what stays free, {free_bytes / 1e9:.1f} GB are there; "
+            "delete uploads or flights that are not needed any more, and upload it again"
+        )
 
 
 def _entries(archive: zipfile.ZipFile, most_bytes: int) -> Iterator[zipfile.ZipInfo]:
@@ -163,13 +176,14 @@ def _check_picture(path: Path) -> None:
         raise Refusal(f"{path.name} has {width_px} x {height_px} pixels, at most {_MOST_PIXELS:,} are taken")
 
 
-def main(part: str, target: str, most_bytes: str) -> None:
+def main(part: str, target: str, most_bytes: str, keep_free_bytes: str) -> None:
     """Print one JSON object: what is wrong, or what the upload holds."""
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_CPU, (_CPU_S, _CPU_S))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
-        answer: dict[str, Any] = {"error": None, "facts": look(Path(part), Path(target), int(most_bytes))}
+        facts = look(Path(part), Path(target), int(most_bytes), int(keep_free_bytes))
+        answer: dict[str, Any] = {"error": None, "facts": facts}
     except Refusal as refusal:
         answer = {"error": str(refusal), "facts": None}
     except MemoryError:
@@ -178,4 +192,4 @@ def main(part: str, target: str, most_bytes: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:4])
+    main(*sys.argv[1:5])

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PureWindowsPath
@@ -36,6 +36,7 @@ _MOST_UPLOADS = 1000
 _PART, _INFO, _FILES = "part", "info.json", "files"
 _CHECK_WITHIN_S = 1800.0
 _LOOK_EVERY_BYTES = 64_000_000  # written between two looks at the free space
+_SILENT_S = 30.0  # a request that sends nothing for so long has lost its link: another one may go on
 _ID = re.compile(r"[0-9a-f]{24}")
 
 
@@ -68,9 +69,10 @@ class Uploads:
         self._busy: set[str] = set()
         self._lock = threading.Lock()
         self._checking = ThreadPoolExecutor(1, thread_name_prefix="upload check")
+        self._child = Child()
         for each in self.all():  # the station was stopped meanwhile
-            if each.state == "checking":
-                self._checking.submit(self._check, each)
+            if each.state == "checking" or (each.state == "receiving" and self.offset(each) == each.bytes):
+                self._begin_check(each)
 
     @property
     def most_bytes(self) -> int:
@@ -136,9 +138,7 @@ class Uploads:
                 raise Problem(409, f"the upload ends at {self.offset(upload)}, not at {offset}; ask where it ends")
             here = await self._append(upload, offset, chunks)
             if here == upload.bytes:
-                upload = replace(upload, state="checking")
-                self._write(upload)
-                self._checking.submit(self._check, upload)
+                self._begin_check(upload)
             return here
         finally:
             with self._lock:
@@ -183,16 +183,18 @@ class Uploads:
 
     def close(self) -> None:
         """Stop checking; what was not checked is when the station starts again."""
+        self._child.end()
         self._checking.shutdown(wait=False, cancel_futures=True)
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
     async def _append(self, upload: Upload, offset: int, chunks: AsyncIterator[bytes]) -> int:
+        self.demand_room(0)  # of each request: many small ones would else fill the disk
         here, looked = offset, offset
         with writing(self._folder / upload.id):
             async with await anyio.open_file(self._folder / upload.id / _PART, "r+b") as file:
                 await file.seek(offset)
-                async for chunk in chunks:
+                async for chunk in _while_they_come(chunks):
                     if here + len(chunk) > upload.bytes:
                         raise Problem(413, f"more came than the {upload.bytes} bytes that were announced")
                     if here - looked > _LOOK_EVERY_BYTES:
@@ -202,19 +204,31 @@ class Uploads:
                     here += len(chunk)
         return here
 
+    def _begin_check(self, upload: Upload) -> None:
+        checked = replace(upload, state="checking")
+        self._write(checked)
+        self._checking.submit(self._check, checked)
+
     def _check(self, upload: Upload) -> None:
         """Look into an upload in a process of its own, and make it ready or refuse it."""
-        folder = self._folder / upload.id
-        error, facts = checked_apart(folder / _PART, self._target(upload), self.most_bytes)
-        if error is None and upload.kind != "photos":
-            self._target(upload).parent.mkdir(exist_ok=True)
-            (folder / _PART).rename(self._target(upload))
-        else:
-            (folder / _PART).unlink(missing_ok=True)
-        if not folder.is_dir():  # deleted meanwhile
+        folder, target = self._folder / upload.id, self._target(upload)
+        part = folder / _PART
+        if part.exists():
+            shutil.rmtree(target.parent, ignore_errors=True)  # of a check that was cut off
+        keep_free_bytes = int(self._settings.free_floor_gb * 1e9)
+        error, facts = checked_apart(
+            part if part.exists() else target, target, self.most_bytes, keep_free_bytes, self._child.run
+        )
+        if self._child.is_ended or not folder.is_dir():  # the station ends; deleted meanwhile
             return
+        if error is not None:
+            shutil.rmtree(target.parent, ignore_errors=True)
+        elif upload.kind != "photos" and part.exists():
+            target.parent.mkdir(exist_ok=True)
+            part.rename(target)
         done = replace(upload, state="ready" if error is None else "refused", why=error, facts=facts)
         self._write(done)
+        part.unlink(missing_ok=True)
         self._events.append(NewEvent("upload.checked", asdict(done)))
 
     def _target(self, upload: Upload) -> Path:
@@ -225,19 +239,66 @@ class Uploads:
         atomic_write_bytes(self._folder / upload.id / _INFO, json.dumps(asdict(upload)).encode())
 
 
+class Child:
+    """Runs one process at a time, which a Ctrl-C at the station does not reach; `end` kills it, and any later one."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self.is_ended = False
+
+    def run(self, command: Sequence[str], timeout_s: float) -> bytes:
+        """What the process prints. Raises subprocess.TimeoutExpired, after which it is gone."""
+        with self._lock:
+            if self.is_ended:
+                return b""
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        with self._process as process:
+            try:
+                return process.communicate(timeout=timeout_s)[0]
+            except subprocess.TimeoutExpired:
+                process.kill()
+                raise
+
+    def end(self) -> None:
+        """Kill it."""
+        with self._lock:
+            self.is_ended = True
+            if self._process is not None:
+                self._process.kill()
+
+
 def checked_apart(
-    part: Path, target: Path, most_bytes: int, run: Callable[..., Any] = subprocess.run
+    part: Path, target: Path, most_bytes: int, keep_free_bytes: int, run: Callable[[Sequence[str], float], bytes]
 ) -> tuple[str | None, Mapping[str, Any] | None]:
     """What is wrong with an upload (None: nothing), and what it holds, found in a process with limits of its own."""
-    command = [sys.executable, "-m", "sorvolo.station.check_upload", str(part), str(target), str(most_bytes)]
+    command = [
+        sys.executable, "-m", "sorvolo.station.check_upload", str(part), str(target), str(most_bytes),
+        str(keep_free_bytes),
+    ]
     try:
-        done = run(command, capture_output=True, timeout=_CHECK_WITHIN_S, stdin=subprocess.DEVNULL)
-        answer = json.loads(done.stdout)
+        answer = json.loads(run(command, _CHECK_WITHIN_S))
         return answer["error"], answer.get("facts")
     except subprocess.TimeoutExpired:
         return "looking into it took too long", None
     except (ValueError, KeyError, TypeError):
         return "looking into it took more memory or time than a flight needs, or broke the decoder", None
+
+
+async def _while_they_come(chunks: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    """The chunks of a request. Raises Problem (408) where none comes for a while."""
+    while True:
+        try:
+            with anyio.fail_after(_SILENT_S):
+                chunk = await anext(chunks, None)
+        except TimeoutError:
+            raise Problem(408, f"nothing came for {_SILENT_S:.0f} s; ask where the upload ends, and go on") from None
+        if chunk is None:
+            return
+        yield chunk
 
 
 def _metadata(text: str) -> dict[str, str]:
