@@ -22,7 +22,7 @@ from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.mqtt import MqttSender, mqtt_place
 from sorvolo.station.relays import Relay
 from sorvolo.station.state import StationState
-from sorvolo.station.webhooks import SIGNATURE, webhook
+from sorvolo.station.webhooks import SIGNATURE, webhook, webhook_name
 
 FOUND = NewEvent("object.found", {"feature": {"type": "Feature", "properties": {"class": "person"}}}, "field", "r1")
 
@@ -111,11 +111,21 @@ def test_a_receiver_that_is_away_is_waited_for(events: EventLog, tmp_path: Path)
     relay.close()
 
 
-@pytest.mark.parametrize("url", ["ftp://host/x", "host", "http://user:secret@host/"])
+@pytest.mark.parametrize("url", ["ftp://host/x", "host", "http://user:secret@host/", "gopher://host/secret"])
 def test_what_is_no_web_address_is_refused_without_its_password(url: str) -> None:
     with pytest.raises(SettingsError, match="no web address") as refused:
         webhook(url)
     assert "secret" not in str(refused.value)
+
+
+def test_a_receiver_is_named_without_its_path_and_its_port_is_one() -> None:
+    """Figures and logs name receivers; the path of a chat's webhook is its password."""
+    urls = [f"https://hooks.example:8443/services/T{number}secret?key=secret" for number in (0, 1)]
+    names = {webhook_name(each) for each in urls}
+    assert len(names) == 2 and all(each.startswith("https://hooks.example:8443/#") for each in names)
+    assert not any("secret" in each for each in names)
+    with pytest.raises(SettingsError, match="give one with"):
+        webhook("http://host:99999")
 
 
 @pytest.mark.parametrize("url", ["http://host", "mqtt://", "mqtt://host:x", "mqtt://host/a/#"])
