@@ -54,6 +54,14 @@ def test_metrics_count_requests_streams_and_what_is_refused(client: TestClient) 
     assert found["sorvolo_disk_free_bytes", ()] > 0 and found["sorvolo_events_total", ()] >= 1
 
 
+def test_invented_methods_make_no_new_series(client: TestClient) -> None:
+    """Anybody may send them, also without a token: each would take memory for ever."""
+    for number in range(3):
+        assert client.request(f"INVENTED{number}", "/api/status").status_code in (404, 405)
+    methods = {dict(labels).get("method") for _, labels in metrics(client)}
+    assert "other" in methods and not any(str(each).startswith("INVENTED") for each in methods)
+
+
 def test_logs_are_json_without_queries_and_tokens(client: TestClient) -> None:
     stream = io.StringIO()
     handler = logging.StreamHandler(stream)

@@ -15,6 +15,8 @@ from sorvolo.station.tokens import Holder
 _LOG = logging.getLogger("sorvolo.station.requests")
 _KEPT = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName", "color_message"}
 
+_METHODS = frozenset({"GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE", "WS"})
+
 Count = Callable[[str, str, int, float], None]
 """Called with a request's route, method, status and seconds."""
 
@@ -76,6 +78,7 @@ class Observer:
         finally:
             seconds = time.monotonic() - began_s
             method = scope.get("method", "WS")
+            method = method if method in _METHODS else "other"  # a client may invent as many as it likes
             self._count(_pattern(scope, status), method, status, seconds)
             _log(scope, method, status, seconds)
 
