@@ -170,3 +170,13 @@ def test_a_small_map_is_shown_from_afar_without_gathering_the_country(tmp_path: 
         assert tracemalloc.get_traced_memory()[1] < 50e6
     finally:
         tracemalloc.stop()
+
+
+def test_an_error_of_the_station_is_answered_in_words(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a problem document, without what is inside."""
+    app = station_app(StationSettings(root))
+    with TestClient(app, base_url="http://localhost:8750", raise_server_exceptions=False) as client:
+        monkeypatch.setattr(app.state.station.shelf, "open", lambda _: 1 / 0)
+        answer = client.get(FIELD)
+        assert answer.status_code == 500 and answer.headers["content-type"] == "application/problem+json"
+        assert "ZeroDivisionError" in answer.json()["detail"] and "division by" not in answer.text

@@ -12,8 +12,9 @@ from sorvolo.errors import InputError, SettingsError, SorvoloError, StoreError
 
 _TITLES = {
     400: "Bad request", 401: "Token needed", 403: "Not allowed", 404: "Not found", 405: "Method not allowed",
-    408: "Nothing came", 409: "Conflict", 410: "Gone", 413: "Too large", 415: "Unknown kind", 421: "Misdirected request",
-    422: "Invalid request", 423: "In use", 429: "Too many attempts", 500: "Error in the station", 507: "Disk full",
+    408: "Nothing came", 409: "Conflict", 410: "Gone", 413: "Too large", 415: "Unknown kind",
+    421: "Misdirected request", 422: "Invalid request", 423: "In use", 429: "Too many attempts",
+    500: "Error in the station", 507: "Disk full",
 }
 _KIND = "application/problem+json"
 _SCHEMA = {
@@ -78,3 +79,8 @@ def answer_problems(app: FastAPI) -> None:
     @app.exception_handler(HTTPException)
     async def _of_http(_: Request, error: HTTPException) -> JSONResponse:
         return problem_answer(error.status_code, str(error.detail), error.headers)
+
+    @app.exception_handler(Exception)
+    async def _of_ours_to_mend(_: Request, error: Exception) -> JSONResponse:
+        words = f"an error in the station ({type(error).__name__}); its log has the rest: please report it"
+        return problem_answer(500, words)
