@@ -95,7 +95,7 @@ def test_ground_that_the_tower_hid_from_the_earlier_camera_is_not_known(truth) -
     assert rendered(None)[1][pixel(3.6, 0.0)]
 
 
-def test_where_nothing_stands_no_way_is_needed() -> None:
+def test_where_nothing_stands_homographies_suffice() -> None:
     flat = Relief(np.zeros((50, 50), np.float32), np.diag([10.0, 10, 1]))
     later = site_from_image_homography(CAMERA, Pose(NADIR_CAMERA_NORTH_UP, LATER))
-    assert flat.way(later, LATER, np.linalg.inv(later), EARLIER, (320, 240)) is None
+    assert flat.find_in_earlier(later, LATER, np.linalg.inv(later), EARLIER, (320, 240)) is None

@@ -161,8 +161,8 @@ def test_a_disk_too_full_is_announced_before_the_work_begins(
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(2 * free, free, free))  # type: ignore[attr-defined]
     video, site = filmed / "flight1" / "flight1.mp4", tmp_path / "site"
-    register = "sorvolo.missions.map.flights.PlanarRun"
-    monkeypatch.setattr(register, Stopping)
+    run = "sorvolo.missions.map.flights.PlanarRun"
+    monkeypatch.setattr(run, Stopping)
     assert main(["map", str(video), "--site", str(site), "--camera", "aov=70", "--model", "none"]) == 1
     printed = capsys.readouterr().err
     if expected:

@@ -72,13 +72,13 @@ class EarlierPictures:
     ) -> ImageRGBA:
         """A picture in an image's pixels, (h, w, 4): over what stands on the ground where that is known."""
         picture_from_site: Matrix3 = np.asarray(np.linalg.inv(site_from_picture), np.float64)
-        way = None if self._relief is None else self._relief.way(
+        found = None if self._relief is None else self._relief.find_in_earlier(
             site_from_image, camera_m, picture_from_site, earlier_m, size
         )
-        if way is None:
+        if found is None:
             image_from_picture = np.linalg.inv(site_from_image) @ site_from_picture
             return np.asarray(cv2.warpPerspective(picture, image_from_picture, size, flags=cv2.INTER_LINEAR), np.uint8)
-        x, y, sees = way
+        x, y, sees = found
         seen = np.asarray(cv2.remap(picture, x, y, cv2.INTER_LINEAR), np.uint8)
         seen[~sees] = 0
         return seen

@@ -30,7 +30,7 @@ class Relief:
         object.__setattr__(self, "above_m", frozen(self.above_m))
         object.__setattr__(self, "cells_from_site", frozen(self.cells_from_site))
 
-    def met(self, ground_m: PointsM, camera_m: Vector3) -> Floats32:
+    def meet_m(self, ground_m: PointsM, camera_m: Vector3) -> Floats32:
         """(h, w) how high a camera's rays to ground places, (h, w, 2), first meet what stands there; 0: the ground."""
         highest = min(float(self.above_m.max(initial=0)), 0.5 * float(camera_m[2]))
         found = np.zeros(ground_m.shape[:2], np.float32)
@@ -45,7 +45,7 @@ class Relief:
             found[meets] = np.minimum(stands[meets], up_m + step_m)
         return found
 
-    def way(
+    def find_in_earlier(
         self, site_from_image: Matrix3, camera_m: Vector3, picture_from_site: Matrix3, earlier_m: Vector3,
         size: tuple[int, int],
     ) -> tuple[Floats32, Floats32, Mask] | None:
@@ -56,9 +56,9 @@ class Relief:
         """
         small = max(2, size[0] // _COARSER), max(2, size[1] // _COARSER)
         coarse_m = _grounds(site_from_image, size, small)
-        up_m = self.met(coarse_m, camera_m)
+        up_m = self.meet_m(coarse_m, camera_m)
         earlier_ground_m = _lowered(_raised(coarse_m, camera_m, up_m), earlier_m, up_m)
-        hidden = self.met(earlier_ground_m, earlier_m) > up_m + _SAME_M
+        hidden = self.meet_m(earlier_ground_m, earlier_m) > up_m + _SAME_M
         if not hidden.any() and not up_m.any():
             return None
         fine_up_m = np.asarray(cv2.resize(up_m, size, interpolation=cv2.INTER_LINEAR), np.float32)
