@@ -47,6 +47,7 @@ export class MapView {
     this.map.on("mousemove", (event) => onMove([event.lngLat.lng, event.lngLat.lat], this.hits(event.point)));
     this.ready = new Promise((done) => this.map.once("style.load", () => {
       for (const [name, picture] of Object.entries(pictures())) this.map.addImage(name, picture);
+      for (const [name, features] of Object.entries(this.data)) this.put(name, features); // put before the style was there
       done();
     }));
   }
@@ -152,10 +153,18 @@ export class MapView {
   }
 
   /** Move to a [lon, lat] or to bounds. */
-  go(place, zoom = 20.5) {
-    const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+  go(place, zoom = 20.5, atOnce = false) {
+    const still = atOnce || matchMedia("(prefers-reduced-motion: reduce)").matches;
     if (place.length === 4) this.map.fitBounds(place, { padding: 40, maxZoom: 21.5, animate: !still });
     else this.map.easeTo({ center: place, zoom: Math.max(this.map.getZoom(), zoom), animate: !still, duration: 500 });
+  }
+
+  /** Bring a place back into view where a panel that grew hides it. */
+  reveal(place) {
+    this.map.resize();
+    const { x, y } = this.map.project(place);
+    const { clientWidth: width, clientHeight: height } = this.map.getContainer();
+    if (x < 20 || y < 20 || x > width - 20 || y > height - 20) this.map.jumpTo({ center: place });
   }
 
   close() {

@@ -31,6 +31,7 @@ export function placePanel(screen, body) {
     if (mine !== turn) return;
     shown = views;
     show(place, views);
+    screen.view?.ready.then(() => requestAnimationFrame(() => { if (mine === turn && !screen.closed) screen.view.reveal(place); }));
   }
 
   function show(place, views) {

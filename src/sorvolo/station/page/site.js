@@ -91,7 +91,7 @@ class SiteScreen {
     const drawn = this.view?.ready.then(() => {
       if (this.closed) return;
       this.view.showVersion(live ? `live-${live}` : versions.at(-1)?.n);
-      if (this.lastPlace) this.view.go(this.lastPlace);
+      if (this.lastPlace) this.view.go(this.lastPlace, 20.5, true);
     });
     if (!isNew) await this.data.load(["changes", "objects", "track"]);
     await drawn;
