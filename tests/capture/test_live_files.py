@@ -12,9 +12,10 @@ from live_sender import EPOCH_NS, RATE, Sender, number_of, packet_of, picture
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
+from sorvolo.capture.live.growing import GrowingFile
 from sorvolo.capture.live.growing_folder import GrowingFolder
 from sorvolo.capture.live.klv import encode
-from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.capture.live.reconnect import LiveSettings, Outages
 from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import open_sources
 from sorvolo.errors import InputError
@@ -216,3 +217,26 @@ def test_a_folder_into_which_nothing_comes(tmp_path: Path) -> None:
         open_sources([f"follow:{tmp_path}"], live=LiveSettings(first_s=0.4))
     with pytest.raises(InputError, match="photos carry their own fixes"):
         open_sources([f"follow:{tmp_path}"], telemetry="udp://:10110")
+
+
+@pytest.mark.parametrize(("keeps_all", "packet"), [(True, 0), (False, 21_276)])
+def test_who_wants_the_newest_frames_begins_near_the_end(tmp_path: Path, keeps_all: bool, packet: int) -> None:
+    """20 MB of a transport stream: a map reads all of it, a watch its last 16 MB, from a packet's first byte."""
+    path = tmp_path / "long.ts"
+    path.write_bytes(b"".join(b"\x47" + number.to_bytes(187, "big") for number in range(106_383)))
+    file = GrowingFile(path, LiveSettings(keeps_all=keeps_all), Outages("long.ts"), threading.Event())
+    data = file.read(188)
+    file.close()
+    assert data[0] == 0x47 and int.from_bytes(data[1:], "big") == packet
+
+
+def test_a_file_whose_end_is_stated_ends_at_once(tmp_path: Path) -> None:
+    """Without that its reader waits for more."""
+    path = tmp_path / "over.ts"
+    path.write_bytes(b"\x47" * 188)
+    (tmp_path / "over.ts.ended").touch()
+    file = GrowingFile(path, LiveSettings(give_up_s=60), Outages("over.ts"), threading.Event())
+    began_s = time.monotonic()
+    assert (len(file.read(1000)), file.read(1000)) == (188, b"")
+    assert time.monotonic() - began_s < 5
+    file.close()

@@ -146,13 +146,14 @@ class Ingest:
     def show_boxes(self, found: Mapping[str, Any]) -> None:
         """Give a mission's detections in one frame to whoever watches the stream; from any thread.
 
-        A mission counts `pts_us` from the flight's first picture, the pictures' own times from the flight's zero.
+        Their time is UTC; the pictures' own times count from the flight's zero, which telemetry ties to UTC.
         """
         stream = str(found.get("stream") or "")
         flight, hub, loop = self._flights.get(stream), self._hubs.get(stream), self._loop
-        if flight is None or hub is None or loop is None or flight.first_pts_us < 0 or not hub.viewers:
+        if flight is None or hub is None or loop is None or flight.zero_us is None or not hub.viewers:
             return
-        words = {**found, "type": "boxes", "pts_us": flight.first_pts_us + int(found["pts_us"])}
+        pts_us = round(datetime.fromisoformat(str(found["time"])).timestamp() * 1e6) - flight.zero_us
+        words = {**found, "type": "boxes", "pts_us": pts_us}
         try:
             loop.call_soon_threadsafe(hub.note, words)
         except RuntimeError:  # the loop was closed: nobody watches any more
@@ -242,8 +243,8 @@ class Ingest:
                     return
                 if flight.take(message) and message.kind is Kind.VIDEO:
                     hub.show(message)
-                elif flight.last_sample is not None and hub.epoch_us is None:
-                    hub.epoch_us = _epoch_us(flight.last_sample.time_ns, message.pts_us)
+                elif flight.last_sample is not None and hub.epoch_us is None and _is_now(flight.last_sample):
+                    hub.epoch_us = flight.zero_us
         finally:
             syncing.cancel()
 
@@ -287,14 +288,10 @@ class Flight:
         self.is_open = True
         self.frames = self.samples = self.repeated = self.missing = 0
         self.last_sample: Sample | None = None
+        self.zero_us: int | None = None  # UTC of the flight's zero, as telemetry has it
         self._needs_key = True
         self._taken_s: deque[float] = deque(maxlen=90)
         _ended(path).unlink(missing_ok=True)
-
-    @property
-    def first_pts_us(self) -> int:
-        """When the flight's first picture is shown; -1 before it came."""
-        return self._file.first_pts_us
 
     @property
     def last_seq(self) -> int:
@@ -354,6 +351,7 @@ class Flight:
     def _check(self, message: Message) -> None:
         if message.kind is Kind.TELEMETRY:
             self.last_sample = sample_from_json(message.payload)
+            self.zero_us = self.last_sample.time_ns // 1000 - message.pts_us
             return
         if not 0 <= message.pts_us < 2**52 or not -(2**40) < (message.dts_us or 0) < 2**52:
             raise Refusal(f"a picture at the time {message.pts_us} us")
@@ -386,10 +384,9 @@ def open_flight(folder: Path, hello: Hello) -> Flight:
         raise StoreError(f"cannot use {folder} ({error.strerror or error}); check the disk") from error
 
 
-def _epoch_us(time_ns: int, pts_us: int) -> int | None:
-    """UTC of a flight's zero; None for one that was recorded, whose delay nobody can state."""
-    is_now = abs(time.time_ns() - time_ns) < _LIVE_NS
-    return time_ns // 1000 - pts_us if is_now else None
+def _is_now(sample: Sample) -> bool:
+    """Whether telemetry is of a flight that goes on, whose delay can be stated, and not of a recorded one."""
+    return abs(time.time_ns() - sample.time_ns) < _LIVE_NS
 
 
 def _ended(path: Path) -> Path:

@@ -21,7 +21,6 @@ _FIRST_90KHZ = 900_000  # the flight's zero, 10 s: pictures that are decoded bef
 _PCR_LEAD_90KHZ = 18_000  # 0.2 s, what a receiver may hold back
 _MARK_HEAD = struct.Struct(">4sQqIIcB4B")
 _MARK_NAME = b"SVL1"
-_MOST_HEAD_BYTES = 16_000_000  # within which the first picture ends
 _SEARCHED_BYTES = 64_000_000  # at a file's end, for the last whole message
 
 
@@ -48,7 +47,7 @@ class FlightFile:
     def __init__(self, path: Path, codec: str) -> None:
         self._codec = codec
         self._counters = _Counters()
-        self.last_seq, self.last_pts_us, self.first_pts_us = 0, -1, -1
+        self.last_seq, self.last_pts_us = 0, -1
         self._file: BinaryIO = path.open("r+b" if path.exists() else "w+b", buffering=0)
         self._recover(path)
 
@@ -70,8 +69,6 @@ class FlightFile:
             self._counters.by_pid = counted
             raise
         self.last_seq, self.last_pts_us = message.seq, max(self.last_pts_us, message.pts_us)
-        if self.first_pts_us < 0 and message.kind is Kind.VIDEO:
-            self.first_pts_us = message.pts_us
 
     def sync(self) -> None:
         """Wait until the disk has all that was written."""
@@ -150,8 +147,6 @@ class FlightFile:
             _, self.last_seq, self.last_pts_us, _, _, _, _, *numbers = _MARK_HEAD.unpack_from(mark, 4)
             self._counters.by_pid = dict(zip((_PAT, _PMT, _VIDEO, _METADATA), numbers))
         keep = first + (end or 0)
-        self._file.seek(0)
-        self.first_pts_us = _first_picture_us(self._file.read(min(keep, _MOST_HEAD_BYTES)) or b"")
         if keep < size:
             self._file.truncate(keep)
         self._file.seek(keep)
@@ -261,16 +256,6 @@ def _whole_end(tail: bytes, *, is_all: bool) -> int | None:
             found = True
         end = at + _PACKET
     return end if found or (not is_all and end is not None) else None
-
-
-def _first_picture_us(head: bytes) -> int:
-    """When the first picture is shown that a file's first bytes hold whole; -1 where there is none."""
-    for at in range(0, len(head) - _PACKET + 1, _PACKET):
-        if _is_mark(head, at):
-            _, _, pts_us, _, _, kind, *_ = _MARK_HEAD.unpack_from(head, at + 4)
-            if kind == Kind.VIDEO.encode():
-                return int(pts_us)
-    return -1
 
 
 def _is_mark(data: bytes, at: int) -> bool:

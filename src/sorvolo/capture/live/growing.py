@@ -10,19 +10,27 @@ ENDED_SUFFIX = ".ended"
 """A file of this name beside a growing one states that nothing more is added."""
 
 _POLL_S = 0.05
+_PACKET_BYTES = 188
+_NEWEST_BYTES = 16_000_000  # of a transport stream, some ten seconds: who wants the newest frames begins there
 
 
 class GrowingFile:
     """What PyAV reads from: it waits for more at the file's end, until nothing was added for `give_up_s`, or until
     a file beside it (`ENDED_SUFFIX`) states its end.
 
-    There is no seeking, so the container must be one that is written front to back: MPEG-TS, fragmented MP4, MKV.
+    There is no seeking, so the container must be one that is written front to back: MPEG-TS, fragmented MP4, MKV. Where
+    the newest frames are wanted rather than all, a long transport stream is begun near its end.
     """
 
     def __init__(self, path: Path, settings: LiveSettings, outages: Outages, stop: threading.Event) -> None:
         self._file = path.open("rb")
         self._ended = path.with_name(path.name + ENDED_SUFFIX)
         self._settings, self._outages, self._stop = settings, outages, stop
+        size = path.stat().st_size
+        if not settings.keeps_all and size > _NEWEST_BYTES and self._file.read(1) == b"\x47":
+            self._file.seek((size - _NEWEST_BYTES) // _PACKET_BYTES * _PACKET_BYTES)
+        else:
+            self._file.seek(0)
 
     def read(self, size: int) -> bytes:
         """At most so many bytes; none when the file has ended."""
