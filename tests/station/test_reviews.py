@@ -1,6 +1,7 @@
 """Several people judge: every verdict is kept with who and when, and nobody overwrites what they did not see."""
 
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,30 @@ def test_while_a_mission_writes_verdicts_wait_for_its_end(client: TestClient, ro
         map_flight(archive, "d", 20, count=1)
     assert client.app.state.station.reviews.settle("field")  # type: ignore[attr-defined]
     assert next(each for each in list_changes(root / "field") if each.id == "b-3").verdict is Verdict.REJECTED
+
+
+def test_a_verdict_waits_for_a_mission_that_fails_and_for_a_station_that_ends(root: Path) -> None:
+    """No new version of the map comes then, which used to be what settled it."""
+
+    def is_settled(change_id: str) -> bool:
+        until_s = time.monotonic() + 10
+        while time.monotonic() < until_s:
+            if next(each for each in list_changes(root / "field") if each.id == change_id).verdict is Verdict.REJECTED:
+                return True
+            time.sleep(0.1)
+        return False
+
+    def opened() -> TestClient:
+        return TestClient(station_app(StationSettings(root)), base_url="http://127.0.0.1:8750")
+
+    with opened() as client:
+        with Archive.open(root / "field", write=True):
+            assert verdict(client, "b-3", "rejected", 0).status_code == 201
+        assert is_settled("b-3")
+    with Archive.open(root / "field", write=True), opened() as client:
+        assert verdict(client, "b-2", "rejected", 0).status_code == 201
+    with opened():
+        assert is_settled("b-2")
 
 
 def test_who_judged_is_the_name_of_the_token(root: Path) -> None:

@@ -2,6 +2,7 @@
 
 import sys
 import threading
+import time
 from dataclasses import dataclass
 
 from sorvolo.errors import SorvoloError
@@ -13,6 +14,7 @@ from sorvolo.station.sites import SiteShelf, bounds_lonlat
 from sorvolo.station.tiles import WebTiles, change_mark
 
 _LOOK_EVERY_S = 0.2
+_SETTLE_EVERY_S = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +32,7 @@ class MapWatch:
     def __init__(self, shelf: SiteShelf, tiles: WebTiles, reviews: Reviews, events: EventLog) -> None:
         self._shelf, self._tiles, self._reviews, self._events = shelf, tiles, reviews, events
         self._seen: dict[str, _Seen] = {}
+        self._settled_s = 0.0
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="maps", daemon=True)
 
@@ -54,6 +57,9 @@ class MapWatch:
                 self._look_at(site_id)
             except (Problem, SorvoloError):  # gone meanwhile, or damaged: who opens it is told why
                 self._seen.pop(site_id, None)
+        if time.monotonic() - self._settled_s > _SETTLE_EVERY_S:
+            self._settled_s = time.monotonic()
+            self._reviews.settle_waiting()
 
     def _look_at(self, site_id: str) -> None:
         archive = self._shelf.open(site_id)
@@ -64,6 +70,7 @@ class MapWatch:
         versions = sum(each.complete for each in archive.versions())
         self._seen[site_id] = _Seen(mark, state, versions)
         if before is None:
+            self._reviews.settle(site_id)  # those that waited when the station was ended
             return
         if state is not None and state.keys[0] and (before.state is None or before.state.revision != state.revision):
             changed = list(state.keys[0]) if before.state is None else state.changed_since(before.state)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from fastapi import APIRouter, Depends, Query
 from pydantic import BaseModel, Field
 
-from sorvolo.errors import StoreError
+from sorvolo.errors import SorvoloError, StoreError
 from sorvolo.missions.site.review import review_changes, withdraw_reviews
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.problems import Problem
@@ -56,6 +56,7 @@ class Reviews:
     def __init__(self, state: StationState, shelf: SiteShelf, events: EventLog) -> None:
         self._state, self._shelf, self._events = state, shelf, events
         self._settling = threading.Lock()
+        self._unsettled: set[str] = set()
 
     def current(self, site_id: str, kind: str) -> dict[str, Review]:
         """The newest verdict on each thing of a kind, by id; those given by the command line included."""
@@ -114,8 +115,18 @@ class Reviews:
                     else:
                         review_changes(archive.folder, [each.id], verdict, each.note)
             except StoreError:  # a mission is writing into the site: when it ends they are settled
+                self._unsettled.add(site_id)
                 return False
+            self._unsettled.discard(site_id)
             return True
+
+    def settle_waiting(self) -> None:
+        """Settle the sites whose verdicts had to wait, such as for a mission that then failed."""
+        for site_id in list(self._unsettled):
+            try:
+                self.settle(site_id)
+            except (Problem, SorvoloError):  # gone meanwhile, or damaged
+                self._unsettled.discard(site_id)
 
     def _from_site(self, site_id: str, known: Mapping[str, Review]) -> dict[str, Review]:
         """Verdicts that the command line gave after ours."""
