@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
+from sorvolo.errors import StoreError
 from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.settings import (
     ImagingSettings,
@@ -20,7 +22,10 @@ from sorvolo.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
+from sorvolo.station import runs as runs_module
 from sorvolo.station.app import station_app
+from sorvolo.station.orders import InputWish, RunWish
+from sorvolo.station.runs import Run
 from sorvolo.station.settings import StationSettings
 
 FLIGHT = SimulationSettings(
@@ -163,8 +168,50 @@ def test_a_mission_that_cannot_do_its_work_says_why(open_station: Callable[[], T
     assert done["state"] == "failed" and done["exit_code"] == 1 and "camera.xml" in done["error"]
 
 
+def test_a_mission_that_cannot_be_noted_does_not_run(
+    open_station: Callable[[], TestClient], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk is full at this very moment: its process would write into the site, known to nobody."""
+    runs = open_station().app.state.station.runs  # type: ignore[attr-defined]
+    spawned: list[subprocess.Popen[bytes]] = []
+    started = runs_module._spawned
+
+    def spawn(folder: Path) -> "subprocess.Popen[bytes]":
+        spawned.append(started(folder))
+        return spawned[-1]
+
+    def fail(_: object) -> None:
+        raise StoreError("disk full")
+
+    monkeypatch.setattr(runs_module, "_spawned", spawn)
+    monkeypatch.setattr(runs, "_begin", fail)
+    with pytest.raises(StoreError):
+        runs.start(RunWish(mission="map", site="new", input=InputWish(input=runs._inputs.all()[0].id)), "Ada")
+    assert spawned[0].poll() == -signal.SIGKILL and runs.all() == []
+
+
+def test_lines_that_cannot_be_read_are_passed_over(open_station: Callable[[], TestClient]) -> None:
+    """A power cut tore one: what stands behind it counts."""
+    client = open_station()
+    runs = client.app.state.station.runs  # type: ignore[attr-defined]
+    runs.close()
+    run = Run("1" * 16, "map", "new", "running", "Ada", "2026-01-01T00:00:00Z")
+    folder = runs._folder / run.id
+    folder.mkdir(parents=True)
+    (folder / "journal.jsonl").write_bytes(b"torn\n" * 1_000_000)
+    runs._begin(run)
+    assert runs.look() == 1 and runs.get(run.id).state == "running"
+    line = {"type": "run.finished", "data": {"headline": "mapped", "exit_code": 0, "error": None}}
+    with (folder / "journal.jsonl").open("ab") as journal:
+        journal.write(json.dumps(line).encode() + b"\n")
+    while runs.look():
+        pass
+    assert runs.get(run.id).headline == "mapped"
+
+
 WRONG: list[tuple[dict[str, Any], int]] = [
     ({"mission": "fly"}, 422), ({"site": ""}, 422), ({"site": "../out"}, 400), ({"site": "station"}, 400),
+    ({"site": "streams"}, 400),
     ({"input": {"input": "0" * 16}}, 404), ({"input": {"upload": "../../etc/passwd"}}, 404), ({"input": None}, 422),
     ({"input": {"path": "/etc/passwd"}}, 422), ({"input": {"input": "a", "upload": "b"}}, 422),
     ({"options": {"camera": "/etc/passwd"}}, 422), ({"options": {"model": "../model"}}, 422),

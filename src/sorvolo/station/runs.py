@@ -127,12 +127,13 @@ class Runs:
             )
             process = _spawned(folder)
             run = replace(run, pid=process.pid)
+            try:
+                self._begin(run)
+            except BaseException:  # a full disk: nobody would know of the mission, nor could stop it
+                process.kill()
+                process.wait()
+                raise
             self._processes[run_id] = process
-            with self._events.appending([_event("run.started", run, _public(run))]) as connection:
-                connection.execute(
-                    "INSERT INTO runs (id, made_at, site, mission, state, record) VALUES (?, ?, ?, ?, ?, ?)",
-                    (run.id, run.started_at, run.site, run.mission, run.state, compact_json(asdict(run))),
-                )
             return run
 
     def stop(self, run_id: str) -> Run:
@@ -154,9 +155,8 @@ class Runs:
     def look(self) -> int:
         """Take in what the running missions wrote since; how many still run."""
         count = 0
-        for row in self._state.rows("SELECT record, journal_offset FROM runs WHERE state = ?", (RUNNING,)):
-            run = Run(**json.loads(row["record"]))
-            count += self._look_at(run, row["journal_offset"]).state == RUNNING
+        for run, offset in self._running():
+            count += self._look_at(run, offset).state == RUNNING
         return count
 
     def look_at_disk(self) -> None:
@@ -170,6 +170,18 @@ class Runs:
             self._events.append(NewEvent("station.disk", data))
 
     # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _begin(self, run: Run) -> None:
+        with self._events.appending([_event("run.started", run, _public(run))]) as connection:
+            connection.execute(
+                "INSERT INTO runs (id, made_at, site, mission, state, record) VALUES (?, ?, ?, ?, ?, ?)",
+                (run.id, run.started_at, run.site, run.mission, run.state, compact_json(asdict(run))),
+            )
+
+    def _running(self) -> list[tuple[Run, int]]:
+        """The missions that run, each with how far its journal was read."""
+        rows = self._state.rows("SELECT record, journal_offset FROM runs WHERE state = ?", (RUNNING,))
+        return [(Run(**json.loads(row["record"])), row["journal_offset"]) for row in rows]
 
     def _watch(self) -> None:
         for count in itertools.count():
@@ -196,11 +208,11 @@ class Runs:
                     continue
                 run, event = _taken(run, line)
                 events.append(event)
-            if has_ended and run.state == RUNNING and not lines:
+            if has_ended and run.state == RUNNING and end == offset:
                 run = self._without_a_word(run, folder)
                 kind = "run.stopped" if run.state == STOPPED else "run.failed"
                 events.append(_event(kind, run, _public(run)))
-            if events or lines:
+            if events or end > offset:
                 self._keep(run, events, end)
         if run.state != RUNNING:
             process = self._processes.pop(run.id, None)
@@ -232,7 +244,7 @@ class Runs:
             )
 
     def _demand_turn(self, wish: RunWish) -> None:
-        running = [each for each in self.all() if each.state == RUNNING]
+        running = [each for each, _ in self._running()]
         if len(running) >= _MOST_RUNNING:
             raise Problem(409, f"{len(running)} missions run already; wait until one ends, or stop one")
         for each in running:

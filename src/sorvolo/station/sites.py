@@ -13,7 +13,7 @@ from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.station.problems import Problem
-from sorvolo.station.settings import STATE_FOLDER
+from sorvolo.station.settings import STATE_FOLDER, STREAMS_FOLDER
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import FlightEntry, VersionEntry
 from sorvolo.store.site.files import CATALOGUE
@@ -62,7 +62,8 @@ class SiteShelf:
         found = self.folders().get(site_id)
         if found is not None:
             return found
-        if not is_plain_name(site_id) or ":" in site_id or site_id == STATE_FOLDER or (self.root / CATALOGUE).exists():
+        is_taken = site_id in (STATE_FOLDER, STREAMS_FOLDER) or (self.root / CATALOGUE).exists()
+        if not is_plain_name(site_id) or ":" in site_id or is_taken:
             raise Problem(400, f"{site_id[:80]!r} cannot name a new site; give letters and digits")
         folder = self.root / site_id
         if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
