@@ -33,6 +33,8 @@ class MapOverview:
                 left, top = self._corner(source)
                 if left is None or top is None or _mark(self._path) != self._mark:
                     return None
+                if max(source.overviews(1), default=1) < 2 ** (level - 1):  # it would be read whole
+                    return None
                 return self._read(source, level, index, left, top)
         except (RasterioError, SorvoloError, OSError):  # damaged or taken away: the tiles themselves have it all
             return None
