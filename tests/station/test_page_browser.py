@@ -422,7 +422,7 @@ def test_heights_along_a_line_and_the_printed_sheet(opened: Watched) -> None:
     page.locator("body[data-printed]").wait_for(state="attached")
     printed = page.locator("body").get_attribute("data-printed")
     assert "b-3" in printed
-    assert re.search(r"the picture is [\d.]+ (m|km) wide, north up, its middle at 46\.\d+, 13\.\d+", printed)
+    assert re.search(r"the picture is [\d.]+ (m|km) wide, north up, its middle at (46|33T)", printed)
     assert page.locator(".sheet img").evaluate("each => each.naturalWidth") > 500
     page.evaluate("dispatchEvent(new Event('afterprint'))")
 
