@@ -199,7 +199,8 @@ class Ingest:
         self._check_space()
         await self._make_room(stream, hello, link)
         flight = self._flights.get(stream)
-        if flight is None or flight.hello.flight != hello.flight or not flight.is_open:
+        known = None if flight is None else (flight.hello.flight, flight.hello.codec)
+        if flight is None or known != (hello.flight, hello.codec) or not flight.is_open:
             flight = await asyncio.to_thread(open_flight, self._folder / stream, hello)
         self._flights[stream], self._links[stream] = flight, link
         self.hub(stream).begin(hello)
