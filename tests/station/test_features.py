@@ -1,9 +1,15 @@
 """OGC API Features: collections of a site, filtered and in pages; pictures of changes by their ids."""
 
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import numpy as np
 import pytest
 from starlette.testclient import TestClient
+
+from sorvolo.station import crops
 
 ITEMS = "/api/sites/field/collections/{}/items"
 
@@ -84,3 +90,31 @@ def test_pictures_of_changes_and_of_places(client: TestClient) -> None:
     for missing in ("change/b-1/2.jpg", "change/nothing/0.jpg", "object/b-1/0.jpg", "frame/a/77/0/0.jpg",
                     "frame/..%2f..%2fetc/0/0/0.jpg"):
         assert client.get(f"/api/sites/field/crops/{missing}").status_code == 404, missing
+
+
+def test_pictures_that_are_cut_hold_up_nothing_else(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some browsers ask for strips of pictures: those that wait took all threads, and no tile was answered."""
+    goes_on = threading.Event()
+
+    def cut(*_: object) -> np.ndarray:
+        goes_on.wait(30)
+        return np.zeros((320, 320, 3), np.uint8)
+
+    monkeypatch.setattr(crops, "cut", cut)
+    with ThreadPoolExecutor(45) as browsers:
+        asked = [browsers.submit(client.get, "/api/sites/field/crops/frame/a/1/5000/-4000.jpg") for _ in range(45)]
+        time.sleep(0.5)
+        try:
+            assert browsers_can_ask(client)
+        finally:
+            goes_on.set()
+        assert {each.result().status_code for each in asked} == {200}
+
+
+def browsers_can_ask(client: TestClient) -> bool:
+    """Whether another request is answered within seconds."""
+    answer: list[int] = []
+    asking = threading.Thread(target=lambda: answer.append(client.get("/api/sites").status_code), daemon=True)
+    asking.start()
+    asking.join(5)
+    return answer == [200]

@@ -1,9 +1,8 @@
 """Pictures of objects and changes that missions stored, and of any place, cut on demand from key frames."""
 
-import threading
-
 import cv2
 import numpy as np
+from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Depends, Response
 
 from sorvolo.geometry.arrays import ImageRGB, PointsM
@@ -22,7 +21,7 @@ CROP_PX, CROP_M = 320, 10.0
 """How large a picture of a place is, and how much ground it shows."""
 
 _KEPT = "private, max-age=86400"
-_CUTTING = threading.Semaphore(2)  # key frames decoded at once: a strip asks for dozens
+_AT_ONCE = 2  # key frames decoded: a strip asks for dozens, and those that wait must not take threads from the rest
 
 
 class JpegResponse(Response):
@@ -33,6 +32,7 @@ class JpegResponse(Response):
 
 def crop_routes(shelf: SiteShelf) -> APIRouter:
     """Pictures by the id of what they show; never by a path."""
+    cutting = CapacityLimiter(_AT_ONCE)
     router = APIRouter(prefix="/api/sites/{site}/crops", tags=["crops"], dependencies=[Depends(needs(Role.VIEW))])
 
     @router.get("/change/{change_id}/{n}.jpg", response_class=JpegResponse)
@@ -57,11 +57,15 @@ def crop_routes(shelf: SiteShelf) -> APIRouter:
         return JpegResponse(data, headers={"cache-control": _KEPT})
 
     @router.get("/frame/{flight}/{index}/{east_mm}/{north_mm}.jpg", response_class=JpegResponse)
-    def of_frame(site: str, flight: str, index: int, east_mm: int, north_mm: int) -> Response:
+    async def of_frame(site: str, flight: str, index: int, east_mm: int, north_mm: int) -> Response:
         """The ground around a place (site millimetres), north up, cut from a key frame."""
-        archive = shelf.open(site)
-        place_m = np.array([east_mm, north_mm]) / 1000
-        return _jpeg(cut(archive, keyframe(archive, flight, index), place_m))
+
+        def made() -> Response:
+            archive = shelf.open(site)
+            place_m = np.array([east_mm, north_mm]) / 1000
+            return _jpeg(cut(archive, keyframe(archive, flight, index), place_m))
+
+        return await to_thread.run_sync(made, limiter=cutting)
 
     return router
 
@@ -85,11 +89,10 @@ def cut(archive: Archive, frame: StoredKeyframe, place_m: PointsM) -> ImageRGB:
         [0, -m_per_px, place_m[1] + m_per_px * (CROP_PX - 1) / 2],
         [0, 0, 1],
     ])
-    with _CUTTING:
-        image = archive.image(frame)
-        image_from_crop = np.linalg.inv(frame.site_from_image) @ site_from_crop
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        cropped = cv2.warpPerspective(image, image_from_crop, (CROP_PX, CROP_PX), flags=flags, borderValue=(127,) * 3)
+    image = archive.image(frame)
+    image_from_crop = np.linalg.inv(frame.site_from_image) @ site_from_crop
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    cropped = cv2.warpPerspective(image, image_from_crop, (CROP_PX, CROP_PX), flags=flags, borderValue=(127,) * 3)
     return np.asarray(cropped, np.uint8)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Depends, Response
 from fastapi.responses import FileResponse
 
@@ -26,6 +27,7 @@ from sorvolo.store.site.archive import Archive
 _WITHIN_S = 30.0
 _CACHE_BYTES = 32_000_000
 _CUTTING = threading.Semaphore(1)
+_AT_ONCE = 3  # one is cut, others wait or are kept already; more would take threads from all other requests
 
 
 class FlightVideos:
@@ -48,6 +50,7 @@ class FlightVideos:
 def video_routes(shelf: SiteShelf, collections: SiteCollections, videos: FlightVideos) -> APIRouter:
     """A flight's video, and pictures of a place cut from it."""
     router = APIRouter(prefix="/api/sites/{site}", tags=["memory"], dependencies=[Depends(needs(Role.VIEW))])
+    cutting = CapacityLimiter(_AT_ONCE)
     cache = BytesCache[tuple[Any, ...], bytes](_CACHE_BYTES, len)
 
     @router.get("/flights/{flight}/video", response_class=FileResponse)
@@ -56,20 +59,24 @@ def video_routes(shelf: SiteShelf, collections: SiteCollections, videos: FlightV
         return FileResponse(_demanded(shelf.open(site), flight, videos), headers={"cache-control": "private"})
 
     @router.get("/crops/video/{flight}/{frame}/{east_mm}/{north_mm}.jpg", response_class=JpegResponse)
-    def crop(site: str, flight: str, frame: int, east_mm: int, north_mm: int) -> Response:
+    async def crop(site: str, flight: str, frame: int, east_mm: int, north_mm: int) -> Response:
         """The ground around a place (site millimetres), north up, from a frame of the flight's video."""
-        archive = shelf.open(site)
-        path = _demanded(archive, flight, videos)
-        feature = next((
-            each for each in collections.get(site, "frames").features if each["id"] == f"{flight}:{frame}"
-        ), None)
-        if feature is None:
-            raise Problem(404, f"{flight[:80]!r} has no frame {frame}")
-        ring = archive.site().frame.ground_from_lonlat(feature["geometry"]["coordinates"][0][:4])
-        place_m = np.array([east_mm, north_mm]) / 1000
-        key = (str(path), path.stat().st_mtime_ns, frame, east_mm, north_mm)
-        data = cache.get(key, lambda: _cut(path, frame, _crop_corners(ring, place_m)))
-        return JpegResponse(data, headers={"cache-control": "private, max-age=86400"})
+
+        def made() -> Response:
+            archive = shelf.open(site)
+            path = _demanded(archive, flight, videos)
+            feature = next((
+                each for each in collections.get(site, "frames").features if each["id"] == f"{flight}:{frame}"
+            ), None)
+            if feature is None:
+                raise Problem(404, f"{flight[:80]!r} has no frame {frame}")
+            ring = archive.site().frame.ground_from_lonlat(feature["geometry"]["coordinates"][0][:4])
+            place_m = np.array([east_mm, north_mm]) / 1000
+            key = (str(path), path.stat().st_mtime_ns, frame, east_mm, north_mm)
+            data = cache.get(key, lambda: _cut(path, frame, _crop_corners(ring, place_m)))
+            return JpegResponse(data, headers={"cache-control": "private, max-age=86400"})
+
+        return await to_thread.run_sync(made, limiter=cutting)
 
     return router
 
