@@ -4,6 +4,7 @@ import socket
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from starlette.testclient import TestClient, WebSocketDenialResponse
@@ -12,7 +13,9 @@ from typer.testing import CliRunner
 
 from sorvolo.cli.main import app as command
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.station import worker
 from sorvolo.station.app import station_app
+from sorvolo.station.orders import Order
 from sorvolo.station.problems import Problem
 from sorvolo.station.security import address_group
 from sorvolo.station.settings import StationSettings, check_exposure
@@ -341,3 +344,19 @@ def test_a_streams_password_is_shown_to_nobody(client: TestClient, root: Path) -
     shown = inputs.shown(InputWish(stream_url="rtsp://me:secretword@93.184.216.34/live?token=secretword"))
     assert shown == {"stream_url": "rtsp://93.184.216.34/live"}
     assert (root / "station").stat().st_mode & 0o077 == 0
+
+
+def test_a_missions_error_holds_no_password(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """FFmpeg's own errors state the whole address, and every viewer reads why a mission failed."""
+    source = "rtsp://me:secretword@93.184.216.34/live?token=hidden"
+    Order("r", "watch", "field", str(tmp_path), source, "", "", str(tmp_path), "", {}).write(tmp_path)
+
+    def fail(*_: object) -> str:
+        raise ValueError(f"Invalid data found when processing input: {source!r}")
+
+    monkeypatch.setitem(worker._MISSIONS, "watch", fail)
+    monkeypatch.setattr(worker, "_Stop", lambda _: SimpleNamespace(until=None))
+    with pytest.raises(ValueError, match="Invalid"):
+        worker.main(tmp_path)
+    text = (tmp_path / "journal.jsonl").read_text()
+    assert "93.184.216.34/live" in text and "secretword" not in text and "hidden" not in text

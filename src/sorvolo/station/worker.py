@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -92,14 +93,28 @@ def main(folder: Path) -> int:
         journal.add(STOPPED, {"exit_code": _STOPPED_CODE, "error": None, "headline": "stopped; nothing was kept"})
         return _STOPPED_CODE
     except SorvoloError as error:
-        journal.add(FAILED, {"exit_code": _WRONG, "error": str(error), "headline": None})
+        journal.add(FAILED, {"exit_code": _WRONG, "error": without_secret(str(error), order.source), "headline": None})
         return _WRONG
     except Exception as error:
         words = f"{type(error).__name__}: {error}" if not isinstance(error, OSError) else f"{error.strerror or error}"
-        journal.add(FAILED, {"exit_code": _WRONG, "error": words, "headline": None})
+        journal.add(FAILED, {"exit_code": _WRONG, "error": without_secret(words, order.source), "headline": None})
         raise  # the traceback goes to the run's log
     journal.add(FINISHED, {"exit_code": 0, "error": None, "headline": headline})
     return 0
+
+
+def without_secret(words: str, source: str) -> str:
+    """The words of an error without a stream's name and password, and what stands behind its `?`.
+
+    FFmpeg's errors hold the whole address; whoever may view the station reads those of its missions.
+    """
+    if "://" not in source:
+        return words
+    parts = urlsplit(source)
+    for secret in (parts.netloc.rpartition("@")[0], parts.password, parts.query):
+        if secret:
+            words = words.replace(secret, "***")
+    return words
 
 
 def _map(order: Order, journal: Journal, until: threading.Event) -> str:
