@@ -10,6 +10,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from sorvolo.station import crops
+from sorvolo.station.features import crop_addresses
 
 ITEMS = "/api/sites/field/collections/{}/items"
 
@@ -90,6 +91,12 @@ def test_pictures_of_changes_and_of_places(client: TestClient) -> None:
     for missing in ("change/b-1/2.jpg", "change/nothing/0.jpg", "object/b-1/0.jpg", "frame/a/77/0/0.jpg",
                     "frame/..%2f..%2fetc/0/0/0.jpg"):
         assert client.get(f"/api/sites/field/crops/{missing}").status_code == 404, missing
+
+
+def test_addresses_of_pictures_are_addresses() -> None:
+    """Names of flights, and so of changes, may hold what ends a path."""
+    address = crop_addresses("demo:site", "change", "flight #2-1")[1]
+    assert address == "/api/sites/demo:site/crops/change/flight%20%232-1/1.jpg"
 
 
 def test_pictures_that_are_cut_hold_up_nothing_else(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
-from urllib.parse import urlencode
+from urllib.parse import quote, urlencode
 
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import JSONResponse
@@ -188,7 +188,8 @@ def _reviewed(features: Sequence[Feature], name: str, site: str, reviews: Review
 
 def crop_addresses(site: str, kind: str, feature_id: str) -> list[str]:
     """Where the pictures of an object, or of a change before and after, are found."""
-    return [f"/api/sites/{site}/crops/{kind}/{feature_id}/{n}.jpg" for n in range(2 if kind == "change" else 1)]
+    base = f"/api/sites/{quote(site, safe=':')}/crops/{kind}/{quote(feature_id, safe='')}"
+    return [f"{base}/{n}.jpg" for n in range(2 if kind == "change" else 1)]
 
 
 def _filtered(

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from fastapi import APIRouter, Depends, Query
@@ -104,15 +105,15 @@ def _row(
     video = videos.find(archive, flight)
     seconds = _seconds(values.get("time"), archive.report(flight).get("flown")) if video is not None else None
     east_mm, north_mm = (round(1000 * float(each)) for each in place_m)
-    base, crop = f"/api/sites/{site_id}/crops", None
+    base, named, crop = f"/api/sites/{quote(site_id, safe=':')}", quote(flight, safe=""), None
     if (flight, name) in kept:
-        crop = f"{base}/frame/{flight}/{name}/{east_mm}/{north_mm}.jpg"
+        crop = f"{base}/crops/frame/{named}/{name}/{east_mm}/{north_mm}.jpg"
     elif seconds is not None and isinstance(name, int):
-        crop = f"{base}/video/{flight}/{name}/{east_mm}/{north_mm}.jpg"
+        crop = f"{base}/crops/video/{named}/{name}/{east_mm}/{north_mm}.jpg"
     here = found.get(flight, [])
     return {
         "flight": flight, "time": values.get("time"), "frame_id": frame["id"], "crop_url": crop, "video_s": seconds,
-        "video_url": None if video is None else f"/api/sites/{site_id}/flights/{flight}/video",
+        "video_url": None if video is None else f"{base}/flights/{named}/video",
         "height_m": values.get("height_above_ground_m"), "sigma_m": values.get("sigma_m"),
         "changes": [each for each in here if each["type"] == "change"],
         "objects": [each for each in here if each["type"] == "object"],
