@@ -350,9 +350,9 @@ def test_the_drone_s_video_is_shown_with_boxes(served: Served, opened: Watched, 
         )
         assert grey > 30  # a picture of the flight, not an empty canvas
         last_us = max(each.pts_us for each in messages if each.kind is Kind.VIDEO)
-        first_us = min(each.pts_us for each in messages if each.kind is Kind.VIDEO)
-        served.station.ingest.show_boxes({
-            "stream": "scout", "pts_us": last_us - first_us, "frame_size_px": [160, 120],
+        ingest = served.station.ingest
+        ingest._loop.call_soon_threadsafe(ingest.hub("scout").note, {
+            "type": "boxes", "pts_us": last_us, "frame_size_px": [160, 120],
             "boxes": [{"class": "person", "score": 0.8, "xywh_px": [40, 40, 20, 30]}],
         })
         page.locator("aside.video footer", has_text="1 in the picture").wait_for()
