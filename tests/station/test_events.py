@@ -3,6 +3,7 @@
 import asyncio
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
@@ -47,6 +48,23 @@ def test_events_older_than_memory_come_from_the_disk_and_lost_ones_are_named(
     found = log.after(1)
     assert found[0]["type"] == LOST and found[0]["data"] == {"from": 2, "to": 4} and found[0]["seq"] == 4
     assert [each["seq"] for each in found[1:]] == [5, 6, 7, 8]
+
+
+def test_a_page_of_an_earlier_station_loads_anew(tmp_path: Path) -> None:
+    """Its last number is above all of ours, where the station's memory was moved away: it would wait for ever."""
+    log = logged(tmp_path, 3)
+
+    async def first_two() -> list[dict[str, Any]]:
+        found: list[dict[str, Any]] = []
+        async for batch in log.follow(5000, quiet_s=0.2):
+            found += batch
+            if len(found) == 2 or not batch:
+                return found
+            log.append(NewEvent("x", {}))
+        raise AssertionError
+
+    found = asyncio.run(first_two())
+    assert [(each["seq"], each["type"]) for each in found] == [(3, LOST), (4, "x")]
 
 
 def test_many_threads_write_and_a_follower_sees_each_once(tmp_path: Path) -> None:

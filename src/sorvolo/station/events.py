@@ -101,6 +101,10 @@ class EventLog:
         loop, arrived = asyncio.get_running_loop(), asyncio.Event()
         self._waiting.add((loop, arrived))
         try:
+            if seq > self._last:  # the numbers of a station whose memory was moved away: no event would come for long
+                seq = self._last
+                gap = {"from": 1, "to": seq}
+                yield [{"seq": seq, "at": utc_now(), "type": LOST, "site": None, "run": None, "data": gap}]
             while True:
                 arrived.clear()
                 events = await asyncio.to_thread(self.after, seq) if seq < self._last else []
