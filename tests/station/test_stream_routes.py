@@ -1,5 +1,6 @@
 """A drone and browsers at a whole station: roles, states, pictures, and the command itself."""
 
+import asyncio
 import json
 import threading
 import time
@@ -15,9 +16,11 @@ from test_stream_messages import units
 
 from sorvolo.cli import main as cli
 from sorvolo.station.app import station_app
+from sorvolo.station.events import NewEvent
 from sorvolo.station.messages import Hello, Kind, Message
 from sorvolo.station.settings import STATE_FOLDER, StationSettings
 from sorvolo.station.state import StationState
+from sorvolo.station.stream_routes import announcing
 from sorvolo.station.tokens import make_token
 
 WS = "ws://127.0.0.1:8750"
@@ -100,6 +103,29 @@ def test_who_only_looks_keeps_no_drone_away(client: TestClient) -> None:
         assert drone.receive_json()["type"] == "welcome"
         assert client.get("/api/streams/early").json()["viewers"] == 1
     assert client.get("/metrics").status_code == 200
+
+
+def test_a_stream_s_states_are_announced_in_their_order() -> None:
+    """Else a page would show a drone as connected that went away just after it came."""
+    written: list[int] = []
+
+    class Disk:
+        """Takes long for the first event."""
+
+        def append(self, event: NewEvent) -> int:
+            time.sleep(0.2 if event.data["n"] == 0 else 0.0)
+            written.append(event.data["n"])
+            return 0
+
+    async def announce() -> None:
+        tell = announcing(Disk())  # type: ignore[arg-type]
+        for number in range(3):
+            tell("scout", {"n": number})
+        while len(written) < 3:
+            await asyncio.sleep(0.02)
+
+    asyncio.run(asyncio.wait_for(announce(), 5))
+    assert written == [0, 1, 2]
 
 
 def test_only_operators_send_and_whoever_sees_the_station_sees_the_video(root: Path) -> None:

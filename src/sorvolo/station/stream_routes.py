@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, Query, WebSocket
@@ -62,11 +63,12 @@ def stream_routes(ingest: Ingest) -> APIRouter:
 
 
 def announcing(events: EventLog) -> Announce:
-    """Stream states as live events; written beside the event loop, as the disk is waited for."""
+    """Stream states as live events; written beside the event loop, as the disk is waited for, and in order."""
+    writing = ThreadPoolExecutor(1, thread_name_prefix="stream states")  # two threads could swap coming and going
 
     def announce(stream: str, state: Mapping[str, Any]) -> None:
         event = NewEvent("stream.state", {**state, "stream": stream})
-        asyncio.get_running_loop().run_in_executor(None, events.append, event)
+        writing.submit(events.append, event)
 
     return announce
 
