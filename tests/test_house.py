@@ -72,3 +72,9 @@ def test_few_functions_are_complex() -> None:
                 if each.complexity > COMPLEX_ABOVE:
                     complex_ones.append(f"{path.relative_to(PACKAGE)}: {each.name} {each.complexity}")
     assert len(complex_ones) <= COMPLEX_SHARE * every, "\n".join(sorted(complex_ones))
+
+
+def test_files_of_tests_have_names_of_their_own() -> None:
+    """Pytest imports them by their bare names: of two alike it collects one."""
+    names = [path.name for path in (ROOT / "tests").rglob("*.py") if path.name != "conftest.py"]
+    assert sorted(names) == sorted(set(names))
