@@ -45,7 +45,10 @@ def doubts(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
             "their edges"
         )
     if figures.residual_median_px is not None and figures.residual_median_px > _BAD_FIT_PX:
-        warnings.append("pictures fit each other badly: high trees or houses, a wrong camera, or a rolling shutter")
+        warnings.append(
+            "pictures fit each other badly: high trees or houses (`sorvolo heights` makes an upright map of them), a "
+            "wrong camera, or a rolling shutter"
+        )
     return warnings
 
 
