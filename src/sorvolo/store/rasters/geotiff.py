@@ -41,7 +41,9 @@ _COG = {
 }
 
 
-_JPEG = {"compress": "JPEG", "quality": 90}  # of the colours; what was never seen becomes a lossless mask
+# of the colours; what was never seen becomes a lossless mask. GDAL makes that mask of the alpha band by a file between,
+# which has none of our overviews: it averages its own
+_JPEG = {"compress": "JPEG", "quality": 90, "overviews": "IGNORE_EXISTING", "overview_resampling": "AVERAGE"}
 _MOST_JPEG_LEVELS = 12.0  # mean difference of a block's colours: noise at quality 90 stays below 6
 COMPRESSIONS = ("deflate", "jpeg")
 """How the map's GeoTIFF may be compressed: without loss, or with a tenth of the size."""
