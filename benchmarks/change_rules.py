@@ -176,7 +176,6 @@ PAIR_RULES: tuple[Rule, ...] = tuple(_rule(name, decision, *switches, stage="pai
     ("growing: not into shade", "0007", (f"{_EXTENT}.shade_of_top", 0.0)),
     ("growing: blurred rim", "0007", (f"{_EXTENT}.blurred", 0.0)),
     ("growing: nearly convex", "0007", (f"{_EXTENT}.convexity", 0.0)),
-    ("growing: a whole thing", "0027", (f"{_EXTENT}.edge", -1.0)),
     ("growing: sharp rim", "0007", (f"{_EXTENT}.beside", _INFINITE)),
     ("regions: activity around", "0007", ("pair.regions:RegionSettings.activity_factor", 0.0)),
     ("regions: bounded activity", "0007", ("pair.regions:RegionSettings.most_clutter", 255.0)),

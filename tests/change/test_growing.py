@@ -70,17 +70,3 @@ def test_a_soft_shadow_is_no_part_of_the_thing() -> None:
     changed = plain(150) * (1 - cv2.GaussianBlur(shade, (0, 0), 2)[..., None])
     changed[THING] = (60, 60, 220)
     assert overlap(compared(plain(150), changed).mask, THING) > 0.8
-
-
-def test_a_car_of_the_grounds_own_colour_is_found_whole_not_its_windows_alone() -> None:
-    rng = np.random.default_rng(5)
-
-    def grain(strength: float, px: float) -> np.ndarray:
-        return cv2.GaussianBlur(rng.normal(0, strength, SIZE).astype(np.float32), (0, 0), px)[..., None]
-
-    ground, car = plain() + grain(12, 2), np.zeros(SIZE, bool)
-    car[150:210, 200:310] = True
-    changed = np.where(car[..., None], plain() + grain(240, 3), ground)
-    for x in (220, 280):
-        changed[155:205, x : x + 12] = 20
-    assert overlap(compared(ground, changed).mask, car) > 0.8

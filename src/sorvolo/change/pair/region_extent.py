@@ -20,7 +20,7 @@ Window = tuple[slice, slice]
 class ExtentSettings:
     """How far a thing reaches from where it differs most (0007). Lengths in px of the half size pictures."""
 
-    reach_px: int = 20  # around a region and its length more: the ground that is looked at
+    reach_px: int = 20  # around a region and half of its length more: the ground that is looked at
     least_levels: float = 5.0  # grey levels: what differs less is no part of the thing, nor what differs by less ...
     of_top: float = 0.07  # ... than this part of the region's largest difference, or ...
     of_quiet: float = 2.0  # ... so many times as much as 90 % of the quiet ground
@@ -31,9 +31,6 @@ class ExtentSettings:
     shade_of_top: float = 0.35  # of the largest difference: what differs less and is darker is the thing's shadow
     shade: ShadeSettings = field(default_factory=lambda: ShadeSettings(no_brighter=1.0, alike=0.1))  # 0024
     blurred: float = 0.2  # of the largest difference within 5 px: what differs less is a thing's blurred rim
-    pooled_px: int = 9  # window of medians, in which a thing of the ground's own colour stands out as a whole, if ...
-    edge: float = 0.2  # ... just outside at most this part is left of what differs along the inside of its outline ...
-    more: float = 0.3  # ... and it is larger by this part than what stands out alone: less is a rim of light (0027)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,23 +62,11 @@ class Piece:
         return x + self.window[1].start, y + self.window[0].start, wide, high
 
 
-def quiet_level(regions: Regions) -> int:
-    """How much the pictures differ where nothing changed: 90 % of the ground off the regions differs less, pooled."""
-    small = regions.labels.shape[1] // 4, regions.labels.shape[0] // 4
-    pooled = np.asarray(cv2.resize(regions.strength, small, interpolation=cv2.INTER_AREA), np.uint8)
-    taken = cv2.resize((regions.labels > 0).view(np.uint8), small, interpolation=cv2.INTER_NEAREST)
-    free = np.asarray(cv2.dilate(taken, np.ones((5, 5), np.uint8)) == 0)
-    return _quantile(pooled, free, 0.9) if free.any() else 255
-
-
-def grown(
-    regions: Regions, region: int, came: bool, views: Views, level: int, settings: ExtentSettings
-) -> Piece | None:
+def grown(regions: Regions, region: int, came: bool, views: Views, settings: ExtentSettings) -> Piece | None:
     """The thing that `region` (0 .. N - 1) is a part of; None where it does not stand out from what is around.
 
     Its difference stands out of that of the quiet ground near: at the lowest limit at which it is one nearly convex
     piece with a sharp rim. Its own soft shadow, in the picture that shows it (the query where it `came`), is left out.
-    What of it has the ground's own colour stands out of the frame's `level` (see `quiet_level`).
     """
     window = _window(regions, region, settings.reach_px)
     strength, labels = regions.strength[window], regions.labels[window]
@@ -95,27 +80,6 @@ def grown(
     shadow = darker & (strength < ceil(settings.shade_of_top * top)) & ~core
     bare = strength * ~shadow
     limit = max(settings.least_levels, settings.of_top * top, settings.of_quiet * _quantile(bare, quiet, 0.9))
-    thing = _strong_part(strength, bare, surely, limit, settings)
-    whole = _whole(regions, window, surely, max(settings.least_levels, settings.of_quiet * level), settings)
-    if whole is None or (thing is not None and not _is_more(whole, thing, settings.more)):
-        return None if thing is None else Piece(window, thing)
-    return Piece(window, whole if thing is None else whole | thing)
-
-
-def _is_more(whole: Mask, thing: Mask, share: float) -> bool:
-    """Whether a piece is larger than the thing found in it by so large a share that it is no rim of light."""
-    beside = whole & (cv2.dilate(thing.view(np.uint8), np.ones((5, 5), np.uint8)) == 0)
-    return bool(np.count_nonzero(beside) > share * np.count_nonzero(thing))
-
-
-def _strong_part(
-    strength: ImageGray, bare: ImageGray, surely: ImageGray, limit: float, settings: ExtentSettings
-) -> Mask | None:
-    """The piece (h, w) around what is `surely` the thing at the lowest limit at which it looks like one.
-
-    `bare` is the difference `strength` (h, w) without the thing's shadow.
-    """
-    top = float(strength[surely > 0].max())
     while limit < settings.highest * top:
         over = cv2.threshold(bare, floor(limit), 255, cv2.THRESH_BINARY)[1]
         above = np.asarray(cv2.morphologyEx(over, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), np.uint8)
@@ -123,49 +87,9 @@ def _strong_part(
         if _is_thing(thing, bare, limit, settings):
             largest_near = cv2.dilate(strength, np.ones((5, 5), np.uint8))
             is_sharp = strength > np.floor(settings.blurred * np.asarray(largest_near, np.float32))
-            return np.asarray((thing > 0) & (is_sharp | (surely > 0)))
+            return Piece(window, (thing > 0) & (is_sharp | (surely > 0)))
         limit *= settings.step
     return None
-
-
-def _whole(
-    regions: Regions, window: Window, surely: ImageGray, limit: float, settings: ExtentSettings
-) -> Mask | None:
-    """All of a thing (h, w) most of which has the ground's own colour: each of its pixels differs by little, but all
-    around differ less, so that it stands out in medians. None where no nearly convex piece ends sharply in the window.
-    """
-    strength = regions.strength[window]
-    pooled = np.asarray(cv2.medianBlur(strength, settings.pooled_px), np.uint8)
-    top = float(strength[surely > 0].max())
-    while limit < settings.highest * top:
-        over = cv2.threshold(pooled, floor(limit), 255, cv2.THRESH_BINARY)[1]
-        thing = held_parts(np.asarray(cv2.max(over, surely), np.uint8), surely)
-        if not _is_cut_off(thing, window, regions.labels.shape) and _ends_sharply(thing, pooled, settings):
-            return np.asarray(thing > 0)
-        limit *= settings.step
-    return None
-
-
-def _is_cut_off(mask: ImageGray, window: Window, shape: tuple[int, ...]) -> bool:
-    """Whether a piece in a window of a picture of `shape` goes on beyond the window."""
-    rows, columns = window
-    sides = (
-        (rows.start > 0, mask[0]), (rows.stop < shape[0], mask[-1]),
-        (columns.start > 0, mask[:, 0]), (columns.stop < shape[1], mask[:, -1]),
-    )
-    return any(goes_on and bool(side.any()) for goes_on, side in sides)
-
-
-def _ends_sharply(mask: ImageGray, pooled: ImageGray, settings: ExtentSettings) -> bool:
-    """Whether a piece is nearly convex, and what differs inside its outline is gone just outside: light goes on."""
-    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    hull = cv2.contourArea(cv2.convexHull(np.concatenate(outlines)))
-    if len(outlines) > 1 or cv2.contourArea(outlines[0]) < settings.convexity * hull:
-        return False
-    full = cv2.drawContours(np.zeros_like(mask), outlines, -1, (1,), cv2.FILLED)
-    inner = np.asarray(full > cv2.erode(full, np.ones((7, 7), np.uint8)))
-    outer = np.asarray(cv2.dilate(full, np.ones((9, 9), np.uint8)) > cv2.dilate(full, np.ones((3, 3), np.uint8)))
-    return not outer.any() or _quantile(pooled, outer, 0.75) <= settings.edge * _quantile(pooled, inner, 0.5)
 
 
 def _is_thing(mask: Image, strength: Image, limit: float, settings: ExtentSettings) -> bool:
@@ -180,7 +104,7 @@ def _is_thing(mask: Image, strength: Image, limit: float, settings: ExtentSettin
 
 def _window(regions: Regions, region: int, reach_px: int) -> Window:
     x, y, wide, high = (int(each) for each in regions.boxes[region])
-    margin = reach_px + max(wide, high)
+    margin = reach_px + max(wide, high) // 2
     height, width = regions.labels.shape
     return np.s_[
         max(0, y - margin) : min(height, y + high + margin), max(0, x - margin) : min(width, x + wide + margin)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.change.pair.illumination import Light, LightSettings, fit_light, relit
-from sorvolo.change.pair.region_extent import ExtentSettings, Piece, Views, grown, quiet_level
+from sorvolo.change.pair.region_extent import ExtentSettings, Piece, Views, grown
 from sorvolo.change.pair.region_score import how_sure
 from sorvolo.change.pair.regions import FEATURES, Regions, RegionSettings, find_regions
 from sorvolo.change.pair.residual_alignment import Settling, SettlingSettings, settle
@@ -173,10 +173,8 @@ def _result(
     parts = np.asarray(labelled, np.int32)
     went = _went(regions, parts)
     pieces: dict[int, Piece] = {}
-    growing = np.flatnonzero(sure & (scores >= masks.least_grown))
-    level = quiet_level(regions) if len(growing) else 0
-    for region in growing:
-        piece = grown(regions, int(region), not went[region], views, level, settings.extent)
+    for region in np.flatnonzero(sure & (scores >= masks.least_grown)):
+        piece = grown(regions, int(region), not went[region], views, settings.extent)
         if piece is not None:
             pieces[int(region)] = piece
     half = regions.labels.shape[::-1]

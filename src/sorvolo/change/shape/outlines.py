@@ -12,6 +12,8 @@ from sorvolo.geometry.homography import apply_homography
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.survey.findings import ChangeKind
 
+_LEAST_PART = 0.1  # of the largest piece: smaller ones do not stretch an outline
+
 
 @dataclass(frozen=True, eq=False)
 class KnownPlace:
@@ -43,7 +45,7 @@ def outline_of(mask: Mask, site_from_mask: Matrix3, tolerance_px: float, join_px
     """The outline, (N, 2) in site metres, of the changed pixels; None when there are none.
 
     It runs along the pixels' outer edges, simplified by at most `tolerance_px`. Pieces less than `join_px` apart are
-    joined; if several remain, the outline is their hull. Holes are filled.
+    joined; if several remain, the outline is the hull of those that are not tiny beside the largest. Holes are filled.
     """
     found = np.argwhere(mask)
     if not len(found):
@@ -66,9 +68,11 @@ def outline_of(mask: Mask, site_from_mask: Matrix3, tolerance_px: float, join_px
 
 
 def _ring_around(part: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """The contour of the one piece of a mask, or the hull of several."""
+    """The contour of the one piece of a mask, or the hull of those that are not tiny beside the largest."""
     contours, _ = cv2.findContours(part, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return np.asarray(contours[0] if len(contours) == 1 else cv2.convexHull(np.vstack(contours)), np.int32)
+    areas = [float(cv2.contourArea(each)) for each in contours]
+    large = [each for each, area in zip(contours, areas) if area >= _LEAST_PART * max(areas)]
+    return np.asarray(large[0] if len(large) == 1 else cv2.convexHull(np.vstack(large)), np.int32)
 
 
 def mask_of(outline_m: PointsM, site_from_mask: Matrix3, shape: tuple[int, int]) -> Mask:
