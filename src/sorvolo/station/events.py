@@ -96,6 +96,13 @@ class EventLog:
             found = [lost, *found]
         return found
 
+    def newest(self, kind: str, site: str) -> dict[str, Any] | None:
+        """The last event of a kind about a site; None where there was none, or none is kept."""
+        rows = self._state.rows(
+            "SELECT * FROM events WHERE type = ? AND site = ? ORDER BY seq DESC LIMIT 1", (kind, site)
+        )
+        return _event(rows[0]) if rows else None
+
     async def follow(self, seq: int, quiet_s: float = 15.0) -> AsyncIterator[list[dict[str, Any]]]:
         """The events after a number as they come, for ever; an empty list where none came for a while."""
         loop, arrived = asyncio.get_running_loop(), asyncio.Event()

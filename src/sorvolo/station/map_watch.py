@@ -12,6 +12,7 @@ from sorvolo.station.pyramid import Pyramid
 from sorvolo.station.reviews import Reviews
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
 from sorvolo.station.tiles import WebTiles, change_mark
+from sorvolo.store.site.archive import Archive
 
 _LOOK_EVERY_S = 0.2
 _SETTLE_EVERY_S = 2.0
@@ -71,15 +72,24 @@ class MapWatch:
         self._seen[site_id] = _Seen(mark, state, versions)
         if before is None:
             self._reviews.settle(site_id)  # those that waited when the station was ended
+            announced = self._events.newest("map.tiles", site_id)  # the map may have grown meanwhile
+            if state is not None and (announced is None or announced["data"]["revision"] != state.revision):
+                self._announce(site_id, archive, state, None)
             return
-        if state is not None and state.keys[0] and (before.state is None or before.state.revision != state.revision):
-            changed = list(state.keys[0]) if before.state is None else state.changed_since(before.state)
-            bounds = bounds_lonlat(changed, archive.site_grid())
-            data = {"revision": state.revision, "bounds": bounds, "tiles": len(changed)}
-            self._events.append(NewEvent("map.tiles", data, site_id))
+        if state is not None and (before.state is None or before.state.revision != state.revision):
+            self._announce(site_id, archive, state, before.state)
         if versions != before.versions:
             self._events.append(NewEvent("site.changed", {"versions": versions}, site_id))
             self._reviews.settle(site_id)
+
+    def _announce(self, site_id: str, archive: Archive, state: Pyramid, before: Pyramid | None) -> None:
+        """The tiles that changed; all of them where nobody knows what was before."""
+        if not state.keys[0]:
+            return
+        changed = list(state.keys[0]) if before is None else state.changed_since(before)
+        bounds = bounds_lonlat(changed, archive.site_grid())
+        data = {"revision": state.revision, "bounds": bounds, "tiles": len(changed)}
+        self._events.append(NewEvent("map.tiles", data, site_id))
 
     def _watch(self) -> None:
         while not self._ending.wait(_LOOK_EVERY_S):
