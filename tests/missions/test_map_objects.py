@@ -248,6 +248,29 @@ def test_a_changes_own_pictures_are_the_last_word(simulated: Path) -> None:
     assert (unsure.class_before, unsure.class_after) == ("", "")
 
 
+def test_a_changes_own_pictures_are_searched_for_the_classes_asked_for(simulated: Path) -> None:
+    """Without any, for all that the model knows: the ground itself shows that something changed."""
+    asked = []
+
+    class Notes(Sees):
+        def detect(
+            self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
+            least_score: float | None = None, classes: Sequence[str] | None = None,
+        ) -> Detections:
+            asked.append(classes)
+            return super().detect(image)
+
+    for classes in ((), ("person",)):
+        ChangeClasses(Notes(simulated, 0.8), [], classes).preliminary(change_at(ChangeKind.APPEARED))
+    assert asked == [None, ("person",)]
+
+
+def test_compare_refuses_a_class_that_the_model_does_not_know(simulated: Path, mapped: Path) -> None:
+    wanted = CompareSettings(classes=("boat",))
+    with pytest.raises(SettingsError, match="the model knows no 'boat'; it knows person, car, small object"):
+        next(compare_flights([simulated / "flight2/flight2.mp4"], mapped, wanted, detector=Knowing(simulated)))
+
+
 def test_a_class_that_is_reported_on_request_alone_is_not_looked_for(simulated: Path, tmp_path: Path) -> None:
     """The map's objects are people and cars where the model is too unsure of small objects."""
     knowing = Knowing(simulated)

@@ -25,6 +25,7 @@ from sorvolo.cli.options import (
     Offset,
     PlaceFormat,
     PlaceFormatOption,
+    names,
 )
 from sorvolo.cli.places import place_heading, place_words
 from sorvolo.cli.progress import ProgressReport, rate_words
@@ -83,6 +84,9 @@ UpdatesMap = Annotated[
 TrustsMap = Annotated[
     bool, typer.Option("--trust-map", help="Compare even with a map that contradicts itself.")
 ]
+NamedClasses = Annotated[
+    str, typer.Option(help="What to look for, with commas.", show_default="what the model usually reports")
+]
 NamingModel = Annotated[str, typer.Option(help="Detector that names what changed: a model's name, a file, or none.")]
 
 
@@ -104,6 +108,7 @@ def compare(
     update: UpdatesMap = True,
     trust_map: TrustsMap = False,
     model: NamingModel = "default",
+    classes: NamedClasses = "",
     give_up: GiveUp = 30.0,
     coordinates: PlaceFormatOption = PlaceFormat.LATLON,
     again: Again = False,
@@ -125,6 +130,7 @@ def compare(
     settings = CompareSettings(
         method.value, views_per_second, votes, voters, offset, ground_elevation, updates_map=update, writes_masks=masks,
         model=model, thesis=thesis_options(thesis or []), trusts_map=trust_map,
+        classes=names(classes),
     )
     results = compare_and_read_results(
         inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area, steps=steps,

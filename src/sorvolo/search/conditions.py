@@ -33,7 +33,8 @@ class LookSettings:
 class FrameLook:
     """One frame as the ground under it is judged: small maps of it, `scale` of its pixels each.
 
-    `lightness` and `texture` (rms within 1.25 m) are grey levels, `crowns` whether trees or bushes show.
+    `lightness` is in grey levels, 0 to 255; `texture` is the rms of lightness within 1.25 m over its mean there (no
+    unit); `crowns` is whether trees or bushes show.
     """
 
     camera: Camera
@@ -94,13 +95,13 @@ def look_at(
     lightness = small.mean(axis=2)
     around = max(3, 2 * round(settings.window * look_m / max(m_per_px, look_m) / 2) + 1)
     mean = cv2.blur(lightness, (around, around))
-    texture = np.sqrt(np.maximum(cv2.blur(lightness**2, (around, around)) - mean**2, 0))
+    texture = np.sqrt(np.maximum(cv2.blur(lightness**2, (around, around)) - mean**2, 0)) / np.maximum(mean, 8)
     green = (2 * small[..., 1] - small[..., 0] - small[..., 2]) / np.maximum(small.sum(axis=2), 1)
     wide = max(3, 2 * round(settings.crown_m / max(m_per_px, look_m) / 2) + 1)
     is_plant = cv2.blur((green > settings.green).astype(np.float32), (wide, wide)) > settings.plants
-    is_rough = cv2.blur(texture / np.maximum(mean, 8), (wide, wide)) > settings.rough
+    is_rough = cv2.blur(texture, (wide, wide)) > settings.rough
     return FrameLook(
-        camera, site_from_camera, blur_px, camera.width_px / size[0], lightness, texture / np.maximum(mean, 8),
+        camera, site_from_camera, blur_px, camera.width_px / size[0], lightness, texture,
         np.asarray(is_plant & is_rough, bool),
     )
 

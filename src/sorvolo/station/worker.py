@@ -145,7 +145,7 @@ def _compare(order: Order, journal: Journal, until: threading.Event) -> str:
     wish, site = order.choices, Path(order.site)
     settings = CompareSettings(
         views_per_second=wish.views_per_second, votes=wish.votes, voters=wish.voters, updates_map=wish.updates_map,
-        model=wish.model or "default", ground_elevation_m=wish.ground_elevation_m,
+        model=wish.model or "default", ground_elevation_m=wish.ground_elevation_m, classes=tuple(wish.classes),
     )
     before, announced = _newest(site), dict[str, None]()
     with Archive.open(site, write=False) as archive:

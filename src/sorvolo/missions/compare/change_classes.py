@@ -15,10 +15,14 @@ _HAS_AFTER = (ChangeKind.APPEARED, ChangeKind.REPLACED, ChangeKind.MOVING)
 
 
 class ChangeClasses:
-    """Names what changes are. `known` are the objects that stood on the map before the flight."""
+    """Names what changes are. `known` are the objects that stood on the map before the flight.
 
-    def __init__(self, detector: Detects, known: Sequence[MapObject]) -> None:
-        self._detector, self._known = detector, known
+    A change's own pictures are searched for `classes`; without any, for all that the model knows, also those that it
+    reports on request alone: there the ground itself shows that something changed.
+    """
+
+    def __init__(self, detector: Detects, known: Sequence[MapObject], classes: Sequence[str] = ()) -> None:
+        self._detector, self._known, self._wanted = detector, known, tuple(classes) or None
 
     def preliminary(self, change: Change) -> Change:
         """The change with its classes by its own pictures and the known objects alone: while the flight goes on."""
@@ -50,6 +54,6 @@ class ChangeClasses:
         thresholds = self._detector.thresholds_for(picture)
         seen = self._detector.detect(
             picture, tiles="auto", m_per_px=change.patch.m_per_px,
-            least_score=LENIENT * min(thresholds.values(), default=0.5),
+            least_score=LENIENT * min(thresholds.values(), default=0.5), classes=self._wanted,
         )
         return class_of_change(change.patch, seen, thresholds, offset_px)

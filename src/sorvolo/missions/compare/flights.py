@@ -15,7 +15,7 @@ from sorvolo.missions.compare.run import CompareRun, Pending
 from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.headline import MapQuality
 from sorvolo.missions.flight.known_camera import known_camera
-from sorvolo.missions.flight.map_objects import open_detector
+from sorvolo.missions.flight.map_objects import check_classes, open_detector
 from sorvolo.missions.flight.request import AlreadyDone, already_done, request_of
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup, known_flights, known_ground_m, prepare, repeated
@@ -58,6 +58,7 @@ def compare_flights(
         if not settings.trusts_map:
             _refuse_contradictory(archive, site)
     looks = open_detector(settings.model) if detector is None else detector
+    check_classes(looks, settings.classes)
     opened = opened_sources(
         inputs, telemetry, camera, known_flights(site), live=live, until=until,
         better_camera=lambda guess: known_camera(guess, archive),

@@ -7,6 +7,7 @@ from sorvolo.change.views import ViewMaker, ViewOutcome
 from sorvolo.missions.compare.change_classes import ChangeClasses
 from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.map_objects import ObjectFinder, search_summary, why_not_searched
+from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.selection import StretchSelection
 from sorvolo.store.site.archive import Archive
@@ -22,17 +23,19 @@ class ComparisonObjects:
     """A detector's part in one comparison; without a detector nothing is searched and no change has a class."""
 
     def __init__(
-        self, detector: Detects | None, setup: FlightSetup, archive: Archive, base_version: int, model: str
+        self, detector: Detects | None, setup: FlightSetup, archive: Archive, base_version: int,
+        settings: CompareSettings,
     ) -> None:
-        self._name, self._model = setup.source.name, model
+        """`settings.classes` are looked for, in frames as in the changes' own pictures."""
+        self._name, self._model = setup.source.name, settings.model
         self._selection = StretchSelection(_OVERLAP, keep_all=setup.source.kind != "video")
         self._finder: ObjectFinder | None = None
         self._classes: ChangeClasses | None = None
         if detector is not None:
             before = {each.flight_id for each in archive.versions() if each.complete and each.id <= base_version}
             known = archive.newest_objects(before - {self._name})
-            self._classes = ChangeClasses(detector, [each.thing for each in known])
-            self._finder = ObjectFinder(detector, setup.source.camera.camera)
+            self._classes = ChangeClasses(detector, [each.thing for each in known], settings.classes)
+            self._finder = ObjectFinder(detector, setup.source.camera.camera, settings.classes)
 
     def close(self) -> None:
         """End the detector's thread."""

@@ -86,7 +86,7 @@ class CompareRun:
             KnownPlace(each.outline_m, each.kind) for each in archive.reviews()
             if each.verdict is Verdict.REJECTED and each.flight_id != source.name
         ]
-        self._objects = ComparisonObjects(detector, setup, archive, base_version, settings.model)
+        self._objects = ComparisonObjects(detector, setup, archive, base_version, settings)
         self._extension = MapExtension(setup, archive, settings, self._writer, self._views)
         self._log = FlightLog()
         self._counts = ViewCounts()

@@ -45,6 +45,12 @@ def open_detector(model: str) -> Detects | None:
     return Detector.load(model)
 
 
+def check_classes(detector: Detects | None, classes: Sequence[str]) -> None:
+    """Raise SettingsError for a class that the detector does not know, before anything is searched."""
+    if detector is not None and (unknown := sorted(set(classes) - set(detector.classes))):
+        raise SettingsError(f"the model knows no {unknown[0]!r}; it knows {', '.join(detector.classes)}")
+
+
 @dataclass(frozen=True, eq=False)
 class FrameDetections:
     """What the detector found in the frame `index`, the crops (JPEG) around the surest, and how long it took."""
@@ -63,8 +69,7 @@ class ObjectFinder:
     """
 
     def __init__(self, detector: Detects, camera: Camera, classes: Sequence[str] = ()) -> None:
-        if unknown := sorted(set(classes) - set(detector.classes)):
-            raise SettingsError(f"the model knows no {unknown[0]!r}; it knows {', '.join(detector.classes)}")
+        check_classes(detector, classes)
         self._detector, self._camera = detector, camera
         self._classes = tuple(classes) or detector.info.usual_classes
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="detector")

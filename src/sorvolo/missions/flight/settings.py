@@ -77,6 +77,7 @@ class CompareSettings:
     trusts_map: bool = False  # also a map that contradicts itself
     model: str = "default"  # that looks for objects: an installed one's name, a file, or "none"
     thesis: ThesisOptions = field(default_factory=ThesisOptions)  # of method thesis: Table 4.2, threads
+    classes: tuple[str, ...] = ()  # that are looked for; none: those that the model usually reports
 
     def __post_init__(self) -> None:
         if self.method != "thesis" and self.thesis != ThesisOptions():
@@ -98,5 +99,5 @@ class CompareSettings:
     def mapping(self) -> MapSettings:
         """How frames that show new ground are mapped."""
         return MapSettings(
-            offset_s=self.offset_s, ground_elevation_m=self.ground_elevation_m, model=self.model
+            offset_s=self.offset_s, ground_elevation_m=self.ground_elevation_m, model=self.model, classes=self.classes
         )
