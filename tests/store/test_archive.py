@@ -6,6 +6,7 @@ import sqlite3
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -389,3 +390,19 @@ def test_a_commit_refuses_an_image_that_was_never_saved(folder: Path) -> None:
         pytest.raises(StoreError, match="never saved"),
     ):
         writer.commit([frame(0)], {0: "flights/a/keyframes/9/000000.jpg"}, {}, "")
+
+
+def test_readers_know_that_the_catalogue_changed_when_they_can_see_it(folder: Path) -> None:
+    """The mark stays through a transaction that others cannot see yet, and is another one once they can."""
+    read = partial(Archive.open, folder, write=False)
+    with opened(folder) as writer, read() as reader, read() as twin:
+        before = reader.change_mark()
+        assert reader.change_mark() == before != twin.change_mark()
+        with writer._files.catalogue.changing() as connection:
+            connection.exec_driver_sql("UPDATE site SET name = 'longer than it was'")
+            assert reader.change_mark() == before
+        after = reader.change_mark()
+        assert after != before
+        assert reader.site().name == "longer than it was"
+        map_flight(writer, "a", 20)
+        assert reader.change_mark() != after

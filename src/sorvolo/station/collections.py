@@ -14,7 +14,6 @@ from shapely.geometry.base import BaseGeometry
 
 from sorvolo.station.problems import Problem
 from sorvolo.station.sites import SiteShelf
-from sorvolo.station.tiles import change_mark
 from sorvolo.store.exports.change_files import changes_geojson
 from sorvolo.store.exports.coverage_files import COVERAGE
 from sorvolo.store.exports.object_files import objects_geojson
@@ -80,7 +79,7 @@ class SiteCollections:
         if name not in _MAKERS:
             raise Problem(404, f"no collection {name[:40]!r}; there are {', '.join(_MAKERS)}")
         archive = self._shelf.open(site_id)
-        mark = (id(archive), change_mark(archive), _search_mark(archive))
+        mark = (archive.change_mark(), _search_mark(archive))
         with self._lock:
             known = self._kept.get((site_id, name))
         if known is not None and known[0] == mark:

@@ -11,7 +11,7 @@ from sorvolo.station.problems import Problem
 from sorvolo.station.pyramid import Pyramid
 from sorvolo.station.reviews import Reviews
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
-from sorvolo.station.tiles import WebTiles, change_mark
+from sorvolo.station.tiles import WebTiles
 from sorvolo.store.site.archive import Archive
 
 _LOOK_EVERY_S = 0.2
@@ -22,7 +22,7 @@ _SETTLE_EVERY_S = 2.0
 class _Seen:
     """A site as it was seen last."""
 
-    mark: tuple[int, ...]
+    mark: tuple[int, int]
     state: Pyramid | None
     versions: int
 
@@ -64,7 +64,7 @@ class MapWatch:
 
     def _look_at(self, site_id: str) -> None:
         archive = self._shelf.open(site_id)
-        mark, before = change_mark(archive), self._seen.get(site_id)
+        mark, before = archive.change_mark(), self._seen.get(site_id)
         if before is not None and before.mark == mark:
             return
         state = self._tiles.live(site_id) if archive.has_site else None

@@ -45,7 +45,7 @@ class WebTiles:
     def live(self, site_id: str) -> Pyramid:
         """The map as it is now: the growing one as of its last flush, else the newest version. Raises as `open`."""
         archive = self._shelf.open(site_id)
-        return self._state(site_id, "live", archive, change_mark(archive))
+        return self._state(site_id, "live", archive, archive.change_mark())
 
     def tile(self, site_id: str, version: str, z: int, x: int, y: int, ending: str = ".webp") -> TileAnswer:
         """An XYZ tile of a version: its number, `live-REVISION` or `live`. Raises Problem (404), StoreError."""
@@ -68,12 +68,12 @@ class WebTiles:
     def _version(self, site_id: str, archive: Archive, number: int) -> Pyramid:
         if number not in {each.id for each in archive.versions() if each.complete}:
             raise Problem(404, f"the map has no version {number}; /api/sites/{site_id} lists those there are")
-        return self._state(site_id, str(number), archive, number)
+        return self._state(site_id, str(number), archive, archive)  # never changes while the site is the same
 
     def _state(self, site_id: str, name: str, archive: Archive, mark: object) -> Pyramid:
         with self._lock:
             known = self._states.get((site_id, name))
-            if known is not None and known[0] == (id(archive), mark):
+            if known is not None and known[0] == mark:
                 return known[1]
         tiles = archive.live_tiles() if name == "live" else archive.tiles(int(name))
         grid = archive.site_grid().grid
@@ -83,20 +83,8 @@ class WebTiles:
         with self._lock:
             if len(self._states) > 200:
                 self._states.clear()
-            self._states[site_id, name] = ((id(archive), mark), made)
+            self._states[site_id, name] = (mark, made)
         return made
-
-
-def change_mark(archive: Archive) -> tuple[int, ...]:
-    """What changes whenever a site's catalogue does: sizes and times of its file and its log."""
-    mark: list[int] = []
-    for name in ("site.db", "site.db-wal"):
-        try:
-            about = (archive.folder / name).stat()
-        except FileNotFoundError:
-            continue
-        mark += [about.st_size, about.st_mtime_ns]
-    return tuple(mark)
 
 
 def _is_exported(archive: Archive, name: str) -> bool:

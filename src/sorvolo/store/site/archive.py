@@ -136,6 +136,10 @@ class Archive:
         """Every state of the map, oldest first, the one being made included."""
         return self._files.versions()
 
+    def change_mark(self) -> tuple[int, int]:
+        """Another one after each change that others made to the catalogue; what is read after it is no older."""
+        return self._files.catalogue.change_mark()
+
     @property
     def exported_version(self) -> int:
         """The version that mosaic.tif and the other files of the map show; 0 for none."""

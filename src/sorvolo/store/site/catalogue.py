@@ -1,6 +1,8 @@
 """The catalogue `site.db`: one SQLite file that is the truth about a site (docs/formats.md)."""
 
+import itertools
 import sqlite3
+import threading
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -11,6 +13,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import ColumnElement, Connection, Row, Table, delete, func, insert, literal, select, update
 from sqlalchemy.exc import DBAPIError
+from sqlalchemy.pool import PoolProxiedConnection
 
 from sorvolo.errors import GeometryError, StoreError
 from sorvolo.geometry.arrays import Floats, Matrix3
@@ -27,6 +30,7 @@ from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 
 _DAY_NS = 86_400_000_000_000
+_numbers = itertools.count()
 
 
 @dataclass(frozen=True)
@@ -124,6 +128,9 @@ class Catalogue:
         """
         self._path, self._write = path, write
         self._engine = schema.open_engine(path, write=write)
+        self._number = next(_numbers)
+        self._watching: PoolProxiedConnection | None = None
+        self._watching_lock = threading.Lock()
         try:
             self._check()
         except BaseException:
@@ -141,7 +148,30 @@ class Catalogue:
 
     def close(self) -> None:
         """Close every connection; the last writer folds the write-ahead log into the file."""
+        with self._watching_lock:
+            if self._watching is not None:
+                self._watching.close()
+                self._watching = None
         self._engine.dispose()
+
+    def change_mark(self) -> tuple[int, int]:
+        """Another one after each transaction of others that changed the catalogue; no two catalogues opened share one.
+
+        What is read after it is at least as new. The file's time is no such mark: a transaction writes the log, waits
+        for the disk, and only then becomes visible. Raises StoreError.
+        """
+        try:
+            with self._watching_lock:
+                if self._watching is None:  # the number counts within one connection, which is kept for it
+                    self._watching = self._engine.raw_connection()
+                    self._watching.detach()
+                cursor = self._watching.cursor()
+                try:
+                    return self._number, int(cursor.execute("PRAGMA data_version").fetchone()[0])
+                finally:
+                    cursor.close()
+        except (sqlite3.Error, DBAPIError) as error:
+            raise _store_error(self._path, str(error)) from error
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
