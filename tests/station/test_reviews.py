@@ -1,17 +1,19 @@
 """Several people judge: every verdict is kept with who and when, and nobody overwrites what they did not see."""
 
+import shutil
 import threading
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from fake_flights import map_flight
+from fake_flights import SITE, map_flight
 from starlette.testclient import TestClient
 
 from sorvolo.missions.site.review import list_changes, review_changes
 from sorvolo.station.app import station_app
 from sorvolo.station.settings import StationSettings
-from sorvolo.station.state import StationState
+from sorvolo.station.state import StationState, utc_now
 from sorvolo.station.tokens import make_token
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Verdict
@@ -56,6 +58,45 @@ def test_verdicts_of_the_command_line_are_seen_and_counted(client: TestClient, r
     assert verdict(client, "b-0", "confirmed", 1).status_code == 409
     assert verdict(client, "b-0", "confirmed", 2).json()["revision"] == 3
     assert len(client.get(REVIEWS, params={"id": "b-0"}).json()) == 3
+
+
+def test_a_new_site_has_no_verdicts_of_a_deleted_one_of_its_name(
+    client: TestClient, root: Path, made_site: Path
+) -> None:
+    """Its changes have the same ids."""
+    assert verdict(client, "b-1", "rejected", 0, note="a shadow").status_code == 201
+    shutil.rmtree(root / "field")
+    time.sleep(0.01)  # a site's time of creation has milliseconds
+    with Archive.open(root / "field", write=True) as archive:
+        archive.create_site(SITE)
+        map_flight(archive, "a", 40)
+        map_flight(archive, "b", 90, compared=True)
+    assert properties(client, "b-1")["review"] is None and client.get(REVIEWS).json() == []
+    assert all(each.verdict is None for each in list_changes(root / "field"))
+    assert verdict(client, "b-1", "confirmed", 0).status_code == 201
+    shutil.rmtree(root / "field")
+    shutil.copytree(made_site, root / "field")  # the first one is back, such as from a backup
+    assert properties(client, "b-1")["note"] == "a shadow"
+
+
+def test_verdicts_of_a_station_of_format_1_are_kept(root: Path) -> None:
+    """They are of the site that was there when they were given."""
+    with closing(StationState.open(root / "station")) as state, state.changing() as connection:
+        connection.execute("DROP TABLE reviews")
+        connection.execute(
+            "CREATE TABLE reviews (number INTEGER PRIMARY KEY AUTOINCREMENT, site TEXT NOT NULL, kind TEXT NOT NULL, "
+            "id TEXT NOT NULL, revision INTEGER NOT NULL, verdict TEXT NOT NULL, note TEXT NOT NULL, "
+            "who TEXT NOT NULL, at TEXT NOT NULL, UNIQUE (site, kind, id, revision))"
+        )
+        for change, at in (("b-0", "2001-01-01T00:00:00.000Z"), ("b-1", utc_now())):
+            connection.execute(
+                "INSERT INTO reviews (site, kind, id, revision, verdict, note, who, at) "
+                "VALUES ('field', 'change', ?, 1, 'confirmed', '', 'Ada', ?)", (change, at),
+            )
+        connection.execute("PRAGMA user_version = 1")
+    with TestClient(station_app(StationSettings(root)), base_url="http://127.0.0.1:8750") as client:
+        assert properties(client, "b-1")["review"] == "confirmed" and properties(client, "b-0")["review"] is None
+        assert [each["id"] for each in client.get(REVIEWS).json()] == ["b-1"]
 
 
 def test_of_many_at_once_one_wins(client: TestClient) -> None:

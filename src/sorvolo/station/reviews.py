@@ -57,12 +57,13 @@ class Reviews:
         self._state, self._shelf, self._events = state, shelf, events
         self._settling = threading.Lock()
         self._unsettled: set[str] = set()
+        self._known: set[tuple[str, str]] = set()
 
     def current(self, site_id: str, kind: str) -> dict[str, Review]:
         """The newest verdict on each thing of a kind, by id; those given by the command line included."""
         rows = self._state.rows(
             "SELECT kind, id, MAX(revision) AS revision, verdict, note, who, at FROM reviews "
-            "WHERE site = ? AND kind = ? GROUP BY id", (site_id, kind),
+            "WHERE site = ? AND made_utc = ? AND kind = ? GROUP BY id", (*self._key(site_id), kind),
         )
         found = {row["id"]: Review(**dict(row)) for row in rows}
         if kind == "change":
@@ -73,8 +74,8 @@ class Reviews:
         """All verdicts of a site, newest first; of one thing."""
         rows = self._state.rows(
             "SELECT kind, id, revision, verdict, note, who, at FROM reviews "
-            "WHERE site = ? AND (? = '' OR kind = ?) AND (? = '' OR id = ?) ORDER BY number DESC LIMIT 5000",
-            (site_id, kind, kind, thing_id, thing_id),
+            "WHERE site = ? AND made_utc = ? AND (? = '' OR kind = ?) AND (? = '' OR id = ?) "
+            "ORDER BY number DESC LIMIT 5000", (*self._key(site_id), kind, kind, thing_id, thing_id),
         )
         return [Review(**dict(row)) for row in rows]
 
@@ -86,12 +87,12 @@ class Reviews:
         if wish.revision != revision:
             raise self._conflict(wish, now)
         made = Review(wish.kind, wish.id, revision + 1, wish.verdict, wish.note, who, utc_now())
-        event = NewEvent("review.changed", asdict(made), site_id)
+        event, key = NewEvent("review.changed", asdict(made), site_id), self._key(site_id)
         try:
             with self._events.appending([event]) as connection:
                 if now is not None and now.who == _ELSEWHERE:
-                    _keep(connection, site_id, now)
-                _keep(connection, site_id, made)
+                    _keep(connection, key, now)
+                _keep(connection, key, made)
         except sqlite3.IntegrityError as error:  # another request was quicker
             raise self._conflict(wish, self.current(site_id, wish.kind).get(wish.id)) from error
         if wish.kind == "change":
@@ -127,6 +128,21 @@ class Reviews:
                 self.settle(site_id)
             except (Problem, SorvoloError):  # gone meanwhile, or damaged
                 self._unsettled.discard(site_id)
+
+    def _key(self, site_id: str) -> tuple[str, str]:
+        """Which site a verdict is of: a new site may have the name, and the ids, of one that was deleted.
+
+        Verdicts of a station of format 1 become those of the site that was there when they were given.
+        """
+        made_utc = self._shelf.open(site_id).created_utc
+        if made_utc and (site_id, made_utc) not in self._known:
+            with self._state.changing() as connection:
+                connection.execute(
+                    "UPDATE reviews SET made_utc = ? WHERE site = ? AND made_utc = '' AND at >= ?",
+                    (made_utc, site_id, made_utc),
+                )
+            self._known.add((site_id, made_utc))
+        return site_id, made_utc
 
     def _from_site(self, site_id: str, known: Mapping[str, Review]) -> dict[str, Review]:
         """Verdicts that the command line gave after ours."""
@@ -169,7 +185,6 @@ def review_routes(reviews: Reviews, shelf: SiteShelf) -> APIRouter:
         site: str, kind: Literal["", "object", "change"] = "", id: str = Query("", max_length=400),
     ) -> list[dict[str, Any]]:
         """Every verdict of the site with who gave it and when, newest first."""
-        shelf.folder(site)
         return [asdict(each) for each in reviews.history(site, kind, id)]
 
     @router.post("", status_code=201)
@@ -180,10 +195,11 @@ def review_routes(reviews: Reviews, shelf: SiteShelf) -> APIRouter:
     return router
 
 
-def _keep(connection: sqlite3.Connection, site_id: str, review: Review) -> None:
+def _keep(connection: sqlite3.Connection, key: tuple[str, str], review: Review) -> None:
     connection.execute(
-        "INSERT INTO reviews (site, kind, id, revision, verdict, note, who, at) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-        (site_id, review.kind, review.id, review.revision, review.verdict, review.note, review.who, review.at),
+        "INSERT INTO reviews (site, made_utc, kind, id, revision, verdict, note, who, at) "
+        "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        (*key, review.kind, review.id, review.revision, review.verdict, review.note, review.who, review.at),
     )
 
 

@@ -5,7 +5,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from sorvolo.errors import StoreError
 from sorvolo.store.atomic import writing
 
 _FILE = "station.db"
-_FORMAT = 1
+_FORMAT = 2
 _TABLES = """
 CREATE TABLE IF NOT EXISTS events (
   seq INTEGER PRIMARY KEY AUTOINCREMENT, at TEXT NOT NULL, type TEXT NOT NULL, site TEXT, run TEXT, data TEXT NOT NULL);
@@ -24,10 +24,20 @@ CREATE TABLE IF NOT EXISTS tokens (
   id TEXT PRIMARY KEY, name TEXT NOT NULL UNIQUE, role TEXT NOT NULL, hash TEXT NOT NULL, made_at TEXT NOT NULL,
   expires_at TEXT);
 CREATE TABLE IF NOT EXISTS reviews (
-  number INTEGER PRIMARY KEY AUTOINCREMENT, site TEXT NOT NULL, kind TEXT NOT NULL, id TEXT NOT NULL,
-  revision INTEGER NOT NULL, verdict TEXT NOT NULL, note TEXT NOT NULL, who TEXT NOT NULL, at TEXT NOT NULL,
-  UNIQUE (site, kind, id, revision));
+  number INTEGER PRIMARY KEY AUTOINCREMENT, site TEXT NOT NULL, made_utc TEXT NOT NULL, kind TEXT NOT NULL,
+  id TEXT NOT NULL, revision INTEGER NOT NULL, verdict TEXT NOT NULL, note TEXT NOT NULL, who TEXT NOT NULL,
+  at TEXT NOT NULL, UNIQUE (site, made_utc, kind, id, revision));
 """
+_FROM_1 = f"""
+BEGIN IMMEDIATE;
+ALTER TABLE reviews RENAME TO reviews_1;
+{_TABLES}
+INSERT INTO reviews SELECT number, site, '', kind, id, revision, verdict, note, who, at FROM reviews_1;
+DROP TABLE reviews_1;
+PRAGMA user_version = 2;
+COMMIT;
+"""
+"""Format 1 kept verdicts by a site's name alone; its rows have no `made_utc` until their site is looked at."""
 
 
 class StationState:
@@ -57,7 +67,9 @@ class StationState:
                 run("PRAGMA synchronous = FULL")
                 run("PRAGMA trusted_schema = OFF")
                 found = run("PRAGMA user_version").fetchone()[0]
-                if found not in (0, _FORMAT):
+                if found == 1:
+                    state._connection.executescript(_FROM_1)
+                elif found not in (0, _FORMAT):
                     raise StoreError(
                         f"{path} has format {found}, this Sorvolo works with {_FORMAT}; use the Sorvolo that made it, "
                         "or move the file away"
@@ -99,7 +111,12 @@ class StationState:
 
 def utc_now() -> str:
     """The time, RFC 3339 UTC to the millisecond."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return utc_after(0.0)
+
+
+def utc_after(seconds: float) -> str:
+    """The time in so many seconds, RFC 3339 UTC to the millisecond; such texts are in order as the times are."""
+    return (datetime.now(UTC) + timedelta(seconds=seconds)).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def compact_json(value: Any) -> str:

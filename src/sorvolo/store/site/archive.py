@@ -115,6 +115,12 @@ class Archive:
         """The site; raises StoreError when there is none yet."""
         return self._files.site()
 
+    @property
+    def created_utc(self) -> str:
+        """When the site was created, to the millisecond: no other site of its name has the same; "" before."""
+        with self._files.catalogue.reading() as connection:
+            return records.created_utc(connection)
+
     def site_grid(self) -> SiteGrid:
         """The pixel grid of the site's tiles; raises StoreError when there is no site yet."""
         return self._files.site_grid()

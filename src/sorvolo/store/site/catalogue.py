@@ -250,6 +250,12 @@ def load_site(connection: Connection) -> Site | None:
         return Site(row.name, origin, checked_crs(row.crs), row.m_per_px, row.is_local, row.height_reference)
 
 
+def created_utc(connection: Connection) -> str:
+    """When the site was created, ISO 8601 UTC to the millisecond; "" before."""
+    found: str | None = connection.execute(select(schema.site.c.created_utc)).scalar_one_or_none()
+    return found or ""
+
+
 def add_site(connection: Connection, site: Site) -> None:
     """Write the site's one row."""
     connection.execute(insert(schema.site).values(
