@@ -39,8 +39,8 @@ def chromium() -> Iterator[Any]:
 class Served:
     """A station at a port of its own, in a thread; `station` is its record."""
 
-    def __init__(self, root: Path) -> None:
-        app = station_app(StationSettings(root))
+    def __init__(self, root: Path, **settings: Any) -> None:
+        app = station_app(StationSettings(root, **settings))
         self.station = app.state.station
         config = uvicorn.Config(app, "127.0.0.1", 0, log_level="error", ws="websockets-sansio", ws_max_size=16_000_000)
         self.server = uvicorn.Server(config)

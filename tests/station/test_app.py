@@ -11,6 +11,7 @@ import pytest
 from fake_flights import LOCAL_SITE, SITE, map_flight
 from starlette.testclient import TestClient
 
+from sorvolo.errors import SettingsError
 from sorvolo.station.app import station_app
 from sorvolo.station.pyramid import BytesCache, Pyramid
 from sorvolo.station.settings import StationSettings
@@ -180,3 +181,22 @@ def test_an_error_of_the_station_is_answered_in_words(root: Path, monkeypatch: p
         answer = client.get(FIELD)
         assert answer.status_code == 500 and answer.headers["content-type"] == "application/problem+json"
         assert "ZeroDivisionError" in answer.json()["detail"] and "division by" not in answer.text
+
+
+def test_a_base_map_of_the_stations_own_is_read_in_ranges(root: Path, tmp_path: Path) -> None:
+    """Pages read pieces of a PMTiles file that may have gigabytes; another file is refused before the start."""
+    (tmp_path / "base.pmtiles").write_bytes(b"PMTiles\x03" + bytes(range(200)))
+    settings = StationSettings(root, base_map=tmp_path / "base.pmtiles")
+    with TestClient(station_app(settings), base_url="http://127.0.0.1:8750") as client:
+        url = client.get("/api/status").json()["base_map_url"]
+        part = client.get(url, headers={"range": "bytes=8-11"})
+        assert part.status_code == 206 and part.content == bytes([0, 1, 2, 3])
+    (tmp_path / "base.pmtiles").write_bytes(b"<html>")
+    with pytest.raises(SettingsError, match="PMTiles"):
+        StationSettings(root, base_map=tmp_path / "base.pmtiles")
+
+
+def test_a_station_without_a_base_map(client: TestClient) -> None:
+    """It offers none."""
+    assert client.get("/api/status").json()["base_map_url"] is None
+    assert client.get("/api/base-map.pmtiles").status_code == 404

@@ -433,17 +433,32 @@ def test_a_base_map_comes_from_a_file(opened: Watched, tmp_path: Path) -> None:
     red = png_from_rgba(np.full((256, 256, 4), (255, 0, 0, 255), np.uint8))
     (tmp_path / "base.pmtiles").write_bytes(pmtiles_of(red))
     page.get_by_label("Base map file").set_input_files(str(tmp_path / "base.pmtiles"))
+    wait_for_red(page)
+    broken = {"name": "x.pmtiles", "mimeType": "", "buffer": b"no map"}
+    page.get_by_label("Base map file").set_input_files(files=[broken])
+    page.locator(".message.error", has_text="cannot be read").wait_for()
+
+
+def test_the_station_s_own_base_map_is_shown_at_once(browser: Any, made_site: Path, tmp_path: Path) -> None:
+    shutil.copytree(made_site, tmp_path / "root" / "field")
+    base = tmp_path / "base.pmtiles"
+    base.write_bytes(pmtiles_of(png_from_rgba(np.full((256, 256, 4), (255, 0, 0, 255), np.uint8))))
+    with Served(tmp_path / "root", base_map=base) as station:
+        watched = Watched(browser.new_context(viewport={"width": 900, "height": 600}), station.url)
+        show(watched, station)
+        wait_for_red(watched.page)
+        assert watched.faults == []
+        watched.page.context.close()
+
+
+def wait_for_red(page: Any) -> None:
     for _ in range(100):
         page.mouse.move(5, 5)
         shot = Image.open(BytesIO(page.locator(".map-canvas").screenshot())).convert("RGB")
         if shot.getpixel((30, shot.height - 60)) == (255, 0, 0):
-            break
+            return
         page.wait_for_timeout(100)
-    else:
-        raise AssertionError("the base map is not shown")
-    broken = {"name": "x.pmtiles", "mimeType": "", "buffer": b"no map"}
-    page.get_by_label("Base map file").set_input_files(files=[broken])
-    page.locator(".message.error", has_text="cannot be read").wait_for()
+    raise AssertionError("the base map is not shown")
 
 
 def pmtiles_of(tile: bytes) -> bytes:

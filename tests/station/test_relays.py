@@ -17,9 +17,11 @@ import pytest
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
+from sorvolo.cli import serve
 from sorvolo.errors import SettingsError
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.mqtt import MqttSender, mqtt_place
+from sorvolo.station.outward import OutwardSettings
 from sorvolo.station.relays import Relay
 from sorvolo.station.state import StationState
 from sorvolo.station.webhooks import SIGNATURE, webhook, webhook_name
@@ -135,9 +137,31 @@ def test_what_is_no_broker_is_refused(url: str) -> None:
 
 
 def test_a_broker_s_address_in_its_parts() -> None:
-    place = mqtt_place("mqtts://crew:p%40ss@broker.example/team/a")
+    place = mqtt_place("mqtts://crew@broker.example/team/a", "p@ss")
     assert (place.host, place.port, place.prefix, place.password) == ("broker.example", 8883, "team/a", "p@ss")
     assert "p@ss" not in str(place)
+
+
+def test_a_password_in_a_broker_s_address_is_refused() -> None:
+    """The list of processes shows a command's arguments to everybody on the machine."""
+    with pytest.raises(SettingsError, match="SORVOLO_MQTT_PASSWORD") as refused:
+        mqtt_place("mqtts://crew:p%40ss@broker.example")
+    assert "p%40ss" not in str(refused.value)
+    assert "p@ss" not in repr(OutwardSettings(mqtt="mqtt://crew@host", mqtt_password="p@ss"))
+
+
+def test_the_password_of_a_broker_comes_from_a_file_of_one_s_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "password"
+    file.write_text("p@ss\n")
+    file.chmod(0o644)
+    with pytest.raises(SettingsError, match="chmod 600"):
+        serve._mqtt_password(file)
+    file.chmod(0o600)
+    assert serve._mqtt_password(file) == "p@ss"
+    monkeypatch.setenv("SORVOLO_MQTT_PASSWORD", "other")
+    assert serve._mqtt_password(None) == "other"
 
 
 class Broker:

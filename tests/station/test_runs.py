@@ -1,12 +1,15 @@
 """Missions of the station: in processes of their own, found again, stopped, refused; a crash touches nothing else."""
 
+import fcntl
 import json
 import os
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +27,10 @@ from sorvolo.simulation.settings import (
 )
 from sorvolo.station import runs as runs_module
 from sorvolo.station.app import station_app
-from sorvolo.station.orders import InputWish, RunWish
-from sorvolo.station.runs import Run
-from sorvolo.station.settings import StationSettings
+from sorvolo.station.orders import InputWish, Order, RunWish
+from sorvolo.station.runs import Run, Runs
+from sorvolo.station.settings import StationLimits, StationSettings
+from sorvolo.station.state import utc_now
 
 FLIGHT = SimulationSettings(
     seed=5, flights=1,
@@ -179,8 +183,8 @@ def test_a_mission_that_cannot_be_noted_does_not_run(
     spawned: list[subprocess.Popen[bytes]] = []
     started = runs_module._spawned
 
-    def spawn(folder: Path) -> "subprocess.Popen[bytes]":
-        spawned.append(started(folder))
+    def spawn(folder: Path, order: Order) -> "subprocess.Popen[bytes]":
+        spawned.append(started(folder, order))
         return spawned[-1]
 
     def fail(_: object) -> None:
@@ -210,6 +214,80 @@ def test_lines_that_cannot_be_read_are_passed_over(open_station: Callable[[], Te
     while runs.look():
         pass
     assert runs.get(run.id).headline == "mapped"
+
+
+def waiting(runs: Runs, run: Run, program: str) -> Run:
+    """A run whose process is a program that waits, with the run's lock; its folder and record are there."""
+    folder = runs._folder / run.id
+    folder.mkdir(parents=True)
+    with (folder / "running.lock").open("wb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        process = subprocess.Popen(
+            [sys.executable, "-c", program], pass_fds=(lock.fileno(),), start_new_session=True, stdout=subprocess.PIPE
+        )
+    assert process.stdout is not None and process.stdout.readline() == b"ready\n"
+    runs._processes[run.id] = process
+    run = replace(run, pid=process.pid)
+    runs._begin(run)
+    return run
+
+
+DEAF = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready', flush=True); time.sleep(60)"
+
+
+@pytest.mark.parametrize(("source", "stops"), [({"input": "1"}, 1), ({"stream": "scout"}, 2)])
+def test_a_mission_that_hangs_is_killed_some_time_after_it_was_stopped(
+    tmp_path: Path, source: dict[str, str], stops: int
+) -> None:
+    """A live flight has longer, to be finished, until it is stopped again. Looking at missions never waits for one."""
+    limits = StationLimits(stop_within_s=0.3, finish_within_s=3600.0)
+    with TestClient(station_app(StationSettings(tmp_path, limits=limits)), base_url=HOST) as client:
+        runs: Runs = client.app.state.station.runs  # type: ignore[attr-defined]
+        runs.close()
+        run = waiting(runs, Run("2" * 16, "map", "new", "running", "Ada", utc_now(), input=source), DEAF)
+        for _ in range(stops):
+            assert runs.look() == 1
+            runs.stop(run.id)
+            began_s = time.monotonic()
+            assert runs.look() == 1 and time.monotonic() - began_s < 0.25
+        time.sleep(0.35)
+        until_s = time.monotonic() + 20
+        while runs.look():
+            assert time.monotonic() < until_s
+            time.sleep(0.02)
+        done = runs.get(run.id)
+        assert done.state == "stopped" and done.exit_code == -signal.SIGKILL
+
+
+def test_a_process_that_states_its_end_and_does_not_come_to_it_holds_up_nobody(tmp_path: Path) -> None:
+    """A thread that never ends; the mission is over, its process is killed after a while."""
+    limits = StationLimits(stop_within_s=0.3)
+    with TestClient(station_app(StationSettings(tmp_path, limits=limits)), base_url=HOST) as client:
+        runs: Runs = client.app.state.station.runs  # type: ignore[attr-defined]
+        runs.close()
+        run = waiting(runs, Run("3" * 16, "map", "new", "running", "Ada", utc_now()), DEAF)
+        line = {"type": "run.finished", "data": {"headline": "mapped", "exit_code": 0, "error": None}}
+        (runs._folder / run.id / "journal.jsonl").write_text(json.dumps(line) + "\n")
+        began_s = time.monotonic()
+        assert runs.look() == 0 and time.monotonic() - began_s < 0.25
+        assert runs.get(run.id).state == "finished" and runs._processes[run.id].poll() is None
+        process, until_s = runs._processes[run.id], time.monotonic() + 20
+        while runs._processes:
+            runs.look()
+            assert time.monotonic() < until_s
+            time.sleep(0.02)
+        assert process.returncode == -signal.SIGKILL
+
+
+def test_the_missions_of_a_site_are_not_cut_off_by_those_of_others(tmp_path: Path) -> None:
+    """The limit counts what was asked for."""
+    with TestClient(station_app(StationSettings(tmp_path)), base_url=HOST) as client:
+        runs: Runs = client.app.state.station.runs  # type: ignore[attr-defined]
+        runs.close()
+        for number, site in enumerate(["mine", "theirs", "theirs"]):
+            runs._begin(Run(str(number), "map", site, "failed", "Ada", f"2026-01-01T00:00:0{number}Z"))
+        assert [each["id"] for each in client.get("/api/runs?site=mine&limit=2").json()] == ["0"]
+        assert [each["id"] for each in client.get("/api/runs?limit=2").json()] == ["2", "1"]
 
 
 WRONG: list[tuple[dict[str, Any], int]] = [

@@ -1,10 +1,12 @@
 """Tests that try to get in: forged hosts and origins, guessed tokens, paths, links, streams of the own network."""
 
+import os
 import socket
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from starlette.testclient import TestClient, WebSocketDenialResponse
@@ -15,10 +17,11 @@ from sorvolo.cli.main import app as command
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.station import worker
 from sorvolo.station.app import station_app
-from sorvolo.station.orders import Order
+from sorvolo.station.orders import SOURCE_VARIABLE, Order
 from sorvolo.station.problems import Problem
 from sorvolo.station.security import address_group
-from sorvolo.station.settings import StationSettings, check_exposure
+from sorvolo.station.server import server_config
+from sorvolo.station.settings import StationLimits, StationSettings, check_exposure
 from sorvolo.station.state import StationState
 from sorvolo.station.stream_addresses import checked_stream
 from sorvolo.station.tokens import Guesses, Role, holder_of, list_tokens, make_token, revoke_token
@@ -78,6 +81,90 @@ def test_names_are_known_on_other_addresses_too(root: Path) -> None:
         client.headers["authorization"] = f"Bearer {token}"
         for host, status in (("field.example:8750", 200), ("192.168.7.9:8750", 200), ("evil.example", 421)):
             assert client.get("/api/status", headers={"host": host}).status_code == status, host
+
+
+def proxied(root: Path, **headers: str) -> tuple[TestClient, str]:
+    """A station behind a TLS proxy on its own machine, as uvicorn runs it, and a token."""
+    with closing(StationState.open(root / "station")) as state:
+        token = make_token(state, "Ada", "review")
+    settings = StationSettings(root, public_url="https://maps.example")
+    config = server_config(station_app(settings), settings)
+    config.load()
+    client = TestClient(config.loaded_app, base_url=HOST, client=("127.0.0.1", 4000))  # type: ignore[arg-type]
+    client.headers.update({"x-forwarded-for": "198.51.100.7", "x-forwarded-proto": "https", **headers})
+    return client, token
+
+
+@pytest.mark.parametrize("host", ["maps.example", "127.0.0.1:8750"])
+def test_behind_a_proxy_its_pages_may_ask(root: Path, host: str) -> None:
+    """Whether the proxy passes the host's name on or not: judge, hear events, log in; others' pages may not."""
+    client, token = proxied(root, host=host, origin="https://maps.example")
+    with client:
+        assert client.get("/api/status").status_code == 401
+        answer = client.post("/api/session", json={"token": token})
+        assert answer.status_code == 200 and "Secure" in answer.headers["set-cookie"]
+        client.headers["authorization"] = f"Bearer {token}"
+        body = {"kind": "change", "id": "b-1", "verdict": "confirmed", "revision": 0}
+        assert client.post("/api/sites/field/reviews", json=body).status_code == 201
+        assert refused(client, "/api/events", **dict(client.headers)) == 0
+        for origin in ("https://evil.example", "https://maps.example.evil.example", "https://maps.example:444"):
+            foreign = client.post("/api/sites/field/reviews", json=body, headers={"origin": origin})
+            assert foreign.status_code == 403, origin
+        assert client.get("/api/status", headers={"host": "evil.example"}).status_code == 421
+
+
+def test_behind_a_proxy_guesses_count_for_who_made_them(root: Path) -> None:
+    """All requests come from the proxy's address; a stranger's guesses do not lock the crew out."""
+    client, token = proxied(root, host="maps.example")
+    with client:
+        for _ in range(6):
+            client.post("/api/session", json={"token": "sorvolo_0_wrong"})
+        assert client.post("/api/session", json={"token": "sorvolo_0_wrong"}).status_code == 429
+        other = {"x-forwarded-for": "198.51.100.8"}
+        assert client.post("/api/session", json={"token": "sorvolo_0_wrong"}, headers=other).status_code == 401
+        assert client.post("/api/session", json={"token": token}, headers=other).status_code == 200
+
+
+@pytest.mark.parametrize("more", [{"names": ("field.example",)}, {"public_url": "https://maps.example"}])
+def test_other_names_of_a_station_on_loopback_need_tokens(root: Path, more: dict[str, Any]) -> None:
+    """Without any a page under that name, wherever it came from, could start missions."""
+    settings = StationSettings(root, **more)
+    with pytest.raises(SettingsError, match="no token was made"):
+        check_exposure(settings, has_tokens=False)
+    check_exposure(settings, has_tokens=True)
+    with TestClient(station_app(settings), base_url=HOST) as client:
+        for host in ("field.example", "127.0.0.1:8750"):
+            assert client.get("/api/sites", headers={"host": host}).status_code in (401, 421)
+
+
+@pytest.mark.parametrize("url", [
+    "http://maps.example", "maps.example", "https://maps.example/station", "https://me:pw@maps.example", "https://:1",
+    "https://maps.example:x", "https://maps.example/?a=b",
+])
+def test_what_is_no_proxy_s_address(tmp_path: Path, url: str) -> None:
+    """The station's pages ask for /api of a whole host, by TLS."""
+    with pytest.raises(SettingsError, match=r"without a path: https://maps\.example"):
+        StationSettings(tmp_path, public_url=url)
+
+
+def test_one_address_keeps_so_many_live_channels_and_no_more(root: Path) -> None:
+    """Each holds memory and a task for as long as it is open; closing one makes room."""
+    settings = StationSettings(root, limits=StationLimits(most_live_per_address=2))
+    with TestClient(station_app(settings), base_url=HOST, client=("127.0.0.1", 5000)) as client, \
+            client.websocket_connect(SOCKET):
+        with client.websocket_connect(SOCKET):
+            assert refused(client, SOCKET) in (429, 4429)
+            assert client.get("/api/events").status_code == 429
+            assert client.get("/api/sites").status_code == 200
+        assert refused(client, SOCKET) == 0
+
+
+def test_the_server_takes_so_many_connections(root: Path) -> None:
+    """uvicorn answers 503 to more."""
+    settings = StationSettings(root, limits=StationLimits(most_connections=7))
+    app = station_app(settings)
+    assert server_config(app, settings).limit_concurrency == 7
+    app.state.station.close()
 
 
 @pytest.mark.parametrize("origin", [
@@ -346,7 +433,9 @@ def test_a_streams_password_is_shown_to_nobody(client: TestClient, root: Path) -
     assert (root / "station").stat().st_mode & 0o077 == 0
 
 
-def test_a_missions_error_holds_no_password(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missions_error_holds_no_password(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """FFmpeg's own errors state the whole address, and every viewer reads why a mission failed."""
     source = "rtsp://me:secretword@93.184.216.34/live?token=hidden"
     Order("r", "watch", "field", str(tmp_path), source, "", "", str(tmp_path), "", {}).write(tmp_path)
@@ -356,7 +445,21 @@ def test_a_missions_error_holds_no_password(tmp_path: Path, monkeypatch: pytest.
 
     monkeypatch.setitem(worker._MISSIONS, "watch", fail)
     monkeypatch.setattr(worker, "_Stop", lambda _: SimpleNamespace(until=None))
-    with pytest.raises(ValueError, match="Invalid"):
-        worker.main(tmp_path)
-    text = (tmp_path / "journal.jsonl").read_text()
-    assert "93.184.216.34/live" in text and "secretword" not in text and "hidden" not in text
+    monkeypatch.setenv(SOURCE_VARIABLE, source)
+    assert worker.main(tmp_path) == 1
+    text = (tmp_path / "journal.jsonl").read_text() + capsys.readouterr().err
+    assert text.count("93.184.216.34/live") == 2 and "secretword" not in text and "hidden" not in text
+
+
+def test_a_mission_gets_a_streams_password_by_its_environment_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its children do not; what the environment holds of another order is left alone."""
+    source = "rtsp://me:secretword@93.184.216.34/live?token=hidden"
+    order = Order("r", "watch", "field", str(tmp_path), source, "", "", str(tmp_path), "", {})
+    order.write(tmp_path)
+    assert "secretword" not in (text := (tmp_path / "order.json").read_text()) and "hidden" not in text
+    monkeypatch.setenv(SOURCE_VARIABLE, source)
+    assert Order.read(tmp_path).source == source and SOURCE_VARIABLE not in os.environ
+    monkeypatch.setenv(SOURCE_VARIABLE, "rtsp://me:pw@192.0.2.1/else")
+    assert Order.read(tmp_path).source == "rtsp://93.184.216.34/live"

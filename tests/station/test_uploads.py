@@ -9,6 +9,7 @@ import threading
 import time
 import zipfile
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from sorvolo.station import check_upload, uploads
 from sorvolo.station.app import station_app
 from sorvolo.station.check_upload import Refusal, look
 from sorvolo.station.problems import Problem
+from sorvolo.station.runs import Run
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.uploads import Child
 
@@ -97,6 +99,21 @@ def test_a_flight_comes_in_pieces_and_is_ready(client: TestClient, tmp_path: Pat
     assert here.finished_path(done["id"]).read_bytes() == data
     assert client.delete(address).status_code == 204 and client.get(address).status_code == 404
     assert not list(here._folder.glob("*"))
+
+
+def test_an_upload_that_a_mission_reads_is_not_deleted(client: TestClient) -> None:
+    """As its flight, its telemetry or its camera; once the mission is over it may go."""
+    runs = client.app.state.station.runs  # type: ignore[attr-defined]
+    runs.close()
+    addresses = [begin(client, f"{name}.srt", 5).headers["location"] for name in ("flight", "log", "other")]
+    flight, log, _ = (each.rpartition("/")[2] for each in addresses)
+    run = Run("1" * 16, "map", "new", "running", "Ada", "2026-01-01T00:00:00Z", input={"upload": flight},
+              options={"telemetry": {"upload": log}})
+    runs._begin(run)
+    assert [client.delete(each).status_code for each in addresses] == [423, 423, 204]
+    assert "Ada" in client.delete(addresses[0]).json()["detail"]
+    runs._keep(replace(run, state="finished"), [])
+    assert [client.delete(each).status_code for each in addresses[:2]] == [204, 204]
 
 
 def test_a_cut_off_video_is_refused_and_cannot_be_flown(client: TestClient, tmp_path: Path) -> None:

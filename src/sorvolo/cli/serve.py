@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import os
 import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -29,6 +30,12 @@ Certificate = Annotated[Path | None, typer.Option(help="TLS certificate, PEM.")]
 Key = Annotated[Path | None, typer.Option(help="TLS key, PEM.")]
 InsecureLan = Annotated[bool, typer.Option("--insecure-lan", help="Listen without TLS in a network that you trust.")]
 Names = Annotated[list[str] | None, typer.Option("--name", help="A host name that browsers use. Can be repeated.")]
+PublicUrl = Annotated[
+    str, typer.Option(help="Address of a TLS proxy on this machine before the station, such as https://maps.example.")
+]
+BaseMap = Annotated[Path | None, typer.Option(help="Base map that pages show below the maps, PMTiles.")]
+Missions = Annotated[int, typer.Option(help="Missions that may run at the same time.")]
+StopWithin = Annotated[float, typer.Option(help="Seconds after which a mission that was stopped is killed.")]
 StreamFrom = Annotated[
     list[str] | None,
     typer.Option(help="Network that streams may be called from, such as 192.168.1.0/24. Can be repeated."),
@@ -45,7 +52,13 @@ WebhookSecret = Annotated[
 ]
 Mqtt = Annotated[
     str,
-    typer.Option(help="MQTT broker: mqtt://HOST:PORT/PREFIX (port, prefix optional), mqtts://USER:PASSWORD@HOST."),
+    typer.Option(help="MQTT broker: mqtt://HOST:PORT/PREFIX (port, prefix optional), mqtts://USER@HOST."),
+]
+MqttPassword = Annotated[
+    Path | None,
+    typer.Option(
+        help="File with the password of the MQTT user, readable by you alone.", show_default="SORVOLO_MQTT_PASSWORD"
+    ),
 ]
 MqttAuthority = Annotated[Path | None, typer.Option(help="For mqtts://: the authority of the broker, PEM.")]
 LogJson = Annotated[bool, typer.Option("--log-json", help="Log each request and fault as a line of JSON on stderr.")]
@@ -58,8 +71,10 @@ Revoke = Annotated[bool, typer.Option("--revoke", help="Make the token of this n
 def serve(
     root: Root, host: Host = "127.0.0.1", port: Port = 8750, tls_cert: Certificate = None, tls_key: Key = None,
     insecure_lan: InsecureLan = False, name: Names = None, stream_from: StreamFrom = None, free_floor: FreeFloor = 2.0,
-    upload_most: UploadMost = 64.0, open_page: Opens = False, webhook: Webhooks = None,
-    webhook_secret: WebhookSecret = "", mqtt: Mqtt = "", mqtt_ca: MqttAuthority = None, cot: Cot = "",
+    upload_most: UploadMost = 64.0, public_url: PublicUrl = "", base_map: BaseMap = None, most_missions: Missions = 4,
+    stop_within: StopWithin = 30.0, open_page: Opens = False, webhook: Webhooks = None,
+    webhook_secret: WebhookSecret = "", mqtt: Mqtt = "", mqtt_password_file: MqttPassword = None,
+    mqtt_ca: MqttAuthority = None, cot: Cot = "",
     cot_ca: CotAuthority = None, cot_cert: CotCertificate = None, log_json: LogJson = False,
 ) -> None:
     """Serve a folder of sites to browsers: the map while it grows, changes, objects, and what to do with them.
@@ -76,15 +91,16 @@ def serve(
     from sorvolo.missions.watch.cot_sender import CotTls
     from sorvolo.station.outward import OutwardSettings
     from sorvolo.station.server import run_station
-    from sorvolo.station.settings import StationSettings
+    from sorvolo.station.settings import StationLimits, StationSettings
 
     _demand_folder(root)
     settings = StationSettings(
         root, host, port, tls_cert, tls_key, insecure_lan, tuple(name or ()), tuple(stream_from or ()), free_floor,
-        upload_most,
+        upload_most, public_url, base_map, StationLimits(most_missions=most_missions, stop_within_s=stop_within),
     )
     receivers = OutwardSettings(
-        tuple(webhook or ()), webhook_secret, mqtt, mqtt_ca, cot, CotTls(cot_ca, cot_cert)
+        tuple(webhook or ()), webhook_secret, mqtt, _mqtt_password(mqtt_password_file) if mqtt else "", mqtt_ca, cot,
+        CotTls(cot_ca, cot_cert),
     )
     console = Console(stderr=True)
 
@@ -130,8 +146,9 @@ def token(
 
 
 def _announce(settings: "StationSettings", console: Console) -> None:
-    console.print(f"station at {settings.address}", soft_wrap=True, highlight=False, markup=False)
-    if not settings.is_loopback and not settings.is_secure:
+    where = settings.address if not settings.public_url else f"{settings.public_url} (proxy to {settings.address})"
+    console.print(f"station at {where}", soft_wrap=True, highlight=False, markup=False)
+    if not settings.is_loopback and settings.tls_cert is None:
         console.print("[yellow]warning[/yellow]  without TLS: who listens in this network can read tokens and maps")
 
 
@@ -148,6 +165,21 @@ def _show_tokens(rows: list[tuple[str, str, str, str | None]], *, as_json: bool)
     for name, role, made_at, expires_at in rows:
         table.add_row(name, role, made_at[:16], (expires_at or "never")[:16])
     Console().print(table)
+
+
+def _mqtt_password(file: Path | None) -> str:
+    """The password in the file, else in SORVOLO_MQTT_PASSWORD; never an argument, which every user of the machine sees.
+
+    Raises SettingsError for a file that others may read.
+    """
+    if file is None:
+        return os.environ.get("SORVOLO_MQTT_PASSWORD", "")
+    try:
+        if file.stat().st_mode & 0o077:
+            raise SettingsError(f"--mqtt-password-file {file}: others may read it; make it yours: chmod 600 {file}")
+        return file.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SettingsError(f"--mqtt-password-file {file}: a file with a password was needed ({error})") from error
 
 
 def _demand_folder(root: Path) -> None:

@@ -1,7 +1,6 @@
 """The station as one web application: its parts joined, its routes, the page."""
 
 import asyncio
-import os
 import shutil
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -27,7 +26,7 @@ from sorvolo.station.ingest import Ingest, IngestLimits
 from sorvolo.station.inputs import Inputs
 from sorvolo.station.logs import Observer
 from sorvolo.station.map_watch import MapWatch
-from sorvolo.station.metrics import StationMetrics, metrics_routes
+from sorvolo.station.metrics import StationMetrics, memory_bytes, metrics_routes
 from sorvolo.station.outward import Outward, OutwardSettings
 from sorvolo.station.place import place_routes
 from sorvolo.station.problems import PROBLEM_ANSWERS, Problem, answer_problems
@@ -49,7 +48,7 @@ from sorvolo.station.wmts import wmts_routes
 PAGE_FOLDER = Path(__file__).parent / "page"
 _FOR_EVER = "public, max-age=31536000, immutable"
 _UPLOADS = "/api/uploads"
-"""The folder below the root that keeps what drones send."""
+_BASE_MAP = "/api/base-map.pmtiles"
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,7 @@ def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardS
         _about_routes(station), _site_routes(station), event_routes(station.events),
         feature_routes(station.collections, station.reviews), review_routes(station.reviews, station.shelf),
         crop_routes(station.shelf), stream_routes(station.ingest), metrics_routes(metrics),
-        upload_routes(station.uploads), run_routes(station.runs, station.inputs),
+        upload_routes(station.uploads, station.runs), run_routes(station.runs, station.inputs),
         place_routes(station.shelf, station.collections, station.reviews, station.videos),
         video_routes(station.shelf, station.collections, station.videos),
         drawing_routes(Drawings(settings, station.shelf, station.events)),
@@ -146,14 +145,24 @@ def _about_routes(station: Station) -> APIRouter:
     @router.get("/api/status")
     def status(request: Request) -> dict[str, Any]:
         """The station at a glance."""
-        free = shutil.disk_usage(station.settings.root).free
+        free, memory = shutil.disk_usage(station.settings.root).free, memory_bytes()
         holder = holder_in(request)
         return {
             "version": __version__, "role": holder.role.word, "name": holder.name,
-            "sites": len(station.shelf.folders()), "memory_mb": _memory_mb(), "disk_free_gb": round(free / 1e9, 2),
+            "sites": len(station.shelf.folders()), "disk_free_gb": round(free / 1e9, 2),
+            "memory_mb": None if memory is None else round(memory / 1e6, 1),
             "disk_floor_gb": station.settings.free_floor_gb, "units_default": "metric",
             "last_event": station.events.last,
+            "base_map_url": None if station.settings.base_map is None else _BASE_MAP,
         }
+
+    @router.get(_BASE_MAP, dependencies=[Depends(needs(Role.VIEW))], response_class=FileResponse)
+    def base_map() -> Response:
+        """The base map as PMTiles, read in ranges; 404 where the station was given none."""
+        path = station.settings.base_map
+        if path is None or not path.is_file():
+            raise Problem(404, "this station has no base map; start it with --base-map FILE.pmtiles")
+        return FileResponse(path, media_type="application/octet-stream", headers={"cache-control": "private, no-cache"})
 
     @router.post("/api/session")
     async def log_in(request: Request, token: Annotated[str, Body(embed=True, max_length=200)]) -> JSONResponse:
@@ -247,12 +256,3 @@ def _doorkeeper(request: Request) -> Doorkeeper:
     keeper = request.scope["state"]["doorkeeper"]
     assert isinstance(keeper, Doorkeeper)
     return keeper
-
-
-def _memory_mb() -> float | None:
-    """Resident memory of this process; None where the system does not say."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except (OSError, ValueError, IndexError):
-        return None
-    return round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 1)

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sorvolo.capture.live.addresses import shown_address
 from sorvolo.station.messages import check_stream
-from sorvolo.station.orders import InputWish
+from sorvolo.station.orders import InputWish, without_password
 from sorvolo.station.problems import Problem
 from sorvolo.station.settings import STATE_FOLDER, STREAMS_FOLDER, StationSettings
 from sorvolo.station.stream_addresses import checked_stream
@@ -81,7 +80,7 @@ class Inputs:
             return None
         plain = wish.model_dump(exclude_none=True)
         if wish.stream_url is not None:
-            plain["stream_url"] = shown_address(wish.stream_url).partition("?")[0]
+            plain["stream_url"] = without_password(wish.stream_url)
         if wish.input is not None:
             plain["name"] = next((each.name for each in self.all() if each.id == wish.input), wish.input)
         if wish.upload is not None:

@@ -63,7 +63,7 @@ class _StationCollector(Collector):
     def collect(self) -> Iterator[Metric]:
         """See `prometheus_client.registry.Collector`."""
         yield GaugeMetricFamily("sorvolo_disk_free_bytes", "Free disk space", shutil.disk_usage(self._root).free)
-        if (memory := _memory_bytes()) is not None:
+        if (memory := memory_bytes()) is not None:
             yield GaugeMetricFamily("sorvolo_memory_bytes", "Resident memory of the station's process", memory)
         yield CounterMetricFamily("sorvolo_events", "Events so far", self._events.last)
         yield from self._of_streams()
@@ -95,7 +95,8 @@ class _StationCollector(Collector):
         yield from (delivered, lost, waiting)
 
 
-def _memory_bytes() -> int | None:
+def memory_bytes() -> int | None:
+    """Resident memory of this process; None where the system does not report it."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):

@@ -16,7 +16,7 @@ from sorvolo.errors import SettingsError
 
 _PORTS = {"mqtt": 1883, "mqtts": 8883}
 _CONNECT_S, _PUBLISH_S, _KEEPALIVE_S = 5.0, 10.0, 30
-_WANTED = "give mqtt://HOST[:PORT][/PREFIX] or mqtts://USER:PASSWORD@HOST"
+_WANTED = "give mqtt://HOST[:PORT][/PREFIX] or mqtts://USER@HOST"
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,10 @@ class MqttPlace:
         return f"{'mqtts' if self.is_secure else 'mqtt'}://{self.host}:{self.port}/{self.prefix}"
 
 
-def mqtt_place(url: str) -> MqttPlace:
-    """The broker that `mqtt://[USER:PASSWORD@]HOST[:PORT][/PREFIX]` or `mqtts://...` names; the prefix is else sorvolo.
+def mqtt_place(url: str, password: str = "") -> MqttPlace:
+    """The broker that `mqtt://[USER@]HOST[:PORT][/PREFIX]` or `mqtts://...` names; the prefix is else sorvolo.
 
-    Raises SettingsError for anything else.
+    Raises SettingsError for anything else, and for a password in the address: the list of processes would show it.
     """
     try:
         parts = urlsplit(url)
@@ -48,8 +48,14 @@ def mqtt_place(url: str) -> MqttPlace:
     host, is_pattern = parts.hostname, bool(set(url.rpartition("@")[2]) & set("+#?"))
     if parts.scheme not in _PORTS or not host or is_pattern:
         raise SettingsError(f"--mqtt {parts.scheme}://{host or ''} is no broker; {_WANTED}")
-    user, password = (unquote(each or "") for each in (parts.username, parts.password))
-    prefix = parts.path.strip("/") or "sorvolo"
+    if parts.password is not None:
+        raise SettingsError(
+            "--mqtt: everybody on this machine could read a password in the address; give it in SORVOLO_MQTT_PASSWORD, "
+            "or in a file of your own with --mqtt-password-file"
+        )
+    prefix, user = parts.path.strip("/") or "sorvolo", unquote(parts.username or "")
+    if password and not user:
+        raise SettingsError(f"--mqtt: a password without a user's name; {_WANTED}")
     return MqttPlace(host, port or _PORTS[parts.scheme], prefix, user, password, parts.scheme == "mqtts")
 
 

@@ -1,13 +1,15 @@
 """What a mission of the station is asked to do: its options within bounds, its inputs by ids, its order on the disk."""
 
 import json
+import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from sorvolo.capture.live.addresses import shown_address
 from sorvolo.store.atomic import atomic_write_bytes
 
 ORDER_FILE, JOURNAL_FILE, LOG_FILE, LOCK_FILE = "order.json", "journal.jsonl", "log.txt", "running.lock"
@@ -18,6 +20,9 @@ BOXES = "frame.boxes"
 
 LOCK_VARIABLE = "SORVOLO_RUN_LOCK"
 """Of the environment of a run's process: the number of its lock's descriptor, which its own children must not have."""
+
+SOURCE_VARIABLE = "SORVOLO_RUN_SOURCE"
+"""Of the same: the input, whose password no file is to hold."""
 
 Mission = Literal["map", "compare", "watch", "search"]
 WRITES: frozenset[str] = frozenset({"map", "compare"})
@@ -89,8 +94,8 @@ class RunWish(BaseModel):
 class Order:
     """What a mission's process is to do: everything resolved to paths and addresses; read by it alone.
 
-    `source` is a path or an address with its password, `stream` the name of the drone's stream behind it, if any.
-    `folder` is where a watch or a search puts its results.
+    `source` is a path or an address with its password, which the order's file leaves out; `stream` is the name of the
+    drone's stream behind it, if any. `folder` is where a watch or a search puts its results.
     """
 
     run: str
@@ -105,14 +110,17 @@ class Order:
     options: Mapping[str, Any]
 
     def write(self, folder: Path) -> None:
-        """Put it into a run's folder, for its process's eyes. Raises StoreError on a full disk."""
-        atomic_write_bytes(folder / ORDER_FILE, json.dumps(asdict(self)).encode())
+        """Put it into a run's folder, without a stream's password. Raises StoreError on a full disk."""
+        kept = asdict(self) | {"source": without_password(self.source)}
+        atomic_write_bytes(folder / ORDER_FILE, json.dumps(kept).encode())
         (folder / ORDER_FILE).chmod(0o600)
 
     @classmethod
     def read(cls, folder: Path) -> "Order":
-        """The order in a run's folder."""
-        return cls(**json.loads((folder / ORDER_FILE).read_bytes()))
+        """The order in a run's folder; the whole address of a stream comes from the process's environment."""
+        order = cls(**json.loads((folder / ORDER_FILE).read_bytes()))
+        source = os.environ.pop(SOURCE_VARIABLE, order.source)
+        return replace(order, source=source) if without_password(source) == order.source else order
 
     @property
     def choices(self) -> MissionOptions:
@@ -123,3 +131,8 @@ class Order:
     def classes(self) -> Sequence[str]:
         """What is looked for; nothing: what the model usually reports."""
         return self.choices.classes
+
+
+def without_password(source: str) -> str:
+    """A path as it is; a stream's address without user, password and what stands behind its `?`."""
+    return shown_address(source).partition("?")[0] if "://" in source else source

@@ -22,13 +22,14 @@ _FOLDER = "relays"
 class OutwardSettings:
     """The receivers of a station's events.
 
-    `webhook_secret` signs what is posted; `mqtt_ca` is the broker's authority, PEM. Raises SettingsError for an address
-    that cannot be.
+    `webhook_secret` signs what is posted; `mqtt_password` is that of the user in `mqtt`, `mqtt_ca` the broker's
+    authority, PEM. Raises SettingsError for an address that cannot be.
     """
 
     webhooks: tuple[str, ...] = ()
     webhook_secret: str = ""
     mqtt: str = ""
+    mqtt_password: str = field(default="", repr=False)
     mqtt_ca: Path | None = None
     cot: str = ""
     cot_tls: CotTls = field(default_factory=CotTls)
@@ -37,7 +38,7 @@ class OutwardSettings:
         for each in self.webhooks:
             webhook(each)
         if self.mqtt:
-            mqtt_place(self.mqtt)
+            mqtt_place(self.mqtt, self.mqtt_password)
         if self.cot:
             cot_place(self.cot)
         if self.cot_tls != CotTls() and not self.cot.startswith("tls://"):
@@ -61,7 +62,7 @@ class Outward:
             send = webhook(url, settings.webhook_secret)
             self._relays.append(Relay(webhook_name(url), send, events, _place(folder, url)))
         if settings.mqtt:
-            place = mqtt_place(settings.mqtt)
+            place = mqtt_place(settings.mqtt, settings.mqtt_password)
             self._mqtt = MqttSender(place, settings.mqtt_ca)
             self._relays.append(Relay(str(place), self._mqtt.send, events, _place(folder, str(place))))
         if settings.cot:

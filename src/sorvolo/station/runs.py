@@ -11,7 +11,9 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,7 @@ from sorvolo.station.orders import (
     LOCK_FILE,
     LOCK_VARIABLE,
     LOG_FILE,
+    SOURCE_VARIABLE,
     WRITES,
     Order,
     RunWish,
@@ -32,14 +35,13 @@ from sorvolo.station.orders import (
 from sorvolo.station.problems import Problem
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.sites import SiteShelf
-from sorvolo.station.state import StationState, compact_json, utc_now
+from sorvolo.station.state import StationState, compact_json, utc_after, utc_now
 from sorvolo.store.atomic import writing
 
 RUNNING, FINISHED, FAILED, STOPPED, LOST = "running", "finished", "failed", "stopped", "lost"
 """States of a run; lost: its process ended without a word, as when the machine was switched off."""
 
 _ENDS = {"run.finished": FINISHED, "run.failed": FAILED, "run.stopped": STOPPED}
-_MOST_RUNNING = 4
 _MOST_LINE_BYTES = 4_000_000
 _MOST_LOG_BYTES = 4000
 _LOOK_EVERY_S = 0.1
@@ -65,6 +67,7 @@ class Run:
     error: str | None = None
     pid: int | None = None
     stop_asked: bool = False
+    kill_at: str | None = None  # when a stop that brought no end becomes a kill
 
 
 class Runs:
@@ -79,6 +82,7 @@ class Runs:
         self._folder = settings.state_folder / "runs"
         self._lock = threading.RLock()
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._lingering_s: dict[str, float] = {}  # ended by their own journal, their processes not yet: since when
         self._is_low = False
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="runs", daemon=True)
@@ -93,9 +97,11 @@ class Runs:
         if self._thread.is_alive():
             self._thread.join(5.0)
 
-    def all(self, limit: int = 200) -> list[Run]:
-        """The newest runs first."""
-        rows = self._state.rows("SELECT record FROM runs ORDER BY made_at DESC, id LIMIT ?", (limit,))
+    def all(self, limit: int = 200, site: str = "") -> list[Run]:
+        """The newest runs first, of one site or ("") of all."""
+        rows = self._state.rows(
+            "SELECT record FROM runs WHERE ? IN ('', site) ORDER BY made_at DESC, id LIMIT ?", (site, limit)
+        )
         return [Run(**json.loads(row["record"])) for row in rows]
 
     def get(self, run_id: str) -> Run:
@@ -125,7 +131,7 @@ class Runs:
                 run_id, wish.mission, wish.site, RUNNING, who, utc_now(), input=self._inputs.shown(wish.input),
                 options=wish.options.model_dump(mode="json", exclude_defaults=True),
             )
-            process = _spawned(folder)
+            process = _spawned(folder, order)
             run = replace(run, pid=process.pid)
             try:
                 self._begin(run)
@@ -139,7 +145,7 @@ class Runs:
     def stop(self, run_id: str) -> Run:
         """Ask a mission to end: a live flight is finished and kept, a recorded one is left out; asked again, at once.
 
-        Raises Problem (404, 409).
+        A process that takes longer to end than the settings allow is killed by `look`. Raises Problem (404, 409).
         """
         with self._lock:
             run = self.get(run_id)
@@ -148,7 +154,10 @@ class Runs:
             if run.pid is not None and not _has_ended(self._folder / run.id):  # the number is still its own
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(run.pid, signal.SIGTERM)
-            asked = replace(run, stop_asked=True)
+            limits = self._settings.limits
+            is_finishing = _is_live(run) and not run.stop_asked
+            within_s = limits.finish_within_s if is_finishing else limits.stop_within_s
+            asked = replace(run, stop_asked=True, kill_at=utc_after(within_s))
             self._keep(asked, [])
             return asked
 
@@ -157,7 +166,20 @@ class Runs:
         count = 0
         for run, offset in self._running():
             count += self._look_at(run, offset).state == RUNNING
+        self._reap()
         return count
+
+    @contextmanager
+    def unused(self, upload_id: str) -> Iterator[None]:
+        """No mission begins meanwhile. Raises Problem (423) where one that runs reads the upload."""
+        with self._lock:
+            for run, _ in self._running():
+                if upload_id in _uploads_of(run):
+                    raise Problem(
+                        423, f"a {run.mission} that {run.who} started reads this upload; wait until it ends, or stop "
+                             "it", run=run.id,
+                    )
+            yield
 
     def look_at_disk(self) -> None:
         """Announce once that the free space fell below the floor, and once that it is above it again."""
@@ -208,23 +230,39 @@ class Runs:
                     continue
                 run, event = _taken(run, line)
                 events.append(event)
-            if has_ended and run.state == RUNNING and end == offset:
+            if has_ended and run.state == RUNNING and end == offset and self._is_gone(run.id):
                 run = self._without_a_word(run, folder)
                 kind = "run.stopped" if run.state == STOPPED else "run.failed"
                 events.append(_event(kind, run, _public(run)))
             if events or end > offset:
                 self._keep(run, events, end)
         if run.state != RUNNING:
-            process = self._processes.pop(run.id, None)
-            if process is not None:
-                process.wait()
+            self._lingering_s.setdefault(run.id, time.monotonic())
             self._shelf.forget(run.site)
+        elif not has_ended and run.kill_at is not None and run.kill_at < utc_now():
+            _kill(run.pid)
         return run
+
+    def _is_gone(self, run_id: str) -> bool:
+        """Whether a process that let go of its lock has ended, as far as anybody can know: never waits."""
+        process = self._processes.get(run_id)
+        return process is None or process.poll() is not None
+
+    def _reap(self) -> None:
+        """Take the exit codes of processes whose runs are over; kill those that state the end and do not come to it."""
+        for run_id, since_s in list(self._lingering_s.items()):
+            process = self._processes.get(run_id)
+            if process is not None and process.poll() is None:
+                if time.monotonic() - since_s > self._settings.limits.stop_within_s:
+                    _kill(process.pid)
+                continue
+            self._processes.pop(run_id, None)
+            del self._lingering_s[run_id]
 
     def _without_a_word(self, run: Run, folder: Path) -> Run:
         """A run whose process ended without its last line: killed, crashed, or switched off with the machine."""
         process = self._processes.get(run.id)
-        code = process.wait() if process is not None else None
+        code = process.poll() if process is not None else None
         if run.stop_asked:
             return replace(run, state=STOPPED, ended_at=utc_now(), exit_code=code, headline="stopped; nothing was kept")
         last = _tail(folder / LOG_FILE)
@@ -245,7 +283,7 @@ class Runs:
 
     def _demand_turn(self, wish: RunWish) -> None:
         running = [each for each, _ in self._running()]
-        if len(running) >= _MOST_RUNNING:
+        if len(running) >= self._settings.limits.most_missions:
             raise Problem(409, f"{len(running)} missions run already; wait until one ends, or stop one")
         for each in running:
             if each.site == wish.site and each.mission in WRITES and wish.mission in WRITES:
@@ -277,7 +315,7 @@ class Runs:
 
 def _public(run: Run) -> dict[str, Any]:
     """A run without what is of no use to a browser."""
-    return {name: value for name, value in asdict(run).items() if name != "pid"}
+    return {name: value for name, value in asdict(run).items() if name not in ("pid", "kill_at")}
 
 
 run_row = _public
@@ -302,10 +340,30 @@ def _taken(run: Run, line: Mapping[str, Any]) -> tuple[Run, NewEvent]:
     return run, _event(kind, run, data)
 
 
-def _spawned(folder: Path) -> "subprocess.Popen[bytes]":
+def _is_live(run: Run) -> bool:
+    """Whether a run reads a stream, which ends when somebody ends it."""
+    return bool((run.input or {}).keys() & {"stream", "stream_url"})
+
+
+def _uploads_of(run: Run) -> set[str]:
+    """The uploads that a run reads."""
+    options = run.options or {}
+    wishes = (run.input, options.get("telemetry"), options.get("camera_file"))
+    return {str(each["upload"]) for each in wishes if each and each.get("upload")}
+
+
+def _kill(pid: int | None) -> None:
+    """End a mission's process and its children at once: they are a session of their own, led by it."""
+    if pid is not None:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(pid, signal.SIGKILL)
+
+
+def _spawned(folder: Path, order: Order) -> "subprocess.Popen[bytes]":
     """A process that does the order in a folder, apart from the server's own fate.
 
     It holds the folder's lock from before its first moment on to its last: who can lock it knows that it has ended.
+    A stream's password goes to it through its environment, which only this user's processes can read.
     """
     lock = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o600)
     try:
@@ -314,7 +372,7 @@ def _spawned(folder: Path) -> "subprocess.Popen[bytes]":
             return subprocess.Popen(
                 [sys.executable, "-m", "sorvolo.station.worker", str(folder.resolve())], cwd=folder,
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, pass_fds=(lock,),
-                env={**os.environ, LOCK_VARIABLE: str(lock)},
+                env={**os.environ, LOCK_VARIABLE: str(lock), SOURCE_VARIABLE: order.source},
             )
     finally:
         os.close(lock)

@@ -4,7 +4,9 @@ import asyncio
 import ipaddress
 import re
 import socket
-from collections.abc import Awaitable, Callable
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import urlsplit
@@ -21,6 +23,7 @@ from sorvolo.station.tokens import Guesses, Holder, Role, has_tokens, holder_of,
 COOKIE = "sorvolo_session"
 _MOST_BODY_BYTES = 1_000_000
 _ANYBODY = re.compile(r"/(page/.*|api/session|favicon\.ico)?")
+_EVENTS = "/api/events"
 _SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 _HEADERS = {
     "content-security-policy": (
@@ -45,6 +48,7 @@ class Doorkeeper:
     def __init__(self, app: ASGIApp, settings: StationSettings, state: StationState, upload_path: str) -> None:
         self._app, self._settings, self._state, self._upload_path = app, settings, state, upload_path
         self._guesses = Guesses()
+        self._live: Counter[str] = Counter()  # channels that are open, by address
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let a request through, or answer it with a problem."""
@@ -55,21 +59,41 @@ class Doorkeeper:
         connection = HTTPConnection(scope)
         try:
             check_host(connection.headers.get("host", ""), self._settings)
-            check_origin(connection, is_websocket=scope["type"] == "websocket")
+            check_origin(connection, self._settings.public_origin, is_websocket=scope["type"] == "websocket")
             holder = await self._holder(connection)
             scope["state"] = {**scope.get("state", {}), "holder": holder, "doorkeeper": self}
             if not scope["path"].startswith(self._upload_path):
                 receive = _limited(connection, receive)
-            await self._app(scope, receive, sending)
+            with self._live_channel(connection):
+                await self._app(scope, receive, sending)
         except Problem as problem:
             await _refuse(scope, receive, sending, problem)
+
+    @contextmanager
+    def _live_channel(self, connection: HTTPConnection) -> Iterator[None]:
+        """Count a WebSocket, or the events as text, while it is open. Raises Problem (429) for one too many."""
+        scope = connection.scope
+        if scope["type"] != "websocket" and scope["path"] != _EVENTS:
+            yield
+            return
+        address = address_group(connection.client.host if connection.client else "")
+        most = self._settings.limits.most_live_per_address
+        if self._live[address] >= most:
+            raise Problem(429, f"{address} keeps {most} live channels open already; close some of its pages")
+        self._live[address] += 1
+        try:
+            yield
+        finally:
+            self._live[address] -= 1
+            if not self._live[address]:
+                del self._live[address]
 
     async def _holder(self, connection: HTTPConnection) -> Holder:
         """Who asks. Raises Problem (401, 429) where nobody who may."""
         if not await asyncio.to_thread(has_tokens, self._state):
-            if self._settings.is_loopback:
+            if self._settings.is_private:
                 return Holder("this machine", Role.OPERATE)
-            raise Problem(401, "this station has no token any more; make one with `sorvolo token`")
+            raise Problem(401, "this station needs tokens and has none; make one with `sorvolo token`")
         if _ANYBODY.fullmatch(connection.scope["path"]):  # not looked at: an old cookie must not keep its owner out
             return Holder("", Role.VIEW)
         token = sent_token(connection)
@@ -151,7 +175,7 @@ def check_host(host: str, settings: StationSettings) -> None:
     address cannot be pointed anywhere. On loopback only loopback addresses are right.
     """
     name = _host_name(host)
-    if name.lower() in {"localhost", settings.host.lower(), *(each.lower() for each in settings.names)}:
+    if name.lower() == "localhost" or name.lower() in settings.host_names:
         return
     if not settings.is_loopback and (_is_address(name) or name.lower() == socket.gethostname().lower()):
         return
@@ -161,11 +185,12 @@ def check_host(host: str, settings: StationSettings) -> None:
                        "with --name")
 
 
-def check_origin(connection: HTTPConnection, *, is_websocket: bool) -> None:
+def check_origin(connection: HTTPConnection, public_origin: str, *, is_websocket: bool) -> None:
     """Raise Problem where a page of another site asks for more than a navigation could.
 
-    Browsers name the page's origin with every WebSocket and every request that may change something; what sends none is
-    no browser.
+    The station's own pages come from the address that was asked, or from `public_origin`, that of a proxy before it (""
+    without one). Browsers name the page's origin with every WebSocket and every request that may change something; what
+    sends none is no browser.
     """
     origin = connection.headers.get("origin")
     if origin is None:
@@ -176,6 +201,8 @@ def check_origin(connection: HTTPConnection, *, is_websocket: bool) -> None:
         raise Problem(403, "a page of another site asked; open the station's own page")
     if not is_websocket and connection.scope.get("method") in ("GET", "HEAD") and origin != "null":
         # reading is kept from other origins by the browser: no answer allows them to read it
+        return
+    if public_origin and origin.lower() == public_origin:
         return
     parts = urlsplit(origin)
     scheme = {"ws": "http", "wss": "https"}.get(connection.scope["scheme"], connection.scope["scheme"])

@@ -6,6 +6,7 @@ import socket
 from collections.abc import Callable
 
 import uvicorn
+from fastapi import FastAPI
 
 from sorvolo.errors import SettingsError
 from sorvolo.station.app import Station, station_app
@@ -33,18 +34,23 @@ def run_station(
     try:
         check_exposure(settings, has_tokens=has_tokens(station.state))
         listening = _listening(settings)
-        config = uvicorn.Config(
-            app, settings.host, settings.port, log_level="warning", access_log=False, server_header=False,
-            log_config=None, ws="websockets-sansio", ws_max_size=_MOST_MESSAGE_BYTES, proxy_headers=False,
-            timeout_graceful_shutdown=2, ssl_certfile=settings.tls_cert, ssl_keyfile=settings.tls_key,
-            h11_max_incomplete_event_size=64_000,
-        )
-        server = _Announcing(config, announce)
+        server = _Announcing(server_config(app, settings), announce)
         logging.getLogger("uvicorn.error").setLevel(logging.ERROR)
         with listening:
             asyncio.run(server.serve([listening]))
     finally:
         station.close()
+
+
+def server_config(app: FastAPI, settings: StationSettings) -> uvicorn.Config:
+    """How the application is served. Who asked is taken from a proxy's word only where the settings name one."""
+    return uvicorn.Config(
+        app, settings.host, settings.port, log_level="warning", access_log=False, server_header=False,
+        log_config=None, ws="websockets-sansio", ws_max_size=_MOST_MESSAGE_BYTES,
+        proxy_headers=bool(settings.public_url), forwarded_allow_ips=["127.0.0.1", "::1"],
+        limit_concurrency=settings.limits.most_connections, timeout_graceful_shutdown=2,
+        ssl_certfile=settings.tls_cert, ssl_keyfile=settings.tls_key, h11_max_incomplete_event_size=64_000,
+    )
 
 
 def _listening(settings: StationSettings) -> socket.socket:

@@ -3,6 +3,7 @@
 import ipaddress
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from sorvolo.errors import SettingsError
 
@@ -14,12 +15,30 @@ STREAMS_FOLDER = "streams"
 
 
 @dataclass(frozen=True)
+class StationLimits:
+    """How much a station does at the same time, and how long it waits for missions that are to end."""
+
+    most_connections: int = 1000  # of all clients; a browser opens six and a few live ones
+    most_live_per_address: int = 64  # event and video channels: a crew behind one router is one address
+    most_missions: int = 4
+    stop_within_s: float = 30.0  # a mission that was stopped is killed then
+    finish_within_s: float = 3600.0  # a live flight that was stopped is finished first
+
+    def __post_init__(self) -> None:
+        counts = (self.most_connections, self.most_live_per_address, self.most_missions)
+        if min(counts) < 1 or min(self.stop_within_s, self.finish_within_s) <= 0:
+            raise SettingsError("limits of a station are counts from 1 and seconds above 0")
+
+
+@dataclass(frozen=True)
 class StationSettings:
     """A station over the sites below `root`.
 
     `host` and `port` are where it listens; `tls_cert` and `tls_key` PEM files. `names` are further host names under
-    which browsers reach it. `stream_ranges` are networks (CIDR) that a stream may be called from although they are
-    private. `free_floor_gb` is the disk space below which nothing new is taken in, `upload_most_gb` the largest upload.
+    which browsers reach it, `public_url` the address of a TLS proxy on this machine that passes requests on to it.
+    `stream_ranges` are networks (CIDR) that a stream may be called from although they are private. `free_floor_gb` is
+    the disk space below which nothing new is taken in, `upload_most_gb` the largest upload. `base_map` is a PMTiles
+    file that pages show below the maps.
     """
 
     root: Path
@@ -32,6 +51,9 @@ class StationSettings:
     stream_ranges: tuple[str, ...] = ()
     free_floor_gb: float = 2.0
     upload_most_gb: float = 64.0
+    public_url: str = ""
+    base_map: Path | None = None
+    limits: StationLimits = StationLimits()
 
     def __post_init__(self) -> None:
         if not 0 < self.port < 65536:
@@ -48,6 +70,10 @@ class StationSettings:
                 raise SettingsError(f"--stream-from {text!r}: a network such as 192.168.1.0/24 was needed") from error
         if not (self.free_floor_gb >= 0 and self.upload_most_gb > 0):
             raise SettingsError("--free-floor and --upload-most are gigabytes: not below 0")
+        if self.public_url:
+            _check_public(self.public_url)
+        if self.base_map is not None and not _is_pmtiles(self.base_map):
+            raise SettingsError(f"--base-map {self.base_map}: a PMTiles file (version 3) was needed")
 
     @property
     def state_folder(self) -> Path:
@@ -60,15 +86,33 @@ class StationSettings:
         return is_loopback(self.host)
 
     @property
+    def is_private(self) -> bool:
+        """Whether only programs of this machine reach it, under this machine's own names: nobody needs a token."""
+        return self.is_loopback and not self.names and not self.public_url
+
+    @property
     def is_secure(self) -> bool:
-        """Whether it speaks TLS."""
-        return self.tls_cert is not None
+        """Whether browsers reach it by TLS, its own or a proxy's."""
+        return self.tls_cert is not None or self.public_url.startswith("https://")
+
+    @property
+    def public_origin(self) -> str:
+        """The origin of pages that a proxy passes on, as browsers write it; "" without a proxy."""
+        parts = urlsplit(self.public_url.lower())
+        return f"https://{parts.netloc.removesuffix(':443')}" if parts.netloc else ""
+
+    @property
+    def host_names(self) -> frozenset[str]:
+        """The names and addresses under which browsers may ask, lower case, besides this machine's own."""
+        public = urlsplit(self.public_url).hostname
+        return frozenset(each.lower() for each in (self.host, *self.names, *([public] if public else [])))
 
     @property
     def address(self) -> str:
         """What a browser on this machine opens."""
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
-        return f"{'https' if self.is_secure else 'http'}://{f'[{host}]' if ':' in host else host}:{self.port}/"
+        scheme = "http" if self.tls_cert is None else "https"
+        return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.port}/"
 
 
 def is_loopback(host: str) -> bool:
@@ -83,15 +127,38 @@ def is_loopback(host: str) -> bool:
 
 def check_exposure(settings: StationSettings, *, has_tokens: bool) -> None:
     """Raise SettingsError where others could reach the station without a password, or read it on the way."""
-    if settings.is_loopback:
+    if settings.is_private:
         return
-    where = f"{settings.host} can be reached from other machines"
+    where = f"{settings.public_url or settings.host} can be reached from other machines"
+    if settings.is_loopback and not settings.public_url:
+        where = f"this station answers to {', '.join(settings.names)}, names that others may point here"
     if not has_tokens:
         raise SettingsError(
             f"{where}, and no token was made; make one first: sorvolo token {settings.root} NAME --role operate"
         )
-    if not (settings.is_secure or settings.insecure_lan):
+    if not (settings.is_loopback or settings.tls_cert or settings.insecure_lan):
         raise SettingsError(
             f"{where}, and without TLS tokens could be read on the way; give --tls-cert and --tls-key, or "
             "--insecure-lan in a network that you trust"
         )
+
+
+def _check_public(url: str) -> None:
+    """Raise SettingsError unless it is the address of a proxy that passes a whole host on."""
+    try:
+        parts = urlsplit(url)
+        is_right = parts.scheme == "https" and bool(parts.hostname) and (parts.port or 1) > 0
+    except ValueError:
+        is_right = False
+    if not is_right or parts.path not in ("", "/") or parts.query or parts.fragment or "@" in parts.netloc:
+        raise SettingsError(
+            f"--public-url {url!r}: the address of a TLS proxy was needed, without a path: https://maps.example"
+        )
+
+
+def _is_pmtiles(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(8) == b"PMTiles\x03"
+    except OSError:
+        return False

@@ -7,6 +7,7 @@ from fastapi import APIRouter, Depends, Header, Request, Response
 from starlette.requests import ClientDisconnect
 
 from sorvolo.station.problems import Problem
+from sorvolo.station.runs import Runs
 from sorvolo.station.security import needs
 from sorvolo.station.tokens import Holder, Role
 from sorvolo.station.uploads import Upload, Uploads
@@ -16,7 +17,7 @@ _KIND = "application/offset+octet-stream"
 _MOST_LENGTH = 10**15
 
 
-def upload_routes(uploads: Uploads) -> APIRouter:
+def upload_routes(uploads: Uploads, runs: Runs) -> APIRouter:
     """Begin, continue, ask after, end an upload."""
     router = APIRouter(prefix="/api/uploads", tags=["uploads"], dependencies=[Depends(needs(Role.OPERATE))])
 
@@ -69,8 +70,9 @@ def upload_routes(uploads: Uploads) -> APIRouter:
 
     @router.delete("/{upload_id}", status_code=204)
     def end(upload_id: str) -> Response:
-        """Take an upload away."""
-        uploads.delete(upload_id)
+        """Take an upload away. 423 while a mission reads it."""
+        with runs.unused(upload_id):
+            uploads.delete(upload_id)
         return _answer(204, {})
 
     return router

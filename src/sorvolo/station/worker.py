@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Iterable, Mapping
 from contextlib import closing
 from dataclasses import replace
@@ -98,7 +99,8 @@ def main(folder: Path) -> int:
     except Exception as error:
         words = f"{type(error).__name__}: {error}" if not isinstance(error, OSError) else f"{error.strerror or error}"
         journal.add(FAILED, {"exit_code": _WRONG, "error": without_secret(words, order.source), "headline": None})
-        raise  # the traceback goes to the run's log
+        sys.stderr.write(without_secret(traceback.format_exc(), order.source))  # the run's log
+        return _WRONG
     journal.add(FINISHED, {"exit_code": 0, "error": None, "headline": headline})
     return 0
 

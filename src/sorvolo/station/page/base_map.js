@@ -32,10 +32,15 @@ export function chooseBaseMap(screen) {
     await showBaseMap(screen, new PMTiles(new FileSource(input.files[0])));
   });
   const own = screen.station.status.base_map_url;
-  return el("div", { class: "stack" }, input, own ? button("The station's base map", async () => {
-    const { PMTiles } = await pmtiles();
-    await showBaseMap(screen, new PMTiles(new URL(own, location.href).href));
-  }) : null, button("No base map", () => { if (screen.view) takeOut(screen.view.map); }, { class: "quiet" }));
+  return el("div", { class: "stack" }, input, own ? button("The station's base map", () => showStationMap(screen)) : null, button("No base map", () => { if (screen.view) takeOut(screen.view.map); }, { class: "quiet" }));
+}
+
+/** Show the base map that the station was started with, if any. */
+export async function showStationMap(screen) {
+  const own = screen.station.status.base_map_url;
+  if (!own) return;
+  const { PMTiles } = await pmtiles();
+  await showBaseMap(screen, new PMTiles(new URL(own, location.href).href));
 }
 
 async function showBaseMap(screen, archive) {

@@ -1,6 +1,7 @@
 // The screen of one site: the map in the middle, panels beside it, live events into both.
 
 import { get, siteUrl } from "./api.js";
+import { showStationMap } from "./base_map.js";
 import { choices } from "./choices.js";
 import { el, fill, icon, message } from "./dom.js";
 import { comparePanel } from "./compare.js";
@@ -91,6 +92,7 @@ class SiteScreen {
     const drawn = this.view?.ready.then(() => {
       if (this.closed) return;
       this.view.showVersion(live ? `live-${live}` : versions.at(-1)?.n);
+      showStationMap(this);
       if (this.lastPlace) this.view.go(this.lastPlace, 20.5, true);
     });
     if (!isNew) await this.data.load(["changes", "objects", "track"]);
