@@ -30,6 +30,7 @@ from sorvolo.cli.review import review
 from sorvolo.cli.search import search_command
 from sorvolo.cli.serve import serve, token
 from sorvolo.cli.simulate import simulate
+from sorvolo.cli.site import site_app
 from sorvolo.cli.stream import stream
 from sorvolo.cli.telemetry import telemetry_command
 from sorvolo.cli.train import train
@@ -55,6 +56,7 @@ for _name, _command in _COMMANDS.items():
 app.add_typer(evaluate_app, name="evaluate")
 app.add_typer(measure_app, name="measure")
 app.add_typer(models_app, name="models")
+app.add_typer(site_app, name="site")
 
 
 @dataclass

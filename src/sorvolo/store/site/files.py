@@ -29,7 +29,12 @@ STAGED = "staged"
 JOURNAL = "run.journal"
 """The file of a flight's folder from which a killed run goes on."""
 
-_LOCK = "site.lock"
+LOCK = "site.lock"
+"""Held by the one process that writes."""
+
+COPYING = "copying.json"
+"""In the folder while a copy of a site is made there."""
+
 _MOST_REPORT_BYTES = 256_000_000  # of a report.json: an hour's track takes a hundredth
 
 
@@ -63,8 +68,9 @@ class SiteFiles:
                 raise StoreError(f"no site at {folder}; make one with: sorvolo map INPUT --site {folder}")
             _refuse_traps(folder, skipped=frozenset({"tiles", "keyframes"}))  # those are read link by link
             return cls(folder, Catalogue(path, write=False), None)
+        refuse_unfinished(folder)
         _make_folder(folder)
-        lock = _lock_folder(folder)
+        lock = lock_folder(folder)
         try:
             _refuse_traps(folder)
             if not path.exists():
@@ -199,26 +205,9 @@ class SiteFiles:
         return TileView(self.blobs, hashes(), hashes)
 
 
-def _make_folder(folder: Path) -> None:
-    """Create the folder; refuse one that holds anything but a site (or what a killed creation left)."""
-    try:
-        with writing(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise StoreError(f"{folder} is a file, a folder was needed; choose another name") from error
-    if (folder / CATALOGUE).exists():
-        return
-    names = (path.name for path in folder.iterdir())
-    foreign = sorted(name for name in names if name != _LOCK and not name.startswith(TEMPORARY_PREFIX))
-    if foreign:
-        raise StoreError(
-            f"{folder} is no site: it holds {foreign[0]!r} and no {CATALOGUE}; choose a new or empty folder"
-        )
-
-
-def _lock_folder(folder: Path) -> int:
+def lock_folder(folder: Path) -> int:
     """The right to write, as a file descriptor to close; raises StoreError when another process has it."""
-    path = folder / _LOCK
+    path = folder / LOCK
     if path.is_symlink():
         refuse_links(folder)
     with writing(path):
@@ -229,6 +218,29 @@ def _lock_folder(folder: Path) -> int:
         os.close(lock)
         raise StoreError(f"another process is mapping into {folder}; wait until it has finished") from error
     return lock
+
+
+def refuse_unfinished(folder: Path) -> None:
+    """Raise StoreError for a folder into which a site is being copied."""
+    if (folder / COPYING).is_file():
+        raise StoreError(f"the copy in {folder} is not finished; run the same `sorvolo site copy` again")
+
+
+def _make_folder(folder: Path) -> None:
+    """Create the folder; refuse one that holds anything but a site (or what a killed creation left)."""
+    try:
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise StoreError(f"{folder} is a file, a folder was needed; choose another name") from error
+    if (folder / CATALOGUE).exists():
+        return
+    names = (path.name for path in folder.iterdir())
+    foreign = sorted(name for name in names if name != LOCK and not name.startswith(TEMPORARY_PREFIX))
+    if foreign:
+        raise StoreError(
+            f"{folder} is no site: it holds {foreign[0]!r} and no {CATALOGUE}; choose a new or empty folder"
+        )
 
 
 def _refuse_traps(folder: Path, *, skipped: frozenset[str] = frozenset()) -> None:

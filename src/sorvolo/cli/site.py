@@ -1,0 +1,85 @@
+"""`sorvolo site`: a site copied to another place, and the copy verified."""
+
+import json
+from collections.abc import Generator
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from sorvolo.cli.options import AsJson
+from sorvolo.cli.progress import ProgressReport
+
+if TYPE_CHECKING:
+    from sorvolo.store.copies.transfer import CopyOutcome, CopyUpdate
+
+site_app = typer.Typer(no_args_is_help=True)
+
+_MOST_FAULTS = 20
+
+
+@site_app.callback()
+def site() -> None:
+    """Copy sites to other places, and verify the copies."""
+
+
+@site_app.command("copy")
+def copy_command(
+    source: Annotated[str, typer.Argument(help="Folder of the map.")],
+    target: Annotated[str, typer.Argument(help="A new or empty folder, or that of an earlier copy of this map.")],
+    verify: Annotated[bool, typer.Option("--verify", help="Copy nothing: compare the copy with the map.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Copy a map with all its versions, flights, pictures and findings; a stopped copy goes on where it was.
+
+    Every file is checked by its SHA-256. While a flight is being mapped, the copy is the map as of the last complete
+    flight. The exit code is 1 if a file is missing, damaged or, with --verify, different.
+
+    Example: sorvolo site copy field /media/usb/field
+
+    Example: sorvolo site copy field /media/usb/field --verify
+    """
+    from sorvolo.missions.site.copy import copy_site, verify_copy
+
+    work = verify_copy(source, target) if verify else copy_site(source, target)
+    outcome = _shown(work, "comparing, file" if verify else "copying, file")
+    if as_json:
+        row = asdict(outcome) | {"faults": dict(outcome.faults), "is_whole": not outcome.faults}
+        typer.echo(json.dumps({"source": source, "target": target, **row}, indent=1))
+    else:
+        _print(outcome, target, verified=verify)
+    if outcome.faults:
+        raise typer.Exit(1)
+
+
+def _shown(work: "Generator[CopyUpdate, None, CopyOutcome]", task: str) -> "CopyOutcome":
+    """Do the work with progress on stderr."""
+    with ProgressReport(Console(stderr=True)) as progress:
+        progress.show("looking at both places")
+        while True:
+            try:
+                update = next(work)
+            except StopIteration as end:
+                return end.value
+            words = f"{update.done_bytes / 1e6:,.0f} of {update.bytes / 1e6:,.0f} MB"
+            progress.show(task, update.done, update.files, words)
+
+
+def _print(outcome: "CopyOutcome", target: str, *, verified: bool) -> None:
+    done = "compared" if verified else "copied"
+    typer.echo(
+        f"{target}: {done} {outcome.copied:,} of {outcome.files:,} files ({outcome.copied_bytes / 1e6:,.1f} MB), "
+        f"version {outcome.newest} of the map"
+    )
+    if outcome.left_out:
+        names = ", ".join(outcome.left_out[:_MOST_FAULTS])
+        typer.echo(f"left out, not of the map: {names}{', ...' if len(outcome.left_out) > _MOST_FAULTS else ''}")
+    for path, fault in list(outcome.faults.items())[:_MOST_FAULTS]:
+        typer.echo(f"{path}: {fault}", err=True)
+    if len(outcome.faults) > _MOST_FAULTS:
+        typer.echo(f"and {len(outcome.faults) - _MOST_FAULTS:,} more (--json lists all)", err=True)
+    if not outcome.faults:
+        typer.echo("every file of the copy is the map's" if verified else "the copy is whole")
+    elif not verified:
+        typer.echo("the rest was copied; restore these files of the map from another copy, or map again", err=True)

@@ -1,0 +1,62 @@
+"""A site copied to another place, or compared with its copy there."""
+
+import tempfile
+import warnings
+from collections.abc import Generator
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+from sorvolo.errors import SettingsError, SorvoloWarning, StoreError
+from sorvolo.store.copies.folder import FolderEnd
+from sorvolo.store.copies.transfer import CopyOutcome, CopyUpdate, SiteEnd, copy, verify
+
+_MAY_BE_SHORT = 1.05  # times the need: other programs write to the disk as well
+
+
+def copy_site(source: str, target: str) -> Generator[CopyUpdate, None, CopyOutcome]:
+    """Copy the site at one address to another, yielding how far it is; a copy that was stopped goes on.
+
+    An address is a folder or `file://` with one. Each file is checked by its SHA-256 while it is written. The copy is
+    the site as of its last complete flight, even while another is being mapped into it. Raises SettingsError or
+    StoreError with what to do: where there is no site, where the target holds another one or what the source lacks,
+    where the disk is too full.
+    """
+    ends = _ends(source, target)
+    with tempfile.TemporaryDirectory(prefix="sorvolo-") as scratch:
+        return (yield from copy(*ends, Path(scratch), room=lambda need, free: _check_room(target, need, free)))
+
+
+def verify_copy(source: str, target: str) -> Generator[CopyUpdate, None, CopyOutcome]:
+    """Compare the copy at an address with its site, every file by its SHA-256; neither is written to."""
+    ends = _ends(source, target)
+    with tempfile.TemporaryDirectory(prefix="sorvolo-") as scratch:
+        return (yield from verify(*ends, Path(scratch)))
+
+
+def _ends(source: str, target: str) -> tuple[SiteEnd, SiteEnd]:
+    ends = open_end(source), open_end(target)
+    if isinstance(ends[0], FolderEnd) and isinstance(ends[1], FolderEnd):
+        one, other = ends[0].folder.resolve(), ends[1].folder.resolve()
+        if one.is_relative_to(other) or other.is_relative_to(one):
+            raise SettingsError(f"{target} and {source} are the same folder, or lie in each other; choose another one")
+    return ends
+
+
+def open_end(address: str) -> SiteEnd:
+    """The place that an address names. Raises SettingsError for one that names none."""
+    parts = urlsplit(address)
+    if "://" not in address:
+        return FolderEnd(Path(address))
+    if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path:
+        return FolderEnd(Path(unquote(parts.path)))
+    raise SettingsError(f"{parts.scheme}:// is no place of sites; give a folder, or file:///FOLDER")
+
+
+def _check_room(target: str, need: int, free: int | None) -> None:
+    if free is None or need == 0:
+        return
+    text = f"the disk of {target} has {free / 1e6:,.0f} MB free, and the copy needs {need / 1e6:,.0f} MB more"
+    if free < need:
+        raise StoreError(f"{text}: free some space, or choose another disk")
+    if free < _MAY_BE_SHORT * need:
+        warnings.warn(f"{text}: it may become full", SorvoloWarning, stacklevel=2)

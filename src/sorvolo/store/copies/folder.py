@@ -1,0 +1,285 @@
+"""A site folder as one end of a copy: read while others write it, or filled and kept whole."""
+
+import hashlib
+import json
+import os
+import shutil
+import sqlite3
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from sorvolo.errors import StoreError
+from sorvolo.store.atomic import (
+    TEMPORARY_PREFIX,
+    atomic_path,
+    atomic_write_bytes,
+    remove_leftovers,
+    scratch_folder,
+    sync_file,
+    writing,
+)
+from sorvolo.store.copies.state import (
+    CatalogueState,
+    SiteFile,
+    SiteState,
+    chunks_of,
+    find_state,
+    is_left_out,
+    is_site_path,
+    missing_from,
+    named_files,
+    refuse_damaged,
+    tile_of,
+    tile_path,
+)
+from sorvolo.store.nofollow import open_below, refuse_links
+from sorvolo.store.site import catalogue as records
+from sorvolo.store.site.catalogue import Catalogue
+from sorvolo.store.site.files import CATALOGUE, COPYING, JOURNAL, LOCK, SiteFiles, lock_folder, refuse_unfinished
+
+_OF_THE_CATALOGUE = frozenset({CATALOGUE, f"{CATALOGUE}-wal", f"{CATALOGUE}-shm", LOCK, COPYING})
+
+
+class FolderEnd:
+    """A folder that a site is copied from or to."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @property
+    def name(self) -> str:
+        """The folder, for messages."""
+        return str(self.folder)
+
+    @property
+    def has_site(self) -> bool:
+        """Whether a whole site, or one that is being copied here, is in the folder."""
+        return (self.folder / CATALOGUE).is_file() or (self.folder / COPYING).is_file()
+
+    def state(self, scratch: Path) -> SiteState:
+        """The site as of now, its catalogue in a file in `scratch`. Others may write the site meanwhile.
+
+        Raises StoreError for no site, one without a map, or one that is a copy that is not finished.
+        """
+        refuse_unfinished(self.folder)
+        files = SiteFiles.open(self.folder, write=False)
+        try:
+            path = scratch / CATALOGUE
+            _copy_catalogue(files.catalogue, path)
+        finally:
+            files.close()
+        with closing(Catalogue(path, write=True)) as copied:
+            with copied.changing() as connection:
+                records.drop_unfinished(connection)
+            held = find_state(copied)
+            named = named_files(copied)
+        if held is None:
+            raise StoreError(f"{self.folder} has no map yet: there is nothing to copy; map a flight into it first")
+        listed, left_out = _listed(self.folder, *named)
+        return SiteState(held, path, listed, left_out)
+
+    def is_still(self, state: SiteState, scratch: Path) -> bool:
+        """Whether the site is as it was: what is copied since then belongs together."""
+        with scratch_folder(scratch) as apart:
+            now = self.state(apart)
+        return now.held == state.held and now.files == state.files
+
+    @contextmanager
+    def opened(self, file: SiteFile) -> Iterator[BinaryIO]:
+        """The file's bytes, which stay the same while it is open. Raises FileNotFoundError when it is gone."""
+        with open_below(self.folder, file.path) as stream:
+            yield stream
+
+    @contextmanager
+    def being_filled(self) -> Iterator[None]:
+        """Hold the right to write into the folder, which is made; StoreError for one with anything but a site."""
+        with writing(self.folder):
+            try:
+                self.folder.mkdir(parents=True, exist_ok=True)
+            except FileExistsError as error:
+                raise StoreError(f"{self.folder} is a file, a folder was needed; choose another name") from error
+        refuse_links(self.folder)
+        if not self.has_site and (foreign := sorted(_foreign(self.folder))):
+            raise StoreError(
+                f"{self.folder} is not empty and holds no site (there is {foreign[0]!r}); choose a new or empty "
+                "folder, or that of an earlier copy of this site"
+            )
+        lock = lock_folder(self.folder)
+        try:
+            yield
+        finally:
+            os.close(lock)
+
+    def accept(self, new: SiteState, scratch: Path) -> None:
+        """Prepare to become a copy of the site, inside `being_filled`.
+
+        Raises StoreError where another site is in the folder, or one that holds what the new state lacks.
+        """
+        if (self.folder / COPYING).is_file():
+            refuse_other(self.name, _identity_of(self.folder / COPYING), new.held)
+        if (self.folder / CATALOGUE).is_file():
+            held, files = self._held(scratch)
+            if held is not None:
+                refuse_other(self.name, held.identity, new.held)
+                refuse_loss(self.name, missing_from(held, files, new))
+        self.folder.mkdir(exist_ok=True)
+        note = {"identity": new.held.identity, "newest_version": new.held.newest}
+        atomic_write_bytes(self.folder / COPYING, json.dumps(note).encode())
+        remove_leftovers([self.folder, *(each for each in self.folder.rglob("*") if each.is_dir())])
+
+    def lacks(self, state: SiteState) -> list[SiteFile]:
+        """The files that have yet to be put: not here, or of another size or time."""
+        return [each for each in state.files.values() if not self._has(each)]
+
+    def put(self, file: SiteFile, stream: BinaryIO) -> None:
+        """Write a file whole or not at all. Raises DamagedError for bytes with another SHA-256 than the file's."""
+        path = self.folder / file.path
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as temporary:
+            descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
+            digest = hashlib.sha256()
+            with os.fdopen(descriptor, "wb") as target:
+                for chunk in chunks_of(stream):
+                    digest.update(chunk)
+                    target.write(chunk)
+            refuse_damaged(file, digest.hexdigest())
+            if file.stamp:
+                os.utime(temporary, ns=(file.stamp, file.stamp))
+
+    def conclude(self, state: SiteState) -> None:
+        """Make the folder this state of the site: its catalogue comes last, then what the state has not is removed."""
+        catalogue = self.folder / CATALOGUE
+        if catalogue.is_file():
+            _overwrite_catalogue(catalogue, state.catalogue)
+        else:
+            with atomic_path(catalogue) as temporary, writing(temporary):
+                shutil.copyfile(state.catalogue, temporary)
+        for path in _paths(self.folder):
+            if path not in state.files and (is_site_path(path) or tile_of(path)):
+                (self.folder / path).unlink(missing_ok=True)
+        _remove_empty(self.folder / "flights")
+        (self.folder / COPYING).unlink(missing_ok=True)
+        sync_file(self.folder)
+
+    def free_bytes(self) -> int | None:
+        """Room on the disk."""
+        there = next(each for each in (self.folder.absolute(), *self.folder.absolute().parents) if each.exists())
+        return shutil.disk_usage(there).free
+
+    def _held(self, scratch: Path) -> tuple[CatalogueState | None, Mapping[str, SiteFile]]:
+        """What the folder's catalogue holds (None: no map), unfinished runs apart, and its files."""
+        path = scratch / f"held-{CATALOGUE}"
+        with closing(Catalogue(self.folder / CATALOGUE, write=False)) as catalogue:
+            _copy_catalogue(catalogue, path)
+        with closing(Catalogue(path, write=True)) as copied:
+            with copied.changing() as connection:
+                records.drop_unfinished(connection)
+            return find_state(copied), _listed(self.folder, *named_files(copied))[0]
+
+    def _has(self, file: SiteFile) -> bool:
+        try:
+            about = (self.folder / file.path).lstat()
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        return about.st_size == file.size and (file.is_lasting or (file.stamp != 0 and about.st_mtime_ns == file.stamp))
+
+
+def refuse_other(name: str, identity: str, held: CatalogueState) -> None:
+    """Raise StoreError unless the site at the other end is the same one."""
+    if identity != held.identity:
+        raise StoreError(
+            f"{name} holds another site, not {held.name!r}; nothing was copied. Choose another place, or the one of an "
+            "earlier copy of this site"
+        )
+
+
+def refuse_loss(name: str, lost: str) -> None:
+    """Raise StoreError where anything would be lost by a copy."""
+    if lost:
+        raise StoreError(
+            f"{name} holds what the source of the copy lacks: {lost}. Nothing was copied; copy in the other direction "
+            "first, or to a new place"
+        )
+
+
+def _identity_of(note: Path) -> str:
+    try:
+        return str(json.loads(note.read_bytes())["identity"])
+    except (ValueError, KeyError, TypeError):
+        return ""
+
+
+def _copy_catalogue(catalogue: Catalogue, path: Path) -> None:
+    """One state of an open catalogue as a file of its own, even while others write it."""
+    with writing(path), catalogue.reading() as connection, closing(sqlite3.connect(path)) as copied:
+        driver = connection.connection.driver_connection
+        assert isinstance(driver, sqlite3.Connection)
+        try:
+            driver.backup(copied)
+        except sqlite3.Error as error:
+            raise StoreError(f"cannot write {path} ({error}); free some space and run it again") from error
+
+
+def _overwrite_catalogue(path: Path, new: Path) -> None:
+    """Replace what a catalogue holds, in one transaction: those who read it see the old state or the new one."""
+    try:
+        with closing(sqlite3.connect(new)) as source, closing(sqlite3.connect(path, timeout=30)) as target:
+            source.backup(target)
+            target.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    except sqlite3.Error as error:
+        raise StoreError(f"cannot write {path} ({error}); free some space and run the copy again") from error
+
+
+def _paths(folder: Path) -> Iterator[str]:
+    """Every file below the folder, as a path with slashes; links are not followed."""
+    for root, _, names in os.walk(folder):
+        for name in names:
+            yield Path(root, name).relative_to(folder).as_posix()
+
+
+def _listed(
+    folder: Path, tiles: set[str], keyframes: set[str], owed: set[tuple[str, str]]
+) -> tuple[dict[str, SiteFile], tuple[str, ...]]:
+    """The files that make the state up, those missing of which the catalogue names (as of size 0), and what is none."""
+    lasting = {tile_path(each): each for each in tiles} | dict.fromkeys(keyframes, "")
+    found: dict[str, SiteFile] = {}
+    foreign = []
+    for path in _paths(folder):
+        if path in lasting or (is_site_path(path) and not is_left_out(path, keyframes, owed)):
+            if (file := _file(folder, path, lasting.get(path, ""))) is not None:
+                found[path] = file
+        elif not (path in _OF_THE_CATALOGUE or is_site_path(path) or tile_of(path) or _is_passing(path)):
+            foreign.append(path)
+    for path in lasting.keys() - found.keys():
+        found[path] = SiteFile(path, 0, lasting[path])
+    return found, tuple(sorted(foreign))
+
+
+def _file(folder: Path, path: str, sha256: str) -> SiteFile | None:
+    try:
+        about = (folder / path).lstat()
+    except FileNotFoundError:  # replaced meanwhile
+        return None
+    return SiteFile(path, about.st_size, sha256, 0 if sha256 else about.st_mtime_ns)
+
+
+def _is_passing(path: str) -> bool:
+    """Whether the file is one that only lies there for a while."""
+    parts = path.split("/")
+    return any(each.startswith(TEMPORARY_PREFIX) for each in parts) or parts[-1] in ("live.png", JOURNAL)
+
+
+def _foreign(folder: Path) -> Iterator[str]:
+    for path in folder.iterdir():
+        if path.name != LOCK and not path.name.startswith(TEMPORARY_PREFIX):
+            yield path.name
+
+
+def _remove_empty(folder: Path) -> None:
+    """Remove folders that hold nothing any more."""
+    for root, _, _ in os.walk(folder, topdown=False):
+        if not any(os.scandir(root)):
+            os.rmdir(root)
