@@ -12,7 +12,7 @@ from sorvolo.capture.source import open_sources
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.survey.flight import Frame
-from sorvolo.survey.objects import CLASSES, Detections
+from sorvolo.survey.objects import CLASSES, Detections, no_detections
 
 
 class TruthDetector:
@@ -55,7 +55,9 @@ class TruthDetector:
         self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None,
     ) -> Detections:
-        """The boxes of a frame of the flight; KeyError for any other picture."""
+        """The boxes of a frame of the flight; KeyError for any other picture, nothing in one without tiles: a part."""
+        if tiles is None:
+            return no_detections(CLASSES)
         self.asked += 1
         index, objects = self._frames[_digest(image)]
         random = np.random.default_rng([self._seed, index])

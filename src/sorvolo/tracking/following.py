@@ -14,6 +14,7 @@ from sorvolo.survey.objects import Detections, Sighting, Track
 from sorvolo.tracking.heading import CompassError, HeadingFromMotion
 from sorvolo.tracking.image_motion import ImageMotion
 from sorvolo.tracking.locate import IMPOSSIBLE_SIZE, GroundHeight, LocateSettings, locate
+from sorvolo.tracking.scene_scale import SceneScale
 from sorvolo.tracking.tracker import IN_PICTURES, Tracker, TrackerSettings, TrackUpdate
 
 _MOST_DRONE_PLACES = 200_000
@@ -156,14 +157,15 @@ class _HeadingFromPictures:
 class PictureFollower:
     """Detections of a flight that nothing places, tracked in the first frame's pixels; after a cut all begins anew.
 
-    `segment` counts the stretches between cuts, from 1.
+    `segment` counts the stretches between cuts, from 1, `impossible_size` the detections that are far too small or far
+    too large for their class beside the scene's cars: they are in no track.
     """
 
     def __init__(self, sure_score: float) -> None:
         self._settings = replace(IN_PICTURES, sure_score=sure_score)
         self._motion, self._tracker = ImageMotion(), Tracker(self._settings)
-        self._earlier = list[Track]()
-        self.segment = 1
+        self._earlier, self._scene = list[Track](), SceneScale()
+        self.segment, self.impossible_size = 1, 0
 
     @property
     def guessed(self) -> int:
@@ -172,13 +174,20 @@ class PictureFollower:
 
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
         """Take the camera's motion out of a frame's detections and give them to their tracks."""
+        size_px = frame.image.shape[:2]
+        self._scene.see(found, size_px)
+        is_impossible = self._scene.impossible(found, size_px)
+        self.impossible_size += int(is_impossible.sum())
         sightings, outline = self._motion.locate(found, frame, time_ns)
         if self._motion.segments != self.segment:
             self.segment = self._motion.segments
             self._earlier += self._tracker.finish()
             self._tracker = Tracker(self._settings, first_id=self._tracker.next_id)
-        update = self._tracker.update(sightings, time_ns=time_ns, footprint_m=outline)
-        return replace(_taken(sightings, update), segment=self.segment)
+        kept = [None if out else each for each, out in zip(sightings, is_impossible)]
+        update = self._tracker.update(
+            [each for each in kept if each is not None], time_ns=time_ns, footprint_m=outline
+        )
+        return replace(_taken(kept, update), segment=self.segment)
 
     def tracks(self) -> Sequence[Track]:
         """All tracks as they are known now."""

@@ -10,6 +10,7 @@ from sorvolo.geometry.arrays import Floats
 from sorvolo.survey.map_objects import MapObject
 from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.tracking.laying import LaidSighting
+from sorvolo.tracking.scene_scale import impossible_beside_cars
 from sorvolo.tracking.standing import Standing, fuse
 
 
@@ -25,7 +26,17 @@ def objects_on_map(
     laid: Sequence[LaidSighting], crops: Sequence[bytes], frames: Sequence[PlacedFrame], flight_id: str, *,
     has_metres: bool,
 ) -> ObjectsOnMap:
-    """Each object once. `crops` are the pictures, JPEG, around each sighting; sizes are left out without metres."""
+    """Each object once. `crops` are the pictures, JPEG, around each sighting.
+
+    Without metres sizes are left out, and so are sightings of a size that their class cannot have beside the cars.
+    """
+    if not has_metres and laid:
+        sides = np.array([each.sides_m for each in laid])
+        out = impossible_beside_cars(
+            [each.sighting.label for each in laid], sides, np.array([each.is_cut for each in laid])
+        )
+        kept = np.flatnonzero(~out).tolist()
+        laid, crops = [laid[k] for k in kept], [crops[k] for k in kept]
     fused = fuse(laid, frames)
     flight_sigma_m = _gps_sigma_m(frames)
     sigmas_m = {each.index: each.sigma_m if math.isfinite(each.sigma_m) else flight_sigma_m for each in frames}

@@ -167,8 +167,8 @@ class ImagePlaces:
 
     @property
     def set_aside(self) -> int:
-        """None: without metres nothing is too short."""
-        return 0
+        """Those beside the scene's cars; none where too few cars show its scale."""
+        return self._follower.impossible_size
 
     def view(self, frame: Frame) -> FrameView | None:
         """Nothing is known of the ground."""
@@ -194,6 +194,9 @@ class ImagePlaces:
         if guessed:
             words = f"{counted(guessed, 'frame')} without a motion that fits: the last motion was continued"
             others.append(Notice("motion_guessed", guessed, words))
+        if self.set_aside:
+            words = f"{counted(self.set_aside, 'detection')} left out: {IMPOSSIBLE_SIZE}, beside the scene's cars"
+            others.append(Notice("too_short", self.set_aside, words))
         if cuts:
             words = f"the picture changed all at once {counted(cuts, 'time')}: objects are counted anew after each cut"
             others.append(Notice("scene_cuts", cuts, words))

@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from sorvolo.capture.sync import DATED_NS
+from sorvolo.detection.scene import SceneMagnifier
 from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
@@ -71,6 +72,8 @@ class WatchRun:
     ) -> None:
         self._setup, self._places, self._detector = setup, places, detector
         self._settings, self._outputs, self._folder = settings, outputs, folder
+        self._classes = settings.classes or detector.info.usual_classes
+        self._magnifier = SceneMagnifier(detector.info, self._classes)
         self.log = WatchLog()
         self._stack = ExitStack()
         self._files = self._stack.enter_context(WatchFiles(folder, outputs, places.site))
@@ -85,6 +88,20 @@ class WatchRun:
     ) -> None:
         self._stack.close()
 
+    def _searched(self, frame: Frame) -> Detections:
+        """What the detector finds in a frame; where nothing places the flight, at the scale that its scene shows."""
+        settings, classes = self._settings, self._classes
+        magnifier = self._magnifier if settings.tiles == "auto" and self._places.site.is_local else None
+        m_per_px = self._places.m_per_px(frame)
+        if magnifier is not None:
+            m_per_px = magnifier.m_per_px(frame.image, lambda part: self._detector.detect(part, classes=classes))
+        found = self._detector.detect(
+            frame.image, tiles=settings.tiles, m_per_px=m_per_px, least_score=settings.least_score, classes=classes
+        )
+        if magnifier is not None:
+            magnifier.see(found, frame.image)
+        return found
+
     def lose(self, lost: LostFrame) -> None:
         """A frame that cannot be used."""
         self.log.read = lost.index + 1
@@ -92,14 +109,11 @@ class WatchRun:
 
     def add(self, frame: Frame, arrived_s: float) -> WatchUpdate:
         """Search one frame, whose turn came at `arrived_s` of the monotonic clock, and take in what it shows."""
-        log, settings = self.log, self._settings
+        log = self.log
         log.read = frame.index + 1
         time_ns = self._utc_ns(frame)
         with log.stage("detect"):
-            found = self._detector.detect(
-                frame.image, tiles=settings.tiles, m_per_px=self._places.m_per_px(frame),
-                least_score=settings.least_score, classes=settings.classes or self._detector.info.usual_classes,
-            )
+            found = self._searched(frame)
         with log.stage("track"):
             taken = self._places.take(frame, time_ns, found)
         sighted = [each for each in taken.sightings if each is not None]
