@@ -1,6 +1,7 @@
 """What a station refuses from a drone: wrong first words, bytes of something else, too much, times that cannot be."""
 
 import asyncio
+import time
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sorvolo.station.ingest import BUSY_CODE, REFUSED_CODE, Ingest, IngestLimits, LinkClosed
-from sorvolo.station.messages import Hello, Kind, Message
+from sorvolo.station.messages import Hello, Kind, Message, Sample
 from sorvolo.station.video import VideoHub
 
 HELLO = Message(Kind.HELLO, 0, 0, Hello("a" * 16, "h264", 160, 120, 10.0).to_json().encode()).to_bytes()
@@ -70,6 +71,36 @@ def test_what_may_pass_later_is_not_refused_for_good(tmp_path: Path) -> None:
     assert drone.closed is not None and drone.closed[0] == BUSY_CODE and "disk is full" in drone.closed[1]
     drone = served(tmp_path / "streams", HELLO, limits=IngestLimits(streams=0, free_bytes=0))
     assert drone.closed is not None and drone.closed[0] == BUSY_CODE
+
+
+def test_a_stream_that_falls_silent_after_its_hello_is_free_for_the_drone_s_next_link(tmp_path: Path) -> None:
+    """It is listed as not connected, its flight is not over, and goes on."""
+    states: list[bool] = []
+    limits = IngestLimits(free_bytes=0, silent_s=0.05)
+    ingest = Ingest(tmp_path, limits, lambda _, state: states.append(state["is_connected"]))
+
+    async def fly() -> tuple[Drone, Drone]:
+        silent, back = Drone(HELLO, waits=True), Drone(HELLO, picture())
+        await ingest.serve("drone", silent)
+        assert ingest.state("drone")["is_connected"] is False
+        await ingest.serve("drone", back)
+        return silent, back
+
+    silent, back = asyncio.run(fly())
+    assert silent.closed is not None and silent.closed[0] == BUSY_CODE and back.closed is None
+    assert states == [True, False, True, False]
+    state = ingest.state("drone")
+    assert state["frames"] == 1 and [each["is_over"] for each in state["flights"]] == [False]
+
+
+@pytest.mark.parametrize(("seconds", "is_known"), [(0, True), (-50, True), (-3600, False), (3600, False)])
+def test_the_delay_of_pictures_is_stated_where_the_clocks_agree(tmp_path: Path, seconds: int, is_known: bool) -> None:
+    """Clocks apart, or a recorded flight: no page is given the flight's zero to count from."""
+    ingest = Ingest(tmp_path, IngestLimits(free_bytes=0))
+    sample = Sample(time.time_ns() + seconds * 1_000_000_000, {"latitude_deg": 46.0})
+    stated = Message(Kind.TELEMETRY, 1, 2_000_000, sample.to_json().encode()).to_bytes()
+    asyncio.run(ingest.serve("drone", Drone(HELLO, stated)))
+    assert ingest.hub("drone").epoch_us == (sample.time_ns // 1000 - 2_000_000 if is_known else None)
 
 
 def test_names_that_were_asked_for_once_are_forgotten(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import re
 import shutil
 import struct
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -193,6 +194,14 @@ def test_a_flight_is_followed_live(served: Served, opened: Watched) -> None:
         "status": "vision", "footprint": ring, "position": [lon, lat], "height_m": 40, "heading_deg": 10,
         "time": "2024-05-01T10:00:00Z",
     })
+    latency = page.locator(".figure", has_text="latency")
+    for seconds, words in ((-86400, "–"), (-3, r"^3[\d.]* s$"), (300, "–"), (0.1, r"^[01][\d.]* s$")):
+        time = datetime.now(UTC) + timedelta(seconds=seconds)  # of the picture; ahead: the clocks are apart
+        announce(served, "frame.placed", {
+            "status": "vision", "footprint": ring, "position": [lon, lat], "height_m": 40, "heading_deg": 10,
+            "time": time.isoformat(),
+        })
+        expect(latency.locator("b")).to_have_text(re.compile(words))
     announce(served, "run.progress", {"frames": 9, "selected": 5, "matched": 3, "frames_per_second": 7.5})
     page.locator(".figure", has_text="frames/s").get_by_text("7.5").wait_for()
     page.locator(".figure", has_text="rejected").get_by_text("2").wait_for()

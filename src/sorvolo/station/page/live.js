@@ -10,6 +10,7 @@ import * as words from "./words.js";
 const STATUS_MS = 10000;
 const RATE_WINDOW_MS = 10000;
 const PLACED_FOR_MS = 3000; // a frame's place counts for so long before telemetry alone is shown
+const CLOCKS_AGREE_S = 0.5;
 const LONGEST_DELAY_S = 600; // more is a recording, or a clock that is wrong
 
 /** Follow the site's live events; `show` draws the figures anew, `close` ends it. */
@@ -65,7 +66,8 @@ class Live {
     this.places.push(Date.now());
     this.statuses[data.status] = (this.statuses[data.status] ?? 0) + 1;
     const delay_s = (new Date(event.at) - new Date(data.time)) / 1000;
-    this.delay_s = Math.abs(delay_s) < LONGEST_DELAY_S ? delay_s : undefined; // a recorded flight has none
+    // a recorded flight has none, and a drone whose clock is ahead of the station's has none that is known
+    this.delay_s = delay_s > -CLOCKS_AGREE_S && delay_s < LONGEST_DELAY_S ? Math.max(0, delay_s) : undefined;
     this.last = data;
     if (position) this.trail.push(position.slice(0, 2));
     const { view, data: site } = this.screen;

@@ -8,6 +8,7 @@ import { number, percent } from "./words.js";
 
 const BOXES_WITHIN_US = 250000; // boxes further from a picture than this are not its own
 const KEPT_BOXES = 300;
+const CLOCKS_AGREE_S = 0.5;
 const OLD_BOXES_US = 4000000; // a slow detector's last boxes are shown, faintly, for so long
 const MOST_HELD_S = 4;
 const STAMP_BYTES = 8;
@@ -140,8 +141,10 @@ class VideoPane {
   shown(pts_us) {
     this.now_us = pts_us;
     this.drawBoxes(pts_us);
-    const behind_s = this.epoch_us !== undefined ? (Date.now() * 1000 - this.epoch_us - pts_us) / 1e6
-      : this.newest ? (this.newest.pts_us - pts_us) / 1e6 + (performance.now() - this.newest.at) / 1000 : null;
+    const here_s = this.newest ? (this.newest.pts_us - pts_us) / 1e6 + (performance.now() - this.newest.at) / 1000 : null;
+    const whole_s = this.epoch_us !== undefined ? (Date.now() * 1000 - this.epoch_us - pts_us) / 1e6 : null;
+    // a picture that left the drone after it came here: the two clocks disagree
+    const behind_s = whole_s === null || whole_s < (here_s ?? 0) - CLOCKS_AGREE_S ? here_s : whole_s;
     if (behind_s !== null) fill(this.delay, `${number(Math.max(0, behind_s), 2)} s behind`);
   }
 
