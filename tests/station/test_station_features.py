@@ -3,14 +3,18 @@
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from fake_flights import frame, image, tile
 from starlette.testclient import TestClient
 
 from sorvolo.station import crops
 from sorvolo.station.features import crop_addresses
+from sorvolo.store.site.archive import Archive
+from sorvolo.survey.findings import Verdict
 
 ITEMS = "/api/sites/field/collections/{}/items"
 
@@ -37,6 +41,24 @@ def test_a_client_finds_its_way_from_the_landing_page(client: TestClient) -> Non
     items = next(each["href"] for each in found[0]["links"] if each["rel"] == "items")
     assert client.get(items).json()["numberMatched"] == 8
     assert client.get(items.replace("/items", "")).json()["id"] == "frames"
+
+
+def test_a_map_that_grows_leaves_its_collections_as_they_are(client: TestClient, root: Path) -> None:
+    """Twice a second all of them were made anew; a flight that is complete, and a verdict, do change them."""
+    kept = client.app.state.station.collections  # type: ignore[attr-defined]
+    before = {name: kept.get("field", name) for name in ("frames", "changes")}
+    with Archive.open(root / "field", write=True) as archive:
+        with archive.begin_flight("c", "c", {}) as writer:
+            for column in range(3):
+                writer.tiles[column, 0] = tile(50 * column)
+                writer.flush()
+                assert all(kept.get("field", name) is made for name, made in before.items())
+            writer.commit([frame(0)], {0: writer.save_image(0, image(0))}, {}, "")
+        assert kept.get("field", "frames") is not before["frames"]
+        assert kept.get("field", "changes") is not before["changes"]
+        changes = kept.get("field", "changes")
+        archive.review("b-1", Verdict.CONFIRMED)
+    assert kept.get("field", "changes") is not changes
 
 
 def test_pages_hold_every_feature_once(client: TestClient) -> None:

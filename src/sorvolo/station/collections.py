@@ -34,6 +34,7 @@ TITLES: Mapping[str, str] = {
 SEARCH_FOLDER = "search"
 """The folder of a site in which the station keeps its latest measured search."""
 
+_POD_FILE = f"{SEARCH_FOLDER}/pod.geojson"
 _MOST_BYTES = 256_000_000
 
 Feature = dict[str, Any]
@@ -66,12 +67,24 @@ class Collection:
         return sorted(int(each) for each in self.tree.query(box(*bbox), predicate="intersects"))
 
 
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """A collection with the state of the site's catalogue, and of what collections hold, that it was made of."""
+
+    mark: object
+    content: object
+    collection: Collection
+
+
 class SiteCollections:
-    """The collections of all sites, made when asked for and kept until the site changes. Threads may share it."""
+    """The collections of all sites, made when asked for and kept until their content changes. Threads may share it.
+
+    A flight that is being mapped changes the site's catalogue twice a second, and none of its collections.
+    """
 
     def __init__(self, shelf: SiteShelf) -> None:
         self._shelf = shelf
-        self._kept: dict[tuple[str, str], tuple[object, Collection]] = {}
+        self._kept: dict[tuple[str, str], _Kept] = {}
         self._lock = threading.Lock()
 
     def get(self, site_id: str, name: str) -> Collection:
@@ -79,14 +92,18 @@ class SiteCollections:
         if name not in _MAKERS:
             raise Problem(404, f"no collection {name[:40]!r}; there are {', '.join(_MAKERS)}")
         archive = self._shelf.open(site_id)
-        mark = (archive.change_mark(), _search_mark(archive))
+        mark = (archive.change_mark(), _modified(archive, _POD_FILE))
         with self._lock:
             known = self._kept.get((site_id, name))
-        if known is not None and known[0] == mark:
-            return known[1]
-        made = Collection.of(_MAKERS[name](archive) if archive.has_site else [])
+        if known is not None and known.mark == mark:
+            return known.collection
+        content = _content(archive)
+        if known is not None and known.content == content:
+            made = known.collection
+        else:
+            made = Collection.of(_MAKERS[name](archive) if archive.has_site else [])
         with self._lock:
-            self._kept[site_id, name] = (mark, made)
+            self._kept[site_id, name] = _Kept(mark, content, made)
         return made
 
 
@@ -219,8 +236,26 @@ def _camera_on_earth(values: Mapping[str, Any], site: Site) -> dict[str, Any]:
     return {"camera_longitude_deg": float(longitudes[0]), "camera_latitude_deg": float(latitudes[0])}
 
 
-def _search_mark(archive: Archive) -> int:
+def _content(archive: Archive) -> object:
+    """What changes whenever a collection of the site may: its flights with their files, versions, verdicts, search."""
+    if not archive.has_site:
+        return None
+    is_local = archive.site().is_local
+    files = [features_name(name, is_local=is_local) for name in ("frames", COVERAGE)]
+    flights = [each for each in archive.flights() if each.status == "complete"]
+    return (
+        archive.created_utc,
+        [(each.id, each.started_utc, each.finished_utc) for each in flights],
+        [_modified(archive, f"flights/{each.id}/{file}") for each in flights for file in files],
+        [each.id for each in archive.versions() if each.complete],
+        [(each.change_id, each.verdict, each.at_utc, each.note) for each in archive.reviews()],
+        _modified(archive, _POD_FILE),
+    )
+
+
+def _modified(archive: Archive, file: str) -> int:
+    """When a file of the site was written last, ns; 0 where there is none."""
     try:
-        return (archive.folder / SEARCH_FOLDER / "pod.geojson").stat().st_mtime_ns
+        return (archive.folder / file).stat().st_mtime_ns
     except OSError:
         return 0

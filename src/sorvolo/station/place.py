@@ -1,6 +1,7 @@
 """The memory of a place: every flight and second that saw it, in order, with pictures and what was found there."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 from urllib.parse import quote
@@ -48,7 +49,10 @@ def place_routes(
             each for flight in dict.fromkeys(frames.features[each]["properties"]["flight"] for each in seen)
             for each in _best(frames, seen, flight, Point(lon, lat), kept)[:most_per_flight]
         ]
-        rows = [_row(site, each, archive, place_m, kept, videos, found) for each in chosen]
+        flights = dict.fromkeys(str(each["properties"]["flight"]) for each in chosen)
+        films = {flight: _film(archive, flight, videos) for flight in flights}
+        base = f"/api/sites/{quote(site, safe=':')}"
+        rows = [_row(base, each, place_m, kept, films[each["properties"]["flight"]], found) for each in chosen]
         return sorted(rows, key=lambda each: (str(each["time"]), each["frame_id"]))
 
     return router
@@ -96,27 +100,36 @@ def _best(
     return [frames.features[each] for each in sorted(own, key=rank)]
 
 
+@dataclass(frozen=True)
+class _Film:
+    """Whether a flight's video is there, and when it began as the flight's report has it."""
+
+    is_there: bool
+    began: Any
+
+
+def _film(archive: Archive, flight: str, videos: FlightVideos) -> _Film:
+    is_there = videos.find(archive, flight) is not None
+    return _Film(is_there, archive.report(flight).get("flown") if is_there else None)
+
+
 def _row(
-    site_id: str, frame: Feature, archive: Archive, place_m: PointsM, kept: set[tuple[str, int]],
-    videos: FlightVideos, found: Mapping[str, list[dict[str, Any]]],
+    base: str, frame: Feature, place_m: PointsM, kept: set[tuple[str, int]], film: _Film,
+    found: Mapping[str, list[dict[str, Any]]],
 ) -> dict[str, Any]:
+    """A frame that shows the place; `base` is the site's address."""
     values = frame["properties"]
     flight, name = values["flight"], values.get("frame")
-    video = videos.find(archive, flight)
-    seconds = _seconds(values.get("time"), archive.report(flight).get("flown")) if video is not None else None
+    seconds = _seconds(values.get("time"), film.began) if film.is_there else None
+    here, named = found.get(flight, []), quote(flight, safe="")
+    source = "frame" if (flight, name) in kept else "video" if seconds is not None and isinstance(name, int) else ""
     east_mm, north_mm = (round(1000 * float(each)) for each in place_m)
-    base, named, crop = f"/api/sites/{quote(site_id, safe=':')}", quote(flight, safe=""), None
-    if (flight, name) in kept:
-        crop = f"{base}/crops/frame/{named}/{name}/{east_mm}/{north_mm}.jpg"
-    elif seconds is not None and isinstance(name, int):
-        crop = f"{base}/crops/video/{named}/{name}/{east_mm}/{north_mm}.jpg"
-    here = found.get(flight, [])
+    crop = f"{base}/crops/{source}/{named}/{name}/{east_mm}/{north_mm}.jpg"
     return {
-        "flight": flight, "time": values.get("time"), "frame_id": frame["id"], "crop_url": crop, "video_s": seconds,
-        "video_url": None if video is None else f"{base}/flights/{named}/video",
+        "flight": flight, "time": values.get("time"), "frame_id": frame["id"], "crop_url": crop if source else None,
+        "video_s": seconds, "video_url": f"{base}/flights/{named}/video" if film.is_there else None,
         "height_m": values.get("height_above_ground_m"), "sigma_m": values.get("sigma_m"),
-        "changes": [each for each in here if each["type"] == "change"],
-        "objects": [each for each in here if each["type"] == "object"],
+        **{f"{kind}s": [each for each in here if each["type"] == kind] for kind in ("change", "object")},
         "reviews": [each["review"] | {"id": each["id"]} for each in here if each["review"] is not None],
     }
 
