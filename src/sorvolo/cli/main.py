@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 import typer
 
 from sorvolo import __version__
+from sorvolo.cli.batch import batch
 from sorvolo.cli.calibrate import calibrate
 from sorvolo.cli.compare import compare
 from sorvolo.cli.demo import demo
@@ -44,7 +45,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "inspect": inspect, "plan": plan, "map": map_command, "compare": compare, "watch": watch_command,
     "search": search_command, "telemetry": telemetry_command, "simulate": simulate, "train": train,
     "calibrate": calibrate, "demo": demo, "history": history, "review": review,
-    "heights": heights, "serve": serve, "stream": stream, "token": token,
+    "heights": heights, "serve": serve, "stream": stream, "token": token, "batch": batch,
 }
 _FAILED, _STOPPED = 1, 130
 _FULL = (errno.ENOSPC, errno.EDQUOT)

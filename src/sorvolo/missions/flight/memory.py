@@ -16,13 +16,14 @@ def memory_budget_bytes(memory_mb: float | None) -> int:
     Raises SettingsError when it is too small to work with.
     """
     if memory_mb is None:
-        return int(_SHARE * _available_bytes())
+        return int(_SHARE * available_bytes())
     if not memory_mb >= _LEAST_MB:
         raise SettingsError(f"--memory must be at least {_LEAST_MB} MB, got {memory_mb:g}")
     return int(memory_mb * 1e6)
 
 
-def _available_bytes() -> int:
+def available_bytes() -> int:
+    """The machine's memory, or the container's limit."""
     machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     try:
         limit = _CGROUP_LIMIT.read_text().strip()

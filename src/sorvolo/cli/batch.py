@@ -1,0 +1,208 @@
+"""`sorvolo batch`: a mission over folders of flights, on this machine or on a cluster."""
+
+import json
+from collections.abc import Callable, Generator, Iterator
+from contextlib import AbstractContextManager, closing
+from dataclasses import asdict
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from sorvolo.cli.map import TO_CHECK
+from sorvolo.cli.options import AsJson, Camera
+from sorvolo.cli.progress import ProgressReport
+from sorvolo.cli.shown import show_path
+from sorvolo.errors import SettingsError
+from sorvolo.survey.wording import counted
+
+if TYPE_CHECKING:
+    from sorvolo.cluster.batch import BatchReport, BatchSettings, BatchUpdate, Executor
+    from sorvolo.cluster.table import BatchTable, Row
+
+_FAILED = 1
+_MOST_ROWS = 40
+_COLOURS = {"done": "green", "known": "green", "doubtful": "yellow", "duplicate": "blue"}
+
+
+class MissionName(StrEnum):
+    """What is done with each flight: the names of `cluster.orders.Mission`."""
+
+    MAP = "map"
+    COMPARE = "compare"
+    SEARCH = "search"
+
+
+class SiteByName(StrEnum):
+    """What makes flights belong to one site: the names of `cluster.sites.SiteBy`."""
+
+    FLIGHT = "flight"
+    PLACE = "place"
+
+
+Places = Annotated[list[Path], typer.Argument(help="Folders with flights: videos and folders of photos, however deep.")]
+Root = Annotated[Path, typer.Option(help="Folder for the maps, one folder for each site.")]
+MissionOption = Annotated[MissionName, typer.Option(help="What to do with each flight.")]
+SiteByOption = Annotated[
+    SiteByName | None,
+    typer.Option(
+        help="flight: each flight has a site of its own. place: flights near each other share one.",
+        show_default="flight; place for compare",
+    ),
+]
+ExecutorName = Annotated[
+    str,
+    typer.Option(help="local: this machine. ray://HOST:PORT: a Ray cluster. ray: this machine's Ray, or a new one."),
+]
+Workers = Annotated[
+    int | None, typer.Option(help="Flights at once, at most.", show_default="one for each core")
+]
+Resolution = Annotated[
+    float | None, typer.Option(help="Ground resolution of new maps, m a pixel. Without it: the frames' own.")
+]
+Model = Annotated[
+    str, typer.Option(help="Detector for people, cars and small objects: a model's name, a file, or none.")
+]
+Tries = Annotated[int, typer.Option(help="Set a flight aside when it ended its process so many times.")]
+Stall = Annotated[float, typer.Option(help="End a process that neither answers nor computes for so many seconds.")]
+Retry = Annotated[bool, typer.Option("--retry", help="Also try flights again that were set aside.")]
+
+
+def batch(
+    context: typer.Context,
+    places: Places,
+    root: Root,
+    mission: MissionOption = MissionName.MAP,
+    site_by: SiteByOption = None,
+    executor: ExecutorName = "local",
+    workers: Workers = None,
+    camera: Camera = "",
+    gsd: Resolution = None,
+    model: Model = "default",
+    tries: Tries = 3,
+    stall: Stall = 300.0,
+    retry: Retry = False,
+    as_json: AsJson = False,
+) -> None:
+    """Map, compare or search many flights. Stopped or killed at any moment, the same command goes on.
+
+    A flight whose process dies is tried again; one that cannot be used, or that ends its process each time, is named.
+    ROOT/batch.jsonl holds what became of each. Ends with exit code 1 where a flight failed or was set aside, with 3
+    where a result is to be checked before use.
+
+    Example: sorvolo batch flights/ --root maps
+
+    Example: sorvolo batch monday/ tuesday/ --root maps --mission compare
+
+    Example: sorvolo batch /mnt/shared/flights --root /mnt/shared/maps --executor ray://head:10001
+    """
+    from sorvolo.cluster.batch import BatchSettings, run_batch
+    from sorvolo.cluster.orders import FlightWish, Mission
+    from sorvolo.cluster.sites import SiteBy
+
+    context.obj.stop_words = f"stopped; the same command goes on: {root} holds what was done"
+    by = site_by or (SiteByName.PLACE if mission is MissionName.COMPARE else SiteByName.FLIGHT)
+    wish = FlightWish(Mission(mission.value), _absolute(camera), _absolute(model), gsd)
+    settings = BatchSettings(wish, SiteBy(by.value), tries, stall, retry)
+    running = run_batch(places, root, settings, _executor_of(executor, workers, settings))
+    # closed even when the bar is stopped: then the workers are ended
+    with closing(running):
+        report = _show_progress(running, Console(stderr=True))
+    if as_json:
+        typer.echo(json.dumps(_plain(report, root), indent=1))
+    else:
+        _show(report, root, Console())
+    counts = report.counts()
+    if counts.get("failed") or counts.get("set aside"):
+        raise typer.Exit(_FAILED)
+    if counts.get("doubtful"):
+        raise typer.Exit(TO_CHECK)
+
+
+def _absolute(name: str) -> str:
+    """The whole path of a file that is there; any other name as it is."""
+    return str(Path(name).resolve()) if name and Path(name).is_file() else name
+
+
+def _executor_of(
+    name: str, workers: int | None, settings: "BatchSettings"
+) -> "Callable[[BatchTable], AbstractContextManager[Executor]]":
+    from sorvolo.cluster.local_executor import LocalExecutor, default_workers
+
+    if workers is not None and workers < 1:
+        raise SettingsError(f"--workers {workers}: at least 1 is needed")
+    if name == "local":
+        count = workers or default_workers()
+        return lambda table: LocalExecutor(count, settings.stall_s, table.lock)
+    raise SettingsError(f"--executor {name}: give local, ray, or ray://HOST:PORT")
+
+
+def _show_progress(running: "Generator[BatchUpdate, None, BatchReport]", console: Console) -> "BatchReport":
+    report: list[BatchReport] = []
+
+    def noted() -> "Iterator[BatchUpdate]":
+        report.append((yield from running))
+
+    with ProgressReport(console) as progress:
+        for update in noted():
+            if update.row is not None:
+                _show_row(update.row, update.is_known, console)
+            words = f"at {', '.join(update.running[:4])}" if update.running else ""
+            progress.show(update.task, update.done, update.total, words)
+    return report[0]
+
+
+def _show_row(row: "Row", is_known: bool, console: Console) -> None:
+    state = _state(row, is_known)
+    words = f"try {row.tries} failed: {row.words}" if row.state == "waiting" else row.words
+    colour = _COLOURS.get(state, "red")
+    console.print(
+        f"[{colour}]{state:>9}[/{colour}]  {escape(row.source)}: {escape(words)}", highlight=False, soft_wrap=True
+    )
+
+
+def _state(row: "Row", is_known: bool) -> str:
+    if row.state == "waiting":
+        return "again"
+    return "known" if is_known and row.state == "done" else row.state.value
+
+
+def _plain(report: "BatchReport", root: Path) -> dict[str, Any]:
+    rows = [{**asdict(row), "is_known": row.key in report.known} for row in report.rows]
+    return {
+        "root": str(root), "counts": report.counts(), "seconds": report.seconds,
+        "cpu_s": round(sum(row.cpu_s for row in report.rows if row.key not in report.known), 3), "tries": report.tries,
+        "crashes": report.crashes, "flights": rows,
+    }
+
+
+def _show(report: "BatchReport", root: Path, console: Console) -> None:
+    from sorvolo.cluster.table import TABLE
+
+    ended = ", ".join(f"{count:,} {name}" for name, count in report.counts().items())
+    console.print(f"{counted(len(report.rows), 'flight')}: {ended}", style="bold", highlight=False)
+    rows = report.rows
+    if len(rows) > _MOST_ROWS:
+        rows = tuple(row for row in rows if row.state != "done")
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in ("flight", "site", "state", "tries", "s", "CPU s", "MB", ""):
+        table.add_column(name, justify="right" if name in ("tries", "s", "CPU s", "MB") else "left", overflow="fold")
+    for row in rows[:_MOST_ROWS]:
+        state = _state(row, row.key in report.known)
+        table.add_row(
+            escape(Path(row.source).name), escape(row.site), f"[{_COLOURS.get(state, 'red')}]{state}", str(row.tries),
+            f"{row.seconds:.1f}", f"{row.cpu_s:.1f}", f"{row.peak_memory_mb:.0f}", escape(row.words),
+        )
+    if rows:
+        console.print(table)
+    if len(rows) > _MOST_ROWS:
+        console.print(f"and {len(rows) - _MOST_ROWS:,} more", highlight=False)
+    console.print(
+        f"tries: {report.tries}, of which {report.crashes} ended their process; {report.seconds:.1f} s", highlight=False
+    )
+    show_path("table", root / TABLE, console)

@@ -1,0 +1,332 @@
+"""A mission over many flights: each is one retried task; a table holds what became of it, whatever is killed when."""
+
+import hashlib
+import time
+from collections import Counter
+from collections.abc import Callable, Generator, Mapping, Sequence, Set
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol, TypeGuard
+
+import sorvolo
+from sorvolo.cluster.cost import Cost, cost_of
+from sorvolo.cluster.orders import Ending, FlightWish, Order, Outcome, Scouted
+from sorvolo.cluster.scout import FoundFlight, Unreadable, find_flights, scout
+from sorvolo.cluster.sites import Placed, SiteBy, existing_site, existing_sites, sites_of
+from sorvolo.cluster.table import FINAL, BatchTable, Row, State
+from sorvolo.detection.models import find_model
+from sorvolo.errors import SettingsError
+from sorvolo.missions.flight.map_objects import DEFAULT_MODEL, NO_MODEL
+from sorvolo.missions.flight.report import software
+from sorvolo.missions.flight.settings import MapSettings
+
+Key = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class BatchSettings:
+    """How a batch goes about its flights."""
+
+    wish: FlightWish = FlightWish()  # noqa: RUF009 (frozen)
+    site_by: SiteBy = SiteBy.FLIGHT
+    most_tries: int = 3  # that end the process of a flight's worker; then it is set aside
+    stall_s: float = 300.0  # without an answer or any work: the worker is ended
+    retries: bool = False  # flights that were set aside before are tried again
+
+    def __post_init__(self) -> None:
+        if self.most_tries < 1:
+            raise SettingsError(f"--tries {self.most_tries}: at least 1 is needed")
+        if not self.stall_s > 0:
+            raise SettingsError(f"--stall {self.stall_s:g}: more than 0 seconds are needed")
+        MapSettings(m_per_px=self.wish.m_per_px)  # which states what is out of range
+        if self.wish.model not in (NO_MODEL, DEFAULT_MODEL):
+            find_model(self.wish.model)
+
+
+class Executor(Protocol):
+    """Where tries at flights run."""
+
+    @property
+    def running(self) -> Mapping[Key, object]:
+        """What runs, by key."""
+
+    @property
+    def cache_mb(self) -> float:
+        """Memory that a try may take for what it could also read again."""
+
+    def has_room(self, cost: Cost) -> bool:
+        """Whether one more try may begin."""
+
+    def start(self, key: Key, order: Order, cost: Cost) -> None:
+        """Begin a try."""
+
+    def next_ended(self) -> tuple[Key, Ending]:
+        """Wait until a try has ended. Raises SorvoloError where it cannot be known any more."""
+
+
+@dataclass(frozen=True)
+class BatchUpdate:
+    """What happened: the flight that it happened to, how many of how many are through, which ones run (their names)."""
+
+    task: str
+    done: int
+    total: int
+    row: Row | None = None
+    is_known: bool = False  # it was through before this batch
+    running: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class BatchReport:
+    """All flights of a batch with what became of them; those in `known` were through before it began."""
+
+    rows: tuple[Row, ...]
+    known: frozenset[Key]
+    seconds: float
+    tries: int
+    crashes: int
+
+    def counts(self) -> dict[str, int]:
+        """How many flights ended how; "known" are those that were done before."""
+        found = Counter(
+            "known" if row.key in self.known and row.state is State.DONE else row.state.value for row in self.rows
+        )
+        return {name: found[name] for name in ("known", *State) if found[name]}
+
+
+def run_batch(
+    places: Sequence[Path], root: Path, settings: BatchSettings,
+    executor_of: Callable[[BatchTable], AbstractContextManager[Executor]],
+) -> Generator[BatchUpdate, None, BatchReport]:
+    """Do the mission over all flights in these folders, each in a site below `root`; yields what happens.
+
+    `executor_of` makes what runs the tries, once the table is open. A flight that was through before, with the same
+    files, wish and version, is left out. Killed, or closed, at any moment, the same call goes on: what was through is
+    known, what ran is taken up from its journal. Raises InputError for folders without flights, StoreError for a root
+    that cannot be used or that another batch works in, SettingsError for an executor that is not there.
+    """
+    started_s = time.monotonic()
+    found = find_flights(places, root)
+    with BatchTable.open(root) as table, executor_of(table) as executor:
+        through = frozenset(row.key for row in table if row.state in FINAL)
+        rows = yield from _listed(found, table, settings)
+        rows = _with_sites(rows, table, settings)
+        known = frozenset(row.key for row in rows if row.state in FINAL and row.key in through)
+        run = _Run(rows, table, settings, executor)
+        for row in rows:
+            if row.state is not State.WAITING:
+                yield run.update(row, is_known=row.key in known)
+        yield from run.through()
+        return BatchReport(
+            tuple(run.rows[row.key] for row in rows), known, round(time.monotonic() - started_s, 3), run.tries,
+            run.crashes,
+        )
+
+
+class _Run:
+    """The flights on their way: those of one site one after the other, sites beside each other."""
+
+    def __init__(
+        self, rows: Sequence[Row], table: BatchTable, settings: BatchSettings, executor: Executor
+    ) -> None:
+        self.rows = {row.key: row for row in rows}
+        self.tries = self.crashes = 0
+        self._table, self._settings, self._executor = table, settings, executor
+        self._waiting: dict[str, list[Row]] = {}  # by site, in order of time
+        for row in sorted(rows, key=_moment):
+            if row.state is State.WAITING:
+                self._waiting.setdefault(row.site, []).append(row)
+
+    def update(self, row: Row | None = None, *, is_known: bool = False) -> BatchUpdate:
+        """How far the batch is."""
+        done = sum(each.state not in (State.WAITING, State.RUNNING) for each in self.rows.values())
+        running = tuple(_name(self.rows[key]) for key in self._executor.running)
+        return BatchUpdate("flights", done, len(self.rows), row, is_known, running)
+
+    def through(self) -> Generator[BatchUpdate]:
+        """Try each flight until it is through. Closed on the way, those that run are marked as waiting again."""
+        try:
+            while self._waiting or self._executor.running:
+                while (row := self._next()) is not None:
+                    self._start(row)
+                    yield self.update()
+                key, ending = self._executor.next_ended()
+                yield self.update(self._end(self.rows[key], ending))
+        finally:
+            for key in list(self._executor.running):
+                self._keep(replace(self.rows[key], state=State.WAITING, words="the batch was stopped"))
+
+    def _next(self) -> Row | None:
+        """The flight to begin: of a site that nobody writes, and of these the one with most frames before it."""
+        busy = {self.rows[key].site for key in self._executor.running}
+        free = [queue for site, queue in self._waiting.items() if site not in busy]
+        if not free:
+            return None
+        row = max(free, key=lambda queue: sum(_frames(each) for each in queue))[0]
+        return row if self._executor.has_room(cost_of(row, self._table)) else None
+
+    def _start(self, row: Row) -> None:
+        self._waiting[row.site].remove(row)
+        if not self._waiting[row.site]:
+            del self._waiting[row.site]
+        cost = cost_of(row, self._table)
+        self._keep(replace(row, state=State.RUNNING, tries=row.tries + 1, words=""))
+        self.tries += 1
+        order = Order(
+            row.source, str((self._table.root / row.site).resolve()), self._settings.wish, self._executor.cache_mb
+        )
+        self._executor.start(row.key, order, cost)
+
+    def _end(self, row: Row, ending: Ending) -> Row:
+        if ending.outcome is not Outcome.CRASHED:
+            return self._keep(row.after(ending, State(ending.outcome.value), ending.words))
+        self.crashes += 1
+        row = replace(row, crashes=row.crashes + 1)
+        if row.crashes >= self._settings.most_tries:
+            words = f"set aside after {row.crashes} tries: {ending.words}"
+            return self._keep(row.after(ending, State.SET_ASIDE, words))
+        row = self._keep(row.after(ending, State.WAITING, ending.words))
+        self._waiting.setdefault(row.site, []).insert(0, row)
+        return row
+
+    def _keep(self, row: Row) -> Row:
+        row = self._table.put(row)
+        self.rows[row.key] = row
+        return row
+
+
+def _listed(
+    found: Sequence[FoundFlight], table: BatchTable, settings: BatchSettings
+) -> Generator[BatchUpdate, None, list[Row]]:
+    """The flights as rows, in the order found: looked into where that is new, each as it is asked for now."""
+    seen = {(row.source, row.stamp): row.scouted for row in table if row.scouted is not None}
+    new = [
+        each.path for each in found
+        if (str(each.path), each.stamp) not in seen and not _is_set_aside(table, each, settings)
+    ]
+    yield BatchUpdate("looking into flights", 0, len(new))
+    answers = dict(zip(new, scout(new, settings.wish.camera, settings.most_tries, [table.lock])))
+    rows = [
+        _row_of(each, answers.get(each.path) or seen.get((str(each.path), each.stamp)), table, settings)
+        for each in found
+    ]
+    return _without_duplicates(rows, table)
+
+
+def _row_of(
+    found: FoundFlight, answer: Scouted | Unreadable | None, table: BatchTable, settings: BatchSettings
+) -> Row:
+    """A flight's row: the one to go on with, or a new one; None for an answer if nobody looked into it again."""
+    scouted = answer if isinstance(answer, Scouted) else None
+    wish = settings.wish
+    fresh = Row(str(found.path), wish.mission.value, found.stamp, _request(found, wish), scouted)
+    if isinstance(answer, Unreadable):
+        state = State.SET_ASIDE if answer.crashed else State.FAILED
+        return table.put(replace(fresh, state=state, words=answer.words))
+    before = table.get(fresh.key)
+    return fresh if before is None else _continued(fresh, before, table.root, settings)
+
+
+def _is_set_aside(table: BatchTable, found: FoundFlight, settings: BatchSettings) -> bool:
+    """Whether nobody could look into it before, and it is not to be tried again."""
+    row = table.get((settings.wish.mission.value, str(found.path)))
+    if row is None or row.state is not State.SET_ASIDE or settings.retries:
+        return False
+    return row.request == _request(found, settings.wish)
+
+
+def _request(found: FoundFlight, wish: FlightWish) -> str:
+    """What is asked for of a flight, as one number: files, options and program."""
+    camera = Path(wish.camera)
+    stamp = (camera.stat().st_size, camera.stat().st_mtime_ns) if wish.camera and camera.is_file() else None
+    text = repr((sorvolo.__version__, software(), found.stamp, wish, stamp))
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
+
+
+def _continued(fresh: Row, before: Row, root: Path, settings: BatchSettings) -> Row:
+    """The row to go on with: the earlier one where the same is asked for and stands, else one that waits."""
+    moved = replace(before, source=fresh.source, stamp=fresh.stamp, scouted=fresh.scouted)
+    if before.request != fresh.request:
+        return replace(fresh, site=before.site)
+    if before.state is State.SET_ASIDE and settings.retries:
+        return replace(moved, state=State.WAITING, crashes=0)
+    if before.state in FINAL and (before.state is State.SET_ASIDE or _is_in_site(before, root)):
+        return moved
+    crashes = 0 if before.state is State.FAILED else before.crashes
+    return replace(moved, state=State.WAITING, crashes=crashes)
+
+
+def _is_in_site(row: Row, root: Path) -> bool:
+    found = existing_site(root / row.site)
+    return found is not None and row.scouted is not None and row.scouted.fingerprint in found.flights
+
+
+def _without_duplicates(rows: Sequence[Row], table: BatchTable) -> list[Row]:
+    """Of rows that are one flight, the one that was through before, else the one with most frames.
+
+    The others are named as duplicates, and so is a flight that was through under another name that is still there.
+    """
+    chosen: dict[Key, Row] = {}
+    for row in rows:
+        other = chosen.setdefault(row.key, row)
+        if row is not other and _rank(row, table) > _rank(other, table):
+            chosen[row.key] = row
+    sources = {row.source for row in rows}
+    return [_named(row, chosen[row.key], sources, table) for row in rows]
+
+
+def _named(row: Row, own: Row, sources: Set[str], table: BatchTable) -> Row:
+    """The row itself where it is `own`, the one that is used; else as a duplicate of it."""
+    before = table.get(row.key)
+    if _is_used(before) and before.source not in sources and Path(before.source).exists():
+        own = before
+    if row.source == own.source:
+        return row
+    frames = f", which has {_frames(own)} frames" if _frames(row) < _frames(own) else ""
+    words = f"the same flight as {own.source}{frames}"
+    return table.put(Row(row.source, row.mission, row.stamp, row.request, None, state=State.DUPLICATE, words=words))
+
+
+def _rank(row: Row, table: BatchTable) -> tuple[bool, int]:
+    before = table.get(row.key)
+    return _is_used(before) and before.source == row.source, _frames(row)
+
+
+def _is_used(row: Row | None) -> TypeGuard[Row]:
+    return row is not None and row.state in (State.DONE, State.DOUBTFUL)
+
+
+def _with_sites(rows: Sequence[Row], table: BatchTable, settings: BatchSettings) -> list[Row]:
+    """The rows with the site of each flight; one that is in a site already stays there."""
+    by_place = settings.site_by is SiteBy.PLACE
+    there = existing_sites(table.root, with_ground=by_place)
+    known = {fingerprint: name for name, site in there.items() for fingerprint in site.flights}
+    known |= {row.scouted.fingerprint: row.site for row in table if row.scouted is not None and row.site}
+    grounds = {name: site.ground for name, site in there.items() if site.ground is not None}
+    names = [each.name for each in table.root.iterdir()]
+    sites = sites_of(_placed(rows), settings.site_by, known, grounds, names)
+    return [_at_site(row, sites, table) for row in rows]
+
+
+def _placed(rows: Sequence[Row]) -> list[Placed]:
+    return [Placed(Path(row.source), row.scouted) for row in rows if row.scouted is not None]
+
+
+def _at_site(row: Row, sites: Mapping[str, str], table: BatchTable) -> Row:
+    if row.scouted is None or row.site == sites[row.scouted.fingerprint]:
+        return row
+    return table.put(replace(row, site=sites[row.scouted.fingerprint]))
+
+
+def _moment(row: Row) -> tuple[int, str]:
+    return (row.scouted.start_ns if row.scouted is not None else 0), row.source
+
+
+def _frames(row: Row) -> int:
+    return row.scouted.frames if row.scouted is not None else 0
+
+
+def _name(row: Row) -> str:
+    path = Path(row.source)
+    return path.stem if path.suffix else path.name

@@ -1,0 +1,32 @@
+"""What a try at a flight asks of a machine, by what flights took so far."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from statistics import median
+
+from sorvolo.cluster.table import Row, State
+
+_UNKNOWN_MB = 1000.0  # before any flight was measured
+_RESERVE = 1.2
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cores and memory that one try is given."""
+
+    cpus: float
+    memory_mb: float
+
+
+def cost_of(row: Row, rows: Iterable[Row]) -> Cost:
+    """The memory of the largest flight of the same mission so far and a fifth more, the cores of the median one.
+
+    After each crash of this flight it is given twice the memory: want of it may have been the reason.
+    """
+    ended = [
+        each for each in rows
+        if each.mission == row.mission and each.state in (State.DONE, State.DOUBTFUL) and each.peak_memory_mb > 0
+    ]
+    memory_mb = _RESERVE * max((each.peak_memory_mb for each in ended), default=_UNKNOWN_MB / _RESERVE)
+    cpus = median([each.cpu_s / each.seconds for each in ended if each.seconds > 0] or [1.0])
+    return Cost(max(1.0, round(cpus)), memory_mb * 2**row.crashes)

@@ -1,0 +1,75 @@
+"""Flights of a batch in processes of this machine."""
+
+import os
+import queue
+import threading
+from collections.abc import Mapping
+from typing import Self
+
+from sorvolo.cluster.cost import Cost
+from sorvolo.cluster.orders import Ending, Order
+from sorvolo.cluster.process import WorkerProcess, run_order
+from sorvolo.missions.flight.memory import available_bytes, memory_budget_bytes
+
+Key = tuple[str, str]
+_SHARE = 0.8  # of the machine's memory, for all workers together
+_LEAST_CACHE_MB = 64.0
+
+
+class LocalExecutor:
+    """At most `workers` processes at once, and no more than the memory holds. A context manager: leaving ends them.
+
+    `lock` is the batch's, which the processes keep until they are gone.
+    """
+
+    def __init__(self, workers: int, stall_s: float, lock: int) -> None:
+        self.workers = workers
+        self._stall_s, self._lock = stall_s, lock
+        self._running: dict[Key, tuple[WorkerProcess, Cost]] = {}
+        self._ended: queue.SimpleQueue[tuple[Key, Ending]] = queue.SimpleQueue()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for worker, _cost in self._running.values():
+            worker.kill()
+        while self._running:  # each is waited for by its thread
+            self.next_ended()
+
+    @property
+    def running(self) -> Mapping[Key, object]:
+        """What runs, by key."""
+        return self._running
+
+    def has_room(self, cost: Cost) -> bool:
+        """Whether one more may begin."""
+        if not self._running:
+            return True
+        taken_mb = sum(each.memory_mb for _, each in self._running.values())
+        return len(self._running) < self.workers and (taken_mb + cost.memory_mb) * 1e6 <= _SHARE * available_bytes()
+
+    @property
+    def cache_mb(self) -> float:
+        """Memory for what a worker could also read again: the machine's share of it, divided among the workers."""
+        return max(_LEAST_CACHE_MB, memory_budget_bytes(None) / 1e6 / self.workers)
+
+    def start(self, key: Key, order: Order, cost: Cost) -> None:
+        """Begin a try."""
+        worker = WorkerProcess(order, [self._lock])
+        self._running[key] = (worker, cost)
+        threading.Thread(target=self._wait, args=(key, worker), daemon=True, name=f"flight {key[1][:8]}").start()
+
+    def next_ended(self) -> tuple[Key, Ending]:
+        """Wait until a try has ended."""
+        key, ending = self._ended.get()
+        del self._running[key]
+        return key, ending
+
+    def _wait(self, key: Key, worker: WorkerProcess) -> None:
+        self._ended.put((key, run_order(worker, self._stall_s)))
+
+
+def default_workers() -> int:
+    """A worker for each core: a mission's decoding and detecting overlap on little more than one."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,239 @@
+"""A worker's own process: one order from its standard input, answers line by line on its standard output.
+
+It ends with whoever holds the other end of its input, so that no flight is mapped for a batch that is gone. It imports
+what its order needs alone: there is a process for each flight.
+"""
+
+import fcntl
+import json
+import os
+import resource
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Generator, Mapping
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from sorvolo.cluster.orders import Mission, Order, Outcome, Scouted, answer_line
+from sorvolo.errors import SorvoloError
+
+_ALIVE_EVERY_S = 0.5
+_SITE_BUSY_S = 30.0  # a worker that was killed on another machine holds its site's lock for a while
+_FIRST_TO_GO = 500  # for the kernel that looks for memory: the worker, not the batch
+
+
+class Answers:
+    """The lines that go back. Only `add` writes them; whatever libraries print goes to the log instead."""
+
+    def __init__(self) -> None:
+        self._file: BinaryIO = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+        self._alive_s = 0.0
+
+    def add(self, kind: str, data: Mapping[str, Any]) -> None:
+        """One answer."""
+        self._file.write(answer_line(kind, data))
+        self._file.flush()
+
+    def alive(self, *_: object) -> None:
+        """That the work goes on, twice a second at most."""
+        if time.monotonic() - self._alive_s >= _ALIVE_EVERY_S:
+            self._alive_s = time.monotonic()
+            self.add("alive", {})
+
+
+def main() -> int:
+    """Do the one order of standard input. 0 also for a flight that cannot be used: that is an answer."""
+    answers = Answers()
+    content = json.loads(sys.stdin.buffer.readline())
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    if "scout" in content:
+        for source in content["scout"]["sources"]:
+            _scout(source, content["scout"]["camera"], answers)
+        return 0
+    order = Order.of(content["order"])
+    try:
+        _wait_for_site(Path(order.site))
+        flight, words, is_good = _MISSIONS[order.wish.mission](order, answers.alive)
+    except SorvoloError as error:
+        answers.add("ended", {"outcome": Outcome.FAILED, "words": str(error)})
+        return 0
+    outcome = Outcome.DONE if is_good else Outcome.DOUBTFUL
+    answers.add("ended", {"outcome": outcome, "words": words, "flight": flight})
+    return 0
+
+
+def _end_with_input() -> None:
+    """End the process at once when nobody holds its input any more; what it was at is taken up from its journal."""
+    with suppress(OSError):
+        while os.read(sys.stdin.fileno(), 4096):
+            pass
+    os._exit(1)
+
+
+def _scout(source: str, camera: str, answers: Answers) -> None:
+    from sorvolo.capture.source import open_sources
+
+    try:
+        found = open_sources([source], camera=camera or None)
+        if len(found) != 1:
+            raise SorvoloError(f"{source} holds {len(found)} flights, one was expected; files came or went meanwhile")
+        flight = found[0]
+    except SorvoloError as error:
+        answers.add("unreadable", {"words": str(error)})
+        return
+    samples = flight.telemetry
+    box = None
+    if samples.has_fixes:
+        latitudes, longitudes = (
+            [each for each in samples[name].tolist() if each == each] for name in ("latitude_deg", "longitude_deg")
+        )
+        box = (min(latitudes), min(longitudes), max(latitudes), max(longitudes))
+    start_ns = flight.start_ns or (int(samples.time_ns[0]) if len(samples) else 0)
+    answers.add("scouted", vars(Scouted(flight.fingerprint, flight.frame_count, start_ns, box)))
+
+
+def _map(order: Order, alive: Callable[..., None]) -> tuple[str, str, bool]:
+    """Map the flight: its name in the site, the headline, and whether it is a map to use."""
+    from sorvolo.missions.flight.settings import MapSettings
+    from sorvolo.missions.map.flights import map_flights
+
+    site, wish = Path(order.site), order.wish
+    settings = MapSettings(m_per_px=wish.m_per_px, model=wish.model, memory_mb=order.memory_mb)
+    flight = _run(map_flights([order.source], site, settings, camera=wish.camera or None), site, alive)
+    return flight, *_headline(site, flight, "headline", "map")
+
+
+def _compare(order: Order, alive: Callable[..., None]) -> tuple[str, str, bool]:
+    """Compare the flight with the site's map; the first flight over a site is mapped."""
+    from sorvolo.missions.compare.flights import compare_flights
+    from sorvolo.missions.flight.settings import CompareSettings
+    from sorvolo.store.site.archive import Archive
+
+    site, wish = Path(order.site), order.wish
+    founder = _founder(site)
+    if not founder or _is_flight(order.source, site, founder):
+        return _map(order, alive)
+    updates = compare_flights(
+        [order.source], site, CompareSettings(model=wish.model), camera=wish.camera or None
+    )
+    flight = _run(updates, site, alive)
+    with Archive.open(site, write=False) as archive:
+        report = archive.report(flight).get("comparison") or {}
+    head = report.get("headline") or {}
+    return flight, str(head.get("text", "")), head.get("quality") == "compared"
+
+
+def _search(order: Order, alive: Callable[..., None]) -> tuple[str, str, bool]:
+    """Map the flight if the site has it not yet; measure what a search of it would have found."""
+    from sorvolo.missions.search.flights import SearchOutputs, search_site
+    from sorvolo.missions.search.settings import SearchSettings
+
+    flight, words, is_good = _map(order, alive)
+    if not is_good:
+        return flight, words, False
+    site = Path(order.site)
+    outputs = SearchOutputs(site.with_name(f"{site.name}-search") / flight, flights=(flight,))
+    report: Mapping[str, Any] = {}
+    with closing(search_site(site, SearchSettings(model=order.wish.model), outputs)) as measuring:
+        for each in measuring:
+            alive()
+            if isinstance(each, dict):
+                report = each
+    head = report.get("headline") or {}
+    return flight, str(head.get("text", "")), bool(head.get("complete"))
+
+
+_MISSIONS = {Mission.MAP: _map, Mission.COMPARE: _compare, Mission.SEARCH: _search}
+
+
+def _run(updates: Generator[Any, None, Any], site: Path, alive: Callable[..., None]) -> str:
+    """Take all updates of a mission over one flight; its name in the site."""
+    from sorvolo.store.site.archive import Archive
+
+    before = _newest(site)
+    known: Any = ()
+
+    def noted() -> Generator[Any]:
+        nonlocal known
+        known = yield from updates
+
+    with closing(updates):
+        for each in noted():
+            alive(each)
+    if known:
+        return str(known[0].flight)
+    with Archive.open(site, write=False) as archive:
+        return next(each.flight_id for each in archive.versions() if each.complete and each.id > before)
+
+
+def _headline(site: Path, flight: str, name: str, good: str) -> tuple[str, bool]:
+    """The first line of a flight's report, and whether its result is one to use."""
+    from sorvolo.store.site.archive import Archive
+
+    with Archive.open(site, write=False) as archive:
+        head = archive.report(flight).get(name) or {}
+    return str(head.get("text", "")), head.get("quality") == good
+
+
+def _newest(site: Path) -> int:
+    from sorvolo.store.site.archive import Archive
+    from sorvolo.store.site.files import CATALOGUE
+
+    if not (site / CATALOGUE).is_file():
+        return 0
+    with Archive.open(site, write=False) as archive:
+        return max((each.id for each in archive.versions() if each.complete), default=0)
+
+
+def _founder(site: Path) -> str:
+    """The flight whose map the site began with; "" where there is no map yet."""
+    from sorvolo.store.site.archive import Archive
+    from sorvolo.store.site.files import CATALOGUE
+
+    if not (site / CATALOGUE).is_file():
+        return ""
+    with Archive.open(site, write=False) as archive:
+        return next((each.flight_id for each in archive.versions() if each.complete), "")
+
+
+def _is_flight(source: str, site: Path, flight: str) -> bool:
+    """Whether the files are those of the site's flight of this name."""
+    from sorvolo.capture.source import open_sources
+    from sorvolo.missions.flight.setup import known_flights
+
+    return open_sources([source])[0].fingerprint == known_flights(site)[flight]
+
+
+def _wait_for_site(site: Path) -> None:
+    """Wait a while for a site whose writer is just ending."""
+    from sorvolo.store.site.files import LOCK
+
+    end_s = time.monotonic() + _SITE_BUSY_S
+    while time.monotonic() < end_s:
+        try:
+            lock = os.open(site / LOCK, os.O_RDWR | os.O_NOFOLLOW)
+        except OSError:  # no site yet, or none that may be opened: the mission states which
+            return
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            time.sleep(0.2)
+        finally:
+            os.close(lock)
+
+
+def _begin() -> int:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the batch decides when its workers end
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(str(_FIRST_TO_GO))
+    return main()
+
+
+if __name__ == "__main__":
+    sys.exit(_begin())

@@ -1,0 +1,135 @@
+"""A disturbed batch of small flights: nothing is lost, nothing doubled, and maps have the bytes of undisturbed ones."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from batch_flights import another, content
+
+from sorvolo.cluster.batch import BatchReport, BatchSettings, run_batch
+from sorvolo.cluster.cost import Cost
+from sorvolo.cluster.local_executor import LocalExecutor
+from sorvolo.cluster.orders import FlightWish, Order
+from sorvolo.cluster.table import BatchTable, State
+from sorvolo.errors import StoreError
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.map.flights import map_flights
+
+
+class Disturbed(LocalExecutor):
+    """A local executor that sends signals to its workers, by the name of their flight: one for each try.
+
+    SIGSEGV at once, others once the flight's first frames are noted.
+    """
+
+    def __init__(self, lock: int, signals: dict[str, list[signal.Signals]]) -> None:
+        super().__init__(2, stall_s=4.0, lock=lock)
+        self.signals = signals
+
+    def start(self, key: tuple[str, str], order: Order, cost: Cost) -> None:
+        super().start(key, order, cost)
+        if waiting := self.signals.get(Path(order.source).name):
+            worker, number = self._running[key][0], waiting.pop(0)
+            if number is signal.SIGSEGV:
+                os.kill(worker.pid, number)
+                return
+            threading.Thread(target=_at_work, args=(order, lambda: os.kill(worker.pid, number)), daemon=True).start()
+
+
+def _at_work(order: Order, strike: Callable[[], None]) -> None:
+    """Strike when the flight's first frames are noted, or it is late."""
+    end_s = time.monotonic() + 20
+    while time.monotonic() < end_s and not list(Path(order.site).glob("flights/*/run.journal")):
+        time.sleep(0.02)
+    strike()
+
+
+def run(places: list[Path], root: Path, camera: Path, signals: dict[str, list[signal.Signals]]) -> BatchReport:
+    @contextmanager
+    def executor(table: BatchTable) -> Iterator[LocalExecutor]:
+        with Disturbed(table.lock, signals) as made:
+            yield made
+
+    running = run_batch(places, root, BatchSettings(FlightWish(camera=str(camera), model="none")), executor)
+    while True:
+        try:
+            next(running)
+        except StopIteration as end:
+            return end.value
+
+
+@pytest.fixture(scope="module")
+def batched(flown: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BatchReport]:
+    """A disturbed batch: one flight's worker killed, then stopped; one poisoned, one broken, one there twice."""
+    folder = tmp_path_factory.mktemp("disturbed")
+    for name in ("killed", "poisoned"):
+        another(flown, folder / "in" / name)
+    another(flown, folder / "in" / "sub" / "killed")  # the same bytes: the same flight
+    (folder / "in" / "broken.mp4").write_text("no video")
+    signals = {"killed": [signal.SIGKILL, signal.SIGSTOP], "poisoned": [signal.SIGSEGV] * 3}
+    return folder, run([folder / "in"], folder / "maps", flown / "camera.xml", signals)
+
+
+def test_each_flight_is_through_once_or_named(batched: tuple[Path, BatchReport]) -> None:
+    folder, report = batched
+    rows = {Path(row.source).relative_to(folder / "in").as_posix(): row for row in report.rows}
+    assert {name: row.state for name, row in rows.items()} == {
+        "broken.mp4": State.FAILED, "killed": State.DONE, "sub/killed": State.DUPLICATE, "poisoned": State.SET_ASIDE,
+    }
+    assert "broken.mp4" in rows["broken.mp4"].words
+    assert rows["sub/killed"].words == f"the same flight as {folder / 'in' / 'killed'}"
+    assert rows["poisoned"].words.startswith("set aside after 3 tries: its process ended by signal 11 (SIGSEGV)")
+    assert (rows["killed"].tries, rows["poisoned"].tries) == (3, 3)
+    assert (report.tries, report.crashes) == (6, 5)
+    assert rows["killed"].cpu_s > 0.5 and rows["killed"].peak_memory_mb > 50
+    assert [path.name for path in (folder / "maps").iterdir() if path.is_dir()] == ["killed"]
+
+
+def test_disturbed_maps_have_the_bytes_of_undisturbed_ones(
+    batched: tuple[Path, BatchReport], flown: Path, tmp_path: Path
+) -> None:
+    folder, _ = batched
+    wanted = tmp_path / "undisturbed" / "killed"
+    flight = folder / "in" / "killed"
+    for _ in map_flights([flight], wanted, MapSettings(model="none"), camera=flown / "camera.xml"):
+        pass
+    assert content(folder / "maps" / "killed") == content(wanted)
+
+
+def test_again_nothing_is_done_twice(batched: tuple[Path, BatchReport], flown: Path) -> None:
+    folder, first = batched
+    again = run([folder / "in"], folder / "maps", flown / "camera.xml", {})
+    assert again.tries == 0
+    assert [row.state for row in again.rows] == [row.state for row in first.rows]
+    assert again.counts() == {"known": 1, "duplicate": 1, "failed": 1, "set aside": 1}
+
+
+def test_a_killed_batch_leaves_no_worker_and_the_same_command_goes_on(flown: Path, tmp_path: Path) -> None:
+    another(flown, tmp_path / "in" / "one")
+    command = [
+        sys.executable, "-m", "sorvolo", "batch", str(tmp_path / "in"), "--root", str(tmp_path / "maps"), "--camera",
+        str(flown / "camera.xml"), "--model", "none", "--json",
+    ]
+    first = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    journal = tmp_path / "maps" / "one" / "flights" / "one" / "run.journal"
+    end_s = time.monotonic() + 60
+    while not journal.exists() and first.poll() is None and time.monotonic() < end_s:
+        time.sleep(0.02)
+    with pytest.raises(StoreError, match=f"another batch works in .*: process {first.pid} on "):
+        BatchTable.open(tmp_path / "maps")
+    first.kill()
+    first.wait()
+    BatchTable.open(tmp_path / "maps").close()  # not before its worker is gone
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads(done.stdout)["flights"]
+    assert (row["state"], row["tries"], row["crashes"]) == ("done", 2, 0)
+    assert os.path.isfile(tmp_path / "maps" / "one" / "mosaic.tif")
