@@ -27,6 +27,7 @@ from sorvolo.cli.map import map_command
 from sorvolo.cli.measure import measure_app
 from sorvolo.cli.models import models_app
 from sorvolo.cli.plan import plan
+from sorvolo.cli.reproduce import reproduce
 from sorvolo.cli.review import review
 from sorvolo.cli.search import search_command
 from sorvolo.cli.serve import serve, token
@@ -46,6 +47,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "search": search_command, "telemetry": telemetry_command, "simulate": simulate, "train": train,
     "calibrate": calibrate, "demo": demo, "history": history, "review": review,
     "heights": heights, "serve": serve, "stream": stream, "token": token, "batch": batch,
+    "reproduce": reproduce,
 }
 _FAILED, _STOPPED = 1, 130
 _FULL = (errno.ENOSPC, errno.EDQUOT)

@@ -3,13 +3,16 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageRGB, ImageRGBA, Matrix3
+from sorvolo.geometry.arrays import Floats, ImageRGB, ImageRGBA, Mask, Matrix3
 from sorvolo.geometry.grid import SiteGrid, TileIndex
+from sorvolo.geometry.homography import apply_homography
 from sorvolo.mosaic.canvas_frame import CanvasFrame, coverage, warp
 from sorvolo.mosaic.map_quality import DEVIATION_BINS, Deviation, deviation
 
+_UNSEEN = 236  # a light grey
 _RECENT = 64  # tiles remembered: neighbouring frames share most
 
 
@@ -24,6 +27,15 @@ class DeviationSummary:
     frames: int
 
 
+@dataclass(frozen=True, eq=False)
+class DeviationPictures:
+    """A part of the map, the frame that it was made of, and how they differ, (H, W, 3) each; grey where unknown."""
+
+    mosaic: ImageRGB
+    frame: ImageRGB
+    difference: ImageRGB
+
+
 class MapDeviation:
     """Compares frames with the map one after another; remembers the map's last tiles."""
 
@@ -33,6 +45,35 @@ class MapDeviation:
 
     def of(self, image: ImageRGB, site_from_image: Matrix3) -> Deviation:
         """The deviation of one undistorted frame, (H, W, 3), from the map under it."""
+        return deviation(*self._both(image, site_from_image))
+
+    def shown(self, image: ImageRGB, site_from_image: Matrix3) -> DeviationPictures:
+        """The pictures of the thesis's Figure 4.1 of one undistorted frame."""
+        mosaic, frame, mask = self._both(image, site_from_image)
+        mosaic[~mask], frame[~mask] = _UNSEEN, _UNSEEN
+        difference = np.abs(mosaic.astype(np.int16) - frame).astype(np.uint8)
+        difference[~mask] = _UNSEEN
+        return DeviationPictures(mosaic, frame, difference)
+
+    def under(self, outline_m: Floats, width_px: int, height_px: int) -> ImageRGB:
+        """(height, width, 3) the map as a frame sees it whose corners lie at `outline_m`, (4, 2) in the site frame.
+
+        The corners are those of the top left pixel, the top right, the bottom right and the bottom left.
+        """
+        grid_from_site = self._site_grid.grid_from_site_affine(np.mean(outline_m, axis=0), 100.0)
+        corners = apply_homography(grid_from_site, np.asarray(outline_m, np.float64))
+        low, high = np.floor(corners.min(axis=0)), np.ceil(corners.max(axis=0)) + 1
+        window = int(low[0]), int(low[1]), int(high[0]), int(high[1])
+        ends = np.array([[0, 0], [width_px - 1, 0], [width_px - 1, height_px - 1], [0, height_px - 1]], np.float32)
+        frame_from_window = cv2.getPerspectiveTransform((corners - low).astype(np.float32), ends)
+        found = cv2.warpPerspective(
+            self._crop(window, self._site_grid.grid.tile_px), frame_from_window, (width_px, height_px)
+        )
+        found[found[..., 3] == 0] = _UNSEEN
+        return np.ascontiguousarray(found[..., :3])
+
+    def _both(self, image: ImageRGB, site_from_image: Matrix3) -> tuple[ImageRGB, ImageRGB, Mask]:
+        """The map and the frame in one window of the grid, and where both are known."""
         height, width = image.shape[:2]
         x, y, z = site_from_image @ np.array([width / 2, height / 2, 1.0])
         grid_from_site = self._site_grid.grid_from_site_affine(np.array([x / z, y / z]), 100.0)
@@ -41,7 +82,7 @@ class MapDeviation:
         window = int(low[0]), int(low[1]), int(high[0]), int(high[1])
         mosaic = self._crop(window, self._site_grid.grid.tile_px)
         mask = (coverage(frame, window) > 0) & (mosaic[..., 3] > 0)
-        return deviation(np.ascontiguousarray(mosaic[..., :3]), warp(image, frame, window), mask)
+        return np.ascontiguousarray(mosaic[..., :3]), warp(image, frame, window), mask
 
     def _crop(self, window: tuple[int, int, int, int], side: int) -> ImageRGBA:
         """(height, width, 4) the map in a window of grid pixels (x0, y0, x1, y1, ends exclusive)."""

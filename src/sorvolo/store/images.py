@@ -32,10 +32,21 @@ _PNG_FAST = [
 ]
 
 
-def jpeg_from_image(image: ImageRGB) -> bytes:
-    """Encode an image as JPEG, quality 92, colour at full resolution."""
+def jpeg_from_image(image: ImageRGB, most_px: int | None = None) -> bytes:
+    """Encode an image as JPEG, quality 92, colour at full resolution; its longer side made `most_px` where longer."""
+    if most_px is not None and max(image.shape[:2]) > most_px:
+        scale = most_px / max(image.shape[:2])
+        size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), _JPEG)
     return data.tobytes()
+
+
+def jpeg_from_rgba(rgba: ImageRGBA, most_px: int | None = None, ground: int = 236) -> bytes:
+    """Encode a picture as `jpeg_from_image` does, what is transparent in it in a grey."""
+    alpha = rgba[..., 3:].astype(np.float32) / 255
+    flat = np.round(rgba[..., :3] * alpha + ground * (1 - alpha))
+    return jpeg_from_image(flat.astype(np.uint8), most_px)
 
 
 def image_from_jpeg(data: bytes, name: str, most_px: int = MOST_KEYFRAME_PX, step: int = 1) -> ImageRGB:

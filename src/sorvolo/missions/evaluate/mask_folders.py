@@ -1,5 +1,6 @@
 """Folders of masks, one a frame: ours, a simulation's, or those of a dataset; nonzero is change."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +21,26 @@ class MaskScores:
     least_px: int
 
 
+@dataclass(frozen=True)
+class ComparedMask:
+    """One found mask, by its name without ending, against the truth: its pixels, and the frame as a whole."""
+
+    name: str
+    path: Path
+    pixels: Counts
+    frame: Counts
+
+
 def compare_mask_folders(found: Path, truth: Path, least_px: int = 1) -> MaskScores:
+    """Compare the masks that both folders have, together; as `compared_masks`."""
+    mine, true = _masks(found), _masks(truth)
+    pixels, frames, compared = Counts(), Counts(), 0
+    for each in compared_masks(found, truth, least_px):
+        pixels, frames, compared = pixels + each.pixels, frames + each.frame, compared + 1
+    return MaskScores(pixels, frames, compared, len(mine) - compared, len(true) - compared, least_px)
+
+
+def compared_masks(found: Path, truth: Path, least_px: int = 1) -> Iterator[ComparedMask]:
     """Compare the masks that both folders have, paired by their names without ending, numbers by their value.
 
     A pixel is changed when any of its colours is nonzero; in lossy formats, from 128 on. A found mask that holds 0, 128
@@ -34,7 +54,6 @@ def compare_mask_folders(found: Path, truth: Path, least_px: int = 1) -> MaskSco
             f"no mask in {found} has the name of one in {truth} ({_some(mine)}; {_some(true)}); give masks of the same "
             "frames, named alike"
         )
-    pixels, frames = Counts(), Counts()
     for name in common:
         changed, unknown = read_mask(mine[name], may_be_unknown=True)
         there, _ = read_mask(true[name], may_be_unknown=False)
@@ -43,9 +62,28 @@ def compare_mask_folders(found: Path, truth: Path, least_px: int = 1) -> MaskSco
             raise InputError(
                 f"{mine[name]} and {true[name]} differ in size: {sizes} pixels; give masks of the same pictures"
             )
-        pixels += pixel_counts(changed, there, unknown)
-        frames += frame_counts(changed, there, unknown, least_px)
-    return MaskScores(pixels, frames, len(common), len(mine) - len(common), len(true) - len(common), least_px)
+        yield ComparedMask(
+            name, mine[name], pixel_counts(changed, there, unknown), frame_counts(changed, there, unknown, least_px)
+        )
+
+
+def frames_against_times(found: Path, is_changed: Callable[[int], bool | None]) -> Iterator[ComparedMask]:
+    """Judge masks of a video's frames where it is only known which frames show a change; None: not judged.
+
+    Masks are named by the numbers of their frames; others are passed over. Raises InputError as `compared_masks`.
+    """
+    for name, path in _masks(found).items():
+        if not name.isdecimal():
+            continue
+        there = is_changed(int(name))
+        changed, unknown = read_mask(path, may_be_unknown=True)
+        if there is None or unknown.all():
+            counts = Counts(unknown=1)
+        elif there:
+            counts = Counts(tp=1) if changed.any() else Counts(fn=1)
+        else:
+            counts = Counts(fp=1) if changed.any() else Counts(tn=1)
+        yield ComparedMask(name, path, Counts(), counts)
 
 
 def has_masks(folder: Path) -> bool:

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from math import inf
+from math import inf, isfinite
 from pathlib import Path
 
 from sorvolo.errors import InputError
@@ -59,6 +59,38 @@ def read_umcd(place: Path, findings: Findings) -> ParsedSet:
             "learnt from them; add lines 'Box: FRAME LEFT TOP WIDTH HEIGHT' to the objects, or label the frames anew"
         )
     return ParsedSet(FORM, tuple(result), tuple(dict.fromkeys(e.name for v in videos.values() for e in v.objects)))
+
+
+@dataclass(frozen=True)
+class UmcdMetadata:
+    """What a video's metadata file states: `fps` (0: not stated), and from which second to which objects are in view.
+
+    `boxed` are the numbers of the frames in which objects have places (lines `Box:`).
+    """
+
+    fps: float
+    in_view_s: tuple[tuple[float, float], ...]
+    boxed: frozenset[int]
+
+    def shows_object(self, time_s: float) -> bool | None:
+        """Whether an object is in view at a time; None within a second of where one comes or goes, or unknown."""
+        inside_s = [min(time_s - start, end - time_s) for start, end in self.in_view_s]  # negative: out of view
+        if not inside_s or not all(map(isfinite, inside_s)):
+            return None
+        if max(inside_s) > _ROUNDED_S:
+            return True
+        return False if max(inside_s) < -_ROUNDED_S else None
+
+
+def read_umcd_metadata(path: Path) -> UmcdMetadata:
+    """One video's metadata file; raises InputError for one that describes no object."""
+    video = _parsed(path, Findings())
+    if not video.objects:
+        raise InputError(f"{path}: describes no object as {FORM}'s metadata does (Type:, Shape:, Dimension:, ...)")
+    return UmcdMetadata(
+        video.fps, tuple((each.from_s, each.until_s) for each in video.objects),
+        frozenset(frame for each in video.objects for frame in each.boxes),
+    )
 
 
 def looks_like_umcd(path: Path) -> bool:

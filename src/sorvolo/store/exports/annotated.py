@@ -10,7 +10,7 @@ import av
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import BoxesPx, ImageRGB
+from sorvolo.geometry.arrays import BoxesPx, ImageRGB, Mask
 from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes, sync_file, writing
 from sorvolo.store.images import jpeg_from_image
 
@@ -47,6 +47,18 @@ def annotated(
         above, below = top - strong - 6, bottom + strong + round(30 * letters)
         corners = [(left, above), (left, below), (right + strong + 2, bottom)]
         written.append(_write(drawn, words[row], corners, letters, colours[row], written))
+    return drawn
+
+
+def with_outlines(image: ImageRGB, mask: Mask) -> ImageRGB:
+    """A copy of the picture (H, W, 3) with the mask's regions outlined; a mask of another size is brought to it."""
+    drawn = image.copy()
+    height, width = image.shape[:2]
+    shape = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+    regions, _ = cv2.findContours(shape, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    strong = max(2, round(2 * max(width, height) / 1280))
+    cv2.drawContours(drawn, regions, -1, (255, 255, 255), 2 * strong)
+    cv2.drawContours(drawn, regions, -1, _COLOURS[2], strong)
     return drawn
 
 

@@ -107,6 +107,34 @@ class Line:
     dot_px: float = 2.0
 
 
+@dataclass(frozen=True)
+class Bar:
+    """One bar of a group: its style, its share from 0 to 1, and what it is."""
+
+    style: str
+    share: float
+    words: str
+
+
+def bar_plot(title: str, groups: Sequence[tuple[str, Sequence[Bar]]], width: float, height: float) -> Markup:
+    """Groups of bars beside each other, shares in per cent upwards, each group with its name below."""
+    y = Scale(0, 1, height - 34, 18)
+    wide = (width - 2 * _MARGIN_PX) / max(1, len(groups))
+    drawn, labels = [], [Label(8, 12, "%", "start")]
+    for place, (name, bars) in enumerate(groups):
+        left, step = _MARGIN_PX + (place + 0.1) * wide, 0.8 * wide / max(1, len(bars))
+        labels.append(Label(_MARGIN_PX + (place + 0.5) * wide, height - 14, name))
+        for k, bar in enumerate(bars):
+            drawn.append((bar.style, left + k * step, y(bar.share), 0.85 * step, y(0) - y(bar.share), bar.words))
+            labels.append(Label(left + (k + 0.42) * step, y(bar.share) - 4, f"{100 * bar.share:.0f}"))
+    ticks = (0.0, 0.25, 0.5, 0.75, 1.0)
+    labels += [Label(_MARGIN_PX - 6, y(tick) + 4, f"{100 * tick:g}", "end") for tick in ticks]
+    frame = Axes(
+        _MARGIN_PX, width - 8, 18, y(0), tuple((_line_style(tick), y(tick)) for tick in ticks), (), tuple(labels)
+    )
+    return render("plots/bars.svg", title=title, bars=drawn, frame=frame, width=width, height=height)
+
+
 def colour_class(place: int) -> str:
     """The style of a line, by its place in the list."""
     return f"c{place % _COLOURS}"

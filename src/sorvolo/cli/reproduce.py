@@ -1,0 +1,149 @@
+"""`sorvolo reproduce`: the experiments of the thesis's chapter 4, on the UMCD dataset or a simulated one."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from sorvolo.cli.options import size_px
+from sorvolo.cli.progress import ProgressReport
+from sorvolo.cli.train import Preset
+from sorvolo.errors import SettingsError
+from sorvolo.survey.wording import counted
+
+if TYPE_CHECKING:
+    from sorvolo.missions.reproduce.rows import Row
+    from sorvolo.missions.reproduce.settings import ReproductionSettings, SimulatedSize
+
+_DEFAULT_OUT = Path("reproduction")
+_PARTIAL = 3  # the exit code of a result that lacks something
+
+Dataset = Annotated[Path | None, typer.Argument(help="The UMCD dataset's folder, in the thesis's layout.")]
+OutFolder = Annotated[Path, typer.Option(help="Folder for tables, figures, maps and models.")]
+Simulated = Annotated[bool, typer.Option("--simulated", help="Simulate a dataset in the same layout instead.")]
+Quick = Annotated[bool, typer.Option("--quick", help="Only a try: one short path, small pictures.")]
+VideoCount = Annotated[int | None, typer.Option(help="At most so many videos of each environment and part.")]
+PathLength = Annotated[float, typer.Option(help="With --simulated: length of each path, m; 0: as in Tables 2.1, 2.3.")]
+PictureSize = Annotated[str, typer.Option(help="With --simulated: picture size, such as 1280x720.")]
+ViewRate = Annotated[float, typer.Option(help="Frames compared per second of video.")]
+Okutama = Annotated[Path | None, typer.Option(help="Okutama-Action's folder, for its column of Table 4.6.")]
+TrainSteps = Annotated[int, typer.Option(help="Steps of each network of Table 4.6; 0: train none.")]
+NetworkPreset = Annotated[Preset, typer.Option(help="Network of Table 4.6: fast, accurate, or the thesis's own.")]
+Weights = Annotated[str, typer.Option(help="Weights to start from: none, auto (ImageNet), or a file.")]
+Device = Annotated[str, typer.Option(help="Where the networks are trained: auto, cpu or cuda.")]
+Seed = Annotated[int, typer.Option(help="Random seed.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print reproduction.json.")]
+
+
+def reproduce(
+    dataset: Dataset = None,
+    out: OutFolder = _DEFAULT_OUT,
+    simulated: Simulated = False,
+    quick: Quick = False,
+    videos: VideoCount = None,
+    length: PathLength = 24.0,
+    size: PictureSize = "1280x720",
+    views_per_second: ViewRate = 5.0,
+    okutama: Okutama = None,
+    train_steps: TrainSteps = 400,
+    preset: NetworkPreset = Preset.FAST,
+    weights: Weights = "none",
+    device: Device = "auto",
+    seed: Seed = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Do the experiments of the thesis's chapter 4: Tables 4.1, 4.3 to 4.6 and the figures, beside the printed ones.
+
+    The same command goes on where it was stopped. Rows that cannot be made are named with the reason, and the exit code
+    is 3.
+
+    Example: sorvolo reproduce UMCD --out chapter4
+
+    Example, without the dataset: sorvolo reproduce --simulated --videos 1
+    """
+    from sorvolo.missions.reproduce.report import PAGE
+    from sorvolo.missions.reproduce.settings import (
+        DetectorSettings,
+        ReproductionSettings,
+        SimulatedSize,
+    )
+    from sorvolo.missions.reproduce.settings import quick as quick_sizes
+
+    settings = ReproductionSettings(
+        videos, views_per_second, seed=seed, detector=DetectorSettings(train_steps, preset.value, weights, device)
+    )
+    simulation = SimulatedSize(length or None, size_px(size) or (1280, 720))
+    if quick:
+        settings, simulation = quick_sizes(settings, simulation)
+    if simulated == (dataset is not None):
+        raise SettingsError("give the folder of the UMCD dataset, or --simulated; one of both")
+    if simulated:
+        dataset = out / "dataset"
+        _simulate(dataset, simulation, settings)
+    assert dataset is not None
+    rows = _rows(dataset, out, settings, okutama, is_whole=not simulated)
+    document = _written(out, rows, dataset, settings, simulation if simulated else None)
+    if as_json:
+        typer.echo(json.dumps(document, indent=1, ensure_ascii=False))
+    else:
+        _show(document, out / PAGE)
+    if document["missing"]:
+        raise typer.Exit(_PARTIAL)
+
+
+def _simulate(place: Path, size: "SimulatedSize", settings: "ReproductionSettings") -> None:
+    from sorvolo.missions.reproduce.simulated import simulated_dataset
+
+    with ProgressReport(Console(stderr=True)) as progress:
+        for name, step in simulated_dataset(place, size, settings):
+            if step.stage == "frames":
+                progress.show(f"simulating {name}, {step.flight}, frame", step.frames_done, step.frames_total)
+
+
+def _rows(
+    place: Path, out: Path, settings: "ReproductionSettings", okutama: Path | None, *, is_whole: bool
+) -> "list[Row]":
+    from sorvolo.missions.reproduce.run import reproduce as reproduced
+
+    console = Console(stderr=True)
+    rows = []
+    with ProgressReport(console) as progress:
+        progress.show("reproducing, row")
+        for update in reproduced(place, out, settings, okutama=okutama, is_whole=is_whole):
+            rows.append(update.row)
+            progress.show("reproducing, row", update.done, update.total, update.row.id)
+            if update.row.missing:
+                words = f"missing  {update.row.id}: {update.row.missing}"
+                console.print(words, style="yellow", highlight=False, markup=False, soft_wrap=True)
+    return rows
+
+
+def _written(
+    out: Path, rows: "list[Row]", place: Path, settings: "ReproductionSettings", size: "SimulatedSize | None"
+) -> dict[str, Any]:
+    from sorvolo.missions.reproduce.report import write_reproduction
+
+    return write_reproduction(out, rows, place, settings, size)
+
+
+def _show(document: dict[str, Any], page: Path) -> None:
+    """The tables as the thesis prints them."""
+    from sorvolo.store.exports.reproduction_sheets import reproduction_sheets
+
+    console = Console()
+    if missing := document["missing"]:
+        words = f"{len(missing)} of {counted(len(missing) + len(document['rows']), 'row')} could not be made"
+        console.print(f"{words}; {page} has the reasons", style="yellow", highlight=False, soft_wrap=True)
+    for sheet in reproduction_sheets(document["tables"]):
+        if sheet.rows:
+            table = Table(*map(escape, sheet.columns), title=escape(sheet.title), box=SIMPLE_HEAD)
+            for row in sheet.rows:
+                table.add_row(*map(escape, row))
+            console.print(table)
+    console.print(document["size"], highlight=False)
+    console.print(f"tables and figures: {page}", highlight=False, soft_wrap=True)

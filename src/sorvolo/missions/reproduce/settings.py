@@ -1,0 +1,72 @@
+"""What a person may choose for the thesis's experiments, and how large they are."""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from sorvolo.errors import SettingsError
+
+ENVIRONMENTS = ("Urban", "Dirt", "Countryside")
+FIGURE_PX = 960
+"""The longer side of a picture in the figures."""
+
+MAP_METHODS = ("thesis", "planar")
+COMPARISONS: dict[str, tuple[Literal["thesis", "robust"], tuple[str, ...]]] = {
+    "thesis": ("thesis", ()),
+    "thesis, eq. 3.21 as printed": ("thesis", ("eq3.21=printed",)),
+    "thesis, thresholds from the light": ("thesis", ("T_gray=light", "T_H=light")),
+    "robust": ("robust", ()),
+}
+"""The ways in which pictures are compared, by their titles: the method and its `--thesis` values."""
+
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """Table 4.6: how the two networks are trained. `steps` 0 trains none; `weights` as `sorvolo train` takes it."""
+
+    steps: int = 400
+    preset: Literal["fast", "accurate", "thesis"] = "fast"
+    weights: str = "none"
+    device: str = "auto"
+    side_px: int = 256  # of the training samples
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.steps <= 10**8:
+            raise SettingsError(f"--train-steps must lie in 0 to 100000000, got {self.steps}")
+
+
+@dataclass(frozen=True)
+class SimulatedSize:
+    """How large a simulated dataset is; the dataset itself is `length_m` None with its own number of videos."""
+
+    length_m: float | None = 24.0  # of each path; None: as Tables 2.1 and 2.3 have them
+    size_px: tuple[int, int] = (1280, 720)
+    bare_videos: int = 1  # without telemetry, of each environment that has such
+    environments: tuple[str, ...] = ENVIRONMENTS
+
+    def __post_init__(self) -> None:
+        if self.length_m is not None and not 4 <= self.length_m <= 1000:
+            raise SettingsError(f"--length must lie in 4 to 1000 m, got {self.length_m:g}")
+
+
+@dataclass(frozen=True)
+class ReproductionSettings:
+    """How much of chapter 4 is done, and how. The dataset's own size is `videos` None."""
+
+    videos: int | None = None  # at most so many of each environment, in each part of the dataset
+    views_per_second: float = 5.0  # that are compared; the thesis compared every frame
+    repeats: int = 5  # of the timed comparison of section 4.2.2
+    seed: int = 1  # of what is simulated, held out, and learnt
+    detector: DetectorSettings = field(default_factory=DetectorSettings)
+
+    def __post_init__(self) -> None:
+        if self.videos is not None and self.videos < 1:
+            raise SettingsError(f"--videos must be 1 or more, got {self.videos}")
+        if not 0.05 <= self.views_per_second <= 240:
+            raise SettingsError(f"--views-per-second must lie in 0.05 to 240, got {self.views_per_second:g}")
+
+
+def quick(settings: ReproductionSettings, size: SimulatedSize) -> tuple[ReproductionSettings, SimulatedSize]:
+    """The same at the size of a try: one short path of small pictures, and a training that only shows that it runs."""
+    detector = replace(settings.detector, steps=min(4, settings.detector.steps), side_px=128)
+    small = replace(size, length_m=10.0, size_px=(480, 270), environments=("Countryside",))
+    return replace(settings, videos=1, repeats=1, detector=detector), small

@@ -1,0 +1,94 @@
+"""The rows put together to the thesis's tables, the published figures beside ours."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from sorvolo.change.metrics import Counts
+from sorvolo.missions.reproduce.comparisons import MASKS, TIMES, rates
+from sorvolo.missions.reproduce.published import (
+    DIFFERENCES,
+    FIGURES,
+    SECTION_4_1_1,
+    SECTION_4_2_2,
+    TABLE_4_1,
+    TABLE_4_3,
+    TABLE_4_4,
+    TABLE_4_5,
+    TABLE_4_6,
+)
+from sorvolo.missions.reproduce.rows import Row
+from sorvolo.missions.reproduce.settings import COMPARISONS, MAP_METHODS
+
+_COUNTS = ("tp", "fp", "fn", "tn")
+
+
+def tables_of(rows: Sequence[Row]) -> dict[str, Any]:
+    """Tables 4.1 and 4.3 to 4.6, sections 4.1.1 and 4.2.2 and Figure 3.12, each `published` and `ours`.
+
+    A rate that nothing was there to divide by is None. A table whose rows are all missing has an empty `ours`.
+    """
+    made = [row for row in rows if not row.missing]
+    frames = _pooled(made, "frames")
+    tables: dict[str, Any] = {
+        "table_4_1": _both(TABLE_4_1, _mosaics(made)),
+        "section_4_1_1": _both(SECTION_4_1_1, _deviations(made)),
+        "figure_3_12": _both(FIGURES["3.12"], [dict(row.values) for row in made if row.kind == "transform"]),
+        "tables_4_3_and_4_4": _both({"method": "thesis", **TABLE_4_3, **TABLE_4_4}, frames),
+        "table_4_5": _both(TABLE_4_5, _pooled(made, "pixels")),
+        "section_4_2_2": _both(SECTION_4_2_2, [dict(row.values) for row in made if row.kind == "seconds"]),
+        "table_4_6": _both(TABLE_4_6, [dict(row.values) for row in made if row.kind == "detector"]),
+    }
+    for name, texts in DIFFERENCES.items():
+        tables[name]["differences"] = list(texts)
+    return tables
+
+
+def _both(published: Any, ours: Any) -> dict[str, Any]:
+    return {"published": published, "ours": ours}
+
+
+def _mosaics(rows: Iterable[Row]) -> list[dict[str, Any]]:
+    keys = (
+        "sequence", "has_telemetry", "method", "frames", "keyframes", "matched", "minutes", "cpu_minutes",
+        "seconds_per_keyframe", "deviation", "quality", "camera",
+    )
+    return [{key: row.values[key] for key in keys} for row in rows if row.kind == "mosaic"]
+
+
+def _deviations(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """By method: the mean deviation over its videos; the correlation of the methods' maps, over those that have one."""
+    found = []
+    alike = [row.values["correlation"] for row in rows if row.kind == "correlation"]
+    for method in MAP_METHODS:
+        shares = [
+            row.values["deviation"] for row in rows
+            if row.kind == "mosaic" and row.values["method"] == method and row.values["deviation"] is not None
+        ]
+        if shares:
+            found.append({
+                "method": method, "videos": len(shares), "deviation": sum(shares) / len(shares),
+                "correlation": sum(alike) / len(alike) if alike else None, "correlated": len(alike),
+            })
+    return found
+
+
+def _pooled(rows: Iterable[Row], kind: str) -> list[dict[str, Any]]:
+    """Counts of all videos together and the rates of section 4.2.1, by method and by what they were judged by."""
+    compared = [row.values for row in rows if row.kind == "comparison" and row.values[kind] is not None]
+    result = []
+    for title in COMPARISONS:
+        for judged_by in (MASKS, TIMES):
+            parts = [each for each in compared if each["method"] == title and each["judged_by"] == judged_by]
+            if parts:
+                result.append(_summed(title, judged_by, parts, kind))
+    return result
+
+
+def _summed(title: str, judged_by: str, parts: Sequence[Mapping[str, Any]], kind: str) -> dict[str, Any]:
+    whole = sum((Counts(**each[kind]) for each in parts), Counts())
+    return {
+        "method": title, "judged_by": judged_by, "videos": len(parts),
+        "views": sum(each["views"] for each in parts), "compared": sum(each["compared"] for each in parts),
+        **{name: getattr(whole, name) for name in _COUNTS}, **rates(whole),
+        "cpu_seconds_per_view": sum(each["cpu_seconds_per_view"] for each in parts) / len(parts),
+    }
