@@ -26,7 +26,7 @@ from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.presets import preset
 from sorvolo.simulation.settings import SimulationSettings
 
-EFFORT = ("seconds", "cpu_s", "registration_cpu_s_per_keyframe", "peak_memory_mb")
+EFFORT = ("seconds", "cpu_s", "registration_cpu_s_per_keyframe", "peak_memory_mb", "reading")
 """Of report.json: what a run took."""
 TIMED = {"report.html", "changes.html"}
 """Pages that show it."""

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from sorvolo.capture.containers import top_boxes
 from sorvolo.capture.source import open_sources
 from sorvolo.capture.video import VideoSource, read_video_info
+from sorvolo.capture.video_spans import SparseReading
 from sorvolo.errors import InputError
 from sorvolo.survey.flight import Frame, LostFrame
 
@@ -275,9 +276,9 @@ def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @settings(max_examples=60, deadline=10_000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(name=st.sampled_from(["a.mp4", "a.ts", "a.mkv"]), seed=st.integers(0, 2**32),
-       flips=st.integers(0, 200), keep=st.floats(0.02, 1.0))
+       flips=st.integers(0, 200), keep=st.floats(0.02, 1.0), sparse=st.sampled_from([None, 0.04, 0.4]))
 def test_damaged_files_raise_nothing_but_input_errors(
-    tmp_path: Path, originals: Path, name: str, seed: int, flips: int, keep: float
+    tmp_path: Path, originals: Path, name: str, seed: int, flips: int, keep: float, sparse: float | None
 ) -> None:
     chance = random.Random(seed)
     data = bytearray((originals / name).read_bytes())
@@ -287,7 +288,8 @@ def test_damaged_files_raise_nothing_but_input_errors(
     path.write_bytes(bytes(data[: max(1, int(keep * len(data)))]))
     try:
         source = open_video(path)
-        times = [frame.time_ns for frame in source.frames(lambda index, time_ns: True)]
+        reading = None if sparse is None else SparseReading(sparse, lambda *_: True, lambda *_: seed % 2 == 0)
+        times = [frame.time_ns for frame in source.frames(lambda index, time_ns: True, reading)]
     except InputError:
         return
     assert len(times) <= 200 and (np.diff(times) > 0).all()

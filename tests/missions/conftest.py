@@ -1,8 +1,10 @@
 """Small simulated flights, made once, that the tests of mapping share; their fixes are good to some centimetres."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import av
 import pytest
 
 from sorvolo.missions.simulate.site import simulate_site
@@ -60,3 +62,20 @@ def oblique(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for _ in simulate_site(folder, replace(_SMALL, motion=motion, output=OutputSettings(telemetry="all"))):
         pass
     return folder
+
+
+@pytest.fixture(scope="session")
+def keyed(filmed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same video with a key frame of the stream each half second, as drones write them; telemetry beside it."""
+    folder = tmp_path_factory.mktemp("keyed")
+    flight = filmed / "flight1"
+    shutil.copy(flight / "flight1.csv", folder)
+    with av.open(str(flight / "flight1.mp4")) as source, av.open(str(folder / "flight1.mp4"), "w") as target:
+        target.metadata.update(source.metadata)
+        stream = target.add_stream("libx264", rate=6, options={"crf": "18", "x264-params": "keyint=3:scenecut=0"})
+        stream.width, stream.height = 480, 270
+        for frame in source.decode(video=0):
+            frame.pict_type = av.video.frame.PictureType.NONE  # the encoder chooses
+            target.mux(stream.encode(frame))
+        target.mux(stream.encode())
+    return folder / "flight1.mp4"

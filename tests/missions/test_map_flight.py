@@ -88,9 +88,23 @@ def test_a_video_with_telemetry_of_each_format(filmed: Path, tmp_path: Path, nam
     run_map(site, _film(filmed), "--telemetry", _telemetry(filmed, name), "--camera", filmed / "camera.xml")
     report = report_of(site, "flight1")
     assert report["georeferenced"] and report["frames"]["vision"] == report["frames"]["selected"] > 8
+    assert "2.5 s apart" in report["reading"]["whole_because"] and not report["reading"]["skipped"]
     absolute_m, shape_m = corner_errors_m(site, "flight1", filmed / "truth")
     assert shape_m < _M_PER_PX
     assert absolute_m < 0.6  # 1 Hz formats interpolate a fix from two that are 5 m apart, turns included
+
+
+def test_a_video_is_mapped_by_the_key_frames_of_its_stream(keyed: Path, filmed: Path, tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    run_map(site, keyed, "--camera", filmed / "camera.xml")
+    report = report_of(site, "flight1")
+    assert report["frames"]["vision"] == report["frames"]["selected"] > 8
+    reading = report["reading"]
+    assert not reading["whole_because"]
+    assert reading["decoded"] < 0.6 * report["frames"]["total"] < 2 * reading["skipped"]
+    absolute_m, shape_m = corner_errors_m(site, "flight1", filmed / "truth")
+    assert shape_m < _M_PER_PX and absolute_m < 0.6
+    assert f"{reading['skipped']} skipped" in (site / "flights" / "flight1" / "report.html").read_text()
 
 
 def test_a_video_that_looks_ahead_by_half_a_right_angle(oblique: Path, tmp_path: Path) -> None:

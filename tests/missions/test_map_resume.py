@@ -22,7 +22,7 @@ from sorvolo.survey.flight import PosedFrame
 from sorvolo.survey.mosaic import MosaicUpdate, Status
 from sorvolo.survey.objects import Detections
 
-_EFFORT = ("seconds", "cpu_s", "registration_cpu_s_per_keyframe", "peak_memory_mb")
+_EFFORT = ("seconds", "cpu_s", "registration_cpu_s_per_keyframe", "peak_memory_mb", "reading")
 _KILLED_AT = 9  # frames
 
 
@@ -117,6 +117,14 @@ def test_it_goes_on_where_it_was(whole: tuple[Path, ...], filmed: Path, tmp_path
     assert len(registered) == len(updates) - _KILLED_AT > 3
     assert content(site) == content(whole[0])
     assert not list(site.rglob("run.journal")) and not list(site.rglob(".tmp-*"))
+
+
+def test_it_goes_on_among_the_key_frames_of_a_stream(keyed: Path, tmp_path: Path) -> None:
+    settings, amid = MapSettings(model="none"), tmp_path / "amid" / "site"
+    for number, _ in enumerate(map_flights([keyed], tmp_path / "site", settings, camera="aov=70"), 1):
+        copy_at(number, tmp_path / "site", amid)
+    assert any([each.is_resumed for each in map_flights([keyed], amid, settings, camera="aov=70")])
+    assert content(amid) == content(tmp_path / "site")
 
 
 def test_killed_before_the_commit_nothing_is_registered_again(

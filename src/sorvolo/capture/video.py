@@ -1,7 +1,7 @@
 """A video file as a flight: its frames upright in RGB, timed by the stream's PTS, with damage counted."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, cast
@@ -9,16 +9,23 @@ from typing import Any, cast
 import av
 import numpy as np
 
-from sorvolo.capture.containers import ends_early, top_boxes
+from sorvolo.capture.containers import ends_early
 from sorvolo.capture.decoding import is_heif
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.telemetry.cleaning import notice
+from sorvolo.capture.video_spans import SparseReading, SparseVideo, UnevenStreamError
+from sorvolo.capture.video_stream import (
+    PIXEL_LIMIT,
+    DecodingDamage,
+    VideoClock,
+    decoded_frames,
+    opened_video,
+    stamp_of,
+    video_stream,
+)
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
-
-PIXEL_LIMIT = 64_000_000
-"""A video of larger frames is refused before it is decoded."""
 
 VIDEO_SUFFIXES = frozenset({
     ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg", ".avi", ".wmv", ".flv",
@@ -28,9 +35,6 @@ VIDEO_SUFFIXES = frozenset({
 
 _SECOND_NS = 1_000_000_000
 _FALLBACK_RATE_HZ = 25.0
-_GAP_S = 2.0
-_CLOCK_RETURNS_WITHIN = 25  # frames after a backward step in which the old clock may come back
-_DEMUX_RETRIES = 20
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,15 @@ class VideoInfo:
     is_cut: bool
 
 
+@dataclass(frozen=True)
+class Reading:
+    """How a video was read: why all of it was decoded (empty: it was not), how many pictures were, and how many not."""
+
+    whole_because: str = ""
+    decoded: int = 0
+    skipped: int = 0
+
+
 class VideoSource:
     """A video's frames; fulfils `capture.source.Source`."""
 
@@ -76,45 +89,82 @@ class VideoSource:
         self.start_ns, self.start_origin = info.start_ns, info.start_origin
         self._notices = tuple(notices)
         self._found: tuple[Notice, ...] = tuple(_cut_notice(info.is_cut))
+        self.reading = Reading()
+        """How the frames were read; complete when `frames` is exhausted."""
 
     def notices(self) -> tuple[Notice, ...]:
         """What was found so far; complete when `frames` is exhausted."""
         return (*self._notices, *self._found)
 
-    def frames(self, wanted: Callable[[int, int], bool]) -> Iterator[Frame | LostFrame]:
-        """Decode the whole video; convert and yield the frames for which `wanted(index, time_ns)` is true.
+    def frames(
+        self, wanted: Callable[[int, int], bool], sparse: SparseReading | None = None
+    ) -> Iterator[Frame | LostFrame]:
+        """Decode the video; convert and yield the frames for which `wanted(index, time_ns)` is true.
 
         A frame's time is `start_ns` plus its PTS since the first; where a PTS is missing or runs backward,
-        the usual step is taken instead and counted. Damaged packets are counted and decoding goes on.
+        the usual step is taken instead and counted. Damaged packets are counted and decoding goes on. With `sparse`
+        only what that needs is decoded, and `wanted` goes for the rest of a stream that cannot be read so.
         """
-        clock = _Clock(self.info.frame_rate_hz)
-        damage = _Damage()
-        sizes = _Sizes()
-        last_ns = 0
-        for index, decoded in enumerate(_decoded_frames(self.info.path, damage)):
-            last_ns = clock.time_ns(decoded)
+        if sparse is None:
+            self.reading = Reading("all frames were asked for")
+            yield from self._all_frames(wanted)
+            return
+        clock, sizes, damage = VideoClock(self.info.frame_rate_hz), _Sizes(), DecodingDamage()
+        timed = replace(sparse, wanted=lambda index, time_ns: sparse.wanted(index, self.start_ns + time_ns))
+
+        def deliver(decoded: av.VideoFrame, index: int, time_ns: int) -> Frame | LostFrame:
+            return self._delivered(decoded, index, self.start_ns + time_ns, sizes, damage)
+
+        video = SparseVideo(self.info.path, clock, timed, deliver)
+        try:
+            for each in video.frames():
+                self.reading = Reading("", video.decoded, max(0, video.pictures - video.decoded))
+                yield each
+            self.reading = Reading("", video.decoded, max(0, video.pictures - video.decoded))
+            self._found = self._damage_notices(self._ends_before(video.last_ns), damage, sizes, clock)
+        except UnevenStreamError as reason:
+            self.reading = Reading(str(reason), video.decoded)
+            yield from self._all_frames(wanted, *video.passed)
+
+    def _all_frames(
+        self, wanted: Callable[[int, int], bool], passed: int = -1, passed_ns: int = -1
+    ) -> Iterator[Frame | LostFrame]:
+        """The wanted frames after one of this number and time since the first, every frame being decoded."""
+        clock, damage, sizes = VideoClock(self.info.frame_rate_hz), DecodingDamage(), _Sizes()
+        last_ns, before = 0, self.reading
+        for index, decoded in enumerate(decoded_frames(self.info.path, damage)):
+            last_ns = clock.time_ns(stamp_of(decoded))
+            self.reading = replace(before, decoded=before.decoded + index + 1)
             self._found = self._damage_notices(self.info.is_cut, damage, sizes, clock)
             time_ns = self.start_ns + last_ns
-            if not wanted(index, time_ns):
-                continue
-            own_px, flight_px = _upright_size_px(decoded, self.info.turn), (self.info.width_px, self.info.height_px)
-            if not is_same_shape(own_px, flight_px):
-                sizes.lost += 1
-                yield LostFrame(index, str(index), time_ns, other_size(own_px, flight_px))
-                continue
-            try:
-                image = self._image(decoded)
-            except (av.FFmpegError, ValueError, MemoryError) as error:
-                damage.unconverted += 1
-                yield LostFrame(index, str(index), time_ns, f"corrupt: {error}")
-                continue
-            sizes.fitted += own_px != flight_px
-            yield Frame(index, str(index), time_ns, image)
-        missing_s = self.info.duration_s - last_ns / _SECOND_NS
-        is_cut = self.info.is_cut or missing_s > max(1.0, 0.05 * self.info.duration_s)
-        self._found = self._damage_notices(is_cut, damage, sizes, clock)
+            if wanted(index, time_ns) and index > passed and last_ns > passed_ns:
+                yield self._delivered(decoded, index, time_ns, sizes, damage)
+        self._found = self._damage_notices(self._ends_before(last_ns), damage, sizes, clock)
 
-    def _damage_notices(self, is_cut: bool, damage: "_Damage", sizes: "_Sizes", clock: "_Clock") -> tuple[Notice, ...]:
+    def _ends_before(self, last_ns: int) -> bool:
+        """Whether the video is shorter than its header states."""
+        missing_s = self.info.duration_s - last_ns / _SECOND_NS
+        return self.info.is_cut or missing_s > max(1.0, 0.05 * self.info.duration_s)
+
+    def _delivered(
+        self, decoded: av.VideoFrame, index: int, time_ns: int, sizes: "_Sizes", damage: DecodingDamage
+    ) -> Frame | LostFrame:
+        """A decoded picture as a frame; what is odd of it is counted."""
+        own_px, flight_px = _upright_size_px(decoded, self.info.turn), (self.info.width_px, self.info.height_px)
+        if not is_same_shape(own_px, flight_px):
+            sizes.lost += 1
+            return LostFrame(index, str(index), time_ns, other_size(own_px, flight_px))
+        try:
+            image = self._image(decoded)
+        except (av.FFmpegError, ValueError, MemoryError) as error:
+            damage.unconverted += 1
+            return LostFrame(index, str(index), time_ns, f"corrupt: {error}")
+        sizes.fitted += own_px != flight_px
+        return Frame(index, str(index), time_ns, image)
+
+    def _damage_notices(
+        self, is_cut: bool, damage: DecodingDamage, sizes: "_Sizes", clock: VideoClock
+    ) -> tuple[Notice, ...]:
         cut = _cut_notice(is_cut or damage.stopped)
         return (*cut, *damage.notices(), *sizes.notices(), *clock.notices())
 
@@ -130,7 +180,7 @@ class VideoSource:
     def glimpses(self, count: int) -> list[Frame]:
         """A few frames spread over the video, found by seeking: quick, but their times are rough."""
         found: list[Frame] = []
-        with _opened(self.info.path) as container:
+        with opened_video(self.info.path) as container:
             stream = container.streams.video[0]
             first_s = (stream.start_time or 0) * float(stream.time_base or 0)
             for part in range(count):
@@ -158,8 +208,8 @@ def read_video_info(path: Path) -> VideoInfo:
     frames are larger than PIXEL_LIMIT.
     """
     _check_file(path)
-    with _opened(path) as container:
-        stream = _video_stream(container, path)
+    with opened_video(path) as container:
+        stream = video_stream(container, path)
         size_px = stream.codec_context.width, stream.codec_context.height
         if size_px[0] * size_px[1] > PIXEL_LIMIT:
             raise InputError(
@@ -174,7 +224,7 @@ def read_video_info(path: Path) -> VideoInfo:
             duration_s = (container.duration or 0) / av.time_base
         codec, count, aspect = stream.codec_context.name, stream.frames, stream.sample_aspect_ratio
         container_name = container.format.name.split(",")[0]
-    first = next(_decoded_frames(path, _Damage()), None)
+    first = next(decoded_frames(path, DecodingDamage()), None)
     if first is None:
         raise InputError(
             f"{path.name}: a {codec} video without a single readable frame; it was cut or never finished: "
@@ -209,75 +259,6 @@ def _upright_size_px(decoded: av.VideoFrame, turn: tuple[bool, bool, bool]) -> t
     return (decoded.height, decoded.width) if turn[0] else (decoded.width, decoded.height)
 
 
-class _Clock:
-    """Frames' times since the first one, strictly increasing whatever the PTS do. `time_ns` changes it."""
-
-    def __init__(self, frame_rate_hz: float) -> None:
-        self._step_ns = max(1, round(_SECOND_NS / frame_rate_hz))
-        self._last_ns = -1
-        self._origin_ns = self._former_origin_ns = 0
-        self._since_backward = _CLOCK_RETURNS_WITHIN
-        self._missing = self._backward = self._gaps = 0
-        self._longest_gap_ns = 0
-
-    def time_ns(self, decoded: av.VideoFrame) -> int:
-        """The frame's time in ns since the first frame."""
-        stamp_ns = None
-        if decoded.pts is not None and decoded.time_base:
-            stamp_ns = round(decoded.pts * decoded.time_base * _SECOND_NS)
-        if self._last_ns < 0:
-            self._missing += stamp_ns is None
-            self._origin_ns = self._former_origin_ns = stamp_ns or 0
-            self._last_ns = 0
-            return 0
-        expected_ns = self._last_ns + self._step_ns
-        self._since_backward += 1
-        if stamp_ns is None:
-            self._missing += 1
-            time_ns = expected_ns
-        elif stamp_ns - self._origin_ns <= self._last_ns:
-            # the clock was set back: go on from here, but remember the old one, should this be a single slip
-            self._backward += 1
-            time_ns = expected_ns
-            self._former_origin_ns, self._origin_ns = self._origin_ns, stamp_ns - time_ns
-            self._since_backward = 0
-        else:
-            time_ns = stamp_ns - self._origin_ns
-            former_ns = stamp_ns - self._former_origin_ns
-            returned = abs(former_ns - expected_ns) < abs(time_ns - expected_ns)
-            if self._since_backward <= _CLOCK_RETURNS_WITHIN and former_ns > self._last_ns and returned:
-                time_ns, self._origin_ns = former_ns, self._former_origin_ns
-        if (gap_ns := time_ns - self._last_ns) > max(_GAP_S * _SECOND_NS, 5 * self._step_ns):
-            self._gaps += 1
-            self._longest_gap_ns = max(self._longest_gap_ns, gap_ns)
-        self._last_ns = time_ns
-        return time_ns
-
-    def notices(self) -> list[Notice]:
-        longest_s = self._longest_gap_ns / _SECOND_NS
-        return [
-            *notice("missing_pts", self._missing, "frames without a time stamp, set by the usual step: {}"),
-            *notice("backward_pts", self._backward, "times that the video's clock runs backward: {}"),
-            *notice("video_gap", self._gaps, f"gaps in the video: {{}}, the longest {longest_s:.1f} s"),
-        ]
-
-
-@dataclass
-class _Damage:
-    """What was damaged while decoding; filled by `_decoded_frames`."""
-
-    packets: int = 0
-    corrupt_frames: int = 0
-    unconverted: int = 0
-    stopped: bool = False
-
-    def notices(self) -> list[Notice]:
-        return [
-            *notice("decode_error", self.packets, "damaged places in the video, skipped: {}"),
-            *notice("damaged_frame", self.corrupt_frames + self.unconverted, "frames damaged in part: {}"),
-        ]
-
-
 @dataclass
 class _Sizes:
     """Frames of another size than the first one's: those that were brought to it, and those of another shape."""
@@ -292,35 +273,6 @@ class _Sizes:
         ]
 
 
-def _decoded_frames(path: Path, damage: _Damage) -> Iterator[av.VideoFrame]:
-    """Every frame that FFmpeg can decode, in order; what it cannot is counted in `damage`."""
-    with _opened(path) as container:
-        stream = _video_stream(container, path)
-        stream.thread_type = "AUTO"
-        for _ in range(_DEMUX_RETRIES):
-            try:
-                for packet in container.demux(stream):
-                    yield from _frames_of(packet, damage)
-                return
-            except (av.FFmpegError, IndexError):
-                # PyAV's IndexError: damage made a stream appear that was not there at the start
-                damage.packets += 1
-        damage.stopped = True
-
-
-def _frames_of(packet: "av.Packet[Any]", damage: _Damage) -> Iterator[av.VideoFrame]:
-    damage.packets += packet.is_corrupt
-    try:
-        decoded = packet.decode()
-    except (av.FFmpegError, ValueError, MemoryError):
-        damage.packets += 1
-        return
-    for frame in decoded:
-        if isinstance(frame, av.VideoFrame) and frame.width * frame.height <= PIXEL_LIMIT:
-            damage.corrupt_frames += frame.is_corrupt
-            yield frame
-
-
 def _check_file(path: Path) -> None:
     if not path.exists():
         raise InputError(f"no such file: {path}")
@@ -331,43 +283,6 @@ def _check_file(path: Path) -> None:
     with path.open("rb") as file:
         if is_heif(file.read(12)):
             raise InputError(f"{path.name} is a HEIC picture, not a video; rename it to {path.stem}.heic")
-
-
-def _opened(path: Path) -> av.container.InputContainer:
-    """Open for reading; nothing but this one file is read, whatever a playlist in it may name."""
-    try:
-        return av.open(f"file:{path}", options={"protocol_whitelist": "file"})
-    except av.FFmpegError as error:
-        raise InputError(f"{path.name} cannot be read as a video: {_why_unreadable(path, error)}") from error
-    except (ValueError, MemoryError) as error:
-        raise InputError(f"{path.name} cannot be read as a video: {error}") from error
-
-
-def _why_unreadable(path: Path, error: Exception) -> str:
-    try:
-        boxes = top_boxes(path)
-    except OSError as reason:
-        return f"{reason}; check its permissions"
-    if "ftyp" in boxes and "moov" not in boxes:
-        return (
-            "moov atom not found: the file was cut before its index, which an MP4 has at its end; "
-            "copy it again from the drone, or repair it there; record as MKV or TS, which survive a cut"
-        )
-    words = getattr(error, "strerror", None) or str(error)
-    return f"{words}; give a video that FFmpeg reads, or a folder of photos"
-
-
-def _video_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
-    # cover art in a music file counts as a video stream
-    cover = av.stream.Disposition.attached_pic
-    streams = [stream for stream in container.streams.video if not stream.disposition & cover]
-    if not streams:
-        kinds = ", ".join(sorted({stream.type for stream in container.streams})) or "nothing"
-        raise InputError(f"{path.name} has no video in it, only {kinds}; give the drone's video file")
-    # PyAV's type does not state that an unknown codec leaves no context
-    if cast(object, streams[0].codec_context) is None:
-        raise InputError(f"{path.name}: the video's codec is unknown to FFmpeg, or its header is damaged")
-    return streams[0]
 
 
 def _turn_of(frame: av.VideoFrame) -> tuple[bool, bool, bool]:

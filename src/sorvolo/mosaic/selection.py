@@ -16,6 +16,7 @@ _SMALL_PX = 256
 _UNTIMED_STEP_S = 0.2  # candidates of a video without telemetry, or live: five a second, the pictures decide
 _LIVE_SPEED_M_S = 5.0  # at least: a flight that has just begun does not show yet how fast it will be
 _USUAL = 25  # frames that show how sharp the flight's usually are
+_SPARSE_SHARE = 2 / 3  # of the way between keyframes that frames which are looked at may lie apart
 _COARSE_PX = 64  # at which a sensor's noise averages out and ground still shows itself
 
 
@@ -143,6 +144,18 @@ def select_keyframes(
         if not reason:
             memory = replace(memory, last=texture)
         yield Selected(each, reason, memory)
+
+
+def shows_all_between(before: ImageRGB, after: ImageRGB, settings: SelectionSettings) -> bool:
+    """Whether no frame between these two is needed to keep the overlap: they lie near each other, and the later one is
+    as sharp as the earlier.
+
+    Keyframes chosen among frames so near overlap by `least_overlap` at least, with the usual settings.
+    """
+    old, new = small_gray(before), small_gray(after)
+    if sharpness(new) < settings.blurred * sharpness(old):
+        return False
+    return 1 - _overlap(normalise_contrast(old), normalise_contrast(new)) <= _SPARSE_SHARE * (1 - settings.overlap)
 
 
 class StretchSelection:

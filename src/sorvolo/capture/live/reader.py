@@ -15,7 +15,7 @@ from sorvolo.capture.live.klv import LocalSet, local_sets
 from sorvolo.capture.live.klv_telemetry import klv_streams
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
 from sorvolo.capture.telemetry.cleaning import notice
-from sorvolo.capture.video import PIXEL_LIMIT
+from sorvolo.capture.video_stream import PIXEL_LIMIT
 from sorvolo.survey.flight import Notice
 
 _SECOND_NS = 1_000_000_000

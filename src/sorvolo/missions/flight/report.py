@@ -10,6 +10,7 @@ from typing import Any
 
 import sorvolo
 from sorvolo.capture.sync import OffsetEstimate
+from sorvolo.capture.video import VideoSource
 from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import TileIndex
@@ -68,6 +69,7 @@ def build_report(
         "flown": utc_text(setup.flown_ns) if setup.flown_ns else None,
         **_headline(result, figures, agreement, is_video=source.kind == "video"),
         "frames": _frames(placed, source.frame_count),
+        "reading": asdict(source.reading) if isinstance(source, VideoSource) else None,
         "camera": _camera(source.camera, result.camera, graph),
         "telemetry": _telemetry(setup),
         "time_offset": _offset(settings, log, result.offset),

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +10,8 @@ from pathlib import Path
 from sorvolo.capture.areas import read_area
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import LiveSource, Source, opened_sources
+from sorvolo.capture.video import VideoSource
+from sorvolo.capture.video_spans import SparseReading
 from sorvolo.errors import SettingsError
 from sorvolo.missions.flight.base_map import open_base
 from sorvolo.missions.flight.control import open_control
@@ -34,7 +36,7 @@ from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.missions.map.thesis_run import ThesisRun
 from sorvolo.mosaic.control import ControlSettings
-from sorvolo.mosaic.selection import SelectionSettings, every, select_keyframes
+from sorvolo.mosaic.selection import SelectionSettings, every, select_keyframes, shows_all_between
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
@@ -126,8 +128,8 @@ def _map_one(
             before.take(step)
             yield update(step, ended, step.index + 1)
         before.search(run.is_unsearched)
-        reader = _Reader(setup, before)
         selection = SelectionSettings(overlap=settings.overlap, least_overlap=min(0.5, settings.overlap))
+        reader = _Reader(setup, before, selection if settings.method == "planar" else None)
         selected = select_keyframes(
             reader.posed(run), selection,
             keep_all=source.kind == "photos" or (settings.method == "thesis" and setup.track is not None),
@@ -152,16 +154,20 @@ def _begun(
 
 
 class _Reader:
-    """Reads a flight's frames after those of a killed run; of these only the ones that are needed again."""
+    """Reads a flight's frames after those of a killed run; of these only the ones that are needed again.
 
-    def __init__(self, setup: FlightSetup, before: Earlier) -> None:
-        self._setup, self._before = setup, before
+    Of a recorded video it decodes the key frames of the stream, and what lies between them where that is needed by
+    `selection`; None: every frame.
+    """
+
+    def __init__(self, setup: FlightSetup, before: Earlier, selection: SelectionSettings | None) -> None:
+        self._setup, self._before, self._selection = setup, before, selection
         self._is_candidate = every(setup.plan.step_s)
         self.read = 0
 
     def posed(self, run: FlightRun) -> Iterator[PosedFrame | LostFrame]:
         """The frames to select from."""
-        for each in _read(self._setup.source, self._is_wanted):
+        for each in self._frames():
             is_new = each.index > self._before.last
             if is_new:
                 self.read = each.index + 1
@@ -175,15 +181,27 @@ class _Reader:
             else:
                 run.look(posed)
 
+    def _frames(self) -> Generator[Frame | LostFrame]:
+        """Those of a recorded flight are decoded while those before them are placed."""
+        source = self._setup.source
+        if isinstance(source, LiveSource):
+            yield from source.frames(self._is_wanted)
+            return
+        if isinstance(source, VideoSource) and self._selection is not None:
+            frames = source.frames(
+                self._is_wanted, SparseReading(self._setup.plan.step_s, self._is_needed, self._is_enough)
+            )
+        else:
+            frames = source.frames(self._is_wanted)
+        with closing(read_ahead(frames, _AHEAD)) as ahead:
+            yield from ahead
+
     def _is_wanted(self, index: int, time_ns: int) -> bool:
-        is_candidate = self._is_candidate(index, time_ns)
-        return is_candidate and (index > self._before.last or index in self._before.needed)
+        return self._is_candidate(index, time_ns) and self._is_needed(index, time_ns)
 
+    def _is_needed(self, index: int, _time_ns: int) -> bool:
+        return index > self._before.last or index in self._before.needed
 
-def _read(source: Source, wanted: Callable[[int, int], bool]) -> Generator[Frame | LostFrame]:
-    """The wanted frames; those of a recorded flight are decoded while those before them are placed."""
-    if isinstance(source, LiveSource):
-        yield from source.frames(wanted)
-    else:
-        with closing(read_ahead(source.frames(wanted), _AHEAD)) as frames:
-            yield from frames
+    def _is_enough(self, before: Frame, after: Frame) -> bool:
+        assert self._selection is not None
+        return shows_all_between(before.image, after.image, self._selection)

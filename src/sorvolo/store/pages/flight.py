@@ -310,8 +310,19 @@ def _effort(report: Mapping[str, Any]) -> str:
         None if total is None else f"{seconds_words(total)} in all",
         None if cpu_s is None else f"{seconds_words(cpu_s)} of processor time",
         with_unit("at most {:.0f} MB of memory", number_at(report, "peak_memory_mb")),
+        _reading(report),
     ]
     return ", ".join(part for part in parts if part)
+
+
+def _reading(report: Mapping[str, Any]) -> str | None:
+    """How much of a video was decoded."""
+    decoded, skipped = number_at(report, "reading", "decoded"), number_at(report, "reading", "skipped")
+    if decoded is None or skipped is None:
+        return None
+    if why := at(report, "reading", "whole_because"):
+        return f"{decoded:.0f} pictures of the video decoded ({why})"
+    return f"{decoded:.0f} pictures of the video decoded and {skipped:.0f} skipped"
 
 
 def _track(report: Mapping[str, Any]) -> TrackColumns:

@@ -1,0 +1,163 @@
+"""A video's stream: opened, decoded picture by picture, timed by its PTS, with damage counted."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import av
+
+from sorvolo.capture.containers import top_boxes
+from sorvolo.capture.telemetry.cleaning import notice
+from sorvolo.errors import InputError
+from sorvolo.survey.flight import Notice
+
+PIXEL_LIMIT = 64_000_000
+"""A video of larger frames is refused before it is decoded."""
+
+_SECOND_NS = 1_000_000_000
+_GAP_S = 2.0
+_CLOCK_RETURNS_WITHIN = 25  # frames after a backward step in which the old clock may come back
+_DEMUX_RETRIES = 20
+
+
+class VideoClock:
+    """Frames' times since the first one, strictly increasing whatever the PTS do. `time_ns` changes it."""
+
+    def __init__(self, frame_rate_hz: float) -> None:
+        self._step_ns = max(1, round(_SECOND_NS / frame_rate_hz))
+        self._last_ns = -1
+        self._origin_ns = self._former_origin_ns = 0
+        self._since_backward = _CLOCK_RETURNS_WITHIN
+        self._missing = self._backward = self._gaps = 0
+        self._longest_gap_ns = 0
+
+    def time_ns(self, stamp_ns: int | None) -> int:
+        """The next frame's time in ns since the first frame, by its PTS in ns; None where it has none."""
+        if self._last_ns < 0:
+            self._missing += stamp_ns is None
+            self._origin_ns = self._former_origin_ns = stamp_ns or 0
+            self._last_ns = 0
+            return 0
+        expected_ns = self._last_ns + self._step_ns
+        self._since_backward += 1
+        if stamp_ns is None:
+            self._missing += 1
+            time_ns = expected_ns
+        elif stamp_ns - self._origin_ns <= self._last_ns:
+            # the clock was set back: go on from here, but remember the old one, should this be a single slip
+            self._backward += 1
+            time_ns = expected_ns
+            self._former_origin_ns, self._origin_ns = self._origin_ns, stamp_ns - time_ns
+            self._since_backward = 0
+        else:
+            time_ns = stamp_ns - self._origin_ns
+            former_ns = stamp_ns - self._former_origin_ns
+            returned = abs(former_ns - expected_ns) < abs(time_ns - expected_ns)
+            if self._since_backward <= _CLOCK_RETURNS_WITHIN and former_ns > self._last_ns and returned:
+                time_ns, self._origin_ns = former_ns, self._former_origin_ns
+        if (gap_ns := time_ns - self._last_ns) > max(_GAP_S * _SECOND_NS, 5 * self._step_ns):
+            self._gaps += 1
+            self._longest_gap_ns = max(self._longest_gap_ns, gap_ns)
+        self._last_ns = time_ns
+        return time_ns
+
+    def notices(self) -> list[Notice]:
+        """What was wrong with the time stamps so far."""
+        longest_s = self._longest_gap_ns / _SECOND_NS
+        return [
+            *notice("missing_pts", self._missing, "frames without a time stamp, set by the usual step: {}"),
+            *notice("backward_pts", self._backward, "times that the video's clock runs backward: {}"),
+            *notice("video_gap", self._gaps, f"gaps in the video: {{}}, the longest {longest_s:.1f} s"),
+        ]
+
+
+@dataclass
+class DecodingDamage:
+    """What was damaged while decoding; filled by `decoded_frames`."""
+
+    packets: int = 0
+    corrupt_frames: int = 0
+    unconverted: int = 0
+    stopped: bool = False
+
+    def notices(self) -> list[Notice]:
+        """What was damaged so far."""
+        return [
+            *notice("decode_error", self.packets, "damaged places in the video, skipped: {}"),
+            *notice("damaged_frame", self.corrupt_frames + self.unconverted, "frames damaged in part: {}"),
+        ]
+
+
+def decoded_frames(path: Path, damage: DecodingDamage) -> Iterator[av.VideoFrame]:
+    """Every frame that FFmpeg can decode, in order; what it cannot is counted in `damage`."""
+    with opened_video(path) as container:
+        stream = video_stream(container, path)
+        stream.thread_type = "AUTO"
+        for _ in range(_DEMUX_RETRIES):
+            try:
+                for packet in container.demux(stream):
+                    yield from _frames_of(packet, damage)
+                return
+            except (av.FFmpegError, IndexError):
+                # PyAV's IndexError: damage made a stream appear that was not there at the start
+                damage.packets += 1
+        damage.stopped = True
+
+
+def stamp_of(picture: "av.VideoFrame | av.Packet[Any]") -> int | None:
+    """A picture's PTS in ns, decoded or not; None where it has none."""
+    if picture.pts is None or not picture.time_base:
+        return None
+    return round(picture.pts * picture.time_base * _SECOND_NS)
+
+
+def _frames_of(packet: "av.Packet[Any]", damage: DecodingDamage) -> Iterator[av.VideoFrame]:
+    damage.packets += packet.is_corrupt
+    try:
+        decoded = packet.decode()
+    except (av.FFmpegError, ValueError, MemoryError):
+        damage.packets += 1
+        return
+    for frame in decoded:
+        if isinstance(frame, av.VideoFrame) and frame.width * frame.height <= PIXEL_LIMIT:
+            damage.corrupt_frames += frame.is_corrupt
+            yield frame
+
+
+def opened_video(path: Path) -> av.container.InputContainer:
+    """Open for reading; nothing but this one file is read, whatever a playlist in it may name."""
+    try:
+        return av.open(f"file:{path}", options={"protocol_whitelist": "file"})
+    except av.FFmpegError as error:
+        raise InputError(f"{path.name} cannot be read as a video: {_why_unreadable(path, error)}") from error
+    except (ValueError, MemoryError) as error:
+        raise InputError(f"{path.name} cannot be read as a video: {error}") from error
+
+
+def _why_unreadable(path: Path, error: Exception) -> str:
+    try:
+        boxes = top_boxes(path)
+    except OSError as reason:
+        return f"{reason}; check its permissions"
+    if "ftyp" in boxes and "moov" not in boxes:
+        return (
+            "moov atom not found: the file was cut before its index, which an MP4 has at its end; "
+            "copy it again from the drone, or repair it there; record as MKV or TS, which survive a cut"
+        )
+    words = getattr(error, "strerror", None) or str(error)
+    return f"{words}; give a video that FFmpeg reads, or a folder of photos"
+
+
+def video_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
+    """The container's first video. Raises InputError where it has none, or of a codec that is not known."""
+    # cover art in a music file counts as a video stream
+    cover = av.stream.Disposition.attached_pic
+    streams = [stream for stream in container.streams.video if not stream.disposition & cover]
+    if not streams:
+        kinds = ", ".join(sorted({stream.type for stream in container.streams})) or "nothing"
+        raise InputError(f"{path.name} has no video in it, only {kinds}; give the drone's video file")
+    # PyAV's type does not state that an unknown codec leaves no context
+    if cast(object, streams[0].codec_context) is None:
+        raise InputError(f"{path.name}: the video's codec is unknown to FFmpeg, or its header is damaged")
+    return streams[0]
