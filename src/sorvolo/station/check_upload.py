@@ -21,6 +21,7 @@ _TEXTS = (".srt", ".csv", ".gpx", ".txt", ".nmea", ".log", ".json", ".xml", ".mr
 _PICTURE_FORMATS = ("JPEG", "TIFF", "PNG")
 _CONTAINERS = {".mp4": "mov", ".mov": "mov", ".m4v": "mov", ".mkv": "matroska", ".ts": "mpegts"}
 _SIGNATURES = {".heic": ((4, b"ftyp"),), ".dng": ((0, b"II*\0"), (0, b"MM\0*"))}
+_PLAIN_KINDS = (0, stat.S_IFREG, stat.S_IFDIR)  # 0: packed where files have no kinds
 _SAFE = re.compile(r"[^\w.() -]", re.ASCII)
 
 
@@ -120,18 +121,23 @@ def _entries(archive: zipfile.ZipFile, most_bytes: int) -> Iterator[zipfile.ZipI
         raise Refusal(f"unpacked it would have more than the {most_bytes / 1e9:.0f} GB that are taken")
     for each in entries:
         path = PurePosixPath(each.filename.replace("\\", "/"))
-        if path.is_absolute() or ".." in path.parts or re.match(r"[A-Za-z]:", each.filename):
-            raise Refusal(f"the name {each.filename[:80]!r} in it leads outside; pack the photos' folder itself")
-        mode = each.external_attr >> 16
-        if mode and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or stat.S_IFMT(mode) == 0):
-            raise Refusal(f"{each.filename[:80]!r} in it is a link or no plain file")
-        if each.flag_bits & 1:
-            raise Refusal("it is encrypted; pack it without a password")
-        if each.file_size > 1_000_000 and each.file_size > _MOST_RATIO * max(each.compress_size, 1):
-            raise Refusal(f"{each.filename[:80]!r} in it would unpack to {each.file_size / 1e6:.0f} MB: no photo does")
+        _demand_harmless(each, path)
         is_wanted = path.suffix.lower() in (*_PHOTOS, *_TEXTS) and not path.name.startswith(".")
         if is_wanted and not each.is_dir() and "__MACOSX" not in path.parts:
             yield each
+
+
+def _demand_harmless(entry: zipfile.ZipInfo, path: PurePosixPath) -> None:
+    """Raise Refusal for a file that leads outside, is a link, is encrypted, or unpacks to more than a photo does."""
+    name = repr(entry.filename[:80])
+    if path.is_absolute() or ".." in path.parts or re.match(r"[A-Za-z]:", entry.filename):
+        raise Refusal(f"the name {name} in it leads outside; pack the photos' folder itself")
+    if stat.S_IFMT(entry.external_attr >> 16) not in _PLAIN_KINDS:
+        raise Refusal(f"{name} in it is a link or no plain file")
+    if entry.flag_bits & 1:
+        raise Refusal("it is encrypted; pack it without a password")
+    if entry.file_size > max(1_000_000, _MOST_RATIO * max(entry.compress_size, 1)):
+        raise Refusal(f"{name} in it would unpack to {entry.file_size / 1e6:.0f} MB: no photo does")
 
 
 def _free_name(name: str, taken: dict[str, Path]) -> str:

@@ -21,6 +21,7 @@ from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import features_name
 from sorvolo.store.nofollow import read_below
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue import FlightEntry
 from sorvolo.survey.flight import Site
 
 TITLES: Mapping[str, str] = {
@@ -200,7 +201,11 @@ _MAKERS: Mapping[str, Callable[[Archive], list[Feature]]] = {
 
 
 def _flights(archive: Archive) -> list[str]:
-    return [each.id for each in archive.flights() if each.status == "complete"]
+    return [each.id for each in _complete(archive)]
+
+
+def _complete(archive: Archive) -> list[FlightEntry]:
+    return [each for each in archive.flights() if each.status == "complete"]
 
 
 def _features_of(archive: Archive, folder: str, name: str, *, local: bool | None = None) -> list[Feature]:
@@ -240,13 +245,11 @@ def _content(archive: Archive) -> object:
     """What changes whenever a collection of the site may: its flights with their files, versions, verdicts, search."""
     if not archive.has_site:
         return None
-    is_local = archive.site().is_local
-    files = [features_name(name, is_local=is_local) for name in ("frames", COVERAGE)]
-    flights = [each for each in archive.flights() if each.status == "complete"]
+    names = [features_name(name, is_local=archive.site().is_local) for name in ("frames", COVERAGE)]
     return (
         archive.created_utc,
-        [(each.id, each.started_utc, each.finished_utc) for each in flights],
-        [_modified(archive, f"flights/{each.id}/{file}") for each in flights for file in files],
+        [(each.id, each.finished_utc) for each in _complete(archive)],
+        [_modified(archive, f"flights/{flight}/{name}") for flight in _flights(archive) for name in names],
         [each.id for each in archive.versions() if each.complete],
         [(each.change_id, each.verdict, each.at_utc, each.note) for each in archive.reviews()],
         _modified(archive, _POD_FILE),

@@ -145,11 +145,8 @@ def _geopackage(site: str, archive: Archive, collections: SiteCollections) -> St
 
 
 def _profile(folder: Path, line: str, step_m: float) -> dict[str, Any]:
-    places = [each.split(",") for each in line.split(";") if each]
-    if not 2 <= len(places) <= _MOST_PROFILE_PLACES or any(len(each) != 2 for each in places):
-        raise Problem(400, f"line={line[:80]}: 2 to {_MOST_PROFILE_PLACES} places LON,LAT;LON,LAT;... were needed")
     try:
-        points = measure_profile(folder, [f"{lat},{lon}" for lon, lat in places], step_m=step_m)
+        points = measure_profile(folder, _places(line), step_m=step_m)
     except InputError as error:
         raise Problem(404 if "heights" in str(error) else 400, str(error)) from error
     points = points[:: max(1, math.ceil(len(points) / _MOST_PROFILE_POINTS))]
@@ -160,6 +157,14 @@ def _profile(folder: Path, line: str, step_m: float) -> dict[str, Any]:
         "ground_m": [_number(each.ground_m) for each in points],
         "sigma_m": sum(known) / len(known) if known else None,
     }
+
+
+def _places(line: str) -> list[str]:
+    """The places of `LON,LAT;LON,LAT;...` as `LAT,LON` each. Raises Problem (400)."""
+    places = [each.split(",") for each in line.split(";") if each]
+    if not 2 <= len(places) <= _MOST_PROFILE_PLACES or any(len(each) != 2 for each in places):
+        raise Problem(400, f"line={line[:80]}: 2 to {_MOST_PROFILE_PLACES} places LON,LAT;LON,LAT;... were needed")
+    return [f"{lat},{lon}" for lon, lat in places]
 
 
 def _number(value: float) -> float | None:

@@ -1,7 +1,6 @@
 """What missions may be started on: files below the root, uploads, streams - each named by an id, never by a path."""
 
 import hashlib
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -9,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sorvolo.station.folders import Folder, folders_below
 from sorvolo.station.messages import check_stream
 from sorvolo.station.orders import InputWish, without_password
 from sorvolo.station.problems import Problem
-from sorvolo.station.settings import STATE_FOLDER, STREAMS_FOLDER, StationSettings
+from sorvolo.station.settings import StationSettings
 from sorvolo.station.stream_addresses import checked_stream
 from sorvolo.station.uploads import VIDEO_ENDINGS, Uploads
-from sorvolo.store.site.files import CATALOGUE
 
 _PHOTO_ENDINGS = (".jpg", ".jpeg", ".dng", ".tif", ".tiff", ".heic")
 _SIDE_ENDINGS = (".csv", ".srt", ".gpx", ".txt", ".nmea", ".log", ".xml", ".yaml", ".yml", ".json")
@@ -95,28 +94,23 @@ def input_row(found: FoundInput) -> dict[str, Any]:
 
 def _inputs_below(root: Path) -> list[FoundInput]:
     found: list[FoundInput] = []
-    waiting, seen = [(root, 0)], 0
-    while waiting and seen < _MOST_FOLDERS and len(found) < _MOST:
-        folder, depth = waiting.pop(0)
-        seen += 1
-        try:
-            entries = sorted(os.scandir(folder), key=lambda each: each.name)
-        except OSError:  # unreadable, or taken away meanwhile
-            continue
-        if any(each.name == CATALOGUE for each in entries):
-            continue
-        files = [each for each in entries if each.is_file(follow_symlinks=False)]
-        found += [each for file in files if (each := _input_of(Path(file.path), root, file.stat().st_size)) is not None]
-        photos = [each for each in files if each.name.lower().endswith(_PHOTO_ENDINGS)]
-        if len(photos) >= 2 and folder != root:
-            size = sum(each.stat().st_size for each in photos)
-            found.append(FoundInput(_id_of(folder, root), _name(folder, root), "photos", folder, size / 1e6))
-        if depth < _DEEPEST:
-            waiting += [
-                (Path(each.path), depth + 1) for each in entries
-                if each.is_dir(follow_symlinks=False) and not each.name.startswith(".")
-                and not (depth == 0 and each.name in (STATE_FOLDER, STREAMS_FOLDER))
-            ]
+    for folder in folders_below(root, deepest=_DEEPEST, most=_MOST_FOLDERS):
+        if len(found) >= _MOST:
+            break
+        if not folder.is_site:
+            found += _inputs_in(folder, root)
+    return found
+
+
+def _inputs_in(folder: Folder, root: Path) -> list[FoundInput]:
+    """The files of a folder that a mission can use, and the folder itself where it holds photos."""
+    files = [each for each in folder.entries if each.is_file(follow_symlinks=False)]
+    known = (_input_of(Path(each.path), root, each.stat().st_size) for each in files)
+    found = [each for each in known if each is not None]
+    sizes = [each.stat().st_size for each in files if each.name.lower().endswith(_PHOTO_ENDINGS)]
+    if len(sizes) >= 2 and folder.path != root:
+        name = _name(folder.path, root)
+        found.append(FoundInput(_id_of(folder.path, root), name, "photos", folder.path, sum(sizes) / 1e6))
     return found
 
 

@@ -72,19 +72,25 @@ class MapWatch:
         self._seen[site_id] = _Seen(mark, state, versions)
         if before is None:
             self._reviews.settle(site_id)  # those that waited when the station was ended
-            announced = self._events.newest("map.tiles", site_id)  # the map may have grown meanwhile
-            if state is not None and (announced is None or announced["data"]["revision"] != state.revision):
+            if self._is_news(site_id, state):
                 self._announce(site_id, archive, state, None)
             return
-        if state is not None and (before.state is None or before.state.revision != state.revision):
+        if _differs(state, before.state):
             self._announce(site_id, archive, state, before.state)
         if versions != before.versions:
             self._events.append(NewEvent("site.changed", {"versions": versions}, site_id))
             self._reviews.settle(site_id)
 
-    def _announce(self, site_id: str, archive: Archive, state: Pyramid, before: Pyramid | None) -> None:
+    def _is_news(self, site_id: str, state: Pyramid | None) -> bool:
+        """Whether a map that is seen for the first time grew since it was announced last."""
+        if state is None:
+            return False
+        announced = self._events.newest("map.tiles", site_id)
+        return announced is None or announced["data"]["revision"] != state.revision
+
+    def _announce(self, site_id: str, archive: Archive, state: Pyramid | None, before: Pyramid | None) -> None:
         """The tiles that changed; all of them where nobody knows what was before."""
-        if not state.keys[0]:
+        if state is None or not state.keys[0]:
             return
         changed = list(state.keys[0]) if before is None else state.changed_since(before)
         bounds = bounds_lonlat(changed, archive.site_grid())
@@ -98,3 +104,8 @@ class MapWatch:
             except Exception as error:  # a full disk: told in the log, tried again
                 sys.stderr.write(f"station: maps cannot be followed: {error}\n")
                 self._ending.wait(2.0)
+
+
+def _differs(now: Pyramid | None, before: Pyramid | None) -> bool:
+    """Whether there is a map, and another one than before."""
+    return now is not None and (before is None or before.revision != now.revision)

@@ -48,15 +48,19 @@ def mqtt_place(url: str, password: str = "") -> MqttPlace:
     host, is_pattern = parts.hostname, bool(set(url.rpartition("@")[2]) & set("+#?"))
     if parts.scheme not in _PORTS or not host or is_pattern:
         raise SettingsError(f"--mqtt {parts.scheme}://{host or ''} is no broker; {_WANTED}")
-    if parts.password is not None:
+    prefix, user = parts.path.strip("/") or "sorvolo", unquote(parts.username or "")
+    _check_password(parts.password, password, user)
+    return MqttPlace(host, port or _PORTS[parts.scheme], prefix, user, password, parts.scheme == "mqtts")
+
+
+def _check_password(in_address: str | None, password: str, user: str) -> None:
+    if in_address is not None:
         raise SettingsError(
             "--mqtt: everybody on this machine could read a password in the address; give it in SORVOLO_MQTT_PASSWORD, "
             "or in a file of your own with --mqtt-password-file"
         )
-    prefix, user = parts.path.strip("/") or "sorvolo", unquote(parts.username or "")
     if password and not user:
         raise SettingsError(f"--mqtt: a password without a user's name; {_WANTED}")
-    return MqttPlace(host, port or _PORTS[parts.scheme], prefix, user, password, parts.scheme == "mqtts")
 
 
 class MqttSender:

@@ -124,13 +124,21 @@ def _row(
     here, named = found.get(flight, []), quote(flight, safe="")
     source = "frame" if (flight, name) in kept else "video" if seconds is not None and isinstance(name, int) else ""
     east_mm, north_mm = (round(1000 * float(each)) for each in place_m)
-    crop = f"{base}/crops/{source}/{named}/{name}/{east_mm}/{north_mm}.jpg"
+    crop = f"{base}/crops/{source}/{named}/{name}/{east_mm}/{north_mm}.jpg" if source else None
     return {
-        "flight": flight, "time": values.get("time"), "frame_id": frame["id"], "crop_url": crop if source else None,
-        "video_s": seconds, "video_url": f"{base}/flights/{named}/video" if film.is_there else None,
+        "flight": flight, "time": values.get("time"), "frame_id": frame["id"], "crop_url": crop, "video_s": seconds,
+        "video_url": f"{base}/flights/{named}/video" if film.is_there else None,
         "height_m": values.get("height_above_ground_m"), "sigma_m": values.get("sigma_m"),
-        **{f"{kind}s": [each for each in here if each["type"] == kind] for kind in ("change", "object")},
-        "reviews": [each["review"] | {"id": each["id"]} for each in here if each["review"] is not None],
+        **_found_here(here),
+    }
+
+
+def _found_here(found: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """What a flight found at the place, by kind, and the verdicts on it."""
+    return {
+        "changes": [each for each in found if each["type"] == "change"],
+        "objects": [each for each in found if each["type"] == "object"],
+        "reviews": [each["review"] | {"id": each["id"]} for each in found if each["review"] is not None],
     }
 
 

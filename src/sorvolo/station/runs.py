@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -42,6 +42,7 @@ RUNNING, FINISHED, FAILED, STOPPED, LOST = "running", "finished", "failed", "sto
 """States of a run; lost: its process ended without a word, as when the machine was switched off."""
 
 _ENDS = {"run.finished": FINISHED, "run.failed": FAILED, "run.stopped": STOPPED}
+_NEVER = "9999"
 _MOST_LINE_BYTES = 4_000_000
 _MOST_LOG_BYTES = 4000
 _LOOK_EVERY_S = 0.1
@@ -221,32 +222,35 @@ class Runs:
         folder = self._folder / run.id
         has_ended = _has_ended(folder)  # asked first: lines written before the end are then all there
         with self._lock:
-            run = self.get(run.id)
             lines, end = _new_lines(folder / JOURNAL_FILE, offset)
-            events: list[NewEvent] = []
-            for line in lines:
-                if line["type"] == BOXES:  # ten a second: shown with the video, not kept
-                    self._show_boxes(line["data"])
-                    continue
-                run, event = _taken(run, line)
+            run, events = self._advanced(self.get(run.id), lines)
+            if has_ended and end == offset and self._is_gone(run):
+                run, event = self._without_a_word(run, folder)
                 events.append(event)
-            if has_ended and run.state == RUNNING and end == offset and self._is_gone(run.id):
-                run = self._without_a_word(run, folder)
-                kind = "run.stopped" if run.state == STOPPED else "run.failed"
-                events.append(_event(kind, run, _public(run)))
             if events or end > offset:
                 self._keep(run, events, end)
         if run.state != RUNNING:
             self._lingering_s.setdefault(run.id, time.monotonic())
             self._shelf.forget(run.site)
-        elif not has_ended and run.kill_at is not None and run.kill_at < utc_now():
+        elif not has_ended and (run.kill_at or _NEVER) < utc_now():
             _kill(run.pid)
         return run
 
-    def _is_gone(self, run_id: str) -> bool:
-        """Whether a process that let go of its lock has ended, as far as anybody can know: never waits."""
-        process = self._processes.get(run_id)
-        return process is None or process.poll() is not None
+    def _advanced(self, run: Run, lines: Sequence[Mapping[str, Any]]) -> tuple[Run, list[NewEvent]]:
+        """The run after lines of its journal, and the events that they become."""
+        events = []
+        for line in lines:
+            if line["type"] == BOXES:  # ten a second: shown with the video, not kept
+                self._show_boxes(line["data"])
+                continue
+            run, event = _taken(run, line)
+            events.append(event)
+        return run, events
+
+    def _is_gone(self, run: Run) -> bool:
+        """Whether a run that counts as running, and whose lock is free, has no process any more; never waits."""
+        process = self._processes.get(run.id)
+        return run.state == RUNNING and (process is None or process.poll() is not None)
 
     def _reap(self) -> None:
         """Take the exit codes of processes whose runs are over; kill those that state the end and do not come to it."""
@@ -259,20 +263,22 @@ class Runs:
             self._processes.pop(run_id, None)
             del self._lingering_s[run_id]
 
-    def _without_a_word(self, run: Run, folder: Path) -> Run:
+    def _without_a_word(self, run: Run, folder: Path) -> tuple[Run, NewEvent]:
         """A run whose process ended without its last line: killed, crashed, or switched off with the machine."""
         process = self._processes.get(run.id)
         code = process.poll() if process is not None else None
         if run.stop_asked:
-            return replace(run, state=STOPPED, ended_at=utc_now(), exit_code=code, headline="stopped; nothing was kept")
+            run = replace(run, state=STOPPED, ended_at=utc_now(), exit_code=code, headline="stopped; nothing was kept")
+            return run, _event("run.stopped", run, _public(run))
         last = _tail(folder / LOG_FILE)
         words = "its process ended without a word"
         if code is not None and code < 0:
             words = f"its process was killed (signal {-code}), perhaps for want of memory"
-        return replace(
+        run = replace(
             run, state=LOST if code is None else FAILED, ended_at=utc_now(), exit_code=code,
             error=f"{words}; the site is as it was before{': ' + last if last else ''}",
         )
+        return run, _event("run.failed", run, _public(run))
 
     def _keep(self, run: Run, events: list[NewEvent], offset: int | None = None) -> None:
         with self._events.appending(events) as connection:

@@ -9,7 +9,6 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
-from urllib.parse import urlsplit
 
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
@@ -192,22 +191,26 @@ def check_origin(connection: HTTPConnection, public_origin: str, *, is_websocket
     without one). Browsers name the page's origin with every WebSocket and every request that may change something; what
     sends none is no browser.
     """
-    origin = connection.headers.get("origin")
+    origin, reads = connection.headers.get("origin"), not is_websocket and _only_reads(connection)
     if origin is None:
-        if connection.headers.get("sec-fetch-site", "none") in ("none", "same-origin"):
-            return
-        if connection.scope.get("method") in _SAFE_METHODS and not is_websocket:
+        if reads or connection.headers.get("sec-fetch-site", "none") in ("none", "same-origin"):
             return
         raise Problem(403, "a page of another site asked; open the station's own page")
-    if not is_websocket and connection.scope.get("method") in ("GET", "HEAD") and origin != "null":
+    if connection.scope.get("method") in ("GET", "HEAD") and not is_websocket and origin != "null":
         # reading is kept from other origins by the browser: no answer allows them to read it
         return
-    if public_origin and origin.lower() == public_origin:
-        return
-    parts = urlsplit(origin)
-    scheme = {"ws": "http", "wss": "https"}.get(connection.scope["scheme"], connection.scope["scheme"])
-    if parts.scheme != scheme or parts.netloc.lower() != connection.headers.get("host", "").lower():
+    if origin.lower() not in (public_origin, _own_origin(connection)) or not origin:
         raise Problem(403, f"a page of {origin[:100]} asked; open the station's own page")
+
+
+def _only_reads(connection: HTTPConnection) -> bool:
+    return connection.scope.get("method") in _SAFE_METHODS
+
+
+def _own_origin(connection: HTTPConnection) -> str:
+    """The origin of pages that came from the address that was asked, lower case."""
+    scheme = {"ws": "http", "wss": "https"}.get(connection.scope["scheme"], connection.scope["scheme"])
+    return f"{scheme}://{connection.headers.get('host', '').lower()}"
 
 
 def _host_name(host: str) -> str:

@@ -58,18 +58,11 @@ class StationSettings:
     def __post_init__(self) -> None:
         if not 0 < self.port < 65536:
             raise SettingsError(f"--port {self.port}: a port from 1 to 65535 was needed")
-        if (self.tls_cert is None) != (self.tls_key is None):
-            raise SettingsError("--tls-cert and --tls-key belong together; give both, or neither")
-        for each in (self.tls_cert, self.tls_key):
-            if each is not None and not each.is_file():
-                raise SettingsError(f"no such file: {each}; a PEM file was needed")
-        for text in self.stream_ranges:
-            try:
-                ipaddress.ip_network(text, strict=False)
-            except ValueError as error:
-                raise SettingsError(f"--stream-from {text!r}: a network such as 192.168.1.0/24 was needed") from error
         if not (self.free_floor_gb >= 0 and self.upload_most_gb > 0):
             raise SettingsError("--free-floor and --upload-most are gigabytes: not below 0")
+        _check_certificate(self.tls_cert, self.tls_key)
+        for text in self.stream_ranges:
+            _check_range(text)
         if self.public_url:
             _check_public(self.public_url)
         if self.base_map is not None and not _is_pmtiles(self.base_map):
@@ -141,6 +134,22 @@ def check_exposure(settings: StationSettings, *, has_tokens: bool) -> None:
             f"{where}, and without TLS tokens could be read on the way; give --tls-cert and --tls-key, or "
             "--insecure-lan in a network that you trust"
         )
+
+
+def _check_certificate(certificate: Path | None, key: Path | None) -> None:
+    """Raise SettingsError unless both files are there, or neither was given."""
+    if (certificate is None) != (key is None):
+        raise SettingsError("--tls-cert and --tls-key belong together; give both, or neither")
+    for each in (certificate, key):
+        if each is not None and not each.is_file():
+            raise SettingsError(f"no such file: {each}; a PEM file was needed")
+
+
+def _check_range(text: str) -> None:
+    try:
+        ipaddress.ip_network(text, strict=False)
+    except ValueError as error:
+        raise SettingsError(f"--stream-from {text!r}: a network such as 192.168.1.0/24 was needed") from error
 
 
 def _check_public(url: str) -> None:

@@ -1,6 +1,5 @@
 """The sites below the root: found by looking, named by ids, opened once and kept open to be read."""
 
-import os
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -12,6 +11,7 @@ import numpy as np
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.grid import SiteGrid, TileIndex
+from sorvolo.station.folders import folders_below
 from sorvolo.station.problems import Problem
 from sorvolo.station.settings import STATE_FOLDER, STREAMS_FOLDER
 from sorvolo.store.site.archive import Archive
@@ -107,26 +107,10 @@ class SiteShelf:
 
 
 def _sites_below(root: Path) -> dict[str, Path]:
-    found: dict[str, Path] = {}
-    waiting, seen = [(root, 0)], 0
-    while waiting and seen < _MOST_FOLDERS:
-        folder, depth = waiting.pop(0)
-        seen += 1
-        if (folder / CATALOGUE).is_file():
-            found[":".join(folder.relative_to(root).parts) or root.resolve().name or "site"] = folder
-            continue
-        if depth == _DEEPEST:
-            continue
-        try:
-            entries = sorted(os.scandir(folder), key=lambda each: each.name)
-        except OSError:  # unreadable, or taken away meanwhile: no sites in it
-            continue
-        waiting += [
-            (Path(each.path), depth + 1) for each in entries
-            if each.is_dir(follow_symlinks=False) and not each.name.startswith(".")
-            and not (depth == 0 and each.name == STATE_FOLDER)
-        ]
-    return found
+    return {
+        ":".join(each.path.relative_to(root).parts) or root.resolve().name or "site": each.path
+        for each in folders_below(root, deepest=_DEEPEST, most=_MOST_FOLDERS) if each.is_site
+    }
 
 
 def outline_lonlat(tiles: Sequence[TileIndex], grid: SiteGrid) -> PointsM:

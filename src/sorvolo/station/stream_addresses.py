@@ -3,7 +3,7 @@
 import ipaddress
 import socket
 from collections.abc import Callable, Sequence
-from urllib.parse import urlsplit, urlunsplit
+from urllib.parse import SplitResult, urlsplit, urlunsplit
 
 from sorvolo.station.problems import Problem
 
@@ -14,6 +14,7 @@ _LISTENED = ("udp", "rtp", "rtmp", "tcp")
 _LOWEST_PORT = 1024
 
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
+Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 
 def checked_stream(
@@ -25,21 +26,33 @@ def checked_stream(
     special networks are refused unless `ranges` (CIDR) name them: a client must not reach the station's own network
     through it. `resolve` gives the addresses of a name. Raises Problem (400), with no password in its words.
     """
-    try:
-        parts = urlsplit(url)
-        scheme, host, port = parts.scheme.lower(), parts.hostname, parts.port
-    except ValueError as error:
-        raise _refused("this is no address of a stream") from error
-    if any(each in url for each in "\r\n\t\\ \0") or not url.isascii():
-        raise _refused("this is no address of a stream")
+    parts, port = _parts(url)
+    scheme, host = parts.scheme.lower(), parts.hostname
     if not host:
         return _waited_for(url, scheme, port)
     if scheme not in CALLED:
         raise _refused(f"streams of {scheme[:20] or 'no scheme'} are not called from here")
     found = (resolve or _resolved)(host, port or 554)
-    allowed = [ipaddress.ip_network(each, strict=False) for each in ranges]
     if not found:
         raise _refused(f"the host {host[:100]} is not known")
+    _demand_allowed(host, found, [ipaddress.ip_network(each, strict=False) for each in ranges])
+    return urlunsplit(parts._replace(netloc=_netloc(parts.netloc, found[0], port)))
+
+
+def _parts(url: str) -> tuple[SplitResult, int | None]:
+    """The parts of an address, and its port. Raises Problem (400) for what is none."""
+    try:
+        parts = urlsplit(url)
+        port = parts.port
+    except ValueError as error:
+        raise _refused("this is no address of a stream") from error
+    if any(each in url for each in "\r\n\t\\ \0") or not url.isascii():
+        raise _refused("this is no address of a stream")
+    return parts, port
+
+
+def _demand_allowed(host: str, found: Sequence[str], allowed: Sequence[Network]) -> None:
+    """Raise Problem (400) unless every address of a host is public, or in a network that the station may call."""
     for text in found:
         address = _plain(ipaddress.ip_address(text.partition("%")[0]))
         named = any(address.version == each.version and address in each for each in allowed)
@@ -48,7 +61,6 @@ def checked_stream(
                 f"{host[:100]} lies in this machine's own or a private network; whoever runs the station may allow it "
                 f"with --stream-from {ipaddress.ip_network(address)}"
             )
-    return urlunsplit(parts._replace(netloc=_netloc(parts.netloc, found[0], port)))
 
 
 def _waited_for(url: str, scheme: str, port: int | None) -> str:

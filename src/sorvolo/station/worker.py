@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -299,11 +299,14 @@ def _headline(site: Path, before: int) -> str:
     """What the reports of the flights that came since say first."""
     with Archive.open(site, write=False) as archive:
         flights = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
-        reports = [archive.report(each) for each in flights]
-    heads: Iterable[Mapping[str, Any]] = (
-        (each.get("comparison") or each).get("headline") or {} for each in reports
-    )
-    return "; ".join(str(each.get("text", "")) for each in heads if each.get("text")) or "finished"
+        texts = [_headline_of(archive.report(each)) for each in flights]
+    return "; ".join(filter(None, texts)) or "finished"
+
+
+def _headline_of(report: Mapping[str, Any]) -> str:
+    """The headline of a flight's report, of its comparison where there is one; "" without any."""
+    headline: Mapping[str, Any] = (report.get("comparison") or report).get("headline") or {}
+    return str(headline.get("text") or "")
 
 
 def _begin(folder: Path) -> int:
