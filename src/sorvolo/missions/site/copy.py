@@ -7,7 +7,9 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 from sorvolo.errors import SettingsError, SorvoloWarning, StoreError
+from sorvolo.store.copies.bucket import BucketEnd
 from sorvolo.store.copies.folder import FolderEnd
+from sorvolo.store.copies.objects import open_objects
 from sorvolo.store.copies.transfer import CopyOutcome, CopyUpdate, SiteEnd, copy, verify
 
 _MAY_BE_SHORT = 1.05  # times the need: other programs write to the disk as well
@@ -16,10 +18,10 @@ _MAY_BE_SHORT = 1.05  # times the need: other programs write to the disk as well
 def copy_site(source: str, target: str) -> Generator[CopyUpdate, None, CopyOutcome]:
     """Copy the site at one address to another, yielding how far it is; a copy that was stopped goes on.
 
-    An address is a folder or `file://` with one. Each file is checked by its SHA-256 while it is written. The copy is
-    the site as of its last complete flight, even while another is being mapped into it. Raises SettingsError or
-    StoreError with what to do: where there is no site, where the target holds another one or what the source lacks,
-    where the disk is too full.
+    An address is a folder, `file://` with one, or `s3://BUCKET/NAME`. Each file is checked by its SHA-256 while it is
+    written. The copy is the site as of its last complete flight, even while another is being mapped into it. Raises
+    SettingsError or StoreError with what to do: where there is no site, where the target holds another one or what the
+    source lacks, where the disk is too full, where a store refuses or cannot be reached.
     """
     ends = _ends(source, target)
     with tempfile.TemporaryDirectory(prefix="sorvolo-") as scratch:
@@ -49,7 +51,9 @@ def open_end(address: str) -> SiteEnd:
         return FolderEnd(Path(address))
     if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path:
         return FolderEnd(Path(unquote(parts.path)))
-    raise SettingsError(f"{parts.scheme}:// is no place of sites; give a folder, or file:///FOLDER")
+    if parts.scheme == "s3":
+        return BucketEnd(open_objects(address))
+    raise SettingsError(f"{parts.scheme}:// is no place of sites; give a folder, file:///FOLDER or s3://BUCKET/NAME")
 
 
 def _check_room(target: str, need: int, free: int | None) -> None:

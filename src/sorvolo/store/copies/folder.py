@@ -184,7 +184,20 @@ class FolderEnd:
             about = (self.folder / file.path).lstat()
         except (FileNotFoundError, NotADirectoryError):
             return False
-        return about.st_size == file.size and (file.is_lasting or (file.stamp != 0 and about.st_mtime_ns == file.stamp))
+        if about.st_size != file.size:
+            return False
+        if file.is_lasting or (file.stamp and about.st_mtime_ns == file.stamp):
+            return True
+        return not file.stamp and bool(file.sha256) and file_sha256(self.folder, file.path) == file.sha256
+
+
+def file_sha256(folder: Path, path: str) -> str:
+    """The SHA-256 of a file below the folder."""
+    digest = hashlib.sha256()
+    with open_below(folder, path) as stream:
+        for chunk in chunks_of(stream):
+            digest.update(chunk)
+    return digest.hexdigest()
 
 
 def refuse_other(name: str, identity: str, held: CatalogueState) -> None:

@@ -1,0 +1,340 @@
+"""An object store as one end of a copy: objects named by their content, and one manifest that is replaced at once."""
+
+import hashlib
+import json
+import secrets
+import threading
+import warnings
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, closing, nullcontext
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, BinaryIO, Self
+
+from sorvolo.errors import SorvoloWarning, StoreError
+from sorvolo.store.copies.folder import refuse_loss, refuse_other
+from sorvolo.store.copies.objects import ConflictError, Objects
+from sorvolo.store.copies.state import (
+    CatalogueState,
+    SiteFile,
+    SiteState,
+    checked_path,
+    chunks_of,
+    find_state,
+    missing_from,
+    named_files,
+    refuse_damaged,
+    tile_of,
+    tile_path,
+)
+from sorvolo.store.site.catalogue import Catalogue
+from sorvolo.store.site.files import CATALOGUE
+from sorvolo.store.site.names import checked_sha256
+
+MANIFEST = "sorvolo-site.json"
+_FORMAT = 1
+_MOST_MANIFEST_BYTES = 256_000_000  # a million pictures
+_SHOWN = ("mosaic.tif", "preview.png")  # the newest map under plain names, for GIS and browsers
+_MOST_SUFFIX = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Manifest:
+    """What a bucket's site consists of: the content of `sorvolo-site.json`. Tiles are those that the catalogue names.
+
+    `id` is another one each time it is written.
+    """
+
+    id: str
+    generation: int
+    written_utc: str
+    held: CatalogueState
+    catalogue: tuple[int, str]  # bytes, SHA-256
+    files: Mapping[str, SiteFile]
+
+    def data(self) -> bytes:
+        """As JSON."""
+        held = self.held
+        return json.dumps({
+            "format": "sorvolo site", "format_version": _FORMAT, "id": self.id, "generation": self.generation,
+            "written_utc": self.written_utc,
+            "site": {"identity": held.identity, "name": held.name}, "digest": held.digest,
+            "versions": sorted(map(list, held.versions)), "reviews": dict(held.reviews),
+            "catalogue": list(self.catalogue),
+            "files": {path: [each.size, each.sha256] for path, each in sorted(self.files.items())},
+        }).encode()
+
+    @classmethod
+    def parsed(cls, data: bytes, where: str) -> Self:
+        """Raises StoreError for what no Sorvolo wrote, or a later one."""
+        try:
+            row = json.loads(data)
+            if row["format"] != "sorvolo site":
+                raise ValueError("another format")
+            if row["format_version"] != _FORMAT:
+                raise StoreError(
+                    f"{where} is written in format {row['format_version']!r}, this Sorvolo reads {_FORMAT}; use "
+                    "the one that wrote it"
+                )
+            files = {
+                checked_path(path): SiteFile(path, _size(size), checked_sha256(sha256))
+                for path, (size, sha256) in row["files"].items()
+            }
+            held = CatalogueState(
+                str(row["site"]["identity"]), str(row["site"]["name"]), str(row["digest"]),
+                frozenset((int(version), int(run), str(utc)) for version, run, utc in row["versions"]),
+                {str(change): str(utc) for change, utc in row["reviews"].items()},
+            )
+            size, sha256 = row["catalogue"]
+            catalogue = _size(size), checked_sha256(sha256)
+            return cls(str(row["id"]), int(row["generation"]), str(row["written_utc"]), held, catalogue, files)
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise StoreError(
+                f"{where}/{MANIFEST} is damaged, or no Sorvolo wrote it; restore it from a copy of the site"
+            ) from error
+
+
+class BucketEnd:
+    """A place in an object store that a site is copied from or to.
+
+    `base` is the manifest's id that a working copy was made of: another writer's work since then is not replaced.
+    None: whatever the site in the folder contains is replaced.
+    """
+
+    def __init__(self, objects: Objects, base: str | None = None) -> None:
+        self._objects, self._base = objects, base
+        self._round = _Round()
+        self.written = ""  # the id of the manifest that `conclude` wrote
+
+    @property
+    def name(self) -> str:
+        """The address, for messages."""
+        return self._objects.name
+
+    @property
+    def has_site(self) -> bool:
+        """Whether a site is there."""
+        return self.find_manifest()[0] is not None
+
+    def find_manifest(self) -> tuple[Manifest | None, str]:
+        """What is there, and its ETag; None and "" where no site is."""
+        try:
+            data, etag = self._objects.read(MANIFEST, _MOST_MANIFEST_BYTES)
+        except FileNotFoundError:
+            return None, ""
+        return Manifest.parsed(data, self.name), etag
+
+    def manifest(self) -> Manifest:
+        """What is there. Raises StoreError where no site is."""
+        found, _ = self.find_manifest()
+        if found is None:
+            raise StoreError(f"no site at {self.name}; put one there: sorvolo site copy FOLDER {self.name}")
+        return found
+
+    def state(self, scratch: Path) -> SiteState:
+        """The site as of now; its catalogue comes to lie in `scratch`."""
+        return self.state_of(self.manifest(), scratch)
+
+    def state_of(self, manifest: Manifest, scratch: Path) -> SiteState:
+        """The site as a manifest describes it. Raises StoreError for a catalogue that is not the one it names."""
+        path = scratch / CATALOGUE
+        size, sha256 = manifest.catalogue
+        self.fetch(SiteFile(_catalogue_key(sha256), size, sha256), _catalogue_key(sha256), path)
+        with closing(Catalogue(path, write=True)) as catalogue:
+            held = find_state(catalogue)
+            tiles, keyframes, _ = named_files(catalogue)
+        if held is None or held.identity != manifest.held.identity:
+            raise StoreError(f"{self.name}: the catalogue is not the one of this site; restore it from a copy")
+        sizes = self._objects.sizes("tiles")
+        files = dict(manifest.files)
+        files |= {tile_path(each): SiteFile(tile_path(each), sizes.get(tile_path(each), 0), each) for each in tiles}
+        files |= {path: SiteFile(path, 0) for path in keyframes - files.keys()}
+        self._round.state_id = manifest.id
+        return SiteState(held, path, files)
+
+    def is_still(self, state: SiteState, scratch: Path) -> bool:
+        """Whether the site is as it was."""
+        return self.manifest().id == self._round.state_id
+
+    def opened(self, file: SiteFile) -> AbstractContextManager[BinaryIO]:
+        """A file's bytes; reading raises FileNotFoundError when it is gone."""
+        if not file.sha256 or (file.size == 0 and tile_of(file.path)):
+            raise FileNotFoundError(2, "no such object", f"{self.name}/{file.path}")
+        return closing(self._objects.opened(_key(file), file.size))
+
+    def fetch(self, file: SiteFile, key: str, path: Path) -> None:
+        """Write an object to a path. Raises StoreError when it is gone, or not what its name states."""
+        digest = hashlib.sha256()
+        try:
+            with closing(self._objects.opened(key, file.size)) as stream, open(path, "wb") as target:
+                for chunk in chunks_of(stream):
+                    digest.update(chunk)
+                    target.write(chunk)
+        except FileNotFoundError as error:
+            raise StoreError(f"{self.name}/{key} is gone; restore it from a copy of the site") from error
+        if digest.hexdigest() != file.sha256:
+            raise StoreError(f"{self.name}/{key} is damaged; restore it from a copy of the site")
+
+    def being_filled(self) -> AbstractContextManager[None]:
+        """Nothing is held meanwhile: `conclude` finds out whether another writer was faster."""
+        return nullcontext()
+
+    def accept(self, new: SiteState, scratch: Path) -> None:
+        """Find out what is there. Raises StoreError where the new state would lose anything of it."""
+        self._round = _Round()
+        manifest, self._round.etag = self.find_manifest()
+        self._round.manifest = manifest
+        if manifest is None:
+            if self._base is not None:
+                raise StoreError(f"the site at {self.name} is gone; copy it there again: sorvolo site copy")
+            self._refuse_foreign()
+        else:
+            refuse_other(self.name, manifest.held.identity, new.held)
+            if self._base is None:
+                refuse_loss(self.name, missing_from(manifest.held, manifest.files, new))
+            elif self._base != manifest.id:
+                raise self._conflict()
+        self._round.stored = self._objects.sizes("")
+
+    def lacks(self, state: SiteState) -> list[SiteFile]:
+        """The files whose bytes are not there, as far as their names or sizes tell; the others are noted."""
+        known = self._round.manifest.files if self._round.manifest is not None else {}
+        lacking = []
+        for file in state.files.values():
+            former = known.get(file.path)
+            same = replace(file, sha256=former.sha256) if former and _is_same_picture(file, former) else file
+            if same.sha256 and self._round.stored.get(_key(same)) == same.size:
+                self._round.files[file.path] = same
+            else:
+                lacking.append(file)
+        return lacking
+
+    def put(self, file: SiteFile, stream: BinaryIO) -> None:
+        """Store a file under its content's name. Raises DamagedError for bytes of another SHA-256 than the file's."""
+        digest, size = hashlib.sha256(), 0
+        for chunk in chunks_of(stream):
+            digest.update(chunk)
+            size += len(chunk)
+        refuse_damaged(file, digest.hexdigest())
+        named = SiteFile(file.path, size, digest.hexdigest())
+        if self._round.stored.get(_key(named)) != size and self._round.claim(_key(named)):
+            self._objects.write(_key(named), stream)
+        self._round.files[file.path] = named
+
+    def conclude(self, state: SiteState) -> None:
+        """Make all that was put the site, unless another writer was faster: then StoreError, and his work stays."""
+        sha256 = hashlib.sha256(state.catalogue.read_bytes()).hexdigest()
+        size = state.catalogue.stat().st_size
+        if self._round.stored.get(_catalogue_key(sha256)) != size:
+            with state.catalogue.open("rb") as stream:
+                self._objects.write(_catalogue_key(sha256), stream)
+        former = self._round.manifest
+        files = {path: each for path, each in self._round.files.items() if path in state.files and not tile_of(path)}
+        manifest = Manifest(
+            secrets.token_hex(16), 1 + (former.generation if former else 0),
+            datetime.now(UTC).isoformat(timespec="seconds"), state.held, (size, sha256), files,
+        )
+        self._swap(manifest)
+        self.written = manifest.id
+        self._show(manifest)
+
+    def free_bytes(self) -> int | None:
+        """Nobody knows."""
+        return None
+
+    def _swap(self, manifest: Manifest) -> None:
+        """Replace the manifest by this one, if it still is the one that was there."""
+        try:
+            self._objects.swap(MANIFEST, manifest.data(), self._round.etag)
+        except (ConflictError, StoreError) as error:
+            # the answer may have been lost, not what was written
+            found, _ = self.find_manifest()
+            if found is not None and found.id == manifest.id:
+                return
+            if isinstance(error, ConflictError):
+                raise self._conflict() from None
+            raise
+
+    def _show(self, manifest: Manifest) -> None:
+        """Give the newest map plain names as well; of two writers, the later one's stay."""
+        former = self._round.manifest
+        shown = {} if former is None else {name: former.files.get(name) for name in _SHOWN}
+        done = ""
+        try:
+            while done != manifest.id:
+                for name in _SHOWN:
+                    if manifest.files.get(name) != shown.get(name) or done:
+                        self._show_as(name, manifest.files.get(name))
+                done, manifest = manifest.id, self.manifest()
+        except StoreError as error:
+            warnings.warn(
+                f"the site is at {self.name}, but not its map under the plain names {', '.join(_SHOWN)}: {error}",
+                SorvoloWarning, stacklevel=2,
+            )
+
+    def _show_as(self, name: str, file: SiteFile | None) -> None:
+        if file is None:
+            self._objects.remove([name])
+        else:
+            self._objects.copy(_key(file), name)
+
+    def _refuse_foreign(self) -> None:
+        foreign = sorted(each for each in self._objects.first() if not _is_ours(each))
+        if foreign:
+            raise StoreError(
+                f"{self.name} is not empty and holds no site (there is {foreign[0][:80]!r}); choose another place"
+            )
+
+    def _conflict(self) -> StoreError:
+        return StoreError(
+            f"another writer has changed the site at {self.name} meanwhile; nothing there was changed, and nothing "
+            "here is lost. Run the same command again"
+        )
+
+
+@dataclass
+class _Round:
+    """What one round of copying found and did."""
+
+    manifest: Manifest | None = None
+    etag: str = ""
+    state_id: str = ""
+    stored: Mapping[str, int] = field(default_factory=dict)
+    files: dict[str, SiteFile] = field(default_factory=dict)
+    claimed: set[str] = field(default_factory=set)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def claim(self, key: str) -> bool:
+        """Whether the caller is the first to write this object: files with the same bytes share one."""
+        with self.lock:
+            is_first = key not in self.claimed
+            self.claimed.add(key)
+        return is_first
+
+
+def _is_same_picture(file: SiteFile, former: SiteFile) -> bool:
+    return not file.sha256 and file.is_lasting and file.size == former.size
+
+
+def _key(file: SiteFile) -> str:
+    """The key of a file's bytes: a tile's path, else its SHA-256 with the ending that programs go by."""
+    if tile_of(file.path):
+        return file.path
+    suffix = Path(file.path).suffix.lower()
+    ending = suffix if suffix[1:].isalnum() and suffix.isascii() and len(suffix) <= _MOST_SUFFIX else ""
+    return f"files/{file.sha256[:2]}/{file.sha256}{ending}"
+
+
+def _catalogue_key(sha256: str) -> str:
+    return f"catalogues/{sha256}.db"
+
+
+def _is_ours(key: str) -> bool:
+    return key.split("/")[0] in ("tiles", "files", "catalogues", MANIFEST, *_SHOWN)
+
+
+def _size(value: Any) -> int:
+    if type(value) is not int or value < 0:
+        raise ValueError(f"a size of {value!r}")
+    return value
