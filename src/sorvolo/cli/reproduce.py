@@ -34,7 +34,7 @@ ViewRate = Annotated[float, typer.Option(help="Frames compared per second of vid
 Okutama = Annotated[Path | None, typer.Option(help="Okutama-Action's folder, for its column of Table 4.6.")]
 TrainSteps = Annotated[int, typer.Option(help="Steps of each network of Table 4.6; 0: train none.")]
 NetworkPreset = Annotated[Preset, typer.Option(help="Network of Table 4.6: fast, accurate, or the thesis's own.")]
-Weights = Annotated[str, typer.Option(help="Weights to start from: none, auto (ImageNet), or a file.")]
+Weights = Annotated[str, typer.Option(help="Weights to start from: auto (ImageNet), none, or a file.")]
 Device = Annotated[str, typer.Option(help="Where the networks are trained: auto, cpu or cuda.")]
 Seed = Annotated[int, typer.Option(help="Random seed.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print reproduction.json.")]
@@ -52,7 +52,7 @@ def reproduce(
     okutama: Okutama = None,
     train_steps: TrainSteps = 400,
     preset: NetworkPreset = Preset.FAST,
-    weights: Weights = "none",
+    weights: Weights = "auto",
     device: Device = "auto",
     seed: Seed = 1,
     as_json: AsJson = False,

@@ -25,7 +25,7 @@ class DetectorSettings:
 
     steps: int = 400
     preset: Literal["fast", "accurate", "thesis"] = "fast"
-    weights: str = "none"
+    weights: str = "auto"  # the thesis, too, begins with ImageNet's
     device: str = "auto"
     side_px: int = 256  # of the training samples
 
@@ -67,6 +67,6 @@ class ReproductionSettings:
 
 def quick(settings: ReproductionSettings, size: SimulatedSize) -> tuple[ReproductionSettings, SimulatedSize]:
     """The same at the size of a try: one short path of small pictures, and a training that only shows that it runs."""
-    detector = replace(settings.detector, steps=min(4, settings.detector.steps), side_px=128)
+    detector = replace(settings.detector, steps=min(4, settings.detector.steps), side_px=128, weights="none")
     small = replace(size, length_m=10.0, size_px=(480, 270), environments=("Countryside",))
     return replace(settings, videos=1, repeats=1, detector=detector), small
