@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from sensor_noise import camera
 
 from sorvolo import kernels
-from sorvolo.change.pair.flight_tuning import FlightTuning
+from sorvolo.change.pair.flight_tuning import FlightTuning, PairMeasures
 from sorvolo.change.pair.region_score import Trees, how_sure
 from sorvolo.change.pair.regions import FEATURES
 from sorvolo.change.pair.residual_alignment import settle
@@ -134,10 +134,10 @@ def test_a_flight_tunes_itself_and_says_how(ground: np.ndarray) -> None:
     loud = np.random.default_rng(5).normal(0, 14, ground.shape)
     for seed in range(3):
         query = np.clip(camera(ground, seed) + loud, 0, 255).astype(np.uint8)
-        tuning.observe(compare_robust(ground, query, settings=tuning.settings()))
+        tuning.observe(PairMeasures.of(compare_robust(ground, query, settings=tuning.settings())))
     chosen = tuning.chosen()
     quiet = FlightTuning()
-    quiet.observe(compare_robust(ground, camera(ground, 1)))
+    quiet.observe(PairMeasures.of(compare_robust(ground, camera(ground, 1))))
     assert chosen["frames"] == 3
     assert float(chosen["noise_levels"]) > float(quiet.chosen()["noise_levels"])
     assert float(chosen["least_difference_levels"]) > float(quiet.chosen()["least_difference_levels"])

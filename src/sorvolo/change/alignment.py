@@ -9,7 +9,7 @@ import numpy as np
 
 from sorvolo.change.local_fit import LocalFit, fit_locally
 from sorvolo.change.map_search import MapSearch, SearchSettings
-from sorvolo.change.reference import ReferenceMap, normalised, resized
+from sorvolo.change.reference import HeldWindow, ReferenceMap, normalised, resized
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, Matrix3, PointsM, PointsPx, Vector3
 from sorvolo.geometry.camera import Camera
@@ -98,7 +98,7 @@ class _Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class _Place:
+class Place:
     """Where a frame lies, in pixels of the size at which frames are aligned. `ratio` is how sure the search is of it:
     infinite for homographies with points all over the frame, 0 for those that may swing where they have none."""
 
@@ -107,6 +107,16 @@ class _Place:
     residual_px: float
     followed: bool
     ratio: float
+
+
+@dataclass(frozen=True, eq=False)
+class AlignStep:
+    """What a frame left in an `Aligner`: its place (None: it has none), the frames without one up to it, and the parts
+    of the map that were held in the end."""
+
+    place: Place | None
+    misses: int
+    windows: tuple[HeldWindow, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +136,7 @@ class _Moved:
     """A place after local fits: `left` is what no camera explains of them, in the frame's own pixels, `size_m` how far
     they moved it in all (median)."""
 
-    place: _Place
+    place: Place
     left: LocalFit | None
     size_m: float
 
@@ -144,7 +154,7 @@ class _Share:
 
 
 class Aligner:
-    """Lays the frames of one flight over a map, in order of time. Only `align` changes it."""
+    """Lays the frames of one flight over a map, in order of time. Only `align` and `recall` change it."""
 
     def __init__(
         self, reference: ReferenceMap, site_grid: SiteGrid, settings: AlignmentSettings = AlignmentSettings()
@@ -154,14 +164,15 @@ class Aligner:
         self._search = MapSearch(reference, site_grid, settings.search, settings.links.features)
         self._count = 0
         self._misses = 0  # frames since the last fit
+        self.step = AlignStep(None, 0, ())
+        """What the last frame left."""
 
     def align(self, image: ImageRGB, camera: Camera, prior: CameraPrior, time_ns: int) -> Aligned | NotAligned:
         """Where an undistorted frame, (H, W, 3), of the distortion-free `camera` lies on the map."""
+        size, gray = self._small(image)
         scale = min(1.0, self._settings.side_px / max(image.shape[:2]))
-        size = max(16, round(image.shape[1] * scale)), max(16, round(image.shape[0] * scale))
         small_camera = camera.resized(*size)
-        gray = cv2.resize(gray_from_rgb(image), size, interpolation=cv2.INTER_AREA)
-        new = self._keyframe(small_camera, normalise_contrast(gray))  # type: ignore[arg-type]
+        new = self._keyframe(small_camera, normalise_contrast(gray))
         by_telemetry = self._telemetry_pose(prior)
         telemetry_homography = None if by_telemetry is None else _homography_of(small_camera, by_telemetry)
         share = _Share(
@@ -172,26 +183,44 @@ class Aligner:
             return telemetry_homography if share.known >= self._settings.least_known else None
 
         placed = self._by_homographies(new, prior, time_ns, telemetry_inside)
-        frame = _Frame(image, camera, gray, new, prior)  # type: ignore[arg-type]
+        frame = _Frame(image, camera, gray, new, prior)
         if self._is_doubtful(placed, prior) and self._may_search():
             placed = self._by_search(frame, by_telemetry, is_inside=telemetry_inside() is not None) or placed
         if isinstance(placed, NotAligned):
             is_outside = share.known < self._settings.least_known
             reason = self._beside() if is_outside else placed.reason
+            self.step = AlignStep(None, self._misses, self._reference.windows)
             return NotAligned(reason, placed.residual_px / scale, is_outside)
         moved = self._settled(frame, placed)
         self._remember(time_ns, moved.place, prior, new)
+        self.step = AlignStep(moved.place, self._misses, self._reference.windows)
         small_from_full = resized(size[0] / image.shape[1], size[1] / image.shape[0])
         return Aligned(
             moved.place.site_from_image @ small_from_full, moved.place.pose.translation_m, placed.residual_px / scale,
             placed.followed, moved.left, moved.size_m,
         )
 
+    def recall(self, image: ImageRGB, camera: Camera, prior: CameraPrior, time_ns: int, step: AlignStep) -> None:
+        """Take a frame that an earlier process aligned as it did."""
+        size, gray = self._small(image)
+        new = self._keyframe(camera.resized(*size), normalise_contrast(gray))
+        if step.place is not None:
+            self._remember(time_ns, step.place, prior, new)
+        self._misses = step.misses
+        self._reference.hold(step.windows)
+        self.step = step
+
     # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _small(self, image: ImageRGB) -> tuple[tuple[int, int], ImageGray]:
+        """The size (width, height) at which a frame is aligned, and its gray there."""
+        scale = min(1.0, self._settings.side_px / max(image.shape[:2]))
+        size = max(16, round(image.shape[1] * scale)), max(16, round(image.shape[0] * scale))
+        return size, np.asarray(cv2.resize(gray_from_rgb(image), size, interpolation=cv2.INTER_AREA), np.uint8)
 
     def _by_homographies(
         self, new: Keyframe, prior: CameraPrior, time_ns: int, telemetry_inside: Callable[[], Matrix3 | None]
-    ) -> "_Place | NotAligned":
+    ) -> Place | NotAligned:
         """The frame placed by the first guess that its points confirm to a part of a pixel, or why none is."""
         nearest = NotAligned("its features are found nowhere in the map where it could be", np.nan)
         for guess, followed in self._guesses(new, new.camera, prior, time_ns, telemetry_inside):
@@ -201,11 +230,11 @@ class Aligner:
                 continue
             pose = pose_from_homography(found[0], new.camera)
             if pose is not None:
-                return _Place(found[0], pose, found[1], followed, np.inf if found[2] else 0.0)
+                return Place(found[0], pose, found[1], followed, np.inf if found[2] else 0.0)
             nearest = _nearer(nearest, NotAligned("the fit is none that a camera above the ground could have", np.nan))
         return nearest
 
-    def _is_doubtful(self, placed: "_Place | NotAligned", prior: CameraPrior) -> bool:
+    def _is_doubtful(self, placed: Place | NotAligned, prior: CameraPrior) -> bool:
         """Whether a frame is nowhere, or where telemetry, as it was so far, hardly can have it."""
         if isinstance(placed, NotAligned):
             return True
@@ -215,7 +244,7 @@ class Aligner:
         """Whether the dear search is worth its time: a flight that fits nowhere is asked every fifth frame."""
         return self._misses < _SEARCHED_MISSES or self._misses % 5 == 1
 
-    def _by_search(self, frame: "_Frame", by_telemetry: Pose | None, *, is_inside: bool) -> "_Place | None":
+    def _by_search(self, frame: "_Frame", by_telemetry: Pose | None, *, is_inside: bool) -> Place | None:
         """The frame placed by learned features, telemetry and its neighbours; what these leave in doubt a local fit
         must confirm. Without telemetry's place the search begins at the last frame's."""
         if by_telemetry is None and self._fits and not frame.prior.knows_place:
@@ -227,13 +256,13 @@ class Aligner:
         found = self._search.find(frame.gray, frame.even.gray, frame.even.camera, frame.prior, start)
         if found is None:
             return None
-        place = _Place(found.fit.site_from_image, found.fit.pose, found.fit.residual_px, False, found.ratio)
+        place = Place(found.fit.site_from_image, found.fit.pose, found.fit.residual_px, False, found.ratio)
         if found.is_sure:
             return place
         local = self._local(frame, place)
         return place if local is not None and local.rest <= self._settings.confirms_rest else None
 
-    def _settled(self, frame: "_Frame", placed: "_Place") -> "_Moved":
+    def _settled(self, frame: "_Frame", placed: Place) -> "_Moved":
         """The place moved as a camera by what a local fit finds where the last fit leaves much, and what is left."""
         moved = _Moved(placed, None, 0.0)
         if placed.residual_px <= self._settings.settled_px and (placed.followed or np.isinf(placed.ratio)):
@@ -250,7 +279,7 @@ class Aligner:
                 break
         return moved
 
-    def _local(self, frame: "_Frame", placed: "_Place") -> LocalFit | None:
+    def _local(self, frame: "_Frame", placed: Place) -> LocalFit | None:
         """The local fit of a frame at its place, in pixels of the `_fine` camera."""
         fine = _fine(frame.camera)
         size = fine.width_px, fine.height_px
@@ -332,7 +361,7 @@ class Aligner:
             return None
         return ideal @ np.linalg.inv(last.seen_from_ideal)
 
-    def _remember(self, time_ns: int, placed: "_Place", prior: CameraPrior, new: Keyframe) -> None:
+    def _remember(self, time_ns: int, placed: Place, prior: CameraPrior, new: Keyframe) -> None:
         # ideal @ inv(seen_from_ideal) gives the fit back
         ideal = site_from_image_homography(new.camera, placed.pose)
         seen_from_ideal = np.linalg.inv(placed.site_from_image) @ ideal
@@ -535,7 +564,7 @@ def _small_from(fine: Camera, small: Camera) -> Matrix3:
     return resized(small.width_px / fine.width_px, small.height_px / fine.height_px)
 
 
-def _as_camera(placed: _Place, local: LocalFit, camera: Camera, small_from_image: Matrix3) -> tuple[_Place, LocalFit]:
+def _as_camera(placed: Place, local: LocalFit, camera: Camera, small_from_image: Matrix3) -> tuple[Place, LocalFit]:
     """The place moved as a local fit in this camera's pixels has it, as far as a camera over level ground can; and what
     is left of the fit. `small_from_image` leads to the place's own pixels."""
     old_px = local.places_px(camera.width_px, camera.height_px)

@@ -1,12 +1,14 @@
 """The known map as a later flight reads it: any view of it, and its features, made once."""
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
 
+from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import ImageGray, ImageRGB, ImageRGBA, Mask, Matrix3, PointsPx
 from sorvolo.geometry.grid import Grid, TileIndex
 from sorvolo.geometry.homography import apply_homography
@@ -19,6 +21,22 @@ _LEVEL_TILES, _LEVEL_STEP_PX = 20, 16  # by which the map's middle grey is known
 _MOST_PX = 48_000_000  # of the map in one view: more is a view towards the horizon
 _FEATURES = FeatureSettings(detection_side_px=_BLOCK_PX + 2 * _APRON_PX, orb_count=1100)
 _NOTHING = Features("orb", np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
+
+
+@dataclass(frozen=True)
+class HeldWindow:
+    """A part of the map that is held in one piece, in pixels of its level; pictures are resampled from it, and where
+    it begins decides their last bit."""
+
+    level: int
+    x: int
+    y: int
+    width_px: int
+    height_px: int
+
+    def __post_init__(self) -> None:
+        if not 0 < self.width_px * self.height_px <= 4 * _MOST_PX:
+            raise GeometryError(f"no part of a map is {self.width_px} x {self.height_px} px")
 
 
 class ReferenceMap:
@@ -39,6 +57,26 @@ class ReferenceMap:
     def is_empty(self) -> bool:
         """Whether the map shows nothing at all."""
         return len(self._tiles) == 0
+
+    @property
+    def windows(self) -> tuple[HeldWindow, ...]:
+        """Those held now, in the order in which they came."""
+        return tuple(
+            HeldWindow(level, x, y, window.shape[1], window.shape[0]) for level, (x, y, window) in self._windows.items()
+        )
+
+    def hold(self, windows: Sequence[HeldWindow]) -> None:
+        """Hold these windows and no others."""
+        before = {each.level: each for each in self.windows}
+        held, self._windows = self._windows, {}
+        for each in windows:
+            if before.get(each.level) == each:
+                self._windows[each.level] = held[each.level]
+                continue
+            self._shrunk.pop(each.level, None)
+            self._windows[each.level] = (
+                each.x, each.y, self._assembled(each.level, each.x, each.y, each.width_px, each.height_px)
+            )
 
     def seen_from(
         self, grid_from_image: Matrix3, width_px: int, height_px: int, shrink: int = 1

@@ -7,24 +7,24 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sorvolo.change.alignment import Aligned, Aligner
+from sorvolo.change.alignment import Aligned, Aligner, AlignStep
 from sorvolo.change.areas.signs import leaning
 from sorvolo.change.coverage.planting import Planted, Planting
 from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.frame_pixels import FramePixels, comparison_camera
 from sorvolo.change.pair.corroboration import CorroborationSettings, Difference, believed, is_whole, unwitnessed
-from sorvolo.change.pair.flight_tuning import FlightTuning
+from sorvolo.change.pair.flight_tuning import FlightTuning, PairMeasures
 from sorvolo.change.pair.robust import RobustSettings, compare_robust
 from sorvolo.change.pair.shade import shade_of_view
 from sorvolo.change.pair.thesis import compare_thesis
 from sorvolo.change.pair.thesis_options import ThesisOptions
 from sorvolo.change.reference import ReferenceMap
-from sorvolo.geometry.arrays import ImageBGR, ImageRGB, Mask, Matrix3
+from sorvolo.geometry.arrays import Boxes, Floats, ImageBGR, ImageGray, ImageRGB, Mask, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.registration.lens import Undistorter
 from sorvolo.survey.findings import ComparedView, ViewStatus
-from sorvolo.survey.flight import PosedFrame
+from sorvolo.survey.flight import Frame, PosedFrame
 from sorvolo.survey.mosaic import PlacedFrame
 
 _ALL_CHANGED_REASON = "more than half of it looks changed (water, snow, ploughing?)"
@@ -40,6 +40,16 @@ class ViewSettings:
     coarser: float = 1.25  # times the map's pixels: views less coarse than that have its pixels
     all_changed: float = 0.5  # share of a view: more is snow, a flood or another place, not a list of changes
     corroboration: CorroborationSettings = field(default_factory=CorroborationSettings)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewTraces:
+    """What a frame's comparison left in its `ViewMaker`: `measured` is None where nothing was compared, or by method
+    thesis."""
+
+    step: AlignStep
+    aligned: Aligned | None
+    measured: PairMeasures | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +73,30 @@ class ViewOutcome:
     leans: Mask | None = None
     planted: tuple[Planted, ...] = ()
     local_m: float = 0.0
+    traces: ViewTraces | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ViewRecord:
+    """A frame's comparison without its pictures, of which `ViewMaker.recall` makes the same outcome again.
+
+    `outcome` has no view; of the view, where there is one, `changed` and `shade` are its masks (h, w), with its boxes
+    and scores.
+    """
+
+    outcome: ViewOutcome
+    changed: Mask | None
+    shade: ImageGray | None
+    boxes: Boxes | None
+    scores: Floats | None
+
+    @classmethod
+    def of(cls, outcome: ViewOutcome) -> "ViewRecord":
+        """That of an outcome."""
+        view = outcome.view
+        if view is None:
+            return cls(outcome, None, None, None, None)
+        return cls(replace(outcome, view=None), view.changed > 0, view.shade, view.boxes, view.scores)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +134,9 @@ class ViewMaker:
     """Compares the frames of one flight with one version of the map, in order of time.
 
     `compare_with_map` finds what differs from the map, `corroborate` keeps what earlier pictures confirm. Either is
-    called for the frames in their order; one may run while the other does, in another thread. With `thesis`, its
-    method compares, which asks no earlier pictures; else the robust one.
+    called for the frames in their order; one may run while the other does, in another thread. The frames that an
+    earlier process compared come first, each to `recall`. With `thesis`, its method compares, which asks no earlier
+    pictures; else the robust one.
     """
 
     def __init__(
@@ -127,31 +162,31 @@ class ViewMaker:
     def compare_with_map(self, posed: PosedFrame) -> ViewOutcome | OneSided:
         """Align one frame and compare it with the map; a `ViewOutcome` if that ended it."""
         frame, small = posed.frame, self.pixels.small
-        image = self._lens.undistort(frame.image)
+        image = self.undistorted(posed)
         aligned = self._aligner.align(image, self._lens.camera, posed.prior, frame.time_ns)
         to_full = self._flight.full.width_px / small.width_px
         if not isinstance(aligned, Aligned):
             status = ViewStatus.OUTSIDE if aligned.is_outside else ViewStatus.NOT_ALIGNED
-            return ViewOutcome(status, aligned.reason, aligned.residual_px * to_full, 0.0, brightness=self.brightness)
+            return ViewOutcome(
+                status, aligned.reason, aligned.residual_px * to_full, 0.0, brightness=self.brightness,
+                traces=ViewTraces(self._aligner.step, None, None),
+            )
         residual_px = aligned.residual_px * to_full
         site_from_full = aligned.site_from_image @ self.pixels.small_from_full
-        reference, known = self._reference.seen_from(
-            self._grid_from_image(aligned.site_from_image), small.width_px, small.height_px
-        )
-        valid = known & self._lens_sees
-        share = np.count_nonzero(valid) / np.count_nonzero(self._lens_sees)
+        reference, known = self._map_under(aligned)
+        share = np.count_nonzero(known) / np.count_nonzero(self._lens_sees)
         if share < self._settings.least_known:
             reason = f"less than {self._settings.least_known:.0%} of it lies on the map"
             return ViewOutcome(
-                ViewStatus.OUTSIDE, reason, residual_px, share, site_from_full, brightness=self.brightness
+                ViewStatus.OUTSIDE, reason, residual_px, share, site_from_full, brightness=self.brightness,
+                traces=ViewTraces(self._aligner.step, aligned, None),
             )
-        if aligned.local is not None:
-            image, valid = aligned.local.warped(image, valid)
+        image, valid = _laid(aligned, image, known)
         query = as_bgr(image)
-        found = self._difference(as_bgr(reference), query, valid)
+        found, measured = self._difference(as_bgr(reference), query, valid)
         outcome = ViewOutcome(
             ViewStatus.COMPARED, "", residual_px, share, site_from_full, brightness=self.brightness,
-            local_m=aligned.local_m,
+            local_m=aligned.local_m, traces=ViewTraces(self._aligner.step, aligned, measured),
         )
         return OneSided(posed, aligned, image, reference, query, valid, found, self._settings_now(), outcome)
 
@@ -165,14 +200,31 @@ class ViewMaker:
         if changed > self._settings.all_changed:
             return replace(outcome, status=ViewStatus.ALL_CHANGED, reason=_ALL_CHANGED_REASON)
         shade = shade_of_view(compared.reference, compared.image, valid) if len(found.boxes) else found.mask
-        view = ComparedView(
-            frame.index, frame.name, self._flight.utc_ns(frame.time_ns), aligned.site_from_image, aligned.camera_m,
-            compared.image, compared.reference, valid, found.mask, found.boxes, found.scores, aligned.residual_px,
-            shade,
-        )
+        view = self._view(frame, aligned, (compared.image, compared.reference, valid), found, shade)
         doubted = _doubted(compared.found, found, self._settings.corroboration.sure)
         planted = self._plant(view, compared)
         return replace(outcome, view=view, doubted=doubted, leans=leans, planted=planted)
+
+    def recall(self, posed: PosedFrame, image: ImageRGB, record: ViewRecord) -> ViewOutcome:
+        """The outcome of a frame that an earlier process compared; `image` is that frame `undistorted`."""
+        outcome, traces = record.outcome, record.outcome.traces
+        assert traces is not None  # a comparison leaves them
+        self._aligner.recall(image, self._lens.camera, posed.prior, posed.frame.time_ns, traces.step)
+        if traces.measured is not None and self._tuning is not None:
+            self._tuning.observe(traces.measured)
+        aligned, shade, boxes, scores = traces.aligned, record.shade, record.boxes, record.scores
+        if record.changed is None or aligned is None or shade is None or boxes is None or scores is None:
+            return outcome
+        if self._tuning is not None:
+            self._planting.pass_over()
+        reference, known = self._map_under(aligned)
+        image, valid = _laid(aligned, image, known)
+        found = Difference(np.where(record.changed, np.uint8(255), np.uint8(0)), boxes, scores)
+        return replace(outcome, view=self._view(posed.frame, aligned, (image, reference, valid), found, shade))
+
+    def undistorted(self, posed: PosedFrame) -> ImageRGB:
+        """A frame's picture at the size at which it is compared, without the lens's distortion."""
+        return self._lens.undistort(posed.frame.image)
 
     def placed(self, posed: PosedFrame, outcome: ViewOutcome, map_sigma_m: float) -> PlacedFrame:
         """The frame's record: placed by the map it fits, or rejected with the reason."""
@@ -223,6 +275,24 @@ class ViewMaker:
         centre = site_from_image @ np.array([camera.cx_px, camera.cy_px, 1.0])
         return self._site_grid.grid_from_site_affine(centre[:2] / centre[2], 50.0) @ site_from_image
 
+    def _map_under(self, aligned: Aligned) -> tuple[ImageRGB, Mask]:
+        """The map's picture (h, w, 3) where a frame lies, and where (h, w) it is known and the lens sees."""
+        small = self.pixels.small
+        reference, known = self._reference.seen_from(
+            self._grid_from_image(aligned.site_from_image), small.width_px, small.height_px
+        )
+        return reference, known & self._lens_sees
+
+    def _view(
+        self, frame: Frame, aligned: Aligned, pictures: tuple[ImageRGB, ImageRGB, Mask], found: Difference,
+        shade: ImageGray,
+    ) -> ComparedView:
+        """The compared view: `pictures` are the frame, the map and where both are valid."""
+        return ComparedView(
+            frame.index, frame.name, self._flight.utc_ns(frame.time_ns), aligned.site_from_image, aligned.camera_m,
+            *pictures, found.mask, found.boxes, found.scores, aligned.residual_px, shade,
+        )
+
     def _corroborated(self, compared: OneSided) -> tuple[Difference, Mask | None]:
         """What differs from the map or from one of the nearest earlier pictures, as far as they confirm it; and the
         ground (h, w) that leans another way in them."""
@@ -258,20 +328,28 @@ class ViewMaker:
             view, lambda picture: compare_robust(reference, as_bgr(picture), compared.valid, settings).mask > 0
         )
 
-    def _difference(self, reference: ImageBGR, query: ImageBGR, valid: Mask) -> Difference:
-        """What differs from the map; the flight's tuning learns of it."""
+    def _difference(
+        self, reference: ImageBGR, query: ImageBGR, valid: Mask
+    ) -> tuple[Difference, PairMeasures | None]:
+        """What differs from the map; the flight's tuning learns of it, by what was measured."""
         settings = self._settings_now()
         if self._tuning is None or settings is None:
             thesis = compare_thesis(reference, query, valid, self._thesis.settings, self._thesis.threads)
-            return Difference(thesis.mask, thesis.boxes, np.full(len(thesis.boxes), 0.5))
+            return Difference(thesis.mask, thesis.boxes, np.full(len(thesis.boxes), 0.5)), None
         found = compare_robust(reference, query, valid, settings)
-        self._tuning.observe(found)
-        return Difference(found.mask, found.boxes, found.scores)
+        measured = PairMeasures.of(found)
+        self._tuning.observe(measured)
+        return Difference(found.mask, found.boxes, found.scores), measured
 
     def _settings_now(self) -> RobustSettings | None:
         """Those of the robust method as the flight has set them so far; None for method thesis."""
         least_score = self._settings.corroboration.least_score
         return None if self._tuning is None else replace(self._tuning.settings(), least_score=least_score)
+
+
+def _laid(aligned: Aligned, image: ImageRGB, known: Mask) -> tuple[ImageRGB, Mask]:
+    """A frame (h, w, 3) laid on the map's picture, and where (h, w) both are known."""
+    return (image, known) if aligned.local is None else aligned.local.warped(image, known)
 
 
 def _doubted(found: Difference, kept: Difference, least_score: float) -> Mask:

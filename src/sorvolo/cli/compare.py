@@ -28,7 +28,7 @@ from sorvolo.cli.options import (
     names,
 )
 from sorvolo.cli.places import place_heading, place_words
-from sorvolo.cli.progress import ProgressReport, rate_words
+from sorvolo.cli.progress import ProgressReport, Resumed, rate_words
 from sorvolo.cli.shown import (
     newest_version,
     read_json,
@@ -195,12 +195,13 @@ def _show_progress(
 ) -> list[str]:
     """Take all updates, printing each change as it is announced; the ids of these."""
     announced: list[str] = []
-    words = None
+    words, resumed = None, Resumed(console)
     with ProgressReport(console) as progress:
         progress.show("opening")
         for update in updates:
-            for change in update.announced:
-                announced.append(change.id)
+            resumed.take(update.views, is_resumed=update.is_resumed)
+            announced += [change.id for change in update.announced]
+            for change in () if update.is_resumed else update.announced:
                 words = words or _announcement(folder, form)
                 console.print(words(change), highlight=False, soft_wrap=True)
             compared = f"{update.compared:,} of {counted(update.views, 'view')} compared"

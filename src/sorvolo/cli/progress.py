@@ -62,22 +62,34 @@ class ProgressReport:
         self._task = task
 
 
+class Resumed:
+    """Announces once, when the first new frame comes, that a run goes on after frames of one that was stopped."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._count = 0
+
+    def take(self, count: int, *, is_resumed: bool) -> None:
+        """An update, and how many frames there are with it."""
+        if is_resumed:
+            self._count = count
+        elif self._count:
+            words = f"going on after {counted(self._count, 'frame')} of a run that was stopped"
+            self._console.print(words, highlight=False)
+            self._count = 0
+
+
 def show_progress(updates: Iterable["MosaicUpdate"], console: Console) -> int:
     """Take all updates of a mapping, showing each flight's progress; return how many there were."""
-    count, flight, before, resumed = 0, 1, None, 0
+    count, flight, before = 0, 1, None
+    resumed = Resumed(console)
     with ProgressReport(console) as progress:
         progress.show("opening")
         for update in updates:
             count += 1
             if before is not None and update.keyframes <= before.keyframes:
                 flight += 1
-            if update.is_resumed:
-                resumed = update.keyframes
-            elif resumed:
-                console.print(
-                    f"going on after {counted(resumed, 'frame')} of a run that was stopped", highlight=False
-                )
-                resumed = 0
+            resumed.take(update.keyframes, is_resumed=update.is_resumed)
             before = update
             task = "mapping, frame" if flight == 1 else f"mapping flight {flight}, frame"
             expected = max(update.frames_expected, update.frames_read)

@@ -243,6 +243,8 @@ def _placed(journal: Journal, view: FrameView | None, name: str, status: str) ->
 def _announce(journal: Journal, update: CompareUpdate, site: Site, announced: dict[str, None]) -> None:
     for change in update.announced:
         announced[change.id] = None
+        if update.is_resumed:
+            continue  # the run that was killed announced it
         stored = stored_changes(change.id.rpartition("-")[0], [change])
         feature = changes_geojson(stored, on_earth(site))["features"][0]
         journal.add("change.announced", {"feature": feature})

@@ -198,3 +198,4 @@ class CompareUpdate:
     compared: int
     seconds: float
     view: FrameView | None = None  # None: not laid on the map
+    is_resumed: bool = False  # compared by a run that was killed

@@ -82,7 +82,7 @@ class Sensitivity:
 
 
 class Planting:
-    """Chooses views of a flight and plants things in them. Only `plant` changes it."""
+    """Chooses views of a flight and plants things in them. Only `plant` and `pass_over` change it."""
 
     def __init__(self, settings: PlantingSettings = PlantingSettings()) -> None:
         self.settings = settings
@@ -92,14 +92,19 @@ class Planting:
     def plant(self, view: ComparedView, find: Callable[[ImageRGB], Mask]) -> tuple[Planted, ...]:
         """Things planted in the view, if it is its turn. `find` (h, w) marks what differs between the map and a picture
         that stands in for the view's own."""
+        if not self.pass_over():
+            return ()
+        return planted_in(view, find, self.settings, np.random.default_rng(self._planted))
+
+    def pass_over(self) -> bool:
+        """Count a view in which an earlier process planted; whether it was its turn."""
         is_due = self._views % self._step == 0
         self._views += 1
-        if not is_due:
-            return ()
-        self._planted += 1
-        if self._planted % self.settings.steps_alike == 0:
-            self._step *= 2
-        return planted_in(view, find, self.settings, np.random.default_rng(self._planted))
+        if is_due:
+            self._planted += 1
+            if self._planted % self.settings.steps_alike == 0:
+                self._step *= 2
+        return is_due
 
 
 def planted_in(

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from statistics import median
 
 from sorvolo.change.pair.robust import RobustResult, RobustSettings
+from sorvolo.geometry.arrays import Floats
 
 MEMORY_FRAMES = 50  # light and wind change within minutes: older frames tell nothing about now
 LEAST_KNOWN = 0.05  # share of a frame that must be known for its measures to count
@@ -19,6 +20,27 @@ class TuningLimits:
     frames_to_settle: int = 10  # frames that must agree before less is tolerated than at first
 
 
+@dataclass(frozen=True, eq=False)
+class PairMeasures:
+    """What one comparison measured: see `RobustResult`. `brightness` (3,) is that of the light, blue green red."""
+
+    known: float
+    noise: float
+    moved_px: float
+    rest_px: float
+    brightness: Floats
+    unevenness: float
+
+    @classmethod
+    def of(cls, result: RobustResult) -> "PairMeasures":
+        """Those of a comparison, without its pictures."""
+        light, settling = result.light, result.settling
+        return cls(
+            float(result.known), float(result.noise), float(settling.moved_px), float(settling.rest_px),
+            light.brightness, float(light.unevenness),
+        )
+
+
 class FlightTuning:
     """What a flight's unchanged ground shows of noise, misalignment, parallax and light. Only `observe` changes it.
 
@@ -29,22 +51,20 @@ class FlightTuning:
     def __init__(self, settings: RobustSettings | None = None, limits: TuningLimits | None = None) -> None:
         self._base = settings or RobustSettings()
         self._limits = limits or TuningLimits()
-        self._seen: deque[RobustResult] = deque(maxlen=MEMORY_FRAMES)
+        self._seen: deque[PairMeasures] = deque(maxlen=MEMORY_FRAMES)
         self._frames = 0
 
-    def observe(self, result: RobustResult) -> bool:
-        """Learn from a comparison; whether the settings are others now. Pictures are not kept."""
-        before = self.settings()
+    def observe(self, measured: PairMeasures) -> None:
+        """Learn from a comparison."""
         self._frames += 1
-        if result.known >= LEAST_KNOWN:
-            self._seen.append(replace(result, mask=result.mask[:0, :0]))
-        return self.settings() != before
+        if measured.known >= LEAST_KNOWN:
+            self._seen.append(measured)
 
     def settings(self) -> RobustSettings:
         """The settings for the next frame; the ones given at first until something was seen."""
         if not self._seen:
             return self._base
-        rest_px = median(each.settling.rest_px for each in self._seen)
+        rest_px = median(each.rest_px for each in self._seen)
         reach_px = self._base.regions.reach_px
         if rest_px > self._limits.restless_px:
             reach_px += 1
@@ -58,14 +78,14 @@ class FlightTuning:
         settings = self.settings()
         if not self._seen:
             return {"frames": self._frames, "settings": "those given: nothing was compared yet"}
-        brightness = [float(median(float(each.light.brightness[band]) for each in self._seen)) for band in range(3)]
+        brightness = [float(median(float(each.brightness[band]) for each in self._seen)) for band in range(3)]
         return {
             "frames": self._frames,
             "noise_levels": round(self._noise(), 1),
-            "misaligned_px": round(2 * median(each.settling.moved_px for each in self._seen), 2),
-            "parallax_px": round(2 * median(each.settling.rest_px for each in self._seen), 2),
+            "misaligned_px": round(2 * median(each.moved_px for each in self._seen), 2),
+            "parallax_px": round(2 * median(each.rest_px for each in self._seen), 2),
             "brightness_blue_green_red": " ".join(f"{each:.2f}" for each in brightness),
-            "clouds_octaves": round(median(each.light.unevenness for each in self._seen), 2),
+            "clouds_octaves": round(median(each.unevenness for each in self._seen), 2),
             "search_px": 2 * settings.regions.reach_px,
             "least_difference_levels": round(
                 settings.regions.least_difference
@@ -77,7 +97,7 @@ class FlightTuning:
     @property
     def brightness(self) -> float:
         """How many times as bright as the reference a middle grey is on this flight; NaN while nothing was seen."""
-        return float(median(float(each.light.brightness.mean()) for each in self._seen)) if self._seen else float("nan")
+        return float(median(float(each.brightness.mean()) for each in self._seen)) if self._seen else float("nan")
 
     def _noise(self) -> float:
         return float(median(each.noise for each in self._seen))

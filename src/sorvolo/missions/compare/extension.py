@@ -6,6 +6,7 @@ from sorvolo.change.map_update import grown_m2
 from sorvolo.change.views import ViewMaker, ViewOutcome
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.missions.map.journal import Step, Taken
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.mosaic.selection import StretchSelection
 from sorvolo.store.site.archive import Archive, FlightWriter
@@ -45,24 +46,33 @@ class MapExtension:
         """The frames that extend the map, once that is complete."""
         return self._frames
 
-    def add(self, posed: PosedFrame, outcome: ViewOutcome) -> None:
-        """Take a frame that shows new ground; those that do not, or that show what the last one did, are left."""
-        is_new = outcome.view is not None and outcome.known < 1 - _NEW_GROUND
-        if not (is_new or outcome.status is ViewStatus.OUTSIDE):
-            return
-        if not self._settings.updates_map or self._setup.track is None:
-            return
-        if self._views.brightness_beside_map(posed, outcome) < NIGHT:
-            return
+    def add(self, posed: PosedFrame, outcome: ViewOutcome, earlier: Taken | None = None) -> Taken | None:
+        """Take a frame that shows new ground; those that do not, or that show what the last one did, are left.
+
+        `earlier` is the frame as a killed run registered it; returned is how it is registered now, None where it is
+        not.
+        """
+        if not self._is_wanted(posed, outcome):
+            return None
         if not self._selection.take(self._views.pixels.ground_m(posed, outcome.site_from_image)):
             self._shown_by[posed.frame.index] = self._last
-            return
+            return None
         self._last = posed.frame.index
         if self._run is None:
             self._run = PlanarRun(self._setup, self._archive, self._settings.mapping, writer=self._writer)
-        self._run.add(posed)
+        taken = _taken_again(self._run, posed, earlier)
         if outcome.site_from_image is not None:
             self._run.note_found(posed.frame.index, outcome.site_from_image, outcome.residual_px)
+        return taken
+
+    def _is_wanted(self, posed: PosedFrame, outcome: ViewOutcome) -> bool:
+        """Whether a frame shows new ground, in a light that the map may have."""
+        is_new = outcome.view is not None and outcome.known < 1 - _NEW_GROUND
+        if not (is_new or outcome.status is ViewStatus.OUTSIDE):
+            return False
+        if not self._settings.updates_map or self._setup.track is None:
+            return False
+        return self._views.brightness_beside_map(posed, outcome) >= NIGHT
 
     def complete(self) -> Sequence[PlacedFrame]:
         """Place the frames for good and paint them; those that extend the map."""
@@ -84,3 +94,14 @@ class MapExtension:
             (each.outline_m for each in self._frames), self._archive.tiles(base_version), self._writer.tiles,
             self._archive.site_grid(),
         )
+
+
+def _taken_again(run: PlanarRun, posed: PosedFrame, earlier: Taken | None) -> Taken | None:
+    """Have a frame placed as a killed run registered it, or anew where that cannot be; as it is registered now."""
+    frame = posed.frame
+    if earlier is not None:
+        step = Step(frame.index, frame.name, frame.time_ns, "", None, earlier, False)
+        if run.again(step) is not None:
+            return earlier
+    run.add(posed)
+    return run.taken

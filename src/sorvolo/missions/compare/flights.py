@@ -11,6 +11,7 @@ from sorvolo.capture.areas import read_area
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.missions.compare.journal import CompareJournal
 from sorvolo.missions.compare.run import CompareRun, Pending
 from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.headline import MapQuality
@@ -20,6 +21,7 @@ from sorvolo.missions.flight.request import AlreadyDone, already_done, request_o
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup, known_flights, known_ground_m, prepare, repeated
 from sorvolo.missions.heights.measure import heights_stamp
+from sorvolo.missions.map.journal import begun_journal
 from sorvolo.mosaic.selection import every
 from sorvolo.registration.opencv_threads import single_threaded_opencv
 from sorvolo.store.site.archive import Archive
@@ -43,6 +45,7 @@ def compare_flights(
     carries the changes that its frame announced. `steps` is a folder for the intermediate pictures of method thesis
     (its Figure 3.14). The flights' findings and the new version of the map are part of the site when a flight's last
     update was yielded.
+    A run that was killed goes on where it was when the same is asked for again.
     A flight that was compared already, as it is asked for, is left out and returned, unless `again` is given.
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being compared is left out, those before it are in.
@@ -74,11 +77,14 @@ def compare_flights(
             reviews = [(each.change_id, each.verdict.value) for each in archive.reviews()]
             heights = heights_stamp(archive, but=source.name)
             request = request_of(setup, settings, wanted, looks, base, reviews, heights, steps)
-            if not again and (compared := already_done(archive, setup, request)):
+            compared = already_done(archive, setup, request)
+            if compared and not again:
                 known.append(compared)
                 continue
             own = settings if is_newest else replace(settings, updates_map=False)  # what later flights painted stays
-            yield from _compare_one(setup, archive, own, wanted, steps, looks, base, request)
+            yield from _compare_one(
+                setup, archive, own, wanted, steps, looks, base, request, anew=again and compared is None
+            )
         return tuple(known)
 
 
@@ -95,13 +101,16 @@ def _refuse_contradictory(archive: Archive, site: Path) -> None:
 
 def _compare_one(
     setup: FlightSetup, archive: Archive, settings: CompareSettings, area: Area | None, steps: Path | None,
-    detector: Detects | None, base: int, request: str,
+    detector: Detects | None, base: int, request: str, *, anew: bool,
 ) -> Generator[CompareUpdate]:
     started_s, source = time.monotonic(), setup.source
     setup = replace(setup, notices=(*setup.notices, *repeated(archive, source.name, "compared")))
     inside = setup.inside(area)
     step_s = 0.0 if source.kind == "photos" else 1.0 / settings.views_per_second
-    with CompareRun(setup, archive, settings, base, steps, detector, request) as run:
+    journal = None
+    if not isinstance(source, LiveSource):
+        journal = CompareJournal(begun_journal(setup, archive, request, anew=anew))
+    with CompareRun(setup, archive, settings, base, steps, detector, request, journal) as run:
 
         def ahead() -> int:  # a live view's changes are announced at once, unless the next view waits already
             return 0 if isinstance(source, LiveSource) and not source.is_behind else _AHEAD
@@ -109,16 +118,18 @@ def _compare_one(
         for each in _ended(source, step_s, setup, inside, run, ahead):
             if isinstance(each, Pending):
                 outcome, announced = run.add(each)
+                is_resumed = each.earlier is not None
                 view = run.view(each.posed)
                 frame: Frame | LostFrame = each.posed.frame
                 status, reason, residual_px = outcome.status, outcome.reason, outcome.residual_px
             else:
                 run.lose(each)
-                view = None
+                view, is_resumed = None, False
                 frame, status, reason, residual_px, announced = each, ViewStatus.LOST, each.reason, float("nan"), ()
             yield CompareUpdate(
                 frame.name, setup.utc_ns(frame.time_ns), status, reason, residual_px, announced, frame.index + 1,
                 source.frame_count, run.views, run.compared, time.monotonic() - started_s, view,
+                is_resumed,
             )
         run.finish(source.notices(), started_s)
 
@@ -133,6 +144,7 @@ def _ended(
     for each in _begun(source.frames(every(step_s)), setup, inside, run, ahead):
         if source.kind == "photos" and isinstance(each, Pending) and each.is_unplaced:
             again.add(each.posed.frame.index)
+            run.put_off(each)
         else:
             yield each
     if again:

@@ -1,12 +1,12 @@
 """Objects beside a comparison: frames that fit the map are searched for them, and they name what changes are."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from sorvolo.change.views import ViewMaker, ViewOutcome
 from sorvolo.missions.compare.change_classes import ChangeClasses
 from sorvolo.missions.flight.detects import Detects
-from sorvolo.missions.flight.map_objects import ObjectFinder, search_summary, why_not_searched
+from sorvolo.missions.flight.map_objects import FrameDetections, ObjectFinder, search_summary, why_not_searched
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.selection import StretchSelection
@@ -47,12 +47,23 @@ class ComparisonObjects:
         """What the detector would have a user know of the frames."""
         return () if self._finder is None else self._finder.notices
 
+    def take_over(self, seen: Iterable[FrameDetections]) -> None:
+        """Take what a killed run's detector found."""
+        if self._finder is not None:
+            for each in seen:
+                self._finder.take_over(each)
+
+    def news(self) -> Sequence[FrameDetections]:
+        """What was found in frames since this was asked last."""
+        return () if self._finder is None else self._finder.news()
+
     def search(self, posed: PosedFrame, outcome: ViewOutcome, views: ViewMaker) -> None:
         """Have a frame that fits the map searched, each stretch of ground in a few of them."""
         if self._finder is None or outcome.site_from_image is None:
             return
         outline_m = views.pixels.ground_m(posed, outcome.site_from_image)
-        if outline_m is not None and self._selection.take(outline_m):
+        is_due = outline_m is not None and self._selection.take(outline_m)
+        if is_due and not self._finder.has_seen(posed.frame.index):
             self._finder.look(posed)
 
     def named(self, announced: Sequence[Change]) -> tuple[Change, ...]:

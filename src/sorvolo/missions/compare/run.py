@@ -17,12 +17,13 @@ from sorvolo.change.reference import ReferenceMap
 from sorvolo.change.relief import Relief
 from sorvolo.change.shape.outlines import KnownPlace
 from sorvolo.change.shape.reported import reported
-from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome, as_bgr
+from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome, ViewRecord, as_bgr
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Mask
 from sorvolo.geometry.summary import median_of_known
 from sorvolo.heights.field import standing
 from sorvolo.missions.compare.extension import MapExtension
+from sorvolo.missions.compare.journal import ComparedFrame, CompareJournal
 from sorvolo.missions.compare.objects import ComparisonObjects
 from sorvolo.missions.compare.report import ViewCounts, comparison_summary, comparison_warnings
 from sorvolo.missions.flight.detects import Detects
@@ -33,6 +34,7 @@ from sorvolo.missions.flight.request import REQUEST
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.heights.measure import flight_with_heights, read_field
+from sorvolo.missions.map.journal import Taken
 from sorvolo.store.exports.change_files import write_pictures
 from sorvolo.store.exports.coverage_files import COVERAGE, coverage_geojson
 from sorvolo.store.exports.map_pictures import picture
@@ -54,10 +56,11 @@ _CACHE_BYTES = 128 * 2**20  # of earlier pictures
 
 @dataclass(frozen=True, eq=False)
 class Pending:
-    """A frame and how its comparison will have ended."""
+    """A frame and how its comparison will have ended; `earlier` is how it ended in a run that was killed."""
 
     posed: PosedFrame
     outcome: "Future[ViewOutcome]"
+    earlier: ComparedFrame | None = None
 
     @property
     def is_unplaced(self) -> bool:
@@ -66,11 +69,14 @@ class Pending:
 
 
 class CompareRun:
-    """A later flight on its way into a site. A context manager: leaving without `finish` leaves the site as it was."""
+    """A later flight on its way into a site. A context manager: leaving without `finish` leaves the site as it was.
+
+    `journal` notes what becomes of each frame, and has what a killed run noted; None: a kill loses it.
+    """
 
     def __init__(
         self, setup: FlightSetup, archive: Archive, settings: CompareSettings, base_version: int, steps: Path | None,
-        detector: Detects | None = None, request: str = "",
+        detector: Detects | None = None, request: str = "", journal: CompareJournal | None = None,
     ) -> None:
         self._setup, self._archive, self._settings, self._steps = setup, archive, settings, steps
         self._base_version = base_version
@@ -78,7 +84,9 @@ class CompareRun:
         self._writer: FlightWriter = archive.begin_flight(
             source.name, source.fingerprint,
             {**vars(settings), "method": f"compare-{settings.method}", REQUEST: request},
+            journal=None if journal is None else journal.file,
         )
+        self._journal = journal
         self._views = _view_maker(setup, archive, settings, base_version)
         self._evidence: EvidenceMap | None = None
         self._areas = AreaMap()
@@ -87,6 +95,8 @@ class CompareRun:
             if each.verdict is Verdict.REJECTED and each.flight_id != source.name
         ]
         self._objects = ComparisonObjects(detector, setup, archive, base_version, settings)
+        if journal is not None:
+            self._objects.take_over(journal.detections)
         self._extension = MapExtension(setup, archive, settings, self._writer, self._views)
         self._log = FlightLog()
         self._counts = ViewCounts()
@@ -109,6 +119,8 @@ class CompareRun:
             self._objects.close()
         finally:  # also when Ctrl-C strikes again meanwhile
             self._writer.__exit__(kind, error, trace)
+            if self._journal is not None:
+                self._journal.file.remove()
 
     @property
     def views(self) -> int:
@@ -129,12 +141,19 @@ class CompareRun:
 
     def begin(self, posed: PosedFrame) -> Pending:
         """Begin to compare a frame, in threads beside what `add` does with those before it."""
+        earlier = None if self._journal is None else self._journal.next_frame(posed.frame.index)
+        if earlier is not None:
+            record = earlier.record
+            recalled = self._comparing.submit(
+                lambda: self._views.recall(posed, self._views.undistorted(posed), record)
+            )
+            return Pending(posed, recalled, earlier)
         compared = self._comparing.submit(self._views.compare_with_map, posed)
         return Pending(posed, self._corroborating.submit(lambda: self._views.corroborate(compared.result())))
 
     def add(self, pending: Pending) -> tuple[ViewOutcome, tuple[Change, ...]]:
         """Take one frame's comparison in; how that ended, and the changes that it was the last missing proof of."""
-        posed = pending.posed
+        posed, earlier = pending.posed, pending.earlier
         with self._log.stage(Stage.COMPARE):
             outcome = pending.outcome.result()
         self._counts.take(outcome, self._views.pixels.ground_m(posed, outcome.site_from_image))
@@ -143,8 +162,13 @@ class CompareRun:
             self._objects.search(posed, outcome, self._views)
         announced = () if outcome.view is None else self._add_view(outcome.view, outcome.leans)
         with self._log.stage(Stage.REGISTER):
-            self._extension.add(posed, outcome)
+            taken = self._extension.add(posed, outcome, None if earlier is None else earlier.taken)
+        self._keep(pending, taken)
         return outcome, announced
+
+    def put_off(self, pending: Pending) -> None:
+        """A frame that was not found on the map is tried again after the others."""
+        self._keep(pending, None)
 
     def view(self, posed: PosedFrame) -> FrameView | None:
         """What a frame that was added shows; None where it was not laid on the map, or from an unknown place."""
@@ -185,6 +209,15 @@ class CompareRun:
         )
 
     # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _keep(self, pending: Pending, taken: Taken | None) -> None:
+        """Note a frame, and what the detector found meanwhile; nothing while those of a killed run are taken over."""
+        if self._journal is None or pending.earlier is not None:
+            return
+        record = ViewRecord.of(pending.outcome.result())
+        self._journal.keep_frame(ComparedFrame(pending.posed.frame.index, record, taken))
+        for seen in self._objects.news():
+            self._journal.keep_detections(seen)
 
     def _add_view(self, view: ComparedView, leans: Mask | None) -> tuple[Change, ...]:
         """Add a compared view to the evidence; the changes announced by it."""

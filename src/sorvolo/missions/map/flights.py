@@ -31,7 +31,7 @@ from sorvolo.missions.flight.setup import (
     prepare,
     repeated,
 )
-from sorvolo.missions.map.journal import Earlier, MapJournal, Step, run_key
+from sorvolo.missions.map.journal import Earlier, MapJournal, Step, begun_journal
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.missions.map.thesis_run import ThesisRun
@@ -78,10 +78,13 @@ def map_flights(
                 ground_m=known_ground_m(archive), known_ground=ground, founds_site=founds_site(archive, source.name),
             )
             request = request_of(setup, replace(settings, live_s=0.0, memory_mb=None), wanted, looks)
-            if not again and (mapped := already_done(archive, setup, request)):
+            mapped = already_done(archive, setup, request)
+            if mapped and not again:
                 known.append(mapped)
                 continue
-            yield from _map_one(setup, archive, settings, wanted, looks, request)
+            yield from _map_one(
+                setup, archive, settings, wanted, looks, request, anew=again and mapped is None
+            )
         return tuple(known)
 
 
@@ -106,14 +109,14 @@ def _known_ground(
 
 def _map_one(
     setup: FlightSetup, archive: Archive, settings: MapSettings, area: Area | None, detector: Detects | None,
-    request: str,
+    request: str, *, anew: bool,
 ) -> Generator[MosaicUpdate]:
     started_s, source = time.monotonic(), setup.source
     refuse_without_texture(source)
     check_room(setup, archive.folder, archive.site().m_per_px if archive.has_site else settings.m_per_px)
     setup = replace(setup, notices=(*setup.notices, *repeated(archive, source.name, "mapped")))
     finder = None if detector is None else ObjectFinder(detector, source.camera.camera, settings.classes)
-    with _begun(setup, archive, settings, finder, request) as run:
+    with _begun(setup, archive, settings, finder, request, anew=anew) as run:
 
         def update(frame: Step | LostFrame | Frame, ended: tuple[Status, str, int], read: int) -> MosaicUpdate:
             view = None if isinstance(frame, LostFrame) else run.view(frame.index, frame.time_ns)
@@ -142,14 +145,15 @@ def _map_one(
 
 
 def _begun(
-    setup: FlightSetup, archive: Archive, settings: MapSettings, finder: ObjectFinder | None, request: str
+    setup: FlightSetup, archive: Archive, settings: MapSettings, finder: ObjectFinder | None, request: str, *,
+    anew: bool,
 ) -> FlightRun:
     """The run of one flight; a recorded one notes how far it is, and goes on where a killed one was."""
     if settings.method == "thesis":
         return ThesisRun(setup, archive, settings, finder, request)
     journal = None
     if not isinstance(setup.source, LiveSource):
-        journal = MapJournal(archive.journal(setup.source.name, run_key(setup, archive, request)))
+        journal = MapJournal(begun_journal(setup, archive, request, anew=anew))
     return PlanarRun(setup, archive, settings, finder=finder, journal=journal, request=request)
 
 

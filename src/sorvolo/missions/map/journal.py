@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
+import sorvolo
 from sorvolo.errors import SorvoloError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
@@ -100,7 +101,7 @@ class MapJournal:
             if step.memory.last is not None:
                 arrays["last"] = step.memory.last
         if step.taken is not None:
-            _put_taken(step.taken, values, arrays)
+            put_taken(step.taken, values, arrays)
         self.file.append(Entry("step", values, arrays))
 
     def keep_detections(self, seen: FrameDetections) -> None:
@@ -117,10 +118,17 @@ class MapJournal:
         """What a killed run did, in order; it ends where an entry is not as one was written."""
         for entry in self.file.entries():
             try:
-                read = _step(entry) if entry.kind == "step" else _seen(entry)
+                read = _step(entry) if entry.kind == "step" else detections_in(entry)
             except (KeyError, TypeError, ValueError, SorvoloError):
                 return  # a damaged entry: what comes after it is done again
             yield read
+
+
+def begun_journal(setup: FlightSetup, archive: Archive, request: str, *, anew: bool) -> RunJournal:
+    """The journal of a run, with what a killed one left that did the very same work; `anew` discards that."""
+    return archive.journal(
+        setup.source.name, run_key(setup, archive, request), sorvolo.__version__, anew=anew
+    )
 
 
 def run_key(setup: FlightSetup, archive: Archive, request: str) -> str:
@@ -130,7 +138,8 @@ def run_key(setup: FlightSetup, archive: Archive, request: str) -> str:
     return content_sha256(request, setup.plan, setup.frame.origin, site, versions)
 
 
-def _put_taken(taken: Taken, values: dict[str, Any], arrays: dict[str, Any]) -> None:
+def put_taken(taken: Taken, values: dict[str, Any], arrays: dict[str, Any]) -> None:
+    """Add a frame that was registered to the values and arrays of an entry."""
     new = taken.registered
     keyframe, features = new.keyframe, new.keyframe.features
     values["keyframe"] = {
@@ -166,11 +175,14 @@ def _step(entry: Entry) -> Step:
         memory = SelectionMemory(arrays.get("last"), tuple(float(each) for each in kept["usual"]), int(kept["count"]))
     return Step(
         int(values["index"]), str(values["name"]), int(values["time_ns"]), str(values["reason"]), memory,
-        _taken(entry) if "keyframe" in values else None, bool(values["searched"]),
+        taken_in(entry), bool(values["searched"]),
     )
 
 
-def _taken(entry: Entry) -> Taken:
+def taken_in(entry: Entry) -> Taken | None:
+    """The registered frame that an entry holds; None where it holds none. Raises what a damaged one leads to."""
+    if "keyframe" not in entry.values:
+        return None
     arrays, kept = entry.arrays, entry.values["keyframe"]
     keyframe_id = int(kept["id"])
     camera = Camera(**kept["camera"], distortion=arrays["distortion"])
@@ -202,7 +214,8 @@ def _picture(entry: Entry) -> StoredPicture | ImageRGB | bytes:
     return entry.arrays["picture"]
 
 
-def _seen(entry: Entry) -> FrameDetections:
+def detections_in(entry: Entry) -> FrameDetections:
+    """A frame's detections that an entry holds. Raises what a damaged one leads to."""
     arrays, values = entry.arrays, entry.values
     found = Detections(
         arrays["boxes_px"], arrays["scores"], arrays["labels"], tuple(str(each) for each in values["classes"])

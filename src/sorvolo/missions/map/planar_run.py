@@ -95,7 +95,7 @@ class PlanarRun(FlightRun):
 
     def add(self, posed: PosedFrame) -> tuple[Status, str, int]:
         """Place one frame; what became of it and how many tiles were painted meanwhile."""
-        frame = posed.frame
+        frame, self._taken = posed.frame, None
         if sees_horizon(self._setup.source.camera.camera, posed.prior):
             return self.lose(frame.index, frame.name, frame.time_ns, _HORIZON)
         with self._log.stage(Stage.UNDISTORT):

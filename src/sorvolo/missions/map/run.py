@@ -55,6 +55,11 @@ class FlightRun(ABC):
             self._journal.file.remove()
 
     @property
+    def taken(self) -> Taken | None:
+        """The frame that `add` registered last; None where it could not."""
+        return self._taken
+
+    @property
     def selected(self) -> int:
         """Frames taken so far, lost ones included."""
         return len(self._log.endings)

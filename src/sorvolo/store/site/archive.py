@@ -1,5 +1,6 @@
 """A site on disk, opened to be read or written: what is in it, and how a flight begins to enter."""
 
+import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Any, Self
 
 from sqlalchemy import Connection
 
-from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.errors import InputError, SettingsError, SorvoloWarning, StoreError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.store.exports.plain import plain_json
@@ -21,7 +22,7 @@ from sorvolo.store.site.journal import RunJournal
 from sorvolo.store.site.names import is_plain_name
 from sorvolo.store.site.object_records import StoredObject, StoredSearch
 from sorvolo.store.site.tiles import GrowingTiles, TileView
-from sorvolo.store.site.upkeep import forget_journals, forget_unfinished, remove_unused, repair
+from sorvolo.store.site.upkeep import forget_journals, forget_unfinished, remove_unused, repair, stopped_flights
 from sorvolo.survey.findings import Verdict
 from sorvolo.survey.flight import Site
 
@@ -268,19 +269,29 @@ class Archive:
             version = records.newest_version(connection, complete=False) or records.newest_version(connection)
         return self._files.tiles(version)
 
-    def journal(self, flight_id: str, key: str) -> RunJournal:
+    def journal(self, flight_id: str, key: str, program: str = "", *, anew: bool = False) -> RunJournal:
         """The journal of a run that is about to begin, with what a killed one of this `key` left in it.
 
-        `key` is the same for the same run over the same map. Journals of other runs are deleted, and their pictures.
+        `key` is the same for the same run over the same map, `program` the version of Sorvolo. Journals of other runs
+        are deleted, and their pictures: a warning names each. `anew`: so is what a killed run left.
         """
         self._require_writable()
         path = self._files.journal_path(flight_id)
         with self._files.catalogue.reading() as connection:
             newest = records.newest_version(connection)
-        journal = RunJournal(path, key, newest)
-        forget_journals(self._files, kept=path if journal.is_begun else None)
+        journal = RunJournal(path, key, newest, program)
+        if not anew and (why_not := journal.why_not):
+            _warn(f"{flight_id}: a run that was stopped cannot go on, since {why_not}; it begins anew")
+        self._forget_stopped(path if journal.is_begun and not anew else None, but=flight_id)
         remove_unused(self._files)
         return journal
+
+    def _forget_stopped(self, kept: Path | None, *, but: str) -> None:
+        """Forget the runs that were stopped, all but `kept`, with a warning for those of other flights than `but`."""
+        for each in stopped_flights(self._files):
+            if each != but:
+                _warn(f"a run of {each} was stopped before it was complete; it will begin anew, for the map changes")
+        forget_journals(self._files, kept)
 
     def begin_flight(
         self,
@@ -304,7 +315,7 @@ class Archive:
             raise SettingsError(f"{flight_id!r} cannot name a flight's folder; choose letters and digits")
         grid = self.site_grid().grid
         if journal is None:
-            forget_journals(self._files)
+            self._forget_stopped(None, but=flight_id)
         with self._files.catalogue.changing() as connection:
             run_id, version_id = records.begin_run(
                 connection, flight_id, fingerprint, str(settings.get("method", "")), plain_json(settings)
@@ -318,3 +329,7 @@ class Archive:
     def _require_writable(self) -> None:
         if not self._files.is_writable:
             raise StoreError(f"{self.folder} was opened to be read; open it with write=True")
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, SorvoloWarning, stacklevel=3)

@@ -5,6 +5,7 @@ import json
 import math
 import os
 import struct
+import threading
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -36,19 +37,20 @@ class Entry:
 
 
 class RunJournal:
-    """The journal of one run at `path`. `append` adds an entry; `entries` are those that are whole, once.
+    """The journal of one run at `path`. `append` adds an entry, from any thread; `entries` are those that are whole.
 
-    `key` says of what run it is, `after` over which version of the map (0: none). A file with others, or a damaged one,
-    counts as empty. Nothing is written before
-    the first `append`, which cuts off what comes after the last entry that was taken. An entry is whole after a kill
-    or is not there; after a power cut those that the disk had not got are dropped. Files are data only: no entry can
-    make this program run anything, or take more memory than the file is long.
+    `key` says of what run it is, `after` over which version of the map (0: none), `program` by which version of
+    Sorvolo. A file with others, or a damaged one,
+    counts as empty. Nothing is written before the first `append`, which cuts off what comes after the last entry that
+    was taken. An entry is whole after a kill or is not there; after a power cut those that the disk had not got are
+    dropped. Files are data only: no entry can make this program run anything.
     """
 
-    def __init__(self, path: Path, key: str, after: int) -> None:
-        self._path, self._run = path, {"key": key, "after": after}
+    def __init__(self, path: Path, key: str, after: int, program: str = "") -> None:
+        self._path, self._run = path, {"key": key, "after": after, "sorvolo": program}
         self._file: BufferedRandom | None = None
         self._end = 0
+        self._lock = threading.Lock()
 
     @property
     def is_begun(self) -> bool:
@@ -57,6 +59,22 @@ class RunJournal:
             return False
         with open(self._path, "rb", opener=_no_link) as file:
             return _read_run(file) == self._run
+
+    @property
+    def why_not(self) -> str:
+        """Why what an earlier process left is of no use, in words; "" where it is, or where there is nothing."""
+        if not self._path.is_file():
+            return ""
+        with open(self._path, "rb", opener=_no_link) as file:
+            run = _read_run(file)
+        for name, reason in (
+            ("sorvolo", f"another version of Sorvolo ({run.get('sorvolo')})"),
+            ("after", "an earlier version of the map: the site has changed"),
+            ("key", "other settings or files"),
+        ):
+            if run.get(name) != self._run[name]:
+                return f"it was of {reason}" if run else "its journal is damaged"
+        return ""
 
     def entries(self) -> Iterator[Entry]:
         """The entries of an earlier process, in order. An entry counts as taken when the next one is asked for."""
@@ -71,9 +89,19 @@ class RunJournal:
                 yield entry
                 self._end = end
 
+    def taken(self) -> Iterator[Entry]:
+        """The entries that were taken before the first `append`, once more, also while new ones are appended."""
+        end = self._end
+        if not end:
+            return
+        with open(self._path, "rb", opener=_no_link) as file:
+            _read_run(file)
+            while file.tell() < end and (entry := _read(file)) is not None:
+                yield entry
+
     def append(self, entry: Entry) -> None:
         """Add an entry. Raises StoreError when the disk is full."""
-        with writing(self._path):
+        with self._lock, writing(self._path):
             file = self._file or self._begun()
             file.write(_packed(entry))
             file.flush()

@@ -81,6 +81,11 @@ def forget_journals(files: SiteFiles, kept: Path | None = None) -> None:
             (flight / JOURNAL).unlink(missing_ok=True)
 
 
+def stopped_flights(files: SiteFiles) -> list[str]:
+    """The flights whose runs were stopped before they were complete."""
+    return [each.name for each in files.flight_folders() if (each / JOURNAL).is_file()]
+
+
 def _remove_unused_pictures(flight: Path, known_runs: set[str]) -> None:
     """Delete the pictures of runs that are not known, then folders of the flight that this emptied."""
     for images in (*(flight / "keyframes").glob("*"), *(flight / STAGED).glob("*")):

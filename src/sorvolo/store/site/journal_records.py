@@ -1,0 +1,109 @@
+"""Records as a journal's entries hold them: frozen dataclasses to plain values and arrays, and back by their types."""
+
+import types
+import zlib
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from functools import cache
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+_MOST_CELLS = 64_000_000  # of a packed mask: a picture's pixels
+_T = TypeVar("_T")
+
+
+class RecordPacker:
+    """Takes records apart. `arrays` are those of all records packed so far, for the entry that holds them."""
+
+    def __init__(self) -> None:
+        self.arrays: dict[str, NDArray[Any]] = {}
+
+    def packed(self, value: Any) -> Any:
+        """The value as JSON holds it. Masks and pictures of one byte (rows, columns) are packed small.
+
+        Raises TypeError for what is neither a record, an array, a sequence nor a plain value.
+        """
+        if value is None or isinstance(value, bool | int | float | str):
+            return value.value if isinstance(value, Enum) else value
+        if isinstance(value, np.generic):
+            return value.item()
+        if isinstance(value, np.ndarray):
+            return self._array(value)
+        if is_dataclass(value) and not isinstance(value, type):
+            return [self.packed(getattr(value, each.name)) for each in fields(value)]
+        if isinstance(value, list | tuple):
+            return [self.packed(each) for each in value]
+        raise TypeError(f"a journal holds no {type(value).__name__}")
+
+    def _array(self, array: NDArray[Any]) -> Any:
+        name = f"a{len(self.arrays)}"
+        is_small = array.ndim == 2 and array.dtype.itemsize == 1
+        if not is_small:
+            self.arrays[name] = array
+            return name
+        data = np.packbits(array) if array.dtype == bool else np.ascontiguousarray(array)
+        self.arrays[name] = np.frombuffer(zlib.compress(data.tobytes(), 1), np.uint8)
+        return [name, array.dtype.str, *array.shape]
+
+
+def unpacked(kind: type[_T], value: Any, arrays: Mapping[str, NDArray[Any]]) -> _T:
+    """A record of this class from what `RecordPacker.packed` made of it.
+
+    Raises KeyError, TypeError or ValueError, or what the record itself raises, for anything else.
+    """
+    return _read(kind, value, arrays)
+
+
+def _read(hint: Any, value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
+    origin = get_origin(hint)
+    if origin is types.UnionType:
+        return None if value is None else _read(next(each for each in get_args(hint) if each is not type(None)),
+                                                value, arrays)
+    if origin is np.ndarray:
+        return _read_array(value, arrays)
+    if origin is tuple or getattr(origin, "__name__", "") == "Sequence":
+        return _read_sequence(get_args(hint), value, arrays)
+    if is_dataclass(hint):
+        hints = _hints(hint)  # type: ignore[arg-type]
+        if not isinstance(value, list) or len(value) != len(hints):
+            raise ValueError(f"a {hint} has {len(hints)} values")
+        return hint(**{name: _read(each, part, arrays) for (name, each), part in zip(hints.items(), value)})  # type: ignore[operator]
+    if issubclass(hint, Enum):
+        return hint(value)
+    if hint is float and type(value) is int:
+        return float(value)
+    if type(value) is not hint:
+        raise TypeError(f"{hint.__name__} was needed, not {type(value).__name__}")
+    return value
+
+
+def _read_sequence(parts: tuple[Any, ...], value: Any, arrays: Mapping[str, NDArray[Any]]) -> tuple[Any, ...]:
+    if not isinstance(value, list):
+        raise TypeError("a sequence was needed")
+    each = parts if parts[-1:] != (Ellipsis,) and len(parts) == len(value) else (parts[0],) * len(value)
+    return tuple(_read(hint, item, arrays) for hint, item in zip(each, value))
+
+
+def _read_array(value: Any, arrays: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+    if isinstance(value, str):
+        return arrays[value]
+    name, kind, rows, columns = value
+    if not (type(rows) is int and type(columns) is int and min(rows, columns) >= 0 and rows * columns <= _MOST_CELLS):
+        raise ValueError("no mask is so large")
+    is_mask = kind == "|b1"
+    size = (rows * columns + 7) // 8 if is_mask else rows * columns
+    data = zlib.decompressobj().decompress(arrays[name].tobytes(), max(1, size))
+    if len(data) != size:
+        raise ValueError("a mask is cut off")
+    cells = np.frombuffer(data, np.uint8)
+    flat = np.unpackbits(cells, count=rows * columns).view(bool) if is_mask else cells
+    return flat.reshape(rows, columns)
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    hints = get_type_hints(kind)
+    return {each.name: hints[each.name] for each in fields(kind)}

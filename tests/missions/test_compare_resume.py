@@ -1,0 +1,145 @@
+"""A comparison that was killed goes on where it was, and ends with the bytes of one that was not."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_map_resume import Seeing, content
+
+from sorvolo.change.views import ViewMaker
+from sorvolo.errors import SorvoloWarning
+from sorvolo.missions.compare.flights import compare_flights
+from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.simulate.site import simulate_site
+from sorvolo.mosaic.planar import PlanarMapper
+from sorvolo.simulation.settings import (
+    ImagingSettings,
+    LaterSettings,
+    PathSettings,
+    SceneSettings,
+    SensorSettings,
+    SimulationSettings,
+)
+from sorvolo.survey.findings import CompareUpdate
+
+_PAIR = SimulationSettings(
+    seed=43, flights=2,
+    scene=SceneSettings(people=0, cars=1, small_objects=3, has_scenery=False),
+    path=PathSettings(height_m=14, speed_m_s=4, length_m=18, strips=1),
+    imaging=ImagingSettings(width_px=320, height_px=180, fps=5),
+    sensor=SensorSettings(noise_m=(0.05, 0.05, 0.05)),
+    later=LaterSettings(people=0, cars=1, small_objects=3, removed=2, moved=0),
+)
+_SETTINGS = CompareSettings(model="none", writes_masks=True)
+_KILLED_AT = 15  # frames
+
+
+def compared(
+    flown: Path, site: Path, settings: CompareSettings = _SETTINGS, then: Callable[[int], None] = lambda _: None
+) -> list[CompareUpdate]:
+    """Compare the second flight; `then` is called after each frame, with their number."""
+    updates = []
+    for each in compare_flights(
+        [flown / "flight2"], site, settings, camera=flown / "camera.xml", detector=Seeing(flown)
+    ):
+        updates.append(each)
+        then(len(updates))
+    return updates
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two flights along one strip, the second finding other objects."""
+    folder = tmp_path_factory.mktemp("pair") / "flown"
+    for _ in simulate_site(folder, _PAIR):
+        pass
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(flown: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A site that nobody killed, whose map the second flight extends, and a copy of it amid the comparison."""
+    folder = tmp_path_factory.mktemp("resume")
+    site, amid = (folder / name / "site" for name in ("whole", "amid"))
+    places = np.loadtxt(flown / "flight1" / "flight1.csv", delimiter=",", skiprows=1, usecols=(3, 4))
+    west, middle, north = places[0, 0] - 1e-3, places[:, 0].mean(), places[0, 1]
+    ring = [[west, north - 1e-3], [middle, north - 1e-3], [middle, north + 1e-3], [west, north + 1e-3]]
+    (folder / "west.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [[*ring, ring[0]]]}))
+    for _ in map_flights(
+        [flown / "flight1"], site, MapSettings(model="none"), camera=flown / "camera.xml", area=folder / "west.geojson"
+    ):
+        pass
+    compared(flown, site, then=lambda count: count != _KILLED_AT or shutil.copytree(site, amid))
+    return site, amid
+
+
+@pytest.fixture
+def worked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What is compared with the map, registered and detected from now on."""
+    done: list[str] = []
+
+    def counted(owner: type, name: str) -> None:
+        work = getattr(owner, name)
+
+        def noted(*args: object, **kwargs: object) -> object:
+            done.append(name)
+            return work(*args, **kwargs)
+
+        monkeypatch.setattr(owner, name, noted)
+
+    counted(ViewMaker, "compare_with_map")
+    counted(PlanarMapper, "register")
+    return done
+
+
+def copy(site: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(site, tmp_path / "site"))
+
+
+def test_it_goes_on_where_it_was(whole: tuple[Path, Path], flown: Path, tmp_path: Path, worked: list[str]) -> None:
+    site = copy(whole[1], tmp_path)
+    updates = compared(flown, site)
+    assert [each.is_resumed for each in updates] == [number < _KILLED_AT for number in range(len(updates))]
+    assert worked.count("compare_with_map") == len(updates) - _KILLED_AT > 3
+    assert content(site) == content(whole[0])
+    report = json.loads((site / "flights" / "flight2" / "report.json").read_text())
+    assert 0 < worked.count("register") < report["comparison"]["extension"]["frames"]  # both parts extended the map
+    assert report["objects"]["sightings"] and sum(report["comparison"]["changes"].values())
+    assert not list(site.rglob("run.journal"))
+
+
+def test_a_journal_that_is_cut_costs_only_what_is_cut_off(
+    whole: tuple[Path, Path], flown: Path, tmp_path: Path, worked: list[str]
+) -> None:
+    site = copy(whole[1], tmp_path)
+    journal = site / "flights" / "flight2" / "run.journal"
+    journal.write_bytes(journal.read_bytes()[: journal.stat().st_size // 2])
+    updates = compared(flown, site)
+    assert 0 < sum(each.is_resumed for each in updates) < _KILLED_AT
+    assert worked.count("compare_with_map") == sum(not each.is_resumed for each in updates)
+    assert content(site) == content(whole[0])
+
+
+def test_other_settings_begin_anew_and_say_so(whole: tuple[Path, Path], flown: Path, tmp_path: Path) -> None:
+    site = copy(whole[1], tmp_path)
+    with pytest.warns(SorvoloWarning, match="flight2: a run that was stopped cannot go on, since .* other settings"):
+        updates = compare_flights(
+            [flown / "flight2"], site, CompareSettings(model="none", votes=2), camera=flown / "camera.xml"
+        )
+        assert not next(updates).is_resumed
+        updates.close()
+    assert not (site / "flights" / "flight2").exists()
+
+
+def test_another_flight_tells_whose_run_it_ends(whole: tuple[Path, Path], flown: Path, tmp_path: Path) -> None:
+    site = copy(whole[1], tmp_path)
+    with pytest.warns(SorvoloWarning, match="a run of flight2 was stopped before it was complete; it will begin anew"):
+        updates = map_flights(
+            [flown / "flight1"], site, MapSettings(model="none"), camera=flown / "camera.xml", again=True
+        )
+        next(updates)
+        updates.close()
