@@ -2,7 +2,7 @@
 
 import types
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
@@ -26,17 +26,13 @@ class RecordPacker:
 
         Raises TypeError for what is neither a record, an array, a sequence nor a plain value.
         """
-        if value is None or isinstance(value, bool | int | float | str):
-            return value.value if isinstance(value, Enum) else value
-        if isinstance(value, np.generic):
-            return value.item()
         if isinstance(value, np.ndarray):
             return self._array(value)
         if is_dataclass(value) and not isinstance(value, type):
             return [self.packed(getattr(value, each.name)) for each in fields(value)]
         if isinstance(value, list | tuple):
             return [self.packed(each) for each in value]
-        raise TypeError(f"a journal holds no {type(value).__name__}")
+        return _plain(value)
 
     def _array(self, array: NDArray[Any]) -> Any:
         name = f"a{len(self.arrays)}"
@@ -57,26 +53,44 @@ def unpacked(kind: type[_T], value: Any, arrays: Mapping[str, NDArray[Any]]) -> 
     return _read(kind, value, arrays)
 
 
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Enum):
+        return value.value
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"a journal holds no {type(value).__name__}")
+
+
 def _read(hint: Any, value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
     origin = get_origin(hint)
     if origin is types.UnionType:
-        return None if value is None else _read(next(each for each in get_args(hint) if each is not type(None)),
-                                                value, arrays)
+        kind = next(each for each in get_args(hint) if each is not types.NoneType)
+        return None if value is None else _read(kind, value, arrays)
     if origin is np.ndarray:
         return _read_array(value, arrays)
-    if origin is tuple or getattr(origin, "__name__", "") == "Sequence":
+    if origin in (tuple, Sequence):
         return _read_sequence(get_args(hint), value, arrays)
     if is_dataclass(hint):
-        hints = _hints(hint)  # type: ignore[arg-type]
-        if not isinstance(value, list) or len(value) != len(hints):
-            raise ValueError(f"a {hint} has {len(hints)} values")
-        return hint(**{name: _read(each, part, arrays) for (name, each), part in zip(hints.items(), value)})  # type: ignore[operator]
-    if issubclass(hint, Enum):
-        return hint(value)
-    if hint is float and type(value) is int:
+        return _read_record(hint, value, arrays)  # type: ignore[arg-type]
+    return _read_plain(hint, value)
+
+
+def _read_record(kind: type, value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
+    hints = _hints(kind)
+    if not isinstance(value, list) or len(value) != len(hints):
+        raise ValueError(f"a {kind.__name__} has {len(hints)} values")
+    return kind(**{name: _read(each, part, arrays) for (name, each), part in zip(hints.items(), value)})
+
+
+def _read_plain(kind: Any, value: Any) -> Any:
+    if issubclass(kind, Enum):
+        return kind(value)
+    if kind is float and type(value) is int:
         return float(value)
-    if type(value) is not hint:
-        raise TypeError(f"{hint.__name__} was needed, not {type(value).__name__}")
+    if type(value) is not kind:
+        raise TypeError(f"{kind.__name__} was needed, not {type(value).__name__}")
     return value
 
 
