@@ -2,8 +2,12 @@
 
 import os
 import signal
+from collections.abc import Iterator
 
+import pytest
 from hypothesis import settings
+
+from postgres_server import PostgresServer, program
 
 # a shell's background job ignores Ctrl-C, and so would the programs that tests start and stop
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -19,3 +23,25 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 settings.register_profile("anywhere", deadline=None)
 settings.register_profile("every time the same", deadline=None, derandomize=True, database=None, print_blob=True)
 settings.load_profile("every time the same" if "CI" in os.environ else "anywhere")
+
+
+os.environ.pop("SORVOLO_CATALOGUE", None)  # where the tester's own catalogues lie
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[PostgresServer]:
+    """A PostgreSQL server for the tests of this process."""
+    pytest.importorskip("psycopg")
+    if program("initdb") is None:
+        pytest.skip("PostgreSQL is not installed (Debian: apt-get install postgresql)")
+    server = PostgresServer()
+    yield server
+    server.remove()
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def kind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Where the catalogues of new sites lie: what holds of a catalogue holds of both."""
+    if request.param == "postgresql":
+        monkeypatch.setenv("SORVOLO_CATALOGUE", request.getfixturevalue("postgres").url)
+    return request.param

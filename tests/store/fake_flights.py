@@ -20,6 +20,7 @@ from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
@@ -83,7 +84,7 @@ def map_flight(archive: Archive, flight_id: str, colour: int, count: int = 4, *,
 
 def check_whole(folder: Path) -> None:
     """Raise AssertionError (or the archive's own error) unless the site is whole and of one piece."""
-    if not (folder / "site.db").exists():
+    if not is_site(folder):
         assert all(path.name.startswith((".tmp-", "site.lock")) for path in folder.glob("*"))
         return
     with Archive.open(folder, write=False) as archive:
@@ -170,7 +171,7 @@ def _map_to_step(folder: Path, seed: int, last: int, steps: Path) -> None:
 
     def watch(called: FrameType, event: str, _: object) -> None:
         nonlocal count, commit
-        ordering = ("archive.py", "flight_writer.py", "catalogue.py", "derived.py", "atomic.py")
+        ordering = ("archive.py", "flight_writer.py", "catalogue.py", "sqlite_database.py", "derived.py", "atomic.py")
         if event != "call" or not called.f_code.co_filename.endswith(ordering):
             return
         if count == last:

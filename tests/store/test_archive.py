@@ -17,12 +17,19 @@ from fake_flights import CAMERA, LOCAL_SITE, SITE, frame, image, map_flight, til
 from sorvolo.errors import GeometryError, SettingsError, StoreError
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.store.site.schema import SCHEMA_VERSION
 from sorvolo.survey.mosaic import Status
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path: Path, kind: str) -> Path:
+    return tmp_path / "site"
+
+
+@pytest.fixture
+def file_folder(tmp_path: Path) -> Path:
+    """For what holds of a catalogue in the site's folder alone, or has nothing to do with catalogues."""
     return tmp_path / "site"
 
 
@@ -94,12 +101,12 @@ def test_a_flight_comes_back_whole(folder: Path) -> None:
     assert json.loads((flight_folder / "report.json").read_text()) == {"colour": 20}
     assert (flight_folder / "report.html").read_text() == "<html>20</html>"
     assert len(json.loads((flight_folder / "frames.geojson").read_text())["features"]) == 5
-    assert {path.name for path in folder.iterdir()} >= {"mosaic.tif", "preview.png", "mosaic.kmz", "site.db"}
+    assert {path.name for path in folder.iterdir()} >= {"mosaic.tif", "preview.png", "mosaic.kmz"} and is_site(folder)
 
 
-def test_a_keyframe_stored_smaller_sees_the_same_ground(folder: Path) -> None:
+def test_a_keyframe_stored_smaller_sees_the_same_ground(file_folder: Path) -> None:
     full = frame(1)
-    with opened(folder) as archive, archive.begin_flight("a", "", {}) as writer:
+    with opened(file_folder) as archive, archive.begin_flight("a", "", {}) as writer:
         path = writer.save_image(1, cv2.resize(image(1), (32, 18), interpolation=cv2.INTER_AREA))
         writer.commit([full], {1: path}, {}, "")
         (keyframe,) = archive.keyframes()
@@ -110,8 +117,8 @@ def test_a_keyframe_stored_smaller_sees_the_same_ground(folder: Path) -> None:
     assert np.abs(full_m - small_m).max() < 1e-9
 
 
-def test_images_come_out_of_the_writer_as_out_of_the_archive(folder: Path) -> None:
-    with opened(folder) as archive:
+def test_images_come_out_of_the_writer_as_out_of_the_archive(file_folder: Path) -> None:
+    with opened(file_folder) as archive:
         with archive.begin_flight("a", "", {}, cache_mb=0) as writer:
             paths = {index: writer.save_image(index, image(index)) for index in range(3)}
             seen = [writer.image(index) for index in range(3)]
@@ -207,8 +214,8 @@ def test_repainting_leaves_no_blobs_behind(folder: Path) -> None:
         assert np.array_equal(writer.tiles[0, 0], tile(29, opaque_columns=100))
 
 
-def test_a_tile_must_have_the_sites_size_and_comes_out_read_only(folder: Path) -> None:
-    with opened(folder) as archive, archive.begin_flight("a", "", {}) as writer:
+def test_a_tile_must_have_the_sites_size_and_comes_out_read_only(file_folder: Path) -> None:
+    with opened(file_folder) as archive, archive.begin_flight("a", "", {}) as writer:
         with pytest.raises(GeometryError, match="512x512"):
             writer.tiles[0, 0] = np.ones((256, 256, 4), np.uint8)
         painted = tile(5)
@@ -266,8 +273,8 @@ def test_only_one_writer_and_one_flight_at_a_time(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("flight_id", ["", "../up", ".hidden", "a/b", "a\0b"])
-def test_a_flight_id_cannot_leave_its_folder(folder: Path, flight_id: str) -> None:
-    with opened(folder) as archive, pytest.raises(SettingsError):
+def test_a_flight_id_cannot_leave_its_folder(file_folder: Path, flight_id: str) -> None:
+    with opened(file_folder) as archive, pytest.raises(SettingsError):
         archive.begin_flight(flight_id, "", {})
 
 
@@ -290,34 +297,34 @@ def test_a_catalogue_that_is_none_is_refused_and_left_alone(tmp_path: Path, cont
     assert (tmp_path / "site.db").read_bytes() == content
 
 
-def test_a_damaged_catalogue_is_refused_and_left_alone(folder: Path) -> None:
-    with opened(folder) as archive:
+def test_a_damaged_catalogue_is_refused_and_left_alone(file_folder: Path) -> None:
+    with opened(file_folder) as archive:
         map_flight(archive, "a", 20)
-    whole = (folder / "site.db").read_bytes()
+    whole = (file_folder / "site.db").read_bytes()
     cut = whole[: len(whole) // 2]
-    (folder / "site.db").write_bytes(cut)
+    (file_folder / "site.db").write_bytes(cut)
     with pytest.raises(StoreError, match="damaged"):
-        opened(folder)
-    assert (folder / "site.db").read_bytes() == cut
+        opened(file_folder)
+    assert (file_folder / "site.db").read_bytes() == cut
 
 
-def test_another_format_version_is_refused_with_both_versions(folder: Path) -> None:
-    with opened(folder):
+def test_another_format_version_is_refused_with_both_versions(file_folder: Path) -> None:
+    with opened(file_folder):
         pass
-    with sqlite3.connect(folder / "site.db") as connection:
+    with sqlite3.connect(file_folder / "site.db") as connection:
         connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 6}")
     connection.close()
     for write in (True, False):
         with pytest.raises(StoreError, match=rf"version {SCHEMA_VERSION + 6},.* version {SCHEMA_VERSION};"):
-            Archive.open(folder, write=write)
+            Archive.open(file_folder, write=write)
 
 
-def test_a_folder_on_a_read_only_disk_can_be_read_but_not_written(folder: Path, tmp_path: Path) -> None:
-    with opened(folder) as archive:
+def test_a_folder_on_a_read_only_disk_can_be_read_but_not_written(file_folder: Path, tmp_path: Path) -> None:
+    with opened(file_folder) as archive:
         map_flight(archive, "a", 20)
     view = tmp_path / "view"
     view.mkdir()
-    commands = [["mount", "--bind", str(folder), str(view)], ["mount", "-o", "remount,bind,ro", str(view)]]
+    commands = [["mount", "--bind", str(file_folder), str(view)], ["mount", "-o", "remount,bind,ro", str(view)]]
     if any(subprocess.run(command, capture_output=True).returncode for command in commands):
         subprocess.run(["umount", str(view)], capture_output=True)
         pytest.skip("no read-only mount could be made here")
@@ -332,14 +339,14 @@ def test_a_folder_on_a_read_only_disk_can_be_read_but_not_written(folder: Path, 
         subprocess.run(["umount", "-l", str(view)], check=True)
 
 
-def test_a_damaged_or_missing_tile_is_named(folder: Path) -> None:
-    with opened(folder) as archive:
+def test_a_damaged_or_missing_tile_is_named(file_folder: Path) -> None:
+    with opened(file_folder) as archive:
         map_flight(archive, "a", 20, count=1)
-    (blob,) = folder.glob("tiles/*/*.png")
+    (blob,) = file_folder.glob("tiles/*/*.png")
     data = bytearray(blob.read_bytes())
     data[len(data) // 2] ^= 1
     blob.write_bytes(data)
-    with Archive.open(folder, write=False) as archive:
+    with Archive.open(file_folder, write=False) as archive:
         with pytest.raises(StoreError, match="damaged"):
             archive.tiles()[-1, 0]
         blob.unlink()
@@ -383,9 +390,9 @@ def test_a_local_site_has_a_map_without_a_place_on_earth(tmp_path: Path) -> None
             writer.commit([], {}, {}, "", crs="EPSG:3857")
 
 
-def test_a_commit_refuses_an_image_that_was_never_saved(folder: Path) -> None:
+def test_a_commit_refuses_an_image_that_was_never_saved(file_folder: Path) -> None:
     with (
-        opened(folder) as archive,
+        opened(file_folder) as archive,
         archive.begin_flight("a", "", {}) as writer,
         pytest.raises(StoreError, match="never saved"),
     ):

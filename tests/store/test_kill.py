@@ -11,8 +11,10 @@ import pytest
 from sorvolo.store.site.archive import Archive
 
 
-@pytest.mark.parametrize(("moments", "rounds"), [("random", 5), ("steps", 6)])
-def test_a_site_survives_being_killed(tmp_path: Path, moments: str, rounds: int) -> None:
+@pytest.mark.parametrize(("moments", "rounds", "kind"), [
+    ("random", 5, "sqlite"), ("steps", 6, "sqlite"), ("random", 3, "postgresql"),
+], indirect=["kind"])
+def test_a_site_survives_being_killed(tmp_path: Path, moments: str, rounds: int, kind: str) -> None:
     folder = tmp_path / "site"
     program = [sys.executable, fake_flights.__file__, moments, str(folder), "1", str(rounds)]
     result = subprocess.run(program, capture_output=True, text=True, timeout=120)

@@ -51,6 +51,7 @@ def features(path: Path) -> dict[str, dict[str, object]]:
     return {each["id"]: each["properties"] for each in json.loads(path.read_text())["features"]}
 
 
+@pytest.mark.usefixtures("kind")
 def test_files_of_a_flight_and_of_the_site(tmp_path: Path) -> None:
     """Both say the same; the crops lie where they say."""
     commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0), thing("a-o2", 9.0, -2.0, "person", length_m=float("nan")))))
@@ -66,6 +67,7 @@ def test_files_of_a_flight_and_of_the_site(tmp_path: Path) -> None:
         assert image_from_jpeg(crop.read_bytes(), "crop").shape == (54, 96, 3)
 
 
+@pytest.mark.usefixtures("kind")
 def test_a_later_flight_replaces_what_it_looked_at(tmp_path: Path) -> None:
     """Gone where two of its frames looked and found nothing, kept where none looked, older where it still stands."""
     commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0), thing("a-o2", 9.0, -2.0), thing("a-o3", -30.0, 0.0))))
@@ -92,6 +94,7 @@ def test_one_frame_does_not_take_away(tmp_path: Path) -> None:
     assert list(features(tmp_path / "objects.geojson")) == []
 
 
+@pytest.mark.usefixtures("kind")
 def test_mapped_again_without_a_model(tmp_path: Path) -> None:
     """The former run's files go with it, crops and all."""
     commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0),)))
@@ -101,6 +104,7 @@ def test_mapped_again_without_a_model(tmp_path: Path) -> None:
     assert not (tmp_path / "flights/a/objects").exists()
 
 
+@pytest.mark.usefixtures("kind")
 def test_what_was_deleted_is_made_again(tmp_path: Path) -> None:
     """The catalogue is the truth."""
     commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0),)))
@@ -114,7 +118,7 @@ def test_a_site_of_format_2(tmp_path: Path) -> None:
     """It is read as having no objects, and brought up to date when it is written."""
     commit(tmp_path, "a", None)
     connection = sqlite3.connect(tmp_path / "site.db")
-    connection.executescript("DROP TABLE objects; DROP TABLE searches; PRAGMA user_version = 2;")
+    connection.executescript("DROP TABLE objects; DROP TABLE searches; DROP TABLE flown; PRAGMA user_version = 2;")
     connection.close()
     with Archive.open(tmp_path, write=False) as archive:
         assert archive.objects() == []

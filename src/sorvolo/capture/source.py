@@ -38,7 +38,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry
 
 _HEAD_BYTES = 262_144
-_SITE_MARK = "site.db"  # in a folder whose pictures are a map, no photos
+_SITE_MARKS = ("site.db", "site-catalogue.json")  # in a folder whose pictures are a map, no photos
 
 LiveSource = LiveStream | GrowingFolder
 """The sources that grow while they are read: their telemetry does, and frames come when they come."""
@@ -207,9 +207,9 @@ def _sort_inputs(inputs: Sequence[Path]) -> tuple[list[Path], list[_AlbumInput]]
 
 def _inside(folder: Path) -> tuple[list[Path], list[_AlbumInput]]:
     """A folder's photos as one album, or, where it has none, its videos."""
-    if (folder / _SITE_MARK).is_file():
+    if mark := next((name for name in _SITE_MARKS if (folder / name).is_file()), None):
         raise InputError(
-            f"{folder}: a site folder (it has {_SITE_MARK}), no flight; give the flight's video or photos (map and "
+            f"{folder}: a site folder (it has {mark}), no flight; give the flight's video or photos (map and "
             "compare take the site as --site)"
         )
     files = [each for each in sorted(folder.iterdir()) if each.is_file() and each.name[0] != "."]

@@ -98,6 +98,13 @@ Memory = Annotated[
     typer.Option(help="Memory for pictures that are needed again, MB. Without it: a quarter of the machine's."),
 ]
 
+CatalogueAddress = Annotated[
+    str,
+    typer.Option(
+        help="Where a new map's catalogue lies: postgresql://USER@HOST/DATABASE, or sqlite, a file in the folder. "
+        "Without it: SORVOLO_CATALOGUE, else sqlite. See docs/catalogue.md."
+    ),
+]
 WithHeights = Annotated[
     bool, typer.Option("--heights/--flat", help="Also make heights and a true orthophoto of each flight.")
 ]
@@ -126,6 +133,7 @@ def map_command(
     classes: SearchedClasses = "",
     memory: Memory = None,
     give_up: GiveUp = 30.0,
+    catalogue: CatalogueAddress = "",
     heights: WithHeights = False,
     again: Again = False,
     as_json: AsJson = False,
@@ -149,6 +157,7 @@ def map_command(
     from sorvolo.missions.flight.settings import MapSettings
     from sorvolo.mosaic.roi_stitching import stitching_settings
 
+    place_catalogue(site, catalogue)
     settings = MapSettings(
         method.value, gsd, overlap, offset, ground_elevation, crs or None, compress.value if compress else None,
         model=model, thesis=stitching_settings(thesis or [], transform=transform.value),
@@ -161,6 +170,14 @@ def map_command(
     _print(reports, site, with_heights=heights, as_json=as_json)
     if any(each["headline"]["quality"] != "map" for each in reports):
         raise typer.Exit(TO_CHECK)
+
+
+def place_catalogue(site: Path, address: str) -> None:
+    """Let a new site's catalogue lie at this address; "" leaves it to the environment. Raises SettingsError."""
+    from sorvolo.store.site.catalogue_place import choose_catalogue
+
+    if address:
+        choose_catalogue(site, address)
 
 
 def _print(reports: Sequence[Mapping[str, Any]], site: Path, *, with_heights: bool, as_json: bool) -> None:

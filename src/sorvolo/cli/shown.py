@@ -41,9 +41,9 @@ def read_json(path: Path) -> dict[str, Any]:
 def newest_version(site: Path) -> int:
     """The id of the site's newest version; 0 where there is no site yet."""
     from sorvolo.store.site.archive import Archive
-    from sorvolo.store.site.files import CATALOGUE
+    from sorvolo.store.site.catalogue_place import is_site
 
-    if not (site / CATALOGUE).is_file():
+    if not is_site(site):
         return 0
     with Archive.open(site, write=False) as archive:
         return max((each.id for each in archive.versions() if each.complete), default=0)

@@ -38,17 +38,17 @@ def telemetry_command(
     Example: sorvolo telemetry field --flight DJI_0042
     """
     from sorvolo.missions.telemetry.doctor import correct_telemetry
-    from sorvolo.store.site.files import CATALOGUE
+    from sorvolo.store.site.catalogue_place import is_site
 
-    is_site = (source / CATALOGUE).is_file()
-    if is_site == (site is not None):
+    from_site = is_site(source)
+    if from_site == (site is not None):
         raise SettingsError("give a flight and --site FOLDER, or the folder of a map alone")
     folder = source if site is None else site
     if site is not None:
         _map_if_new(source, site, telemetry, camera)
     target = out or folder.with_name(f"{folder.resolve().name}-telemetry") / (flight or source.stem)
     report = correct_telemetry(
-        folder, target, flight=flight, source=None if is_site else source, telemetry=telemetry or None,
+        folder, target, flight=flight, source=None if from_site else source, telemetry=telemetry or None,
         camera=camera or None,
     )
     if as_json:

@@ -12,7 +12,7 @@ from sorvolo.capture.video import VIDEO_SUFFIXES
 from sorvolo.cluster.orders import Scouted, ScoutOrder
 from sorvolo.cluster.process import WorkerProcess
 from sorvolo.errors import InputError
-from sorvolo.store.site.files import CATALOGUE
+from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.survey.wording import counted
 
 _PHOTOS = PHOTO_SUFFIXES - {".png"}  # of a camera: PNGs are masks, screenshots, maps
@@ -65,7 +65,7 @@ def find_flights(places: Sequence[Path], root: Path) -> list[FoundFlight]:
 
 def _folders(place: Path, root: Path) -> Iterator[tuple[Path, list[str]]]:
     for folder, folders, names in os.walk(place):
-        if CATALOGUE in names or Path(folder) == root:
+        if is_site(Path(folder)) or Path(folder) == root:
             folders.clear()
             continue
         folders[:] = sorted(name for name in folders if not name.startswith("."))

@@ -11,7 +11,7 @@ from sorvolo.cluster.orders import Scouted
 from sorvolo.errors import StoreError
 from sorvolo.missions.flight.setup import known_ground_m
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.files import CATALOGUE
+from sorvolo.store.site.catalogue_place import is_site
 
 Box = tuple[float, float, float, float]
 """South, west, north and east of ground, degrees."""
@@ -87,7 +87,7 @@ def existing_sites(root: Path, *, with_ground: bool) -> dict[str, ExistingSite]:
 
 def existing_site(folder: Path, *, with_ground: bool = False) -> ExistingSite | None:
     """The site in a folder; None where there is none."""
-    if not (folder / CATALOGUE).is_file():
+    if not is_site(folder):
         return None
     try:
         with Archive.open(folder, write=False) as archive:

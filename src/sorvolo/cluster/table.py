@@ -19,7 +19,7 @@ from sorvolo.cluster.orders import Ending, Scouted
 from sorvolo.errors import StoreError
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.site.catalogue import utc_now
-from sorvolo.store.site.files import CATALOGUE
+from sorvolo.store.site.catalogue_place import is_site
 
 TABLE, LOCK = "batch.jsonl", "batch.lock"
 _FORMAT = 1
@@ -145,7 +145,7 @@ class BatchTable:
 
 
 def _make(root: Path) -> None:
-    if (root / CATALOGUE).exists():
+    if is_site(root):
         raise StoreError(f"{root} is a site itself; a batch makes several: name the folder above it, or a new one")
     try:
         with writing(root):

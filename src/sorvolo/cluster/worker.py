@@ -181,9 +181,9 @@ def _headline(site: Path, flight: str, name: str, good: str) -> tuple[str, bool]
 
 def _newest(site: Path) -> int:
     from sorvolo.store.site.archive import Archive
-    from sorvolo.store.site.files import CATALOGUE
+    from sorvolo.store.site.catalogue_place import is_site
 
-    if not (site / CATALOGUE).is_file():
+    if not is_site(site):
         return 0
     with Archive.open(site, write=False) as archive:
         return max((each.id for each in archive.versions() if each.complete), default=0)
@@ -192,9 +192,9 @@ def _newest(site: Path) -> int:
 def _founder(site: Path) -> str:
     """The flight whose map the site began with; "" where there is no map yet."""
     from sorvolo.store.site.archive import Archive
-    from sorvolo.store.site.files import CATALOGUE
+    from sorvolo.store.site.catalogue_place import is_site
 
-    if not (site / CATALOGUE).is_file():
+    if not is_site(site):
         return ""
     with Archive.open(site, write=False) as archive:
         return next((each.flight_id for each in archive.versions() if each.complete), "")

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from sorvolo.station.settings import STATE_FOLDER, STREAMS_FOLDER
-from sorvolo.store.site.files import CATALOGUE
+from sorvolo.store.site.catalogue_place import is_site
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Folder:
     @property
     def is_site(self) -> bool:
         """Whether it is the folder of a site."""
-        return (self.path / CATALOGUE).is_file()
+        return is_site(self.path)
 
     @cached_property
     def entries(self) -> list[os.DirEntry[str]]:

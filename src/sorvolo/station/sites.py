@@ -16,7 +16,7 @@ from sorvolo.station.problems import Problem
 from sorvolo.station.settings import STATE_FOLDER, STREAMS_FOLDER
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import FlightEntry, VersionEntry
-from sorvolo.store.site.files import CATALOGUE
+from sorvolo.store.site.catalogue_place import CATALOGUE, catalogue_file, is_site
 from sorvolo.store.site.names import is_plain_name
 
 _DEEPEST = 2  # folders below the root: `sorvolo demo` puts its site one deeper than its folder
@@ -62,7 +62,7 @@ class SiteShelf:
         found = self.folders().get(site_id)
         if found is not None:
             return found
-        is_taken = site_id in (STATE_FOLDER, STREAMS_FOLDER) or (self.root / CATALOGUE).exists()
+        is_taken = site_id in (STATE_FOLDER, STREAMS_FOLDER) or is_site(self.root)
         if not is_plain_name(site_id) or ":" in site_id or is_taken:
             raise Problem(400, f"{site_id[:80]!r} cannot name a new site; give letters and digits")
         folder = self.root / site_id
@@ -72,9 +72,9 @@ class SiteShelf:
 
     def open(self, site_id: str) -> Archive:
         """The site, opened to be read; not to be closed. Raises Problem (404, 410), StoreError as `Archive.open`."""
-        path = self.folder(site_id) / CATALOGUE
+        folder = self.folder(site_id)
         try:
-            about = path.stat()
+            about = (catalogue_file(folder) or folder / CATALOGUE).stat()
         except OSError as error:
             self.forget(site_id)
             raise Problem(410, f"the site {site_id!r} was deleted meanwhile; /api/sites lists the others") from error
@@ -83,7 +83,7 @@ class SiteShelf:
             known = self._open.get(site_id)
             if known is not None and known[0] == key:
                 return known[1]
-        archive = Archive.open(path.parent, write=False)
+        archive = Archive.open(folder, write=False)
         with self._lock:
             if known is not None:
                 known[1].close()

@@ -29,6 +29,7 @@ from sorvolo.store.exports.change_files import changes_geojson
 from sorvolo.store.exports.detection_files import tracks_collection
 from sorvolo.store.exports.plain import plain_json, utc_text
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.store.site.change_records import stored_changes
 from sorvolo.survey.findings import CompareUpdate
 from sorvolo.survey.flight import Site
@@ -291,7 +292,7 @@ def _rate(frames: int, seconds: float) -> float | None:
 
 
 def _newest(site: Path) -> int:
-    if not (site / "site.db").is_file():
+    if not is_site(site):
         return 0
     with Archive.open(site, write=False) as archive:
         return max((each.id for each in archive.versions() if each.complete), default=0)

@@ -9,7 +9,7 @@ from typing import Any
 from sorvolo.errors import InputError
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.mosaic.paired_flights import PairedFlights, true_names
-from sorvolo.store.site.files import CATALOGUE
+from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.survey.flight import Site
 from sorvolo.survey.frame_rows import FrameRow
 
@@ -44,7 +44,7 @@ def map_frames(site: Path, described: Site) -> dict[str, list[FrameRow]]:
 
 def refuse_simulation(site: Path) -> None:
     """Raise InputError for the folder of a simulation: the likely slip is that site and truth are swapped."""
-    if not (site / CATALOGUE).is_file() and (site / "truth" / "frames.geojson").is_file():
+    if not is_site(site) and (site / "truth" / "frames.geojson").is_file():
         raise InputError(f"{site}: a simulation's folder, no site; give the site first, and --truth {site}")
 
 

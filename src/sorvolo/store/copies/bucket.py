@@ -29,7 +29,7 @@ from sorvolo.store.copies.state import (
     tile_path,
 )
 from sorvolo.store.site.catalogue import Catalogue
-from sorvolo.store.site.files import CATALOGUE
+from sorvolo.store.site.catalogue_place import CATALOGUE
 from sorvolo.store.site.names import checked_sha256
 
 MANIFEST = "sorvolo-site.json"
@@ -141,7 +141,7 @@ class BucketEnd:
         path = scratch / CATALOGUE
         size, sha256 = manifest.catalogue
         self.fetch(SiteFile(_catalogue_key(sha256), size, sha256), _catalogue_key(sha256), path)
-        with closing(Catalogue(path, write=True)) as catalogue:
+        with closing(Catalogue.at(path, write=True)) as catalogue:
             held = find_state(catalogue)
             tiles, keyframes, _ = named_files(catalogue)
         if held is None or held.identity != manifest.held.identity:

@@ -37,9 +37,12 @@ from sorvolo.store.copies.state import (
 from sorvolo.store.nofollow import open_below, refuse_links
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site.catalogue import Catalogue
-from sorvolo.store.site.files import CATALOGUE, COPYING, JOURNAL, LOCK, SiteFiles, lock_folder, refuse_unfinished
+from sorvolo.store.site.catalogue_place import CATALOGUE, POINTER, is_site
+from sorvolo.store.site.files import COPYING, JOURNAL, LOCK, SiteFiles, lock_folder, refuse_unfinished
+from sorvolo.store.site.row_copies import copy_rows
+from sorvolo.store.site.sqlite_database import SqliteDatabase
 
-_OF_THE_CATALOGUE = frozenset({CATALOGUE, f"{CATALOGUE}-wal", f"{CATALOGUE}-shm", LOCK, COPYING})
+_OF_THE_CATALOGUE = frozenset({CATALOGUE, f"{CATALOGUE}-wal", f"{CATALOGUE}-shm", POINTER, LOCK, COPYING})
 
 
 class FolderEnd:
@@ -56,7 +59,7 @@ class FolderEnd:
     @property
     def has_site(self) -> bool:
         """Whether a whole site, or one that is being copied here, is in the folder."""
-        return (self.folder / CATALOGUE).is_file() or (self.folder / COPYING).is_file()
+        return is_site(self.folder) or (self.folder / COPYING).is_file()
 
     def state(self, scratch: Path) -> SiteState:
         """The site as of now, its catalogue in a file in `scratch`. Others may write the site meanwhile.
@@ -70,7 +73,7 @@ class FolderEnd:
             _copy_catalogue(files.catalogue, path)
         finally:
             files.close()
-        with closing(Catalogue(path, write=True)) as copied:
+        with closing(Catalogue.at(path, write=True)) as copied:
             with copied.changing() as connection:
                 records.drop_unfinished(connection)
             held = find_state(copied)
@@ -119,7 +122,7 @@ class FolderEnd:
         """
         if (self.folder / COPYING).is_file():
             refuse_other(self.name, _identity_of(self.folder / COPYING), new.held)
-        if (self.folder / CATALOGUE).is_file():
+        if is_site(self.folder):
             held, files = self._held(scratch)
             if held is not None:
                 refuse_other(self.name, held.identity, new.held)
@@ -154,6 +157,8 @@ class FolderEnd:
         catalogue = self.folder / CATALOGUE
         if catalogue.is_file():
             _overwrite_catalogue(catalogue, state.catalogue)
+        elif is_site(self.folder):
+            _overwrite_rows(self.folder, state.catalogue)
         else:
             with atomic_path(catalogue) as temporary, writing(temporary):
                 shutil.copyfile(state.catalogue, temporary)
@@ -172,9 +177,9 @@ class FolderEnd:
     def _held(self, scratch: Path) -> tuple[CatalogueState | None, Mapping[str, SiteFile]]:
         """What the folder's catalogue holds (None: no map), unfinished runs apart, and its files."""
         path = scratch / f"held-{CATALOGUE}"
-        with closing(Catalogue(self.folder / CATALOGUE, write=False)) as catalogue:
+        with closing(Catalogue.open(self.folder, write=False)) as catalogue:
             _copy_catalogue(catalogue, path)
-        with closing(Catalogue(path, write=True)) as copied:
+        with closing(Catalogue.at(path, write=True)) as copied:
             with copied.changing() as connection:
                 records.drop_unfinished(connection)
             return find_state(copied), _listed(self.folder, *named_files(copied))[0]
@@ -227,11 +232,16 @@ def _identity_of(note: Path) -> str:
 
 def _copy_catalogue(catalogue: Catalogue, path: Path) -> None:
     """One state of an open catalogue as a file of its own, even while others write it."""
-    with writing(path), catalogue.reading() as connection, closing(sqlite3.connect(path)) as copied:
+    with writing(path), catalogue.reading() as connection:
         driver = connection.connection.driver_connection
-        assert isinstance(driver, sqlite3.Connection)
+        if not isinstance(driver, sqlite3.Connection):
+            SqliteDatabase(path, write=True).create()
+            with closing(Catalogue.at(path, write=True)) as target, target.changing() as written:
+                copy_rows(connection, written)
+            return
         try:
-            driver.backup(copied)
+            with closing(sqlite3.connect(path)) as copied:
+                driver.backup(copied)
         except sqlite3.Error as error:
             raise StoreError(f"cannot write {path} ({error}); free some space and run it again") from error
 
@@ -244,6 +254,15 @@ def _overwrite_catalogue(path: Path, new: Path) -> None:
             target.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     except sqlite3.Error as error:
         raise StoreError(f"cannot write {path} ({error}); free some space and run the copy again") from error
+
+
+def _overwrite_rows(folder: Path, new: Path) -> None:
+    """The same where the catalogue lies in a database."""
+    with (
+        closing(Catalogue.open(folder, write=True)) as target, target.changing() as written,
+        closing(Catalogue.at(new, write=False)) as source, source.reading() as read,
+    ):
+        copy_rows(read, written)
 
 
 def _paths(folder: Path) -> Iterator[str]:

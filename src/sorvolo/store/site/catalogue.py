@@ -1,19 +1,26 @@
-"""The catalogue `site.db`: one SQLite file that is the truth about a site (docs/formats.md)."""
+"""The catalogue: the one truth about a site (docs/formats.md), in SQLite or in PostgreSQL."""
 
-import itertools
-import sqlite3
-import threading
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from sqlalchemy import ColumnElement, Connection, Row, Table, delete, func, insert, literal, select, update
-from sqlalchemy.exc import DBAPIError
-from sqlalchemy.pool import PoolProxiedConnection
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Row,
+    Table,
+    bindparam,
+    delete,
+    func,
+    insert,
+    literal,
+    select,
+    update,
+)
 
 from sorvolo.errors import GeometryError, StoreError
 from sorvolo.geometry.arrays import Floats, Matrix3
@@ -21,16 +28,17 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.geometry.pose import Pose
-from sorvolo.store.atomic import atomic_path
 from sorvolo.store.rasters.geotiff import COMPRESSIONS
 from sorvolo.store.site import schema
+from sorvolo.store.site.catalogue_place import open_database
+from sorvolo.store.site.database import Database
 from sorvolo.store.site.names import checked_crs, checked_image_path
 from sorvolo.store.site.schema import SCHEMA_VERSION
+from sorvolo.store.site.sqlite_database import SqliteDatabase
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 
 _DAY_NS = 86_400_000_000_000
-_numbers = itertools.count()
 
 
 @dataclass(frozen=True)
@@ -119,107 +127,53 @@ class StoredKeyframe:
 
 
 class Catalogue:
-    """The open database; `reading` and `changing` give one transaction each, the functions below use them."""
+    """The open catalogue; `reading` and `changing` give one transaction each, the functions below use them."""
 
-    def __init__(self, path: Path, *, write: bool) -> None:
+    def __init__(self, database: Database, site: Path, *, write: bool) -> None:
         """Open, and bring an older format up to date if it is to be written.
 
-        Raises StoreError when the file is damaged, no catalogue, or of a format that is not known.
+        Raises StoreError when it is damaged, no catalogue, of a format that is not known, or out of reach; for a
+        writer, also when another process writes.
         """
-        self._path, self._write = path, write
-        self._engine = schema.open_engine(path, write=write)
-        self._number = next(_numbers)
-        self._watching: PoolProxiedConnection | None = None
-        self._watching_lock = threading.Lock()
+        self._database = database
+        self.reading, self.changing = database.reading, database.changing
+        self.fold_log, self.change_mark, self.close = database.fold_log, database.change_mark, database.close
         try:
-            self._check()
+            database.check()
+            self._bring_up_to_date(site, write=write)
         except BaseException:
-            self._engine.dispose()
+            database.close()
             raise
 
-    @staticmethod
-    def create(path: Path) -> None:
-        """Put an empty catalogue at `path`, whole from its first moment."""
-        try:
-            with atomic_path(path) as temporary:
-                schema.create_tables(temporary)
-        except (sqlite3.Error, DBAPIError) as error:
-            raise _store_error(path, str(error.orig if isinstance(error, DBAPIError) else error)) from error
+    @classmethod
+    def open(cls, folder: Path, *, write: bool) -> Self:
+        """The catalogue of a site folder, wherever it lies. Raises as the constructor."""
+        return cls(open_database(folder, write=write), folder, write=write)
 
-    def close(self) -> None:
-        """Close every connection; the last writer folds the write-ahead log into the file."""
-        with self._watching_lock:
-            if self._watching is not None:
-                self._watching.close()
-                self._watching = None
-        self._engine.dispose()
+    @classmethod
+    def at(cls, path: Path, *, write: bool) -> Self:
+        """A catalogue in a file of SQLite's. Raises as the constructor."""
+        return cls(SqliteDatabase(path, write=write), path.parent, write=write)
 
-    def change_mark(self) -> tuple[int, int]:
-        """Another one after each transaction of others that changed the catalogue; no two catalogues opened share one.
+    @property
+    def place(self) -> str:
+        """What messages call it."""
+        return self._database.place
 
-        What is read after it is at least as new. The file's time is no such mark: a transaction writes the log, waits
-        for the disk, and only then becomes visible. Raises StoreError.
-        """
-        try:
-            with self._watching_lock:
-                if self._watching is None:  # the number counts within one connection, which is kept for it
-                    self._watching = self._engine.raw_connection()
-                    self._watching.detach()
-                cursor = self._watching.cursor()
-                try:
-                    return self._number, int(cursor.execute("PRAGMA data_version").fetchone()[0])
-                finally:
-                    cursor.close()
-        except (sqlite3.Error, DBAPIError) as error:
-            raise _store_error(self._path, str(error)) from error
-
-    @contextmanager
-    def reading(self) -> Iterator[Connection]:
-        """A transaction that sees one state of the catalogue."""
-        with self._naming_faults(), self._engine.begin() as connection:
-            yield connection
-
-    @contextmanager
-    def changing(self) -> Iterator[Connection]:
-        """A transaction that happens whole, on the disk, or not at all."""
-        with self._naming_faults(), self._engine.begin() as connection:
-            yield connection
-
-    def fold_log(self) -> None:
-        """Move the write-ahead log into the file and empty it: on a full disk, its space is needed again."""
-        connection = self._engine.raw_connection()
-        try:
-            connection.cursor().execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        except sqlite3.OperationalError as error:
-            raise StoreError(f"disk full: could not tidy {self._path} ({error}); free some space") from error
-        finally:
-            connection.close()
-
-    def _check(self) -> None:
+    def _bring_up_to_date(self, site: Path, *, write: bool) -> None:
         with self.reading() as connection:
-            application = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
-            version = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
-            if application != schema.APPLICATION_ID:
-                raise StoreError(f"{self._path} is not a Sorvolo catalogue; choose another site folder")
-            if not schema.OLDEST_VERSION <= version <= SCHEMA_VERSION:
-                raise StoreError(
-                    f"the site {self._path.parent} has format version {version}, this Sorvolo works with "
-                    f"version {SCHEMA_VERSION}; use the Sorvolo that made it, or map into a new folder"
-                )
-            if self._write:
-                fault = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one()
-                if fault != "ok":
-                    raise StoreError(_damaged(self._path, fault))
-        if self._write and version < SCHEMA_VERSION:
-            with self.changing() as connection:
-                schema.upgrade(connection, version)
+            version = schema.format_of(connection)
+        if not schema.OLDEST_VERSION <= version <= SCHEMA_VERSION:
+            raise StoreError(
+                f"the site {site} has format version {version}, this Sorvolo works with "
+                f"version {SCHEMA_VERSION}; use the Sorvolo that made it, or map into a new folder"
+            )
+        if write and version < SCHEMA_VERSION:
+            from sorvolo.store.site.migrations.upgrade import upgrade  # Alembic loads slowly, and seldom has work
 
-    @contextmanager
-    def _naming_faults(self) -> Iterator[None]:
-        try:
-            yield
-        except DBAPIError as error:
-            raise _store_error(self._path, str(error.orig)) from error
+            with self.changing() as connection:
+                upgrade(connection, version)
+                self._database.set_format(connection, SCHEMA_VERSION)
 
 
 @contextmanager
@@ -317,7 +271,7 @@ def _compressions(connection: Connection) -> dict[int, str]:
 
 def _flown_ns(connection: Connection) -> dict[int, int]:
     """When the flights were flown that made the versions, by version; none in a file of a format before 4."""
-    if connection.exec_driver_sql("PRAGMA user_version").scalar_one() < 4:
+    if schema.format_of(connection) < 4:
         return {}
     return {row.version_id: row.first_ns for row in connection.execute(select(schema.flown))}
 
@@ -389,16 +343,21 @@ def begin_run(
 
 def change_tiles(connection: Connection, version_id: int, changed: Mapping[TileIndex, str | None]) -> None:
     """Give tiles of a version other content; None removes one."""
-    for (column, row), sha256 in changed.items():
-        connection.execute(delete(schema.version_tiles).where(
-            schema.version_tiles.c.version_id == version_id,
-            schema.version_tiles.c.tile_column == column,
-            schema.version_tiles.c.tile_row == row,
-        ))
-        if sha256 is not None:
-            connection.execute(insert(schema.version_tiles).values(
-                version_id=version_id, tile_column=column, tile_row=row, sha256=sha256
-            ))
+    tiles = schema.version_tiles
+    if changed:
+        connection.execute(
+            delete(tiles).where(
+                tiles.c.version_id == version_id, tiles.c.tile_column == bindparam("column"),
+                tiles.c.tile_row == bindparam("row"),
+            ),
+            [{"column": column, "row": row} for column, row in changed],
+        )
+    painted = [
+        {"version_id": version_id, "tile_column": column, "tile_row": row, "sha256": sha256}
+        for (column, row), sha256 in changed.items() if sha256 is not None
+    ]
+    if painted:
+        connection.execute(insert(tiles), painted)
 
 
 def complete_run(
@@ -465,7 +424,11 @@ def _drop(connection: Connection, table: Table, unfinished: ColumnElement[bool])
     first = connection.execute(select(func.min(table.c.id)).where(unfinished)).scalar()
     if first is not None:
         connection.execute(delete(table).where(unfinished))
-        connection.exec_driver_sql("UPDATE sqlite_sequence SET seq = ? WHERE name = ?", (first - 1, table.name))
+        if connection.dialect.name == "sqlite":
+            connection.exec_driver_sql("UPDATE sqlite_sequence SET seq = ? WHERE name = ?", (first - 1, table.name))
+        else:
+            known = update(schema.numbers).where(schema.numbers.c.name == table.name)
+            connection.execute(known.values(last=first - 1))
 
 
 def owe_documents(connection: Connection, flight_ids: Collection[str]) -> None:
@@ -541,25 +504,14 @@ def derived_version(connection: Connection) -> int:
 
 
 def _inserted(connection: Connection, table: Table, values: Mapping[str, Any]) -> int:
+    """The number of the row, which no row of the table had before; SQLite gives it by itself."""
+    if connection.dialect.name != "sqlite":
+        known = update(schema.numbers).where(schema.numbers.c.name == table.name)
+        given = known.values(last=schema.numbers.c.last + 1).returning(schema.numbers.c.last)
+        values = {**values, "id": connection.execute(given).scalar_one()}
     key = connection.execute(insert(table).values(**values)).inserted_primary_key
-    assert key is not None  # SQLite gives one for each inserted row
+    assert key is not None  # both give one for each inserted row
     return int(key[0])
-
-
-def _store_error(path: Path, fault: str) -> StoreError:
-    """What to do about a fault of SQLite's."""
-    if "full" in fault:
-        return StoreError(f"disk full: could not write {path} ({fault}); free some space and run it again")
-    if any(words in fault for words in ("readonly", "locked", "unable to open", "disk I/O")):
-        return StoreError(f"cannot use {path}: {fault}; check the disk and its permissions")
-    return StoreError(_damaged(path, fault))
-
-
-def _damaged(path: Path, fault: object) -> str:
-    return (
-        f"{path} is damaged or not a Sorvolo catalogue ({fault}); nothing was changed: "
-        "restore it from a copy, or map into a new folder"
-    )
 
 
 def _row_of(keyframe: StoredKeyframe, run_id: int) -> dict[str, Any]:

@@ -188,9 +188,8 @@ def outlines_meet(one_m: PointsM, other_m: PointsM) -> bool:
 
 
 def _is_older(connection: Connection) -> bool:
-    """Whether the file, opened to be read, is of a format that knew no changes."""
-    version: int = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
-    return version < 2
+    """Whether the catalogue, opened to be read, is of a format that knew no changes."""
+    return schema.format_of(connection) < 2
 
 
 def _centre(outline_m: PointsM) -> PointsM:

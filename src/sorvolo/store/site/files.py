@@ -18,11 +18,11 @@ from sorvolo.store.images import image_from_jpeg
 from sorvolo.store.nofollow import read_below, refuse_links
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site.catalogue import Catalogue, VersionEntry
+from sorvolo.store.site.catalogue_place import CATALOGUE, POINTER, create_database, is_site
 from sorvolo.store.site.names import checked_document, checked_image_path, checked_name
 from sorvolo.store.site.tiles import TileBlobs, TileView
 from sorvolo.survey.flight import Site
 
-CATALOGUE = "site.db"
 STAGED = "staged"
 """The folder of a flight in which its next run collects pictures until it is committed."""
 
@@ -62,20 +62,19 @@ class SiteFiles:
     @classmethod
     def open(cls, folder: Path, *, write: bool) -> Self:
         """Open a site folder. Raises StoreError as `Archive.open` does; to write, the folder is made and locked."""
-        path = folder / CATALOGUE
         if not write:
-            if not path.is_file():
+            if not is_site(folder):
                 raise StoreError(f"no site at {folder}; make one with: sorvolo map INPUT --site {folder}")
             _refuse_traps(folder, skipped=frozenset({"tiles", "keyframes"}))  # those are read link by link
-            return cls(folder, Catalogue(path, write=False), None)
+            return cls(folder, Catalogue.open(folder, write=False), None)
         refuse_unfinished(folder)
         _make_folder(folder)
         lock = lock_folder(folder)
         try:
             _refuse_traps(folder)
-            if not path.exists():
-                Catalogue.create(path)
-            return cls(folder, Catalogue(path, write=True), lock)
+            if not _has_catalogue(folder):
+                create_database(folder)
+            return cls(folder, Catalogue.open(folder, write=True), lock)
         except BaseException:
             os.close(lock)
             raise
@@ -233,7 +232,7 @@ def _make_folder(folder: Path) -> None:
             folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
         raise StoreError(f"{folder} is a file, a folder was needed; choose another name") from error
-    if (folder / CATALOGUE).exists():
+    if _has_catalogue(folder):
         return
     names = (path.name for path in folder.iterdir())
     foreign = sorted(name for name in names if name != LOCK and not name.startswith(TEMPORARY_PREFIX))
@@ -241,6 +240,11 @@ def _make_folder(folder: Path) -> None:
         raise StoreError(
             f"{folder} is no site: it holds {foreign[0]!r} and no {CATALOGUE}; choose a new or empty folder"
         )
+
+
+def _has_catalogue(folder: Path) -> bool:
+    """Whether a catalogue, or what calls itself one, is there already: it is never written over."""
+    return any((folder / name).exists() for name in (CATALOGUE, POINTER))
 
 
 def _refuse_traps(folder: Path, *, skipped: frozenset[str] = frozenset()) -> None:

@@ -23,6 +23,7 @@ from sorvolo.store.rasters.geotiff import parse_crs
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
 from sorvolo.store.site.catalogue import StoredKeyframe
+from sorvolo.store.site.database import ConnectionLostError
 from sorvolo.store.site.derived import STAGED_FOLDERS
 from sorvolo.store.site.files import SiteFiles
 from sorvolo.store.site.tiles import GrowingTiles
@@ -69,6 +70,8 @@ class FlightWriter:
         if not self._is_open:
             return
         self._is_open = False
+        if isinstance(error, ConnectionLostError):  # as after a kill: the same command goes on from the journal
+            return
         try:
             # files that no reader can see go first: on a full disk, forgetting the run needs their space
             forget_journals(self._files)

@@ -160,6 +160,5 @@ def _finite(number: float) -> float | None:
 
 
 def _is_older(connection: Connection) -> bool:
-    """Whether the file, opened to be read, is of a format that knew no objects."""
-    version: int = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
-    return version < 3
+    """Whether the catalogue, opened to be read, is of a format that knew no objects."""
+    return schema.format_of(connection) < 3

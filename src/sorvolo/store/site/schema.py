@@ -1,32 +1,27 @@
-"""The tables of the catalogue `site.db`, how it is opened, and how an older one is brought up to date."""
-
-import os
-import sqlite3
-from pathlib import Path
+"""The tables of the catalogue, the same in SQLite and in PostgreSQL, and the formats that are read."""
 
 from sqlalchemy import (
     JSON,
+    BigInteger,
     Boolean,
     Column,
     Connection,
-    Engine,
     Float,
     ForeignKey,
     Index,
     Integer,
     LargeBinary,
     MetaData,
-    String,
     Table,
-    create_engine,
-    event,
 )
-from sqlalchemy.pool import QueuePool
+from sqlalchemy import String as AnyString
 
 SCHEMA_VERSION = 4
 OLDEST_VERSION = 1
 """The oldest format that is still read, and brought up to date when it is opened to be written."""
-APPLICATION_ID = 0x536F7256  # "SorV", in the file's header
+
+String = AnyString().with_variant(AnyString(collation="C"), "postgresql")  # ordered by bytes, as SQLite does
+Nanoseconds = BigInteger().with_variant(Integer, "sqlite")  # SQLite's integers have 64 bits
 
 metadata = MetaData()
 site = Table(
@@ -68,7 +63,7 @@ keyframes = Table(
     Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
     Column("frame_index", Integer, primary_key=True),
     Column("name", String, nullable=False),
-    Column("time_ns", Integer, nullable=False),
+    Column("time_ns", Nanoseconds, nullable=False),
     Column("status", String, nullable=False),
     Column("image_path", String, nullable=False),
     Column("camera", JSON, nullable=False),  # width_px, height_px, fx_px, fy_px, cx_px, cy_px
@@ -151,61 +146,21 @@ objects = Table(
 flown = Table(
     "flown", metadata,  # when the flight was flown that made a version; kept when its run is replaced
     Column("version_id", ForeignKey("versions.id", ondelete="CASCADE"), primary_key=True),
-    Column("first_ns", Integer, nullable=False),  # UTC; from 1970 on where no clock has a date
-    Column("last_ns", Integer, nullable=False),
+    Column("first_ns", Nanoseconds, nullable=False),  # UTC; from 1970 on where no clock has a date
+    Column("last_ns", Nanoseconds, nullable=False),
 )
-_NEW_IN_2 = [leftovers, comparisons, changes, reviews]
-_NEW_IN_3 = [searches, objects]
-_NEW_IN_4 = [flown]
+postgres_metadata = MetaData()
+numbers = Table(
+    "numbers", postgres_metadata,  # what SQLite keeps by itself: the number given last to a run and to a version
+    Column("name", String, primary_key=True),  # "runs", "versions"; "writes" counts the transactions that wrote
+    Column("last", BigInteger, nullable=False),
+)
+NUMBERED = ("runs", "versions")
+WRITES = "writes"
 
 
-def create_tables(path: Path) -> None:
-    """Make an empty catalogue of the newest format in a file that does not exist yet."""
-    connection = sqlite3.connect(path)
-    connection.execute("PRAGMA journal_mode = WAL")
-    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-    connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-    connection.close()
-    engine = open_engine(path, write=True)
-    metadata.create_all(engine)
-    engine.dispose()
-
-
-def upgrade(connection: Connection, version: int) -> None:
-    """Bring a catalogue of an older format up to date, inside the caller's transaction."""
-    if version < 2:
-        metadata.create_all(connection, tables=_NEW_IN_2)
-    if version < 3:
-        metadata.create_all(connection, tables=_NEW_IN_3)
-    if version < 4:
-        metadata.create_all(connection, tables=_NEW_IN_4)
-        connection.exec_driver_sql(  # the flights whose keyframes are stored
-            "INSERT OR IGNORE INTO flown SELECT versions.id, min(time_ns), max(time_ns) FROM versions "
-            "JOIN keyframes ON keyframes.run_id = versions.run_id GROUP BY versions.id"
-        )
-    connection.exec_driver_sql(f"PRAGMA user_version = {SCHEMA_VERSION}")
-
-
-def open_engine(path: Path, *, write: bool) -> Engine:
-    """Connections to the file; a reader's cannot write."""
-    uri = path.resolve().as_uri() + ("?mode=rw" if write else "?mode=ro")
-    if not write and not os.access(path.parent, os.W_OK) and not path.with_name(path.name + "-wal").exists():
-        uri += "&immutable=1"  # SQLite cannot put its lock files beside a file on a read-only disk
-
-    def connect() -> sqlite3.Connection:
-        # isolation_level None: the module must not begin transactions by itself, SQLAlchemy does it below
-        connection = sqlite3.connect(
-            uri, uri=True, timeout=30, isolation_level=None, check_same_thread=False
-        )
-        connection.execute("PRAGMA trusted_schema = OFF")  # a stranger's triggers and views call no functions
-        connection.execute("PRAGMA foreign_keys = ON")
-        connection.execute("PRAGMA synchronous = FULL")
-        return connection
-
-    engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool)
-
-    @event.listens_for(engine, "begin")
-    def begin(connection: Connection) -> None:
-        connection.exec_driver_sql("BEGIN")
-
-    return engine
+def format_of(connection: Connection) -> int:
+    """The format of the catalogue, 1 to SCHEMA_VERSION where this Sorvolo knows it."""
+    if connection.dialect.name == "sqlite":
+        return int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
+    return int(connection.exec_driver_sql("SELECT version_num FROM alembic_version").scalar_one())

@@ -1,0 +1,260 @@
+"""A catalogue in PostgreSQL: one schema for each site. The one place that knows PostgreSQL's ways."""
+
+import hashlib
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, func, insert, select, text, update
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.pool import QueuePool
+
+from sorvolo.errors import StoreError
+from sorvolo.store.site import schema
+from sorvolo.store.site.database import ConnectionLostError, damaged, numbers
+
+OLDEST_SERVER = 15
+_PATIENCE_S = 20.0
+"""How long a writer waits for a server that restarts, and for the lock of a process that was just killed."""
+
+_LOOK_AGAIN_S = 0.25
+_WAITS = {  # of libpq, unless the URL has others: a server that is not there is noticed within a minute
+    "connect_timeout": "10", "keepalives_idle": "20", "keepalives_interval": "10", "keepalives_count": "3",
+    "tcp_user_timeout": "60000",
+}
+_LOST = ("08", "57P01", "57P02", "57P03", "57P05")
+_FULL = ("53100", "53200", "53400")
+_FORBIDDEN = ("42501", "25006")
+_NOT_OURS = ("3F000", "42P01", "42703", "22P02")
+
+
+class PostgresDatabase:
+    """A schema of a database. Its one writer holds an advisory lock on the connection that it writes with.
+
+    A lock is lost with its connection; the writer takes it again, and refuses to go on when another process wrote
+    meanwhile. Readers' transactions see one state, and cannot write. Threads may share it.
+    """
+
+    def __init__(self, url: URL, name: str, *, write: bool) -> None:
+        """`url` may have a password; `name` is the schema's, checked: letters, digits and underscores."""
+        self._url, self._name, self._write = url, name, write
+        self._readers = _open_engine(url, name, write=False)
+        self._writers = _open_engine(url, name, write=True)
+        self._writer: Connection | None = None
+        self._writes = -1  # how many transactions had written when this writer last looked
+        self._mutex = threading.RLock()
+        self._number = next(numbers)
+
+    @property
+    def place(self) -> str:
+        """Server, database and schema, without a password."""
+        return f"{shown_url(self._url)} (schema {self._name})"
+
+    def create(self) -> None:
+        """Make the schema and its tables in one transaction. Raises StoreError, also for a server that is too old."""
+        with self._naming_faults(), self._writers.begin() as connection:
+            self._check_server(connection)
+            connection.execute(text(f"CREATE SCHEMA {self._name}"))
+            schema.metadata.create_all(connection)
+            schema.postgres_metadata.create_all(connection)
+            connection.execute(insert(schema.numbers), [
+                {"name": name, "last": 0} for name in (*schema.NUMBERED, schema.WRITES)
+            ])
+            self.set_format(connection, schema.SCHEMA_VERSION)
+
+    def check(self) -> None:
+        """Raise StoreError where server or schema is none of ours; a writer takes the lock, or StoreError."""
+        with self.reading() as connection:
+            self._check_server(connection)
+            known = text("SELECT 1 FROM pg_namespace WHERE nspname = :name")
+            if connection.execute(known, {"name": self._name}).first() is None:
+                raise StoreError(
+                    f"{shown_url(self._url)} has no schema {self._name}, which holds this site's catalogue; restore it "
+                    "there, or name the right database in SORVOLO_CATALOGUE. Nothing was changed"
+                )
+        if self._write:
+            with self._mutex, self._naming_faults():
+                self._ready_writer()
+
+    def set_format(self, connection: Connection, number: int) -> None:
+        """Note the format in Alembic's own table."""
+        from sorvolo.store.site.migrations.upgrade import stamp  # only where tables are made: Alembic loads slowly
+
+        stamp(connection, number)
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A transaction that sees one state of the catalogue."""
+        with self._naming_faults(), self._patiently(self._readers.connect) as connection, connection.begin():
+            yield connection
+
+    @contextmanager
+    def changing(self) -> Iterator[Connection]:
+        """A transaction that happens whole, on the server's disk, or not at all; for the one writer."""
+        with self._mutex, self._naming_faults():
+            connection = self._ready_writer()
+            with connection.begin():
+                yield connection
+                count = update(schema.numbers).where(schema.numbers.c.name == schema.WRITES)
+                connection.execute(count.values(last=schema.numbers.c.last + 1))
+            self._writes += 1
+
+    def fold_log(self) -> None:
+        """Nothing: the server's log lies on the server."""
+
+    def change_mark(self) -> tuple[int, int]:
+        """As of `Database`: how many transactions have written."""
+        with self.reading() as connection:
+            return self._number, _writes(connection)
+
+    def close(self) -> None:
+        """Close every connection, which frees the lock."""
+        with self._mutex:
+            self._drop_writer()
+        self._readers.dispose()
+
+    def _check_server(self, connection: Connection) -> None:
+        version = int(connection.execute(text("SHOW server_version_num")).scalar_one()) // 10_000
+        if version < OLDEST_SERVER:
+            raise StoreError(
+                f"{shown_url(self._url)} is PostgreSQL {version}, {OLDEST_SERVER} or later was needed; choose another "
+                "server"
+            )
+        encoding = connection.execute(text("SHOW server_encoding")).scalar_one()
+        if encoding != "UTF8":
+            raise StoreError(
+                f"{shown_url(self._url)} has the encoding {encoding}, UTF8 was needed; choose another database"
+            )
+
+    def _patiently(self, connect: Callable[[], Connection]) -> Connection:
+        """A connection; a writer, which may have worked for hours, waits for a server that restarts."""
+        until_s = time.monotonic() + (_PATIENCE_S if self._write and self._writes >= 0 else 0.0)
+        while True:
+            try:
+                return connect()
+            except DBAPIError:
+                if time.monotonic() >= until_s:
+                    raise
+            time.sleep(_LOOK_AGAIN_S)
+
+    def _ready_writer(self) -> Connection:
+        """The connection that holds the lock; made anew, and locked, where the server closed it between two uses."""
+        if self._writer is not None:
+            try:
+                with self._writer.begin():
+                    self._writer.execute(select(1))
+                return self._writer
+            except DBAPIError as error:
+                self._drop_writer()
+                if not _is_lost(error):
+                    raise
+        connection = self._patiently(self._writers.connect)
+        try:
+            self._lock(connection)
+            with connection.begin():
+                writes = _writes(connection)
+            if self._writes not in (-1, writes):
+                raise StoreError(f"another process wrote to {self.place} while the connection was lost; run it again")
+        except BaseException:
+            connection.close()
+            raise
+        self._writer, self._writes = connection, writes
+        return connection
+
+    def _lock(self, connection: Connection) -> None:
+        key = int.from_bytes(hashlib.sha256(self._name.encode()).digest()[:8], signed=True)
+        until_s = time.monotonic() + _PATIENCE_S
+        while True:  # the server notices a killed process only when it reads from it again
+            with connection.begin():
+                if connection.execute(select(func.pg_try_advisory_lock(key))).scalar_one():
+                    return
+            if time.monotonic() >= until_s:
+                raise StoreError(f"another process is mapping into {self.place}; wait until it has finished")
+            time.sleep(_LOOK_AGAIN_S)
+
+    def _drop_writer(self) -> None:
+        if self._writer is not None:
+            writer, self._writer = self._writer, None
+            writer.invalidate()  # closed at once: a connection that goes back to a pool keeps its lock
+            writer.close()
+
+    @contextmanager
+    def _naming_faults(self) -> Iterator[None]:
+        try:
+            yield
+        except DBAPIError as error:
+            if _is_lost(error):
+                with self._mutex:
+                    self._drop_writer()
+            raise self._fault(error) from error
+
+    def _fault(self, error: DBAPIError) -> StoreError:
+        """What to do about a fault of PostgreSQL's. Its words never hold the password."""
+        state = _state(error)
+        lines = str(error.orig).strip().splitlines() or [type(error.orig).__name__]
+        fault = lines[0]
+        if state.startswith(_FULL):
+            return StoreError(
+                f"disk full: could not write {self.place} ({fault}); free some space on the server and run it again"
+            )
+        if state.startswith(_FORBIDDEN):
+            return StoreError(
+                f"{self.place} cannot be written or read by {self._url.username or 'this user'} ({fault}); ask for a "
+                "role that may, or work with a copy of the site"
+            )
+        if state.startswith(_NOT_OURS):
+            return damaged(self.place, fault)
+        if not state or _is_lost(error):
+            return self._unreachable(" ".join(lines))
+        return StoreError(f"cannot use {self.place}: {fault} ({state})")
+
+    def _unreachable(self, fault: str) -> StoreError:
+        if any(words in fault for words in ("password", "authentication failed", "pg_hba", "role \"")):
+            return StoreError(
+                f"{shown_url(self._url)} refused {self._url.username or 'this user'} ({fault}); give the password in "
+                "~/.pgpass or PGPASSWORD"
+            )
+        if "does not exist" in fault:
+            return StoreError(f"{shown_url(self._url)}: {fault}; make the database, or correct SORVOLO_CATALOGUE")
+        return ConnectionLostError(
+            f"no connection to {self.place} ({fault}); what was stored is safe: run the same command again when the "
+            "server is there, it goes on where it was"
+        )
+
+
+def shown_url(url: URL) -> str:
+    """A URL as messages and the site folder have it: neither user nor password."""
+    host = url.host or url.query.get("host") or "localhost"
+    port = f":{url.port}" if url.port else ""
+    return f"postgresql://{host}{port}/{url.database or ''}"
+
+
+def _open_engine(url: URL, name: str, *, write: bool) -> Engine:
+    own: dict[str, Any] = {key: value for key, value in _WAITS.items() if key not in url.query}
+    mode = "off" if write else "on"
+    asked = url.query.get("options", "")
+    own["options"] = f"{asked} -csearch_path={name} -cdefault_transaction_read_only={mode}".strip()
+    own.setdefault("application_name", "sorvolo")
+    pool: dict[str, Any] = {"poolclass": NullPool} if write else {"poolclass": QueuePool, "pool_pre_ping": True}
+    try:
+        return create_engine(
+            url.difference_update_query(["options"]), connect_args=own, isolation_level="REPEATABLE READ", **pool
+        )
+    except ModuleNotFoundError as error:
+        raise StoreError("a catalogue in PostgreSQL needs psycopg: pip install 'sorvolo[postgres]'") from error
+
+
+def _writes(connection: Connection) -> int:
+    query = select(schema.numbers.c.last).where(schema.numbers.c.name == schema.WRITES)
+    return connection.execute(query).scalar_one()
+
+
+def _state(error: DBAPIError) -> str:
+    """PostgreSQL's five letters for what went wrong; "" where no server answered."""
+    return getattr(error.orig, "sqlstate", None) or ""
+
+
+def _is_lost(error: DBAPIError) -> bool:
+    return error.connection_invalidated or _state(error).startswith(_LOST)

@@ -1,0 +1,92 @@
+"""A PostgreSQL server of the tests' own, in a temporary folder, as a user without rights; gone with the tests."""
+
+import os
+import pwd
+import shutil
+import socket
+import subprocess
+import tempfile
+from pathlib import Path
+
+_SETTINGS = {  # nothing here outlives the tests
+    "listen_addresses": "127.0.0.1", "unix_socket_directories": "", "fsync": "off", "full_page_writes": "off",
+    "shared_buffers": "16MB", "max_connections": "60", "log_min_messages": "error",
+}
+_HBA = """host all guarded 127.0.0.1/32 scram-sha-256
+host all all 127.0.0.1/32 trust
+"""
+
+
+def program(name: str) -> str | None:
+    """Debian keeps the server's programs out of the path."""
+    found = shutil.which(name)
+    beside = sorted(Path("/usr/lib/postgresql").glob(f"*/bin/{name}"), key=lambda path: int(path.parts[-3]))
+    return str(beside[-1]) if beside else found
+
+
+class PostgresServer:
+    """A server on a port of its own; may be stopped and started again. The user "guarded" needs a password."""
+
+    def __init__(self) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.folder = Path(tempfile.mkdtemp(prefix="sorvolo-postgres-"))
+        self._user = None
+        if os.getuid() == 0:
+            self._user = "postgres" if _is_known("postgres") else "nobody"
+            shutil.chown(self.folder, self._user)
+        initdb = [program("initdb"), "-D", str(self._data), "-U", "sorvolo", "-A", "trust", "-E", "UTF8", "-N"]
+        self._run([*initdb, "--locale=C"])
+        (self._data / "pg_hba.conf").write_text(_HBA)
+        self.start()
+
+    @property
+    def url(self) -> str:
+        return f"postgresql://sorvolo@127.0.0.1:{self.port}/postgres"
+
+    @property
+    def _data(self) -> Path:
+        return self.folder / "data"
+
+    def start(self) -> None:
+        options = " ".join(f"-c {name}='{value}'" for name, value in (_SETTINGS | {"port": str(self.port)}).items())
+        self._run([program("pg_ctl"), "-D", str(self._data), "-w", "-t", "60", "-l", str(self.folder / "log"), "-o",
+                   options, "start"])
+
+    def stop(self) -> None:
+        """As good as a crash: connections are cut."""
+        self._run([program("pg_ctl"), "-D", str(self._data), "-w", "-m", "immediate", "stop"])
+
+    def remove(self) -> None:
+        self.stop()
+        shutil.rmtree(self.folder)
+
+    def sql(self, *statements: str) -> list[tuple[object, ...]]:
+        """Run statements, each in a transaction of its own; the rows of the last one."""
+        import psycopg  # an extra, as the server is
+
+        with psycopg.connect(self.url, autocommit=True) as connection:
+            for each in statements:
+                cursor = connection.execute(each)
+            return cursor.fetchall() if cursor.description else []
+
+    def _run(self, command: list[str | None]) -> None:
+        # C and a home of its own: neither the tester's language nor files are to matter
+        environment = {"PATH": os.environ["PATH"], "LC_ALL": "C", "HOME": str(self.folder)}
+        with open(self.folder / "said", "w+") as said:  # no pipe: the server would keep it open
+            done = subprocess.run(
+                [str(each) for each in command], user=self._user, cwd=self.folder, env=environment, stdout=said,
+                stderr=said, timeout=120,
+            )
+            said.seek(0)
+            assert done.returncode == 0, said.read()
+
+
+def _is_known(user: str) -> bool:
+    try:
+        pwd.getpwnam(user)
+    except KeyError:
+        return False
+    return True
+
