@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from sorvolo.errors import InputError
+from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.heights.contours import contours
 from sorvolo.heights.field import HeightField, along
-from sorvolo.heights.lattice import Lattice
+from sorvolo.heights.lattice import MOST_SIDE, CellSettings, Lattice
 from sorvolo.heights.volumes import above_rim, between, tie
 
 GRID = SiteGrid.at(Geodetic(46.0, -91.0, 100.0), 0.2, "EPSG:32615")
@@ -97,3 +97,24 @@ def test_contours_of_a_cone_are_closed_circles() -> None:
         if level >= 99:  # those that the model holds as a whole
             np.testing.assert_array_equal(line[0], line[-1])
     assert sum(level == 103.0 for level, _ in found) == 1
+
+
+def test_a_long_corridor_has_cells_that_its_raster_can_hold() -> None:
+    """A power line of 6 km mapped at 2 cm: OpenCV resamples no picture of more than 32,766 pixels a side."""
+    corridor = np.array([[-3000.0, -20], [3000, 20]])
+    cell_m = Lattice.cell_for(corridor, 0.02, CellSettings())
+    lattice = Lattice.over(corridor, SiteGrid.at(Geodetic(46.0, -91.0, 100.0), cell_m, "EPSG:32615"))
+    assert 25_000 < max(lattice.shape) <= MOST_SIDE
+    with pytest.raises(GeometryError, match=r"cells larger than 0\.06 m \(--cell\)"):
+        Lattice.over(corridor, SiteGrid.at(Geodetic(46.0, -91.0, 100.0), 0.06, "EPSG:32615"))
+
+
+def test_heights_at_more_places_than_a_picture_has_rows() -> None:
+    """A profile of a long line; outside of the model there are none."""
+    plane = field(GRID, lambda x, y: x / 10 + 0 * y)
+    points = np.column_stack([np.linspace(-25, 15, 40_000), np.zeros(40_000)])
+    heights, sigmas = plane.at(points)
+    inside = points[:, 0] > -19.5
+    np.testing.assert_allclose(heights[inside], points[inside, 0] / 10, atol=0.12)
+    np.testing.assert_allclose(sigmas[inside], 0.05, rtol=1e-5)
+    assert np.isnan(heights[points[:, 0] < -21]).all()

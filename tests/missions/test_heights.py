@@ -11,8 +11,10 @@ import rasterio
 from real_data import real_data
 from sorvolo.cli.main import main
 from sorvolo.errors import GeometryError, InputError, SettingsError, StoreError
+from sorvolo.missions.compare.flights import _without_heights
+from sorvolo.missions.compare.run import _earlier_pictures
 from sorvolo.missions.flight.settings import MapSettings
-from sorvolo.missions.heights.measure import measure_profile, measure_volume, write_contours
+from sorvolo.missions.heights.measure import heights_stamp, measure_profile, measure_volume, write_contours
 from sorvolo.missions.heights.run import HeightSettings, make_heights
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.simulate.site import simulate_site
@@ -24,6 +26,7 @@ from sorvolo.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
+from sorvolo.store.site.archive import Archive
 
 _SURVEY = SimulationSettings(
     seed=12, flights=1, scene=SceneSettings(people=0, cars=2, small_objects=2, has_scenery=True),
@@ -157,6 +160,27 @@ def test_heights_of_an_earlier_map_of_the_flight_are_refused(with_heights: Path,
             write_contours(with_heights, tmp_path / "lines.geojson", 1.0)
     finally:
         report.write_text(kept)
+
+
+@pytest.mark.parametrize("content", [b"{}", b"[]", b"\xff", b'{"run": 1, "cell_m": 0}', b'{"run": 1, "cell_m": 1e999}'])
+def test_damaged_heights_are_named_and_no_comparison_stops_at_them(
+    mapped: Path, tmp_path: Path, content: bytes
+) -> None:
+    """Comparisons do without them and announce it; who wants heights is asked to make them again."""
+    report = next(mapped.glob("flights/*/frames.geojson")).with_name("heights.json")
+    kept = report.read_bytes() if report.exists() else None
+    report.write_bytes(content)
+    try:
+        with pytest.raises(InputError, match=r"damaged heights.json; make its heights again: sorvolo heights"):
+            write_contours(mapped, tmp_path / "lines.geojson", 1.0)
+        with Archive.open(mapped, write=False) as archive:
+            _earlier_pictures(archive, "later")
+            assert heights_stamp(archive, but="later") is None
+            (notice,) = _without_heights(archive, "later")
+            assert report.parent.name in notice.text and "sorvolo heights" in notice.text
+            assert _without_heights(archive, report.parent.name) == ()
+    finally:
+        report.unlink() if kept is None else report.write_bytes(kept)
 
 
 @pytest.mark.slow

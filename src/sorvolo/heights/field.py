@@ -28,19 +28,15 @@ class HeightField:
 
     def at(self, points_m: PointsM) -> tuple[Floats, Floats]:
         """(N,) heights and sigmas at site points, (N, 2), between cells; NaN outside and beside holes."""
-        cells = self.lattice.cells_from_site(points_m).astype(np.float32).reshape(-1, 1, 2)
-        heights, sigmas = (
-            cv2.remap(band, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR, borderValue=float("nan"))[:, 0]
-            for band in (self.up_m, self.sigma_m)
-        )
-        return heights.astype(np.float64), sigmas.astype(np.float64)
+        some = 1 << 20  # OpenCV takes no more than 32766 rows at a time
+        bands = [self._bands_at(points_m[first:first + some]) for first in range(0, max(len(points_m), 1), some)]
+        heights, sigmas = (np.concatenate(each) for each in zip(*bands))
+        return heights, sigmas
 
     def on(self, lattice: Lattice, shift_m: Floats | None = None) -> "HeightField":
         """The same heights over another lattice, moved by (east, north), m."""
         points = lattice.points_m().reshape(-1, 2) - (np.zeros(2) if shift_m is None else shift_m)
-        some = 1 << 20  # OpenCV takes no more than 32767 rows at a time
-        bands = [self._bands_at(points[first:first + some]) for first in range(0, len(points), some)]
-        up_m, sigma_m = (np.concatenate(each).reshape(lattice.shape).astype(np.float32) for each in zip(*bands))
+        up_m, sigma_m = (each.reshape(lattice.shape).astype(np.float32) for each in self.at(points))
         return HeightField(lattice, up_m, sigma_m)
 
     def inside(self, polygons: Sequence[Sequence[PointsM]]) -> Mask:

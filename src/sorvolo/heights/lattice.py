@@ -11,6 +11,9 @@ from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, frozen
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import apply_homography
 
+MOST_SIDE = 32_766
+"""The most rows or columns of a height model: OpenCV resamples no larger picture."""
+
 
 @dataclass(frozen=True)
 class CellSettings:
@@ -20,6 +23,7 @@ class CellSettings:
     coarse_px: float = 6.0
     few_cells: float = 2e6
     most_cells: float = 60e6  # bounds the memory: larger sites get larger cells still
+    most_side: int = 30_000  # of the box's longer side; the raster, north up, may be a little longer (`MOST_SIDE`)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +42,11 @@ class Lattice:
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 1 or not self.cell_m > 0:
             raise GeometryError(f"a height model needs cells, got {self.width} x {self.height} of {self.cell_m} m")
+        if max(self.width, self.height) > MOST_SIDE:
+            raise GeometryError(
+                f"a height model of {self.width:,} x {self.height:,} cells: at most {MOST_SIDE:,} a side are possible; "
+                f"give cells larger than {self.cell_m:.3g} m (--cell)"
+            )
         object.__setattr__(self, "site_from_cells", frozen(self.site_from_cells))
 
     @classmethod
@@ -63,9 +72,12 @@ class Lattice:
     @staticmethod
     def cell_for(points_m: PointsM, pixel_m: float, settings: "CellSettings") -> float:
         """The cells' side over the box of these points: fine on small sites, coarser on larger ones."""
-        side_m = float(np.sqrt(np.prod(points_m.max(axis=0) - points_m.min(axis=0))))
+        sides_m = points_m.max(axis=0) - points_m.min(axis=0)
+        side_m = float(np.sqrt(np.prod(sides_m)))
         few_m, most_m = side_m / np.sqrt(settings.few_cells), side_m / np.sqrt(settings.most_cells)
-        return float(f"{max(np.clip(few_m, settings.fine_px * pixel_m, settings.coarse_px * pixel_m), most_m):.3g}")
+        longest_m = float(sides_m.max()) / settings.most_side
+        wanted_m = np.clip(few_m, settings.fine_px * pixel_m, settings.coarse_px * pixel_m)
+        return float(f"{max(wanted_m, most_m, longest_m):.3g}")
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -71,7 +71,7 @@ def thing_of(changed: Mask, shadow: Mask, settings: ThingSettings = ThingSetting
         return changed
     _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
     areas = stats[:, cv2.CC_STAT_AREA].copy()
-    areas[0] = 0  # the ground
+    areas[0] = -1  # the ground: no piece, however small pieces may be
     kept = (areas >= settings.least_piece * areas.max())[labels].view(np.uint8)
     return np.asarray((cv2.dilate(_hull(kept).view(np.uint8), np.ones((3, 3), np.uint8)) > 0) & changed)
 

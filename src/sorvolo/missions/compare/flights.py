@@ -20,14 +20,14 @@ from sorvolo.missions.flight.map_objects import check_classes, open_detector
 from sorvolo.missions.flight.request import AlreadyDone, already_done, request_of
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup, known_flights, known_ground_m, prepare, repeated
-from sorvolo.missions.heights.measure import heights_stamp
+from sorvolo.missions.heights.measure import damaged_heights, heights_stamp
 from sorvolo.missions.map.journal import begun_journal
 from sorvolo.mosaic.selection import every
 from sorvolo.registration.opencv_threads import single_threaded_opencv
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.area import Area
 from sorvolo.survey.findings import CompareUpdate, ViewStatus
-from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
+from sorvolo.survey.flight import Frame, LostFrame, Notice, PosedFrame
 
 _AHEAD = 2  # frames that are compared while the evidence of one is gathered: a thread for each
 
@@ -99,12 +99,25 @@ def _refuse_contradictory(archive: Archive, site: Path) -> None:
             )
 
 
+def _without_heights(archive: Archive, flight: str) -> tuple[Notice, ...]:
+    """The notice of heights that could not be used: what stands is then compared as if it were flat."""
+    damaged = damaged_heights(archive, but=flight)
+    if not damaged:
+        return ()
+    return (Notice(
+        "damaged heights", len(damaged),
+        f"the heights of {', '.join(damaged)} cannot be read and were left out (heights.json is damaged); make them "
+        f"again: sorvolo heights {archive.folder} --flight {damaged[0]}",
+    ),)
+
+
 def _compare_one(
     setup: FlightSetup, archive: Archive, settings: CompareSettings, area: Area | None, steps: Path | None,
     detector: Detects | None, base: int, request: str, *, anew: bool,
 ) -> Generator[CompareUpdate]:
     started_s, source = time.monotonic(), setup.source
-    setup = replace(setup, notices=(*setup.notices, *repeated(archive, source.name, "compared")))
+    notices = (*setup.notices, *repeated(archive, source.name, "compared"), *_without_heights(archive, source.name))
+    setup = replace(setup, notices=notices)
     inside = setup.inside(area)
     step_s = 0.0 if source.kind == "photos" else 1.0 / settings.views_per_second
     journal = None

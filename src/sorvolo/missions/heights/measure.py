@@ -1,6 +1,7 @@
 """`sorvolo measure`: volumes, profiles and contours of flights that have heights."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,15 +118,23 @@ def read_field(archive: Archive, flight_id: str, file: HeightFile) -> HeightFiel
 
 
 def flight_with_heights(archive: Archive, but: str) -> str | None:
-    """The newest flight, `but` one, that has heights of its present map; None where there is none."""
+    """The newest flight, `but` one, that has heights of its present map, and a report of them that can be read."""
     for version in reversed(archive.versions()):
         flight_id = version.flight_id
         keyframes = archive.keyframes(flight_id)
-        if flight_id == but or not keyframes or not archive.height_path(flight_id, HeightFile.REPORT).exists():
-            continue
-        if _report(archive, flight_id)["run"] == run_of(keyframes):
+        known = _read_report(archive, flight_id)
+        if flight_id != but and keyframes and known is not None and known["run"] == run_of(keyframes):
             return flight_id
     return None
+
+
+def damaged_heights(archive: Archive, but: str) -> list[str]:
+    """The flights, `but` one, whose heights are there and cannot be used: their report is damaged."""
+    return [
+        each.id for each in archive.flights()
+        if each.id != but and archive.height_path(each.id, HeightFile.REPORT).exists()
+        and _read_report(archive, each.id) is None
+    ]
 
 
 def heights_stamp(archive: Archive, but: str) -> tuple[str, int] | None:
@@ -137,15 +146,24 @@ def heights_stamp(archive: Archive, but: str) -> tuple[str, int] | None:
 
 
 def _report(archive: Archive, flight_id: str) -> Mapping[str, Any]:
-    folder = archive.flight_folder(flight_id)
-    try:
-        report = json.loads(read_below(folder, HeightFile.REPORT, _MOST_BYTES))
-        return {"run": report["run"], "cell_m": float(report["cell_m"])}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    """What a flight's heights.json states. Raises InputError where there is none, or it is damaged."""
+    report = _read_report(archive, flight_id)
+    if report is None:
+        is_there = archive.height_path(flight_id, HeightFile.REPORT).exists()
+        found = "has a damaged heights.json; make its heights again" if is_there else "has no heights; make them"
         raise InputError(
-            f"flight {flight_id} of {archive.folder} has no heights; make them: "
-            f"sorvolo heights {archive.folder} --flight {flight_id}"
-        ) from error
+            f"flight {flight_id} of {archive.folder} {found}: sorvolo heights {archive.folder} --flight {flight_id}"
+        )
+    return report
+
+
+def _read_report(archive: Archive, flight_id: str) -> Mapping[str, Any] | None:
+    try:
+        report = json.loads(read_below(archive.flight_folder(flight_id), HeightFile.REPORT, _MOST_BYTES))
+        known = {"run": report["run"], "cell_m": float(report["cell_m"])}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return known if 0 < known["cell_m"] < math.inf else None
 
 
 def _line(line: Any, level_m: float, site: Site) -> dict[str, Any]:
