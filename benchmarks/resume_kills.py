@@ -1,12 +1,14 @@
 """How often a run that is killed at a random moment, and started again, ends with the bytes of one that was not.
 
-    python benchmarks/resume_kills.py --kills 20 --seed 1 --command map
+    python benchmarks/resume_kills.py --kills 20 --seed 1 --mission map
 
-Two small simulated flights; `map` makes the map of the first, `compare` compares the second with it. Each round starts
-the command in a process of its own, kills it (SIGKILL) after a share of the undisturbed run's time that is drawn from
-0 to 1, and runs the same command again to its end. All files of the site are compared with those of the undisturbed
-run, byte by byte, but for the catalogue (`site.db`, which holds when a run was made) and what a report says of the time
-and the memory that it took (docs/formats.md).
+Two small simulated flights; `map` makes the map of the first, `compare` compares the second with it, `watch` searches
+the second with the model that is installed and runs a program for each object. Each round starts the command in a
+process of its own, kills it (SIGKILL) after a share of the undisturbed run's time that is drawn from 0 to 1, and runs
+the same command again to its end. All files are compared with those of the undisturbed run, byte by byte, but for the
+catalogue (`site.db`, which holds when a run was made) and what a report says of the time and the memory that it took
+(docs/formats.md). Of a watch, each alert must have been sent once: one that was sent in the moment of the kill, before
+that was noted, may come twice, and is counted.
 """
 
 import argparse
@@ -18,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -48,6 +51,7 @@ def content(site: Path) -> dict[str, bytes]:
         data = path.read_bytes()
         if path.name == "report.json":
             report = json.loads(data)
+            report.get("objects", {}).pop("seconds", None)
             data = json.dumps({key: value for key, value in report.items() if key not in EFFORT}).encode()
         found[str(path.relative_to(site))] = data
     return found
@@ -68,55 +72,81 @@ def run(command: list[str], kill_s: float | None = None) -> tuple[float, str]:
     return time.monotonic() - started_s, printed
 
 
+class Trial:
+    """The command of one mission, its undisturbed result, and what it begins from."""
+
+    def __init__(self, options: argparse.Namespace, folder: Path) -> None:
+        self._options, self._folder = options, folder
+        self._base = folder / "base" / "site"
+        self._alerts = folder / "alerts"
+        for _ in simulate_site(folder / "flown", simulated(options.width)):
+            pass
+        if options.mission == "compare":
+            self._base.parent.mkdir()
+            run(self._command("map", self._base))
+
+    def begin(self, name: str) -> Path:
+        """A folder of this name, the same each time, as it is before the mission."""
+        place = self._folder / name / "site"
+        shutil.rmtree(place.parent, ignore_errors=True)
+        place.parent.mkdir()
+        self._alerts.unlink(missing_ok=True)
+        if self._base.is_dir():
+            shutil.copytree(self._base, place)
+        return place
+
+    def run(self, place: Path, kill_s: float | None = None) -> tuple[float, str]:
+        """The mission, perhaps killed: see `run`."""
+        return run(self._command(self._options.mission, place), kill_s)
+
+    def alerts(self) -> Counter[str]:
+        """How often each object was announced since `begin`."""
+        return Counter(self._alerts.read_text().split()) if self._alerts.is_file() else Counter()
+
+    def _command(self, mission: str, place: Path) -> list[str]:
+        flown = self._folder / "flown"
+        shared = ["--camera", str(flown / "camera.xml"), "--model", self._options.model]
+        flight = str(flown / ("flight1" if mission == "map" else "flight2"))
+        command = [sys.executable, "-m", "sorvolo", mission, flight]
+        if mission != "watch":
+            return [*command, "--site", str(place), *shared]
+        told = f"{sys.executable} -c \"open('{self._alerts}', 'a').write('{{id}} ')\""
+        return [*command, "--out", str(place), *shared, "--save", "pictures", "--alert-command", told]
+
+
 def rounds(options: argparse.Namespace, folder: Path) -> dict[str, object]:
     """The undisturbed run, then the killed ones."""
-    for _ in simulate_site(folder / "flown", simulated(options.width)):
-        pass
-    sorvolo = [sys.executable, "-m", "sorvolo"]
-    shared = ["--camera", str(folder / "flown" / "camera.xml"), "--model", options.model]
-
-    def command(name: str, site: Path) -> list[str]:
-        flight = folder / "flown" / ("flight1" if name == "map" else "flight2")
-        return [*sorvolo, name, str(flight), "--site", str(site), *shared]
-
-    base = folder / "base" / "site"
-    base.parent.mkdir()
-    if options.command == "compare":
-        run(command("map", base))
-    sites = [folder / name / "site" for name in ("undisturbed", "killed")]
-    for each in sites:
-        each.parent.mkdir()
-    if base.is_dir():
-        shutil.copytree(base, sites[0])
-    whole_s, _ = run(command(options.command, sites[0]))
-    wanted = content(sites[0])
+    trial = Trial(options, folder)
+    whole = trial.begin("undisturbed")
+    whole_s, _ = trial.run(whole)
+    wanted, announced = content(whole), trial.alerts()
     draw, rows = random.Random(options.seed), []
     for number in range(options.kills):
-        shutil.rmtree(sites[1], ignore_errors=True)
-        if base.is_dir():
-            shutil.copytree(base, sites[1])
+        place = trial.begin("killed")
         kill_s = draw.random() * whole_s
-        run(command(options.command, sites[1]), kill_s)
-        again_s, printed = run(command(options.command, sites[1]))
-        found = content(sites[1])
+        trial.run(place, kill_s)
+        again_s, printed = trial.run(place)
+        found = content(place)
         differing = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
         resumed = re.search(r"going on after (\d+) frame", printed)
         rows.append({
             "kill_s": round(kill_s, 2), "again_s": round(again_s, 2), "same": not differing,
             "frames_taken_over": int(resumed[1]) if resumed else 0, "differing": differing[:10],
+            "alerts_lost": len(announced - trial.alerts()), "alerts_twice": len(trial.alerts() - announced),
         })
         print(number + 1, rows[-1], flush=True)
     return {
-        "command": options.command, "seed": options.seed, "width_px": options.width, "model": options.model,
-        "undisturbed_s": round(whole_s, 2), "kills": len(rows), "same": sum(bool(each["same"]) for each in rows),
+        "mission": options.mission, "seed": options.seed, "width_px": options.width, "model": options.model,
+        "undisturbed_s": round(whole_s, 2), "alerts": announced.total(), "kills": len(rows),
+        "same": sum(bool(each["same"]) for each in rows),
         "resumed": sum(bool(each["frames_taken_over"]) for each in rows), "rounds": rows,
     }
 
 
 def main() -> None:
-    """Write results/resume_kills_COMMAND.json."""
+    """Write results/resume_kills_MISSION.json."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--command", choices=("map", "compare"), default="map")
+    parser.add_argument("--mission", choices=("map", "compare", "watch"), default="map")
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--width", type=int, default=480)
@@ -125,7 +155,7 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         result = rounds(options, Path(folder))
-    out = options.out or Path(__file__).parent / "results" / f"resume_kills_{options.command}.json"
+    out = options.out or Path(__file__).parent / "results" / f"resume_kills_{options.mission}.json"
     out.write_text(json.dumps({"machine": machine(), "commit": commit(), **result}, indent=1) + "\n")
     print(f"{result['same']} of {result['kills']} with the same bytes, {result['resumed']} went on; {out}")
 

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from sorvolo.cli.options import AsJson, Camera, GiveUp, GroundElevation, PlaceFormat, PlaceFormatOption, names
 from sorvolo.cli.places import place_heading, place_words
-from sorvolo.cli.progress import ProgressReport, rate_words
+from sorvolo.cli.progress import ProgressReport, Resumed, rate_words
 from sorvolo.cli.shown import read_json, show_notices_and_warnings, show_path
 from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted, counted_list
@@ -201,10 +201,12 @@ def _show_progress(
     updates: "Iterator[WatchUpdate]", console: Console, form: PlaceFormat, *, is_quiet: bool
 ) -> Iterator[Path]:
     """Take all updates, printing each new object; the folder of each."""
+    resumed = Resumed(console)
     with ProgressReport(console) as progress:
         progress.show("opening")
         for update in updates:
-            for track in update.new if not is_quiet else ():
+            resumed.take(update.frames_detected, is_resumed=update.is_resumed)
+            for track in () if is_quiet or update.is_resumed else update.new:
                 console.print(_words_of(track, update.site, form), highlight=False, soft_wrap=True)
             delay = f"{1000 * update.latency_s:.0f} ms delay"
             progress.show(

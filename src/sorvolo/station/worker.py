@@ -252,7 +252,9 @@ def _announce(journal: Journal, update: CompareUpdate, site: Site, announced: di
 
 
 def _seen(journal: Journal, update: "WatchUpdate", stream: str) -> None:
-    """Write a frame's boxes, and each object that it confirmed."""
+    """Write a frame's boxes, and each object that it confirmed; of a watch that was killed, it has written them."""
+    if update.is_resumed:
+        return
     found = update.detections
     boxes = [
         {"class": name, "score": round(float(score), 3), "xywh_px": [

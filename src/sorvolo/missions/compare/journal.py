@@ -7,6 +7,7 @@ from typing import Any
 from sorvolo.change.views import ViewRecord
 from sorvolo.errors import SorvoloError
 from sorvolo.missions.flight.map_objects import FrameDetections
+from sorvolo.missions.flight.replay import Replay
 from sorvolo.missions.map.journal import MapJournal, Taken, detections_in, put_taken, taken_in
 from sorvolo.store.site.journal import Entry, RunJournal
 from sorvolo.store.site.journal_records import RecordPacker, unpacked
@@ -27,8 +28,7 @@ class CompareJournal(MapJournal):
     def __init__(self, journal: RunJournal) -> None:
         super().__init__(journal)
         self.detections = tuple(each for each in self._read() if isinstance(each, FrameDetections))
-        self._frames = (_frame(each) for each in journal.taken() if each.kind == "view")
-        self._next: ComparedFrame | None = None
+        self._frames = Replay(_frame(each) for each in journal.taken() if each.kind == "view")
 
     def keep_frame(self, frame: ComparedFrame) -> None:
         """Note a compared frame. Raises StoreError when the disk is full."""
@@ -40,12 +40,7 @@ class CompareJournal(MapJournal):
 
     def next_frame(self, index: int) -> ComparedFrame | None:
         """The next frame that a killed run compared, if it is the one of this index, which is asked for once."""
-        if self._next is None:
-            self._next = next(self._frames, None)
-        if self._next is None or self._next.index != index:
-            return None
-        frame, self._next = self._next, None
-        return frame
+        return self._frames.take(index)
 
     def _read(self) -> Iterator[ComparedFrame | FrameDetections]:
         """What a killed run noted, in order; it ends where an entry is not as one was written."""

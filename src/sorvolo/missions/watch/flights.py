@@ -17,6 +17,7 @@ from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
 from sorvolo.missions.watch.cot_sender import check_host, cot_place
 from sorvolo.missions.watch.ground import over_heights
+from sorvolo.missions.watch.journal import WatchJournal, begun_journal
 from sorvolo.missions.watch.places import places_of
 from sorvolo.missions.watch.run import WatchRun, WatchUpdate
 from sorvolo.missions.watch.settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
@@ -41,6 +42,9 @@ def watch(
     wanted frame of a recorded flight is searched; of a live one, read with the settings `live`, the newest, so that
     latency stays bounded, and the others are counted. Objects are placed on the ground where telemetry allows it, else
     followed in the picture.
+
+    A watch of a recorded flight that was killed goes on where it was when the same is asked for again: what was found
+    is not searched for again, and alerts that were sent are not sent again.
 
     Set `until`, close the generator, or press Ctrl-C, to end early: all that was found until then is written. Raises
     InputError, SettingsError or StoreError with what to do.
@@ -90,8 +94,12 @@ def _watch_one(
         setup, ground = prepared(mapping), None
     least = settings.least_score if settings.least_score is not None else min(detector.info.thresholds.values())
     places = places_of(setup, least, ground)
-    claim_folder(folder, source.name, source.fingerprint, replaces=not isinstance(source, LiveSource))
-    with WatchRun(setup, places, detector, settings, outputs, folder) as run:
+    journal = begun_journal(setup, settings, outputs, detector, folder)
+    claim_folder(
+        folder, source.name, source.fingerprint, replaces=not isinstance(source, LiveSource),
+        goes_on=journal.is_begun,
+    )
+    with closing(journal), WatchRun(setup, places, detector, settings, outputs, folder, WatchJournal(journal)) as run:
         ended = _STOPPED
         try:
             ended = yield from _search(run, source, settings, until)

@@ -1,42 +1,57 @@
 """Reports tracks while a watch runs: to a TAK server, a command and a URL, each through an outbox of its own."""
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from sorvolo.missions.watch.alerts import Outbox, Pace, alert_command, alert_url
 from sorvolo.missions.watch.cot_sender import CotSender, cot_place
+from sorvolo.missions.watch.journal import Sent, WatchJournal
 from sorvolo.missions.watch.settings import WatchOutputs
 from sorvolo.store.exports.cursor_on_target import cot_event, cot_removal, cot_type
 from sorvolo.store.exports.detection_files import track_properties
 from sorvolo.survey.flight import Notice, Site
 from sorvolo.survey.objects import Track
 
+_COT, _COMMAND, _URL = "cot", "alert_command", "alert_url"
+
 
 class Notifier:
-    """Sends alerts of new tracks, and keeps a TAK server's map up to date."""
+    """Sends alerts of new tracks, and keeps a TAK server's map up to date.
 
-    def __init__(self, flight: str, fingerprint: str, site: Site, outputs: WatchOutputs, folder: Path) -> None:
+    `journal` has what a killed watch sent, which is not sent again, and notes what is sent.
+    """
+
+    def __init__(
+        self, flight: str, fingerprint: str, site: Site, outputs: WatchOutputs, folder: Path, journal: WatchJournal
+    ) -> None:
+        self._journal = journal
         self._flight, self._uid = flight, f"sorvolo.{flight}.{fingerprint[:8]}"
         self._site, self._outputs, self._folder = site, outputs, folder
         self._pace = Pace(outputs.cot_every_s)
         self._sent_types: dict[int, str] = {}
+        self._caught_up: dict[int, Track] = {}  # tracks of frames that a killed watch searched
         self._cot: Outbox[bytes] | None = None
         self._sender: CotSender | None = None
-        self._alerts: list[Outbox[Mapping[str, Any]]] = []
+        self._alerts: dict[str, Outbox[Mapping[str, Any]]] = {}
         if outputs.cot and not site.is_local:
             self._sender = CotSender(cot_place(outputs.cot), outputs.cot_tls)
-            self._cot = Outbox(self._sender.send, code="cot", what=f"sending to {outputs.cot}")
+            self._cot = Outbox(self._sender.send, code=_COT, what=f"sending to {outputs.cot}")
         if outputs.alert_command:
-            run = alert_command(outputs.alert_command)
-            self._alerts.append(Outbox(run, code="alert_command", what="the alert command"))
+            self._add_receiver(_COMMAND, alert_command(outputs.alert_command), "the alert command")
         if outputs.alert_url:
-            post = alert_url(outputs.alert_url)
-            self._alerts.append(Outbox(post, code="alert_url", what=f"the alert to {outputs.alert_url}"))
+            self._add_receiver(_URL, alert_url(outputs.alert_url), f"the alert to {outputs.alert_url}")
 
-    def report(self, new: Sequence[Track], seen: Sequence[Track], crops: Mapping[int, str], segment: int) -> None:
-        """Send one alert for each new track, and the TAK server all tracks that are seen, each at its pace."""
+    def report(
+        self, new: Sequence[Track], seen: Sequence[Track], crops: Mapping[int, str], segment: int, *,
+        is_resumed: bool = False,
+    ) -> None:
+        """Send one alert for each new track, and the TAK server all tracks that are seen, each at its pace.
+
+        Of frames that a killed watch searched (`is_resumed`) only alerts that it did not send are sent; the TAK server
+        gets each of their tracks once, with the first frame after them.
+        """
         of_segment = {"segment": segment} if self._site.is_local else {}
         for track in new:
             crop = crops.get(track.id)
@@ -45,9 +60,15 @@ class Notifier:
                 "crop": None if crop is None else str((self._folder / crop).resolve()),
             }
             alert["time"] = alert["last_seen"]
-            for outbox in self._alerts:
-                outbox.put(alert)
-        for track in seen:
+            for receiver, outbox in self._alerts.items():
+                if Sent(receiver, track.id) not in self._journal.sent:
+                    outbox.put(alert)
+        if is_resumed:
+            self._caught_up |= {track.id: track for track in seen}
+            return
+        shown = {**self._caught_up, **{track.id: track for track in seen}}
+        self._caught_up = {}
+        for track in shown.values():
             if self._cot is not None and self._pace.allows(track.id):
                 self._sent_types[track.id] = cot_type(track.label, self._outputs.cot_types)
                 self._cot.put(self._event(track))
@@ -55,6 +76,8 @@ class Notifier:
     def withdraw(self, track_ids: Iterable[int]) -> None:
         """Tracks that turned out to be others leave the TAK server's map."""
         for track_id in track_ids:
+            if (earlier := self._caught_up.pop(track_id, None)) is not None:
+                self._sent_types[track_id] = cot_type(earlier.label, self._outputs.cot_types)
             if self._cot is not None and track_id in self._sent_types:
                 uid, kind = f"{self._uid}.{track_id}", self._sent_types.pop(track_id)
                 self._cot.put(cot_removal(uid, type_=kind, now_ns=time.time_ns()))
@@ -67,7 +90,7 @@ class Notifier:
 
     def close(self, alerts_s: float, events_s: float) -> None:
         """Wait until all is sent, at most so long for the alerts and for the TAK server."""
-        for outbox in self._alerts:
+        for outbox in self._alerts.values():
             outbox.close(alerts_s)
         if self._cot is not None and self._sender is not None:
             self._cot.close(events_s)
@@ -79,9 +102,17 @@ class Notifier:
         if self._outputs.cot and self._cot is None:
             text = f"nothing was sent to {self._outputs.cot}: this flight has no place on Earth"
             found.append(Notice("cot_without_place", 1, text))
-        for outbox in self._alerts:
+        for outbox in self._alerts.values():
             found += outbox.notices()
         return (*found, *(self._cot.notices() if self._cot is not None else ()))
+
+    def _add_receiver(self, code: str, send: Callable[[Mapping[str, Any]], None], what: str) -> None:
+        """A receiver of alerts; what it has got is noted at once."""
+        def noted(alert: Mapping[str, Any]) -> None:
+            send(alert)
+            self._journal.keep_sent(code, alert["id"])
+
+        self._alerts[code] = Outbox(noted, code=code, what=what)
 
     def _event(self, track: Track) -> bytes:
         return cot_event(

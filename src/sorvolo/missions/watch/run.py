@@ -10,10 +10,12 @@ from typing import Self
 
 from sorvolo.capture.sync import DATED_NS
 from sorvolo.detection.scene import SceneMagnifier
+from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
 from sorvolo.missions.watch.files import SeenFrame, WatchFiles
+from sorvolo.missions.watch.journal import SearchedFrame, WatchJournal
 from sorvolo.missions.watch.notifier import Notifier
 from sorvolo.missions.watch.places import Places
 from sorvolo.missions.watch.report import WatchLog, build_watch_report, count_by_class, source_notices
@@ -41,6 +43,7 @@ class WatchUpdate:
     source. `size_px` is the frame's width and height, `clip_ns` its time after the source's first frame, `view` what
     ground it shows by telemetry. Places are metres of `site`; where it is local, pixels of the first frame of their
     `segment`, which counts from 1.
+    `is_resumed`: a watch that was killed had searched the frame.
     """
 
     frame_name: str
@@ -61,15 +64,20 @@ class WatchUpdate:
     size_px: tuple[int, int]
     clip_ns: int
     view: FrameView | None
+    is_resumed: bool
 
 
 class WatchRun:
-    """One watch. A context manager; `finish` writes what is known at the end, however the watch ended."""
+    """One watch. A context manager; `finish` writes what is known at the end, however the watch ended.
+
+    `journal` notes what is detected and sent, and has what a killed watch noted.
+    """
 
     def __init__(
         self, setup: FlightSetup, places: Places, detector: Detects, settings: WatchSettings, outputs: WatchOutputs,
-        folder: Path,
+        folder: Path, journal: WatchJournal,
     ) -> None:
+        self._journal = journal
         self._setup, self._places, self._detector = setup, places, detector
         self._settings, self._outputs, self._folder = settings, outputs, folder
         self._classes = settings.classes or detector.info.usual_classes
@@ -77,7 +85,7 @@ class WatchRun:
         self.log = WatchLog()
         self._stack = ExitStack()
         self._files = self._stack.enter_context(WatchFiles(folder, outputs, places.site))
-        self._notifier = Notifier(setup.source.name, setup.source.fingerprint, places.site, outputs, folder)
+        self._notifier = Notifier(setup.source.name, setup.source.fingerprint, places.site, outputs, folder, journal)
         self._stack.callback(self._notifier.close, 0.0, 0.0)
 
     def __enter__(self) -> Self:
@@ -88,19 +96,29 @@ class WatchRun:
     ) -> None:
         self._stack.close()
 
-    def _searched(self, frame: Frame) -> Detections:
-        """What the detector finds in a frame; where nothing places the flight, at the scale that its scene shows."""
+    def _searched(self, frame: Frame, earlier: SearchedFrame | None) -> SearchedFrame:
+        """What the detector finds in a frame; where nothing places the flight, at the scale that its scene shows.
+
+        `earlier` is what it found in a watch that was killed, which is taken in its place.
+        """
         settings, classes = self._settings, self._classes
         magnifier = self._magnifier if settings.tiles == "auto" and self._places.site.is_local else None
         m_per_px = self._places.m_per_px(frame)
+        looks: list[Detections] = []
+
+        def look(part: ImageRGB) -> Detections:
+            known = None if earlier is None else earlier.looks[len(looks)]
+            looks.append(self._detector.detect(part, classes=classes) if known is None else known)
+            return looks[-1]
+
         if magnifier is not None:
-            m_per_px = magnifier.m_per_px(frame.image, lambda part: self._detector.detect(part, classes=classes))
+            m_per_px = magnifier.m_per_px(frame.image, look)
         found = self._detector.detect(
             frame.image, tiles=settings.tiles, m_per_px=m_per_px, least_score=settings.least_score, classes=classes
-        )
+        ) if earlier is None else earlier.found
         if magnifier is not None:
             magnifier.see(found, frame.image)
-        return found
+        return SearchedFrame(frame.index, found, tuple(looks))
 
     def lose(self, lost: LostFrame) -> None:
         """A frame that cannot be used."""
@@ -112,8 +130,12 @@ class WatchRun:
         log = self.log
         log.read = frame.index + 1
         time_ns = self._utc_ns(frame)
+        earlier = self._journal.next_frame(frame.index)
         with log.stage("detect"):
-            found = self._searched(frame)
+            searched = self._searched(frame, earlier)
+        if earlier is None:
+            self._journal.keep_frame(searched)
+        found = searched.found
         with log.stage("track"):
             taken = self._places.take(frame, time_ns, found)
         sighted = [each for each in taken.sightings if each is not None]
@@ -128,25 +150,27 @@ class WatchRun:
                 frame, time_ns, found, taken.sightings, taken.track_ids, frozenset(each.id for each in confirmed),
                 f"frame {frame.name}, counted so far: {counted_list(counts)}", taken.segment,
             ))
-            self._hand_over(taken, confirmed, seen, new)
+            self._hand_over(taken, confirmed, seen, new, is_resumed=earlier is not None)
         latency_s = time.monotonic() - arrived_s
-        log.latency_s.append(latency_s)
+        if earlier is None:
+            log.latency_s.append(latency_s)
         source = self._setup.source
         return WatchUpdate(
             frame.name, time_ns, found, sighted, new, seen, counts,
             latency_s, log.read, log.detected, source.frame_count, log.seconds, self._folder,
             self._places.site, taken.segment, (frame.image.shape[1], frame.image.shape[0]),
-            frame.time_ns - source.start_ns, self._places.view(frame),
+            frame.time_ns - source.start_ns, self._places.view(frame), earlier is not None,
         )
 
     def _hand_over(
-        self, taken: Taken, confirmed: Sequence[Track], seen: Sequence[Track], new: Sequence[Track]
+        self, taken: Taken, confirmed: Sequence[Track], seen: Sequence[Track], new: Sequence[Track], *,
+        is_resumed: bool,
     ) -> None:
         """Crops, reports and withdrawals of one frame, and the files that show all tracks so far."""
         for track in seen:
             self._files.crop_of(track)
         self._files.forget(taken.merged)
-        self._notifier.report(new, seen, self._files.crop_names, taken.segment)
+        self._notifier.report(new, seen, self._files.crop_names, taken.segment, is_resumed=is_resumed)
         self._notifier.withdraw(taken.merged)
         self._files.show(confirmed)
 
@@ -177,6 +201,7 @@ class WatchRun:
         atomic_write_bytes(self._folder / "report.json", json_bytes(report))
         page = watch_page(report, rows, crops, self._places.path_m())
         atomic_write_bytes(self._folder / "report.html", page.encode())
+        self._journal.file.remove()
 
     def _utc_ns(self, frame: Frame) -> int:
         """A frame's UTC by telemetry's clock; by its own where telemetry's was never set."""

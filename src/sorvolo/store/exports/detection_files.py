@@ -37,8 +37,12 @@ DETECTIONS, TRACKS = "detections", "tracks"
 TRACKS_KML, TRACKS_GPX = "tracks.kml", "tracks.gpx"
 ANNOTATED_VIDEO, ANNOTATED_PICTURES, LABELS = "annotated.mp4", "annotated", "labels"
 
+JOURNAL = "run.journal"
+"""How far a watch is, until it is complete."""
+
 _OURS = (
-    LINES, *(features_name(name, is_local=is_local) for name in (DETECTIONS, TRACKS) for is_local in (False, True)),
+    JOURNAL, LINES,
+    *(features_name(name, is_local=is_local) for name in (DETECTIONS, TRACKS) for is_local in (False, True)),
     TRACKS_KML, TRACKS_GPX, CROPS, ANNOTATED_VIDEO, ANNOTATED_PICTURES, LABELS,
     "report.json", "report.html",
 )
@@ -49,11 +53,13 @@ _OF_FIRST_PICTURE = (
 )
 
 
-def claim_folder(folder: Path, source: str, fingerprint: str, *, replaces: bool = True) -> None:
+def claim_folder(
+    folder: Path, source: str, fingerprint: str, *, replaces: bool = True, goes_on: bool = False
+) -> None:
     """Make the folder, or empty it of an earlier watch of the very same source, and mark it.
 
-    Other files in it stay. Raises StoreError for a folder with anything but such a watch; without `replaces` (a live
-    stream is never the same twice) for one with any watch.
+    Other files in it stay, and all of a watch that `goes_on`. Raises StoreError for a folder with anything but such a
+    watch; without `replaces` (a live stream is never the same twice) for one with any watch that does not go on.
     """
     if folder.exists() and not folder.is_dir():
         raise StoreError(f"{folder} is a file; give a folder with --out")
@@ -61,14 +67,14 @@ def claim_folder(folder: Path, source: str, fingerprint: str, *, replaces: bool 
         earlier = _mark_of(folder)
         if earlier is None:
             raise StoreError(f"{folder} is not empty and holds no earlier watch; give another folder with --out")
-        if not replaces or (earlier.get("source"), earlier.get("fingerprint")) != (source, fingerprint):
+        if not (replaces or goes_on) or (earlier.get("source"), earlier.get("fingerprint")) != (source, fingerprint):
             raise StoreError(
                 f"{folder} holds a watch of {earlier.get('source')}, which stays; give another folder with --out"
             )
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers([folder])
-        for name in _OURS:
+        for name in () if goes_on else _OURS:
             if (folder / name).is_dir():
                 shutil.rmtree(folder / name)
             else:

@@ -51,6 +51,7 @@ class RunJournal:
         self._file: BufferedRandom | None = None
         self._end = 0
         self._lock = threading.Lock()
+        self._is_over = False
 
     @property
     def is_begun(self) -> bool:
@@ -100,8 +101,10 @@ class RunJournal:
                 yield entry
 
     def append(self, entry: Entry) -> None:
-        """Add an entry. Raises StoreError when the disk is full."""
+        """Add an entry; nothing once the run is over. Raises StoreError when the disk is full."""
         with self._lock, writing(self._path):
+            if self._is_over:
+                return
             file = self._file or self._begun()
             file.write(_packed(entry))
             file.flush()
@@ -114,8 +117,10 @@ class RunJournal:
 
     def remove(self) -> None:
         """The run is over: nothing is left to go on from."""
-        self.close()
-        self._path.unlink(missing_ok=True)
+        with self._lock:
+            self._is_over = True
+            self.close()
+            self._path.unlink(missing_ok=True)
         folder = self._path.parent
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()

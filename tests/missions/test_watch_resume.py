@@ -1,0 +1,172 @@
+"""A watch that was killed goes on where it was: the same lists in the end, and nobody is notified twice."""
+
+import json
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from truth_detector import TruthDetector
+
+from sorvolo.cli.main import main
+from sorvolo.errors import SorvoloWarning
+from sorvolo.missions.simulate.site import simulate_site
+from sorvolo.missions.watch.flights import watch
+from sorvolo.missions.watch.run import WatchUpdate
+from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
+from sorvolo.simulation.settings import (
+    ImagingSettings,
+    OutputSettings,
+    PathSettings,
+    SceneSettings,
+    SensorSettings,
+    SimulationSettings,
+)
+
+_EFFORT = ("seconds", "latency_s", "frames_per_second", "peak_memory_mb")
+_KILLED_AT = 12  # frames
+
+
+_FLOWN = SimulationSettings(
+    seed=78, flights=1,
+    scene=SceneSettings(people=4, cars=3, small_objects=0, has_scenery=False),
+    path=PathSettings(height_m=20, speed_m_s=5, length_m=24, strips=2, strip_spacing_m=7),
+    imaging=ImagingSettings(width_px=320, height_px=180, fps=5),
+    sensor=SensorSettings(noise_m=(0.1, 0.1, 0.1)),
+    output=OutputSettings(telemetry="all", truth_step=1),
+)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small flight over people and cars."""
+    folder = tmp_path_factory.mktemp("watch") / "flown"
+    for _ in simulate_site(folder, _FLOWN):
+        pass
+    return folder
+
+
+@pytest.fixture(scope="module")
+def detector(flown: Path) -> TruthDetector:
+    return TruthDetector(flown)
+
+
+@pytest.fixture(params=["on the ground", "in the picture"])
+def video(request: pytest.FixtureRequest, flown: Path, tmp_path: Path) -> Path:
+    """The flight with its telemetry, and without any."""
+    source = flown / "flight1" / "flight1.mp4"
+    return source if request.param == "on the ground" else Path(shutil.copy(source, tmp_path / "flight1.mp4"))
+
+
+def watched(
+    video: Path, folder: Path, detector: TruthDetector, alerts: Path, then: Callable[[int], None] = lambda _: None,
+    settings: WatchSettings = WatchSettings(),  # noqa: B008
+) -> list[WatchUpdate]:
+    """Watch a flight, with alerts to a program that writes their ids to a file."""
+    told = f"{sys.executable} -c \"open('{alerts}', 'a').write('{{id}} ')\""
+    outputs = WatchOutputs(folder=folder, save="pictures", labels=("coco",), alert_command=told)
+    updates = []
+    for each in watch(video, settings, outputs, camera="aov=70", detector=detector):
+        updates.append(each)
+        then(len(updates))
+    return updates
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """All files but pages, without what a watch took."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.name != "report.html":
+            data = path.read_bytes()
+            if path.name == "report.json":
+                data = json.dumps({k: v for k, v in json.loads(data).items() if k not in _EFFORT}).encode()
+            found[str(path.relative_to(folder))] = data
+    return found
+
+
+def ids(alerts: Path, count: int) -> list[int]:
+    """Those sent so far, once there are so many."""
+    end_s = time.monotonic() + 20
+    while len(words := alerts.read_text().split() if alerts.exists() else []) < count and time.monotonic() < end_s:
+        time.sleep(0.05)
+    return [int(each) for each in words]
+
+
+def test_it_goes_on_and_tells_nobody_twice(video: Path, detector: TruthDetector, tmp_path: Path) -> None:
+    whole, amid, alerts = tmp_path / "whole", tmp_path / "amid", tmp_path / "sent"
+    reported: list[int] = []
+
+    def killed(count: int) -> None:
+        if count == _KILLED_AT:
+            reported.extend(ids(alerts, 1))
+            time.sleep(0.3)  # what was sent is noted after it
+            shutil.copytree(whole, amid)
+
+    updates = watched(video, whole, detector, alerts, killed)
+    found = [track.id for each in updates for track in each.new]
+    assert found == ids(alerts, len(found)) and 1 <= len(reported) < len(found)
+    shutil.move(whole, tmp_path / "first")
+    shutil.move(amid, whole)
+    alerts.unlink()
+    detector.asked = 0
+    resumed = watched(video, whole, detector, alerts)
+    assert [each.is_resumed for each in resumed] == [number < _KILLED_AT for number in range(len(updates))]
+    assert detector.asked == len(updates) - _KILLED_AT
+    assert ids(alerts, len(found) - len(reported)) == found[len(reported):]
+    assert content(whole) == content(tmp_path / "first")
+    assert "run.journal" not in content(whole)
+
+
+def test_an_alert_that_was_not_sent_is_sent(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
+    video, folder, amid = flown / "flight1" / "flight1.mp4", tmp_path / "watch", tmp_path / "amid"
+    (tmp_path / "none").mkdir()  # no file can be written there: each alert fails
+
+    def killed(count: int) -> None:
+        if count == _KILLED_AT:
+            time.sleep(1.0)
+            shutil.copytree(folder, amid)
+
+    updates = watched(video, folder, detector, tmp_path / "none", killed)
+    shutil.rmtree(folder)
+    shutil.move(amid, folder)
+    (tmp_path / "none").rmdir()
+    watched(video, folder, detector, tmp_path / "none")
+    found = [track.id for each in updates for track in each.new]
+    assert ids(tmp_path / "none", len(found)) == found
+
+
+def test_other_settings_begin_anew_and_say_so(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
+    video, folder = flown / "flight1" / "flight1.mp4", tmp_path / "watch"
+    updates = watch(video, WatchSettings(), WatchOutputs(folder=folder), camera="aov=70", detector=detector)
+    next(updates)
+    shutil.copytree(folder, tmp_path / "amid")
+    updates.close()
+    assert not (folder / "run.journal").exists()
+    with pytest.warns(SorvoloWarning, match="a watch that was stopped cannot go on, since it was of other settings"):
+        again = watch(
+            video, WatchSettings(frames_per_second=2), WatchOutputs(folder=tmp_path / "amid"), camera="aov=70",
+            detector=detector,
+        )
+        assert not next(again).is_resumed
+        again.close()
+
+
+def test_what_was_printed_is_not_printed_again(
+    flown: Path, detector: TruthDetector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    video, folder = flown / "flight1" / "flight1.mp4", tmp_path / "watch"
+    command = ["watch", str(video), "--out", str(folder), "--camera", "aov=70"]
+    monkeypatch.setattr("sorvolo.missions.watch.flights.Detector.load", lambda _: detector)
+    closing = watch(video, WatchSettings(), WatchOutputs(folder=folder), camera="aov=70")
+    new = [track.id for _, each in zip(range(_KILLED_AT), closing) for track in each.new]
+    shutil.copytree(folder, tmp_path / "amid")
+    closing.close()
+    shutil.rmtree(folder)
+    shutil.move(tmp_path / "amid", folder)
+    assert main(command) == 0
+    printed = capsys.readouterr().err
+    assert new and f"going on after {_KILLED_AT} frames of a run that was stopped" in printed
+    assert not any(f" {each}  at " in printed for each in new)
