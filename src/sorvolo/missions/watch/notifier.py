@@ -52,17 +52,8 @@ class Notifier:
         Of frames that a killed watch searched (`is_resumed`) only alerts that it did not send are sent; the TAK server
         gets each of their tracks once, with the first frame after them.
         """
-        of_segment = {"segment": segment} if self._site.is_local else {}
         for track in new:
-            crop = crops.get(track.id)
-            alert = {
-                "flight": self._flight, **track_properties(track, self._site), **of_segment,
-                "crop": None if crop is None else str((self._folder / crop).resolve()),
-            }
-            alert["time"] = alert["last_seen"]
-            for receiver, outbox in self._alerts.items():
-                if Sent(receiver, track.id) not in self._journal.sent:
-                    outbox.put(alert)
+            self._alert(track, crops.get(track.id), segment)
         if is_resumed:
             self._caught_up |= {track.id: track for track in seen}
             return
@@ -105,6 +96,18 @@ class Notifier:
         for outbox in self._alerts.values():
             found += outbox.notices()
         return (*found, *(self._cot.notices() if self._cot is not None else ()))
+
+    def _alert(self, track: Track, crop: str | None, segment: int) -> None:
+        """Send the alert of a track to those who have not got it."""
+        of_segment = {"segment": segment} if self._site.is_local else {}
+        alert = {
+            "flight": self._flight, **track_properties(track, self._site), **of_segment,
+            "crop": None if crop is None else str((self._folder / crop).resolve()),
+        }
+        alert["time"] = alert["last_seen"]
+        for receiver, outbox in self._alerts.items():
+            if Sent(receiver, track.id) not in self._journal.sent:
+                outbox.put(alert)
 
     def _add_receiver(self, code: str, send: Callable[[Mapping[str, Any]], None], what: str) -> None:
         """A receiver of alerts; what it has got is noted at once."""

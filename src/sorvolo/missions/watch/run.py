@@ -96,6 +96,15 @@ class WatchRun:
     ) -> None:
         self._stack.close()
 
+    def _found(self, frame: Frame) -> tuple[Detections, bool]:
+        """What is detected in a frame, which is noted; and whether a watch that was killed had detected it."""
+        earlier = self._journal.next_frame(frame.index)
+        with self.log.stage("detect"):
+            searched = self._searched(frame, earlier)
+        if earlier is None:
+            self._journal.keep_frame(searched)
+        return searched.found, earlier is not None
+
     def _searched(self, frame: Frame, earlier: SearchedFrame | None) -> SearchedFrame:
         """What the detector finds in a frame; where nothing places the flight, at the scale that its scene shows.
 
@@ -130,12 +139,7 @@ class WatchRun:
         log = self.log
         log.read = frame.index + 1
         time_ns = self._utc_ns(frame)
-        earlier = self._journal.next_frame(frame.index)
-        with log.stage("detect"):
-            searched = self._searched(frame, earlier)
-        if earlier is None:
-            self._journal.keep_frame(searched)
-        found = searched.found
+        found, is_resumed = self._found(frame)
         with log.stage("track"):
             taken = self._places.take(frame, time_ns, found)
         sighted = [each for each in taken.sightings if each is not None]
@@ -150,16 +154,16 @@ class WatchRun:
                 frame, time_ns, found, taken.sightings, taken.track_ids, frozenset(each.id for each in confirmed),
                 f"frame {frame.name}, counted so far: {counted_list(counts)}", taken.segment,
             ))
-            self._hand_over(taken, confirmed, seen, new, is_resumed=earlier is not None)
+            self._hand_over(taken, confirmed, seen, new, is_resumed=is_resumed)
         latency_s = time.monotonic() - arrived_s
-        if earlier is None:
+        if not is_resumed:
             log.latency_s.append(latency_s)
         source = self._setup.source
         return WatchUpdate(
             frame.name, time_ns, found, sighted, new, seen, counts,
             latency_s, log.read, log.detected, source.frame_count, log.seconds, self._folder,
             self._places.site, taken.segment, (frame.image.shape[1], frame.image.shape[0]),
-            frame.time_ns - source.start_ns, self._places.view(frame), earlier is not None,
+            frame.time_ns - source.start_ns, self._places.view(frame), is_resumed,
         )
 
     def _hand_over(
