@@ -1,0 +1,200 @@
+"""What each mission costs for a frame of 1080p video and for a large photo: processor time, memory, bytes kept.
+
+python benchmarks/unit_costs.py [--only NAME...] [--megapixels 12] [--seed 1] [--output FILE]
+
+Each command of Sorvolo runs as a process of its own on a short and on a long input; the operating system accounts for
+its processor time and peak memory, so that other work on the machine disturbs wall time alone, which is not given (a
+loaded machine has slower caches: processor time grows by some tens of per cent). The difference of both runs over the
+difference of their frames is the unit cost; what remains of the short run is the start (imports, models). Bytes are
+what the site, or the watch's folder, has more on the disk. One thread of OpenMP. Inputs are simulated: 1080p video at
+10 frames a second from 30 m, photos of `--megapixels` from 40 m with 70 % overlap. Written to results/unit_costs.json;
+`--only` measures those rows anew and keeps the others.
+"""
+
+import argparse
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from provenance import commit, machine
+from sorvolo.missions.simulate.site import simulate_site
+from sorvolo.simulation.settings import (
+    ImagingSettings,
+    LaterSettings,
+    OutputSettings,
+    PathSettings,
+    SceneSettings,
+    SimulationSettings,
+)
+
+RESULTS = Path(__file__).parent / "results" / "unit_costs.json"
+FPS, VIDEO_S, SPEED_M_S = 10.0, (3.0, 12.0), 6.0
+PHOTO_STRIPS = (1, 3)
+LIMIT_S = 1500
+
+
+@dataclass(frozen=True)
+class Job:
+    """A mission on one kind of input: its arguments after `sorvolo`, and the folder whose bytes are counted.
+
+    In the texts {flight1}, {flight2} are inputs, {site} a new site, {mapped} one that holds the first flight, {out} a
+    new folder.
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+    grows: str
+
+
+VIDEO_JOBS = (
+    Job("map", ("map", "{flight1}", "--site", "{site}", "--model", "none"), "{site}"),
+    Job("map with objects", ("map", "{flight1}", "--site", "{site}"), "{site}"),
+    Job("compare", ("compare", "{flight2}", "--site", "{mapped}", "--model", "none"), "{mapped}"),
+    Job("watch", ("watch", "{flight2}", "--out", "{out}"), "{out}"),
+)
+PHOTO_JOBS = (
+    *VIDEO_JOBS,
+    Job("heights", ("heights", "{mapped}"), "{mapped}"),
+    Job("search", ("search", "{mapped}"), "{mapped}"),
+)
+
+
+def main() -> None:
+    """Simulate, run, account, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="*", help="rows such as 'video: watch'")
+    parser.add_argument("--megapixels", type=float, default=12.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--output", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    known = json.loads(options.output.read_text()) if options.only and options.output.is_file() else {"rows": {}}
+    rows = known["rows"]
+    photos = f"photo, {options.megapixels:g} MP"
+    with tempfile.TemporaryDirectory() as scratch:
+        for kind, jobs in (("video", VIDEO_JOBS), (photos, PHOTO_JOBS)):
+            wanted = [job for job in jobs if options.only is None or f"{kind}: {job.name}" in options.only]
+            if not wanted:
+                continue
+            flights = [
+                simulated(Path(scratch) / f"{kind}{size}", kind, size, options.seed, options.megapixels)
+                for size in (0, 1)
+            ]
+            for job in wanted:
+                rows[f"{kind}: {job.name}"] = unit_cost(job, flights, Path(scratch) / "work") | {
+                    "commit": commit(), "load_1_min": os.getloadavg()[0],
+                }
+                written(options.output, rows)
+    show(rows)
+
+
+def written(output: Path, rows: dict[str, Any]) -> None:
+    """The rows so far, with where they are from."""
+    result = {"benchmark": "unit_costs", "machine": machine(), "commit": commit(), "rows": rows}
+    output.parent.mkdir(exist_ok=True)
+    output.write_text(json.dumps(result, indent=1) + "\n")
+
+
+def simulated(folder: Path, kind: str, size: int, seed: int, megapixels: float) -> Path:
+    """Two flights over a path of the small (0) or the large (1) size."""
+    if kind == "video":
+        imaging = ImagingSettings(1920, 1080, fps=FPS)
+        path = PathSettings(30.0, SPEED_M_S, VIDEO_S[size] * SPEED_M_S, strips=1)
+    else:
+        width_px = 2 * round(math.sqrt(megapixels * 1e6 * 4 / 3) / 2)
+        imaging = ImagingSettings(width_px, 2 * round(width_px * 3 / 8), fps=5.0)
+        path = PathSettings(40.0, SPEED_M_S, 22.0, strips=PHOTO_STRIPS[size], strip_spacing_m=16.0)
+    settings = SimulationSettings(
+        seed=seed, scene=SceneSettings(people=4, cars=2, small_objects=3), path=path, imaging=imaging,
+        later=LaterSettings(removed=1, moved=1),
+        output=OutputSettings(photos=kind != "video", photo_overlap=0.7, truth_step=1_000_000),
+    )
+    for _ in simulate_site(folder, settings):
+        pass
+    return folder
+
+
+def unit_cost(job: Job, flights: Sequence[Path], work: Path) -> dict[str, Any]:
+    """The job on both sizes, and what a frame or a photo costs."""
+    runs = [run(job, simulation, work) for simulation in flights]
+    short, long = runs
+    more = long["frames"] - short["frames"]
+    cpu_s = (long["cpu_s"] - short["cpu_s"]) / more
+    return {
+        "cpu_s": round(cpu_s, 4), "start_cpu_s": round(short["cpu_s"] - cpu_s * short["frames"], 2),
+        "peak_mb": round(long["peak_mb"]), "bytes": round((long["bytes"] - short["bytes"]) / more), "runs": runs,
+    }
+
+
+def run(job: Job, simulation: Path, work: Path) -> dict[str, Any]:
+    """One run of the job: frames that went in, processor seconds, peak memory, bytes that came."""
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir()
+    places = {
+        **{f"flight{number}": str(pictures(simulation, number)) for number in (1, 2)},
+        "site": str(work / "site"), "mapped": str(work / "mapped"), "out": str(work / "out"),
+    }
+    camera = ("--camera", str(simulation / "camera.xml"))
+    if any("{mapped}" in each for each in job.arguments):
+        run_sorvolo(["map", places["flight1"], "--site", places["mapped"], "--model", "none", *camera])
+    number = 2 if any("{flight2}" in each for each in job.arguments) else 1
+    grown = Path(job.grows.format(**places))
+    before = bytes_below(grown)
+    own_camera = camera if any("{flight" in each for each in job.arguments) else ()
+    used = run_sorvolo([*(each.format(**places) for each in job.arguments), *own_camera])
+    return {"frames": frames_of(simulation, number), **used, "bytes": bytes_below(grown) - before}
+
+
+def pictures(simulation: Path, number: int) -> Path:
+    """A flight's video, or its folder of photos."""
+    folder = simulation / f"flight{number}"
+    return folder / "photos" if (folder / "photos").is_dir() else folder / f"flight{number}.mp4"
+
+
+def frames_of(simulation: Path, number: int) -> int:
+    """How many frames or photos a flight has."""
+    features = json.loads((simulation / "truth" / "frames.geojson").read_text())["features"]
+    return sum(each["properties"]["flight"] == f"flight{number}" for each in features)
+
+
+def run_sorvolo(arguments: Sequence[str]) -> dict[str, float]:
+    """Run a command to its end; its processor seconds and peak memory, MB. Exit codes 0 and 3 are results."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    child = subprocess.Popen(
+        ["timeout", str(LIMIT_S), sys.executable, "-m", "sorvolo", *arguments], env=environment,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+    )
+    assert child.stderr is not None
+    errors = child.stderr.read()
+    _, status, used = os.wait4(child.pid, 0)
+    code = child.returncode = os.waitstatus_to_exitcode(status)
+    if code not in (0, 3):
+        raise SystemExit(f"sorvolo {' '.join(arguments)} ended with {code}: {errors.strip().splitlines()[-1:]}")
+    return {"cpu_s": used.ru_utime + used.ru_stime, "peak_mb": used.ru_maxrss / 1024}
+
+
+def bytes_below(folder: Path) -> int:
+    """The sizes of all files below a folder."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if folder.is_dir() else 0
+
+
+def show(rows: dict[str, Any]) -> None:
+    """The table."""
+    table = Table("mission", "CPU s a frame", "start, CPU s", "peak MB", "bytes a frame")
+    for name, row in rows.items():
+        table.add_row(name, *(str(row[key]) for key in ("cpu_s", "start_cpu_s", "peak_mb", "bytes")))
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
