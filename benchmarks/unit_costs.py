@@ -5,10 +5,11 @@ python benchmarks/unit_costs.py [--only NAME...] [--megapixels 12] [--seed 1] [-
 Each command of Sorvolo runs as a process of its own on a short and on a long input; the operating system accounts for
 its processor time and peak memory, so that other work on the machine disturbs wall time alone, which is not given (a
 loaded machine has slower caches: processor time grows by some tens of per cent). The difference of both runs over the
-difference of their frames is the unit cost; what remains of the short run is the start (imports, models). Bytes are
-what the site, or the watch's folder, has more on the disk. One thread of OpenMP. Inputs are simulated: 1080p video at
-10 frames a second from 30 m, photos of `--megapixels` from 40 m with 70 % overlap. Written to results/unit_costs.json;
-`--only` measures those rows anew and keeps the others.
+difference of their units is the unit cost; what remains of the short run is the start (imports, models). A unit is a
+photo, and of a video a key frame (map), a view (compare) or a searched frame (watch); decoding is a row of its own and
+taken off the others. Bytes are what the site, or the watch's folder, has more on the disk. One thread of OpenMP. Inputs
+are simulated: 1080p video at 10 frames a second from 30 m, photos of `--megapixels` from 40 m with 70 % overlap.
+Written to results/unit_costs.json; `--only` measures those rows anew and keeps the others.
 """
 
 import argparse
@@ -39,7 +40,7 @@ from sorvolo.simulation.settings import (
 )
 
 RESULTS = Path(__file__).parent / "results" / "unit_costs.json"
-FPS, VIDEO_S, SPEED_M_S = 10.0, (3.0, 12.0), 6.0
+FPS, VIDEO_S, SPEED_M_S = 10.0, (2.0, 8.0), 6.0
 PHOTO_STRIPS = (1, 3)
 LIMIT_S = 1500
 
@@ -57,14 +58,23 @@ class Job:
     grows: str
 
 
+_DECODE = """
+import sys, av
+with av.open(sys.argv[1]) as video:
+    video.streams.video[0].codec_context.thread_count = 1
+    for frame in video.decode(video=0):
+        frame.to_ndarray(format="rgb24")
+"""
+DECODE = Job("decode", ("-c", _DECODE, "{flight1}"), "{out}")
 VIDEO_JOBS = (
+    DECODE,
     Job("map", ("map", "{flight1}", "--site", "{site}", "--model", "none"), "{site}"),
     Job("map with objects", ("map", "{flight1}", "--site", "{site}"), "{site}"),
     Job("compare", ("compare", "{flight2}", "--site", "{mapped}", "--model", "none"), "{mapped}"),
     Job("watch", ("watch", "{flight2}", "--out", "{out}"), "{out}"),
 )
 PHOTO_JOBS = (
-    *VIDEO_JOBS,
+    *VIDEO_JOBS[1:],
     Job("heights", ("heights", "{mapped}"), "{mapped}"),
     Job("search", ("search", "{mapped}"), "{mapped}"),
 )
@@ -91,7 +101,8 @@ def main() -> None:
                 for size in (0, 1)
             ]
             for job in wanted:
-                rows[f"{kind}: {job.name}"] = unit_cost(job, flights, Path(scratch) / "work") | {
+                decode_s = rows.get("video: decode", {}).get("cpu_s", 0.0) if kind == "video" else 0.0
+                rows[f"{kind}: {job.name}"] = unit_cost(job, flights, Path(scratch) / "work", decode_s) | {
                     "commit": commit(), "load_1_min": os.getloadavg()[0],
                 }
                 written(options.output, rows)
@@ -124,20 +135,22 @@ def simulated(folder: Path, kind: str, size: int, seed: int, megapixels: float) 
     return folder
 
 
-def unit_cost(job: Job, flights: Sequence[Path], work: Path) -> dict[str, Any]:
-    """The job on both sizes, and what a frame or a photo costs."""
+def unit_cost(job: Job, flights: Sequence[Path], work: Path, decode_s: float) -> dict[str, Any]:
+    """The job on both sizes, and what a unit costs besides decoding its frames."""
     runs = [run(job, simulation, work) for simulation in flights]
     short, long = runs
-    more = long["frames"] - short["frames"]
-    cpu_s = (long["cpu_s"] - short["cpu_s"]) / more
+    more = {name: long[name] - short[name] for name in ("units", "frames", "cpu_s", "bytes")}
+    decode_s = 0.0 if job == DECODE else decode_s
+    cpu_s = (more["cpu_s"] - decode_s * more["frames"]) / more["units"]
+    start_s = short["cpu_s"] - cpu_s * short["units"] - decode_s * short["frames"]
     return {
-        "cpu_s": round(cpu_s, 4), "start_cpu_s": round(short["cpu_s"] - cpu_s * short["frames"], 2),
-        "peak_mb": round(long["peak_mb"]), "bytes": round((long["bytes"] - short["bytes"]) / more), "runs": runs,
+        "cpu_s": round(cpu_s, 4), "start_cpu_s": round(start_s, 2), "peak_mb": round(long["peak_mb"]),
+        "bytes": round(more["bytes"] / more["units"]), "runs": runs,
     }
 
 
 def run(job: Job, simulation: Path, work: Path) -> dict[str, Any]:
-    """One run of the job: frames that went in, processor seconds, peak memory, bytes that came."""
+    """One run of the job: frames that went in, units done, processor seconds, peak memory, bytes that came."""
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir()
     places = {
@@ -146,13 +159,30 @@ def run(job: Job, simulation: Path, work: Path) -> dict[str, Any]:
     }
     camera = ("--camera", str(simulation / "camera.xml"))
     if any("{mapped}" in each for each in job.arguments):
-        run_sorvolo(["map", places["flight1"], "--site", places["mapped"], "--model", "none", *camera])
+        kept = simulation / "mapped"
+        if not kept.is_dir():
+            run_python(["-m", "sorvolo", "map", places["flight1"], "--site", str(kept), "--model", "none", *camera])
+        shutil.copytree(kept, places["mapped"])
     number = 2 if any("{flight2}" in each for each in job.arguments) else 1
     grown = Path(job.grows.format(**places))
     before = bytes_below(grown)
-    own_camera = camera if any("{flight" in each for each in job.arguments) else ()
-    used = run_sorvolo([*(each.format(**places) for each in job.arguments), *own_camera])
-    return {"frames": frames_of(simulation, number), **used, "bytes": bytes_below(grown) - before}
+    is_ours = job != DECODE
+    takes_camera = is_ours and any("{flight" in each for each in job.arguments)
+    arguments = [each if each == _DECODE else each.format(**places) for each in job.arguments]
+    used = run_python([*(("-m", "sorvolo") if is_ours else ()), *arguments, *(camera if takes_camera else ())])
+    frames = frames_of(simulation, number)
+    return {"frames": frames, "units": units_of(grown, number, frames), **used, "bytes": bytes_below(grown) - before}
+
+
+def units_of(grown: Path, number: int, frames: int) -> int:
+    """Key frames or views of a site's newest flight, searched frames of a watch; else all frames."""
+    report = grown / "report.json"
+    if report.is_file():
+        return int(json.loads(report.read_text())["frames"]["detected"])
+    places = sorted((grown / "flights").glob("*/frames.*json")) if grown.is_dir() else []
+    if not places or len(places) < number:
+        return frames
+    return len(json.loads(places[number - 1].read_text())["features"])
 
 
 def pictures(simulation: Path, number: int) -> Path:
@@ -167,11 +197,11 @@ def frames_of(simulation: Path, number: int) -> int:
     return sum(each["properties"]["flight"] == f"flight{number}" for each in features)
 
 
-def run_sorvolo(arguments: Sequence[str]) -> dict[str, float]:
-    """Run a command to its end; its processor seconds and peak memory, MB. Exit codes 0 and 3 are results."""
+def run_python(arguments: Sequence[str]) -> dict[str, float]:
+    """Run a program to its end; its processor seconds and peak memory, MB. Exit codes 0 and 3 are results."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     child = subprocess.Popen(
-        ["timeout", str(LIMIT_S), sys.executable, "-m", "sorvolo", *arguments], env=environment,
+        ["timeout", str(LIMIT_S), sys.executable, *arguments], env=environment,
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
     )
     assert child.stderr is not None
@@ -179,7 +209,7 @@ def run_sorvolo(arguments: Sequence[str]) -> dict[str, float]:
     _, status, used = os.wait4(child.pid, 0)
     code = child.returncode = os.waitstatus_to_exitcode(status)
     if code not in (0, 3):
-        raise SystemExit(f"sorvolo {' '.join(arguments)} ended with {code}: {errors.strip().splitlines()[-1:]}")
+        raise SystemExit(f"{' '.join(arguments)} ended with {code}: {errors.strip().splitlines()[-1:]}")
     return {"cpu_s": used.ru_utime + used.ru_stime, "peak_mb": used.ru_maxrss / 1024}
 
 
@@ -190,7 +220,7 @@ def bytes_below(folder: Path) -> int:
 
 def show(rows: dict[str, Any]) -> None:
     """The table."""
-    table = Table("mission", "CPU s a frame", "start, CPU s", "peak MB", "bytes a frame")
+    table = Table("mission", "CPU s a unit", "start, CPU s", "peak MB", "bytes a unit")
     for name, row in rows.items():
         table.add_row(name, *(str(row[key]) for key in ("cpu_s", "start_cpu_s", "peak_mb", "bytes")))
     Console().print(table)
