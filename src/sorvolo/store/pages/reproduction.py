@@ -80,7 +80,7 @@ def _histogram(rows: Iterable[Mapping[str, Any]]) -> dict[str, Any] | None:
 
 
 def _histogram_plot(means: Mapping[str, Floats]) -> dict[str, Any]:
-    highest = max(float(each.max()) for each in means.values())
+    highest = 1.05 * max(float(each.max()) for each in means.values())
     x, y = Scale(0, _GRAY_LEVELS, _MARGIN_PX, _WIDE_PX - 12), Scale(0, highest, _LOW_PX - 34, 18)
     width = _GRAY_LEVELS / len(next(iter(means.values())))
     lines = [
@@ -119,7 +119,7 @@ def _outline_plot(row: Mapping[str, Any], outlines_m: Floats, px: float) -> dict
         for xs, ys in zip(x, y)
     ]
     centres = [(float(a), float(b)) for a, b in zip(x.mean(axis=1), y.mean(axis=1))]
-    lines.append(Line(colour_class(5), centres, centres, "middle of a frame"))
+    lines.append(Line(colour_class(1), centres, centres, "middle of a frame"))
     bar_m = round_length(float(high[0] - low[0]) / 4)
     foot = height - 14
     lines.append(Line("ink", [(_MARGIN_PX, foot), (_MARGIN_PX + bar_m * px, foot)]))
