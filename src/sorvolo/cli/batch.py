@@ -139,6 +139,10 @@ def _executor_of(
     if name == "local":
         count = workers or default_workers()
         return lambda table: LocalExecutor(count, settings.stall_s, table.lock)
+    if name == "ray" or name.startswith("ray://"):
+        from sorvolo.cluster.ray_executor import ray_executor
+
+        return lambda table: ray_executor(name, workers, settings.stall_s, table.root)
     raise SettingsError(f"--executor {name}: give local, ray, or ray://HOST:PORT")
 
 

@@ -1,0 +1,332 @@
+"""Flights of a batch on a Ray cluster whose machines share a disk; the only place that knows Ray.
+
+Ray places tasks and notices machines that die. Tries, their count, and what was done are the batch's own: Ray is told
+to try nothing again.
+"""
+
+import importlib.util
+import os
+import secrets
+import socket
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import sorvolo
+from sorvolo.cluster.cost import Cost
+from sorvolo.cluster.orders import Ending, Order, Outcome
+from sorvolo.cluster.process import WorkerProcess, run_order
+from sorvolo.cluster.table import LOCK
+from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes
+
+Key = tuple[str, str]
+_SCHEME = "ray://"
+_REACH_S, _PROBE_S, _LOOK_S, _CANCEL_S = 8.0, 90.0, 2.0, 10.0
+_CACHE_SHARE = 0.25
+_LEAST_CACHE_MB = 64.0
+
+
+@contextmanager
+def ray_executor(name: str, workers: int | None, stall_s: float, root: Path) -> "Iterator[RayExecutor]":
+    """The executor on the cluster at `ray://HOST:PORT`, or for "ray" on this machine's, which is started if need be.
+
+    At most `workers` flights at once (None: as many as the cluster's cores hold). Leaving ends what runs. Raises
+    SettingsError where Ray is not installed, no cluster of this version answers, or the token is wrong, and StoreError
+    where a machine of the cluster does not share `root`.
+    """
+    if importlib.util.find_spec("ray") is None or importlib.util.find_spec("grpc") is None:
+        raise SettingsError(f"--executor {name} needs Ray; install it: pip install 'sorvolo[fleet]'")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers
+    os.environ.setdefault("RAY_CLIENT_MAX_CONNECTION_TIMEOUT_S", "5")  # thrice: it listens
+    if name == "ray" and not _started():
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # its own listens on loopback alone
+    _connect(name, workers)
+    import ray
+
+    try:
+        _check_machines(root)
+        executor = RayExecutor(name, workers, stall_s, root)
+        try:
+            yield executor
+        finally:
+            executor.end()
+    finally:
+        ray.shutdown()
+
+
+class RayExecutor:
+    """Tries as tasks of the cluster that this process is connected to; see `ray_executor`."""
+
+    def __init__(self, name: str, workers: int | None, stall_s: float, root: Path) -> None:
+        import ray
+
+        self._ray: Any = ray
+        self._name, self._workers, self._stall_s, self._root = name, workers, stall_s, str(root.resolve())
+        self._running: dict[Key, Any] = {}
+
+    @property
+    def running(self) -> Mapping[Key, object]:
+        """What runs, by key."""
+        return self._running
+
+    @property
+    def cache_mb(self) -> float:
+        """Memory that a try may take for what it could also read again: of the smallest machine, a core's share."""
+        with self._cluster():
+            shares = [each["memory"] / each["CPU"] for each in self._machines()]
+        return max(_LEAST_CACHE_MB, _CACHE_SHARE * min(shares) / 1e6)
+
+    def has_room(self, cost: Cost) -> bool:
+        """Whether one more try may begin."""
+        if self._workers is not None:
+            return len(self._running) < self._workers
+        with self._cluster():
+            slots = sum(each["CPU"] // min(cost.cpus, each["CPU"]) for each in self._machines())
+        return len(self._running) < slots
+
+    def start(self, key: Key, order: Order, cost: Cost) -> None:
+        """Begin a try, on a machine with so many cores and so much memory; no more than the largest one has."""
+        with self._cluster():
+            machines = self._machines()
+            task = self._ray.remote(_try).options(
+                num_cpus=min(cost.cpus, max(each["CPU"] for each in machines)),
+                memory=int(min(cost.memory_mb * 1e6, max(each["memory"] for each in machines))),
+                max_retries=0, scheduling_strategy="SPREAD", name=f"sorvolo {Path(order.source).name}",
+            )
+            self._running[key] = task.remote(order, self._stall_s, self._root, sorvolo.__version__)
+
+    def next_ended(self) -> tuple[Key, Ending]:
+        """Wait until a try has ended. Raises SettingsError where the cluster is gone."""
+        ended: list[Any] = []
+        with self._cluster():
+            while not ended:
+                ended, _ = self._ray.wait(list(self._running.values()), num_returns=1, timeout=_LOOK_S)
+            key = next(each for each, task in self._running.items() if task == ended[0])
+            ending = self._ending(ended[0])
+        del self._running[key]
+        return key, ending
+
+    def end(self) -> None:
+        """End what runs; a mapping goes on from its journal when it is asked for again."""
+        with suppress(Exception):  # of a cluster that is gone, nothing runs
+            for task in self._running.values():
+                self._ray.cancel(task, force=True)
+            self._ray.wait(list(self._running.values()), num_returns=len(self._running), timeout=_CANCEL_S)
+
+    def _ending(self, task: Any) -> Ending:
+        try:
+            ending = self._ray.get(task)
+        except (StoreError, InputError) as error:  # what every flight would meet on that machine
+            raise getattr(error, "cause", error) from None  # Ray's own holds a whole traceback
+        except self._ray.exceptions.RayError as error:
+            words = str(error).strip().split("\n")[0]
+            return Ending(Outcome.CRASHED, f"its machine or Ray's worker was lost ({type(error).__name__}): {words}")
+        assert isinstance(ending, Ending)
+        return ending
+
+    def _machines(self) -> list[dict[str, float]]:
+        """What the machines have that are there; those without cores run nothing."""
+        found = [each["Resources"] for each in _working(self._ray)]
+        machines = [{"CPU": each["CPU"], "memory": each.get("memory", 0.0)} for each in found]
+        if not machines:
+            raise ConnectionError("no machine with a core is left")
+        return machines
+
+    @contextmanager
+    def _cluster(self) -> Iterator[None]:
+        """Turn what Ray raises of a cluster that is gone into an error that says what to do."""
+        import grpc
+
+        errors = self._ray.exceptions
+        try:
+            yield
+        except (ConnectionError, grpc.RpcError, errors.RaySystemError, errors.RpcError) as error:
+            raise SettingsError(
+                f"--executor {self._name}: the cluster is gone ({_first_line(error)}); when it is back, the same "
+                "command goes on"
+            ) from error
+
+
+def _try(order: Order, stall_s: float, root: str, version: str) -> Ending:
+    """On a machine of the cluster: a try in a process of its own, which ends with Ray's worker."""
+    _demand_fit(root, version)
+    if not Path(order.source).exists():
+        host = socket.gethostname()
+        raise StoreError(f"the machine {host} does not have {order.source}; flights need the same path on all machines")
+    return run_order(WorkerProcess(order), stall_s)
+
+
+def _demand_fit(root: str, version: str) -> None:
+    """Raise SettingsError or StoreError on a machine that joined later and cannot take part."""
+    host = socket.gethostname()
+    if sorvolo.__version__ != version:
+        raise InputError(
+            f"the machine {host} has Sorvolo {sorvolo.__version__}, the batch {version}; install the same one"
+        )
+    if not (Path(root) / LOCK).exists():
+        raise StoreError(_unshared(host, root))
+
+
+def _unshared(host: str, root: str) -> str:
+    return (
+        f"the machine {host} does not see the files of this one in {root}; put ROOT on a disk that all machines have "
+        "under the same path (NFS, for example)"
+    )
+
+
+def _started() -> str:
+    """HOST:PORT of the cluster that this machine is part of, as RAY_ADDRESS or `ray start` names it; "" for none."""
+    named = os.environ.get("RAY_ADDRESS", "")
+    noted = Path(os.environ.get("RAY_TMPDIR", "/tmp"), "ray", "ray_current_cluster")
+    return named if named or not noted.is_file() else noted.read_text().strip()
+
+
+def _connect(name: str, workers: int | None) -> None:
+    import ray
+
+    options: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
+    try:
+        if name.startswith(_SCHEME):
+            _demand_reachable(name)
+            with warnings.catch_warnings(action="ignore"):  # of what the error states
+                ray.init(address=name, **options)
+        elif address := _started():
+            _demand_listening(name, address)
+            ray.init(address=address, **options)
+        else:
+            ray.init(address="local", num_cpus=workers, include_dashboard=False, **options)
+    except ray.exceptions.AuthenticationError as error:
+        raise SettingsError(
+            f"--executor {name}: the cluster wants another token; set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH to "
+            "the file of the token that it was started with"
+        ) from error
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        raise SettingsError(f"--executor {name}: {_why_not(name, error)}") from error
+
+
+def _why_not(name: str, error: Exception) -> str:
+    import ray
+
+    words = _first_line(error)
+    if "ersion" in str(error):
+        both = " ".join(str(error).split())[:300]
+        return f"the cluster has another version of Ray or Python than this machine (Ray {ray.__version__}): {both}"
+    if "oken" in str(error) or "nauthenticated" in str(error):
+        return f"the cluster wants another token: {words}; set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH"
+    if name.startswith(_SCHEME):
+        return (
+            f"what listens there takes no Ray client ({words}): a cluster with a token (set RAY_AUTH_MODE=token and "
+            "RAY_AUTH_TOKEN_PATH), or no Ray"
+        )
+    return f"no Ray cluster answers: {words}"
+
+
+def _demand_reachable(name: str) -> None:
+    """Raise SettingsError within seconds where no gRPC answers at ray://HOST:PORT; Ray itself waits for minutes."""
+    import grpc
+
+    address = name.removeprefix(_SCHEME)
+    host, colon, port = address.rpartition(":")
+    if not (host and colon and port.isdecimal()):
+        raise SettingsError(f"--executor {name}: give ray://HOST:PORT, such as ray://192.168.1.10:10001")
+    _demand_listening(name, address)
+    try:
+        with grpc.insecure_channel(address) as channel:  # it may be something else that listens there
+            grpc.channel_ready_future(channel).result(timeout=_REACH_S)
+    except grpc.FutureTimeoutError:
+        raise SettingsError(f"--executor {name}: what listens at {address} is no Ray cluster") from None
+
+
+def _demand_listening(name: str, address: str) -> None:
+    """Raise SettingsError where nothing listens at HOST:PORT."""
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_REACH_S).close()
+    except (OSError, OverflowError, ValueError) as error:
+        how = (
+            f"start one on that machine: ray start --head --ray-client-server-port {port}" if name.startswith(_SCHEME)
+            else "`ray start` noted it, or RAY_ADDRESS names it: `ray stop` forgets one that is gone"
+        )
+        raise SettingsError(
+            f"--executor {name}: no Ray cluster answers at {address} ({_first_line(error)}); {how} (docs/cluster.md)"
+        ) from None
+
+
+def _check_machines(root: Path) -> None:
+    """Have each machine read what is written here, and answer beside it. Raises SettingsError, StoreError."""
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    name, word = f"{TEMPORARY_PREFIX}{secrets.token_hex(6)}-probe", secrets.token_hex(16)
+    path = root.resolve() / name
+    atomic_write_bytes(path, word.encode())
+    answers = []
+    try:
+        probe: Any = ray.remote(_probe_of(str(path), word))
+        asked = [
+            probe.options(
+                num_cpus=0, max_retries=0,
+                scheduling_strategy=NodeAffinitySchedulingStrategy(each["NodeID"], soft=False),
+            ).remote()
+            for each in _working(ray)
+        ]
+        try:
+            answers = ray.get(asked, timeout=_PROBE_S)
+        except ray.exceptions.RayError as error:
+            raise SettingsError(f"a machine of the cluster does not run tasks: {_first_line(error)}") from error
+        for host, version, sees in answers:
+            _demand_same(host, version)
+            if not sees or not (root / f"{name}-{host}").is_file():
+                raise StoreError(_unshared(host, str(root.resolve())))
+    finally:
+        path.unlink(missing_ok=True)
+        for left in root.glob(f"{name}-*"):
+            left.unlink(missing_ok=True)
+    if not answers:
+        raise SettingsError("the cluster has no machine with a core")
+
+
+def _working(ray: Any) -> list[dict[str, Any]]:
+    """The machines of the cluster that are there and have a core."""
+    return [each for each in ray.nodes() if each["Alive"] and each["Resources"].get("CPU", 0) > 0]
+
+
+def _demand_same(host: str, version: str) -> None:
+    if version != sorvolo.__version__:
+        has = f"Sorvolo {version}" if version else "no Sorvolo"
+        raise SettingsError(
+            f"the machine {host} has {has}, this one {sorvolo.__version__}; install the same one on all machines"
+        )
+
+
+def _probe_of(path: str, word: str) -> Any:
+    """A function that travels whole, as a machine may not have this module: its host, its Sorvolo, whether it sees."""
+
+    def probe() -> tuple[str, str, bool]:
+        import socket
+
+        host = socket.gethostname()
+        try:
+            import sorvolo
+
+            version = sorvolo.__version__
+        except ImportError:
+            version = ""
+        try:
+            with open(path) as file:
+                sees = file.read() == word
+            with open(f"{path}-{host}", "w") as file:
+                file.write(word)
+        except OSError:
+            sees = False
+        return host, version, sees
+
+    return probe
+
+
+def _first_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).split("\n") if line.strip()]
+    return (lines or [type(error).__name__])[0][:300]

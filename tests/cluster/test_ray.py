@@ -1,0 +1,131 @@
+"""A batch on a Ray cluster of two machines, one of which dies: nothing lost, the maps of an undisturbed run."""
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from batch_flights import another, content
+
+from sorvolo.cli.main import main
+from sorvolo.cluster.batch import BatchSettings, run_batch
+from sorvolo.cluster.orders import FlightWish
+from sorvolo.cluster.ray_executor import _demand_fit, _demand_same, _probe_of, ray_executor
+from sorvolo.cluster.table import LOCK, State
+from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.map.flights import map_flights
+
+ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'sorvolo[fleet]'")
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
+    """A head without cores and two machines of a core each, on this one."""
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # this cluster is seen by nobody else for a few seconds
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    monkeypatch.setenv("RAY_ADDRESS", made.address)
+    for _ in range(2):
+        made.add_node(num_cpus=1)
+    yield made
+    made.shutdown()
+
+
+def test_a_machine_that_dies_loses_nothing(cluster: object, flown: Path, tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        another(flown, tmp_path / "in" / name)
+    root = tmp_path / "maps"
+
+    def kill_a_machine() -> None:
+        end_s = time.monotonic() + 60
+        while time.monotonic() < end_s and not list(root.glob("*/flights/*/run.journal")):
+            time.sleep(0.02)
+        nodes = cluster.worker_nodes  # type: ignore[attr-defined]
+        cluster.remove_node(next(iter(nodes)), allow_graceful=False)  # type: ignore[attr-defined]
+
+    killer = threading.Thread(target=kill_a_machine)
+    killer.start()
+    settings = BatchSettings(FlightWish(camera=str(flown / "camera.xml"), model="none"))
+    running = run_batch(
+        [tmp_path / "in"], root, settings, lambda table: ray_executor("ray", None, 60.0, table.root)
+    )
+    while True:
+        try:
+            next(running)
+        except StopIteration as end:
+            report = end.value
+            break
+    killer.join()
+    assert [row.state for row in report.rows] == [State.DONE, State.DONE]
+    assert (report.tries, report.crashes) == (3, 1)
+    for name in ("one", "two"):
+        wanted = tmp_path / "undisturbed" / name
+        for _ in map_flights([tmp_path / "in" / name], wanted, MapSettings(model="none"), camera=flown / "camera.xml"):
+            pass
+        assert content(root / name) == content(wanted)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("ray://127.0.0.1", "give ray://HOST:PORT"), ("ray://:10001", "give ray://HOST:PORT"),
+        ("ray://127.0.0.1:{port}", "no Ray cluster answers at 127.0.0.1:"),
+        ("ray", "`ray stop` forgets one that is gone"),
+    ],
+)
+def test_a_cluster_that_is_not_there_is_an_error_within_seconds(
+    name: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with socket.socket() as silent:  # its port is taken, and nobody answers
+        silent.bind(("127.0.0.1", 0))
+        (tmp_path / "in").mkdir()
+        (tmp_path / "in" / "1.mp4").write_text("no video")
+        monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{silent.getsockname()[1]}")
+        address, started_s = name.format(port=silent.getsockname()[1]), time.monotonic()
+        assert main(["batch", str(tmp_path / "in"), "--root", str(tmp_path / "maps"), "--executor", address]) == 1
+    said = capsys.readouterr().err
+    assert f"error: --executor {address}: " in said and words in said
+    assert time.monotonic() - started_s < 30
+
+
+def test_what_listens_but_is_no_cluster_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        (tmp_path / "1.mp4").write_text("no video")
+        address = f"ray://127.0.0.1:{other.getsockname()[1]}"
+        assert main(["batch", str(tmp_path / "1.mp4"), "--root", str(tmp_path / "maps"), "--executor", address]) == 1
+    assert f"what listens at {address[6:]} is no Ray cluster" in capsys.readouterr().err
+
+
+def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import importlib.util
+
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(SettingsError, match=r"pip install 'sorvolo\[fleet\]'"), ray_executor("ray", 1, 9.0, tmp_path):
+        pass
+
+
+def test_a_machine_that_does_not_share_the_disk_is_named(tmp_path: Path) -> None:
+    probe = _probe_of(str(tmp_path / "word"), "word of the batch")
+    assert probe()[2] is False
+    (tmp_path / "word").write_text("word of the batch")
+    assert probe()[2] is True
+    assert (tmp_path / f"word-{socket.gethostname()}").read_text() == "word of the batch"
+    with pytest.raises(StoreError, match="does not see the files of this one"):
+        _demand_fit(str(tmp_path), "0.1.0")
+    (tmp_path / LOCK).touch()
+    _demand_fit(str(tmp_path), "0.1.0")
+
+
+def test_a_machine_with_another_sorvolo_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"the machine far has Sorvolo 0\.0\.9, this one"):
+        _demand_same("far", "0.0.9")
+    with pytest.raises(SettingsError, match="the machine far has no Sorvolo, this one"):
+        _demand_same("far", "")
+    with pytest.raises(InputError, match=rf"{os.uname().nodename} has Sorvolo .*, the batch 0\.0\.9"):
+        _demand_fit(str(tmp_path), "0.0.9")
