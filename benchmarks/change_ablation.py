@@ -32,7 +32,7 @@ import numpy as np
 
 import real_dates
 from change_events import flight as flight_path
-from change_rules import RULES, switched_off
+from change_rules import RULES, Rule, switched_off
 from decision_replay import decided, gather
 from provenance import commit, machine
 from real_strips import FLIGHTS as FLIGHTS_OF_PHOTOS
@@ -366,43 +366,52 @@ def _when(change: Any, _: dict[str, Any]) -> int | None:
 # ---- switching off --------------------------------------------------------------------------------------------------
 
 
+def wanted_rules(options: argparse.Namespace) -> list[Rule]:
+    """The rules that were named; else those of the stage."""
+    if options.rules is not None:
+        return [each for each in RULES if each.name in options.rules]
+    return [each for each in RULES if each.stage == options.stage]
+
+
+def totals_of(flights: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """The scores of all flights together; `iou` is the mean over their outlines."""
+    keys = ("found", "of", "false", "twice", "withdrawn", "named", "real", "drawn_found", "drawn_false",
+            "drawn_elsewhere")
+    outlines = sum(each.get("outlines", 0) for each in flights)
+    iou = round(sum(each.get("iou_sum", 0) for each in flights) / max(outlines, 1), 4)
+    return {key: sum(each.get(key, 0) for each in flights) for key in keys} | {"iou": iou}
+
+
 def ablate(recorded: Sequence[Recorded], options: argparse.Namespace) -> None:
     """One row for the code as it is, and one for each rule without it."""
-    wanted = [each for each in RULES if each.stage == options.stage]
-    if options.rules is not None:
-        wanted = [each for each in RULES if each.name in options.rules]
-    known = json.loads(options.output.read_text()) if options.output.is_file() else {"rows": []}
-    rows = known["rows"]
+    rows = json.loads(options.output.read_text())["rows"] if options.output.is_file() else []
     done = {(row["rule"], row["stage"]) for row in rows}
     if options.stage == "decision":
         for each in recorded:
             gather(each.found(), each.m_per_px, each.name, each.folder / GATHERED)
-    for rule in (None, *wanted):
+    for rule in (None, *wanted_rules(options)):
         name, stage = ("all rules", options.stage) if rule is None else (rule.name, rule.stage)
         if (name, stage) in done:
             continue
-        started, flights = time.process_time(), {}
-        with switched_off(rule):
-            for each in recorded:
-                flights[each.name] = scored(each, *run_of(each, stage))
-                gc.collect()
-        totals = {
-            key: sum(each.get(key, 0) for each in flights.values())
-            for key in ("found", "of", "false", "twice", "withdrawn", "named", "real", "drawn_found", "drawn_false",
-                        "drawn_elsewhere")
-        }
-        outlines = sum(each.get("outlines", 0) for each in flights.values())
-        totals["iou"] = round(sum(each.get("iou_sum", 0) for each in flights.values()) / max(outlines, 1), 4)
-        rows.append({
-            "rule": name, "stage": stage, "decision": rule.decision if rule else "", **totals, "flights": flights,
-            "cpu_s": round(time.process_time() - started),
-        })
-        print(f"{name:32} {stage:9}", *(f"{key} {value}" for key, value in totals.items()), file=sys.stderr, flush=True)
+        decision = "" if rule is None else rule.decision
+        rows.append({"rule": name, "stage": stage, "decision": decision, **scored_without(rule, stage, recorded)})
         options.output.write_text(json.dumps({
             "benchmark": "change_ablation", "machine": machine(), "commit": commit(),
             "seeds_from": options.seeds_from, "lengths_m": dict(FLIGHTS),
             "rows": rows,
         }, indent=1) + "\n")
+
+
+def scored_without(rule: Rule | None, stage: str, recorded: Sequence[Recorded]) -> dict[str, Any]:
+    """The scores of all flights without a rule, together and each by itself."""
+    started, flights = time.process_time(), {}
+    with switched_off(rule):
+        for each in recorded:
+            flights[each.name] = scored(each, *run_of(each, stage))
+            gc.collect()
+    totals, name = totals_of(list(flights.values())), "all rules" if rule is None else rule.name
+    print(f"{name:32} {stage:9}", *(f"{key} {value}" for key, value in totals.items()), file=sys.stderr, flush=True)
+    return {**totals, "flights": flights, "cpu_s": round(time.process_time() - started)}
 
 
 if __name__ == "__main__":

@@ -269,39 +269,54 @@ def found_among(
     size_px: tuple[int, int],
 ) -> dict[str, Any]:
     """Events, the outlines (N, 2) in the site's metres by id, against the polygons."""
-    true_from_map = np.linalg.inv(map_from_true)
-    reported = []
-    for name, ring_m in rings_m.items():
-        there_m = moved_frame(apply_homography(true_from_map, ring_m), frame, LocalFrame(simulation_origin()))
-        reported.append((name, drawn(pixels(there_m, size_px), size_px)))
-    everywhere = np.any([mask for _, mask in reported], axis=0) if reported else np.zeros(drawn_shape(size_px), bool)
+    reported = drawn_events(rings_m, frame, map_from_true, size_px)
+    everywhere = np.any([np.zeros(drawn_shape(size_px), bool), *(mask for _, mask in reported)], axis=0)
     hits, covered, touching = {}, {}, set()
     for name, each in truth["changes"].items():
         mask = drawn(np.array(each["px"], float), size_px)
-        overlaps = [int((mask & other).sum()) for _, other in reported]
-        touching |= {number for number, overlap in enumerate(overlaps) if overlap}
-        sizes = [int(other.sum()) for _, other in reported]
+        overlaps, sizes = np.array([[(mask & other).sum(), other.sum()] for _, other in reported]).reshape(-1, 2).T
+        touching |= set(np.flatnonzero(overlaps).tolist())
+        hits[name] = is_hit(each["kind"], int(mask.sum()), overlaps.tolist(), sizes.tolist())
         if each["kind"] == "area":
             covered[name] = round(float((mask & everywhere).sum() / mask.sum()), 2)
-            hits[name] = any(overlap >= _LEAST_COVERED * mask.sum() for overlap in overlaps)
-        else:
-            hits[name] = any(
-                overlap >= _LEAST_OVERLAP * min(mask.sum(), size) and overlap and size <= _MOST_TIMES * mask.sum()
-                for overlap, size in zip(overlaps, sizes)
-            )
     quiet = np.any([drawn(np.array(ring, float), size_px) for ring in truth["unchanged"].values()], axis=0)
     false = [name for name, mask in reported if (mask & quiet).sum() >= _FALSE_SHARE * max(1, mask.sum())]
-    by_kind = {
-        kind: f"{sum(hits[name] for name in names)} of {len(names)}"
-        for kind in ("appeared", "disappeared", "replaced", "area")
-        for names in [[name for name, each in truth["changes"].items() if each["kind"] == kind]]
-    }
     return {
-        "found": sum(hits.values()), "drawn": len(hits), "by_kind": by_kind, "false": len(false),
+        "found": sum(hits.values()), "drawn": len(hits), "by_kind": hits_by_kind(hits, truth), "false": len(false),
         "unchanged_m2": round(float(quiet.sum()) * _CELL_M**2), "events": len(reported),
-        "elsewhere": len(set(range(len(reported))) - touching) - len(false), "areas_covered": covered,
+        "elsewhere": len(reported) - len(touching) - len(false), "areas_covered": covered,
         "missed": [name for name, hit in hits.items() if not hit], "false_ids": false,
     }
+
+
+def drawn_events(
+    rings_m: dict[str, np.ndarray], frame: LocalFrame, map_from_true: np.ndarray, size_px: tuple[int, int]
+) -> list[tuple[str, np.ndarray]]:
+    """The cells of each event, by its id, on the ground of the drawn polygons."""
+    true_from_map, found = np.linalg.inv(map_from_true), []
+    for name, ring_m in rings_m.items():
+        there_m = moved_frame(apply_homography(true_from_map, ring_m), frame, LocalFrame(simulation_origin()))
+        found.append((name, drawn(pixels(there_m, size_px), size_px)))
+    return found
+
+
+def is_hit(kind: str, size: int, overlaps: list[int], sizes: list[int]) -> bool:
+    """Whether one of the events, each with its overlap and size in cells, is a drawn change of `size` cells."""
+    if kind == "area":
+        return any(overlap >= _LEAST_COVERED * size for overlap in overlaps)
+    return any(
+        overlap >= _LEAST_OVERLAP * min(size, other) and overlap > 0 and other <= _MOST_TIMES * size
+        for overlap, other in zip(overlaps, sizes)
+    )
+
+
+def hits_by_kind(hits: dict[str, bool], truth: dict[str, Any]) -> dict[str, str]:
+    """How many of the drawn changes of each kind were found, such as `3 of 4`."""
+    found = {}
+    for kind in ("appeared", "disappeared", "replaced", "area"):
+        names = [name for name, each in truth["changes"].items() if each["kind"] == kind]
+        found[kind] = f"{sum(hits[name] for name in names)} of {len(names)}"
+    return found
 
 
 def simulation_origin() -> Any:

@@ -7,6 +7,7 @@ sensor's size and its pixel's only in that ratio. `docs/errata.md` lists where t
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import chain
 
 import numpy as np
 
@@ -176,27 +177,31 @@ def plan_strips(
     width_m, length_m = footprint_size_m(camera, settings.height_m)
     spacing_m, photo_m = width_m * (1 - settings.side_overlap), length_m * (1 - settings.forward_overlap)
     outlines_m = np.concatenate([rings[0] for rings in polygons_m])
-    bearing_deg = settings.strip_bearing_deg
-    if not np.isfinite(bearing_deg):
-        bearing_deg = longest_bearing_deg(outlines_m)
+    wished_deg = settings.strip_bearing_deg
+    bearing_deg = wished_deg if np.isfinite(wished_deg) else longest_bearing_deg(outlines_m)
     turn = np.radians(90 - bearing_deg)
     # strip axes: x along the strips, y across
     strip_from_site = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     turned = [[ring @ strip_from_site.T for ring in rings] for rings in polygons_m]
     across = outlines_m @ strip_from_site[1]
     levels = _strip_levels(float(across.min()), float(across.max()), width_m, spacing_m)
-    reaches_m = np.full((len(levels), 2), 0.5 * spacing_m)
-    reaches_m[0, 0] = reaches_m[-1, 1] = 0.5 * width_m
-    bands = list(zip((levels - reaches_m[:, 0]).tolist(), (levels + reaches_m[:, 1]).tolist()))
+    bands = _strip_bands(levels, width_m, spacing_m)
     spans = zip(*(band_spans(rings, bands) for rings in turned))
     passes: list[Floats] = []
     for index, (level, parts) in enumerate(zip(levels, spans)):
-        strip = _passes(level, [span for part in parts for span in part], gap_m=2 * length_m, photo_m=photo_m)
+        strip = _passes(level, list(chain.from_iterable(parts)), gap_m=2 * length_m, photo_m=photo_m)
         passes += strip if index % 2 == 0 else [each[::-1] for each in reversed(strip)]
     return FlightPlan(
         np.array(passes) @ strip_from_site, settings.height_m, settings.speed_m_s, photo_m, spacing_m,
         float(bearing_deg % 360),
     )
+
+
+def _strip_bands(levels: Floats, width_m: float, spacing_m: float) -> list[tuple[float, float]]:
+    """From where to where each strip, at its level across, covers the ground: the outermost ones to their edge."""
+    reaches_m = np.full((len(levels), 2), 0.5 * spacing_m)
+    reaches_m[0, 0] = reaches_m[-1, 1] = 0.5 * width_m
+    return list(zip((levels - reaches_m[:, 0]).tolist(), (levels + reaches_m[:, 1]).tolist()))
 
 
 def _passes(

@@ -133,23 +133,29 @@ def _local_set(packet: bytes, body: int) -> LocalSet | None:
     """The set in a packet whose value begins at `body`; None where the checksum does not fit."""
     time_ns, version, is_sound = 0, 0, False
     values: dict[str, float] = {}
-    at = body
+    for tag, at, value in _items_in(packet, body):
+        if tag == CHECKSUM_TAG:
+            is_sound = len(value) == 2 and int.from_bytes(value, "big") == checksum(packet[:at])
+        elif tag == VERSION_TAG:
+            version = int.from_bytes(value[:2], "big")
+        elif not 0 < len(value) <= 8:
+            continue
+        elif tag == TIME_TAG:
+            time_ns = int.from_bytes(value, "big") * 1000
+        elif tag in ITEMS:
+            values[ITEMS[tag].name] = _number(ITEMS[tag], value)
+    return LocalSet(time_ns if time_ns < 2**63 else 0, version, values) if is_sound else None
+
+
+def _items_in(packet: bytes, at: int) -> Iterator[tuple[int, int, bytes]]:
+    """The items of a set from `at` on: tag, where the value begins, the value. Raises InputError for a damaged one."""
     while at < len(packet):
         tag, at = _ber_oid(packet, at)
         length, at = _ber_length(packet, at)
         if at + length > len(packet):
             raise InputError("an item that is longer than its set")
-        value = packet[at: at + length]
-        if tag == CHECKSUM_TAG:
-            is_sound = length == 2 and int.from_bytes(value, "big") == checksum(packet[:at])
-        elif tag == TIME_TAG and 0 < length <= 8:
-            time_ns = int.from_bytes(value, "big") * 1000
-        elif tag == VERSION_TAG and length:
-            version = int.from_bytes(value[:2], "big")
-        elif tag in ITEMS and 0 < length <= 8:
-            values[ITEMS[tag].name] = _number(ITEMS[tag], value)
+        yield tag, at, packet[at: at + length]
         at += length
-    return LocalSet(time_ns if time_ns < 2**63 else 0, version, values) if is_sound else None
 
 
 def _number(item: Item, value: bytes) -> float:

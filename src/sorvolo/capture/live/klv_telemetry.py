@@ -136,15 +136,12 @@ def metadata_of(sets: Sequence[tuple[int, LocalSet]], counts: Counter[str], name
 
     `counts` are what `klv.local_sets` counted. Raises InputError, which calls the file `name`, without a usable sample.
     """
-    video_ns = [stamp_ns for stamp_ns, each in sets if each.time_ns]
-    timed = [each for _, each in sets if each.time_ns]
-    counts["no_time"] += len(sets) - len(timed)
-    rows = [columns_of(each) for each in timed]
+    dated = [(stamp_ns, each) for stamp_ns, each in sets if each.time_ns]
+    counts["no_time"] += len(sets) - len(dated)
+    timed, video_ns = [each for _, each in dated], [stamp_ns for stamp_ns, _ in dated]
+    is_tied = min(video_ns, default=-1) >= 0  # for all samples or for none
     telemetry = clean(
-        FORMAT, name, [each.time_ns for each in timed],
-        {column: [row.get(column, nan) for row in rows] for column in TELEMETRY_COLUMNS},
-        # a tie to the video holds for all samples or for none
-        video_ns if min(video_ns, default=-1) >= 0 else None,
+        FORMAT, name, [each.time_ns for each in timed], _columns_of_all(timed), video_ns if is_tied else None,
         notices=klv_notices(counts),
     )
     lens = next((each for each in timed if isfinite(each["sensor_horizontal_fov_deg"])), None)
@@ -162,8 +159,7 @@ def _sets_in(path: Path, counts: Counter[str]) -> list[tuple[int, LocalSet]]:
             if not streams or not container.streams.video:
                 return []
             for packet in container.demux([container.streams.video[0], *streams]):
-                stamp = packet.pts if packet.pts is not None else packet.dts
-                stamp_ns = -1 if stamp is None else round(stamp * packet.time_base * 1_000_000_000)
+                stamp_ns = _stamp_ns(packet)
                 if packet.stream.type != "video":
                     found += [(stamp_ns, each) for each in local_sets(bytes(packet), counts)]
                 elif stamp_ns >= 0:
@@ -175,6 +171,18 @@ def _sets_in(path: Path, counts: Counter[str]) -> list[tuple[int, LocalSet]]:
 
 
 # ---- inside ---------------------------------------------------------------------------------------------------
+
+
+def _columns_of_all(sets: Sequence[LocalSet]) -> dict[str, list[float]]:
+    """Telemetry's columns over several sets, NaN where one states nothing."""
+    rows = [columns_of(each) for each in sets]
+    return {column: [row.get(column, nan) for row in rows] for column in TELEMETRY_COLUMNS}
+
+
+def _stamp_ns(packet: Any) -> int:
+    """When a packet is shown, ns on its file's clock; -1 where it states nothing."""
+    stamp = packet.pts if packet.pts is not None else packet.dts
+    return -1 if stamp is None else round(stamp * packet.time_base * 1_000_000_000)
 
 
 def _name(stream: Any) -> str:

@@ -118,12 +118,7 @@ def prepare(
         return _found_by_pictures(source, site)
     if not source.telemetry.has_fixes:
         return _without_gps(source, settings, site, telemetry_named, known_ground)
-    if site is not None and site.is_local:
-        raise InputError(
-            f"the site {site.name} has no geo-reference, but the flight {source.name} has GPS: map it into a new site "
-            "folder"
-        )
-    laid = None if site is None else _laid(site, source, founds_site=founds_site)
+    laid = _laid(site, source, founds_site=founds_site)
     setup = _with_gps(source, settings, site, laid, telemetry_named, ground_m)
     return setup if known_ground is None else _with_known_ground(setup, known_ground)
 
@@ -198,12 +193,19 @@ def _without_gps(
     )
 
 
-def _laid(site: Site, source: Source, *, founds_site: bool) -> Geodetic:
-    """The origin of the frame in which a flight is laid: the site's.
+def _laid(site: Site | None, source: Source, *, founds_site: bool) -> Geodetic | None:
+    """The origin of the frame in which a flight with GPS is laid: the site's; None without a site.
 
     The flight that made the site was laid before the ground's height was known; the metres of a degree depend on it in
-    the fifth digit, which is 0.1 mm between frames.
+    the fifth digit, which is 0.1 mm between frames. Raises InputError for a site that has no place on Earth.
     """
+    if site is None:
+        return None
+    if site.is_local:
+        raise InputError(
+            f"the site {site.name} has no geo-reference, but the flight {source.name} has GPS: map it into a new site "
+            "folder"
+        )
     first = site_origin(source.telemetry) if founds_site else None
     place = (site.origin.latitude_deg, site.origin.longitude_deg)
     return first if first is not None and (first.latitude_deg, first.longitude_deg) == place else site.origin

@@ -50,11 +50,7 @@ def watch(
     InputError, SettingsError or StoreError with what to do.
     """
     until = until or threading.Event()
-    if outputs.cot:
-        check_host(cot_place(outputs.cot))
-        outputs.cot_tls.context()
-    finder = Detector.load(settings.model) if detector is None else detector
-    _demand_known_classes(finder, settings, outputs)
+    finder = _checked_detector(detector, settings, outputs)
     sources = open_sources([source], telemetry, camera, live=live, until=until)
     with ExitStack() as stack:
         for each in sources:
@@ -70,6 +66,16 @@ def watch(
                 each, finder, settings, replace(outputs, folder=folder), folder, until,
                 telemetry_named=telemetry is not None,
             )
+
+
+def _checked_detector(detector: Detects | None, settings: WatchSettings, outputs: WatchOutputs) -> Detects:
+    """The detector of a watch. Raises InputError or SettingsError where it, or where its finds go, cannot be used."""
+    if outputs.cot:
+        check_host(cot_place(outputs.cot))
+        outputs.cot_tls.context()
+    finder = Detector.load(settings.model) if detector is None else detector
+    _demand_known_classes(finder, settings, outputs)
+    return finder
 
 
 def _demand_known_classes(detector: Detects, settings: WatchSettings, outputs: WatchOutputs) -> None:

@@ -67,6 +67,20 @@ class WatchUpdate:
     is_resumed: bool
 
 
+@dataclass(frozen=True, eq=False)
+class _Tracks:
+    """The confirmed tracks after a frame, those that it shows, and those that it confirmed."""
+
+    confirmed: Sequence[Track]
+    seen: Sequence[Track]
+    new: Sequence[Track]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many there are of each class."""
+        return count_by_class(self.confirmed)
+
+
 class WatchRun:
     """One watch. A context manager; `finish` writes what is known at the end, however the watch ended.
 
@@ -143,40 +157,41 @@ class WatchRun:
         with log.stage("track"):
             taken = self._places.take(frame, time_ns, found)
         sighted = [each for each in taken.sightings if each is not None]
+        tracks = self._tracks_after(taken)
         log.searched(time_ns, found, 0 if self._places.site.is_local else len(sighted))
-        confirmed = [track for track in self._places.tracks() if track.confirmed]
-        counts = count_by_class(confirmed)
-        seen_ids = set(taken.track_ids)
-        seen = [track for track in confirmed if track.id in seen_ids]
-        new = [track for track in confirmed if track.id in taken.new_ids]
         with log.stage("hand over"):
             self._files.add(SeenFrame(
-                frame, time_ns, found, taken.sightings, taken.track_ids, frozenset(each.id for each in confirmed),
-                f"frame {frame.name}, counted so far: {counted_list(counts)}", taken.segment,
+                frame, time_ns, found, taken.sightings, taken.track_ids,
+                frozenset(each.id for each in tracks.confirmed),
+                f"frame {frame.name}, counted so far: {counted_list(tracks.counts)}", taken.segment,
             ))
-            self._hand_over(taken, confirmed, seen, new, is_resumed=is_resumed)
+            self._hand_over(taken, tracks, is_resumed=is_resumed)
         latency_s = time.monotonic() - arrived_s
         if not is_resumed:
             log.latency_s.append(latency_s)
         source = self._setup.source
         return WatchUpdate(
-            frame.name, time_ns, found, sighted, new, seen, counts,
+            frame.name, time_ns, found, sighted, tracks.new, tracks.seen, tracks.counts,
             latency_s, log.read, log.detected, source.frame_count, log.seconds, self._folder,
             self._places.site, taken.segment, (frame.image.shape[1], frame.image.shape[0]),
             frame.time_ns - source.start_ns, self._places.view(frame), is_resumed,
         )
 
-    def _hand_over(
-        self, taken: Taken, confirmed: Sequence[Track], seen: Sequence[Track], new: Sequence[Track], *,
-        is_resumed: bool,
-    ) -> None:
+    def _tracks_after(self, taken: Taken) -> "_Tracks":
+        confirmed = [track for track in self._places.tracks() if track.confirmed]
+        seen = [track for track in confirmed if track.id in set(taken.track_ids)]
+        return _Tracks(confirmed, seen, [each for each in confirmed if each.id in taken.new_ids])
+
+    def _hand_over(self, taken: Taken, tracks: "_Tracks", *, is_resumed: bool) -> None:
         """Crops, reports and withdrawals of one frame, and the files that show all tracks so far."""
-        for track in seen:
+        for track in tracks.seen:
             self._files.crop_of(track)
         self._files.forget(taken.merged)
-        self._notifier.report(new, seen, self._files.crop_names, taken.segment, is_resumed=is_resumed)
+        self._notifier.report(
+            tracks.new, tracks.seen, self._files.crop_names, taken.segment, is_resumed=is_resumed
+        )
         self._notifier.withdraw(taken.merged)
-        self._files.show(confirmed)
+        self._files.show(tracks.confirmed)
 
     def finish(self, *, ended: str, skipped: int) -> None:
         """The last word on every track, the files for other programs, and the report."""
