@@ -28,6 +28,7 @@ from sorvolo.cli.options import (
     names,
 )
 from sorvolo.cli.places import place_heading, place_words
+from sorvolo.cli.places_of_sites import Passing, not_sent, opened_site
 from sorvolo.cli.progress import ProgressReport, Resumed, rate_words
 from sorvolo.cli.shown import (
     newest_version,
@@ -60,7 +61,9 @@ class ChangeMethod(StrEnum):
 LaterFlights = Annotated[
     list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources of a later flight.")
 ]
-ComparedSite = Annotated[Path, typer.Option(help="Folder of the map that an earlier flight made.")]
+ComparedSite = Annotated[
+    str, typer.Option(help="Folder of the map that an earlier flight made, or s3://BUCKET/NAME.")
+]
 MethodOption = Annotated[
     ChangeMethod, typer.Option(help="robust: copes with light, shadows and wind. thesis: the baseline.")
 ]
@@ -132,14 +135,15 @@ def compare(
         model=model, thesis=thesis_options(thesis or []), trusts_map=trust_map,
         classes=names(classes),
     )
-    results = compare_and_read_results(
-        inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area, steps=steps,
-        live=LiveSettings(keeps_all=True, give_up_s=give_up), form=coordinates, again=again,
-    )
-    if as_json:
-        typer.echo(json.dumps({"site": str(site), "flights": results}, indent=1))
-    else:
-        show_results(results, site, Console(), coordinates)
+    with opened_site(site, writes=True) as place:
+        results = compare_and_read_results(
+            inputs, place.folder, settings, telemetry=telemetry, camera=camera or None, area=area, steps=steps,
+            live=LiveSettings(keeps_all=True, give_up_s=give_up), form=coordinates, again=again, sent=place.sent,
+        )
+        if as_json:
+            typer.echo(json.dumps({"site": str(place.folder), "flights": results}, indent=1))
+        else:
+            show_results(results, place.folder, Console(), coordinates)
     if any(each["comparison"]["headline"]["quality"] != "compared" for each in results):
         raise typer.Exit(TO_CHECK)
 
@@ -148,18 +152,22 @@ def compare_and_read_results(
     inputs: Sequence[Path | str], site: Path, settings: "CompareSettings", *, telemetry: Path | str | None = None,
     camera: str | None = None, area: Path | None = None, steps: Path | None = None,
     live: "LiveSettings | None" = None, form: PlaceFormat = PlaceFormat.LATLON, again: bool = False,
+    sent: Passing = not_sent,
 ) -> list[dict[str, Any]]:
-    """Compare with progress and announcements on stderr; report and changes of each flight, in order."""
+    """Compare with progress and announcements on stderr; report and changes of each flight, in order.
+
+    `sent` sees the mission's updates and may send what a flight added.
+    """
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.compare.flights import compare_flights
     from sorvolo.store.site.archive import Archive
 
     before = newest_version(site)
     with ended_by_signal(inputs) as until:
-        comparing = compare_flights(
+        comparing = sent(compare_flights(
             inputs, site, settings, telemetry=telemetry, camera=camera, area=area, steps=steps,
             live=live or LiveSettings(keeps_all=True), until=until, again=again,
-        )
+        ))
         known: list[AlreadyDone] = []
 
         def noted() -> "Iterator[CompareUpdate]":

@@ -11,12 +11,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson
+from sorvolo.cli.places_of_sites import SiteArgument, opened_site
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.shown import read_json, show_path
 
 
 def heights(
-    site: Annotated[Path, typer.Argument(help="Folder of the map.")],
+    site: SiteArgument,
     flight: Annotated[str, typer.Option(help="Which flight. Without it: that of the newest map.")] = "",
     cell: Annotated[
         float | None, typer.Option(help="Side of the height model's cells, m. Without it: 3 to 6 pixels of the map.")
@@ -32,11 +33,12 @@ def heights(
 
     Example: sorvolo heights field --flight DJI_0042 --cell 0.1
     """
-    report = make_and_read(site, flight, cell, has_orthophoto=orthophoto)
-    if as_json:
-        typer.echo(json.dumps({"site": str(site), "heights": report}, indent=1))
-    else:
-        show_heights(site, report, Console())
+    with opened_site(site, writes=True) as place:
+        report = make_and_read(place.folder, flight, cell, has_orthophoto=orthophoto)
+        if as_json:
+            typer.echo(json.dumps({"site": str(place.folder), "heights": report}, indent=1))
+        else:
+            show_heights(place.folder, report, Console())
 
 
 def make_and_read(

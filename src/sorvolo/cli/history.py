@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson, Compression, PlaceFormat, PlaceFormatOption
+from sorvolo.cli.places_of_sites import SiteArgument, opened_site
 from sorvolo.cli.shown import site_of
 from sorvolo.errors import SettingsError
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def history(
-    site: Annotated[Path, typer.Argument(help="Folder of the map.")],
+    site: SiteArgument,
     at: Annotated[
         str | None, typer.Option(help="Version number, or a date or time (UTC): the newest version by then.")
     ] = None,
@@ -37,20 +38,33 @@ def history(
 
     Example: sorvolo history field --at 2026-05-31 --export may.tif
     """
+    if at is not None and export is None:
+        raise SettingsError("--at chooses the map to write: give --export FILE.tif, FILE.png or FILE.kmz as well")
+    with opened_site(site) as place:
+        if export is None:
+            _list(place.folder, coordinates, as_json=as_json)
+        else:
+            _export(place.folder, at, export, compress, as_json=as_json)
+
+
+def _list(site: Path, coordinates: PlaceFormat, *, as_json: bool) -> None:
+    from sorvolo.missions.site.history import site_history
+    from sorvolo.store.exports.plain import plain_json
+
+    entries = site_history(site)
+    if as_json:
+        typer.echo(json.dumps({"site": str(site), "versions": plain_json(entries)}, indent=1))
+        return
+    _show(entries, Console())
+    if entries:
+        _show_place(site, coordinates, Console())
+
+
+def _export(site: Path, at: str | None, export: Path, compress: Compression, *, as_json: bool) -> None:
     from sorvolo.missions.site.history import export_version, site_history
     from sorvolo.store.exports.plain import plain_json
 
-    if at is not None and export is None:
-        raise SettingsError("--at chooses the map to write: give --export FILE.tif, FILE.png or FILE.kmz as well")
     entries = site_history(site)
-    if export is None:
-        if as_json:
-            typer.echo(json.dumps({"site": str(site), "versions": plain_json(entries)}, indent=1))
-        else:
-            _show(entries, Console())
-            if entries:
-                _show_place(site, coordinates, Console())
-        return
     version = export_version(site, at, export, compress=compress.value)
     if as_json:
         entry = next(each for each in entries if each.version == version.id)

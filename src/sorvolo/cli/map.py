@@ -27,6 +27,7 @@ from sorvolo.cli.options import (
     Offset,
     names,
 )
+from sorvolo.cli.places_of_sites import Passing, not_sent, opened_site
 from sorvolo.cli.progress import show_progress
 from sorvolo.cli.shown import newest_version, read_json, show_done, show_notices_and_warnings, show_path
 from sorvolo.survey.wording import counted, counted_list
@@ -56,6 +57,9 @@ class Transform(StrEnum):
     HOMOGRAPHY = "homography"
 
 
+MappedSite = Annotated[
+    str, typer.Option(help="Folder of the map, or s3://BUCKET/NAME; an existing map is extended.")
+]
 Resolution = Annotated[
     float | None, typer.Option(help="Ground resolution of a new map, m a pixel. Without it: the frames' own.")
 ]
@@ -112,7 +116,7 @@ WithHeights = Annotated[
 
 def map_command(
     inputs: Annotated[list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources.")],
-    site: Annotated[Path, typer.Option(help="Folder of the map; an existing map is extended.")],
+    site: MappedSite,
     telemetry: LiveTelemetry = None,
     camera: Camera = "",
     area: Area = None,
@@ -163,11 +167,12 @@ def map_command(
         model=model, thesis=stitching_settings(thesis or [], transform=transform.value),
         control_sigma_m=gcp_accuracy, checks=names(check), memory_mb=memory, classes=names(classes),
     )
-    reports = map_and_read_reports(
-        inputs, site, settings, telemetry=telemetry, camera=camera or None, area=area,
-        live=LiveSettings(keeps_all=True, give_up_s=give_up), control=gcp, base=base, again=again,
-    )
-    _print(reports, site, with_heights=heights, as_json=as_json)
+    with opened_site(site, writes=True) as place:
+        reports = map_and_read_reports(
+            inputs, place.folder, settings, telemetry=telemetry, camera=camera or None, area=area,
+            live=LiveSettings(keeps_all=True, give_up_s=give_up), control=gcp, base=base, again=again, sent=place.sent,
+        )
+        _print(reports, place.folder, with_heights=heights, as_json=as_json)
     if any(each["headline"]["quality"] != "map" for each in reports):
         raise typer.Exit(TO_CHECK)
 
@@ -198,18 +203,22 @@ def map_and_read_reports(
     inputs: Sequence[Path | str], site: Path, settings: "MapSettings", *, telemetry: Path | str | None = None,
     camera: str | None = None, area: Path | None = None,
     live: "LiveSettings | None" = None, control: Path | None = None, base: Path | None = None, again: bool = False,
+    sent: Passing = not_sent,
 ) -> list[dict[str, Any]]:
-    """Map with progress on stderr; the reports of the flights, in order, and of those that were mapped already."""
+    """Map with progress on stderr; the reports of the flights, in order, and of those that were mapped already.
+
+    `sent` sees the mission's updates and may send what a flight added.
+    """
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.map.flights import map_flights
     from sorvolo.store.site.archive import Archive
 
     before = newest_version(site)
     with ended_by_signal(inputs) as until:
-        mapping = map_flights(
+        mapping = sent(map_flights(
             inputs, site, settings, telemetry=telemetry, camera=camera, area=area,
             live=live or LiveSettings(keeps_all=True), until=until, control=control, base=base, again=again,
-        )
+        ))
         known: list[AlreadyDone] = []
 
         def noted() -> Iterator["MosaicUpdate"]:

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -13,6 +12,7 @@ from rich.table import Table
 
 from sorvolo.cli.options import AsJson, PlaceFormat, PlaceFormatOption
 from sorvolo.cli.places import place_heading, place_words
+from sorvolo.cli.places_of_sites import SiteArgument, opened_site
 from sorvolo.cli.shown import site_of, unit_of
 from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
@@ -25,7 +25,7 @@ _COLOURS = {"confirmed": "green", "rejected": "red"}
 
 
 def review(
-    site: Annotated[Path, typer.Argument(help="Folder of the map.")],
+    site: SiteArgument,
     ids: Annotated[
         list[str] | None,
         typer.Argument(help="Changes to judge: their ids, or numbers with --flight.", show_default="list all changes"),
@@ -49,17 +49,18 @@ def review(
     from sorvolo.survey.findings import Verdict
 
     _demand_whole_verdict(ids, confirm, reject, note)
-    if ids:
-        verdict = Verdict.CONFIRMED if confirm else Verdict.REJECTED
-        changes = review_changes(site, ids, verdict, note, flight=flight)
-    else:
-        changes = list_changes(site, flight)
-    place_of = site_of(site)
-    if as_json:
-        rows = [_plain(each, place_of) for each in changes]
-        typer.echo(json.dumps({"site": str(site), "changes": rows}, indent=1))
-    else:
-        _show(changes, place_of, coordinates, Console())
+    with opened_site(site, writes=bool(ids)) as place:
+        if ids:
+            verdict = Verdict.CONFIRMED if confirm else Verdict.REJECTED
+            changes = review_changes(place.folder, ids, verdict, note, flight=flight)
+        else:
+            changes = list_changes(place.folder, flight)
+        place_of = site_of(place.folder)
+        if as_json:
+            rows = [_plain(each, place_of) for each in changes]
+            typer.echo(json.dumps({"site": str(place.folder), "changes": rows}, indent=1))
+        else:
+            _show(changes, place_of, coordinates, Console())
 
 
 def _demand_whole_verdict(ids: list[str] | None, confirm: bool, reject: bool, note: str) -> None:

@@ -1,18 +1,16 @@
 """`sorvolo site`: a site copied to another place, and the copy verified."""
 
 import json
-from collections.abc import Generator
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from sorvolo.cli.options import AsJson
-from sorvolo.cli.progress import ProgressReport
+from sorvolo.cli.places_of_sites import show_copy
 
 if TYPE_CHECKING:
-    from sorvolo.store.copies.transfer import CopyOutcome, CopyUpdate
+    from sorvolo.store.copies.transfer import CopyOutcome
 
 site_app = typer.Typer(no_args_is_help=True)
 
@@ -26,8 +24,8 @@ def site() -> None:
 
 @site_app.command("copy")
 def copy_command(
-    source: Annotated[str, typer.Argument(help="Folder of the map.")],
-    target: Annotated[str, typer.Argument(help="A new or empty folder, or that of an earlier copy of this map.")],
+    source: Annotated[str, typer.Argument(help="Folder of the map, or s3://BUCKET/NAME.")],
+    target: Annotated[str, typer.Argument(help="A new or empty folder or s3:// place, or that of an earlier copy.")],
     verify: Annotated[bool, typer.Option("--verify", help="Copy nothing: compare the copy with the map.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -43,7 +41,7 @@ def copy_command(
     from sorvolo.missions.site.copy import copy_site, verify_copy
 
     work = verify_copy(source, target) if verify else copy_site(source, target)
-    outcome = _shown(work, "comparing, file" if verify else "copying, file")
+    outcome = show_copy(work, "comparing, file" if verify else "copying, file")
     if as_json:
         row = asdict(outcome) | {"faults": dict(outcome.faults), "is_whole": not outcome.faults}
         typer.echo(json.dumps({"source": source, "target": target, **row}, indent=1))
@@ -51,19 +49,6 @@ def copy_command(
         _print(outcome, target, verified=verify)
     if outcome.faults:
         raise typer.Exit(1)
-
-
-def _shown(work: "Generator[CopyUpdate, None, CopyOutcome]", task: str) -> "CopyOutcome":
-    """Do the work with progress on stderr."""
-    with ProgressReport(Console(stderr=True)) as progress:
-        progress.show("looking at both places")
-        while True:
-            try:
-                update = next(work)
-            except StopIteration as end:
-                return end.value
-            words = f"{update.done_bytes / 1e6:,.0f} of {update.bytes / 1e6:,.0f} MB"
-            progress.show(task, update.done, update.files, words)
 
 
 def _print(outcome: "CopyOutcome", target: str, *, verified: bool) -> None:

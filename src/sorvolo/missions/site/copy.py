@@ -46,13 +46,19 @@ def _ends(source: str, target: str) -> tuple[SiteEnd, SiteEnd]:
 
 def open_end(address: str) -> SiteEnd:
     """The place that an address names. Raises SettingsError for one that names none."""
+    folder = folder_of(address)
+    return BucketEnd(open_objects(address)) if folder is None else FolderEnd(folder)
+
+
+def folder_of(address: str) -> Path | None:
+    """The folder that an address names; None for a place in an object store. Raises SettingsError for any other."""
     parts = urlsplit(address)
     if "://" not in address:
-        return FolderEnd(Path(address))
+        return Path(address)
     if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path:
-        return FolderEnd(Path(unquote(parts.path)))
+        return Path(unquote(parts.path))
     if parts.scheme == "s3":
-        return BucketEnd(open_objects(address))
+        return None
     raise SettingsError(f"{parts.scheme}:// is no place of sites; give a folder, file:///FOLDER or s3://BUCKET/NAME")
 
 

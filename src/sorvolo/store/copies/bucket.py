@@ -95,17 +95,23 @@ class Manifest:
             ) from error
 
 
+class OvertakenError(StoreError):
+    """Another writer has changed the site in the store meanwhile."""
+
+
 class BucketEnd:
     """A place in an object store that a site is copied from or to.
 
-    `base` is the manifest's id that a working copy was made of: another writer's work since then is not replaced.
-    None: whatever the site in the folder contains is replaced.
+    `base` is the id of the manifest that a working copy was made of ("": none was there): no other one is replaced.
+    None: one is replaced whose content the new state has.
     """
 
     def __init__(self, objects: Objects, base: str | None = None) -> None:
         self._objects, self._base = objects, base
         self._round = _Round()
-        self.written = ""  # the id of the manifest that `conclude` wrote
+        self.written: Manifest | None = None  # by `conclude`
+        self.shown: Manifest | None = None  # what `state` last gave
+        self.tile_bytes: Mapping[str, int] = {}  # of the site's tiles, by SHA-256, after `state` or `conclude`
 
     @property
     def name(self) -> str:
@@ -150,12 +156,12 @@ class BucketEnd:
         files = dict(manifest.files)
         files |= {tile_path(each): SiteFile(tile_path(each), sizes.get(tile_path(each), 0), each) for each in tiles}
         files |= {path: SiteFile(path, 0) for path in keyframes - files.keys()}
-        self._round.state_id = manifest.id
+        self.shown, self.tile_bytes = manifest, {each: sizes.get(tile_path(each), 0) for each in tiles}
         return SiteState(held, path, files)
 
     def is_still(self, state: SiteState, scratch: Path) -> bool:
         """Whether the site is as it was."""
-        return self.manifest().id == self._round.state_id
+        return self.shown is not None and self.manifest().id == self.shown.id
 
     def opened(self, file: SiteFile) -> AbstractContextManager[BinaryIO]:
         """A file's bytes; reading raises FileNotFoundError when it is gone."""
@@ -186,15 +192,15 @@ class BucketEnd:
         manifest, self._round.etag = self.find_manifest()
         self._round.manifest = manifest
         if manifest is None:
-            if self._base is not None:
+            if self._base:
                 raise StoreError(f"the site at {self.name} is gone; copy it there again: sorvolo site copy")
             self._refuse_foreign()
         else:
+            if self._base not in (None, manifest.id):
+                raise self._conflict()
             refuse_other(self.name, manifest.held.identity, new.held)
             if self._base is None:
                 refuse_loss(self.name, missing_from(manifest.held, manifest.files, new))
-            elif self._base != manifest.id:
-                raise self._conflict()
         self._round.stored = self._objects.sizes("")
 
     def lacks(self, state: SiteState) -> list[SiteFile]:
@@ -203,8 +209,9 @@ class BucketEnd:
         lacking = []
         for file in state.files.values():
             former = known.get(file.path)
-            same = replace(file, sha256=former.sha256) if former and _is_same_picture(file, former) else file
-            if same.sha256 and self._round.stored.get(_key(same)) == same.size:
+            same = former if former and _is_same_picture(file, former) else file
+            stored = self._round.stored.get(_key(same)) if same.sha256 else None
+            if stored is not None and same.size in (stored, 0):  # 0: not fetched into a working copy
                 self._round.files[file.path] = same
             else:
                 lacking.append(file)
@@ -224,20 +231,34 @@ class BucketEnd:
 
     def conclude(self, state: SiteState) -> None:
         """Make all that was put the site, unless another writer was faster: then StoreError, and his work stays."""
-        sha256 = hashlib.sha256(state.catalogue.read_bytes()).hexdigest()
-        size = state.catalogue.stat().st_size
-        if self._round.stored.get(_catalogue_key(sha256)) != size:
-            with state.catalogue.open("rb") as stream:
-                self._objects.write(_catalogue_key(sha256), stream)
-        former = self._round.manifest
-        files = {path: each for path, each in self._round.files.items() if path in state.files and not tile_of(path)}
+        former, stored = self._round.manifest, self._round.stored
+        self.tile_bytes = {
+            sha256: stored.get(path, each.size)
+            for path, each in self._round.files.items() if (sha256 := tile_of(path)) and path in state.files
+        }
+        files = {
+            path: replace(each, stamp=0)
+            for path, each in self._round.files.items() if path in state.files and not tile_of(path)
+        }
+        if former and former.held == state.held and dict(former.files) == files:
+            self.written = former  # nothing is new
+            return
+        size, sha256 = self._store_catalogue(state.catalogue)
         manifest = Manifest(
             secrets.token_hex(16), 1 + (former.generation if former else 0),
             datetime.now(UTC).isoformat(timespec="seconds"), state.held, (size, sha256), files,
         )
         self._swap(manifest)
-        self.written = manifest.id
+        self.written = manifest
         self._show(manifest)
+
+    def _store_catalogue(self, path: Path) -> tuple[int, str]:
+        """Store the catalogue under its content's name; its bytes and SHA-256."""
+        sha256, size = hashlib.sha256(path.read_bytes()).hexdigest(), path.stat().st_size
+        if self._round.stored.get(_catalogue_key(sha256)) != size:
+            with path.open("rb") as stream:
+                self._objects.write(_catalogue_key(sha256), stream)
+        return size, sha256
 
     def free_bytes(self) -> int | None:
         """Nobody knows."""
@@ -286,8 +307,8 @@ class BucketEnd:
                 f"{self.name} is not empty and holds no site (there is {foreign[0][:80]!r}); choose another place"
             )
 
-    def _conflict(self) -> StoreError:
-        return StoreError(
+    def _conflict(self) -> OvertakenError:
+        return OvertakenError(
             f"another writer has changed the site at {self.name} meanwhile; nothing there was changed, and nothing "
             "here is lost. Run the same command again"
         )
@@ -299,7 +320,6 @@ class _Round:
 
     manifest: Manifest | None = None
     etag: str = ""
-    state_id: str = ""
     stored: Mapping[str, int] = field(default_factory=dict)
     files: dict[str, SiteFile] = field(default_factory=dict)
     claimed: set[str] = field(default_factory=set)
@@ -314,7 +334,7 @@ class _Round:
 
 
 def _is_same_picture(file: SiteFile, former: SiteFile) -> bool:
-    return not file.sha256 and file.is_lasting and file.size == former.size
+    return not file.sha256 and file.is_lasting and file.size in (former.size, 0)
 
 
 def _key(file: SiteFile) -> str:

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import sqlite3
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -39,10 +40,13 @@ from sorvolo.store.site import catalogue as records
 from sorvolo.store.site.catalogue import Catalogue
 from sorvolo.store.site.catalogue_place import CATALOGUE, POINTER, is_site
 from sorvolo.store.site.files import COPYING, JOURNAL, LOCK, SiteFiles, lock_folder, refuse_unfinished
+from sorvolo.store.site.origin import ORIGIN, TILE_SIZES, UNSENT
 from sorvolo.store.site.row_copies import copy_rows
 from sorvolo.store.site.sqlite_database import SqliteDatabase
 
-_OF_THE_CATALOGUE = frozenset({CATALOGUE, f"{CATALOGUE}-wal", f"{CATALOGUE}-shm", POINTER, LOCK, COPYING})
+_OF_THE_FOLDER = frozenset({
+    CATALOGUE, f"{CATALOGUE}-wal", f"{CATALOGUE}-shm", POINTER, LOCK, COPYING, ORIGIN, TILE_SIZES, UNSENT,
+})
 
 
 class FolderEnd:
@@ -126,11 +130,19 @@ class FolderEnd:
             held, files = self._held(scratch)
             if held is not None:
                 refuse_other(self.name, held.identity, new.held)
-                refuse_loss(self.name, missing_from(held, files, new))
+                self._refuse_loss(held, files, new)
         self.folder.mkdir(exist_ok=True)
         note = {"identity": new.held.identity, "newest_version": new.held.newest}
         atomic_write_bytes(self.folder / COPYING, json.dumps(note).encode())
         remove_leftovers([self.folder, *(each for each in self.folder.rglob("*") if each.is_dir())])
+
+    def _refuse_loss(self, held: CatalogueState, files: Mapping[str, SiteFile], new: SiteState) -> None:
+        refuse_loss(self.name, missing_from(held, files, new))
+
+    def find_held(self) -> CatalogueState | None:
+        """What the folder's catalogue holds, unfinished runs apart; None for no map."""
+        with tempfile.TemporaryDirectory(prefix="sorvolo-") as scratch:
+            return self._held(Path(scratch))[0]
 
     def lacks(self, state: SiteState) -> list[SiteFile]:
         """The files that have yet to be put: not here, or of another size or time."""
@@ -283,7 +295,7 @@ def _listed(
         if path in lasting or (is_site_path(path) and not is_left_out(path, keyframes, owed)):
             if (file := _file(folder, path, lasting.get(path, ""))) is not None:
                 found[path] = file
-        elif not (path in _OF_THE_CATALOGUE or is_site_path(path) or tile_of(path) or _is_passing(path)):
+        elif not (path in _OF_THE_FOLDER or is_site_path(path) or tile_of(path) or _is_passing(path)):
             foreign.append(path)
     for path in lasting.keys() - found.keys():
         found[path] = SiteFile(path, 0, lasting[path])
@@ -306,7 +318,7 @@ def _is_passing(path: str) -> bool:
 
 def _foreign(folder: Path) -> Iterator[str]:
     for path in folder.iterdir():
-        if path.name != LOCK and not path.name.startswith(TEMPORARY_PREFIX):
+        if path.name not in (LOCK, ORIGIN, TILE_SIZES, UNSENT) and not path.name.startswith(TEMPORARY_PREFIX):
             yield path.name
 
 

@@ -20,6 +20,7 @@ from sorvolo.store.site import catalogue as records
 from sorvolo.store.site.catalogue import Catalogue, VersionEntry
 from sorvolo.store.site.catalogue_place import CATALOGUE, POINTER, create_database, is_site
 from sorvolo.store.site.names import checked_document, checked_image_path, checked_name
+from sorvolo.store.site.origin import ORIGIN, TILE_SIZES, UNSENT, find_origin
 from sorvolo.store.site.tiles import TileBlobs, TileView
 from sorvolo.survey.flight import Site
 
@@ -36,6 +37,10 @@ COPYING = "copying.json"
 """In the folder while a copy of a site is made there."""
 
 _MOST_REPORT_BYTES = 256_000_000  # of a report.json: an hour's track takes a hundredth
+
+
+class BusyError(StoreError):
+    """Another process writes the site."""
 
 
 class HeightFile(StrEnum):
@@ -56,7 +61,8 @@ class SiteFiles:
 
     def __init__(self, folder: Path, catalogue: Catalogue, lock: int | None) -> None:
         self.folder, self.catalogue = folder, catalogue
-        self.blobs = TileBlobs(folder / "tiles")
+        self._origin = find_origin(folder)
+        self.blobs = TileBlobs(folder / "tiles", self._origin)
         self._lock = lock
 
     @classmethod
@@ -145,6 +151,8 @@ class SiteFiles:
         Raises StoreError when it is gone, damaged, or no keyframe of this flight.
         """
         name = checked_image_path(image_path, flight_id)
+        if self._origin is not None and not (self.folder / name).exists():
+            self._origin.fetch(name)
         try:
             return image_from_jpeg(read_below(self.folder, name), str(self.folder / name), step=step)
         except FileNotFoundError as error:
@@ -215,7 +223,7 @@ def lock_folder(folder: Path) -> int:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         os.close(lock)
-        raise StoreError(f"another process is mapping into {folder}; wait until it has finished") from error
+        raise BusyError(f"another process is mapping into {folder}; wait until it has finished") from error
     return lock
 
 
@@ -235,7 +243,8 @@ def _make_folder(folder: Path) -> None:
     if _has_catalogue(folder):
         return
     names = (path.name for path in folder.iterdir())
-    foreign = sorted(name for name in names if name != LOCK and not name.startswith(TEMPORARY_PREFIX))
+    own = (LOCK, ORIGIN, TILE_SIZES, UNSENT)
+    foreign = sorted(name for name in names if name not in own and not name.startswith(TEMPORARY_PREFIX))
     if foreign:
         raise StoreError(
             f"{folder} is no site: it holds {foreign[0]!r} and no {CATALOGUE}; choose a new or empty folder"

@@ -15,6 +15,7 @@ from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, sync_file
 from sorvolo.store.images import png_from_rgba, rgba_from_png
 from sorvolo.store.nofollow import read_below
 from sorvolo.store.site.names import checked_sha256, is_sha256
+from sorvolo.store.site.origin import Origin
 
 _CACHE_BYTES = 96 << 20  # the tiles of a map of some hectares, which half a dozen exports read one after the other
 
@@ -22,11 +23,12 @@ _CACHE_BYTES = 96 << 20  # the tiles of a map of some hectares, which half a doz
 class TileBlobs:
     """The folder `tiles/<aa>/<sha256>.png`; a blob is never overwritten, so versions of a map share it.
 
-    The tiles read last are kept in memory. Threads may share it.
+    The tiles read last are kept in memory. A tile that is not there is fetched from `origin`, in the folder of a
+    working copy. Threads may share it.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, origin: Origin | None = None) -> None:
+        self._folder, self._origin = folder, origin
         self.cache_bytes = _CACHE_BYTES
         self._unsynced: set[str] = set()
         self._read: OrderedDict[str, ImageRGBA] = OrderedDict()
@@ -56,7 +58,7 @@ class TileBlobs:
                 self._read.move_to_end(sha256)
                 return self._read[sha256]
         path = self._path(sha256)
-        data = read_below(self._folder.parent, f"{self._folder.name}/{sha256[:2]}/{sha256}.png")
+        data = self._bytes(f"{self._folder.name}/{path.parent.name}/{path.name}")
         if hashlib.sha256(data).hexdigest() != sha256:
             raise StoreError(f"the tile {path} is damaged; restore it from a copy of the site, or map again")
         tile = rgba_from_png(data, str(path))
@@ -68,6 +70,14 @@ class TileBlobs:
             while self._read_bytes > self.cache_bytes:
                 self._forget(next(iter(self._read)))
         return tile
+
+    def _bytes(self, name: str) -> bytes:
+        try:
+            return read_below(self._folder.parent, name)
+        except FileNotFoundError:
+            if self._origin is None or not self._origin.fetch(name):
+                raise
+            return read_below(self._folder.parent, name)
 
     def sync(self) -> None:
         """Wait until every blob written so far is on the disk."""
@@ -94,8 +104,10 @@ class TileBlobs:
 
     def size_bytes(self, hashes: Iterable[str]) -> int:
         """How much room blobs take, each counted once."""
-        paths = [self._path(sha256) for sha256 in set(hashes)]
-        return sum(path.stat().st_size for path in paths if path.is_file())
+        paths = {sha256: self._path(sha256) for sha256 in set(hashes)}
+        here = {sha256: path.stat().st_size for sha256, path in paths.items() if path.is_file()}
+        there = {} if self._origin is None or len(here) == len(paths) else self._origin.tile_sizes()
+        return sum(here.get(sha256, there.get(sha256, 0)) for sha256 in paths)
 
     def remove_leftovers(self) -> int:
         """Delete the half-written blobs of killed writers and count them."""

@@ -1,0 +1,197 @@
+"""A site in an object store, worked on in a folder: fetched when asked for, sent back without losing others' work."""
+
+import hashlib
+import json
+import os
+import re
+import threading
+from collections.abc import Generator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Self
+
+from sorvolo.errors import StoreError
+from sorvolo.store.atomic import atomic_write_bytes
+from sorvolo.store.copies.bucket import BucketEnd, Manifest
+from sorvolo.store.copies.folder import FolderEnd
+from sorvolo.store.copies.objects import Objects, open_objects
+from sorvolo.store.copies.state import CatalogueState, DamagedError, SiteFile, SiteState, tile_of
+from sorvolo.store.copies.transfer import CopyUpdate, copy
+from sorvolo.store.site.catalogue_place import CATALOGUE
+from sorvolo.store.site.origin import ORIGIN, TILE_SIZES, UNSENT, cache_folder
+
+
+class WorkingCopy:
+    """The folder in which a site of a store is worked on, on this machine; made by `of`.
+
+    Catalogue, reports and maps lie in it; tiles and pictures of the flights come when they are asked for.
+    """
+
+    def __init__(self, objects: Objects, folder: Path) -> None:
+        self.folder, self._objects = folder, objects
+
+    @classmethod
+    def of(cls, address: str, below: Path | None = None) -> Self:
+        """The working copy of `s3://BUCKET/NAME`, in the folder of working copies, or `below` a folder in it.
+
+        Raises SettingsError for an address that names none.
+        """
+        objects = open_objects(address)
+        store = f"{os.environ.get('AWS_ENDPOINT_URL', '')} {objects.name}"
+        name = re.sub(r"[^A-Za-z0-9._-]", "-", objects.name.rsplit("/", 1)[1])
+        apart = f"{name}-{hashlib.sha256(store.encode()).hexdigest()[:12]}"
+        return cls(objects, (cache_folder() / "sites" / apart) if below is None else below / name)
+
+    @property
+    def address(self) -> str:
+        """Where the site lies."""
+        return self._objects.name
+
+    @property
+    def is_unsent(self) -> bool:
+        """Whether the folder may hold what the store has not."""
+        return (self.folder / UNSENT).is_file()
+
+    def begin_writing(self) -> None:
+        """Note, before the site is written to, that it is to be sent."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        atomic_write_bytes(self.folder / UNSENT, b"")
+
+    def fetch(self, scratch: Path) -> Generator[CopyUpdate, None, bool]:
+        """Make the folder what the store has now; whether there is a site. What was not sent yet is sent before.
+
+        Raises OvertakenError where another writer has changed the site, and StoreError as copies do.
+        """
+        if self.is_unsent:
+            yield from self.send(scratch)
+        end = BucketEnd(self._objects)
+        manifest, _ = end.find_manifest()
+        known = known_manifest(self.folder)
+        if manifest is None:
+            if known is not None:
+                raise StoreError(
+                    f"the site at {self.address} is gone; what this machine has of it lies in {self.folder}: delete "
+                    "that folder to begin a new site there"
+                )
+            return False
+        if known is None or known.id != manifest.id or not (self.folder / CATALOGUE).is_file():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            yield from copy(end, _WorkingFolder(self.folder), scratch)
+            self._note(end)
+        return True
+
+    def send(self, scratch: Path) -> Generator[CopyUpdate, None, bool]:
+        """Send what the store has not; whether there was anything. Raises OvertakenError; StoreError as copies do."""
+        known = known_manifest(self.folder)
+        folder = _WorkingFolder(self.folder)
+        if not folder.has_map:
+            (self.folder / UNSENT).unlink(missing_ok=True)
+            return False
+        before = "" if known is None else known.id
+        end = BucketEnd(self._objects, base=before)
+        outcome = yield from copy(folder, end, scratch, threads=8)
+        if outcome.faults:
+            lost = ", ".join(outcome.faults)
+            raise StoreError(f"{self.folder} lacks files that {self.address} has not either: {lost}")
+        self._note(end)
+        (self.folder / UNSENT).unlink(missing_ok=True)
+        return end.written is not None and end.written.id != before
+
+    def set_aside(self) -> Path:
+        """Keep the folder, which another writer's work has overtaken, under another name; where it lies now."""
+        moment = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+        kept = self.folder.with_name(f"{self.folder.name}-kept-{moment}")
+        (self.folder / UNSENT).unlink(missing_ok=True)
+        os.rename(self.folder, kept)
+        return kept
+
+    def _note(self, end: BucketEnd) -> None:
+        """Note what the folder was made of, or has become in the store."""
+        manifest = end.written or end.shown
+        assert manifest is not None
+        atomic_write_bytes(self.folder / TILE_SIZES, json.dumps(end.tile_bytes).encode())
+        note = {"address": self.address, "manifest": json.loads(manifest.data())}
+        atomic_write_bytes(self.folder / ORIGIN, json.dumps(note).encode())
+
+
+class StoreOrigin:
+    """Where the tiles and pictures of a working copy come from. Threads may share it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._end: BucketEnd | None = None
+        self._files: Mapping[str, SiteFile] = {}
+        self._sizes: Mapping[str, int] | None = None
+        self._opening = threading.Lock()
+
+    def fetch(self, path: str) -> bool:
+        """Put the file of this path into the folder, checked; whether the store has one. Raises StoreError."""
+        end = self._opened()
+        sha256 = tile_of(path)
+        file = SiteFile(path, self.tile_sizes().get(sha256, 0), sha256) if sha256 else self._files.get(path)
+        if file is None or (sha256 and not file.size):
+            return False
+        with end.opened(file) as stream:
+            try:
+                FolderEnd(self._folder).put(file, stream)
+            except FileNotFoundError:
+                return False
+            except DamagedError as error:
+                raise StoreError(f"{path} is damaged in the store, at {end.name}; restore it from a copy") from error
+        return True
+
+    def tile_sizes(self) -> Mapping[str, int]:
+        """The bytes of each tile in the store, by its SHA-256."""
+        with self._opening:
+            if self._sizes is None:
+                self._sizes = _read_sizes(self._folder / TILE_SIZES)
+            return self._sizes
+
+    def _opened(self) -> BucketEnd:
+        with self._opening:
+            if self._end is None:
+                self._end = BucketEnd(open_objects(_address_of(self._folder)))
+                known = known_manifest(self._folder)
+                self._files = {} if known is None else known.files
+            return self._end
+
+
+class _WorkingFolder(FolderEnd):
+    """The folder of a working copy: what is fetched when asked for need not be there; the store replaces it."""
+
+    @property
+    def has_map(self) -> bool:
+        """Whether a flight was ever completed."""
+        if not (self.folder / CATALOGUE).is_file():
+            return False
+        return self.find_held() is not None
+
+    def lacks(self, state: SiteState) -> list[SiteFile]:
+        """Nothing that comes when it is asked for."""
+        return [each for each in super().lacks(state) if not each.is_lasting]
+
+    def _refuse_loss(self, held: CatalogueState, files: Mapping[str, SiteFile], new: SiteState) -> None:
+        """All that was added here was sent before."""
+
+
+def known_manifest(folder: Path) -> Manifest | None:
+    """What a working copy was made of; None where nobody knows."""
+    try:
+        note = json.loads((folder / ORIGIN).read_bytes())
+    except (FileNotFoundError, ValueError):
+        return None
+    return Manifest.parsed(json.dumps(note.get("manifest")).encode(), str(folder)) if isinstance(note, dict) else None
+
+
+def _address_of(folder: Path) -> str:
+    return str(json.loads((folder / ORIGIN).read_bytes())["address"])
+
+
+def _read_sizes(path: Path) -> Mapping[str, int]:
+    try:
+        sizes = json.loads(path.read_bytes())
+    except (FileNotFoundError, ValueError):
+        return {}
+    return sizes if isinstance(sizes, dict) else {}
+
+
