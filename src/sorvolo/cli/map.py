@@ -161,18 +161,23 @@ def map_command(
     from sorvolo.missions.flight.settings import MapSettings
     from sorvolo.mosaic.roi_stitching import stitching_settings
 
-    place_catalogue(site, catalogue)
     settings = MapSettings(
         method.value, gsd, overlap, offset, ground_elevation, crs or None, compress.value if compress else None,
         model=model, thesis=stitching_settings(thesis or [], transform=transform.value),
         control_sigma_m=gcp_accuracy, checks=names(check), memory_mb=memory, classes=names(classes),
     )
     with opened_site(site, writes=True) as place:
+        place_catalogue(place.folder, catalogue)
         reports = map_and_read_reports(
             inputs, place.folder, settings, telemetry=telemetry, camera=camera or None, area=area,
             live=LiveSettings(keeps_all=True, give_up_s=give_up), control=gcp, base=base, again=again, sent=place.sent,
         )
         _print(reports, place.folder, with_heights=heights, as_json=as_json)
+    _exit_by(reports)
+
+
+def _exit_by(reports: Sequence[Mapping[str, Any]]) -> None:
+    """End with the code for results that are to be checked, where any is."""
     if any(each["headline"]["quality"] != "map" for each in reports):
         raise typer.Exit(TO_CHECK)
 

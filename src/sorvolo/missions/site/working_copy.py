@@ -10,7 +10,7 @@ from sorvolo.missions.site.copy import folder_of
 from sorvolo.store.copies.bucket import OvertakenError
 from sorvolo.store.copies.transfer import CopyUpdate
 from sorvolo.store.copies.working import WorkingCopy
-from sorvolo.store.site.catalogue_place import CATALOGUE
+from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.store.site.files import BusyError
 
 
@@ -28,7 +28,7 @@ def fetch_site(address: str, *, writes: bool) -> Generator[CopyUpdate, None, Pat
         try:
             there = yield from _fetched(working, Path(scratch))
         except BusyError:
-            if writes or not (working.folder / CATALOGUE).is_file():
+            if writes or not is_site(working.folder):
                 raise
             return working.folder  # a flight is being mapped into it: it is as new as that one
     if not there and not writes:

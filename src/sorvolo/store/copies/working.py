@@ -17,7 +17,7 @@ from sorvolo.store.copies.folder import FolderEnd
 from sorvolo.store.copies.objects import Objects, open_objects
 from sorvolo.store.copies.state import CatalogueState, DamagedError, SiteFile, SiteState, tile_of
 from sorvolo.store.copies.transfer import CopyUpdate, copy
-from sorvolo.store.site.catalogue_place import CATALOGUE
+from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.store.site.origin import ORIGIN, TILE_SIZES, UNSENT, cache_folder
 
 
@@ -74,7 +74,7 @@ class WorkingCopy:
                     "that folder to begin a new site there"
                 )
             return False
-        if known is None or known.id != manifest.id or not (self.folder / CATALOGUE).is_file():
+        if known is None or known.id != manifest.id or not is_site(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
             yield from copy(end, _WorkingFolder(self.folder), scratch)
             self._note(end)
@@ -162,9 +162,7 @@ class _WorkingFolder(FolderEnd):
     @property
     def has_map(self) -> bool:
         """Whether a flight was ever completed."""
-        if not (self.folder / CATALOGUE).is_file():
-            return False
-        return self.find_held() is not None
+        return is_site(self.folder) and self.find_held() is not None
 
     def lacks(self, state: SiteState) -> list[SiteFile]:
         """Nothing that comes when it is asked for."""
