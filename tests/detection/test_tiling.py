@@ -9,7 +9,7 @@ from toy_models import draw, rectangle_model
 
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.detector import Detector
-from sorvolo.detection.tiling import MOST_AT_ONCE_PX, MOST_WHOLE_PX, TASK, plan_tiles, scale_for
+from sorvolo.detection.tiling import MOST_AT_ONCE_PX, MOST_WHOLE_PX, TASK, plan_tiles, scale_for, whole_m_per_px
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.planning import BOTTOM_CRITICAL_M, required_px_per_m
 from sorvolo.survey.objects import CLASSES
@@ -47,6 +47,13 @@ class TestScale:
 
     def test_no_more_than_three_times(self) -> None:
         assert scale_for(_INFO, 1.0, CLASSES) == 3
+
+    @pytest.mark.parametrize(("size_px", "shown"), [((540, 960), 2.15), ((1080, 1920), 1.08), ((2160, 3840), 1.0)])
+    def test_frames_of_a_video_are_magnified_to_one_tile_at_most(self, size_px: tuple[int, int], shown: float) -> None:
+        m_per_px = whole_m_per_px(_INFO, CLASSES, 0.25, size_px)
+        assert scale_for(_INFO, m_per_px, CLASSES) == pytest.approx(shown, abs=0.01)
+        assert len(plan_tiles(size_px, _INFO, CLASSES, m_per_px=m_per_px).places_px) == 1 or shown == 1.0
+        assert whole_m_per_px(_INFO, CLASSES, 0.01, size_px) == 0.01
 
     def test_cars_alone_need_less(self) -> None:
         assert scale_for(_INFO, 0.2, ["car"]) == 1 < scale_for(_INFO, 0.2, CLASSES)

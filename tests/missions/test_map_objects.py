@@ -40,7 +40,7 @@ class Knowing(TruthDetector):
 
     def detect(
         self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
-        least_score: float | None = None, classes: Sequence[str] | None = None,
+        least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
     ) -> Detections:
         """See `TruthDetector.detect`."""
         try:
@@ -213,7 +213,7 @@ class Sees(Knowing):
 
     def detect(
         self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
-        least_score: float | None = None, classes: Sequence[str] | None = None,
+        least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
     ) -> Detections:
         """See `Knowing.detect`."""
         x, y = image.shape[1] / 2, image.shape[0] / 2
@@ -255,7 +255,7 @@ def test_a_changes_own_pictures_are_searched_for_the_classes_asked_for(simulated
     class Notes(Sees):
         def detect(
             self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
-            least_score: float | None = None, classes: Sequence[str] | None = None,
+            least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
         ) -> Detections:
             asked.append(classes)
             return super().detect(image)
@@ -290,7 +290,7 @@ def test_small_objects_are_looked_for_where_they_are_asked_for(simulated: Path, 
 
         def detect(
             self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
-            least_score: float | None = None, classes: Sequence[str] | None = None,
+            least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
         ) -> Detections:
             asked.append(tuple(classes or ()))
             return no_detections(self.classes)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import socket
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -16,7 +17,8 @@ from sorvolo.errors import InputError
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.missions.telemetry.doctor import correct_telemetry
+from sorvolo.missions.telemetry.doctor import CotReceiver, correct_telemetry
+from sorvolo.missions.watch.cot_sender import CotPlace
 from sorvolo.simulation.settings import (
     ImagingSettings,
     OutputSettings,
@@ -142,6 +144,24 @@ def test_files_for_other_programs_hold_the_same_places(corrected: tuple[dict[str
     assert float(sensor.get("fov", "0")) == pytest.approx(float(rows[0]["horizontal_fov_deg"]), abs=0.1)
     assert float(sensor.get("elevation", "0")) < -60 and 20 < float(sensor.get("range", "0")) < 45
     assert events[-1].find("detail/track") is not None
+
+
+def test_the_track_is_sent_to_a_team(corrected: tuple[dict[str, Any], Path], tmp_path: Path) -> None:
+    """Every event, in order; a receiver that is not there is an error, and the files are written all the same."""
+    site = corrected[1] / "site"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5)
+        place = CotPlace("udp", "127.0.0.1", receiver.getsockname()[1])
+        report = correct_telemetry(site, tmp_path / "sent", cot=CotReceiver(place))
+        events = [receiver.recv(10_000) for _ in range(report["frames"])]
+    assert report["cot_sent"] == report["frames"]
+    assert events == (tmp_path / "sent" / "cot.xml").read_bytes().splitlines()
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        nobody = CotPlace("tls", "127.0.0.1", closed.getsockname()[1])
+    with pytest.raises(InputError, match="nothing could be sent"):
+        correct_telemetry(site, tmp_path / "unsent", cot=CotReceiver(nobody))
+    assert (tmp_path / "unsent" / "cot.xml").exists()
 
 
 def test_a_sound_log_is_called_sound(filmed: Path, tmp_path: Path) -> None:

@@ -40,6 +40,9 @@ HeldOutShare = Annotated[
 Tiles = Annotated[
     str, typer.Option(help="Cut pictures into tiles: none, auto (by ground resolution), or pixels a side.")
 ]
+FromAbove = Annotated[
+    bool, typer.Option("--from-above", help="The pictures look straight down: models that want it look twice.")
+]
 ReportFolder = Annotated[Path | None, typer.Option(help="Folder for detector.html, detector.json, detections.json.")]
 BootstrapDraws = Annotated[int, typer.Option(min=20, help="Bootstrap draws for the confidence intervals.")]
 Seed = Annotated[int, typer.Option(help="Random seed of the bootstrap and of what is held out.")]
@@ -58,6 +61,7 @@ def detector(
     videos: VideoPattern = "",
     held_out: HeldOutShare = 0.0,
     tiles: Tiles = "none",
+    from_above: FromAbove = False,
     out: ReportFolder = None,
     draws: BootstrapDraws = 1000,
     seed: Seed = 1,
@@ -80,7 +84,7 @@ def detector(
     )
     from sorvolo.store.exports.plain import plain_json
 
-    settings = EvaluationSettings(_tiles(tiles), draws, seed)
+    settings = EvaluationSettings(_tiles(tiles), draws, seed, from_above)
     arms = [list(names(each)) for each in (model, *(compare or ()))]
     labelled = read_sets(
         data, form=form, classes=class_names(classes), ignore=names(ignore), unlabelled=names(unlabelled),
@@ -91,6 +95,7 @@ def detector(
     description = {
         "sorvolo": __version__, "data": ", ".join(map(str, data)), "arms": "; ".join(", ".join(arm) for arm in arms),
         "videos": videos or "all", "held_out": held_out or "all", "tiles": tiles, "draws": draws, "seed": seed,
+        "from_above": from_above,
         "notices": "; ".join(notices),
     }
     if out is not None:

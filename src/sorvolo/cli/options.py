@@ -32,6 +32,8 @@ Offset = Annotated[
 GroundElevation = Annotated[
     float | None, typer.Option(help="Elevation of the ground, m, in the telemetry's own height reference.")
 ]
+CotAuthority = Annotated[Path | None, typer.Option(help="For tls://: the authority of the server's certificate, PEM.")]
+CotCertificate = Annotated[Path | None, typer.Option(help="For tls://: own certificate and its key in one PEM file.")]
 GiveUp = Annotated[float, typer.Option(help="End a live source after so many seconds without a picture.")]
 
 

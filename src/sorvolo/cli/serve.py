@@ -12,8 +12,8 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from sorvolo.cli.options import AsJson
-from sorvolo.cli.watch import Cot, CotAuthority, CotCertificate
+from sorvolo.cli.options import AsJson, CotAuthority, CotCertificate
+from sorvolo.cli.watch import Cot
 from sorvolo.errors import InputError, SettingsError
 
 if TYPE_CHECKING:

@@ -9,13 +9,16 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from sorvolo.cli.options import AsJson, Camera
+from sorvolo.cli.options import AsJson, Camera, CotAuthority, CotCertificate
 from sorvolo.cli.shown import show_path
 from sorvolo.errors import SettingsError
 
 _Site = Annotated[Path | None, typer.Option(help="Folder of the map that the flight is in, or is mapped into first.")]
 _Flight = Annotated[str, typer.Option(help="Flight of the map.", show_default="its only one")]
 _Log = Annotated[str, typer.Option(help="The flight's log if it is not beside the video.")]
+_Cot = Annotated[
+    str, typer.Option(help="Send the track to a TAK server or team: udp://host:port, tcp://host:port, tls://host:port.")
+]
 _Out = Annotated[Path | None, typer.Option(help="Folder for results.", show_default="SITE-telemetry/FLIGHT")]
 
 
@@ -26,6 +29,9 @@ def telemetry_command(
     telemetry: _Log = "",
     camera: Camera = "",
     out: _Out = None,
+    cot: _Cot = "",
+    cot_ca: CotAuthority = None,
+    cot_cert: CotCertificate = None,
     as_json: AsJson = False,
 ) -> None:
     """Correct a flight's telemetry by its map, and report what was wrong: compass, clock, heights.
@@ -37,19 +43,24 @@ def telemetry_command(
 
     Example: sorvolo telemetry field --flight DJI_0042
     """
-    from sorvolo.missions.telemetry.doctor import correct_telemetry
+    from sorvolo.missions.telemetry.doctor import CotReceiver, correct_telemetry
+    from sorvolo.missions.watch.cot_sender import CotTls, check_host, cot_place
     from sorvolo.store.site.catalogue_place import is_site
 
     from_site = is_site(source)
     if from_site == (site is not None):
         raise SettingsError("give a flight and --site FOLDER, or the folder of a map alone")
+    receiver = CotReceiver(cot_place(cot), CotTls(cot_ca, cot_cert)) if cot else None
+    if receiver is not None:  # before minutes of work
+        check_host(receiver.place)
+        receiver.tls.context()
     folder = source if site is None else site
     if site is not None:
         _map_if_new(source, site, telemetry, camera)
     target = out or folder.with_name(f"{folder.resolve().name}-telemetry") / (flight or source.stem)
     report = correct_telemetry(
         folder, target, flight=flight, source=None if from_site else source, telemetry=telemetry or None,
-        camera=camera or None,
+        camera=camera or None, cot=receiver,
     )
     if as_json:
         typer.echo(json.dumps({"folder": str(target), **report}, indent=1))
@@ -63,6 +74,8 @@ def _show(report: Mapping[str, Any], target: Path, console: Console) -> None:
         console.print(f"  {sentence}", highlight=False, soft_wrap=True)
     for warning in report["warnings"]:
         console.print(f"[yellow]warning[/yellow]  {escape(warning)}", highlight=False)
+    if report["cot_sent"] is not None:
+        console.print(f"  {report['cot_sent']} of {report['frames']} Cursor on Target events sent", highlight=False)
     for name in report["files"]:
         show_path("written", target / name, console)
 

@@ -15,7 +15,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.options import AsJson, Camera, GiveUp, GroundElevation, PlaceFormat, PlaceFormatOption, names
+from sorvolo.cli.options import (
+    AsJson,
+    Camera,
+    CotAuthority,
+    CotCertificate,
+    GiveUp,
+    GroundElevation,
+    PlaceFormat,
+    PlaceFormatOption,
+    names,
+)
 from sorvolo.cli.places import place_heading, place_words
 from sorvolo.cli.progress import ProgressReport, Resumed, rate_words
 from sorvolo.cli.shown import read_json, show_notices_and_warnings, show_path
@@ -52,8 +62,6 @@ Labels = Annotated[str, typer.Option(help="Write labels to correct and train wit
 Cot = Annotated[
     str, typer.Option(help="Send objects to a TAK server or team: udp://host:port, tcp://host:port, tls://host:port.")
 ]
-CotAuthority = Annotated[Path | None, typer.Option(help="For tls://: the authority of the server's certificate, PEM.")]
-CotCertificate = Annotated[Path | None, typer.Option(help="For tls://: own certificate and its key in one PEM file.")]
 CotType = Annotated[
     list[str] | None, typer.Option(help="Cursor on Target type of a class, such as person=a-f-G. Can be repeated.")
 ]

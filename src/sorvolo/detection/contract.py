@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
@@ -27,7 +27,8 @@ class ModelInfo:
     model finds a class well. `stride`: the sides of its input are multiples of it. `thermal`: it was trained on
     thermal frames; `daylight`: on daylight. `thermal_by`: the installed model that looks at thermal frames
     in its place, "" for none. `precision` is float32 or int8. `on_request`: classes too unsure to be reported unless a
-    person asks for them.
+    person asks for them. `turned`: pictures from straight above are looked at twice, once turned by a quarter, and each
+    class is reported from this mean score on; empty: once.
     """
 
     name: str
@@ -45,6 +46,7 @@ class ModelInfo:
     trained_on: str = ""
     created: str = ""
     on_request: tuple[str, ...] = ()
+    turned: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def usual_classes(self) -> tuple[str, ...]:
@@ -82,7 +84,8 @@ def _info(fields: Mapping[str, Any]) -> ModelInfo:
     if missing := [name for name in _NEEDED if name not in fields]:
         raise ValueError(f"it lacks {', '.join(missing)}")
     classes = _classes(fields)
-    thresholds, best_px = _thresholds(fields, classes), _best_px(fields, classes)
+    thresholds, best_px = _thresholds(fields, "thresholds", classes), _best_px(fields, classes)
+    turned = _thresholds(fields, "turned", classes) if fields.get("turned") else {}
     stride = int(fields.get("stride", _FALLBACK_STRIDE))
     if not 1 <= stride <= 256:
         raise ValueError(f"its stride must lie in 1 to 256, not {stride}")
@@ -92,7 +95,8 @@ def _info(fields: Mapping[str, Any]) -> ModelInfo:
     texts = {each: _words(fields[each]) for each in _TEXTS if each in fields}
     return ModelInfo(
         str(fields["name"]), classes, MappingProxyType(thresholds), MappingProxyType(best_px), stride,
-        bool(fields.get("thermal", False)), bool(fields.get("daylight", True)), on_request=on_request, **texts,
+        bool(fields.get("thermal", False)), bool(fields.get("daylight", True)), on_request=on_request,
+        turned=MappingProxyType(turned), **texts,
     )
 
 
@@ -103,10 +107,10 @@ def _classes(fields: Mapping[str, Any]) -> tuple[str, ...]:
     return classes
 
 
-def _thresholds(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, float]:
-    thresholds = {each: float(fields["thresholds"][each]) for each in classes}
+def _thresholds(fields: Mapping[str, Any], key: str, classes: Sequence[str]) -> dict[str, float]:
+    thresholds = {each: float(fields[key][each]) for each in classes}
     if not all(0 <= each <= 1 for each in thresholds.values()):
-        raise ValueError(f"its thresholds must lie in 0 to 1, not {thresholds}")
+        raise ValueError(f"its {key} must lie in 0 to 1, not {thresholds}")
     return thresholds
 
 

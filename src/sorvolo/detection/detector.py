@@ -2,7 +2,7 @@
 
 import math
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import overload
 
@@ -15,6 +15,7 @@ from sorvolo.detection.models import find_model, thermal_model
 from sorvolo.detection.session import Seen, Session
 from sorvolo.detection.suppression import SeenTile, merge_tiles
 from sorvolo.detection.tiling import Tiles, plan_tiles
+from sorvolo.detection.turning import QUARTERS, agreed, turned, turned_back
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.survey.flight import Notice
@@ -92,18 +93,18 @@ class Detector:
     @overload
     def detect(
         self, image: Picture, *, tiles: Tiles = None, m_per_px: float | None = None,
-        least_score: float | None = None, classes: Sequence[str] | None = None,
+        least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
     ) -> Detections: ...
 
     @overload
     def detect(
         self, image: Sequence[Picture], *, tiles: Tiles = None, m_per_px: float | None = None,
-        least_score: float | None = None, classes: Sequence[str] | None = None,
+        least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
     ) -> list[Detections]: ...
 
     def detect(
         self, image: Picture | Sequence[Picture], *, tiles: Tiles = None, m_per_px: float | None = None,
-        least_score: float | None = None, classes: Sequence[str] | None = None,
+        least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
     ) -> Detections | list[Detections]:
         """The objects in a picture, best first; for a sequence of pictures, or an array (N, H, W, C), a list of them.
 
@@ -111,6 +112,7 @@ class Detector:
         (grey is stretched as a thermal camera's). `tiles` cuts a large one: "auto" by `m_per_px` (the ground's
         sampling distance; None or NaN: not known), a number of its pixels a side, or None for the picture as a whole;
         docs/detector.md gives the rule. `least_score` None means each class's own threshold; `classes` None means all.
+        `from_above`: the camera looked about straight down; a model whose file asks for it (`turned`) then looks twice.
         Raises InputError for anything that is no picture, SettingsError for a class, score or tile that cannot be.
         """
         wanted = self._wanted(classes)
@@ -118,14 +120,14 @@ class Detector:
             raise SettingsError(f"the least score must lie in 0 to 1, not {least_score}")
         sampling = math.nan if m_per_px is None else float(m_per_px)
         if not isinstance(image, Sequence) and getattr(image, "ndim", 0) != 4:
-            return self._seen(image, tiles, sampling, wanted, least_score)
-        return [self._seen(each, tiles, sampling, wanted, least_score) for each in image]
+            return self._seen(image, tiles, sampling, wanted, least_score, from_above)
+        return [self._seen(each, tiles, sampling, wanted, least_score, from_above) for each in image]
 
-    def thresholds_for(self, picture: Picture) -> Mapping[str, float]:
+    def thresholds_for(self, picture: Picture, *, from_above: bool = False) -> Mapping[str, float]:
         """From which score on each class is reported in such a picture: those of the model that looks at it."""
         if self._is_own(thermal=is_thermal(picture)):
-            return self.info.thresholds
-        return {**self.info.thresholds, **self._night_session().info.thresholds}
+            return _thresholds(self.info, from_above)
+        return {**self.info.thresholds, **_thresholds(self._night_session().info, from_above)}
 
     def _wanted(self, classes: Sequence[str] | None) -> tuple[str, ...]:
         if classes is None:
@@ -140,20 +142,24 @@ class Detector:
 
     def _seen(
         self, picture: Picture, tiles: Tiles, m_per_px: float, wanted: Sequence[str],
-        least_score: float | None,
+        least_score: float | None, from_above: bool,
     ) -> Detections:
         thermal = is_thermal(picture)
         session = self._session_for(thermal)
         rgb = rgb_from_picture(picture)
-        size_px = rgb.shape[0], rgb.shape[1]
         asked = [name for name in wanted if name in session.info.classes]
-        plan = plan_tiles(
-            size_px, session.info, asked, tiles=tiles, m_per_px=m_per_px, fixed_px=session.fixed_px,
-            thermal=thermal,
-        )
-        looks = [SeenTile(place, _look(session, rgb, place, plan.scale)) for place in plan.places_px]
-        seen = looks[0].seen if len(looks) == 1 else merge_tiles(looks, size_px)
-        least = _least_scores(session.info, asked, least_score)
+
+        def whole(shown: ImageRGB) -> Seen:
+            size_px = shown.shape[0], shown.shape[1]
+            plan = plan_tiles(
+                size_px, session.info, asked, tiles=tiles, m_per_px=m_per_px, fixed_px=session.fixed_px,
+                thermal=thermal,
+            )
+            looks = [SeenTile(place, _look(session, shown, place, plan.scale)) for place in plan.places_px]
+            return looks[0].seen if len(looks) == 1 else merge_tiles(looks, size_px)
+
+        seen = _seen_turned(rgb, whole) if from_above and session.info.turned else whole(rgb)
+        least = _least_scores(session.info, _thresholds(session.info, from_above), asked, least_score)
         kept = seen.scores >= least[seen.labels]
         labels = seen.labels[kept]
         if session is not self._session:
@@ -184,9 +190,24 @@ class Detector:
         return self._at_night or self._session
 
 
-def _least_scores(info: ModelInfo, wanted: Sequence[str], least_score: float | None) -> Floats:
+def _seen_turned(rgb: ImageRGB, whole: Callable[[ImageRGB], Seen]) -> Seen:
+    """What the looks at a picture from straight above agree on."""
+    looks = []
+    for quarters in QUARTERS:
+        seen = whole(turned(rgb, quarters))
+        looks.append(Seen(turned_back(seen.boxes_px, quarters, (rgb.shape[0], rgb.shape[1])), seen.scores, seen.labels))
+    return agreed(looks)
+
+
+def _thresholds(info: ModelInfo, from_above: bool) -> Mapping[str, float]:
+    return info.turned if from_above and info.turned else info.thresholds
+
+
+def _least_scores(
+    info: ModelInfo, thresholds: Mapping[str, float], wanted: Sequence[str], least_score: float | None
+) -> Floats:
     """(classes,) the score from which on each of the model's classes is reported; infinite where it is not wanted."""
-    least = [info.thresholds[name] if least_score is None else least_score for name in info.classes]
+    least = [thresholds[name] if least_score is None else least_score for name in info.classes]
     return np.where([name in wanted for name in info.classes], least, np.inf)
 
 

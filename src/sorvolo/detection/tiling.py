@@ -70,6 +70,14 @@ def needed_px_per_m(info: ModelInfo, name: str, length_m: float) -> float:
     return info.best_px[name][0] / length_m
 
 
+def whole_m_per_px(info: ModelInfo, wanted: Sequence[str], m_per_px: float, size_px: tuple[int, int]) -> float:
+    """The sampling distance by which "auto" magnifies a picture of (height, width) `size_px` no further than to one
+    tile, `MOST_WHOLE_PX`: of many frames that show the same ground none needs to be searched at any price."""
+    scale = scale_for(info, m_per_px, wanted)
+    most = max(1.0, math.sqrt(MOST_WHOLE_PX / (size_px[0] * size_px[1])))
+    return m_per_px * min(1.0, most / scale)
+
+
 def plan_tiles(
     size_px: tuple[int, int], info: ModelInfo, wanted: Sequence[str], *, tiles: Tiles = "auto",
     m_per_px: float = math.nan, fixed_px: tuple[int, int] | None = None, thermal: bool = False,

@@ -39,11 +39,12 @@ _NAMED = 5  # damaged pictures
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """`tiles` as Detector.detect takes it; `draws` of the bootstrap; `seed` of whatever is random."""
+    """`tiles`, `from_above` as Detector.detect takes them; `draws` of the bootstrap; `seed` of whatever is random."""
 
     tiles: Literal["auto"] | int | None = None
     draws: int = DRAWS
     seed: int = 1
+    from_above: bool = False
 
 
 @dataclass(frozen=True)
@@ -229,11 +230,12 @@ def _found(
             else:
                 started = time.perf_counter()
                 detections.append(detector.detect(
-                    image, tiles=settings.tiles, m_per_px=picture.m_per_px, least_score=LEAST_SCORE
+                    image, tiles=settings.tiles, m_per_px=picture.m_per_px, least_score=LEAST_SCORE,
+                    from_above=settings.from_above,
                 ))
                 seconds += time.perf_counter() - started
                 count += 1
-                lights.append(detector.thresholds_for(image))
+                lights.append(detector.thresholds_for(image, from_above=settings.from_above))
             progress(EvaluationProgress(detector.info.name, each.name, len(detections), len(each)))
         usual = max(lights, key=lights.count, default=detector.info.thresholds)
         if others := len(lights) - lights.count(usual):

@@ -33,10 +33,11 @@ class Detects(Protocol):
 
     def detect(
         self, image: ImageRGB, *, tiles: Literal["auto"] | int | None = None, m_per_px: float | None = None,
-        least_score: float | None = None, classes: Sequence[str] | None = None,
+        least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
     ) -> Detections:
         """The objects in one picture, (H, W, 3), best first.
 
         `tiles` cuts a large picture: "auto" by `m_per_px` (the ground's sampling distance), a number of pixels a side,
         or None for the picture as a whole. None for `least_score` means each class's own; for `classes`, all.
+        `from_above`: the camera looked about straight down.
         """

@@ -10,6 +10,7 @@ from typing import Any
 
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import installed_models
+from sorvolo.detection.turning import is_from_above
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
@@ -102,7 +103,8 @@ class ObjectFinder:
         height_m, sigma_m = posed.prior.position_m[2], posed.prior.position_sigma_m[2]
         knows_height = math.isfinite(sigma_m) and height_m > 1.0
         m_per_px = float(height_m) / self._camera.fx_px if knows_height else None
-        self._waiting.append(self._thread.submit(self._look, posed.frame, m_per_px))
+        from_above = is_from_above(posed.prior.rotation)
+        self._waiting.append(self._thread.submit(self._look, posed.frame, m_per_px, from_above))
         self._take(_AHEAD)
 
     def news(self) -> list[FrameDetections]:
@@ -145,9 +147,11 @@ class ObjectFinder:
             self._seen[seen.index] = seen
             self._news.append(seen)
 
-    def _look(self, frame: Frame, m_per_px: float | None) -> FrameDetections:
+    def _look(self, frame: Frame, m_per_px: float | None, from_above: bool) -> FrameDetections:
         started_s = time.monotonic()
-        found = self._detector.detect(frame.image, tiles="auto", m_per_px=m_per_px, classes=self._classes)
+        found = self._detector.detect(
+            frame.image, tiles="auto", m_per_px=m_per_px, classes=self._classes, from_above=from_above
+        )
         surest = found.surest(_MOST_CROPS)
         crops = tuple(_crop(frame.image, box) for box in surest.boxes_px)
         return FrameDetections(frame.index, surest, crops, time.monotonic() - started_s)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from sorvolo.capture.sync import DATED_NS
+from sorvolo.detection.turning import is_from_above
 from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Mask, Vector3
 from sorvolo.geometry.sun import direction_from_angles, sun_direction
 from sorvolo.missions.flight.detects import Detects
@@ -141,7 +142,7 @@ class _Round:
             if any_of(planted.boxes_px):
                 found = detector.detect(
                     planted.image, tiles="auto", m_per_px=float(pose.translation_m[2]) / each.placed.camera.fx_px,
-                    classes=wanted,
+                    classes=wanted, from_above=is_from_above(pose.rotation),
                 ).surest(_MOST_DETECTIONS)
                 self._boxes_px[each.placed.index] = planted.boxes_px
                 self._laid += [laid for laid in lay_on_ground(found, each.placed) if laid is not None]

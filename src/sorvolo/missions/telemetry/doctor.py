@@ -1,7 +1,7 @@
 """`sorvolo telemetry`: a mapped flight's telemetry corrected by its map, and what was wrong with it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from math import isfinite, nan
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from sorvolo.geometry.pose import Pose, gimbal_angles_from_rotation
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
 from sorvolo.missions.telemetry.words import fault_sentences
+from sorvolo.missions.watch.cot_sender import CotPlace, CotTls, send_all
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes, writing
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import json_bytes, plain_json
@@ -29,6 +30,14 @@ from sorvolo.survey.mosaic import Status
 _KLV_STEP_S = 0.2
 
 
+@dataclass(frozen=True)
+class CotReceiver:
+    """Whom Cursor on Target events are sent to."""
+
+    place: CotPlace
+    tls: CotTls = field(default_factory=CotTls)
+
+
 @dataclass(frozen=True, eq=False)
 class _Solved:
     """A frame that has a camera, and when it was taken, seconds into the flight."""
@@ -40,13 +49,15 @@ class _Solved:
 
 def correct_telemetry(
     site_folder: Path, folder: Path, *, flight: str = "", source: Path | None = None, telemetry: str | None = None,
-    camera: str | None = None,
+    camera: str | None = None, cot: CotReceiver | None = None,
 ) -> dict[str, Any]:
-    """Write a flight's corrected telemetry into `folder`; the report, which telemetry.json holds as well.
+    """Write a flight's corrected telemetry into `folder`; the report, which telemetry.json holds as well, and
+    `cot_sent`, how many events were sent.
 
     Without `flight` it is the site's only one, or that of `source`. With `source`, the flight's video or photos, its
     own telemetry is compared with the map, and a video is written again as a transport stream with corrected metadata.
-    Raises InputError for a site without GPS, a flight that it has not, and a source of another flight.
+    The events of cot.xml, with their own times, are sent to `cot`. Raises InputError for a site without GPS, a flight
+    that it has not, a source of another flight, and a receiver that takes nothing.
     """
     with Archive.open(site_folder, write=False) as archive:
         site = archive.site()
@@ -54,14 +65,14 @@ def correct_telemetry(
             raise InputError(f"{site_folder} was mapped without GPS: its cameras have no place on Earth to write down")
         if source is None:
             name = _flight(archive, flight)
-            return _written(archive, site, name, folder, _solved(archive, name, 0), None, None)
+            return _written(archive, site, name, folder, _solved(archive, name, 0), None, None, cot)
         with opened_sources([source], telemetry, camera) as sources:
             opened = sources[0]
             name = _flight(archive, flight or opened.name)
             setup = prepare(opened, MapSettings(), site, telemetry_named=telemetry is not None)
             solved = _solved(archive, name, _first_ns(setup))
             solved, faults = _judged(setup, solved, archive.report(name))
-            return _written(archive, site, name, folder, solved, setup, faults)
+            return _written(archive, site, name, folder, solved, setup, faults, cot)
 
 
 def _flight(archive: Archive, wanted: str) -> str:
@@ -115,7 +126,7 @@ def _clock(report: Mapping[str, Any]) -> tuple[Bias, float]:
 
 def _written(
     archive: Archive, site: Site, name: str, folder: Path, solved: Sequence[_Solved], setup: FlightSetup | None,
-    faults: TelemetryFaults | None,
+    faults: TelemetryFaults | None, cot: CotReceiver | None,
 ) -> dict[str, Any]:
     frames = [_frame(each, site) for each in solved]
     with writing(folder):
@@ -140,7 +151,8 @@ def _written(
         "warnings": _warnings(site),
     }))
     atomic_write_bytes(folder / "telemetry.json", json_bytes(report))
-    return report
+    sent = None if cot is None else send_all(texts["cot.xml"].splitlines(), cot.place, cot.tls)
+    return {**report, "cot_sent": sent}
 
 
 def _video(source: Source) -> Path | None:

@@ -2,6 +2,7 @@
 
 import socket
 import ssl
+from collections.abc import Sequence
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
@@ -78,6 +79,26 @@ def check_host(place: CotPlace) -> None:
             f"--cot {place}: the host {place.host!r} has no address ({error}); check its name and the network, or give "
             "its IP address"
         ) from error
+
+
+def send_all(events: Sequence[bytes], place: CotPlace, tls: CotTls = CotTls()) -> int:
+    """Send recorded events one after the other; how many arrived as far as the sender can know.
+
+    Raises InputError where nothing can be sent at all.
+    """
+    sender, sent, last = CotSender(place, tls), 0, ""
+    try:
+        for event in events:
+            try:
+                sender.send(event)
+                sent += 1
+            except OSError as error:
+                last = str(error)
+    finally:
+        sender.close()
+    if events and not sent:
+        raise InputError(f"--cot {place}: nothing could be sent ({last}); check the address, the port and the network")
+    return sent
 
 
 class CotSender:

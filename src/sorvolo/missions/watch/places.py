@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Protocol
 
+from sorvolo.detection.turning import is_from_above
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.pose import Pose
 from sorvolo.missions.flight.setup import FlightSetup, new_site
@@ -29,6 +30,9 @@ class Places(Protocol):
 
     def m_per_px(self, frame: Frame) -> float | None:
         """The ground's sampling distance in the frame; None where unknown."""
+
+    def is_from_above(self, frame: Frame) -> bool:
+        """Whether the frame is a photo taken about straight down."""
 
     @property
     def set_aside(self) -> int:
@@ -82,6 +86,10 @@ class GroundPlaces:
     def m_per_px(self, frame: Frame) -> float | None:
         """Along the optical axis; None where the camera looks at the horizon or its height is not known."""
         return self._follower.m_per_px(self._prior(frame))
+
+    def is_from_above(self, frame: Frame) -> bool:
+        """By telemetry. A video shows the same ground in many frames, which need no second look."""
+        return self._setup.source.kind == "photos" and is_from_above(self._prior(frame).rotation)
 
     @property
     def set_aside(self) -> int:
@@ -164,6 +172,10 @@ class ImagePlaces:
     def m_per_px(self, frame: Frame) -> float | None:
         """Unknown."""
         return None
+
+    def is_from_above(self, frame: Frame) -> bool:
+        """Unknown, so that it is searched as it is."""
+        return False
 
     @property
     def set_aside(self) -> int:

@@ -10,6 +10,7 @@ from typing import Self
 
 from sorvolo.capture.sync import DATED_NS
 from sorvolo.detection.scene import SceneMagnifier
+from sorvolo.detection.tiling import whole_m_per_px
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.setup import FlightSetup
@@ -136,8 +137,11 @@ class WatchRun:
 
         if magnifier is not None:
             m_per_px = magnifier.m_per_px(frame.image, look)
+        if m_per_px is not None and self._setup.source.kind != "photos":
+            m_per_px = whole_m_per_px(self._detector.info, classes, m_per_px, frame.image.shape[:2])
         found = self._detector.detect(
-            frame.image, tiles=settings.tiles, m_per_px=m_per_px, least_score=settings.least_score, classes=classes
+            frame.image, tiles=settings.tiles, m_per_px=m_per_px, least_score=settings.least_score, classes=classes,
+            from_above=self._places.is_from_above(frame),
         ) if earlier is None else earlier.found
         if magnifier is not None:
             magnifier.see(found, frame.image)
