@@ -8,9 +8,9 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, fit_similarity, site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
+from sorvolo.mosaic.graph_settings import PoseGraphSettings
 from sorvolo.mosaic.keyframes import Keyframes
 from sorvolo.mosaic.planar import KnownKeyframe, PlanarMapper, PlanarSettings
-from sorvolo.mosaic.pose_graph import PoseGraphSettings
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Status
 

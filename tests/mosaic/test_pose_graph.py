@@ -14,7 +14,8 @@ from sorvolo.geometry.homography import (
 )
 from sorvolo.geometry.level_ground import footprint, ground_from_pixels
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
-from sorvolo.mosaic.pose_graph import PoseGraph, PoseGraphSettings, pose_from_link
+from sorvolo.mosaic.graph_settings import PoseGraphSettings
+from sorvolo.mosaic.pose_graph import PoseGraph, pose_from_link
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
 

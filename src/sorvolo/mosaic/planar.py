@@ -13,10 +13,12 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
 from sorvolo.mosaic.exposure import ColourPairs, Exposure, ExposureSettings, solve_exposure, tie_colours
+from sorvolo.mosaic.graph_report import GraphReport
+from sorvolo.mosaic.graph_settings import PoseGraphSettings
 from sorvolo.mosaic.ground_ties import GroundTies
 from sorvolo.mosaic.keyframes import Keyframes
 from sorvolo.mosaic.overview import Overview, lay_out
-from sorvolo.mosaic.pose_graph import GraphReport, PoseGraph, PoseGraphSettings, pose_from_link
+from sorvolo.mosaic.pose_graph import PoseGraph, pose_from_link
 from sorvolo.registration.features import gray_from_rgb, normalise_contrast, orb_features
 from sorvolo.registration.link import Effort, LinkCache, LinkPrediction, LinkSettings, link
 from sorvolo.survey.flight import CameraPrior

@@ -7,98 +7,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import SuperLU
 
 from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Rows
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.homography import (
-    apply_homography,
-    fit_similarity,
-    pose_from_homography,
-    site_from_image_homography,
-)
+from sorvolo.geometry.homography import pose_from_homography, site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
-from sorvolo.mosaic.bundle import (
-    NO_GROUND,
-    SHARED,
-    Ground,
-    Nodes,
-    Solution,
-    linearise_ground,
-    solve,
-)
+from sorvolo.mosaic.bundle import NO_GROUND, SHARED, Ground, Nodes, Solution, linearise_ground, solve
+from sorvolo.mosaic.graph_alignment import change_to_fixes, change_to_ground, move_all
+from sorvolo.mosaic.graph_offsets import shared_sigma, unconfirmed
+from sorvolo.mosaic.graph_report import GraphReport, ground_sigma_m
 from sorvolo.mosaic.graph_rows import LinkRows, NodeRows
+from sorvolo.mosaic.graph_settings import PoseGraphSettings
 from sorvolo.mosaic.graph_weights import LinkNoise, Trust, link_noise, miss_px, telemetry_trust
-from sorvolo.mosaic.ground_ties import GroundTies, similarity_of_most
+from sorvolo.mosaic.ground_ties import GroundTies
 from sorvolo.mosaic.normal_equations import factorised
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
-
-_OFFSET_GROUPS = ((2,), (5, 6), (7,))  # of SHARED: altitude's zero, tilt, heading; judged together
-_OFFSETS = tuple(k for group in _OFFSET_GROUPS for k in group)
-# prior sigma of an offset that is taken as telemetry reports it
-_AS_REPORTED_SIGMA = np.array([np.inf, np.inf, 0.1, np.inf, np.inf, 0.002, 0.002, 0.003])
-_CALIBRATED = 0.005  # relative: a focal length known so well is held
-_RADIAL_SIGMA = 0.03  # of a lens that nobody calibrated
-_FREE_M = 1e4  # a zero of heights that nothing is known of
-_STRAINED = 3.0  # times the noise that is believed of a link: the ground around it cannot be laid without bending more
-_GPS_OFFSET_M = 5.0  # of a receiver, the same all flight
-_TILT_OFFSET_DEG = 2.0  # a gimbal's zero, or a camera's mount
-_HEADING_OFFSET_DEG = 5.0  # a drone's compass beside its motors
-
-
-@dataclass(frozen=True)
-class PoseGraphSettings:
-    """What the graph may move and when it solves."""
-
-    pairs_per_link: int = 40
-    independent_pairs: float = 20.0  # matches of one link share lens and relief errors: they count as so many
-    sigma_px: float = 0.3  # floor of a match's noise; calibration and rolling shutter never are better
-    window: int = 6  # recent keyframes freed by each local solve
-    region: int = 120  # keyframes; a larger flight is solved around its newest ones only, until it ends or is strained
-    focal_sigma: float = 0.0  # relative; 0 holds the focal length
-    radial_sigma: float = 0.0  # prior of the left-over radial distortion; 0 holds it
-    altitude_offset_sigma_m: float = 1.0  # how well the altitude's zero is known to be the ground
-    gps_offset_sigma_m: float = 0.0  # > 0 when a known map fixes the datum instead of this flight's GPS
-    tilt_offset_sigma_deg: float = 0.0  # of gimbal or mount against the vertical, the same all flight
-    heading_offset_sigma_deg: float = 0.0  # of the compass, the same all flight
-
-    @classmethod
-    def of_flight(
-        cls, focal_sigma: float, altitude_offset_sigma_m: float | None, *, joins_map: bool
-    ) -> "PoseGraphSettings":
-        """What is free on a flight whose focal length is known to `focal_sigma` (relative) and the zero of whose
-        heights to `altitude_offset_sigma_m` (infinite: not at all; None: a flight without telemetry). `joins_map`: a
-        known map fixes where it lies.
-        """
-        calibrated = focal_sigma <= _CALIBRATED
-        has_telemetry = altitude_offset_sigma_m is not None
-        height_known = altitude_offset_sigma_m is not None and bool(np.isfinite(altitude_offset_sigma_m))
-        return cls(
-            focal_sigma=0.0 if calibrated or not height_known else focal_sigma,
-            radial_sigma=0.0 if calibrated else _RADIAL_SIGMA,
-            altitude_offset_sigma_m=_altitude_offset_prior_m(altitude_offset_sigma_m),
-            gps_offset_sigma_m=_GPS_OFFSET_M if joins_map else 0.0,
-            tilt_offset_sigma_deg=_TILT_OFFSET_DEG if has_telemetry else 0.0,
-            heading_offset_sigma_deg=_HEADING_OFFSET_DEG if has_telemetry else 0.0,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class GraphReport:
-    """What the flight taught about itself; sigmas are one standard deviation."""
-
-    focal_scale: float
-    focal_scale_sigma: float
-    radial: float
-    altitude_offset_m: float
-    links: int
-    links_dropped: int
-    relief_m: float
-    rms_px: float
-    angles_contradicted: int = 0  # frames whose stated angles the pictures rule out: these angles are not used
-    turned_deg: tuple[float, float] = (0.0, 0.0)  # tilt and heading that all stated angles are off by
 
 
 @dataclass(eq=False)
@@ -115,7 +40,7 @@ class PoseGraph:
     last returned: those, and no others, have to be painted again.
     """
 
-    def __init__(self, settings: PoseGraphSettings = PoseGraphSettings()) -> None:
+    def __init__(self, settings: PoseGraphSettings = PoseGraphSettings()) -> None:  # noqa: B008 (frozen)
         self._settings = settings
         self._ids: dict[int, int] = {}
         self._names: list[int] = []
@@ -271,7 +196,9 @@ class PoseGraph:
         """The flight is over: settle with every offset free, judge which are real, and settle again."""
         self._as_reported[:] = False
         moved = self.settle()
-        self._judge_offsets()
+        sigma = shared_sigma(self._settings, self._as_reported)
+        factors = factorised(self._solve(self._own(), shared=True, iterations=0).normal)
+        self._as_reported[unconfirmed(self._shared, sigma, factors, self._settings.offsets)] = True
         return moved | self.settle()
 
     def report(self) -> GraphReport:
@@ -313,7 +240,11 @@ class PoseGraph:
         index = np.flatnonzero(own)
         sample = index if len(index) <= 250 else index[np.linspace(0, len(index) - 1, 250).round().astype(int)]
         factors = factorised(solution.normal)
-        found = [self._ground_sigma_m(at, 6 * int(solution.position[at]), factors) for at in sample.tolist()]
+        rotations, heights_m = self._rows.rotations, self._rows.centres_m[:, 2]
+        found = [
+            ground_sigma_m(rotations[at], heights_m[at], 6 * int(solution.position[at]), factors)
+            for at in sample.tolist()
+        ]
         every = np.interp(index, sample, found) if len(sample) else np.zeros(0)
         return {self._names[at]: float(value) for at, value in zip(index, every, strict=True)}
 
@@ -367,7 +298,7 @@ class PoseGraph:
 
     def _solve(self, free: NDArray[np.bool_], *, shared: bool, iterations: int) -> Solution:
         pairs = self._links.pairs()
-        sigma = self._shared_sigma() if shared else np.zeros(len(SHARED))
+        sigma = shared_sigma(self._settings, self._as_reported) if shared else np.zeros(len(SHARED))
         solution = solve(self._state(), pairs, self._shared, sigma, free, iterations, ground=self._weighed_ground())
         if iterations:
             self._rows.rotations[:], self._rows.centres_m[:] = solution.nodes.rotations, solution.nodes.centres_m
@@ -401,7 +332,7 @@ class PoseGraph:
         usual_px = float(np.median(self._links.sigma_px))
         false = noise.is_false(usual_px)  # perhaps: the whole map is solved before one is dropped
         believed_px = np.maximum(self._links.sigma_px[chosen], usual_px)
-        self._is_strained |= bool((noise.across_px > _STRAINED * believed_px).any())
+        self._is_strained |= bool((noise.across_px > self._settings.strained * believed_px).any())
         self._weigh(chosen[~false], noise, ~false)
         self._weigh_telemetry()
         return self._moved(np.flatnonzero(free))
@@ -434,42 +365,6 @@ class PoseGraph:
         factor = float(np.clip(np.median(miss[rows.seen]), 1.0, 1e4)) if rows.seen.any() else 1.0
         return replace(ground, sigma_px=ground.sigma_px * factor, sigma_m=ground.sigma_m * factor)
 
-    def _shared_sigma(self) -> Floats:
-        """(8,) prior sigma of each shared unknown; those taken as reported are held close to zero."""
-        settings = self._settings
-        tilt, heading = np.radians([settings.tilt_offset_sigma_deg, settings.heading_offset_sigma_deg])
-        sigma = np.array([
-            settings.focal_sigma, settings.radial_sigma, settings.altitude_offset_sigma_m,
-            settings.gps_offset_sigma_m, settings.gps_offset_sigma_m, tilt, tilt, heading,
-        ])
-        return np.where(self._as_reported, np.minimum(sigma, _AS_REPORTED_SIGMA), sigma)
-
-    def _judge_offsets(self) -> None:
-        """Take telemetry's offsets as reported where this flight does not contradict them.
-
-        An offset that all frames share (altitude's zero, gimbal, compass) and that the rest of the flight sees at
-        less than two of its own sigmas is noise: left free, it would only turn, tilt or scale the whole map.
-        """
-        sigma = self._shared_sigma()
-        solution = self._solve(self._own(), shared=True, iterations=0)
-        size = solution.normal.shape[0]
-        first = size - len(SHARED)
-        factors = factorised(solution.normal)
-        silent = set()
-        for k in _OFFSETS:
-            if not 0 < sigma[k] < 100.0:
-                continue
-            unit = np.zeros(size)
-            unit[first + k] = 1.0
-            variance = max(float(factors.solve(unit)[first + k]), 1e-30)
-            information = 1 / variance - 1 / sigma[k] ** 2  # of the flight alone, without the prior
-            estimate = self._shared[k] / variance / information if information > 0 else 0.0
-            if estimate**2 * max(information, 0.0) <= 4.0:
-                silent.add(k)
-        for group in _OFFSET_GROUPS:
-            if silent.issuperset(group):
-                self._as_reported[list(group)] = True
-
     def _due(self) -> bool:
         """Whether it is time to solve everything: often at first; of a large flight only where its newest ground is
         strained, as it is after a loop without fixes."""
@@ -480,50 +375,26 @@ class PoseGraph:
     def _align(self) -> None:
         """Bring the whole map to known ground, else to its GPS fixes, by a similarity where it is far off: the solve
         only bends a little."""
-        if not len(self._ground.node):
-            self._align_to_fixes()
-        elif self._own().all():
-            self._align_to_ground()
-
-    def _align_to_fixes(self) -> None:
-        own = self._own()
-        sigma = self._rows.stated_sigma_m[:, :2].max(axis=1)
-        usable = own & np.isfinite(sigma)
-        if usable.sum() < 3 or not own.all():
+        if not self._own().all():
             return
-        fixes = self._rows.prior_centres_m[usable, :2]
-        places = self._rows.centres_m[usable, :2]
-        for _ in range(3):  # trimmed: a few wild fixes must not turn the map
-            spread = float(np.sqrt(((fixes - fixes.mean(0)) ** 2).sum(1).mean()))
-            uncertainty = float(np.median(sigma[usable])) / (np.sqrt(len(fixes)) * max(spread, 1e-9))
-            if len(fixes) < 3 or uncertainty > 0.15 or np.ptp(places, axis=0).max() <= 0:
-                return
-            change = fit_similarity(fixes, places)
-            miss = np.linalg.norm(places @ change[:2, :2].T + change[:2, 2] - fixes, axis=1)
-            keep = miss <= max(3 * float(np.median(miss)), 1e-6)
-            if keep.all():
-                break
-            fixes, places = fixes[keep], places[keep]
-        scale = float(np.hypot(change[0, 0], change[1, 0]))
-        turn = float(np.arctan2(change[1, 0], change[0, 0]))
-        if abs(np.log(scale)) < max(3 * uncertainty, 0.02) and abs(turn) < max(3 * uncertainty, 0.03):
-            return
-        self._move_all(change)
+        change = self._change_to_ground() if len(self._ground.node) else self._change_to_fixes()
+        if change is not None:
+            move_all(self._rows, change)
 
-    def _align_to_ground(self) -> None:
-        """Bring the whole map to known ground by a similarity of where it has the tied points, wild ones left out."""
+    def _change_to_fixes(self) -> Matrix3 | None:
+        sigma_m = self._rows.stated_sigma_m[:, :2].max(axis=1)
+        usable = np.isfinite(sigma_m)
+        if usable.sum() < 3:
+            return None
+        places_m, fixes_m = self._rows.centres_m[usable, :2], self._rows.prior_centres_m[usable, :2]
+        return change_to_fixes(places_m, fixes_m, sigma_m[usable])
+
+    def _change_to_ground(self) -> Matrix3 | None:
         names = np.array(self._names)[self._ground.node]
         ties = GroundTies(names, self._ground.ideal, self._ground.place_m, self._ground.sigma_px, self._ground.sigma_m)
         places_m = self.ground_places_m(ties)
         known = np.isfinite(places_m).all(axis=1)
-        change = similarity_of_most(ties.place_m[known, :2], places_m[known])
-        if change is None:
-            return
-        before = np.median(np.linalg.norm(places_m[known] - ties.place_m[known, :2], axis=1))
-        moved = apply_homography(change, places_m[known])
-        after = np.median(np.linalg.norm(moved - ties.place_m[known, :2], axis=1))
-        if before > 3 * after:  # else the solve, which knows more than a similarity, has it
-            self._move_all(change)
+        return change_to_ground(places_m[known], ties.place_m[known, :2])
 
     def _forget_places(self) -> None:
         """Take the flight's own frame out of its telemetry: looking down, with the heading that the map has."""
@@ -535,15 +406,6 @@ class PoseGraph:
             self._rows.set_prior(
                 at, CameraPrior(self._rows.centres_m[at].copy(), np.full(3, np.inf), down, sigma_deg)
             )
-
-    def _move_all(self, change: Matrix3) -> None:
-        """Shift, turn and scale the whole map by a similarity of the ground."""
-        scale = float(np.hypot(change[0, 0], change[1, 0]))
-        turn = float(np.arctan2(change[1, 0], change[0, 0]))
-        matrix = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]])
-        centres_m = self._rows.centres_m
-        self._rows.rotations[:] = matrix @ self._rows.rotations
-        centres_m[:] = np.column_stack([centres_m[:, :2] @ change[:2, :2].T + change[:2, 2], centres_m[:, 2] * scale])
 
     def _weigh_links(self) -> None:
         """Learn each link's noise across the parallax and the relief along it; drop links that cannot be true."""
@@ -579,31 +441,6 @@ class PoseGraph:
                 node.reported_m = outline
                 moved.add(self._names[at])
         return frozenset(moved)
-
-    def _ground_sigma_m(self, at: int, start: int, factors: SuperLU) -> float:
-        """One sigma of the ground point at a node's image centre, per axis; its unknowns begin at `start`."""
-        block = self._ground_centre_jacobian(at)
-        right = np.zeros((factors.shape[0], 2))
-        right[start:start + 6] = block.T
-        return float(np.sqrt(max(0.0, np.trace(block @ factors.solve(right)[start:start + 6]) / 2)))
-
-    def _ground_centre_jacobian(self, at: int) -> Floats:
-        """(2, 6) how the ground point at the image's centre moves with the camera's turn and shift."""
-        ray = self._rows.rotations[at][:, 2]
-        slope = ray / min(ray[2], -1e-3)
-        flat = np.eye(3)
-        flat[:, 2] -= slope
-        cross = np.array([[0, -ray[2], ray[1]], [ray[2], 0, -ray[0]], [-ray[1], ray[0], 0]])
-        turn = -self._rows.centres_m[at, 2] / min(ray[2], -1e-3) * flat @ -cross
-        return np.concatenate([turn, flat], axis=1)[:2]
-
-
-def _altitude_offset_prior_m(sigma_m: float | None) -> float:
-    """The prior sigma of the altitude's zero: 0 holds it (no telemetry), a wide one where `sigma_m` is infinite."""
-    if sigma_m is None:
-        return 0.0
-    return sigma_m if np.isfinite(sigma_m) else _FREE_M
-
 
 def pose_from_link(each: Link, new: Camera, old: Camera, site_from_old: Pose) -> Pose | None:
     """The new keyframe's pose as one link gives it."""

@@ -22,7 +22,7 @@ from sorvolo.missions.flight.warnings import flight_warnings
 from sorvolo.mosaic.base_ties import BaseReport
 from sorvolo.mosaic.consistency import Consistency, Stated, consistency
 from sorvolo.mosaic.flight_figures import FlightFigures, flight_figures, shown_m2, stated_height_m, track_row
-from sorvolo.mosaic.pose_graph import GraphReport
+from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.store.exports.control_files import control_summary
 from sorvolo.store.exports.plain import utc_text
 from sorvolo.survey.control import ControlReport

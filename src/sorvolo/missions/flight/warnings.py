@@ -6,7 +6,7 @@ from sorvolo.missions.flight.log import FlightLog
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.consistency import NOTHING_KNOWN, Consistency
 from sorvolo.mosaic.flight_figures import FlightFigures
-from sorvolo.mosaic.pose_graph import GraphReport
+from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.wording import counted, plural
 

@@ -22,10 +22,10 @@ from sorvolo.missions.map.painting import FlightPainter, site_from_image
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.mosaic.base_ties import BaseReport, FoundFrame, tie_to_base
 from sorvolo.mosaic.exposure import Exposure
+from sorvolo.mosaic.graph_settings import PoseGraphSettings
 from sorvolo.mosaic.keyframes import Keyframes
 from sorvolo.mosaic.placing import map_m_per_px, sees_horizon
 from sorvolo.mosaic.planar import PlanarMapper, Registered
-from sorvolo.mosaic.pose_graph import PoseGraphSettings
 from sorvolo.registration.lens import Undistorter, refined_camera
 from sorvolo.store.exports.control_files import control_documents
 from sorvolo.store.exports.map_pictures import picture

@@ -1,0 +1,46 @@
+"""What a flight taught the pose graph about itself, and how well its cameras place the ground."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse.linalg import SuperLU
+
+from sorvolo.geometry.arrays import Floats, Matrix3
+
+
+@dataclass(frozen=True, eq=False)
+class GraphReport:
+    """What the flight taught about itself; sigmas are one standard deviation."""
+
+    focal_scale: float
+    focal_scale_sigma: float
+    radial: float
+    altitude_offset_m: float
+    links: int
+    links_dropped: int
+    relief_m: float
+    rms_px: float
+    angles_contradicted: int = 0  # frames whose stated angles the pictures rule out: these angles are not used
+    turned_deg: tuple[float, float] = (0.0, 0.0)  # tilt and heading that all stated angles are off by
+
+
+def ground_sigma_m(rotation: Matrix3, height_m: float, start: int, factors: SuperLU) -> float:
+    """One sigma of the ground point at a camera's image centre, per axis; its unknowns begin at `start` of `factors`.
+
+    `rotation` is site_from_camera, `height_m` the camera's height.
+    """
+    block = _ground_centre_jacobian(rotation, height_m)
+    right = np.zeros((factors.shape[0], 2))
+    right[start:start + 6] = block.T
+    return float(np.sqrt(max(0.0, np.trace(block @ factors.solve(right)[start:start + 6]) / 2)))
+
+
+def _ground_centre_jacobian(rotation: Matrix3, height_m: float) -> Floats:
+    """(2, 6) how the ground point at the image's centre moves with the camera's turn and shift."""
+    ray = rotation[:, 2]
+    slope = ray / min(ray[2], -1e-3)
+    flat = np.eye(3)
+    flat[:, 2] -= slope
+    cross = np.array([[0, -ray[2], ray[1]], [ray[2], 0, -ray[0]], [-ray[1], ray[0], 0]])
+    turn = -height_m / min(ray[2], -1e-3) * flat @ -cross
+    return np.concatenate([turn, flat], axis=1)[:2]
