@@ -33,6 +33,7 @@ ASSUMPTIONS: dict[str, tuple[float, str]] = {
     "used_share": (0.7, "of a machine that is planned with"),
     "core_hour_eur": (0.02, "price of a core for an hour, its memory, power and room included"),
     "tb_month_eur": (5, "price of a terabyte in an object store for a month"),
+    "put_million_eur": (5, "price of a million objects written into a store"),
     "gbit_month_eur": (300, "price of one Gbit/s of incoming network for a month"),
     "hours_a_month": (730, "a stream that never ends; a working fleet has a tenth"),
     "disk_gb_s": (1, "read from a store by one reader"),
@@ -61,7 +62,7 @@ def main() -> None:
     print("### Assumptions\n")
     print(table(("name", "value", "what"), ((name, f"{given[name]:g}", ASSUMPTIONS[name][1]) for name in ASSUMPTIONS)))
     print("### Unit costs\n")
-    print(table(("mission", "processor s", "start, s", "peak memory, MB", "kept, kB"), unit_rows(costs)))
+    print(table(("mission", "processor s", "start, s", "peak memory, MB", "kept, kB", "files"), unit_rows(costs)))
     print(f"### {given['streams']:,.0f} live streams\n")
     names = (
         "work on each stream", "cores a stream", "cores", "memory, TB", "network, Gbit/s", "machines", "runs out first",
@@ -88,7 +89,7 @@ def unit_rows(costs: Mapping[str, Any]) -> Iterable[Sequence[str]]:
     for name, row in costs.items():
         yield (
             name, f"{row['cpu_s']:.2f}", f"{row['start_cpu_s']:.0f}", f"{row['peak_mb']:,.0f}",
-            f"{row['bytes'] / 1000:,.0f}",
+            f"{row['bytes'] / 1000:,.0f}", f"{row['files']:.1f}",
         )
 
 
@@ -141,9 +142,12 @@ def archive_rows(costs: Mapping[str, Any], given: Mapping[str, float]) -> Iterab
                 f"{mission} once", f"{hours:,.0f} core hours: {ceil(machines):,} machines for 30 days, "
                 f"{hours * given['core_hour_eur']:,.0f} EUR",
             )
-    kept_tb = photos * costs[f"{prefix}: map"]["bytes"] / 1e12
+    mapped = costs[f"{prefix}: map"]
+    kept_tb, files_m = photos * mapped["bytes"] / 1e12, photos * mapped["files"] / 1e6
     months = 12 * given["years"]
-    yield "maps beside the photos", f"{kept_tb:,.0f} TB"
+    puts_eur = files_m * given["put_million_eur"]
+    yield "maps beside the photos", f"{kept_tb:,.0f} TB in {files_m:,.0f} million files"
+    yield "these files written into an object store", f"{puts_eur:,.0f} EUR"
     total_tb = given["archive_tb"] + kept_tb
     eur = total_tb * given["tb_month_eur"] * months
     yield "kept", f"{total_tb:,.0f} TB, {eur:,.0f} EUR in {given['years']:g} years"

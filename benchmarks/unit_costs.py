@@ -7,7 +7,7 @@ its processor time and peak memory, so that other work on the machine disturbs w
 loaded machine has slower caches: processor time grows by some tens of per cent). The difference of both runs over the
 difference of their units is the unit cost; what remains of the short run is the start (imports, models). A unit is a
 photo, and of a video a key frame (map), a view (compare) or a searched frame (watch); decoding is a row of its own and
-taken off the others. Bytes are what the site, or the watch's folder, has more on the disk. One thread of OpenMP. Inputs
+taken off the others. Bytes and files are what the site, or the watch's folder, has more. One thread of OpenMP. Inputs
 are simulated: 1080p video at 10 frames a second from 30 m, photos of `--megapixels` from 40 m with 70 % overlap.
 Written to results/unit_costs.json; `--only` measures those rows anew and keeps the others.
 """
@@ -139,13 +139,13 @@ def unit_cost(job: Job, flights: Sequence[Path], work: Path, decode_s: float) ->
     """The job on both sizes, and what a unit costs besides decoding its frames."""
     runs = [run(job, simulation, work) for simulation in flights]
     short, long = runs
-    more = {name: long[name] - short[name] for name in ("units", "frames", "cpu_s", "bytes")}
+    more = {name: long[name] - short[name] for name in ("units", "frames", "cpu_s", "bytes", "files")}
     decode_s = 0.0 if job == DECODE else decode_s
     cpu_s = (more["cpu_s"] - decode_s * more["frames"]) / more["units"]
     start_s = short["cpu_s"] - cpu_s * short["units"] - decode_s * short["frames"]
     return {
         "cpu_s": round(cpu_s, 4), "start_cpu_s": round(start_s, 2), "peak_mb": round(long["peak_mb"]),
-        "bytes": round(more["bytes"] / more["units"]), "runs": runs,
+        "bytes": round(more["bytes"] / more["units"]), "files": round(more["files"] / more["units"], 1), "runs": runs,
     }
 
 
@@ -165,13 +165,15 @@ def run(job: Job, simulation: Path, work: Path) -> dict[str, Any]:
         shutil.copytree(kept, places["mapped"])
     number = 2 if any("{flight2}" in each for each in job.arguments) else 1
     grown = Path(job.grows.format(**places))
-    before = bytes_below(grown)
+    before_bytes, before_files = below(grown)
     is_ours = job != DECODE
     takes_camera = is_ours and any("{flight" in each for each in job.arguments)
     arguments = [each if each == _DECODE else each.format(**places) for each in job.arguments]
     used = run_python([*(("-m", "sorvolo") if is_ours else ()), *arguments, *(camera if takes_camera else ())])
     frames = frames_of(simulation, number)
-    return {"frames": frames, "units": units_of(grown, number, frames), **used, "bytes": bytes_below(grown) - before}
+    size, files = below(grown)
+    kept = {"bytes": size - before_bytes, "files": files - before_files}
+    return {"frames": frames, "units": units_of(grown, number, frames), **used, **kept}
 
 
 def units_of(grown: Path, number: int, frames: int) -> int:
@@ -213,16 +215,17 @@ def run_python(arguments: Sequence[str]) -> dict[str, float]:
     return {"cpu_s": used.ru_utime + used.ru_stime, "peak_mb": used.ru_maxrss / 1024}
 
 
-def bytes_below(folder: Path) -> int:
-    """The sizes of all files below a folder."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if folder.is_dir() else 0
+def below(folder: Path) -> tuple[int, int]:
+    """The bytes and the number of all files below a folder."""
+    sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()] if folder.is_dir() else []
+    return sum(sizes), len(sizes)
 
 
 def show(rows: dict[str, Any]) -> None:
     """The table."""
-    table = Table("mission", "CPU s a unit", "start, CPU s", "peak MB", "bytes a unit")
+    table = Table("mission", "CPU s a unit", "start, CPU s", "peak MB", "bytes a unit", "files a unit")
     for name, row in rows.items():
-        table.add_row(name, *(str(row[key]) for key in ("cpu_s", "start_cpu_s", "peak_mb", "bytes")))
+        table.add_row(name, *(str(row[key]) for key in ("cpu_s", "start_cpu_s", "peak_mb", "bytes", "files")))
     Console().print(table)
 
 

@@ -4,6 +4,8 @@ import csv
 import io
 import shutil
 from dataclasses import replace
+from functools import reduce
+from operator import xor
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +55,12 @@ def copied(dataset: Path, to: Path) -> Path:
     """The dataset anew, to be broken."""
     shutil.copytree(dataset, to)
     return to
+
+
+def log_of_another_year() -> str:
+    """An NMEA log, a fix a second."""
+    bodies = [f"GPRMC,1200{second:02d}.00,A,4153.5387,N,01236.2125,E,9.7,90.0,010109,,,A" for second in range(9)]
+    return "".join(f"${body}*{reduce(xor, body.encode()):02X}\r\n" for body in bodies)
 
 
 def test_simulated_dataset_has_the_layout_of_chapter_2(dataset: Path) -> None:
@@ -133,6 +141,8 @@ def test_missing_and_broken_files_cost_their_rows_alone(dataset: Path, tmp_path:
     broken = copied(dataset, tmp_path / "umcd")
     part = broken / WITH / MOSAICKING / "Countryside"
     shutil.copy(part / "path1.mp4", part / "path2.mp4")
+    shutil.copy(part / "path1.mp4", part / "path3.mp4")
+    (part / "path3.log").write_text(log_of_another_year())
     (part / "path1.mp4").write_bytes(b"no video at all" * 99)
     (part / "path2.csv").write_text("Name,Value\n1,2\n")
     (broken / WITH / CHANGES / "Countryside" / "path1.txt").unlink()  # nothing for the detector to look at
@@ -142,6 +152,7 @@ def test_missing_and_broken_files_cost_their_rows_alone(dataset: Path, tmp_path:
     reasons = {each.row.id: each.row.missing for each in updates if each.row.missing}
     assert "path1.mp4" in reasons["mosaic/with/countryside/path1/planar"]
     assert "no telemetry beside it (found: path2.csv)" in reasons["mosaic/with/countryside/path2/thesis"]
+    assert "the telemetry is of another flight" in reasons["mosaic/with/countryside/path3/planar"]
     assert "the map of countryside/path1 could not be made" in reasons["comparison/countryside/path1/robust"]
     assert "no mosaicking video of its path" in reasons["comparison/countryside/path9/robust"]
     assert "video/Videos With Telemetry/Mosaicking/Urban/path4.mp4" in reasons
