@@ -119,7 +119,7 @@ def test_a_keyframe_stored_smaller_sees_the_same_ground(file_folder: Path) -> No
 
 def test_images_come_out_of_the_writer_as_out_of_the_archive(file_folder: Path) -> None:
     with opened(file_folder) as archive:
-        with archive.begin_flight("a", "", {}, cache_mb=0) as writer:
+        with archive.begin_flight("a", "", {}, tiles_mb=0, images_mb=0) as writer:
             paths = {index: writer.save_image(index, image(index)) for index in range(3)}
             seen = [writer.image(index) for index in range(3)]
             writer.save_image(0, image(9))
@@ -205,7 +205,7 @@ def test_versions_share_the_tiles_in_which_they_agree(folder: Path) -> None:
 
 
 def test_repainting_leaves_no_blobs_behind(folder: Path) -> None:
-    with opened(folder) as archive, archive.begin_flight("a", "", {}, cache_mb=2) as writer:
+    with opened(folder) as archive, archive.begin_flight("a", "", {}, tiles_mb=2, images_mb=2) as writer:
         for colour in range(20, 30):
             for column in range(4):  # more than fit into memory, so that some are written between flushes
                 writer.tiles[column, 0] = tile(colour, opaque_columns=100 + column)

@@ -16,7 +16,14 @@ from fake_flights import LOCAL_SITE, ORIGIN, SITE, frame, tile
 from sorvolo.geometry.geodesy import Geodetic, Projection
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.store.exports.frame_files import frames_geojson
-from sorvolo.store.exports.map_pictures import picture, pictures, write_kmz, write_live_preview, write_preview
+from sorvolo.store.exports.map_pictures import (
+    picture,
+    pictures,
+    write_kmz,
+    write_live_preview,
+    write_preview,
+    write_small_maps,
+)
 from sorvolo.store.exports.plain import geojson_bytes, plain_json, utc_text
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
@@ -173,6 +180,24 @@ def test_previews_are_png_with_a_transparent_background(tmp_path: Path) -> None:
     assert not (tmp_path / "live.png").exists()
     write_live_preview({(0, 0): tile(9)}, tmp_path / "live.png")
     assert cv2.imread(str(tmp_path / "live.png"))[0, 0].tolist() == [0, 0, 9]
+
+
+def test_small_maps_are_written_from_one_reading_of_the_tiles(tmp_path: Path) -> None:
+    class Counted(dict):
+        reads = 0
+
+        def __getitem__(self, index: tuple[int, int]) -> np.ndarray:
+            Counted.reads += 1
+            return super().__getitem__(index)
+
+    tiles, site_grid = marked_tiles((-700, 2300)), SiteGrid.at(ORIGIN, 0.2, "EPSG:32633")
+    write_preview(tiles, tmp_path / "preview.png")
+    write_kmz(tiles, site_grid, "two fields", tmp_path / "two.kmz")
+    write_small_maps(Counted(tiles), site_grid, "two fields", tmp_path / "small.png", tmp_path / "small.kmz")
+    assert Counted.reads <= len(tiles) + 1
+    assert (tmp_path / "small.kmz").read_bytes() == (tmp_path / "two.kmz").read_bytes()
+    one, two = (cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED) for name in ("preview.png", "small.png"))
+    assert np.abs(np.array(one.shape) - two.shape).max() <= 1 and max(two.shape) <= 2048
 
 
 @pytest.mark.parametrize("origin", [ORIGIN, Geodetic(-17.0, 179.9999), Geodetic(78.2, 15.6)])

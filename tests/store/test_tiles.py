@@ -76,6 +76,17 @@ def test_tiles_read_lately_are_kept_until_they_are_removed(tmp_path: Path) -> No
         blobs.load(sha256)
 
 
+def test_what_is_released_is_read_again_from_the_disk(tmp_path: Path) -> None:
+    tiles = GrowingTiles(TileBlobs(tmp_path), {}, 512, 8 << 20)
+    painted = np.full((512, 512, 4), 9, np.uint8)
+    tiles[0, 0] = painted
+    tiles.save()
+    tiles[0, 1] = painted + 1
+    tiles.release()
+    assert set(tiles._loaded) == {(0, 1)} and tiles._bytes == painted.nbytes
+    assert (tiles[0, 0] == 9).all() and (tiles[0, 1] == 10).all()
+
+
 def test_no_more_tiles_are_kept_than_memory_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sorvolo.store.site.tiles._CACHE_BYTES", 2 * flat(1).nbytes)
     blobs = TileBlobs(tmp_path)

@@ -99,7 +99,7 @@ SearchedClasses = Annotated[
 ]
 Memory = Annotated[
     float | None,
-    typer.Option(help="Memory for pictures that are needed again, MB. Without it: a quarter of the machine's."),
+    typer.Option(help="Memory for pictures that are needed again, MB. Without it: 512, or a quarter of the machine's."),
 ]
 
 CatalogueAddress = Annotated[
@@ -107,6 +107,13 @@ CatalogueAddress = Annotated[
     typer.Option(
         help="Where a new map's catalogue lies: postgresql://USER@HOST/DATABASE, or sqlite, a file in the folder. "
         "Without it: SORVOLO_CATALOGUE, else sqlite. See docs/catalogue.md."
+    ),
+]
+Refly = Annotated[
+    list[Path] | None,
+    typer.Option(
+        help="Waypoints over ground that no picture shows: .plan, .kmz (DJI), .geojson or .kml. Kept up to date while "
+        "the flight goes on. Can be repeated."
     ),
 ]
 WithHeights = Annotated[
@@ -139,6 +146,7 @@ def map_command(
     give_up: GiveUp = 30.0,
     catalogue: CatalogueAddress = "",
     heights: WithHeights = False,
+    refly: Refly = None,
     again: Again = False,
     as_json: AsJson = False,
 ) -> None:
@@ -171,6 +179,7 @@ def map_command(
         reports = map_and_read_reports(
             inputs, place.folder, settings, telemetry=telemetry, camera=camera or None, area=area,
             live=LiveSettings(keeps_all=True, give_up_s=give_up), control=gcp, base=base, again=again, sent=place.sent,
+            refly=refly or (),
         )
         _print(reports, place.folder, with_heights=heights, as_json=as_json)
     _exit_by(reports)
@@ -208,7 +217,7 @@ def map_and_read_reports(
     inputs: Sequence[Path | str], site: Path, settings: "MapSettings", *, telemetry: Path | str | None = None,
     camera: str | None = None, area: Path | None = None,
     live: "LiveSettings | None" = None, control: Path | None = None, base: Path | None = None, again: bool = False,
-    sent: Passing = not_sent,
+    sent: Passing = not_sent, refly: Sequence[Path] = (),
 ) -> list[dict[str, Any]]:
     """Map with progress on stderr; the reports of the flights, in order, and of those that were mapped already.
 
@@ -223,6 +232,7 @@ def map_and_read_reports(
         mapping = sent(map_flights(
             inputs, site, settings, telemetry=telemetry, camera=camera, area=area,
             live=live or LiveSettings(keeps_all=True), until=until, control=control, base=base, again=again,
+            refly=refly,
         ))
         known: list[AlreadyDone] = []
 
@@ -313,10 +323,22 @@ def _quality_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         *_control_rows(report.get("control")),
         ("base map", _base(report.get("base"))),
         ("map", _size(report)),
+        ("ground seen", _seen(report.get("seen"), has_metres=report["georeferenced"])),
         ("objects found", _objects(report.get("objects") or {})),
         ("clock offset", _clock_offset(report["time_offset"])),
         ("took", f"{report['seconds']['total']:.1f} s, memory at most {report['peak_memory_mb']:,.0f} MB"),
     ]
+
+
+def _seen(seen: Mapping[str, Any] | None, *, has_metres: bool) -> str:
+    """How much ground one picture alone shows, and what none does."""
+    if seen is None or not has_metres or not seen["seen_m2"]:
+        return ""
+    words = f"{seen['one_view_m2'] / seen['seen_m2']:.0%} of it by one picture alone"
+    if not seen["holes"]:
+        return f"{words}, no holes"
+    planned = f"; waypoints in {', '.join(seen['refly'])}" if seen["refly"] else "; --refly plans a flight over them"
+    return escape(f"{words}, {counted(seen['holes'], 'hole')} of {seen['holes_m2']:,.0f} m2{planned}")
 
 
 def _placed_by(report: Mapping[str, Any]) -> str:

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 
 from sorvolo.detection.contract import METADATA_KEY, ModelInfo, info_from_metadata
@@ -80,6 +79,8 @@ def describe(model: bytes, where: str) -> Engine:
 
 def _cuda_engine(model: bytes, where: str, threads: int) -> Engine | None:
     """The model on the GPU; None where the runtime finds none."""
+    import onnxruntime  # 30 MB of memory, for those who detect
+
     if CUDA not in onnxruntime.get_available_providers():
         return None
     session = _onnx_session(model, where, threads, [CUDA, "CPUExecutionProvider"])
@@ -101,6 +102,8 @@ def _count(threads: int) -> str:
 def _onnx_session(
     model: bytes, where: str, threads: int, providers: list[str], *, optimise: bool = True
 ) -> Any:
+    import onnxruntime
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.log_severity_level = 4
@@ -116,6 +119,8 @@ def _onnx_session(
 
 def _refusal(message: str) -> str:
     """Why the runtime refuses a model, and what to do."""
+    import onnxruntime
+
     runtime = f"ONNX Runtime {onnxruntime.__version__}"
     first = " ".join(message.split())[:200]
     if "IR version" in message or "opset" in message.lower():

@@ -1,7 +1,7 @@
 """Planning a flight: from a camera and a task to height, overlap and rate, and over an area to waypoints."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -34,6 +34,7 @@ from sorvolo.survey.area import Area
 from sorvolo.survey.flight import CameraModel
 from sorvolo.survey.objects import TYPICAL_SIZE_M
 
+_SLOW_M_S = 3.0  # over what is flown again
 DEFAULT_SIZE_PX = (1920, 1080)
 """Frame size where neither the user nor a preset names one."""
 
@@ -164,6 +165,19 @@ def plan_over(area: Area, answers: FlightAnswers, settings: PlanSettings) -> Fli
 def write_plan(path: Path, plan: FlightPlan, area: Area, *, dji_drone: str = "fly") -> None:
     """Write a plan made by `plan_over` as .plan, .kmz (for a DJI drone), .geojson or .kml."""
     write_waypoints(path, plan, area.frame, area.name, dji_drone=dji_drone)
+
+
+def fly_again(
+    area: Area, camera: Camera, height_m: float, files: Sequence[Path], *, dji_drone: str = "fly"
+) -> FlightPlan:
+    """Slow passes over what a flight with this camera did not see, written to the files; as high as it was flown."""
+    wishes = PlanSettings(
+        height_m=min(height_m, LEGAL_CEILING_M), model="none", speed_m_s=_SLOW_M_S, forward_overlap=0.7,
+    )
+    plan = plan_over(area, answer_questions(CameraModel(camera, "the mapped flight's", 0.01), wishes), wishes)
+    for path in files:
+        write_plan(path, plan, area, dji_drone=dji_drone)
+    return plan
 
 
 def critical_dimension_m(facing: str, critical_m: float) -> float:

@@ -6,7 +6,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats32, ImageGray, Matrix3, PointsPx
@@ -84,6 +83,8 @@ def _sampled(planes: Floats32, points_px: PointsPx) -> Floats32:
 @lru_cache(maxsize=1)
 def _network() -> Any:
     """The packaged model, opened once; on as many cores as there are."""
+    import onnxruntime  # 30 MB of memory, for flights that ORB does not lay
+
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     stored = files("sorvolo.registration").joinpath("learned_features.onnx").read_bytes()

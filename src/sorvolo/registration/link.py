@@ -29,6 +29,7 @@ class LinkSettings:
     refine_reach_px: float = 8.0  # a refined point may leave the first fit by this much
     max_pairs: int = 40  # pairs kept per link, spread over the overlap
     min_correlation: float = 0.35  # of the overlaid images: the last check against a false fit
+    most_shared: float = 0.4  # of a picture: what is known to share less is searched with SIFT there alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +58,10 @@ class LinkCache:
             self._corners[keyframe.id] = corners(keyframe.gray, self._settings)
             _trim(self._corners, self._capacity)
         return self._corners[keyframe.id]
+
+    def has_sift(self, keyframe: Keyframe) -> bool:
+        """Whether the keyframe's SIFT features are known."""
+        return keyframe.id in self._sift
 
     def sift(self, keyframe: Keyframe) -> Features:
         """The keyframe's SIFT features."""
@@ -118,7 +123,7 @@ def _candidates(
             yield fitted
     if effort is Effort.CHEAP:
         return
-    fitted = _fit(cache.sift(new), cache.sift(old), prediction, settings)
+    fitted = _fit(*_sift_pair(new, old, prediction, settings, cache), prediction, settings)
     if fitted is not None:
         yield fitted
     if prediction is not None:
@@ -140,6 +145,43 @@ def _fit(
         return None
     agree = found[1]
     return _Fit(found[0], new_px[agree], old_px[agree], is_sub_pixel=new.kind == "sift" and agree.mean() > 0.25)
+
+
+def _sift_pair(
+    new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache
+) -> tuple[Features, Features]:
+    """SIFT features of both; where they are known to share little, of that part alone: the rest is most of the cost."""
+    if prediction is not None and prediction.is_tight and not (cache.has_sift(new) and cache.has_sift(old)):
+        in_new = _shared_box(new.gray, old.gray, prediction.new_from_old, prediction.search_px)
+        old_from_new: Matrix3 = np.linalg.inv(prediction.new_from_old).astype(np.float64)
+        in_old = _shared_box(old.gray, new.gray, old_from_new, prediction.search_px)
+        if _share(in_new, new.gray) + _share(in_old, old.gray) < 2 * settings.most_shared:
+            return _sift_in(new, in_new, settings), _sift_in(old, in_old, settings)
+    return cache.sift(new), cache.sift(old)
+
+
+def _shared_box(image: ImageGray, other: ImageGray, image_from_other: Matrix3, margin_px: float) -> tuple[slice, slice]:
+    """Rows and columns of `image` in which the other one lies, and as much around it."""
+    height, width = other.shape
+    corners_px = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
+    seen = np.nan_to_num(apply_homography(image_from_other, corners_px), nan=0.0, posinf=0.0, neginf=0.0)
+    size = np.array(image.shape[::-1])
+    low = np.clip(np.floor(seen.min(axis=0) - margin_px), 0, size).astype(int)
+    high = np.clip(np.ceil(seen.max(axis=0) + margin_px), 0, size).astype(int)
+    return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
+
+
+def _share(box: tuple[slice, slice], image: ImageGray) -> float:
+    return float(image[box].size / image.size)
+
+
+def _sift_in(keyframe: Keyframe, box: tuple[slice, slice], settings: LinkSettings) -> Features:
+    """The SIFT features within rows and columns of a keyframe's picture."""
+    part = keyframe.gray[box]
+    if min(part.shape) < 2 * settings.refine_window_px:
+        return Features("sift", np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+    found = sift_features(np.ascontiguousarray(part), settings.features)
+    return Features(found.kind, found.points_px + np.array([box[1].start, box[0].start]), found.descriptors)
 
 
 def _as_link(new: Keyframe, old: Keyframe, found: _Fit, settings: LinkSettings) -> Link:

@@ -22,13 +22,14 @@ from sorvolo.store.exports.plain import features_name
 from sorvolo.store.nofollow import read_below
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import FlightEntry
+from sorvolo.store.site.files import LIVE_COVERAGE
 from sorvolo.survey.flight import Site
 
 TITLES: Mapping[str, str] = {
     "frames": "Frames: what of the ground each shows, and how it was placed",
     "objects": "People, cars and small objects, each once, by the newest look at each place",
     "changes": "Changes between flights",
-    "coverage": "Ground that comparisons could speak about, and the rest with its reason",
+    "coverage": "Ground that flights saw, and its holes; ground compared, and the rest with its reason",
     "pod": "Probability of detection of the latest measured search",
     "track": "The drone's way, one line a flight",
 }
@@ -36,6 +37,7 @@ SEARCH_FOLDER = "search"
 """The folder of a site in which the station keeps its latest measured search."""
 
 _POD_FILE = f"{SEARCH_FOLDER}/pod.geojson"
+_LIVE_COVERAGE = LIVE_COVERAGE.removesuffix(".geojson")
 _MOST_BYTES = 256_000_000
 
 Feature = dict[str, Any]
@@ -93,7 +95,7 @@ class SiteCollections:
         if name not in _MAKERS:
             raise Problem(404, f"no collection {name[:40]!r}; there are {', '.join(_MAKERS)}")
         archive = self._shelf.open(site_id)
-        mark = (archive.change_mark(), _modified(archive, _POD_FILE))
+        mark = (archive.change_mark(), _modified(archive, _POD_FILE), _modified(archive, LIVE_COVERAGE))
         with self._lock:
             known = self._kept.get((site_id, name))
         if known is not None and known.mark == mark:
@@ -185,6 +187,10 @@ def _coverage(archive: Archive) -> list[Feature]:
             values = {**(each.get("properties") or {}), "flight": flight}
             geometry = _lonlat(each.get("geometry"), archive.site())
             features.append({"type": "Feature", "id": f"{flight}:{number}", "geometry": geometry, "properties": values})
+    for number, each in enumerate(_features_of(archive, "", _LIVE_COVERAGE, local=False)):  # of the flight in the air
+        values = {**(each.get("properties") or {}), "flight": None}
+        geometry = _lonlat(each.get("geometry"), archive.site())
+        features.append({"type": "Feature", "id": f"live:{number}", "geometry": geometry, "properties": values})
     return features
 
 
@@ -212,7 +218,7 @@ def _features_of(archive: Archive, folder: str, name: str, *, local: bool | None
     """The features of a GeoJSON file of the site; none where there is no such file or somebody broke it."""
     is_local = archive.site().is_local if local is None else local
     try:
-        file = f"{folder}/{features_name(name, is_local=is_local)}"
+        file = "/".join(filter(None, (folder, features_name(name, is_local=is_local))))
         features = json.loads(read_below(archive.folder, file, _MOST_BYTES)).get("features")
     except (OSError, ValueError, RecursionError, AttributeError):
         return []
@@ -253,6 +259,7 @@ def _content(archive: Archive) -> object:
         [each.id for each in archive.versions() if each.complete],
         [(each.change_id, each.verdict, each.at_utc, each.note) for each in archive.reviews()],
         _modified(archive, _POD_FILE),
+        _modified(archive, LIVE_COVERAGE),
     )
 
 

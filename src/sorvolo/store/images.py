@@ -161,3 +161,8 @@ class ImageCache:
         """Drop the image at `index`: its file changes."""
         dropped = self._images.pop(index, None)
         self._bytes -= 0 if dropped is None else dropped.nbytes
+
+    def clear(self) -> None:
+        """Drop all images."""
+        self._images.clear()
+        self._bytes = 0

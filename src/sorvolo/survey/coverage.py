@@ -44,3 +44,17 @@ class CoveredGround:
     why: str
     smallest_m: float
     faint_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class SeenGround:
+    """Ground that a flight's pictures show alike: polygons (outline, then holes; (N, 2) site metres each).
+
+    `views` is how many pictures show it at least; 0: a hole, which none shows though it lies in the area that was asked
+    for, or amid what was seen. `m_per_px` is the median of the finest picture's resolution there, NaN for a hole.
+    """
+
+    polygons: tuple[tuple[PointsM, ...], ...]
+    area_m2: float
+    views: int
+    m_per_px: float

@@ -34,7 +34,7 @@ class MapSettings:
     thesis: RoiStitchingSettings = field(default_factory=RoiStitchingSettings)  # of method thesis
     control_sigma_m: float = 0.05  # of the control points' places, horizontal
     checks: tuple[str, ...] = ()  # control points held back to measure the map; "NAME*" for all that begin so
-    memory_mb: float | None = None  # for what can be read again; None: a quarter of the machine's
+    memory_mb: float | None = None  # for what can be read again; None: 512 MB
     classes: tuple[str, ...] = ()  # that are looked for; none: those that the model usually reports
 
     def __post_init__(self) -> None:

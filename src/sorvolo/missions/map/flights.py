@@ -31,6 +31,7 @@ from sorvolo.missions.flight.setup import (
     prepare,
     repeated,
 )
+from sorvolo.missions.map.coverage import FlightCoverage
 from sorvolo.missions.map.journal import Earlier, MapJournal, Step, begun_journal
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.map.run import FlightRun
@@ -50,7 +51,7 @@ def map_flights(
     telemetry: Path | str | None = None, camera: Path | str | None = None, area: Path | None = None,
     detector: Detects | None = None, live: LiveSettings = LiveSettings(keeps_all=True),  # noqa: B008 (frozen)
     until: threading.Event | None = None, control: Path | None = None,
-    base: Path | None = None, again: bool = False,
+    base: Path | None = None, again: bool = False, refly: Sequence[Path] = (),
 ) -> Generator[MosaicUpdate, None, tuple[AlreadyDone, ...]]:
     """Map one or more flights into the site folder, yielding an update for each selected frame.
 
@@ -63,6 +64,7 @@ def map_flights(
     Nothing of a flight is part of the site until its last update was yielded.
     A run that was killed goes on where it was when the same is asked for again. A flight that the site has already, by
     the same files, settings and version of the program, is left out and returned, unless `again` is given.
+    `refly` are files for waypoints over ground that the pictures leave out, kept up to date while the flight goes on.
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being mapped is left out, those before it are in.
     """
@@ -82,8 +84,9 @@ def map_flights(
             if mapped and not again:
                 known.append(mapped)
                 continue
+            coverage = FlightCoverage(setup, archive, wanted, refly, settings.live_s)
             yield from _map_one(
-                setup, archive, settings, wanted, looks, request, anew=again and mapped is None
+                setup, archive, settings, wanted, looks, request, coverage, anew=again and mapped is None
             )
         return tuple(known)
 
@@ -109,14 +112,14 @@ def _known_ground(
 
 def _map_one(
     setup: FlightSetup, archive: Archive, settings: MapSettings, area: Area | None, detector: Detects | None,
-    request: str, *, anew: bool,
+    request: str, coverage: FlightCoverage, *, anew: bool,
 ) -> Generator[MosaicUpdate]:
     started_s, source = time.monotonic(), setup.source
     refuse_without_texture(source)
     check_room(setup, archive.folder, archive.site().m_per_px if archive.has_site else settings.m_per_px)
     setup = replace(setup, notices=(*setup.notices, *repeated(archive, source.name, "mapped")))
     finder = None if detector is None else ObjectFinder(detector, source.camera.camera, settings.classes)
-    with _begun(setup, archive, settings, finder, request, anew=anew) as run:
+    with _begun(setup, archive, settings, finder, request, coverage, anew=anew) as run:
 
         def update(frame: Step | LostFrame | Frame, ended: tuple[Status, str, int], read: int) -> MosaicUpdate:
             view = None if isinstance(frame, LostFrame) else run.view(frame.index, frame.time_ns)
@@ -140,13 +143,14 @@ def _map_one(
         )
         for each in selected:
             ended = run.take(each)
+            coverage.show(run.pictures_on_ground)
             yield update(each if isinstance(each, LostFrame) else each.posed.frame, ended, reader.read)
         run.finish(source.notices(), started_s)
 
 
 def _begun(
-    setup: FlightSetup, archive: Archive, settings: MapSettings, finder: ObjectFinder | None, request: str, *,
-    anew: bool,
+    setup: FlightSetup, archive: Archive, settings: MapSettings, finder: ObjectFinder | None, request: str,
+    coverage: FlightCoverage, *, anew: bool,
 ) -> FlightRun:
     """The run of one flight; a recorded one notes how far it is, and goes on where a killed one was."""
     if settings.method == "thesis":
@@ -154,7 +158,7 @@ def _begun(
     journal = None
     if not isinstance(setup.source, LiveSource):
         journal = MapJournal(begun_journal(setup, archive, request, anew=anew))
-    return PlanarRun(setup, archive, settings, finder=finder, journal=journal, request=request)
+    return PlanarRun(setup, archive, settings, finder=finder, journal=journal, request=request, coverage=coverage)
 
 
 class _Reader:

@@ -16,6 +16,7 @@ from sorvolo.missions.flight.memory import memory_budget_bytes
 from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.missions.map.coverage import FlightCoverage
 from sorvolo.missions.map.journal import MapJournal, Step, StoredPicture, Taken
 from sorvolo.missions.map.known_keyframes import KnownKeyframes
 from sorvolo.missions.map.painting import FlightPainter, site_from_image
@@ -26,6 +27,7 @@ from sorvolo.mosaic.graph_settings import PoseGraphSettings
 from sorvolo.mosaic.keyframes import Keyframes
 from sorvolo.mosaic.placing import map_m_per_px, sees_horizon
 from sorvolo.mosaic.planar import PlanarMapper, Registered
+from sorvolo.mosaic.seen_ground import PictureOnGround
 from sorvolo.registration.lens import Undistorter, refined_camera
 from sorvolo.store.exports.control_files import control_documents
 from sorvolo.store.exports.map_pictures import picture
@@ -49,8 +51,10 @@ class PlanarRun(FlightRun):
     def __init__(
         self, setup: FlightSetup, archive: Archive, settings: MapSettings, writer: FlightWriter | None = None,
         finder: ObjectFinder | None = None, journal: MapJournal | None = None, request: str = "",
+        coverage: FlightCoverage | None = None,
     ) -> None:
         super().__init__(setup, archive, settings, writer, finder, journal, request)
+        self._coverage = coverage
         model = setup.source.camera
         self._lens = Undistorter(model.camera)
         self._known = KnownKeyframes.of(archive, setup.source.name)
@@ -61,7 +65,7 @@ class PlanarRun(FlightRun):
                 model.focal_sigma, offset_sigma_m, joins_map=self._known.count > 0 or setup.known_ground is not None
             ),
             known=self._known.for_graph(),
-            keyframes=Keyframes(self._spill, memory_budget_bytes(settings.memory_mb) // 2),
+            keyframes=Keyframes(self._spill, memory_budget_bytes(settings.memory_mb) // 4),
         )
         self._times_ns: dict[int, int] = {}  # of the flight's keyframes that have a place
         self._held: dict[int, ImageRGB | bytes] = {}  # JPEG where all of the flight waits for its place
@@ -134,6 +138,16 @@ class PlanarRun(FlightRun):
         camera = self._refined(self._setup.source.camera.camera)
         return self._setup.view(time_ns, camera, self._mapper.pose(keyframe_id))
 
+    def pictures_on_ground(self) -> Sequence[PictureOnGround]:
+        """See `FlightRun.pictures_on_ground`."""
+        camera = self._refined(self._setup.source.camera.camera)
+        poses = [self._mapper.pose(each) for each in self._mapper.placed()]
+        outlines_m = [(pose, footprint(camera, pose)) for pose in poses]
+        return [
+            PictureOnGround(outline_m, float(pose.translation_m[2]) / camera.fx_px)
+            for pose, outline_m in outlines_m if is_on_ground(outline_m)
+        ]
+
     def note_found(self, index: int, site_from_image: Matrix3, residual_px: float) -> None:
         """Where the site's map shows a frame's ground: (3, 3) of its full undistorted picture, and how well that fits.
 
@@ -176,7 +190,10 @@ class PlanarRun(FlightRun):
         )
         report["objects"] = self._search_summary(search)
         page = report_page(report, shown, crops_of(search), self._archive.site())
-        documents = {} if self._control is None else control_documents(self._control)
+        documents = {} if self._control is None else dict(control_documents(self._control))
+        if self._coverage is not None:
+            files, report["seen"] = self._coverage.conclude(self.pictures_on_ground())
+            documents.update(files)
         writer.commit(
             placed, self.images, report, page, crs=self._settings.crs, search=search, documents=documents
         )

@@ -12,13 +12,15 @@ from sorvolo.missions.flight.request import REQUEST
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, new_site
 from sorvolo.missions.map.journal import MapJournal, Step, Taken
+from sorvolo.mosaic.seen_ground import PictureOnGround
 from sorvolo.mosaic.selection import Selected
 from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
 from sorvolo.survey.map_objects import ObjectSearch
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
-_MOST_CACHE_MB = 256  # of tiles, and of pictures: more is not used
+_MOST_TILES_MB, _MOST_IMAGES_MB = 64, 256  # more gains nothing
+_PICTURES_AROUND = 6
 
 
 class FlightRun(ABC):
@@ -124,6 +126,10 @@ class FlightRun(ABC):
     def add(self, posed: PosedFrame) -> tuple[Status, str, int]:
         """Place one frame; what became of it, in words if not by vision, and how many tiles were painted meanwhile."""
 
+    def pictures_on_ground(self) -> Sequence[PictureOnGround]:
+        """Where the pictures that have a place lie by now."""
+        return ()
+
     def view(self, index: int, time_ns: int) -> FrameView | None:
         """What the frame of this index and time shows, as it lies now; None where the camera's place is not known."""
         return None
@@ -159,6 +165,12 @@ class FlightRun(ABC):
     def _detector_notices(self) -> tuple[Notice, ...]:
         return () if self._finder is None else self._finder.notices
 
+    def _images_mb(self) -> int:
+        """For the pictures that lie around a place, which are painted one after the other."""
+        camera = self._setup.source.camera.camera
+        picture_mb = 3 * camera.width_px * camera.height_px // 1_000_000
+        return min(_MOST_IMAGES_MB, max(_MOST_TILES_MB, _PICTURES_AROUND * picture_mb))
+
     def _make_site(self, m_per_px: float, ground_up_m: float) -> None:
         """Make the site if there is none; see `new_site`."""
         if not self._archive.has_site:
@@ -170,10 +182,11 @@ class FlightRun(ABC):
         if self._writer is None:
             source = self._setup.source
             settings: dict[str, Any] = {**vars(self._settings), REQUEST: self._request}
-            cache_mb = min(_MOST_CACHE_MB, int(memory_budget_bytes(self._settings.memory_mb) / 1e6) // 8)
+            memory_mb = int(memory_budget_bytes(self._settings.memory_mb) / 1e6)
             journal = None if self._journal is None else self._journal.file
             self._writer = self._archive.begin_flight(
-                source.name, source.fingerprint, settings, cache_mb=cache_mb, journal=journal
+                source.name, source.fingerprint, settings, tiles_mb=min(_MOST_TILES_MB, memory_mb // 8),
+                images_mb=min(self._images_mb(), memory_mb // 2), journal=journal,
             )
             self._began_writer = True
         return self._writer

@@ -6,18 +6,15 @@ from pathlib import Path
 
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.geometry.arrays import Floats
-from sorvolo.geometry.planning import LEGAL_CEILING_M
-from sorvolo.missions.plan_flight import PlanSettings, answer_questions, plan_over, write_plan
+from sorvolo.missions.plan_flight import fly_again
 from sorvolo.missions.search.report import Searched, is_coarse, needed_m_per_px
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.store.exports.pod_files import CellGrid, Region, swollen_polygons
 from sorvolo.survey.area import Area
-from sorvolo.survey.flight import CameraModel
 
 _LEAST_M2 = 20.0  # of a hole that is flown again
 _MOST_HOLES = 60
 _LOWEST_M = 10.0
-_SLOW_M_S = 3.0
 
 
 @dataclass(frozen=True)
@@ -47,13 +44,7 @@ def write_refly(
     if is_coarse(searched, settings, info):
         needed = needed_m_per_px(searched.labels[0], info)
         height_m = max(_LOWEST_M, min(height_m, 0.9 * needed * camera.fx_px))
-    wishes = PlanSettings(
-        height_m=min(height_m, LEGAL_CEILING_M), model="none", speed_m_s=_SLOW_M_S, forward_overlap=0.7,
-    )
-    answers = answer_questions(CameraModel(camera, "the mapped flight's", 0.01), wishes)
-    plan = plan_over(area, answers, wishes)
-    for path in files:
-        write_plan(path, plan, area, dji_drone=dji_drone)
+    plan = fly_again(area, camera, height_m, files, dji_drone=dji_drone)
     return Refly(
         len(large), sum(each.area_m2 for each in large), plan.height_m, plan.duration_s, tuple(map(str, files))
     )

@@ -18,7 +18,7 @@ const matched = (property, table, other) => ["match", ["get", property], ...Obje
 /** Layers by group: what a tick in the panel shows and hides. */
 export const GROUPS = {
   mosaic: ["Mosaic", true], frames: ["Footprints of the frames", false], track: ["Track", true],
-  objects: ["Objects", true], changes: ["Changes", true], coverage: ["What could not be compared", false],
+  objects: ["Objects", true], changes: ["Changes", true], coverage: ["Holes, and what could not be compared", false],
   pod: ["Probability of detection", false], drone: ["Drone and field of view", true], drawings: ["Drawings and zones", true],
 };
 
@@ -36,9 +36,9 @@ function layers() {
 
 function groundLayers() {
   return [
-    { id: "coverage", group: "coverage", type: "fill", source: "coverage", filter: ["==", ["get", "status"], "not-compared"],
+    { id: "coverage", group: "coverage", type: "fill", source: "coverage", filter: ["in", ["get", "status"], ["literal", ["not-compared", "hole"]]],
       paint: { "fill-pattern": "hatch", "fill-opacity": 0.75 } },
-    { id: "coverage-edge", group: "coverage", type: "line", source: "coverage", filter: ["==", ["get", "status"], "not-compared"],
+    { id: "coverage-edge", group: "coverage", type: "line", source: "coverage", filter: ["in", ["get", "status"], ["literal", ["not-compared", "hole"]]],
       paint: { "line-color": "#fff", "line-width": 1.2, "line-dasharray": [3, 2] } },
     { id: "pod", group: "pod", type: "fill", source: "pod", filter: ["==", ["get", "kind"], "pod"],
       paint: { "fill-opacity": 0.5, "fill-color": ["interpolate", ["linear"], ["get", "pod_from"],

@@ -10,6 +10,7 @@ const MOST = 60;
 export function waypointsFor(data) {
   const holes = [
     ...data.all.pod.filter((each) => each.properties.kind === "hole"),
+    ...data.all.coverage.filter((each) => each.properties.status === "hole"),
     ...data.all.coverage.filter((each) => each.properties.status === "not-compared" && ["view-rejected", "one-view", "blurred"].includes(each.properties.gap)),
   ];
   const rings = holes.flatMap((each) => (each.geometry.type === "MultiPolygon" ? each.geometry.coordinates : [each.geometry.coordinates]).map((rings_) => rings_[0]));

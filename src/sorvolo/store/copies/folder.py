@@ -39,7 +39,16 @@ from sorvolo.store.nofollow import open_below, refuse_links
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site.catalogue import Catalogue
 from sorvolo.store.site.catalogue_place import CATALOGUE, POINTER, is_site
-from sorvolo.store.site.files import COPYING, JOURNAL, LOCK, SiteFiles, lock_folder, refuse_unfinished
+from sorvolo.store.site.files import (
+    COPYING,
+    JOURNAL,
+    LIVE_COVERAGE,
+    LIVE_PREVIEW,
+    LOCK,
+    SiteFiles,
+    lock_folder,
+    refuse_unfinished,
+)
 from sorvolo.store.site.origin import ORIGIN, TILE_SIZES, UNSENT
 from sorvolo.store.site.row_copies import copy_rows
 from sorvolo.store.site.sqlite_database import SqliteDatabase
@@ -313,7 +322,8 @@ def _file(folder: Path, path: str, sha256: str) -> SiteFile | None:
 def _is_passing(path: str) -> bool:
     """Whether the file is one that only lies there for a while."""
     parts = path.split("/")
-    return any(each.startswith(TEMPORARY_PREFIX) for each in parts) or parts[-1] in ("live.png", JOURNAL)
+    passing = (LIVE_PREVIEW, LIVE_COVERAGE, JOURNAL)
+    return any(each.startswith(TEMPORARY_PREFIX) for each in parts) or parts[-1] in passing
 
 
 def _foreign(folder: Path) -> Iterator[str]:

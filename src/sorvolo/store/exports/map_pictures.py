@@ -86,6 +86,18 @@ def write_preview(tiles: Mapping[TileIndex, ImageRGBA], path: Path, max_px: int 
     atomic_write_bytes(path, png_from_rgba(picture(tiles, max_px).rgba))
 
 
+def write_small_maps(
+    tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, name: str, preview: Path, kmz: Path
+) -> None:
+    """Write what `write_preview` and `write_kmz` do, the tiles being read once for both."""
+    shown = picture(tiles, _KMZ_PX)
+    small = shown.rgba
+    while max(small.shape[:2]) > PREVIEW_PX:
+        small = shrink(small, -(-small.shape[1] // 2), -(-small.shape[0] // 2))
+    atomic_write_bytes(preview, png_from_rgba(small))
+    _write_kmz(shown, site_grid, name, kmz)
+
+
 def write_live_preview(tiles: Mapping[TileIndex, ImageRGBA], path: Path) -> None:
     """Write a small PNG of the map while it grows; nothing when there are no tiles yet."""
     if tiles:
@@ -98,7 +110,10 @@ def write_kmz(tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, name: s
 
     The site must have a CRS. Raises StoreError on a full disk.
     """
-    small = picture(tiles, _KMZ_PX)
+    _write_kmz(picture(tiles, _KMZ_PX), site_grid, name, path)
+
+
+def _write_kmz(small: Picture, site_grid: SiteGrid, name: str, path: Path) -> None:
     west, south, east, north = _bounds_deg(small, site_grid)
     size = np.array(small.rgba.shape[1::-1])
     counts = -(-size // _KMZ_PIECE_PX)

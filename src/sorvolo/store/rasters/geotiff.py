@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import escape
+from zlib import crc32
 
 import numpy as np
 import rasterio
@@ -127,18 +128,22 @@ def _write_plain(tiles: Mapping[TileIndex, ImageRGBA], grid: Grid, path: Path) -
         "crs": crs_of_epsg(grid.crs) if grid.crs else None,
         "transform": Affine(grid.m_per_px, 0, outer_corner_m[0], 0, -grid.m_per_px, outer_corner_m[1]),
     }
+    verified = dict.fromkeys(_spread(sorted(tiles), _VERIFIED_BLOCKS), 0)  # and the CRC-32 of their pixels
     with rasterio.open(path, "w", **profile) as sink:
         sink.colorinterp = [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]
-        for column, row in sorted(tiles, key=lambda index: (index[1], index[0])):
-            x0, y0, _, _ = grid.tile_window((column, row))
+        for index in sorted(tiles, key=lambda index: (index[1], index[0])):
+            x0, y0, _, _ = grid.tile_window(index)
             window = Window(x0 - left, y0 - top, grid.tile_px, grid.tile_px)
-            sink.write(np.moveaxis(tiles[column, row], 2, 0), window=window)
+            tile = tiles[index]
+            sink.write(np.moveaxis(tile, 2, 0), window=window)
+            if index in verified:
+                verified[index] = crc32(tile.tobytes())
     # GDAL can lose blocks on a full disk and still close without a word
     with rasterio.open(path, driver="GTiff") as source:
-        for index in _spread(sorted(tiles), _VERIFIED_BLOCKS):
+        for index, written in verified.items():
             x0, y0, _, _ = grid.tile_window(index)
             read = source.read(window=Window(x0 - left, y0 - top, grid.tile_px, grid.tile_px))
-            if not np.array_equal(np.moveaxis(read, 0, 2), tiles[index]):
+            if crc32(np.moveaxis(read, 0, 2).tobytes()) != written:
                 raise StoreError(_differs(path))
 
 

@@ -95,6 +95,11 @@ class Archive:
         """Where the mission may keep a small PNG of the growing map; removed when the flight is done."""
         return self._files.live_preview_path
 
+    @property
+    def live_coverage_path(self) -> Path:
+        """Where the mission may keep the ground seen by now, as GeoJSON; removed when the flight is done."""
+        return self._files.live_coverage_path
+
     def flight_folder(self, flight_id: str) -> Path:
         """Where a flight's frames.geojson, report.json, report.html, keyframes and changes lie."""
         return self._files.flight_folder(flight_id)
@@ -299,14 +304,15 @@ class Archive:
         fingerprint: str,
         settings: Mapping[str, Any],
         *,
-        cache_mb: int = 256,
+        tiles_mb: int = 64,
+        images_mb: int = 256,
         journal: RunJournal | None = None,
     ) -> FlightWriter:
         """Start to map a flight; a flight mapped before keeps its rank, and stays readable until the commit.
 
-        `settings["method"]`, if any, is listed with the flight. `journal` is the run's, which ends with it. Images and
-        tiles are kept in memory up to `cache_mb` each. Raises SettingsError for an id that is no folder name,
-        StoreError when there is no site or another flight is being mapped.
+        `settings["method"]`, if any, is listed with the flight. `journal` is the run's, which ends with it. Tiles
+        and images are kept in memory up to `tiles_mb` and `images_mb`. Raises SettingsError for an id that is no folder
+        name, StoreError when there is no site or another flight is being mapped.
         """
         self._require_writable()
         if self._writer is not None and self._writer.is_open:
@@ -321,9 +327,9 @@ class Archive:
                 connection, flight_id, fingerprint, str(settings.get("method", "")), plain_json(settings)
             )
             base = records.tile_hashes(connection, version_id)
-        self._files.blobs.cache_bytes = min(self._files.blobs.cache_bytes, cache_mb * _MEGABYTE)
-        tiles = GrowingTiles(self._files.blobs, base, grid.tile_px, cache_mb * _MEGABYTE)
-        self._writer = FlightWriter(self._files, flight_id, run_id, version_id, tiles, cache_mb * _MEGABYTE)
+        self._files.blobs.cache_bytes = min(self._files.blobs.cache_bytes, tiles_mb * _MEGABYTE)
+        tiles = GrowingTiles(self._files.blobs, base, grid.tile_px, tiles_mb * _MEGABYTE)
+        self._writer = FlightWriter(self._files, flight_id, run_id, version_id, tiles, images_mb * _MEGABYTE)
         return self._writer
 
     def _require_writable(self) -> None:

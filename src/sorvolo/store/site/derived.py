@@ -10,7 +10,7 @@ from typing import Any
 from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.store.atomic import atomic_write_bytes, sync_file, temporary_beside, writing
 from sorvolo.store.exports.change_files import change_placemarks, changes_geojson, crop_names
-from sorvolo.store.exports.map_pictures import Picture, pictures, write_kmz, write_preview
+from sorvolo.store.exports.map_pictures import Picture, pictures, write_preview, write_small_maps
 from sorvolo.store.exports.object_files import CROPS, OBJECTS, object_placemarks, objects_geojson
 from sorvolo.store.exports.placemarks import Placemark, gpx_bytes, kml_bytes
 from sorvolo.store.exports.plain import features_name, features_path, geojson_bytes
@@ -39,9 +39,10 @@ def write_map_files(files: SiteFiles, version: VersionEntry) -> None:
             write_cog, tiles, files.site_grid(), files.mosaic_path, crs=version.export_crs or None,
             compress=version.compress,
         )
-        write_preview(tiles, files.preview_path)
-        if not files.site().is_local:
-            write_kmz(tiles, files.site_grid(), files.site().name, files.kmz_path)
+        if files.site().is_local:
+            write_preview(tiles, files.preview_path)
+        else:
+            write_small_maps(tiles, files.site_grid(), files.site().name, files.preview_path, files.kmz_path)
         geotiff.result()
 
 

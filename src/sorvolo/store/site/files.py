@@ -27,6 +27,7 @@ from sorvolo.survey.flight import Site
 STAGED = "staged"
 """The folder of a flight in which its next run collects pictures until it is committed."""
 
+LIVE_PREVIEW, LIVE_COVERAGE = "live.png", "live-coverage.geojson"
 JOURNAL = "run.journal"
 """The file of a flight's folder from which a killed run goes on."""
 
@@ -115,7 +116,12 @@ class SiteFiles:
     @property
     def live_preview_path(self) -> Path:
         """A small PNG of the growing map."""
-        return self.folder / "live.png"
+        return self.folder / LIVE_PREVIEW
+
+    @property
+    def live_coverage_path(self) -> Path:
+        """The ground that a flight which is being mapped has seen by now."""
+        return self.folder / LIVE_COVERAGE
 
     def flight_folder(self, flight_id: str) -> Path:
         """Where a flight's files lie; raises StoreError for an id that is no plain name."""

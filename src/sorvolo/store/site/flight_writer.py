@@ -221,6 +221,8 @@ class FlightWriter:
             if search is not None:
                 object_records.add_search(connection, self._run_id, search)
         self._is_open = False
+        self._growing.release()
+        self._cache.clear()
         forget_journals(self._files)
         repair(self._files)
         remove_unused(self._files)

@@ -235,6 +235,11 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
         self._changed.clear()
         return changed
 
+    def release(self) -> None:
+        """Drop from memory what is on the disk."""
+        for index in self._loaded.keys() - self._unsaved:
+            self._bytes -= self._loaded.pop(index).nbytes
+
     def take_back(self) -> None:
         """Undo every change: the tiles are the earlier version's again."""
         for index in self._unsaved | {each for each in self if self._hashes.get(each) != self._base.get(each)}:

@@ -69,7 +69,8 @@ def remove_unused(files: SiteFiles) -> None:
     remove_leftovers([files.folder, *flights, *(images for each in over for images in each.glob("keyframes/*"))])
     files.blobs.remove_leftovers()
     files.blobs.remove(files.blobs.stored() - used)
-    files.live_preview_path.unlink(missing_ok=True)
+    for path in (files.live_preview_path, files.live_coverage_path):
+        path.unlink(missing_ok=True)
     for flight in over:
         _remove_unused_pictures(flight, {str(run_id) for run_id in runs.get(flight.name, set())})
 
