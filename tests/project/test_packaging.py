@@ -71,6 +71,13 @@ def section_of(model: str) -> str:
     return found[1]
 
 
+def test_lock_names_each_package_once() -> None:
+    """Two versions of one package cannot be installed, and a fresh clone would end there."""
+    lines = [line for line in (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines() if "==" in line]
+    names = [line.partition("==")[0].lower().replace("_", "-") for line in lines]
+    assert sorted(names) == sorted(set(names))
+
+
 def test_build_lock_holds_what_the_build_requires() -> None:
     locked = dict(
         line.split("==") for line in (ROOT / "requirements-build.lock").read_text(encoding="utf-8").splitlines()
