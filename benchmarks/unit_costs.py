@@ -1,6 +1,6 @@
 """What each mission costs for a frame of 1080p video and for a large photo: processor time, memory, bytes kept.
 
-python benchmarks/unit_costs.py [--only NAME...] [--megapixels 12] [--seed 1] [--output FILE]
+python benchmarks/unit_costs.py [--only NAME...] [--megapixels 12] [--seed 1] [--flights DIR] [--output FILE]
 
 Each command of Sorvolo runs as a process of its own on a short and on a long input; the operating system accounts for
 its processor time and peak memory, so that other work on the machine disturbs wall time alone, which is not given (a
@@ -9,7 +9,7 @@ difference of their units is the unit cost; what remains of the short run is the
 photo, and of a video a key frame (map), a view (compare) or a searched frame (watch); decoding is a row of its own and
 taken off the others. Bytes and files are what the site, or the watch's folder, has more. One thread of OpenMP. Inputs
 are simulated: 1080p video at 10 frames a second from 30 m, photos of `--megapixels` from 40 m with 70 % overlap.
-Written to results/unit_costs.json; `--only` measures those rows anew and keeps the others.
+`--flights` keeps them. Written to results/unit_costs.json; `--only` measures those rows anew and keeps the others.
 """
 
 import argparse
@@ -86,8 +86,14 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", help="rows such as 'video: watch'")
     parser.add_argument("--megapixels", type=float, default=12.0)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--flights", type=Path, help="where the simulated flights are, or are to be kept")
     parser.add_argument("--output", type=Path, default=RESULTS)
+    parser.add_argument("--simulate", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.simulate:
+        folder, kind, size = options.simulate
+        simulate(Path(folder), kind, int(size), options.seed, options.megapixels)
+        return
     known = json.loads(options.output.read_text()) if options.only and options.output.is_file() else {"rows": {}}
     rows = known["rows"]
     photos = f"photo, {options.megapixels:g} MP"
@@ -96,10 +102,7 @@ def main() -> None:
             wanted = [job for job in jobs if options.only is None or f"{kind}: {job.name}" in options.only]
             if not wanted:
                 continue
-            flights = [
-                simulated(Path(scratch) / f"{kind}{size}", kind, size, options.seed, options.megapixels)
-                for size in (0, 1)
-            ]
+            flights = [simulated(options.flights or Path(scratch), kind, size, options) for size in (0, 1)]
             for job in wanted:
                 decode_s = rows.get("video: decode", {}).get("cpu_s", 0.0) if kind == "video" else 0.0
                 rows[f"{kind}: {job.name}"] = unit_cost(job, flights, Path(scratch) / "work", decode_s) | {
@@ -116,7 +119,23 @@ def written(output: Path, rows: dict[str, Any]) -> None:
     output.write_text(json.dumps(result, indent=1) + "\n")
 
 
-def simulated(folder: Path, kind: str, size: int, seed: int, megapixels: float) -> Path:
+def simulated(place: Path, kind: str, size: int, options: Any) -> Path:
+    """The folder of two flights of a kind and size, made where it is not there.
+
+    A process of its own makes it: the peak memory of a child counts what its parent had when it began it.
+    """
+    folder = place / f"{kind}{size}"
+    if not folder.is_dir():
+        place.mkdir(parents=True, exist_ok=True)
+        subprocess.run(
+            [sys.executable, __file__, "--seed", str(options.seed), "--megapixels", str(options.megapixels),
+             "--simulate", str(folder), kind, str(size)],
+            check=True,
+        )
+    return folder
+
+
+def simulate(folder: Path, kind: str, size: int, seed: int, megapixels: float) -> None:
     """Two flights over a path of the small (0) or the large (1) size."""
     if kind == "video":
         imaging = ImagingSettings(1920, 1080, fps=FPS)
@@ -132,7 +151,6 @@ def simulated(folder: Path, kind: str, size: int, seed: int, megapixels: float) 
     )
     for _ in simulate_site(folder, settings):
         pass
-    return folder
 
 
 def unit_cost(job: Job, flights: Sequence[Path], work: Path, decode_s: float) -> dict[str, Any]:
