@@ -1,9 +1,9 @@
 """`sorvolo batch`: a mission over folders of flights, on this machine or on a cluster."""
 
 import json
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, closing
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.map import TO_CHECK
-from sorvolo.cli.options import AsJson, Camera
+from sorvolo.cli.map import TO_CHECK, ended_by_signal
+from sorvolo.cli.options import AsJson, Camera, GiveUp
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.shown import show_path
 from sorvolo.errors import SettingsError
@@ -45,7 +45,10 @@ class SiteByName(StrEnum):
     PLACE = "place"
 
 
-Places = Annotated[list[Path], typer.Argument(help="Folders with flights: videos and folders of photos, however deep.")]
+Places = Annotated[
+    list[str],
+    typer.Argument(help="Folders with flights, however deep; or live sources, as ADDRESS or SITE=ADDRESS."),
+]
 Root = Annotated[Path, typer.Option(help="Folder for the maps, one folder for each site.")]
 MissionOption = Annotated[MissionName, typer.Option(help="What to do with each flight.")]
 SiteByOption = Annotated[
@@ -84,6 +87,7 @@ def batch(
     camera: Camera = "",
     gsd: Resolution = None,
     model: Model = "default",
+    give_up: GiveUp = 30.0,
     tries: Tries = 3,
     stall: Stall = 300.0,
     retry: Retry = False,
@@ -92,6 +96,8 @@ def batch(
     """Map, compare or search many flights. Stopped or killed at any moment, the same command goes on.
 
     A flight whose process dies is tried again; one that cannot be used, or that ends its process each time, is named.
+    Live sources are mapped side by side until they end; Ctrl-C ends them and finishes their maps.
+
     ROOT/batch.jsonl holds what became of each. Ends with exit code 1 where a flight failed or was set aside, with 3
     where a result is to be checked before use.
 
@@ -99,29 +105,59 @@ def batch(
 
     Example: sorvolo batch monday/ tuesday/ --root maps --mission compare
 
+    Example: sorvolo batch north=rtsp://192.168.1.10/live south=udp://:5000 --root maps
+
     Example: sorvolo batch /mnt/shared/flights --root /mnt/shared/maps --executor ray://head:10001
     """
-    from sorvolo.cluster.batch import BatchSettings, run_batch
+    from sorvolo.cluster.batch import BatchSettings
     from sorvolo.cluster.orders import FlightWish, Mission
     from sorvolo.cluster.sites import SiteBy
 
     context.obj.stop_words = f"stopped; the same command goes on: {root} holds what was done"
     by = site_by or (SiteByName.PLACE if mission is MissionName.COMPARE else SiteByName.FLIGHT)
-    wish = FlightWish(Mission(mission.value), _absolute(camera), _absolute(model), gsd)
+    wish = FlightWish(Mission(mission.value), _absolute(camera), _absolute(model), gsd, give_up)
     settings = BatchSettings(wish, SiteBy(by.value), tries, stall, retry)
-    running = run_batch(places, root, settings, _executor_of(executor, workers, settings))
-    # closed even when the bar is stopped: then the workers are ended
-    with closing(running):
-        report = _show_progress(running, Console(stderr=True))
+    report = _run(places, root, settings, executor, workers)
     if as_json:
         typer.echo(json.dumps(_plain(report, root), indent=1))
     else:
-        _show(report, root, Console())
+        _show(report, [Path(each) for each in places], root, Console())
     counts = report.counts()
     if counts.get("failed") or counts.get("set aside"):
         raise typer.Exit(_FAILED)
     if counts.get("doubtful"):
         raise typer.Exit(TO_CHECK)
+
+
+def _run(
+    places: Sequence[str], root: Path, settings: "BatchSettings", executor: str, workers: int | None
+) -> "BatchReport":
+    """The batch of folders, or of live sources, with its progress."""
+    from sorvolo.cluster.batch import run_batch
+    from sorvolo.cluster.streams import is_stream, run_streams, streams_of
+
+    live = [each for each in places if is_stream(each)]
+    _check_live(live, places, workers)
+    if live:  # one that waits for its drone does nothing, and gives up by itself
+        settings = replace(settings, stall_s=settings.stall_s + settings.wish.give_up_s)
+    executors = _executor_of(executor, workers or len(live) or None, settings)
+    streams = streams_of(live)
+    with ended_by_signal([each.address for each in streams]) as until:
+        running = (
+            run_streams(streams, root, settings, executors, until) if streams
+            else run_batch([Path(each) for each in places], root, settings, executors)
+        )
+        # closed even when the bar is stopped: then the workers are ended
+        with closing(running):
+            return _show_progress(running, Console(stderr=True))
+
+
+def _check_live(live: Sequence[str], places: Sequence[str], workers: int | None) -> None:
+    """Raise SettingsError for live sources beside folders, and for fewer workers than live sources."""
+    if live and len(live) < len(places):
+        raise SettingsError("give folders of flights or live sources, not both: they are two batches with two roots")
+    if live and workers is not None and workers < len(live):
+        raise SettingsError(f"--workers {workers}: {len(live)} live sources need as many at once")
 
 
 def _absolute(name: str) -> str:
@@ -185,7 +221,14 @@ def _plain(report: "BatchReport", root: Path) -> dict[str, Any]:
     }
 
 
-def _show(report: "BatchReport", root: Path, console: Console) -> None:
+def _label(source: str, places: Sequence[Path]) -> str:
+    """A flight's path below the folder that was given."""
+    path = Path(source)
+    below = [path.relative_to(place.resolve()).as_posix() for place in places if path.is_relative_to(place.resolve())]
+    return min((each for each in below if each != "."), key=len, default=path.name)
+
+
+def _show(report: "BatchReport", places: Sequence[Path], root: Path, console: Console) -> None:
     from sorvolo.cluster.table import TABLE
 
     ended = ", ".join(f"{count:,} {name}" for name, count in report.counts().items())
@@ -199,8 +242,8 @@ def _show(report: "BatchReport", root: Path, console: Console) -> None:
     for row in rows[:_MOST_ROWS]:
         state = _state(row, row.key in report.known)
         table.add_row(
-            escape(Path(row.source).name), escape(row.site), f"[{_COLOURS.get(state, 'red')}]{state}", str(row.tries),
-            f"{row.seconds:.1f}", f"{row.cpu_s:.1f}", f"{row.peak_memory_mb:.0f}", escape(row.words),
+            escape(_label(row.source, places)), escape(row.site), f"[{_COLOURS.get(state, 'red')}]{state}",
+            str(row.tries), f"{row.seconds:.1f}", f"{row.cpu_s:.1f}", f"{row.peak_memory_mb:.0f}", escape(row.words),
         )
     if rows:
         console.print(table)

@@ -61,8 +61,11 @@ class Executor(Protocol):
     def start(self, key: Key, order: Order, cost: Cost) -> None:
         """Begin a try."""
 
-    def next_ended(self) -> tuple[Key, Ending]:
-        """Wait until a try has ended. Raises SorvoloError where it cannot be known any more."""
+    def finish(self, key: Key) -> None:
+        """Have a live flight end, and be finished."""
+
+    def next_ended(self, timeout_s: float | None = None) -> tuple[Key, Ending] | None:
+        """Wait until a try has ended; None where none did for so long. Raises SorvoloError if the executor is gone."""
 
 
 @dataclass(frozen=True)
@@ -151,8 +154,9 @@ class _Run:
                 while (row := self._next()) is not None:
                     self._start(row)
                     yield self.update()
-                key, ending = self._executor.next_ended()
-                yield self.update(self._end(self.rows[key], ending))
+                if (ended := self._executor.next_ended()) is not None:
+                    key, ending = ended
+                    yield self.update(self._end(self.rows[key], ending))
         finally:
             for key in list(self._executor.running):
                 self._keep(replace(self.rows[key], state=State.WAITING, words="the batch was stopped"))

@@ -60,9 +60,16 @@ class LocalExecutor:
         self._running[key] = (worker, cost)
         threading.Thread(target=self._wait, args=(key, worker), daemon=True, name=f"flight {key[1][:8]}").start()
 
-    def next_ended(self) -> tuple[Key, Ending]:
-        """Wait until a try has ended."""
-        key, ending = self._ended.get()
+    def finish(self, key: Key) -> None:
+        """Have a live flight end, and be finished."""
+        self._running[key][0].finish()
+
+    def next_ended(self, timeout_s: float | None = None) -> tuple[Key, Ending] | None:
+        """Wait until a try has ended; None where none did for so long."""
+        try:
+            key, ending = self._ended.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
         del self._running[key]
         return key, ending
 

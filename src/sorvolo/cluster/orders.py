@@ -6,6 +6,9 @@ from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from typing import Any, Self
 
+FINISH = b"finish\n"
+"""What a worker is sent to end a live flight, which is then finished like any other's."""
+
 
 class Mission(StrEnum):
     """What is done with each flight of a batch."""
@@ -29,18 +32,19 @@ class FlightWish:
     """What a batch asks for of each flight; everything else is as the mission's own defaults.
 
     `camera` is what --camera takes ("" for none), `m_per_px` the ground resolution of a new map (None: the frames'
-    own).
+    own); a live source has ended when nothing came for `give_up_s`.
     """
 
     mission: Mission = Mission.MAP
     camera: str = ""
     model: str = "default"
     m_per_px: float | None = None
+    give_up_s: float = 30.0
 
 
 @dataclass(frozen=True)
 class Order:
-    """One try at one flight: the file or folder, the site's folder, and how much memory its caches may take, MB."""
+    """One try at one flight: the file, folder or address, the site's folder, and how much its caches may take, MB."""
 
     source: str
     site: str

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from sorvolo.cluster.orders import Ending, Order, Outcome, ScoutOrder, answer_of
+from sorvolo.cluster.orders import FINISH, Ending, Order, Outcome, ScoutOrder, answer_of
 
 _LOOK_EVERY_S = 1.0
 _LIVELY = 0.01  # seconds of processor time a second, below which a process does nothing
@@ -50,6 +50,15 @@ class WorkerProcess:
     def kill(self) -> None:
         """End it at once; a mapping goes on from its journal when it is asked for again."""
         self._process.kill()
+
+    def finish(self) -> None:
+        """Have it end a live flight, and finish that."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(FINISH)
+            self._process.stdin.flush()
+        except (BrokenPipeError, ValueError):  # it has ended
+            pass
 
     def answers(self, stall_s: float) -> Iterator[tuple[str, dict[str, Any]]]:
         """Its answers until it ends. A process that neither answers nor computes for `stall_s` is killed.

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import sorvolo
+from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.orders import Ending, Order, Outcome
 from sorvolo.cluster.process import WorkerProcess, run_order
@@ -66,6 +67,7 @@ class RayExecutor:
         self._ray: Any = ray
         self._name, self._workers, self._stall_s, self._root = name, workers, stall_s, str(root.resolve())
         self._running: dict[Key, Any] = {}
+        self._actors: dict[Key, Any] = {}  # of those that are live
 
     @property
     def running(self) -> Mapping[Key, object]:
@@ -91,29 +93,47 @@ class RayExecutor:
         """Begin a try, on a machine with so many cores and so much memory; no more than the largest one has."""
         with self._cluster():
             machines = self._machines()
-            task = self._ray.remote(_try).options(
-                num_cpus=min(cost.cpus, max(each["CPU"] for each in machines)),
-                memory=int(min(cost.memory_mb * 1e6, max(each["memory"] for each in machines))),
-                max_retries=0, scheduling_strategy="SPREAD", name=f"sorvolo {Path(order.source).name}",
-            )
-            self._running[key] = task.remote(order, self._stall_s, self._root, sorvolo.__version__)
+            asked = {
+                "num_cpus": min(cost.cpus, max(each["CPU"] for each in machines)),
+                "memory": int(min(cost.memory_mb * 1e6, max(each["memory"] for each in machines))),
+                "scheduling_strategy": "SPREAD",
+            }
+            given = (order, self._stall_s, self._root, sorvolo.__version__)
+            if is_live_address(order.source):
+                actor = self._ray.remote(_LiveTry).options(max_concurrency=2, max_restarts=0, **asked).remote()
+                self._actors[key], self._running[key] = actor, actor.run.remote(*given)
+                return
+            name = f"sorvolo {Path(order.source).name}"
+            self._running[key] = self._ray.remote(_try).options(max_retries=0, name=name, **asked).remote(*given)
 
-    def next_ended(self) -> tuple[Key, Ending]:
-        """Wait until a try has ended. Raises SettingsError where the cluster is gone."""
+    def finish(self, key: Key) -> None:
+        """Have a live flight end, and be finished."""
+        with self._cluster():
+            self._actors[key].finish.remote()
+
+    def next_ended(self, timeout_s: float | None = None) -> tuple[Key, Ending] | None:
+        """Wait until a try has ended; None where none did for so long. Raises SettingsError if the cluster is gone."""
         ended: list[Any] = []
         with self._cluster():
             while not ended:
-                ended, _ = self._ray.wait(list(self._running.values()), num_returns=1, timeout=_LOOK_S)
+                ended, _ = self._ray.wait(list(self._running.values()), num_returns=1, timeout=timeout_s or _LOOK_S)
+                if not ended and timeout_s is not None:
+                    return None
             key = next(each for each, task in self._running.items() if task == ended[0])
             ending = self._ending(ended[0])
         del self._running[key]
+        if (actor := self._actors.pop(key, None)) is not None:
+            self._ray.kill(actor)
         return key, ending
 
     def end(self) -> None:
         """End what runs; a mapping goes on from its journal when it is asked for again."""
         with suppress(Exception):  # of a cluster that is gone, nothing runs
-            for task in self._running.values():
-                self._ray.cancel(task, force=True)
+            for actor in self._actors.values():
+                self._ray.kill(actor)
+            for key, task in self._running.items():
+                if key not in self._actors:
+                    self._ray.cancel(task, force=True)
             self._ray.wait(list(self._running.values()), num_returns=len(self._running), timeout=_CANCEL_S)
 
     def _ending(self, task: Any) -> Ending:
@@ -148,6 +168,24 @@ class RayExecutor:
                 f"--executor {self._name}: the cluster is gone ({_first_line(error)}); when it is back, the same "
                 "command goes on"
             ) from error
+
+
+class _LiveTry:
+    """On a machine of the cluster: a try at a live flight, which can be told to end. Ray calls both in threads."""
+
+    def __init__(self) -> None:
+        self._worker: WorkerProcess | None = None
+
+    def run(self, order: Order, stall_s: float, root: str, version: str) -> Ending:
+        """The try in a process of its own, which ends with this one."""
+        _demand_fit(root, version)
+        self._worker = WorkerProcess(order)
+        return run_order(self._worker, stall_s)
+
+    def finish(self) -> None:
+        """Have the flight end."""
+        if self._worker is not None:
+            self._worker.finish()
 
 
 def _try(order: Order, stall_s: float, root: str, version: str) -> Ending:

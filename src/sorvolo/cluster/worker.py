@@ -17,7 +17,9 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from sorvolo.cluster.orders import Mission, Order, Outcome, Scouted, answer_line
+from sorvolo.capture.live.addresses import is_live_address, without_secret
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.cluster.orders import FINISH, Mission, Order, Outcome, Scouted, answer_line
 from sorvolo.errors import SorvoloError
 
 _ALIVE_EVERY_S = 0.5
@@ -48,8 +50,10 @@ class Answers:
 def main() -> int:
     """Do the one order of standard input. 0 also for a flight that cannot be used: that is an answer."""
     answers = Answers()
-    content = json.loads(sys.stdin.buffer.readline())
-    threading.Thread(target=_end_with_input, daemon=True).start()
+    with os.fdopen(os.dup(sys.stdin.fileno()), "rb", buffering=0) as line:  # what follows it is another's to read
+        content = json.loads(line.readline())
+    until = threading.Event()
+    threading.Thread(target=_follow_input, args=(until,), daemon=True).start()
     if "scout" in content:
         for source in content["scout"]["sources"]:
             _scout(source, content["scout"]["camera"], answers)
@@ -57,20 +61,24 @@ def main() -> int:
     order = Order.of(content["order"])
     try:
         _wait_for_site(Path(order.site))
-        flight, words, is_good = _MISSIONS[order.wish.mission](order, answers.alive)
+        flight, words, is_good = _MISSIONS[order.wish.mission](order, answers.alive, until)
     except SorvoloError as error:
-        answers.add("ended", {"outcome": Outcome.FAILED, "words": str(error)})
+        answers.add("ended", {"outcome": Outcome.FAILED, "words": without_secret(str(error), order.source)})
         return 0
     outcome = Outcome.DONE if is_good else Outcome.DOUBTFUL
     answers.add("ended", {"outcome": outcome, "words": words, "flight": flight})
     return 0
 
 
-def _end_with_input() -> None:
-    """End the process at once when nobody holds its input any more; what it was at is taken up from its journal."""
+def _follow_input(until: threading.Event) -> None:
+    """Set the event when a live flight is to end; end the process at once when nobody holds its input any more.
+
+    What it was at then is taken up from its journal.
+    """
     with suppress(OSError):
-        while os.read(sys.stdin.fileno(), 4096):
-            pass
+        while data := os.read(sys.stdin.fileno(), 4096):
+            if FINISH in data:
+                until.set()
     os._exit(1)
 
 
@@ -96,18 +104,25 @@ def _scout(source: str, camera: str, answers: Answers) -> None:
     answers.add("scouted", vars(Scouted(flight.fingerprint, flight.frame_count, start_ns, box)))
 
 
-def _map(order: Order, alive: Callable[..., None]) -> tuple[str, str, bool]:
+def _live(order: Order) -> LiveSettings:
+    return LiveSettings(keeps_all=True, give_up_s=order.wish.give_up_s)
+
+
+def _map(order: Order, alive: Callable[..., None], until: threading.Event) -> tuple[str, str, bool]:
     """Map the flight: its name in the site, the headline, and whether it is a map to use."""
     from sorvolo.missions.flight.settings import MapSettings
     from sorvolo.missions.map.flights import map_flights
 
     site, wish = Path(order.site), order.wish
     settings = MapSettings(m_per_px=wish.m_per_px, model=wish.model, memory_mb=order.memory_mb)
-    flight = _run(map_flights([order.source], site, settings, camera=wish.camera or None), site, alive)
+    updates = map_flights(
+        [order.source], site, settings, camera=wish.camera or None, live=_live(order), until=until
+    )
+    flight = _run(updates, site, alive)
     return flight, *_headline(site, flight, "headline", "map")
 
 
-def _compare(order: Order, alive: Callable[..., None]) -> tuple[str, str, bool]:
+def _compare(order: Order, alive: Callable[..., None], until: threading.Event) -> tuple[str, str, bool]:
     """Compare the flight with the site's map; the first flight over a site is mapped."""
     from sorvolo.missions.compare.flights import compare_flights
     from sorvolo.missions.flight.settings import CompareSettings
@@ -116,9 +131,10 @@ def _compare(order: Order, alive: Callable[..., None]) -> tuple[str, str, bool]:
     site, wish = Path(order.site), order.wish
     founder = _founder(site)
     if not founder or _is_flight(order.source, site, founder):
-        return _map(order, alive)
+        return _map(order, alive, until)
     updates = compare_flights(
-        [order.source], site, CompareSettings(model=wish.model), camera=wish.camera or None
+        [order.source], site, CompareSettings(model=wish.model), camera=wish.camera or None, live=_live(order),
+        until=until,
     )
     flight = _run(updates, site, alive)
     with Archive.open(site, write=False) as archive:
@@ -127,12 +143,12 @@ def _compare(order: Order, alive: Callable[..., None]) -> tuple[str, str, bool]:
     return flight, str(head.get("text", "")), head.get("quality") == "compared"
 
 
-def _search(order: Order, alive: Callable[..., None]) -> tuple[str, str, bool]:
+def _search(order: Order, alive: Callable[..., None], until: threading.Event) -> tuple[str, str, bool]:
     """Map the flight if the site has it not yet; measure what a search of it would have found."""
     from sorvolo.missions.search.flights import SearchOutputs, search_site
     from sorvolo.missions.search.settings import SearchSettings
 
-    flight, words, is_good = _map(order, alive)
+    flight, words, is_good = _map(order, alive, until)
     if not is_good:
         return flight, words, False
     site = Path(order.site)
@@ -205,6 +221,8 @@ def _is_flight(source: str, site: Path, flight: str) -> bool:
     from sorvolo.capture.source import open_sources
     from sorvolo.missions.flight.setup import known_flights
 
+    if is_live_address(source):
+        return False
     return open_sources([source])[0].fingerprint == known_flights(site)[flight]
 
 

@@ -15,11 +15,10 @@ from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
 
 import numpy as np
 
-from sorvolo.capture.live.addresses import is_live_address
+from sorvolo.capture.live.addresses import is_live_address, without_secret
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.errors import SorvoloError
 from sorvolo.geometry.pose import gimbal_angles_from_rotation
@@ -104,20 +103,6 @@ def main(folder: Path) -> int:
         return _WRONG
     journal.add(FINISHED, {"exit_code": 0, "error": None, "headline": headline})
     return 0
-
-
-def without_secret(words: str, source: str) -> str:
-    """The words of an error without a stream's name and password, and what stands behind its `?`.
-
-    FFmpeg's errors hold the whole address; whoever may view the station reads those of its missions.
-    """
-    if "://" not in source:
-        return words
-    parts = urlsplit(source)
-    for secret in (parts.netloc.rpartition("@")[0], parts.password, parts.query):
-        if secret:
-            words = words.replace(secret, "***")
-    return words
 
 
 def _map(order: Order, journal: Journal, until: threading.Event) -> str:

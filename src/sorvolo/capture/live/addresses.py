@@ -85,6 +85,20 @@ def shown_address(url: str) -> str:
     return urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
 
 
+def without_secret(words: str, source: str) -> str:
+    """The words of an error without a stream's name and password, and what stands behind its `?`.
+
+    FFmpeg's errors hold the whole address; others may read those of a mission.
+    """
+    if "://" not in source:
+        return words
+    parts = urlsplit(source)
+    for secret in (parts.netloc.rpartition("@")[0], parts.password, parts.query):
+        if secret:
+            words = words.replace(secret, "***")
+    return words
+
+
 def _stream(text: str) -> StreamAddress:
     try:
         parts = urlsplit(text)

@@ -1,0 +1,160 @@
+"""Live streams side by side: each is mapped into a site of its own by a process that is started again when it dies."""
+
+import hashlib
+import re
+import threading
+import time
+from collections.abc import Callable, Generator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from sorvolo.capture.live.addresses import is_live_address, live_address, shown_address
+from sorvolo.capture.source import safe_name
+from sorvolo.cluster.batch import BatchReport, BatchSettings, BatchUpdate, Executor, Key
+from sorvolo.cluster.cost import cost_of
+from sorvolo.cluster.orders import Ending, Mission, Order, Outcome, Scouted
+from sorvolo.cluster.table import BatchTable, Row, State
+from sorvolo.errors import SettingsError
+
+_LOOK_S = 0.5
+_SETTLED_S = 60.0  # after which a process that dies is no longer taken to die of its beginning
+_LONGEST_WAIT_S = 60.0
+
+
+@dataclass(frozen=True)
+class Stream:
+    """A live source, and the site that it is mapped into. `shown` has no password."""
+
+    address: str
+    site: str
+
+    @property
+    def shown(self) -> str:
+        """The address as it may be printed and kept."""
+        return shown_address(self.address).partition("?")[0] if "://" in self.address else self.address
+
+
+def streams_of(texts: Sequence[str]) -> list[Stream]:
+    """Streams given as ADDRESS or SITE=ADDRESS. Raises SettingsError for two of one site, InputError for no address."""
+    found = []
+    for text in texts:
+        named = re.match(r"([A-Za-z0-9][\w.-]*)=(.+)", text)
+        address = named[2] if named else text
+        live_address(address)
+        found.append(Stream(address, named[1] if named else _name(address)))
+    sites = [each.site for each in found]
+    if twice := next((each for each in sites if sites.count(each) > 1), ""):
+        raise SettingsError(f"two streams would be mapped into the site {twice}; name the site of each: SITE=ADDRESS")
+    return found
+
+
+def _name(address: str) -> str:
+    """The site of a stream that nobody named: its host and path, or the file's or folder's name."""
+    place = shown_address(address).partition("?")[0].partition(":")[2].strip("/")
+    return safe_name(place if "://" in address else Path(place).stem)
+
+
+def is_stream(text: str) -> bool:
+    """Whether an input of a batch is a live source, alone or as SITE=ADDRESS."""
+    return is_live_address(text) or is_live_address(text.partition("=")[2])
+
+
+def run_streams(
+    streams: Sequence[Stream], root: Path, settings: BatchSettings,
+    executor_of: Callable[[BatchTable], AbstractContextManager[Executor]], until: threading.Event,
+) -> Generator[BatchUpdate, None, BatchReport]:
+    """Map, or compare, each stream until it ends or `until` is set; then its flight is finished like any other's.
+
+    A process that dies is started again, after a second and ever longer: its site is as after the last flight that was
+    finished, and what comes from then on is a flight of its own. One that dies `most_tries` times in a row within a
+    minute of its start is set aside; the others go on. Raises as `run_batch`.
+    """
+    if settings.wish.mission is Mission.SEARCH:
+        raise SettingsError("--mission search measures flights that are over: give map or compare for live streams")
+    started_s = time.monotonic()
+    with BatchTable.open(root) as table, executor_of(table) as executor:
+        run = _Streams(streams, table, settings, executor, until)
+        yield from run.through()
+        return BatchReport(
+            tuple(run.rows.values()), frozenset(), round(time.monotonic() - started_s, 3), run.tries, run.crashes
+        )
+
+
+class _Streams:
+    """The streams while they run."""
+
+    def __init__(
+        self, streams: Sequence[Stream], table: BatchTable, settings: BatchSettings, executor: Executor,
+        until: threading.Event,
+    ) -> None:
+        self._table, self._settings, self._executor, self._until = table, settings, executor, until
+        rows = [_row(each, settings) for each in streams]
+        self.rows = {row.key: row for row in rows}
+        self._addresses = {row.key: each.address for row, each in zip(rows, streams)}
+        self._due_s: dict[Key, float] = dict.fromkeys(self.rows, 0.0)  # those that wait for their start
+        self._told = False
+        self.tries = self.crashes = 0
+
+    def through(self) -> Generator[BatchUpdate]:
+        """Run them all until each has ended."""
+        while self._due_s or self._executor.running:
+            yield from self._begin()
+            if self._until.is_set() and not self._told:
+                self._told = True
+                for key in self._executor.running:
+                    self._executor.finish(key)
+            if self._executor.running:
+                if (ended := self._executor.next_ended(_LOOK_S)) is not None:
+                    yield self._update(self._end(*ended))
+            else:
+                self._until.wait(_LOOK_S)
+
+    def _begin(self) -> Generator[BatchUpdate]:
+        """Start those that are due; none any more once they are to end."""
+        if self._until.is_set():
+            for key in self._due_s:
+                row = replace(self.rows[key], state=State.DONE, words="stopped while it waited")
+                yield self._update(self._keep(row))
+            self._due_s.clear()
+        for key in [key for key, due_s in self._due_s.items() if due_s <= time.monotonic()]:
+            row = self.rows[key]
+            cost = cost_of(replace(row, crashes=0), self._table)
+            if not self._executor.has_room(cost):
+                return
+            del self._due_s[key]
+            site = str((self._table.root / row.site).resolve())
+            row = self._keep(replace(row, state=State.RUNNING, tries=row.tries + 1, words=""))
+            self.tries += 1
+            order = Order(self._addresses[key], site, self._settings.wish, self._executor.cache_mb)
+            self._executor.start(key, order, cost)
+            yield self._update(row)
+
+    def _end(self, key: Key, ending: Ending) -> Row:
+        row = self.rows[key]
+        if ending.outcome is not Outcome.CRASHED:
+            return self._keep(row.after(ending, State(ending.outcome.value), ending.words))
+        self.crashes += 1
+        row = replace(row, crashes=1 if ending.seconds > _SETTLED_S else row.crashes + 1)
+        if row.crashes >= self._settings.most_tries:
+            words = f"set aside after {row.crashes} tries: {ending.words}"
+            return self._keep(row.after(ending, State.SET_ASIDE, words))
+        self._due_s[key] = time.monotonic() + min(_LONGEST_WAIT_S, 2.0 ** (row.crashes - 1))
+        return self._keep(row.after(ending, State.WAITING, ending.words))
+
+    def _keep(self, row: Row) -> Row:
+        row = self._table.put(row)
+        self.rows[row.key] = row
+        return row
+
+    def _update(self, row: Row) -> BatchUpdate:
+        running = tuple(self.rows[key].site for key in self._executor.running)
+        through = sum(each.state not in (State.WAITING, State.RUNNING) for each in self.rows.values())
+        return BatchUpdate("streams", through, len(self.rows), row, running=running)
+
+
+def _row(stream: Stream, settings: BatchSettings) -> Row:
+    """A stream's row: every time a new one, since a stream is another flight each time."""
+    name = hashlib.sha256(f"stream {stream.site}".encode()).hexdigest()
+    scouted = Scouted(name, 0, 0, None)
+    return Row(stream.shown, settings.wish.mission.value, "", "", scouted, stream.site)
