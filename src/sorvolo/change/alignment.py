@@ -32,13 +32,19 @@ from sorvolo.survey.mosaic import Features, Keyframe, Link
 
 _UNKNOWN = CameraPrior(np.zeros(3), np.full(3, np.inf), np.eye(3), np.full(3, np.inf))
 _NO_FEATURES = Features("orb", np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
-_SMALL = 4  # times smaller are the copies that are shifted onto each other
-_SEARCHED_MISSES = 8  # frames in a row
-_CELLS = 4, 3
-_LOCAL_SIDE_PX = 960  # of the pictures that a local fit is made from
-_LOCAL_ROUNDS, _FAR_M = 2, 0.6  # a place that moves by so much is fitted once more
-_LOCAL_PRIOR = np.full(3, 2.0), np.radians([2.0, 2.0, 2.0])  # m, and by axis: what a local fit moves a camera by
-_TRACKED_S = 2.0  # a fit older than this predicts nothing
+
+
+@dataclass(frozen=True)
+class MovingSettings:
+    """How a local fit moves a camera, and how the last fits predict the next one."""
+
+    side_px: int = 960  # longest side of the pictures that a local fit is made from
+    rounds: int = 2  # of local fits, where a place moves by ...
+    far_m: float = 0.6  # ... this or more
+    place_sigma_m: float = 2.0  # by axis: what a local fit moves a camera by, ...
+    turn_sigma_deg: float = 2.0  # ... and turns it by
+    predicts_s: float = 2.0  # a fit older than this predicts nothing
+    shrink: int = 4  # times smaller are the copies that are shifted onto each other
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,8 @@ class AlignmentSettings:
     most_residual_px: float = 2.2  # of the registered image: worse, and what differs is the fit, not the ground
     doubtful_px: float = 1.5  # a fit that leaves more is checked: a predicted one by features, others by the search
     least_spread: float = 0.6  # share of a frame's cells with points: with less a homography may swing
+    cells: tuple[int, int] = (4, 3)  # across and down
+    searched_misses: int = 8  # frames in a row that fit nowhere: of later ones every fifth is searched for
     confirms_rest: float = 0.42  # of a local fit: less confirms a place in doubt; other ground had 0.53 once
     settled_px: float = 1.2  # a fit that leaves more is followed by a local one
     most_features: int = 60_000  # of the whole map, to look for a frame whose place is not known at all
@@ -57,6 +65,7 @@ class AlignmentSettings:
         default_factory=lambda: LinkSettings(FeatureSettings(orb_count=900), min_inliers=20, max_pairs=150)
     )
     search: SearchSettings = field(default_factory=SearchSettings)  # for frames that no homography places
+    moving: MovingSettings = MovingSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +251,7 @@ class Aligner:
 
     def _may_search(self) -> bool:
         """Whether the dear search is worth its time: a flight that fits nowhere is asked every fifth frame."""
-        return self._misses < _SEARCHED_MISSES or self._misses % 5 == 1
+        return self._misses < self._settings.searched_misses or self._misses % 5 == 1
 
     def _by_search(self, frame: "_Frame", by_telemetry: Pose | None, *, is_inside: bool) -> Place | None:
         """The frame placed by learned features, telemetry and its neighbours; what these leave in doubt a local fit
@@ -267,21 +276,22 @@ class Aligner:
         moved = _Moved(placed, None, 0.0)
         if placed.residual_px <= self._settings.settled_px and (placed.followed or np.isinf(placed.ratio)):
             return moved
-        for _ in range(_LOCAL_ROUNDS):
+        moving = self._settings.moving
+        for _ in range(moving.rounds):
             local = self._local(frame, moved.place)
             if local is None:
                 break
-            fine = _fine(frame.camera)
+            fine = _fine(frame.camera, moving.side_px)
             size_m = float(local.median_px * moved.place.pose.translation_m[2] / fine.fx_px)
-            place, left = _as_camera(moved.place, local, fine, _small_from(fine, frame.even.camera))
+            place, left = _as_camera(moved.place, local, fine, _small_from(fine, frame.even.camera), moving)
             moved = _Moved(place, left.resized(frame.camera.width_px / fine.width_px), max(size_m, moved.size_m))
-            if size_m < _FAR_M:
+            if size_m < moving.far_m:
                 break
         return moved
 
     def _local(self, frame: "_Frame", placed: Place) -> LocalFit | None:
         """The local fit of a frame at its place, in pixels of the `_fine` camera."""
-        fine = _fine(frame.camera)
+        fine = _fine(frame.camera, self._settings.moving.side_px)
         size = fine.width_px, fine.height_px
         seen = self._seen(placed.site_from_image @ _small_from(fine, frame.even.camera), fine)
         if seen is None:
@@ -341,11 +351,12 @@ class Aligner:
 
     def _predicted(self, camera: Camera, prior: CameraPrior, time_ns: int) -> Matrix3 | None:
         """The last fit moved on at the flight's velocity, turned as telemetry says the camera turned."""
-        if not self._fits or not 0 <= time_ns - self._fits[-1].time_ns <= _TRACKED_S * 1e9:
+        longest_ns = self._settings.moving.predicts_s * 1e9
+        if not self._fits or not 0 <= time_ns - self._fits[-1].time_ns <= longest_ns:
             return None
         last = self._fits[-1]
         since_s = (time_ns - last.time_ns) / 1e9
-        if len(self._fits) > 1 and last.time_ns - self._fits[-2].time_ns <= _TRACKED_S * 1e9:
+        if len(self._fits) > 1 and last.time_ns - self._fits[-2].time_ns <= longest_ns:
             before = self._fits[-2]
             moved_m = last.pose.translation_m - before.pose.translation_m
             velocity_m_s = moved_m / ((last.time_ns - before.time_ns) / 1e9)
@@ -387,7 +398,7 @@ class Aligner:
 
     def _shifted(self, new: Keyframe, site_from_image: Matrix3) -> Matrix3:
         """The guess moved to where phase correlation of small copies puts it: refinement reaches a few pixels only."""
-        seen = self._seen(site_from_image, new.camera, shrink=_SMALL)
+        seen = self._seen(site_from_image, new.camera, shrink=self._settings.moving.shrink)
         if seen is None or seen[1].mean() < self._settings.least_known:
             return site_from_image
         old = normalised(*seen).astype(np.float32)
@@ -491,7 +502,7 @@ class Aligner:
             return NotAligned("its points fit the map badly", residual_px)
         fit: Matrix3 = guess @ np.linalg.inv(found.new_from_old)
         is_held = residual_px <= self._settings.doubtful_px and (
-            _spread_of(found.new_px, seen[1]) >= self._settings.least_spread
+            _spread_of(found.new_px, seen[1], self._settings.cells) >= self._settings.least_spread
         )
         return _stiffened(fit, found, guess, new.camera), residual_px, is_held
 
@@ -511,11 +522,11 @@ def _nearer(first: NotAligned, second: NotAligned) -> NotAligned:
     return second if second.residual_px < first.residual_px else first
 
 
-def _spread_of(points_px: PointsPx, known: Mask) -> float:
-    """The share of the frame's cells on known ground, 4 x 3 in all, that hold points."""
+def _spread_of(points_px: PointsPx, known: Mask, across_down: tuple[int, int]) -> float:
+    """The share of the frame's cells on known ground, so many across and down, that hold points."""
     height, width = known.shape
-    cells = np.array(_CELLS)
-    on_map = cv2.resize(known.astype(np.float32), _CELLS, interpolation=cv2.INTER_AREA) > 0.5
+    cells = np.array(across_down)
+    on_map = cv2.resize(known.astype(np.float32), across_down, interpolation=cv2.INTER_AREA) > 0.5
     held = np.zeros_like(on_map)
     x, y = (points_px * cells / [width, height]).astype(int).clip(0, cells - 1).T
     held[y, x] = True
@@ -553,9 +564,9 @@ def _stiffened(site_from_image: Matrix3, link: Link, site_from_old: Matrix3, cam
     return site_from_image if worse else stiff
 
 
-def _fine(camera: Camera) -> Camera:
+def _fine(camera: Camera, side_px: int) -> Camera:
     """The camera at the size at which local fits are made."""
-    share = min(1.0, _LOCAL_SIDE_PX / max(camera.width_px, camera.height_px))
+    share = min(1.0, side_px / max(camera.width_px, camera.height_px))
     return camera.resized(round(camera.width_px * share), round(camera.height_px * share))
 
 
@@ -564,16 +575,19 @@ def _small_from(fine: Camera, small: Camera) -> Matrix3:
     return resized(small.width_px / fine.width_px, small.height_px / fine.height_px)
 
 
-def _as_camera(placed: Place, local: LocalFit, camera: Camera, small_from_image: Matrix3) -> tuple[Place, LocalFit]:
+def _as_camera(
+    placed: Place, local: LocalFit, camera: Camera, small_from_image: Matrix3, settings: MovingSettings
+) -> tuple[Place, LocalFit]:
     """The place moved as a local fit in this camera's pixels has it, as far as a camera over level ground can; and what
     is left of the fit. `small_from_image` leads to the place's own pixels."""
     old_px = local.places_px(camera.width_px, camera.height_px)
     new_px = old_px + local.moved_px.reshape(-1, 2)
     ground_m = apply_homography(placed.site_from_image @ small_from_image, old_px)
     known = local.is_known.ravel()
-    found = fit_camera(
-        new_px[known], ground_m[known], camera, PosePrior(placed.pose, *_LOCAL_PRIOR), start_px=6.0, band_px=3.0
+    prior = PosePrior(
+        placed.pose, np.full(3, settings.place_sigma_m), np.radians(np.full(3, settings.turn_sigma_deg))
     )
+    found = fit_camera(new_px[known], ground_m[known], camera, prior, start_px=6.0, band_px=3.0)
     if found is None:
         return placed, local
     left_px = new_px - apply_homography(np.linalg.inv(found.site_from_image), ground_m)

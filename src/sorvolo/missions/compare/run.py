@@ -48,10 +48,16 @@ from sorvolo.survey.findings import Change, ComparedView, Verdict, ViewStatus
 from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
-_VIDEO_SIDE_PX, _PHOTO_SIDE_PX = 1280, 1600  # frames come faster than photos, and show a place more often
-_PHOTO_FINER = 2.0  # times a photo's and the map's own pixels, at most: the robust method looks at half of them
-_FINE_M_PER_PX = 0.07  # a car has 60 px: finer pictures gain nothing, and large smooth ground loses (decision 0022)
-_CACHE_BYTES = 128 * 2**20  # of earlier pictures
+
+@dataclass(frozen=True)
+class ViewSizes:
+    """How large frames are compared where nothing else is asked for; how much of earlier pictures is kept at hand."""
+
+    video_px: int = 1280  # longest side; a video's frames come faster than photos, and show a place more often
+    photo_px: int = 1600
+    photo_finer: float = 2.0  # times a photo's and the map's own pixels, at most: the robust method sees half of them
+    fine_m_per_px: float = 0.07  # a car has 60 px: finer gains nothing, and large smooth ground loses (decision 0022)
+    cache_bytes: int = 128 * 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,20 +299,22 @@ class CompareRun:
         }
 
 
-def _view_maker(setup: FlightSetup, archive: Archive, settings: CompareSettings, base_version: int) -> ViewMaker:
+def _view_maker(
+    setup: FlightSetup, archive: Archive, settings: CompareSettings, base_version: int, sizes: ViewSizes = ViewSizes(),
+) -> ViewMaker:
     source, site_grid = setup.source, archive.site_grid()
-    side_px = settings.side_px or (_VIDEO_SIDE_PX if source.kind == "video" else _PHOTO_SIDE_PX)
+    side_px = settings.side_px or (sizes.video_px if source.kind == "video" else sizes.photo_px)
     finer = 1.0
     if source.kind == "photos" and settings.method != "thesis":
-        finer = max(1.0, min(_PHOTO_FINER, site_grid.grid.m_per_px / _FINE_M_PER_PX))
+        finer = max(1.0, min(sizes.photo_finer, site_grid.grid.m_per_px / sizes.fine_m_per_px))
     flight = FlightCamera(source.camera.camera, setup.usual_height_m, side_px, setup.utc_ns, finer)
     reference = ReferenceMap(archive.tiles(base_version), site_grid.grid)
     if settings.method == "thesis":
         return ViewMaker(flight, reference, site_grid, settings.thesis, None)
-    return ViewMaker(flight, reference, site_grid, None, _earlier_pictures(archive, source.name))
+    return ViewMaker(flight, reference, site_grid, None, _earlier_pictures(archive, source.name, sizes))
 
 
-def _earlier_pictures(archive: Archive, superseded: str) -> EarlierPictures:
+def _earlier_pictures(archive: Archive, superseded: str, sizes: ViewSizes = ViewSizes()) -> EarlierPictures:
     """The keyframes of earlier flights, rendered over the newest heights; not those of a flight that the map does not
     show any more."""
     keyframes = [
@@ -316,7 +324,7 @@ def _earlier_pictures(archive: Archive, superseded: str) -> EarlierPictures:
     relief = None if tall is None else Relief(
         *standing(read_field(archive, tall, HeightFile.SURFACE), read_field(archive, tall, HeightFile.GROUND))
     )
-    images = ImageCache(lambda index: with_known_pixels(archive.image(keyframes[index])), _CACHE_BYTES)
+    images = ImageCache(lambda index: with_known_pixels(archive.image(keyframes[index])), sizes.cache_bytes)
     return EarlierPictures(
         [EarlierPicture(each.camera, each.site_from_image, each.site_from_camera) for each in keyframes], images.get,
         relief,
