@@ -1,4 +1,4 @@
-"""The errors a person must act on; every message says what was found, what was needed and what to do."""
+"""The errors a person must act on; every message states what was found, what was needed and what to do."""
 
 
 class SorvoloError(Exception):

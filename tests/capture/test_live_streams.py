@@ -51,7 +51,7 @@ def test_frames_come_in_order_with_the_times_of_their_metadata() -> None:
         source.close()
     assert [frame.index for frame in frames] == list(range(25))
     for frame in frames:
-        # the drone's clock, not this computer's, says when each picture was taken
+        # each picture's time is that of the drone's clock, not this computer's
         sent = round((frame.time_ns - EPOCH_NS) / S * RATE)
         assert number_of(frame.image) == sent % 38
         assert abs(frame.time_ns - EPOCH_NS - sent * S // RATE) < 0.01 * S

@@ -413,7 +413,7 @@ def test_null_and_teleporting_fixes_are_dropped_and_counted(tmp_path: Path) -> N
     source = open_photos(tmp_path)
     found = codes(source)
     assert found["null_fix"] == 1 and found["jump"] == 1
-    # a photo whose fix is dropped keeps its sample: it may still say how the camera looked
+    # a photo whose fix is dropped keeps its sample: it may still state how the camera looked
     assert np.isfinite(source.telemetry["latitude_deg"]).sum() == 8
     assert len(source.telemetry) == 10 and len(all_frames(source)) == 10
 

@@ -25,7 +25,7 @@ _GPS_IFD, _ORIENTATION = 34853, 274
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    """The one line that a command, which must fail with code 1, says on stderr."""
+    """The one line that a command, which must fail with code 1, prints on stderr."""
     capsys.readouterr()
     assert cli.main(["map", "--model", "none", *map(str, arguments)]) == 1
     printed = capsys.readouterr().err.splitlines()
@@ -171,7 +171,7 @@ def test_half_written_telemetry_with_lost_jumping_and_backward_fixes(
 
 
 def test_telemetry_of_another_path_at_the_same_time(film: Path, filmed: Path, tmp_path: Path) -> None:
-    """A map without a reference cannot tell place from place, but the motion does not fit, and the report says so."""
+    """A map without a reference cannot tell place from place, but the motion does not fit, and the report states it."""
     lines = (filmed / "flight1" / "other" / "flight1.nmea").read_text().splitlines()
     places = [line.split(",") for line in lines]
 

@@ -1,4 +1,4 @@
-"""The first line of a mapped flight: no map, a map to check, or a map; the exit code says the same."""
+"""The first line of a mapped flight: no map, a map to check, or a map; the exit code agrees."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The preflight: numbers that follow from the flight, and findings that say what to do."""
+"""The preflight: numbers that follow from the flight, and findings that state what to do."""
 
 import json
 from pathlib import Path

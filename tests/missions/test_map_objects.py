@@ -129,7 +129,7 @@ def test_compare_names_changes(simulated: Path, compared: Path) -> None:
 
 
 def test_without_a_model(simulated: Path, tmp_path: Path) -> None:
-    """Mapping works, and the report says that nothing was looked for."""
+    """Mapping works, and the report states that nothing was looked for."""
     for _ in map_flights([simulated / "flight1/flight1.mp4"], tmp_path / "site", MapSettings(model="none")):
         pass
     assert report_of(tmp_path / "site", "flight1")["objects"]["why_not"] == "no model was wanted"

@@ -16,7 +16,7 @@ from sorvolo.survey.objects import CLASSES, Detections, no_detections
 
 
 class TruthDetector:
-    """What a good detector would say of a simulated flight's frames.
+    """What a good detector would find in a simulated flight's frames.
 
     `misses` is the share of objects not seen in a frame, `false_alarms` the mean number of boxes around nothing;
     edges err by `jitter` of the box's sides. The same frame always gets the same answer.

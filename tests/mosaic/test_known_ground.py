@@ -21,7 +21,7 @@ def brighter(images: dict[int, np.ndarray], ids: list[int], gain: float) -> dict
 
 @pytest.fixture(scope="module")
 def halves():
-    """Two flights side by side, the later one 6 % brighter than its exposure says, and the map of the first."""
+    """Two flights side by side, the later one 6 % brighter than its exposure states, and the map of the first."""
     frames, images = flight()
     early = [each for each in frames if each.id % 4 < 2]
     late = [replace(each, rank=1) for each in frames if each.id % 4 >= 2]

@@ -1,4 +1,4 @@
-"""The planar method on small rendered flights: everything placed, and what cannot be placed says why."""
+"""The planar method on small rendered flights: everything placed, and the reason of what cannot be placed."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""The pose graph on exact links with noise: the shape, what it says has moved, and what telemetry cannot spoil."""
+"""The pose graph on exact links with noise: the shape, what it reports as moved, and what telemetry cannot spoil."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The thesis's method: it places what it should, says why it did not, and repeats itself exactly."""
+"""The thesis's method: it places what it should, reports why it did not, and repeats itself exactly."""
 
 import cv2
 import numpy as np

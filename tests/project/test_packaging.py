@@ -1,4 +1,4 @@
-"""What an sdist and a wheel hold, and what the licences on paper say; `make wheel` itself runs by hand and in CI."""
+"""What an sdist and a wheel hold, and the licences on paper; `make wheel` itself runs by hand and in CI."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""A camera's pose from pairs that are mostly wrong, held by telemetry where they say little."""
+"""A camera's pose from pairs that are mostly wrong, held by telemetry where they leave it open."""
 
 import numpy as np
 

@@ -127,7 +127,7 @@ def test_problems_are_documents(client: TestClient, path: str) -> None:
 
 
 def test_a_site_deleted_while_it_is_looked_at(client: TestClient, root: Path) -> None:
-    """It is gone, which is said; a new one in its place is another site."""
+    """It is gone, which is reported; a new one in its place is another site."""
     assert client.get(FIELD).status_code == 200
     (root / "field").rename(root.parent / "elsewhere")
     assert client.get(FIELD).status_code in (404, 410)

@@ -1,4 +1,4 @@
-"""The API as it describes itself: whatever is sent by that description, it answers as it says, and never with a 500."""
+"""The API as it describes itself: whatever is sent by that description, it answers by it, and never with a 500."""
 
 import json
 from collections import Counter

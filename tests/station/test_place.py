@@ -15,7 +15,7 @@ from sorvolo.store.site.archive import Archive
 
 
 def test_every_flight_that_saw_a_place_is_remembered_in_order(client: TestClient, root: Path) -> None:
-    """With the changes that were found there and what people said of them."""
+    """With the changes that were found there and the verdicts on them."""
     with Archive.open(root / "field", write=True) as archive, archive.begin_flight("c", "c", {}) as writer:
         paths = {0: writer.save_image(0, image(0))}
         writer.commit([frame(0)], paths, {}, "", changes=[fake_change(1, "c", east_m=0.0, north_m=5.0)])

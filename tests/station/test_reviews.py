@@ -100,7 +100,7 @@ def test_verdicts_of_a_station_of_format_1_are_kept(root: Path) -> None:
 
 
 def test_of_many_at_once_one_wins(client: TestClient) -> None:
-    """The others are told, so nothing is lost."""
+    """The others get a conflict, so nothing is lost."""
     codes: list[int] = []
     threads = [
         threading.Thread(target=lambda: codes.append(verdict(client, "b-2", "confirmed", 0).status_code))

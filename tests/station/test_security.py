@@ -311,7 +311,7 @@ def test_each_wrong_token_doubles_the_wait() -> None:
 
 
 def test_others_reach_it_only_with_tokens_and_tls(tmp_path: Path) -> None:
-    """Or with a word that says that the network is trusted."""
+    """Or with the option that the network is trusted."""
     check_exposure(StationSettings(tmp_path), has_tokens=False)
     check_exposure(StationSettings(tmp_path, "localhost"), has_tokens=False)
     with pytest.raises(SettingsError, match="sorvolo token"):

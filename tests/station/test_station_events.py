@@ -39,7 +39,7 @@ def test_what_is_written_with_events_is_written_or_neither(tmp_path: Path) -> No
 def test_events_older_than_memory_come_from_the_disk_and_lost_ones_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A browser that slept for long is told to load anew instead of missing something silently."""
+    """A browser that slept for long loads anew instead of missing something silently."""
     monkeypatch.setattr(events_module, "_IN_MEMORY", 2)
     log = logged(tmp_path, 8)
     assert [each["seq"] for each in log.after(2)] == [3, 4, 5, 6, 7, 8]

@@ -1,4 +1,4 @@
-"""Changes enter the site with their flight, appear as files, are replaced whole, and keep what people said of them."""
+"""Changes enter the site with their flight, appear as files, are replaced whole, and keep their verdicts."""
 
 import json
 import sqlite3

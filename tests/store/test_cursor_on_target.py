@@ -1,4 +1,4 @@
-"""Cursor on Target: what an event says."""
+"""Cursor on Target: what an event holds."""
 
 from dataclasses import replace
 from datetime import datetime

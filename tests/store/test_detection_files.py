@@ -1,4 +1,4 @@
-"""A watch's folder: who may write into it, what its files say, that lines outlive a kill, and the annotated video."""
+"""A watch's folder: who may write into it, what its files hold, that lines outlive a kill, and the annotated video."""
 
 import json
 import os

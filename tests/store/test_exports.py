@@ -1,4 +1,4 @@
-"""Frames, pictures and KMZ lie where the site says, and say what is not known."""
+"""Frames, pictures and KMZ lie where the site has them, and name what is not known."""
 
 import json
 import time

@@ -53,7 +53,7 @@ def features(path: Path) -> dict[str, dict[str, object]]:
 
 @pytest.mark.usefixtures("kind")
 def test_files_of_a_flight_and_of_the_site(tmp_path: Path) -> None:
-    """Both say the same; the crops lie where they say."""
+    """Both agree; the crops lie where they state."""
     commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0), thing("a-o2", 9.0, -2.0, "person", length_m=float("nan")))))
     own, whole = features(tmp_path / "flights/a/objects.geojson"), features(tmp_path / "objects.geojson")
     assert list(own) == list(whole) == ["a-o1", "a-o2"]
@@ -84,7 +84,7 @@ def test_a_later_flight_replaces_what_it_looked_at(tmp_path: Path) -> None:
 
 
 def test_one_frame_does_not_take_away(tmp_path: Path) -> None:
-    """One of a later flight's frames may have missed it; a flight of one frame says what it says."""
+    """One of a later flight's frames may have missed it; a flight of one frame counts as it is."""
     commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0),)))
     mixed = search((), west_m=100.0, east_m=200.0, frames=2)
     once = replace(mixed, outlines_m=np.concatenate([mixed.outlines_m, search(()).outlines_m[:1]]))
@@ -140,7 +140,7 @@ def test_a_site_of_a_later_format_is_refused(tmp_path: Path) -> None:
 
 
 def test_section_of_the_report() -> None:
-    """Text is escaped; without a model it says why nothing was looked for; old reports have no section."""
+    """Text is escaped; without a model it states why nothing was looked for; old reports have no section."""
     row = {"id": "a-o1", "class": "<i>", "score": 0.8, "east_m": 1.0, "north_m": 2.0, "sigma_m": None, "views": 3}
     placed = {**row, "id": "a-o2", "sigma_m": 0.534}
     reported = {"model": "fast", "classes": {"<i>": 1}, "list": [row, placed]}

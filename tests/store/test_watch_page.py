@@ -1,4 +1,4 @@
-"""The page of a watch: what it says, that it is whole and needs nothing else, and that names stay text."""
+"""The page of a watch: its content, that it is whole and needs nothing else, and that names stay text."""
 
 import re
 from typing import Any

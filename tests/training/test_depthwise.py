@@ -1,4 +1,4 @@
-"""Our depthwise convolution says and teaches what torch's own does."""
+"""Our depthwise convolution and its gradients are those of torch's own."""
 
 import pytest
 

@@ -37,7 +37,7 @@ def _batch(count: int = 4) -> "torch.Tensor":
 
 
 def _model(rpn: Stem = "extended-residual", classes: tuple[str, ...] = _CLASSES) -> FasterRCNN:
-    """A network whose norms are as little alike as those of a trained one, and that is sure of what it says."""
+    """A network whose norms are as little alike as those of a trained one, and that is sure of its answers."""
     torch.manual_seed(5)
     model = fast(classes, rpn)
     for each in model.modules():

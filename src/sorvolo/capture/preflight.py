@@ -70,7 +70,7 @@ class TelemetryFacts:
 class FlightFacts:
     """The flight, as far as telemetry and camera give it; NaN elsewhere.
 
-    `height_reference` says above what `height_m` is. `forward_overlap` is that of consecutive photos;
+    `height_reference` is what `height_m` is counted from. `forward_overlap` is that of consecutive photos;
     `frame_interval_s` the longest time between two frames that keeps 70 % overlap (eqs 3.16-3.17).
     """
 
@@ -176,7 +176,7 @@ def _tie(source: Source, frames: FrameFacts) -> tuple[str, float]:
     if any(notice.code == "no_date" for notice in telemetry.notices):
         return "unknown: the telemetry has no date", math.nan
     if not source.start_ns:
-        return "unknown: the video does not say when it began", math.nan
+        return "unknown: the video does not state when it began", math.nan
     both_ns = common_ns(telemetry, source.start_ns, frames.duration_s)
     return "by UTC", both_ns / _SECOND_NS
 

@@ -350,7 +350,7 @@ class Aligner:
             yield partial(self._anywhere, features)
 
     def _predicted(self, camera: Camera, prior: CameraPrior, time_ns: int) -> Matrix3 | None:
-        """The last fit moved on at the flight's velocity, turned as telemetry says the camera turned."""
+        """The last fit moved on at the flight's velocity, turned as telemetry has the camera turned."""
         longest_ns = self._settings.moving.predicts_s * 1e9
         if not self._fits or not 0 <= time_ns - self._fits[-1].time_ns <= longest_ns:
             return None

@@ -134,7 +134,7 @@ def _rest(
 ) -> float:
     """The share of the second half's displacements that is left by the smooth one of the first; 1 where it is none.
 
-    Each half's cells have windows of their own, so that noise of one half says nothing about the other.
+    Each half's cells have windows of their own, so that the noise of one half is independent of the other's.
     """
     field, _, _ = _field(agreement, halves[0], reach, settings)
     _, moved, sure = _field(agreement, halves[1], reach, settings)

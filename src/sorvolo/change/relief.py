@@ -56,7 +56,7 @@ class Relief:
         size: tuple[int, int],
     ) -> tuple[Floats32, Floats32, Mask] | None:
         """Where an image's pixels lie in an earlier picture, x and y (h, w), and whether the earlier camera saw there
-        what the later one sees. None where nothing stands: then homographies say it all.
+        what the later one sees. None where nothing stands: then homographies are enough.
 
         `site_from_image` and `picture_from_site` hold for level ground; `size` is the image's width and height.
         """

@@ -73,7 +73,7 @@ def search_command(
 
     People and cars are drawn into the flight's own frames, the detector searches them, and the share that a map would
     report becomes a map of the probability of detection. Ends with exit code 3 where part of the area was not seen well
-    enough; the first line says why.
+    enough; the first line states why.
 
     Example: sorvolo search field --area search-area.kml --refly holes.kml
 

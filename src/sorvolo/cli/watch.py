@@ -82,7 +82,7 @@ LeastScore = Annotated[
     float | None, typer.Option(help="Lowest score to report, 0 to 1.", show_default="each class's own")
 ]
 WatchOffset = Annotated[
-    float | None, typer.Option(help="Telemetry time minus video time, s.", show_default="as their clocks say")
+    float | None, typer.Option(help="Telemetry time minus video time, s.", show_default="as their clocks have it")
 ]
 HeightModel = Annotated[
     str, typer.Option(help="GeoTIFF of ground heights in the telemetry's reference.", show_default="level ground")

@@ -157,7 +157,7 @@ class RayExecutor:
 
     @contextmanager
     def _cluster(self) -> Iterator[None]:
-        """Turn what Ray raises of a cluster that is gone into an error that says what to do."""
+        """Turn what Ray raises of a cluster that is gone into an error that states what to do."""
         import grpc
 
         errors = self._ray.exceptions

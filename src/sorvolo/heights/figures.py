@@ -1,4 +1,4 @@
-"""What a report says of a flight's heights: figures, and what a user should know before using them."""
+"""A flight's heights in its report: figures, and what a user should know before using them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -17,7 +17,7 @@ from sorvolo.heights.semiglobal import SmoothingSettings, smoothed
 from sorvolo.heights.views import View, inside
 
 _MORE = 3  # views beyond the wanted ones
-_ANGLES = 16  # directions in a picture that are told apart, over half a turn
+_ANGLES = 16  # directions in a picture that are distinguished, over half a turn
 _ANGLE_RAD = np.pi / _ANGLES
 
 

@@ -139,7 +139,7 @@ def corrected(
 ) -> ImageRGB:
     """The image as it would be with gain 1 and no vignette: times gains (3,), divided by exp(a2 r^2 + a4 r^4).
 
-    `place` says which part of a whole picture the image is: its first pixel's x and y, the whole's width and height.
+    `place` is the part of a whole picture that the image is: its first pixel's x and y, the whole's width and height.
     """
     if not vignette.any():
         if (gains == 1).all():

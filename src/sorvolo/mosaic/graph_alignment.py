@@ -16,7 +16,7 @@ class AlignmentSettings:
 
     rounds: int = 3  # trimmed: a few wild fixes must not turn the map
     wild: float = 3.0  # times the median miss: such a fix is left out
-    most_uncertain: float = 0.15  # relative, of scale and turn by these fixes: they say too little
+    most_uncertain: float = 0.15  # relative, of scale and turn by these fixes: beyond, they leave them open
     least_sigmas: float = 3.0  # of scale or turn, or ...
     least_scale: float = 0.02  # ... relative, ...
     least_turn_rad: float = 0.03

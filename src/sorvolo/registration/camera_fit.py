@@ -1,4 +1,4 @@
-"""Pairs of image and ground points, most of them perhaps wrong, and what telemetry says, to the camera's pose."""
+"""Pairs of image and ground points, most of them perhaps wrong, and telemetry's pose, to the camera's pose."""
 
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ class PosePrior:
 
 @dataclass(frozen=True, eq=False)
 class CameraFit:
-    """A camera over level ground that explains pairs. `agree` (N,) says which; `residual_px` is their median miss."""
+    """A camera over level ground that explains pairs. `agree` (N,) marks them; `residual_px` is their median miss."""
 
     pose: Pose
     site_from_image: Matrix3

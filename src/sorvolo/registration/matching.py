@@ -1,4 +1,4 @@
-"""Features of two views to index pairs: brute force inside the area where the prediction says they meet."""
+"""Features of two views to index pairs: brute force inside the area that the prediction allows."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""What a flight's instruments say of it: the true path, sampled, with noise, bias, a wrong clock and
+"""What a flight's instruments report: the true path, sampled, with noise, bias, a wrong clock and
 faults."""
 
 from dataclasses import dataclass

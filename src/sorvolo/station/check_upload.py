@@ -1,4 +1,4 @@
-"""A process that looks into one upload within limits of memory and time: is it what its name says, is it no bomb?"""
+"""A process that looks into one upload within limits of memory and time: does it match its name, is it no bomb?"""
 
 import json
 import re

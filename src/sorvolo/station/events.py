@@ -81,7 +81,7 @@ class EventLog:
                 self._waiting.discard((loop, event))
 
     def after(self, seq: int) -> list[dict[str, Any]]:
-        """The events after a number, oldest first, some hundreds at most; what is lost is said by one event."""
+        """The events after a number, oldest first, some hundreds at most; what is lost is reported by one event."""
         with self._lock:
             recent, last = list(self._recent), self._last
         if seq >= last:

@@ -169,7 +169,7 @@ def _words(text: str) -> frozenset[str]:
 
 
 def _reviewed(features: Sequence[Feature], name: str, site: str, reviews: Reviews) -> list[Feature]:
-    """The features with what people said of them, where the collection is one that people judge."""
+    """The features with their verdicts, where the collection is one that people judge."""
     kind = _REVIEWED.get(name)
     if kind is None:
         return list(features)

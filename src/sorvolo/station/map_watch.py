@@ -56,7 +56,7 @@ class MapWatch:
         for site_id in folders:
             try:
                 self._look_at(site_id)
-            except (Problem, SorvoloError):  # gone meanwhile, or damaged: who opens it is told why
+            except (Problem, SorvoloError):  # gone meanwhile, or damaged: opening it reports why
                 self._seen.pop(site_id, None)
         if time.monotonic() - self._settled_s > _SETTLE_EVERY_S:
             self._settled_s = time.monotonic()
@@ -101,7 +101,7 @@ class MapWatch:
         while not self._ending.wait(_LOOK_EVERY_S):
             try:
                 self.look()
-            except Exception as error:  # a full disk: told in the log, tried again
+            except Exception as error:  # a full disk: logged, tried again
                 sys.stderr.write(f"station: maps cannot be followed: {error}\n")
                 self._ending.wait(2.0)
 

@@ -16,7 +16,7 @@ ORDER_FILE, JOURNAL_FILE, LOG_FILE, LOCK_FILE = "order.json", "journal.jsonl", "
 """The files of a run's folder: what it is to do, what it did line by line, what it printed, who is at it."""
 
 BOXES = "frame.boxes"
-"""The type of a journal's line that says what was detected in one frame."""
+"""The type of a journal's line for what was detected in one frame."""
 
 LOCK_VARIABLE = "SORVOLO_RUN_LOCK"
 """Of the environment of a run's process: the number of its lock's descriptor, which its own children must not have."""

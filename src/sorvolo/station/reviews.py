@@ -1,4 +1,4 @@
-"""What people say of objects and changes: every verdict kept with who and when; none is lost to another's."""
+"""Verdicts on objects and changes: each kept with who gave it and when; none is lost to another's."""
 
 import sqlite3
 import threading
@@ -20,7 +20,7 @@ from sorvolo.station.tokens import Holder, Role
 from sorvolo.survey.findings import Verdict
 
 NO_VERDICT = "none"
-_ELSEWHERE = "sorvolo review"  # who said what came by the command line
+_ELSEWHERE = "sorvolo review"  # who gave a verdict by the command line
 
 
 class ReviewWish(BaseModel):
@@ -80,7 +80,7 @@ class Reviews:
         return [Review(**dict(row)) for row in rows]
 
     def give(self, site_id: str, wish: ReviewWish, who: str) -> Review:
-        """Keep a verdict. Raises Problem: 404 for an unknown thing, 409 where somebody said something since."""
+        """Keep a verdict. Raises Problem: 404 for an unknown thing, 409 where somebody judged it since."""
         self._demand_thing(site_id, wish.kind, wish.id)
         now = self.current(site_id, wish.kind).get(wish.id)
         revision = now.revision if now is not None else 0

@@ -214,7 +214,7 @@ class Runs:
                 if count % _DISK_EVERY == 0:
                     self.look_at_disk()
                 self.look()
-            except Exception as error:  # a full disk, a folder taken away: told in the log, tried again
+            except Exception as error:  # a full disk, a folder taken away: logged, tried again
                 sys.stderr.write(f"station: runs cannot be followed: {error}\n")
                 self._ending.wait(2.0)
 

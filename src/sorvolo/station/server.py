@@ -72,7 +72,7 @@ def _listening(settings: StationSettings) -> socket.socket:
 
 
 class _Announcing(uvicorn.Server):
-    """A server that says when it listens."""
+    """A server that announces that it listens."""
 
     def __init__(self, config: uvicorn.Config, announce: Callable[[], None]) -> None:
         super().__init__(config)

@@ -91,7 +91,7 @@ class FlightFile:
         return b"".join([*(self._tables() if message.is_key else ()), *pictures])
 
     def _tables(self) -> Iterator[bytes]:
-        """The packets that say what is in the stream: before each key frame, so that a reader may begin there."""
+        """The packets that describe the stream: before each key frame, so that a reader may begin there."""
         pat = struct.pack(">HBBBHH", 1, 0xC1, 0, 0, 1, 0xE000 | _PMT)
         yield self._table(_PAT, 0x00, pat)
         streams = struct.pack(">BHH", _TYPES[self._codec], 0xE000 | _VIDEO, 0xF000)

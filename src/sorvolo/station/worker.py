@@ -286,7 +286,7 @@ def _newest(site: Path) -> int:
 
 
 def _headline(site: Path, before: int) -> str:
-    """What the reports of the flights that came since say first."""
+    """The headlines of the flights that came since."""
     with Archive.open(site, write=False) as archive:
         flights = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
         texts = [_headline_of(archive.report(each)) for each in flights]

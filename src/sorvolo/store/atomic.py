@@ -69,7 +69,7 @@ def scratch_folder(parent: Path) -> Iterator[Path]:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn the operating system's refusals to write into a StoreError that says what to do."""
+    """Turn the operating system's refusals to write into a StoreError that states what to do."""
     try:
         yield
     except OSError as error:
@@ -94,7 +94,7 @@ def sync_file(path: Path) -> None:
 
 
 def remove_leftovers(folders: Iterable[Path]) -> int:
-    """Delete what killed writers left in these folders (not below them) and say how many things it was.
+    """Delete what killed writers left in these folders (not below them); how many things it was.
 
     Only for a folder that no other process is writing to.
     """

@@ -26,7 +26,7 @@ def read_mask(path: Path, *, may_be_unknown: bool) -> tuple[Mask, Mask]:
     if picture is None:
         raise InputError(f"{path}: cannot be read as a picture; make this mask anew")
     values = np.asarray(picture)
-    if values.ndim == 3:  # alpha says nothing of change
+    if values.ndim == 3:  # alpha is no part of the change
         values = values[..., :3].max(axis=2) if values.shape[2] != 2 else values[..., 0]
     if path.suffix.lower() in _LOSSY:
         changed: Mask = values >= 128

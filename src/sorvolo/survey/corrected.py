@@ -46,7 +46,7 @@ class Bias:
 @dataclass(frozen=True)
 class TelemetryFaults:
     """What was wrong with a flight's telemetry. `clock_s` is telemetry's clock less the video's; `heading_deg` positive
-    where the compass read too far clockwise; `tilt_deg` how far the camera looked from where it was said to, sideways
+    where the compass read too far clockwise; `tilt_deg` how far the camera looked from its stated direction, sideways
     and forward together; `height_m` positive where the log was too high above the ground."""
 
     clock_s: Bias

@@ -1,4 +1,4 @@
-"""How much ground a pixel covers where nothing but the pictures says so: by the cars, else the people, in them."""
+"""How much ground a pixel covers where only the pictures show it: by the cars, else the people, in them."""
 
 from collections import deque
 from collections.abc import Sequence

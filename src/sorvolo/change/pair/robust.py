@@ -81,7 +81,7 @@ def compare_robust(
 
 
 class Examined(NamedTuple):
-    """The regions that differ at half size, before anything is said about them; and what the pair set itself."""
+    """The regions that differ at half size, before any is judged; and what the pair set itself."""
 
     regions: Regions
     light: Light

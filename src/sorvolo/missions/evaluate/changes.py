@@ -52,7 +52,7 @@ class ClassCounts:
 
 @dataclass(frozen=True, eq=False)
 class FlightChanges:
-    """One compared flight against the truth; what could not be measured is None, and `remarks` say why.
+    """One compared flight against the truth; what could not be measured is None, and `remarks` state why.
 
     `map_shift_m` is how far the map lies from the truth (rms over frames); it is taken out before events are matched.
     `classes` is None where no change has a class: nobody looked.
@@ -117,7 +117,7 @@ def _against_simulation(
 
 
 def as_json(measured: Sequence[FlightChanges]) -> list[dict[str, Any]]:
-    """The measures with all their rates, as JSON can say them."""
+    """The measures with all their rates, as JSON can hold them."""
     return [
         {
             "flight": each.flight,
@@ -189,7 +189,7 @@ def _true_masks(truth: Path, true_flights: Mapping[str, Path], flight: str | Non
         return truth
     name = flight or (next(iter(true_flights)) if len(true_flights) == 1 else "")
     if name not in true_flights:
-        raise InputError(f"{truth}: has masks of {', '.join(true_flights)}; say which with --flight")
+        raise InputError(f"{truth}: has masks of {', '.join(true_flights)}; name one with --flight")
     return true_flights[name] / "changes"
 
 
@@ -288,7 +288,7 @@ def _read_true(
         try:
             events.append(_true_event(feature, described, map_from_truth, ground, views, path))
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise InputError(f"{path}: an event is not as docs/simulation.md says ({error!r})") from error
+            raise InputError(f"{path}: an event is not as docs/simulation.md has it ({error!r})") from error
     return events
 
 
@@ -323,7 +323,7 @@ def _read_found(path: Path, described: Site, clock: tuple[int, int]) -> list[Fou
                 announced_ns,
             ))
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise InputError(f"{path}: a change is not as docs/formats.md says ({error!r})") from error
+            raise InputError(f"{path}: a change is not as docs/formats.md has it ({error!r})") from error
     return events
 
 

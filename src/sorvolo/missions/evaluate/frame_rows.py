@@ -82,7 +82,7 @@ def frame_row(feature: Mapping[str, Any], frame: LocalFrame, path: Path) -> Fram
             frame.ground_from_lonlat([fix])[0], time_ns_of(str(properties.get("time") or "")),
         )
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(f"{path}: a feature is not as docs/formats.md says ({error!r})") from error
+        raise InputError(f"{path}: a feature is not as docs/formats.md has it ({error!r})") from error
 
 
 def time_ns_of(text: str) -> int:

@@ -88,7 +88,7 @@ def _read_found(path: Path, behind_ns: int) -> list[JudgedObject]:
                 _number(properties["sigma_m"]), time_ns_of(properties["last_seen"]) + behind_ns,
             ))
         except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{path}: an object is not as docs/formats.md says ({error!r})") from error
+            raise InputError(f"{path}: an object is not as docs/formats.md has it ({error!r})") from error
     return objects
 
 
@@ -112,7 +112,7 @@ def _read_true(
                 floats(properties["velocity_m_s"]), float(properties["length_m"]), must_find=seen,
             ))
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise InputError(f"{path}: an object is not as docs/simulation.md says ({error!r})") from error
+            raise InputError(f"{path}: an object is not as docs/simulation.md has it ({error!r})") from error
     return objects
 
 

@@ -48,7 +48,7 @@ def refuse_without_texture(source: Source) -> None:
             return
         seen += 1
     if not seen:
-        return  # nothing can be read there: its frames will say so
+        return  # nothing can be read there: its frames are reported as lost
     raise InputError(
         f"{source.name}: its pictures show no texture ({seen} all over the flight are of one gray, or noise "
         "alone); is the lens covered? `sorvolo inspect` shows what the flight holds"

@@ -1,4 +1,4 @@
-"""What a measured search says: chances over all flights, holes and their reasons, the figures of a search, in words."""
+"""A measured search's report: chances over all flights, holes and their reasons, the figures of a search, in words."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass

@@ -22,7 +22,7 @@ def list_changes(site: Path, flight: str | None = None) -> list[StoredChange]:
 def review_changes(
     site: Path, ids: Sequence[str], verdict: Verdict, note: str = "", *, flight: str | None = None
 ) -> list[StoredChange]:
-    """Confirm or reject changes by id, or by number when `flight` says whose; return them as they are now.
+    """Confirm or reject changes by id, or by number when `flight` names whose; return them as they are now.
 
     The flight's changes.geojson and changes.html follow. Rejected changes do not come back in later flights. Raises
     InputError for an unknown id or flight (then no verdict is given), StoreError when another process is writing.

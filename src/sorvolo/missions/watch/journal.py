@@ -32,7 +32,7 @@ class SearchedFrame:
 
 @dataclass(frozen=True)
 class Sent:
-    """That a receiver was told of a track: it has the message. `receiver` is the one's code in notices."""
+    """A receiver has the message about a track. `receiver` is the one's code in notices."""
 
     receiver: str
     track_id: int

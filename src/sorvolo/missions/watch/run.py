@@ -244,7 +244,7 @@ class WatchRun:
         if total and self.log.placed < 0.5 * total:
             warnings.append(
                 f"{total - self.log.placed} of {total} detections have no place on the ground and are in no track; "
-                "the notices say why"
+                "the notices state why"
             )
         if self._setup.source.camera.focal_sigma > 0.1:
             warnings.append(f"camera: {self._setup.source.camera.origin}; until then places are some percent off")

@@ -54,7 +54,7 @@ export function pictures(feature) {
     el("figure", {}, picture(src, `${titleOf(feature)}, ${names[k] ?? ""}`), el("figcaption", {}, names[k] ?? ""))));
 }
 
-/** A picture that says so where it cannot be had. */
+/** A picture, or a note where it cannot be had. */
 export function picture(src, alt) {
   const image = el("img", { src, alt, loading: "lazy", decoding: "async" });
   image.addEventListener("error", () => image.replaceWith(el("div", { class: "gone" }, "no picture")));

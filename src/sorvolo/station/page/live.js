@@ -159,7 +159,7 @@ class Live {
   async look() {
     try {
       this.screen.station.status = { ...this.screen.station.status, ...await get("/api/status") };
-    } catch { /* the connection's own sign says so */ }
+    } catch { /* the connection's own sign shows it */ }
     if (!this.screen.closed) this.show();
   }
 

@@ -30,7 +30,7 @@ export async function judge(screen, feature, verdict, note = null) {
 
 const wordsOf = (verdict) => (verdict === "none" || !verdict ? "no verdict" : verdict);
 
-/** Who said what and when, in a line. */
+/** Who judged it how and when, in a line. */
 export function verdictLine(feature) {
   const { review, reviewer, reviewed_at: at, note } = feature.properties;
   if (!review && !note) return el("p", { class: "verdict none" }, "Not reviewed yet");

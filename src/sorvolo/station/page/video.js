@@ -49,7 +49,7 @@ class VideoPane {
       const list = await get("/api/streams");
       const on = list.find((each) => each.is_connected) ?? null;
       if (on) this.offer(on.stream);
-    } catch { /* the connection's own sign says so */ }
+    } catch { /* the connection's own sign shows it */ }
   }
 
   heard({ data }) {
@@ -104,7 +104,7 @@ class VideoPane {
     try {
       const state = await get(`/api/streams/${encodeURIComponent(this.stream)}`);
       if (state.is_connected) this.screen.live.heard(state.telemetry);
-    } catch { /* the connection's own sign says so */ }
+    } catch { /* the connection's own sign shows it */ }
   }
 
   said(words) {

@@ -107,7 +107,7 @@ def copy(
     """Make `target` what `source` is at one moment, however often that one changes meanwhile.
 
     What is there already is not copied again, so that a stopped copy goes on. `scratch` is a folder for catalogues.
-    `room` is told the bytes that are needed and those that are free, before each round, and may raise. Files that the
+    `room` gets the bytes that are needed and those that are free, before each round, and may raise. Files that the
     source has lost or that are damaged there are left out and named in the outcome. Raises StoreError as the ends do,
     and when the source did not stand still for one of `most_rounds` rounds.
     """

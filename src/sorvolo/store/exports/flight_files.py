@@ -231,7 +231,7 @@ def read_orthophoto(path: Path, m_per_px: float | None = None) -> tuple[ImageRGB
             size_m = m_per_px or own
             if not size_m:
                 raise InputError(
-                    f"{path}: has no metric coordinate system; say its pixel size with --ground-gsd"
+                    f"{path}: has no metric coordinate system; give its pixel size with --ground-gsd"
                 )
             return np.ascontiguousarray(np.moveaxis(source.read([1, 2, 3]), 0, -1)), float(size_m)
     except rasterio.errors.RasterioIOError as error:

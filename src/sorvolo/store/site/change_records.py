@@ -164,7 +164,7 @@ def put_reviews(connection: Connection, changes: Sequence[StoredChange], verdict
 
 
 def drop_reviews(connection: Connection, changes: Sequence[StoredChange]) -> None:
-    """Forget what was said of these changes."""
+    """Forget the verdicts on these changes."""
     for each in changes:
         connection.execute(delete(schema.reviews).where(schema.reviews.c.change_id == each.id))
 

@@ -1,4 +1,4 @@
-"""Format 2: comparisons, their changes, and what people say of them; files that a replaced run leaves."""
+"""Format 2: comparisons, their changes, and the verdicts on them; files that a replaced run leaves."""
 
 import sqlalchemy as sa
 from alembic import op
