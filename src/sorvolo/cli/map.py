@@ -157,11 +157,9 @@ def map_command(
 
     Example: sorvolo map DJI_0042.MP4 --site field
 
-    Example: sorvolo map photos/ --site field --camera phantom.xml --area field.geojson
+    Example: sorvolo map photos/ --site field --camera phantom.xml --area field.geojson --refly holes.plan --heights
 
     Example: sorvolo map photos/ --site field --gcp gcp_list.txt --check CP*
-
-    Example: sorvolo map photos/ --site field --heights
 
     Example: sorvolo map rtsp://192.168.1.10/live --telemetry serial:/dev/ttyUSB0 --site field
     """
