@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 import typer
 
 from sorvolo import __version__
+from sorvolo.cli.archive import archive_app
 from sorvolo.cli.batch import batch
 from sorvolo.cli.calibrate import calibrate
 from sorvolo.cli.compare import compare
@@ -56,6 +57,7 @@ _ASKED_AGAIN_S = 0.02
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 for _name, _command in _COMMANDS.items():
     app.command(_name)(_command)
+app.add_typer(archive_app, name="archive")
 app.add_typer(evaluate_app, name="evaluate")
 app.add_typer(measure_app, name="measure")
 app.add_typer(models_app, name="models")

@@ -35,7 +35,9 @@ from sorvolo.store.site.names import checked_sha256
 MANIFEST = "sorvolo-site.json"
 _FORMAT = 1
 _MOST_MANIFEST_BYTES = 256_000_000  # a million pictures
-_SHOWN = ("mosaic.tif", "preview.png")  # the newest map under plain names, for GIS and browsers
+SHOWN = ("mosaic.tif", "preview.png")
+"""The newest map, which has plain names as well, for GIS and browsers."""
+
 _MOST_SUFFIX = 10
 
 
@@ -167,7 +169,7 @@ class BucketEnd:
         """A file's bytes; reading raises FileNotFoundError when it is gone."""
         if not file.sha256 or (file.size == 0 and tile_of(file.path)):
             raise FileNotFoundError(2, "no such object", f"{self.name}/{file.path}")
-        return closing(self._objects.opened(_key(file), file.size))
+        return closing(self._objects.opened(key_of(file), file.size))
 
     def fetch(self, file: SiteFile, key: str, path: Path) -> None:
         """Write an object to a path. Raises StoreError when it is gone, or not what its name states."""
@@ -210,7 +212,7 @@ class BucketEnd:
         for file in state.files.values():
             former = known.get(file.path)
             same = former if former and _is_same_picture(file, former) else file
-            stored = self._round.stored.get(_key(same)) if same.sha256 else None
+            stored = self._round.stored.get(key_of(same)) if same.sha256 else None
             if stored is not None and same.size in (stored, 0):  # 0: not fetched into a working copy
                 self._round.files[file.path] = same
             else:
@@ -225,29 +227,21 @@ class BucketEnd:
             size += len(chunk)
         refuse_damaged(file, digest.hexdigest())
         named = SiteFile(file.path, size, digest.hexdigest())
-        if self._round.stored.get(_key(named)) != size and self._round.claim(_key(named)):
-            self._objects.write(_key(named), stream)
+        if self._round.stored.get(key_of(named)) != size and self._round.claim(key_of(named)):
+            self._objects.write(key_of(named), stream)
         self._round.files[file.path] = named
 
     def conclude(self, state: SiteState) -> None:
         """Make all that was put the site, unless another writer was faster: then StoreError, and his work stays."""
         former, stored = self._round.manifest, self._round.stored
-        self.tile_bytes = {
-            sha256: stored.get(path, each.size)
-            for path, each in self._round.files.items() if (sha256 := tile_of(path)) and path in state.files
-        }
-        files = {
-            path: replace(each, stamp=0)
-            for path, each in self._round.files.items() if path in state.files and not tile_of(path)
-        }
+        here = {path: replace(each, stamp=0) for path, each in self._round.files.items() if path in state.files}
+        self.tile_bytes = {tile_of(path): stored.get(path, each.size) for path, each in here.items() if tile_of(path)}
+        files = {path: each for path, each in here.items() if not tile_of(path)}
         if former and former.held == state.held and dict(former.files) == files:
             self.written = former  # nothing is new
             return
         size, sha256 = self._store_catalogue(state.catalogue)
-        manifest = Manifest(
-            secrets.token_hex(16), 1 + (former.generation if former else 0),
-            datetime.now(UTC).isoformat(timespec="seconds"), state.held, (size, sha256), files,
-        )
+        manifest = _next_manifest(former, state.held, (size, sha256), files)
         self._swap(manifest)
         self.written = manifest
         self._show(manifest)
@@ -280,17 +274,17 @@ class BucketEnd:
     def _show(self, manifest: Manifest) -> None:
         """Give the newest map plain names as well; of two writers, the later one's stay."""
         former = self._round.manifest
-        shown = {} if former is None else {name: former.files.get(name) for name in _SHOWN}
+        shown = {} if former is None else {name: former.files.get(name) for name in SHOWN}
         done = ""
         try:
             while done != manifest.id:
-                for name in _SHOWN:
+                for name in SHOWN:
                     if manifest.files.get(name) != shown.get(name) or done:
                         self._show_as(name, manifest.files.get(name))
                 done, manifest = manifest.id, self.manifest()
         except StoreError as error:
             warnings.warn(
-                f"the site is at {self.name}, but not its map under the plain names {', '.join(_SHOWN)}: {error}",
+                f"the site is at {self.name}, but not its map under the plain names {', '.join(SHOWN)}: {error}",
                 SorvoloWarning, stacklevel=2,
             )
 
@@ -298,7 +292,7 @@ class BucketEnd:
         if file is None:
             self._objects.remove([name])
         else:
-            self._objects.copy(_key(file), name)
+            self._objects.copy(key_of(file), name)
 
     def _refuse_foreign(self) -> None:
         foreign = sorted(each for each in self._objects.first() if not _is_ours(each))
@@ -312,6 +306,13 @@ class BucketEnd:
             f"another writer has changed the site at {self.name} meanwhile; nothing there was changed, and nothing "
             "here is lost. Run the same command again"
         )
+
+
+def sites_at(objects: Objects) -> list[str]:
+    """The sites at a place and in the folders right below it, by name; "." where the place itself is one."""
+    if BucketEnd(objects).has_site:
+        return ["."]
+    return sorted(each for each in objects.folders() if objects.has(f"{each}/{MANIFEST}"))
 
 
 @dataclass
@@ -333,11 +334,19 @@ class _Round:
         return is_first
 
 
+def _next_manifest(
+    former: Manifest | None, held: CatalogueState, catalogue: tuple[int, str], files: Mapping[str, SiteFile]
+) -> Manifest:
+    generation = 1 if former is None else former.generation + 1
+    now_utc = datetime.now(UTC).isoformat(timespec="seconds")
+    return Manifest(secrets.token_hex(16), generation, now_utc, held, catalogue, files)
+
+
 def _is_same_picture(file: SiteFile, former: SiteFile) -> bool:
     return not file.sha256 and file.is_lasting and file.size in (former.size, 0)
 
 
-def _key(file: SiteFile) -> str:
+def key_of(file: SiteFile) -> str:
     """The key of a file's bytes: a tile's path, else its SHA-256 with the ending that programs go by."""
     if tile_of(file.path):
         return file.path
@@ -351,7 +360,7 @@ def _catalogue_key(sha256: str) -> str:
 
 
 def _is_ours(key: str) -> bool:
-    return key.split("/")[0] in ("tiles", "files", "catalogues", MANIFEST, *_SHOWN)
+    return key.split("/")[0] in ("tiles", "files", "catalogues", MANIFEST, *SHOWN)
 
 
 def _size(value: Any) -> int:

@@ -27,6 +27,8 @@ _STATUS = re.compile(r"status code: (\d{3})")
 _CLOCK = "this machine's clock is off: set it (by NTP), then run the same command again"
 _FULL = "the store is full: free some space there"
 _KEYS = "the keys are not valid: check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY (or AWS_PROFILE)"
+_NO_KEYS = "no keys were found: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"
+_SLOW = "the connection is too slow or was cut; run the same command again, which goes on where it was"
 _REGION = "the bucket lies in another region: set AWS_REGION to it, and AWS_ENDPOINT_URL where it is not Amazon's"
 _TOKEN = "the session has ended: get new keys (AWS_SESSION_TOKEN)"
 _WORDS = {
@@ -43,6 +45,13 @@ _WORDS = {
     "QuotaExceeded": _FULL, "XMinioStorageFull": _FULL,
 }  # S3's codes of errors
 
+_BY_STATUS = {"403": _WORDS["AccessDenied"], "401": _KEYS, "301": _REGION}
+_WITHOUT_ANSWER = (  # by what the library says, the first that is in it
+    ("169.254.", _NO_KEYS), ("credential", _NO_KEYS),
+    ("certificate", "the store's certificate is not trusted: set AWS_CA_BUNDLE to its authority's PEM file"),
+    ("timed out", _SLOW), ("timedout", _SLOW),
+    ("", "no connection, or it was cut: check the network and AWS_ENDPOINT_URL, then run the same command again"),
+)
 
 T = TypeVar("T")
 
@@ -139,6 +148,23 @@ class Objects:
             return [each["path"] for each in next(iter(obstore.list(self._store)), [])]
 
         return self._tried(some, "list")
+
+    def folders(self) -> list[str]:
+        """The first parts of all keys that have several."""
+        import obstore
+
+        found = self._tried(lambda: obstore.list_with_delimiter(self._store), "list")
+        return [each.strip("/").rpartition("/")[2] for each in found["common_prefixes"]]
+
+    def has(self, key: str) -> bool:
+        """Whether there is such an object."""
+        import obstore
+
+        try:
+            self._tried(lambda: obstore.head(self._store, key), "read")
+        except FileNotFoundError:
+            return False
+        return True
 
     def copy(self, key: str, to: str) -> None:
         """Give an object a second key, in the store itself."""
@@ -304,14 +330,8 @@ def _words_of(text: str) -> str:
         return f"{_WORDS[code[1]]} ({code[1]})"
     if "redirect" in text:
         return _REGION
-    if status:
-        known = {"403": _WORDS["AccessDenied"], "401": _KEYS, "301": _REGION}.get(status[1], "")
-        answered = f"the store answered {status[1]}{f' {code[1]}' if code else ''}"
-        return f"{known} ({answered})" if known else f"{answered}; run the same command again later"
-    if "169.254." in text or "credential" in text.lower():
-        return "no keys were found: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"
-    if "certificate" in text.lower():
-        return "the store's certificate is not trusted: set AWS_CA_BUNDLE to its authority's PEM file"
-    if "timed out" in text or "TimedOut" in text:
-        return "the connection is too slow or was cut; run the same command again, which goes on where it was"
-    return "no connection, or it was cut: check the network and AWS_ENDPOINT_URL, then run the same command again"
+    if status is None:
+        return next(words for hint, words in _WITHOUT_ANSWER if hint in text.lower())
+    answered = f"the store answered {status[1]}{f' {code[1]}' if code else ''}"
+    known = _BY_STATUS.get(status[1], "")
+    return f"{known} ({answered})" if known else f"{answered}; run the same command again later"

@@ -171,13 +171,9 @@ def verify(
     """
     state = source.state(_made(scratch / "source"))
     theirs = copied.state(_made(scratch / "copy"))
-    faults: dict[str, str] = {}
     if state.held.identity != theirs.held.identity:
         raise StoreError(f"{copied.name} holds another site, not {state.held.name!r}")
-    if state.held.digest != theirs.held.digest:
-        faults["site.db"] = f"differs: version {theirs.held.newest} of the map, the site has {state.held.newest}"
-    faults |= {path: "not in the site" for path in theirs.files.keys() - state.files.keys()}
-    faults |= {path: "missing" for path in state.files.keys() - theirs.files.keys()}
+    faults = _differences(state, theirs)
     both = [each for each in state.files.values() if each.path in theirs.files]
     total = sum(each.size for each in both)
 
@@ -197,6 +193,15 @@ def verify(
     if faults and not source.is_still(state, scratch):
         raise StoreError(f"{source.name} changed while it was compared; run the same command again")
     return CopyOutcome(len(state.files), total, len(both), total, state.held.newest, faults, state.left_out)
+
+
+def _differences(state: SiteState, theirs: SiteState) -> dict[str, str]:
+    """How a copy differs by its catalogue and the names of its files."""
+    faults = {}
+    if state.held.digest != theirs.held.digest:
+        faults["site.db"] = f"differs: version {theirs.held.newest} of the map, the site has {state.held.newest}"
+    faults |= {path: "not in the site" for path in theirs.files.keys() - state.files.keys()}
+    return faults | {path: "missing" for path in state.files.keys() - theirs.files.keys()}
 
 
 def sha256_at(end: SiteEnd, file: SiteFile) -> str:

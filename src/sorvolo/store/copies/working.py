@@ -12,7 +12,7 @@ from typing import Self
 
 from sorvolo.errors import StoreError
 from sorvolo.store.atomic import atomic_write_bytes
-from sorvolo.store.copies.bucket import BucketEnd, Manifest
+from sorvolo.store.copies.bucket import SHOWN, BucketEnd, Manifest, key_of
 from sorvolo.store.copies.folder import FolderEnd
 from sorvolo.store.copies.objects import Objects, open_objects
 from sorvolo.store.copies.state import CatalogueState, DamagedError, SiteFile, SiteState, tile_of
@@ -179,6 +179,14 @@ def known_manifest(folder: Path) -> Manifest | None:
     except (FileNotFoundError, ValueError):
         return None
     return Manifest.parsed(json.dumps(note.get("manifest")).encode(), str(folder)) if isinstance(note, dict) else None
+
+
+def store_address(folder: Path, path: str) -> str:
+    """Where a file of a working copy's site lies in the store; "" for one that it has not."""
+    known = known_manifest(folder)
+    if known is None or path not in known.files:
+        return ""
+    return f"{_address_of(folder)}/{path if path in SHOWN else key_of(known.files[path])}"
 
 
 def _address_of(folder: Path) -> str:

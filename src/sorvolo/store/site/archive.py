@@ -108,6 +108,10 @@ class Archive:
         """Where a file of a flight's heights lies, whether it is there or not."""
         return self._files.height_path(flight_id, file)
 
+    def frames(self, flight_id: str) -> Sequence[Any]:
+        """The features of a flight's frames.geojson (docs/formats.md); none when somebody took it away or broke it."""
+        return self._files.frames(flight_id)
+
     def report(self, flight_id: str) -> Mapping[str, Any]:
         """A flight's report.json (docs/formats.md); empty when somebody took it away or broke it."""
         return self._files.report(flight_id)

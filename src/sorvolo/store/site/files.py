@@ -173,7 +173,14 @@ class SiteFiles:
 
     def coverage(self, flight_id: str) -> Sequence[Any]:
         """The features of a flight's coverage.geojson; none when it has none, or somebody broke it."""
-        name = features_name(COVERAGE, is_local=self.site().is_local)
+        return self._features(flight_id, COVERAGE)
+
+    def frames(self, flight_id: str) -> Sequence[Any]:
+        """The features of a flight's frames.geojson; none when somebody took it away or broke it."""
+        return self._features(flight_id, "frames")
+
+    def _features(self, flight_id: str, collection: str) -> Sequence[Any]:
+        name = features_name(collection, is_local=self.site().is_local)
         features = self._document(flight_id, name).get("features")
         return features if isinstance(features, list) else []
 

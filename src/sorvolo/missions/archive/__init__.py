@@ -1,0 +1,1 @@
+"""An archive: the sites of a folder, indexed and found by place and time."""
