@@ -19,6 +19,7 @@ import numpy as np
 
 import detection_data
 from mosaic_methods import commit, machine
+from provenance import note_scoring
 from sorvolo.missions.evaluate.detector import EvaluationSettings, evaluate_detector, write_evaluation
 from sorvolo.missions.simulate.pictures import simulate_pictures
 from sorvolo.simulation.flight import simulate_flight
@@ -47,11 +48,13 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", default=[*REAL, "simulated", "pictures", "pictures_thermal"])
     parser.add_argument("--seeds", type=int, default=4, help="so many simulated flights of each preset")
     parser.add_argument("--tiles", default=None, help="auto, or pixels a side; none by default")
+    parser.add_argument("--from-above", action="store_true", help="the pictures look straight down")
     parser.add_argument("--out", type=Path, help="folder for the pages")
     parser.add_argument("--results", type=Path, default=RESULTS, help="the file that is written")
     options = parser.parse_args()
     tiles = int(options.tiles) if options.tiles and options.tiles.isdecimal() else options.tiles
-    settings = EvaluationSettings(tiles)
+    settings = EvaluationSettings(tiles, from_above=options.from_above)
+    scoring = note_scoring(f"detector_accuracy, {' '.join(options.sets)}{' from above' * options.from_above}")
     runs = {}
     for name in options.sets:
         with tempfile.TemporaryDirectory() as folder:
@@ -69,7 +72,8 @@ def main() -> None:
             write_evaluation(measured, options.out / name, {"benchmark": "detector_accuracy", "set": name})
     options.results.write_text(json.dumps(plain_json({
         "benchmark": "detector_accuracy", "machine": machine(), "commit": commit(), "model": Path(options.model).name,
-        "tiles": options.tiles, "draws": settings.draws, "seed": settings.seed, "first_simulated_seed": FIRST_SEED,
+        "tiles": options.tiles, "from_above": options.from_above, **scoring,
+        "draws": settings.draws, "seed": settings.seed, "first_simulated_seed": FIRST_SEED,
         "sets": runs,
     }), indent=1) + "\n")
 

@@ -3,7 +3,9 @@
 FLIGHTS is the folder with `brighton_beach` (18 photos, no part of it was learnt as bare ground, cars are parked there)
 and `caliterra` (from its 47th photo on; the ground up to there taught the judge what is no car, so that its figures are
 too good; one white car and some machines). Photos are shown at half size, as they would be at half the resolution, and
-counted at each model's own thresholds, without any check of sizes on the ground. With --out FOLDER, each report's crop
+counted at each model's own thresholds. As in a map, photos are shown at the scale of their ground (M_PER_PX, roughly
+known), models that ask for it look twice, and boxes of a size on the ground that their class cannot have do not count;
+with --plain each photo is shown as it is, once, and every box counts. With --out FOLDER, each report's crop
 is drawn there; how many of them are right was counted by eye, and is given with --right MODEL:FLIGHT:CLASS=COUNT.
 
 Writes results/false_alarms.json: reports a photo, and false ones where --right is given.
@@ -18,10 +20,15 @@ import cv2
 import numpy as np
 
 from mosaic_methods import commit, machine
+from provenance import note_scoring
 from sorvolo.detection.detector import Detector
+from sorvolo.survey.objects import Detections
+from sorvolo.tracking.cut_boxes import cut_edges
+from sorvolo.tracking.plausible import TOO_SHORT_CUT_PX, impossible_size
 
 RESULTS = Path(__file__).parent / "results" / "false_alarms.json"
 FIRST = {"brighton_beach": "", "caliterra": "IMG_9400.jpg"}
+M_PER_PX = {"brighton_beach": 0.034, "caliterra": 0.07}  # of a photo at half size
 SHOWN = ("person", "car")
 SCALE, CROP_PX, IN_A_ROW = 0.5, 120, 10
 
@@ -32,6 +39,7 @@ def main() -> None:
     parser.add_argument("flights", type=Path)
     parser.add_argument("models", nargs="+")
     parser.add_argument("--right", nargs="*", default=[])
+    parser.add_argument("--plain", action="store_true", help="as it is, once, every box")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--results", type=Path, default=RESULTS)
     wishes = parser.parse_args()
@@ -41,7 +49,9 @@ def main() -> None:
         detector = Detector.load(model, provider="cpu", threads=1)
         name = Path(model).stem
         out = wishes.out and wishes.out / name
-        found[name] = {flight: looked(detector, wishes.flights / flight, out) for flight in FIRST}
+        found[name] = {
+            flight: looked(detector, wishes.flights / flight, out, is_plain=wishes.plain) for flight in FIRST
+        }
         for flight, rows in found[name].items():
             for label in SHOWN:
                 if (count := right.get(f"{name}:{flight}:{label}")) is not None:
@@ -49,13 +59,14 @@ def main() -> None:
                     rows[label]["false_a_photo"] = round((rows[label]["reports"] - count) / rows["photos"], 3)
         print(name, json.dumps(found[name]), flush=True)
     document = {
-        "benchmark": "false_alarms", "machine": machine(), "commit": commit(), "scale": SCALE,
+        "benchmark": "false_alarms", "machine": machine(), "commit": commit(), "scale": SCALE, "plain": wishes.plain,
+        **note_scoring("false_alarms, brighton_beach and caliterra"),
         "date": time.strftime("%Y-%m-%d"), "models": found,
     }
     wishes.results.write_text(json.dumps(document, indent=1) + "\n")
 
 
-def looked(detector: Detector, folder: Path, out: Path | None) -> dict:
+def looked(detector: Detector, folder: Path, out: Path | None, *, is_plain: bool) -> dict:
     """Reports of each class over a flight's photos."""
     paths = [each for each in sorted(folder.iterdir()) if each.suffix.lower() == ".jpg"]
     paths = [each for each in paths if each.name >= FIRST[folder.name]]
@@ -64,7 +75,13 @@ def looked(detector: Detector, folder: Path, out: Path | None) -> dict:
     for path in paths:
         whole = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
         shown = cv2.resize(whole, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_AREA)
-        seen = detector.detect(np.ascontiguousarray(shown[..., ::-1]), tiles="auto", classes=SHOWN)
+        picture = np.ascontiguousarray(shown[..., ::-1])
+        if is_plain:
+            seen = detector.detect(picture, tiles="auto", classes=SHOWN)
+        else:
+            m_per_px = M_PER_PX[folder.name]
+            seen = detector.detect(picture, tiles="auto", m_per_px=m_per_px, classes=SHOWN, from_above=True)
+            seen = possible(seen, shown, m_per_px)
         for box, score, label in zip(seen.boxes_px, seen.scores, seen.names):
             scores[label].append(float(score))
             crops[label].append(crop(shown, box, f"{score:.2f} {path.stem[-4:]}"))
@@ -73,13 +90,21 @@ def looked(detector: Detector, folder: Path, out: Path | None) -> dict:
         for label, each in crops.items():
             if each:
                 cv2.imwrite(str(out / f"{folder.name}-{label}.png"), sheet(each))
+    thresholds = detector.info.thresholds if is_plain else detector.info.turned or detector.info.thresholds
     return {"photos": len(paths)} | {
         label: {
-            "threshold": detector.info.thresholds[label], "reports": len(each),
+            "threshold": thresholds[label], "reports": len(each),
             "a_photo": round(len(each) / len(paths), 3), "highest": round(max(each, default=0.0), 3),
         }
         for label, each in scores.items()
     }
+
+
+def possible(seen: Detections, shown: np.ndarray, m_per_px: float) -> Detections:
+    """Without boxes of a size that their class cannot have, as maps leave them out."""
+    cut = cut_edges(seen.boxes_px, shown.shape[1], shown.shape[0], TOO_SHORT_CUT_PX)
+    sides_m = (seen.boxes_px[:, 2:] - seen.boxes_px[:, :2]).astype(float) * m_per_px
+    return seen.only(~impossible_size(seen.names, sides_m, cut))
 
 
 def crop(picture: np.ndarray, box: np.ndarray, text: str) -> np.ndarray:
