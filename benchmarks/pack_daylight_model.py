@@ -32,7 +32,7 @@ from train_default_model import reader
 from train_judge import CAR, untrained
 
 VERSION, CREATED = "6", "2026-11-23"
-# where people planted into real ground are found best (docs/decisions/0029): 37 to 65 px a metre
+# where people planted into real ground are found best (docs/decisions/0032): 37 to 65 px a metre
 BEST_PX = {**AERIAL_BEST_PX, "person": [22, 110]}
 # of two looks, one turned: three false people and two false cars in 32 photos of bare ground
 TURNED = {"person": 0.66, "car": 0.74, "small object": 0.44}

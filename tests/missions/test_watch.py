@@ -3,6 +3,7 @@
 import json
 import socket
 import sys
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from rasterio.transform import Affine
 from truth_detector import TruthDetector
 
 from sorvolo.detection.contract import ModelInfo
+from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.simulate.site import simulate_site
@@ -150,6 +152,27 @@ def test_without_telemetry_objects_are_counted_in_the_picture(
     assert "No GeoJSON, KML or GPX is written" in (folder / "report.html").read_text()
     tracks = _read(folder / "tracks.json")
     assert tracks["crs"] is None and "x_px" in tracks["features"][0]["properties"]
+
+
+@pytest.mark.parametrize("has_telemetry", [True, False])
+def test_views_never_exceed_the_frames_searched(flown: Path, tmp_path: Path, has_telemetry: bool) -> None:
+    """With the packaged detector: each track's views are frames that show it, each counted once."""
+    video = _video(flown)
+    if not has_telemetry:
+        video = tmp_path / "bare.mp4"
+        video.write_bytes(_video(flown).read_bytes())
+    settings = WatchSettings(least_score=0.3, every=5, tiles=None)
+    folder = tmp_path / "watch"
+    found = Detector.load("default", provider="cpu", threads=1)
+    deque(watch(video, settings, WatchOutputs(folder=folder), camera=flown / "camera.xml", detector=found), 0)
+    searched = _read(folder / "report.json")["frames"]["detected"]
+    lines = [json.loads(line) for line in (folder / "detections.jsonl").read_text().splitlines()]
+    features = _read(folder / ("tracks.geojson" if has_telemetry else "tracks.json"))["features"]
+    views = {each["properties"]["id"]: each["properties"]["views"] for each in features}
+    assert views and max(views.values()) >= 3, "a car that several frames show is one track"
+    for track, count in views.items():
+        assert count <= searched
+        assert count <= len({line["frame"] for line in lines if line["track"] == track})
 
 
 def test_after_a_cut_places_and_objects_begin_anew(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:

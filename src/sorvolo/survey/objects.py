@@ -11,8 +11,12 @@ from sorvolo.geometry.arrays import BoxesPx, Floats, Labels, Mask, Rows, TimesNs
 CLASSES = ("person", "car", "small object")
 """The classes of Sorvolo's own models, in the order of their labels; other models bring their own names."""
 
-TYPICAL_SIZE_M = {"person": (0.6, 0.5, 1.7), "car": (4.4, 1.8, 1.5), "small object": (0.6, 0.45, 0.35)}
-"""Length, width and height of a class's usual member; how high the middle of a box lies above the ground."""
+TYPICAL_SIZE_M = {
+    "person": (0.6, 0.5, 1.7), "car": (4.4, 1.8, 1.5), "small object": (0.6, 0.45, 0.35), "truck": (8.0, 2.5, 3.2),
+    "bus": (12.0, 2.55, 3.2),
+}
+"""Length, width and height of a class's usual member; how high the middle of a box lies above the ground. Trucks and
+buses are classes of models that were trained on them."""
 
 
 @dataclass(frozen=True, eq=False)

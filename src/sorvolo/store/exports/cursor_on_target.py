@@ -14,7 +14,7 @@ from sorvolo.survey.flight import Site
 from sorvolo.survey.objects import Track
 
 COT_TYPES: Mapping[str, str] = MappingProxyType({
-    "person": "a-u-G", "car": "a-u-G-E-V-C", "small object": "b-m-p-s-m",
+    "person": "a-u-G", "car": "a-u-G-E-V-C", "truck": "a-u-G-E-V-C", "bus": "a-u-G-E-V-C", "small object": "b-m-p-s-m",
 })
 """The event type of each class: unknown on the ground, unknown civilian vehicle, a spot on the map."""
 
