@@ -81,7 +81,8 @@ def options_by_command() -> dict[str, set[str]]:
 def options_of_other_programs() -> set[str]:
     scripts = [*(ROOT / "benchmarks").glob("*.py"), *(ROOT / "docs").rglob("*.py")]
     own = {each for path in scripts for each in re.findall(r'add_argument\(\s*"(--[a-z0-9-]+)"', path.read_text())}
-    return own | {"--no-deps", "--strict"}  # of pip and mypy
+    ray = {"--head", "--block", "--node-ip-address", "--ray-client-server-port", "--include-dashboard", "--address"}
+    return own | ray | {"--no-deps", "--strict"}  # of pip and mypy
 
 
 def test_pictures_are_few_and_all_used() -> None:
