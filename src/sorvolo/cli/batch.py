@@ -140,7 +140,8 @@ def _run(
     _check_live(live, places, workers)
     if live:  # one that waits for its drone does nothing, and gives up by itself
         settings = replace(settings, stall_s=settings.stall_s + settings.wish.give_up_s)
-    executors = _executor_of(executor, workers or len(live) or None, settings)
+    most = len(live) if live and workers is None else workers
+    executors = _executor_of(executor, most, settings)
     streams = streams_of(live)
     with ended_by_signal([each.address for each in streams]) as until:
         running = (

@@ -17,9 +17,7 @@ from sorvolo.cluster.sites import Placed, SiteBy, existing_site, existing_sites,
 from sorvolo.cluster.table import FINAL, BatchTable, Row, State
 from sorvolo.detection.models import find_model
 from sorvolo.errors import SettingsError
-from sorvolo.missions.flight.map_objects import DEFAULT_MODEL, NO_MODEL
-from sorvolo.missions.flight.report import software
-from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.flight.software import software
 
 Key = tuple[str, str]
 
@@ -39,8 +37,11 @@ class BatchSettings:
             raise SettingsError(f"--tries {self.most_tries}: at least 1 is needed")
         if not self.stall_s > 0:
             raise SettingsError(f"--stall {self.stall_s:g}: more than 0 seconds are needed")
-        MapSettings(m_per_px=self.wish.m_per_px)  # which states what is out of range
-        if self.wish.model not in (NO_MODEL, DEFAULT_MODEL):
+        if self.wish.m_per_px is not None:
+            from sorvolo.missions.flight.settings import MapSettings  # which takes long to import
+
+            MapSettings(m_per_px=self.wish.m_per_px)  # states what is out of range
+        if self.wish.model not in ("none", "default"):
             find_model(self.wish.model)
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from sorvolo.capture.source import safe_name
 from sorvolo.cluster.orders import Scouted
 from sorvolo.errors import StoreError
-from sorvolo.missions.flight.setup import known_ground_m
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import is_site
 
@@ -99,6 +98,8 @@ def existing_site(folder: Path, *, with_ground: bool = False) -> ExistingSite | 
 
 def _ground(archive: Archive) -> Box | None:
     """Where a site's map is; None without a place on Earth, and without a map."""
+    from sorvolo.missions.flight.setup import known_ground_m  # only by place, as it takes long to import
+
     if not archive.has_site or (site := archive.site()).is_local:
         return None
     ground_m = known_ground_m(archive)

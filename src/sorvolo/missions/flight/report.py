@@ -1,11 +1,9 @@
 """What a flight's report has: counted, measured and named while it is mapped."""
 
-import platform
 import resource
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from typing import Any
 
 import sorvolo
@@ -18,6 +16,7 @@ from sorvolo.missions.flight.headline import map_headline
 from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.missions.flight.software import software
 from sorvolo.missions.flight.warnings import flight_warnings
 from sorvolo.mosaic.base_ties import BaseReport
 from sorvolo.mosaic.consistency import Consistency, Stated, consistency
@@ -28,8 +27,6 @@ from sorvolo.store.exports.plain import utc_text
 from sorvolo.survey.control import ControlReport
 from sorvolo.survey.flight import CameraModel, Notice, Site
 from sorvolo.survey.mosaic import PlacedFrame, Status
-
-_LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "av", "rasterio")
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +88,6 @@ def build_report(
         "versions": software(),
         "track": [track_row(each) for each in placed],
     }
-
-
-def software() -> dict[str, str]:
-    """The versions of what computes a map, by name."""
-    return {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}}
 
 
 def _headline(

@@ -10,8 +10,8 @@ from sorvolo.capture.source import LiveSource
 from sorvolo.capture.video import VideoSource
 from sorvolo.missions.flight.control import FlightControl
 from sorvolo.missions.flight.detects import Detects
-from sorvolo.missions.flight.report import software
 from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.missions.flight.software import software
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.journal import content_sha256
 from sorvolo.survey.area import Area
