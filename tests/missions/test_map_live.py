@@ -176,6 +176,9 @@ def test_a_stream_with_metadata_becomes_a_map_like_a_files(
     assert report["flight"].startswith("127.0.0.1") and report["inputs"] == [drone.address]
     assert corner_error_m(site, flight, drone) < 0.4
     assert (site / "mosaic.tif").is_file()
+    delay_s = report["delay_s"]
+    assert delay_s["frames"] >= report["frames"]["vision"] - 2  # each, once the map has begun
+    assert 0 < delay_s["median"] <= delay_s["p95"] <= delay_s["largest"] < 60
 
 
 def test_a_later_flight_is_compared_live(flight: FilmedFlight, mapped_live: tuple[Path, Drone, int]) -> None:

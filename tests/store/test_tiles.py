@@ -112,6 +112,14 @@ def test_png_keeps_every_value_under_transparency() -> None:
     assert np.array_equal(rgba_from_png(png_from_rgba(rgba), "x"), rgba)
 
 
+def test_an_enlarged_tile_is_kept_as_it_is_in_few_bytes() -> None:
+    small = np.random.default_rng(1).integers(0, 255, (64, 64, 4), np.uint8)
+    enlarged = small.repeat(4, axis=0).repeat(4, axis=1)
+    data = png_from_rgba(enlarged)
+    assert np.array_equal(rgba_from_png(data, "enlarged"), enlarged)
+    assert len(data) < 0.4 * len(png_from_rgba(np.roll(enlarged, 1, axis=0)))  # rows that repeat, but not in pairs
+
+
 def test_jpeg_keeps_colour_at_full_resolution() -> None:
     image = np.zeros((32, 32, 3), np.uint8)
     image[:, 16:] = (255, 0, 0)

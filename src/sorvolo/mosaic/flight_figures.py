@@ -99,3 +99,11 @@ def _tilt_deg(poses: Sequence[Pose]) -> float:
         return 0.0
     axes_up = [each.rotation[2, 2] for each in poses]
     return float(np.degrees(np.arccos(np.clip(-np.median(axes_up), -1, 1))))
+
+
+def delay_figures(delays_s: Sequence[float]) -> dict[str, float | int] | None:
+    """The spread of the times (s) from a key frame's arrival to its pixels in the map; None without any."""
+    if not delays_s:
+        return None
+    median, p95 = np.percentile(delays_s, [50, 95])
+    return {"frames": len(delays_s), "median": float(median), "p95": float(p95), "largest": max(delays_s)}

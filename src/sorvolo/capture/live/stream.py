@@ -159,6 +159,11 @@ class LiveStream:
         return self._reader.outages.silent_s
 
     @property
+    def arrived_s(self) -> float:
+        """When the frame was there that was given last, by the monotonic clock."""
+        return self._arrived_s
+
+    @property
     def is_behind(self) -> bool:
         """Whether the next frame is there already, for whoever looks at them is slower than they come."""
         return self._queue.holds_any

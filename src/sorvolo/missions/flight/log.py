@@ -47,6 +47,8 @@ class FlightLog:
         self.wall_s: dict[str, float] = {}
         self.cpu_s: dict[str, float] = {}
         self.offset_applied_s = 0.0
+        self.delays_s: list[float] = []
+        """Of each key frame of a stream: from when it came until its pixels were in the map's tiles."""
         self._started_cpu_s = time.process_time()
 
     def end(self, index: int, name: str, time_ns: int, status: Status, reason: str) -> None:

@@ -20,7 +20,14 @@ from sorvolo.missions.flight.software import software
 from sorvolo.missions.flight.warnings import flight_warnings
 from sorvolo.mosaic.base_ties import BaseReport
 from sorvolo.mosaic.consistency import Consistency, Stated, consistency
-from sorvolo.mosaic.flight_figures import FlightFigures, flight_figures, shown_m2, stated_height_m, track_row
+from sorvolo.mosaic.flight_figures import (
+    FlightFigures,
+    delay_figures,
+    flight_figures,
+    shown_m2,
+    stated_height_m,
+    track_row,
+)
 from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.store.exports.control_files import control_summary
 from sorvolo.store.exports.plain import utc_text
@@ -81,6 +88,7 @@ def build_report(
         "native_ground_sampling_distance_m": figures.native_m_per_px,
         "height_above_ground_m": figures.height_m,
         "area_m2": shown_m2(tiles, site.m_per_px),
+        "delay_s": delay_figures(log.delays_s),
         **_effort(log, seconds, max(1, len(placed))),
         "notices": [asdict(each) for each in (*source.telemetry.notices, *setup.notices, *notices)],
         "warnings": flight_warnings(placed, figures, setup, log, agreement, graph),

@@ -25,6 +25,7 @@ from sorvolo.store.site.archive import Archive, FlightWriter
 
 _PAINT_EVERY = 8  # keyframes painted together: tiles that several touch are rendered once; not where somebody waits
 _PAINT_AT_ONCE = 24  # at most, the newest first: a solve may move a hundred
+_PAINT_LIVE = 3  # of those moved, beside the newest, while somebody waits for that
 _PAINT_REST = 4  # times as long as a painting took: showing a map that still moves must not hold up the flight
 _COARSE_MAP = 0.77  # times the pictures' own pixels: a coarser map does not need every pixel of them
 _CACHE_BYTES = 128 * 1024 * 1024  # of earlier flights' pictures
@@ -42,8 +43,8 @@ class _Fineness:
 class FlightPainter:
     """Stores a flight's pictures and paints them into its site; ground that the map shows already stays as it is.
 
-    While the flight goes on, `show` paints small copies of them, enlarged: that is cheap, however often the map moves.
-    `finish` paints the pictures themselves.
+    While the flight goes on, `show` paints small copies of them, enlarged: that is cheap, however often the map moves;
+    of a live flight (`is_live`) the newest at once, for somebody waits for it. `finish` paints the pictures themselves.
 
     `native_m_per_px` is the ground sampling distance of the flight's own pictures. Keyframes have ids from
     `known.count` on, earlier flights' those before.
@@ -52,9 +53,13 @@ class FlightPainter:
     def __init__(
         self, writer: FlightWriter, archive: Archive, mapper: PlanarMapper, lens: Undistorter, known: KnownKeyframes,
         native_m_per_px: float, log: FlightLog, live_s: float,
+        *, is_live: bool,
     ) -> None:
         self._writer, self._archive, self._mapper, self._known, self._log = writer, archive, mapper, known, log
         self._live_s, self._paint_every = live_s, _PAINT_EVERY if live_s >= 1 else 1
+        self._is_live = is_live
+        self.shown_s = 0.0
+        """When readers could see the newest key frame of a live flight, by the monotonic clock."""
         self.images: dict[int, str] = {}
         """Where each frame's picture is stored, by frame index: what `FlightWriter.commit` wants."""
         self.exposure = Exposure({}, {}, 0.0)
@@ -100,17 +105,18 @@ class FlightPainter:
         self._frames |= set(moved)
         self._dirty |= set(moved)
 
-    def show(self) -> int:
-        """Paint small copies of what moved and let readers see it, now and then; how many tiles were painted."""
+    def show(self, newest: int) -> int:
+        """Paint small copies of what moved and let readers see it; how many tiles were painted.
+
+        Of a live flight the newest key frame and a few others each time, else many now and then.
+        """
         started_s = time.monotonic()
+        painted = self._show_now(newest) if self._is_live else 0
         if len(self._frames) - self._painted_at < self._paint_every or started_s < self._paint_again_s:
-            return 0
+            return painted
         self._painted_at = len(self._frames)
-        with self._log.stage(Stage.PAINT):
-            self.exposure = self.exposure.updated(self._mapper.recent_exposure())
-            newest = sorted(self._dirty)[-_PAINT_AT_ONCE:]
-            painted = self._paint(self._live_canvas, newest, self._live)
-        self._dirty.difference_update(newest)
+        self._adapt()
+        painted += self._paint_small(sorted(self._dirty)[-(_PAINT_LIVE if self._is_live else _PAINT_AT_ONCE):])
         self._paint_again_s = time.monotonic() + _PAINT_REST * (time.monotonic() - started_s)
         self._flush()
         return painted
@@ -129,6 +135,24 @@ class FlightPainter:
             self._paint(self._new_canvas(), self._frames, _Fineness(1, self._archive.site_grid(), self._stored))
 
     # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _show_now(self, newest: int) -> int:
+        """Paint the newest key frame and let readers see it."""
+        painted = self._paint_small([newest])
+        with self._log.stage(Stage.STORE):
+            self._writer.flush()
+        self.shown_s = time.monotonic()
+        return painted
+
+    def _adapt(self) -> None:
+        with self._log.stage(Stage.PAINT):
+            self.exposure = self.exposure.updated(self._mapper.recent_exposure())
+
+    def _paint_small(self, keyframe_ids: Collection[int]) -> int:
+        with self._log.stage(Stage.PAINT):
+            painted = self._paint(self._live_canvas, keyframe_ids, self._live)
+        self._dirty.difference_update(keyframe_ids)
+        return painted
 
     def _flush(self) -> None:
         """Let readers see what was painted, and the whole map small; the larger the map, the less often."""

@@ -4,6 +4,8 @@ import time
 from collections.abc import Mapping, Sequence
 from types import TracebackType
 
+from sorvolo.capture.live.stream import LiveStream
+from sorvolo.capture.source import LiveSource
 from sorvolo.capture.sync import OffsetEstimate
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3
@@ -113,7 +115,11 @@ class PlanarRun(FlightRun):
         ended = self._take(frame, registered, picture)
         if has_place and ended[0] is not Status.REJECTED:
             self._taken = Taken(registered, StoredPicture(*self.begin().stored(frame.index)))
-            return *ended, self._started_painter().show()
+            painter = self._started_painter()
+            painted = painter.show(registered.keyframe.id)
+            if isinstance(self._setup.source, LiveStream):
+                self._log.delays_s.append(painter.shown_s - self._setup.source.arrived_s)
+            return *ended, painted
         self._taken = Taken(registered, b"" if ended[0] is Status.REJECTED else picture)
         return *ended, 0
 
@@ -243,7 +249,7 @@ class PlanarRun(FlightRun):
             writer = self.begin()
             self._painter = FlightPainter(
                 writer, self._archive, self._mapper, self._lens, self._known, self._native_m_per_px(), self._log,
-                self._settings.live_s,
+                self._settings.live_s, is_live=isinstance(self._setup.source, LiveSource),
             )
             for keyframe_id, held in self._held.items():
                 image = image_from_jpeg(held, "") if isinstance(held, bytes) else held
