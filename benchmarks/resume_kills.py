@@ -3,12 +3,12 @@
     python benchmarks/resume_kills.py --kills 20 --seed 1 --mission map
 
 Two small simulated flights; `map` makes the map of the first, `compare` compares the second with it, `watch` searches
-the second with the model that is installed and runs a program for each object. Each round starts the command in a
-process of its own, kills it (SIGKILL) after a share of the undisturbed run's time that is drawn from 0 to 1, and runs
-the same command again to its end. All files are compared with those of the undisturbed run, byte by byte, but for the
-catalogue (`site.db`, which holds when a run was made) and what a report says of the time and the memory that it took
-(docs/formats.md). Of a watch, each alert must have been sent once: one that was sent in the moment of the kill, before
-that was noted, may come twice, and is counted.
+the second, two frames a second, with the model that is installed, and runs a program for each object. Each round starts
+the command in a process of its own, kills it (SIGKILL) after a share of the undisturbed run's time that is drawn from 0
+to 1, and runs the same command again to its end. All files are compared with those of the undisturbed run, byte by
+byte, but for the catalogue (`site.db`, which holds when a run was made) and what a report says of the time and the
+memory that it took (docs/formats.md). Of a watch, each alert must have been sent once: one that was sent in the moment
+of the kill, before that was noted, may come twice, and is counted.
 """
 
 import argparse
@@ -111,7 +111,7 @@ class Trial:
         if mission != "watch":
             return [*command, "--site", str(place), *shared]
         told = f"{sys.executable} -c \"open('{self._alerts}', 'a').write('{{id}} ')\""
-        return [*command, "--out", str(place), *shared, "--save", "pictures", "--alert-command", told]
+        return [*command, "--out", str(place), *shared, "--save", "pictures", "--fps", "2", "--alert-command", told]
 
 
 def rounds(options: argparse.Namespace, folder: Path) -> dict[str, object]:

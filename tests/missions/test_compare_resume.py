@@ -137,7 +137,7 @@ def test_other_settings_begin_anew_and_say_so(whole: tuple[Path, Path], flown: P
 
 def test_another_flight_tells_whose_run_it_ends(whole: tuple[Path, Path], flown: Path, tmp_path: Path) -> None:
     site = copy(whole[1], tmp_path)
-    with pytest.warns(SorvoloWarning, match="a run of flight2 was stopped before it was complete; it will begin anew"):
+    with pytest.warns(SorvoloWarning, match="a run of flight2 was stopped before it was complete, and cannot go on"):
         updates = map_flights(
             [flown / "flight1"], site, MapSettings(model="none"), camera=flown / "camera.xml", again=True
         )

@@ -57,9 +57,16 @@ class FilmedFlight:
 
 
 class Drone:
-    """It stands and sends until it may fly, then flies and sends until it has landed; then `landed` is set."""
+    """It stands and sends until it may fly, then flies and sends until it has landed; then `landed` is set.
 
-    def __init__(self, flight: FilmedFlight, *, metadata: bool, speed: float = 2.0, count: int = 10_000) -> None:
+    It begins with frame `first` of the flight, its clock `later_s` ahead.
+    """
+
+    def __init__(
+        self, flight: FilmedFlight, *, metadata: bool, speed: float = 2.0, count: int = 10_000, first: int = 0,
+        later_s: int = 0,
+    ) -> None:
+        self._first, self._later_ns = first, later_s * 10**9
         self._flight, self._metadata, self._speed = flight, metadata, speed
         self._count = min(count, len(flight.images))
         self._took_off: int | None = None
@@ -89,7 +96,7 @@ class Drone:
     def _frame(self, index: int) -> int:
         if self._wants_to_fly and self._took_off is None:
             self._took_off, self.took_off_s = index, time.monotonic()
-        return 0 if self._took_off is None else index - self._took_off
+        return self._first + (0 if self._took_off is None else index - self._took_off)
 
     def _image(self, index: int) -> Any:
         frame = self._frame(index)
@@ -109,7 +116,7 @@ class Drone:
             float(np.interp(at_s, flight.seconds, printed[name]))
             for name in ("latitude_deg", "longitude_deg", "orthometric_height_m")
         )
-        return encode(_CLOCK_NS + index * 10**9 // flight.rate, {
+        return encode(_CLOCK_NS + self._later_ns + index * 10**9 // flight.rate, {
             "platform_heading_deg": float(flight.headings[nearest]), "platform_pitch_deg": 0.0,
             "platform_roll_deg": 0.0, "sensor_relative_azimuth_deg": azimuth,
             "sensor_relative_elevation_deg": elevation, "sensor_relative_roll_deg": roll % 360,

@@ -109,6 +109,11 @@ class Frame:
     time_ns: int
     image: ImageRGB
 
+    @classmethod
+    def unseen(cls, index: int, name: str, time_ns: int) -> "Frame":
+        """One whose picture is not there any more: it has no pixel."""
+        return cls(index, name, time_ns, np.zeros((0, 0, 3), np.uint8))
+
 
 @dataclass(frozen=True)
 class LostFrame:

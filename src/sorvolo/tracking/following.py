@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, rotation_from_vector, site_from_gimbal_rotation
 from sorvolo.survey.flight import CameraModel, CameraPrior, Frame
@@ -24,17 +24,35 @@ _OVER_MODEL = LocateSettings(ground_sigma_m=1.0)  # of a height model, where it 
 
 
 @dataclass(frozen=True, eq=False)
+class Located:
+    """A frame's detections as they were placed: all that their tracks need of the frame.
+
+    A detection without a place has no sighting; `unlocated` counts those by reason. `outline_m` (4, 2) is the ground
+    that the frame shows, `camera_m` (2,) where its camera was; None where that is not known. `segment`: see `Taken`.
+    """
+
+    time_ns: int
+    sightings: tuple[Sighting | None, ...]
+    unlocated: tuple[tuple[str, int], ...]
+    outline_m: PointsM | None
+    camera_m: Floats | None
+    segment: int
+
+
+@dataclass(frozen=True, eq=False)
 class Taken:
     """What became of a frame's detections, each with its sighting, if it has a place, and its track (0: none).
 
-    `merged` are ids of tracks that turned out to be objects seen before. `segment` counts the stretches of a flight
-    that is followed in the picture, from 1, each with places in the pixels of its own first frame; 0 on the ground.
+    `located` is what that was made from, for a follower that goes on in another process. `merged` are ids of tracks
+    that turned out to be objects seen before. `segment` counts the stretches of a flight that is followed in the
+    picture, from 1, each with places in the pixels of its own first frame; 0 on the ground.
     """
 
     sightings: Sequence[Sighting | None]
     track_ids: Sequence[int]
     new_ids: frozenset[int]
     merged: frozenset[int]
+    located: Located
     segment: int = 0
 
 
@@ -50,7 +68,8 @@ def watched_prior(prior: CameraPrior, height_sigma_m: float, *, has_gimbal: bool
 
 
 class GroundFollower:
-    """Detections of a flight with telemetry, placed on the ground and tracked in site metres. Only `take` changes it.
+    """Detections of a flight with telemetry, placed on the ground and tracked in site metres. Only `take` and `recall`
+    change it.
 
     All detections score `sure_score` or more. `ground` gives the ground's height over the flight's zero; None: it is
     level. Without `knows_heading` the camera's heading comes from the pictures' motion. `unlocated` counts detections
@@ -92,17 +111,25 @@ class GroundFollower:
             found, frame.index, frame.name, time_ns, self._camera.camera, prior, focal_sigma=self._camera.focal_sigma,
             ground_height_m=self._ground or 0.0, settings=LocateSettings() if self._ground is None else _OVER_MODEL,
         )
-        self.unlocated.update(unlocated)
         outline_m = footprint(self._camera.camera, Pose(prior.rotation, prior.position_m), self._below_m(prior))
+        return self.recall(Located(
+            time_ns, tuple(sightings), tuple(unlocated.items()), outline_m if np.isfinite(outline_m).all() else None,
+            prior.position_m[:2] if prior.knows_place else None, 0,
+        ))
+
+    def recall(self, located: Located) -> Taken:
+        """Give detections that were placed already to their tracks."""
+        self.unlocated.update(dict(located.unlocated))
         update = self._tracker.update(
-            [each for each in sightings if each is not None], time_ns=time_ns,
-            footprint_m=outline_m if np.isfinite(outline_m).all() else None,
+            [each for each in located.sightings if each is not None], time_ns=located.time_ns,
+            footprint_m=located.outline_m,
         )
-        if prior.knows_place and self._heading is None:
-            self._compass.add(time_ns / 1e9, prior.position_m[:2], self._tracker.shift_m)
-        if prior.knows_place and len(self._path) < _MOST_DRONE_PLACES:
-            self._path.append(prior.position_m[:2])
-        return _taken(sightings, update)
+        if located.camera_m is not None:
+            if self._heading is None:
+                self._compass.add(located.time_ns / 1e9, located.camera_m, self._tracker.shift_m)
+            if len(self._path) < _MOST_DRONE_PLACES:
+                self._path.append(located.camera_m)
+        return _taken(located, update)
 
     def tracks(self) -> Sequence[Track]:
         """All tracks as they are known now."""
@@ -166,6 +193,7 @@ class PictureFollower:
         self._motion, self._tracker = ImageMotion(), Tracker(self._settings)
         self._earlier, self._scene = list[Track](), SceneScale()
         self.segment, self.impossible_size = 1, 0
+        self._recalled = 0  # segments of an earlier process
 
     @property
     def guessed(self) -> int:
@@ -174,20 +202,37 @@ class PictureFollower:
 
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
         """Take the camera's motion out of a frame's detections and give them to their tracks."""
-        size_px = frame.image.shape[:2]
+        is_impossible = self._judged(found, frame.image.shape[:2])
+        sightings, outline = self._motion.locate(found, frame, time_ns)
+        kept = tuple(None if out else each for each, out in zip(sightings, is_impossible))
+        return self._follow(Located(time_ns, kept, (), outline, None, self._recalled + self._motion.segments))
+
+    def recall(self, located: Located, found: Detections, size_px: tuple[int, int]) -> Taken:
+        """Give detections that an earlier process located to their tracks; `size_px` is the frame's height and width.
+
+        The next frame is taken as after a cut: the camera has moved since.
+        """
+        self._judged(found, size_px)
+        self._recalled = located.segment
+        return self._follow(located)
+
+    def _judged(self, found: Detections, size_px: tuple[int, int]) -> Mask:
+        """Which detections (N,) have a size that their class cannot have beside the scene's cars."""
         self._scene.see(found, size_px)
         is_impossible = self._scene.impossible(found, size_px)
         self.impossible_size += int(is_impossible.sum())
-        sightings, outline = self._motion.locate(found, frame, time_ns)
-        if self._motion.segments != self.segment:
-            self.segment = self._motion.segments
+        return is_impossible
+
+    def _follow(self, located: Located) -> Taken:
+        if located.segment != self.segment:
+            self.segment = located.segment
             self._earlier += self._tracker.finish()
             self._tracker = Tracker(self._settings, first_id=self._tracker.next_id)
-        kept = [None if out else each for each, out in zip(sightings, is_impossible)]
         update = self._tracker.update(
-            [each for each in kept if each is not None], time_ns=time_ns, footprint_m=outline
+            [each for each in located.sightings if each is not None], time_ns=located.time_ns,
+            footprint_m=located.outline_m,
         )
-        return replace(_taken(kept, update), segment=self.segment)
+        return replace(_taken(located, update), segment=self.segment)
 
     def tracks(self) -> Sequence[Track]:
         """All tracks as they are known now."""
@@ -202,7 +247,7 @@ class PictureFollower:
         return np.zeros((0, 2))
 
 
-def _taken(sightings: Sequence[Sighting | None], update: TrackUpdate) -> Taken:
+def _taken(located: Located, update: TrackUpdate) -> Taken:
     ids = iter(update.track_ids)
-    of_detections = [0 if each is None else next(ids) for each in sightings]
-    return Taken(sightings, of_detections, frozenset(update.new), frozenset(update.merged))
+    of_detections = [0 if each is None else next(ids) for each in located.sightings]
+    return Taken(located.sightings, of_detections, frozenset(update.new), frozenset(update.merged), located)

@@ -27,7 +27,10 @@ class GrowingFile:
         self._ended = path.with_name(path.name + ENDED_SUFFIX)
         self._settings, self._outages, self._stop = settings, outages, stop
         size = path.stat().st_size
+        self.is_whole = True
+        """Whether it is read from its beginning."""
         if not settings.keeps_all and size > _NEWEST_BYTES and self._file.read(1) == b"\x47":
+            self.is_whole = False
             self._file.seek((size - _NEWEST_BYTES) // _PACKET_BYTES * _PACKET_BYTES)
         else:
             self._file.seek(0)

@@ -13,6 +13,7 @@ import numpy as np
 
 from sorvolo.capture.decoding import PHOTO_SUFFIXES
 from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.capture.live.segments import FlightSoFar
 from sorvolo.capture.live.telemetry_log import TelemetryLog
 from sorvolo.capture.photo_metadata import PhotoMetadata, read_photo_metadata
 from sorvolo.capture.photos import read_picture
@@ -20,6 +21,7 @@ from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.sync import FIX_DELAY_S, PHOTO_TIE
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Floats, TimesNs
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
 
 _POLL_S = 0.25
@@ -56,6 +58,7 @@ class GrowingFolder:
         self.inputs: tuple[str, ...] = (str(folder),)
         self.start_ns, self.start_origin = 0, "the first photo's EXIF, else when it came"
         self.camera: CameraModel = None  # type: ignore[assignment]  # set by `open_growing_folder`
+        self.gaps_s: tuple[float, ...] = ()
 
     @property
     def frame_count(self) -> int:
@@ -92,6 +95,29 @@ class GrowingFolder:
 
     def wait_for_telemetry(self, time_ns: int) -> None:
         """Each photo carries its own fix."""
+
+    @property
+    def is_reread(self) -> bool:
+        """Photos that were taken are not taken again."""
+        return False
+
+    @property
+    def is_stream(self) -> bool:
+        """The photos stay."""
+        return False
+
+    def samples(self, since: int) -> tuple[TimesNs, Floats]:
+        """Positions after the first so many, as `FlightSoFar` has them."""
+        return self._log.samples(since)
+
+    def continue_from(self, so_far: FlightSoFar) -> None:
+        """Go on with a flight that an earlier process read: its photos are not taken again."""
+        self._seen |= {self._folder / name for name in so_far.names}
+        self._ready = deque(each for each in self._ready if each.name not in so_far.names)
+        self._log.precede(so_far.times_ns, so_far.samples)
+        self._count, self._last_ns, self._first = so_far.next_index, so_far.last_ns, self._folder
+        self.name, self.fingerprint, self.camera = so_far.name, so_far.fingerprint, so_far.camera
+        self.start_ns = so_far.start_ns
 
     def notices(self) -> tuple[Notice, ...]:
         """What was found so far and survived."""

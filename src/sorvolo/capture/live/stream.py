@@ -5,7 +5,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from math import isfinite, nan
 from pathlib import Path
@@ -23,13 +23,15 @@ from sorvolo.capture.live.klv import LocalSet
 from sorvolo.capture.live.klv_telemetry import FORMAT, camera_of, columns_of, ground_elevation_m, klv_notices
 from sorvolo.capture.live.links import NmeaLink
 from sorvolo.capture.live.reader import StreamFacts, StreamReader
-from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.capture.live.reconnect import LiveSettings, Outages
+from sorvolo.capture.live.segments import FlightSoFar, segment_notices
 from sorvolo.capture.live.telemetry_log import TelemetryLog
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.sync import DATED_NS
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.capture.telemetry.nmea import Epoch
 from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Floats, TimesNs
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
 
 _HOLD_S = 0.5  # the first frames of a connection come in a burst: only then is their delay known
@@ -73,8 +75,15 @@ class LiveStream:
         self._clock = StreamClock()
         self._log = TelemetryLog("nmea" if link else FORMAT, link or address.shown)
         self._link = NmeaLink(link, settings, self._fix) if link else None
-        file = None if path is None else lambda outages: GrowingFile(path, settings, outages, self._closing)
-        self._reader = StreamReader(address, self, settings, self._closing, file)
+        self._is_whole = False  # a file that is read from its beginning
+
+        def opened(outages: Outages) -> GrowingFile:
+            assert path is not None
+            file = GrowingFile(path, settings, outages, self._closing)
+            self._is_whole = file.is_whole
+            return file
+
+        self._reader = StreamReader(address, self, settings, self._closing, None if path is None else opened)
         self._facts: StreamFacts | None = None
         self._lock = threading.RLock()
         self._held: list[_Held] | None = []
@@ -95,6 +104,9 @@ class LiveStream:
         self.name, self.fingerprint, self.inputs = "", "", (address.shown, *([link] if link else []))
         self.start_ns, self.start_origin = 0, ""
         self.camera: CameraModel = None  # type: ignore[assignment]  # set by `open_stream` once the size is known
+        self.gaps_s: tuple[float, ...] = ()
+        self._first_index = self._later_ns = 0  # of this segment's frames, in the flight
+        self._after_ns = -1  # frames of a file that an earlier process had read
 
     # ---- what a mission asks ----------------------------------------------------------------------------------
 
@@ -122,13 +134,14 @@ class LiveStream:
     @property
     def frame_count(self) -> int:
         """0 while the flight goes on, then how many frames came."""
-        return self._count if self._reader.is_over.is_set() else 0
+        return self._first_index + self._count if self._reader.is_over.is_set() else 0
 
     @property
     def telemetry(self) -> Telemetry:
         """What is known so far, its times on the frames' clock."""
         found = self._link.notices() if self._link else klv_notices(self._reader.metadata_counts)
-        return self._log.telemetry(found)
+        known = self._log.telemetry(found)
+        return replace(known, time_ns=known.time_ns + self._later_ns) if self._later_ns else known
 
     @property
     def telemetry_version(self) -> int:
@@ -187,7 +200,34 @@ class LiveStream:
         Only where every frame is kept: where the newest wins, what is known so far has to do.
         """
         if self._settings.keeps_all and self._log.version:
-            self._log.wait_past(time_ns, self._arrived_s + self._settings.fix_wait_s)
+            self._log.wait_past(time_ns - self._later_ns, self._arrived_s + self._settings.fix_wait_s)
+
+    def samples(self, since: int) -> tuple[TimesNs, Floats]:
+        """Telemetry after the first so many samples, as `FlightSoFar` has it."""
+        return self._log.samples(since)
+
+    @property
+    def is_reread(self) -> bool:
+        """Whether each process reads all frames from the first one: those of a file that grows, if all are kept."""
+        return self._is_file and self._settings.keeps_all
+
+    @property
+    def is_stream(self) -> bool:
+        """Whether what is not read when it comes is lost."""
+        return not self._is_file
+
+    def continue_from(self, so_far: FlightSoFar) -> None:
+        """Go on with a flight that an earlier process read; before `frames` is asked for, and telemetry."""
+        if self._is_whole and self._clock.tie is Tie.ARRIVAL:
+            self._later_ns = so_far.start_ns - self.start_ns  # each process has timed it by when it began to read
+        if not self.is_reread:
+            self._first_index = so_far.next_index
+            began_ns = self.start_ns + self._later_ns
+            self.gaps_s = (*so_far.gaps_s, max(0.0, (began_ns - so_far.last_ns) / 1e9))
+            self._log.precede(so_far.times_ns, so_far.samples)
+            self._after_ns = so_far.last_ns if self._is_file else -1
+        self.name, self.fingerprint, self.camera = so_far.name, so_far.fingerprint, so_far.camera
+        self.start_ns, self.start_origin = so_far.start_ns, so_far.start_origin
 
     def notices(self) -> tuple[Notice, ...]:
         """What was found so far and survived, outages with their lengths among it."""
@@ -195,6 +235,7 @@ class LiveStream:
         words = f"the stream states no time: frames are timed by {Tie.ARRIVAL.words}"
         return (
             *self._reader.notices(),
+            *segment_notices(self.gaps_s),
             *notice("arrival_times", int(arrival), words),
             *notice("size_changed", self._resized, "frames of another size, brought to the first one's: {}"),
             *notice("other_shape", self._lost, "frames of another shape, not used: {}"),
@@ -212,9 +253,13 @@ class LiveStream:
 
     def arrivals(self, wanted: Callable[[int, int], bool]) -> Iterator[tuple[float, Frame | LostFrame]]:
         """The same as `frames`, each with when it was there (monotonic clock)."""
+        def is_wanted(index: int, time_ns: int) -> bool:
+            index, time_ns = index + self._first_index, time_ns + self._later_ns
+            return time_ns > self._after_ns and wanted(index, time_ns)
+
         with self._asking:
-            self._queue.sift(lambda arrived: wanted(arrived.index, arrived.time_ns))
-            self._wanted = wanted
+            self._queue.sift(lambda arrived: is_wanted(arrived.index, arrived.time_ns))
+            self._wanted = is_wanted
         self._is_asked.set()
         try:
             while not self._is_ended:
@@ -402,7 +447,8 @@ class LiveStream:
     # ---- pictures ---------------------------------------------------------------------------------------------
 
     def _converted(self, arrived: Arrived) -> Frame | LostFrame:
-        index, name, decoded = arrived.index, str(arrived.index), arrived.decoded
+        index, time_ns, decoded = arrived.index + self._first_index, arrived.time_ns + self._later_ns, arrived.decoded
+        name = str(index)
         width_px, height_px = self._size_px
         fitted: dict[str, Any] = {}
         own_px = decoded.width, decoded.height
@@ -410,14 +456,14 @@ class LiveStream:
             # a sender that saves bandwidth shows the same in fewer pixels; another shape is another view
             if not is_same_shape(own_px, self._size_px):
                 self._lost += 1
-                return LostFrame(index, name, arrived.time_ns, other_size(own_px, self._size_px))
+                return LostFrame(index, name, time_ns, other_size(own_px, self._size_px))
             self._resized += 1
             fitted = {"width": width_px, "height": height_px}
         try:
             image = decoded.to_ndarray(format="rgb24", **fitted)
         except (av.FFmpegError, ValueError, MemoryError) as error:
-            return LostFrame(index, name, arrived.time_ns, f"corrupt: {error}")
-        return Frame(index, name, arrived.time_ns, np.ascontiguousarray(image, dtype=np.uint8))
+            return LostFrame(index, name, time_ns, f"corrupt: {error}")
+        return Frame(index, name, time_ns, np.ascontiguousarray(image, dtype=np.uint8))
 
 
 def open_stream(

@@ -9,7 +9,7 @@ import numpy as np
 
 from sorvolo.capture.telemetry.cleaning import clean, notice
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.arrays import Floats, TimesNs
 from sorvolo.survey.flight import TELEMETRY_COLUMNS, Notice, Telemetry, no_telemetry
 
 _FIRST_ROWS = 1024
@@ -47,6 +47,27 @@ class TelemetryLog:
             self._fixes += bool(np.isfinite(self._rows[self._count, _PLACE]))
             self._count += 1
             self._changed.notify_all()
+
+    def precede(self, times_ns: TimesNs, samples: Floats) -> None:
+        """Put samples (N, columns of `TELEMETRY_COLUMNS`) of an earlier process before those there are; of these, the
+        ones that are not newer are left out."""
+        if not len(times_ns):
+            return
+        with self._changed:
+            newer = self._times_ns[: self._count] > times_ns[-1]
+            times_ns = np.concatenate([times_ns, self._times_ns[: self._count][newer]])
+            samples = np.concatenate([samples, self._rows[: self._count][newer]])
+            room = max(_FIRST_ROWS, 2 * len(times_ns))
+            self._times_ns, self._rows = np.zeros(room, np.int64), np.full((room, len(TELEMETRY_COLUMNS)), np.nan)
+            self._times_ns[: len(times_ns)], self._rows[: len(times_ns)] = times_ns, samples
+            self._count, self._newest_ns = len(times_ns), int(times_ns[-1])
+            self._fixes, self._known_count = int(np.isfinite(samples[:, _PLACE]).sum()), -1
+            self._changed.notify_all()
+
+    def samples(self, since: int) -> tuple[TimesNs, Floats]:
+        """The times (N,) and samples (N, columns of `TELEMETRY_COLUMNS`) after the first so many."""
+        with self._changed:
+            return self._times_ns[since : self._count].copy(), self._rows[since : self._count].copy()
 
     @property
     def version(self) -> int:

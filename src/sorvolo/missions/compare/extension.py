@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from sorvolo.change.map_update import grown_m2
 from sorvolo.change.views import ViewMaker, ViewOutcome
+from sorvolo.missions.compare.journal import ComparedFrame
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.map.journal import Step, Taken
@@ -46,11 +47,11 @@ class MapExtension:
         """The frames that extend the map, once that is complete."""
         return self._frames
 
-    def add(self, posed: PosedFrame, outcome: ViewOutcome, earlier: Taken | None = None) -> Taken | None:
+    def add(self, posed: PosedFrame, outcome: ViewOutcome, earlier: ComparedFrame | None = None) -> Taken | None:
         """Take a frame that shows new ground; those that do not, or that show what the last one did, are left.
 
-        `earlier` is the frame as a killed run registered it; returned is how it is registered now, None where it is
-        not.
+        `earlier` is the frame as a killed run compared and registered it; returned is how it is registered now, None
+        where it is not.
         """
         if not self._is_wanted(posed, outcome):
             return None
@@ -96,12 +97,15 @@ class MapExtension:
         )
 
 
-def _taken_again(run: PlanarRun, posed: PosedFrame, earlier: Taken | None) -> Taken | None:
+def _taken_again(run: PlanarRun, posed: PosedFrame, earlier: ComparedFrame | None) -> Taken | None:
     """Have a frame placed as a killed run registered it, or anew where that cannot be; as it is registered now."""
     frame = posed.frame
-    if earlier is not None:
-        step = Step(frame.index, frame.name, frame.time_ns, "", None, earlier, False)
+    if earlier is not None and earlier.taken is not None:
+        step = Step(frame.index, frame.name, frame.time_ns, "", None, earlier.taken, False)
         if run.again(step) is not None:
-            return earlier
+            return earlier.taken
+    if earlier is not None and not earlier.is_whole:
+        run.lose(frame.index, frame.name, frame.time_ns, "its picture was lost when a run was stopped")
+        return None
     run.add(posed)
     return run.taken

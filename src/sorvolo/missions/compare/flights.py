@@ -16,12 +16,13 @@ from sorvolo.missions.compare.run import CompareRun, Pending
 from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.headline import MapQuality
 from sorvolo.missions.flight.known_camera import known_camera
+from sorvolo.missions.flight.live_journal import SourceNotes
 from sorvolo.missions.flight.map_objects import check_classes, open_detector
 from sorvolo.missions.flight.request import AlreadyDone, already_done, request_of
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup, known_flights, known_ground_m, prepare, repeated
 from sorvolo.missions.heights.measure import damaged_heights, heights_stamp
-from sorvolo.missions.map.journal import begun_journal
+from sorvolo.missions.map.journal import begun_journal, go_on_live
 from sorvolo.mosaic.selection import every
 from sorvolo.registration.opencv_threads import single_threaded_opencv
 from sorvolo.store.site.archive import Archive
@@ -69,23 +70,28 @@ def compare_flights(
     with Archive.open(site, write=True) as archive, opened as sources, single_threaded_opencv():
         known = []
         for source in sources:
+            base, is_newest = _base_version(archive, source)
+            asked = settings, wanted, looks, base, _reviews(archive), heights_stamp(archive, but=source.name), steps
+            samples = go_on_live(source, archive, asked, live.same_flight_s, anew=again)
             setup = prepare(
                 source, settings.mapping, archive.site(), telemetry_named=telemetry is not None, finds_itself=True,
                 ground_m=known_ground_m(archive),
             )
-            base, is_newest = _base_version(archive, source)
-            reviews = [(each.change_id, each.verdict.value) for each in archive.reviews()]
-            heights = heights_stamp(archive, but=source.name)
-            request = request_of(setup, settings, wanted, looks, base, reviews, heights, steps)
+            request = request_of(setup, *asked)
             compared = already_done(archive, setup, request)
             if compared and not again:
                 known.append(compared)
                 continue
             own = settings if is_newest else replace(settings, updates_map=False)  # what later flights painted stays
             yield from _compare_one(
-                setup, archive, own, wanted, steps, looks, base, request, anew=again and compared is None
+                setup, archive, own, wanted, steps, looks, base, request, anew=again and compared is None,
+                samples=samples,
             )
         return tuple(known)
+
+
+def _reviews(archive: Archive) -> list[tuple[str, str]]:
+    return [(each.change_id, each.verdict.value) for each in archive.reviews()]
 
 
 def _refuse_contradictory(archive: Archive, site: Path) -> None:
@@ -113,16 +119,17 @@ def _without_heights(archive: Archive, flight: str) -> tuple[Notice, ...]:
 
 def _compare_one(
     setup: FlightSetup, archive: Archive, settings: CompareSettings, area: Area | None, steps: Path | None,
-    detector: Detects | None, base: int, request: str, *, anew: bool,
+    detector: Detects | None, base: int, request: str, *, anew: bool, samples: int,
 ) -> Generator[CompareUpdate]:
     started_s, source = time.monotonic(), setup.source
     notices = (*setup.notices, *repeated(archive, source.name, "compared"), *_without_heights(archive, source.name))
     setup = replace(setup, notices=notices)
     inside = setup.inside(area)
     step_s = 0.0 if source.kind == "photos" else 1.0 / settings.views_per_second
-    journal = None
-    if not isinstance(source, LiveSource):
-        journal = CompareJournal(begun_journal(setup, archive, request, anew=anew))
+    file, notes, keeps_pictures = begun_journal(setup, archive, request, anew=anew), None, False
+    if isinstance(source, LiveSource):
+        notes, keeps_pictures = SourceNotes(file, source, samples), not source.is_reread
+    journal = CompareJournal(file, notes, keeps_pictures=keeps_pictures)
     with CompareRun(setup, archive, settings, base, steps, detector, request, journal) as run:
 
         def ahead() -> int:  # a live view's changes are announced at once, unless the next view waits already
@@ -154,6 +161,7 @@ def _ended(
     """The frames as their comparisons end; photos that were not found on the map are tried again after the others,
     beside those that were (a video shows the same ground again anyway)."""
     again: set[int] = set()
+    yield from run.recalled()
     for each in _begun(source.frames(every(step_s)), setup, inside, run, ahead):
         if source.kind == "photos" and isinstance(each, Pending) and each.is_unplaced:
             again.add(each.posed.frame.index)

@@ -57,13 +57,14 @@ class ComparisonObjects:
         """What was found in frames since this was asked last."""
         return () if self._finder is None else self._finder.news()
 
-    def search(self, posed: PosedFrame, outcome: ViewOutcome, views: ViewMaker) -> None:
-        """Have a frame that fits the map searched, each stretch of ground in a few of them."""
+    def search(self, posed: PosedFrame, outcome: ViewOutcome, views: ViewMaker, *, may_look: bool = True) -> None:
+        """Have a frame that fits the map searched, each stretch of ground in a few of them; not unless it `may_look`.
+        """
         if self._finder is None or outcome.site_from_image is None:
             return
         outline_m = views.pixels.ground_m(posed, outcome.site_from_image)
         is_due = outline_m is not None and self._selection.take(outline_m)
-        if is_due and not self._finder.has_seen(posed.frame.index):
+        if is_due and may_look and not self._finder.has_seen(posed.frame.index):
             self._finder.look(posed)
 
     def named(self, announced: Sequence[Change]) -> tuple[Change, ...]:

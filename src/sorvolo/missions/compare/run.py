@@ -1,7 +1,7 @@
 """One later flight on its way into a site: views to evidence, evidence to changes, changes into the map."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ from sorvolo.geometry.arrays import Mask
 from sorvolo.geometry.summary import median_of_known
 from sorvolo.heights.field import standing
 from sorvolo.missions.compare.extension import MapExtension
-from sorvolo.missions.compare.journal import ComparedFrame, CompareJournal
+from sorvolo.missions.compare.journal import ComparedFrame, CompareJournal, KeptFrame
 from sorvolo.missions.compare.objects import ComparisonObjects
 from sorvolo.missions.compare.report import ViewCounts, comparison_summary, comparison_warnings
 from sorvolo.missions.flight.detects import Detects
@@ -39,13 +39,13 @@ from sorvolo.store.exports.change_files import write_pictures
 from sorvolo.store.exports.coverage_files import COVERAGE, coverage_geojson
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.exports.plain import features_name, geojson_bytes
-from sorvolo.store.images import ImageCache
+from sorvolo.store.images import ImageCache, array_from_bytes, image_from_jpeg, jpeg_from_image
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.coverage import CoveredGround
 from sorvolo.survey.findings import Change, ComparedView, Verdict, ViewStatus
-from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
+from sorvolo.survey.flight import Frame, LostFrame, Notice, PosedFrame
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
 
@@ -157,6 +157,14 @@ class CompareRun:
         compared = self._comparing.submit(self._views.compare_with_map, posed)
         return Pending(posed, self._corroborating.submit(lambda: self._views.corroborate(compared.result())))
 
+    def recalled(self) -> Iterator[Pending]:
+        """The frames of a run that was killed which nobody can read again."""
+        for each in () if self._journal is None else self._journal.kept_frames():
+            assert each.kept is not None
+            image = image_from_jpeg(bytes(each.kept.jpeg), each.kept.name)
+            posed = PosedFrame(Frame(each.index, each.kept.name, each.kept.time_ns, image), each.kept.prior)
+            yield Pending(posed, self._comparing.submit(self._views.recall, posed, image, each.record), each)
+
     def add(self, pending: Pending) -> tuple[ViewOutcome, tuple[Change, ...]]:
         """Take one frame's comparison in; how that ended, and the changes that it was the last missing proof of."""
         posed, earlier = pending.posed, pending.earlier
@@ -165,10 +173,10 @@ class CompareRun:
         self._counts.take(outcome, self._views.pixels.ground_m(posed, outcome.site_from_image))
         self._placed[posed.frame.index] = self._views.placed(posed, outcome, self._map_sigma_m)
         with self._log.stage(Stage.DETECT):
-            self._objects.search(posed, outcome, self._views)
+            self._objects.search(posed, outcome, self._views, may_look=earlier is None or earlier.is_whole)
         announced = () if outcome.view is None else self._add_view(outcome.view, outcome.leans)
         with self._log.stage(Stage.REGISTER):
-            taken = self._extension.add(posed, outcome, None if earlier is None else earlier.taken)
+            taken = self._extension.add(posed, outcome, earlier)
         self._keep(pending, taken)
         return outcome, announced
 
@@ -220,8 +228,13 @@ class CompareRun:
         """Note a frame, and what the detector found meanwhile; nothing while those of a killed run are taken over."""
         if self._journal is None or pending.earlier is not None:
             return
+        posed, kept = pending.posed, None
+        if self._journal.keeps_pictures:
+            jpeg = array_from_bytes(jpeg_from_image(self._views.undistorted(posed)))
+            kept = KeptFrame(posed.frame.name, posed.frame.time_ns, posed.prior, jpeg)
         record = ViewRecord.of(pending.outcome.result())
-        self._journal.keep_frame(ComparedFrame(pending.posed.frame.index, record, taken))
+        compared = ComparedFrame(posed.frame.index, record, taken, kept)
+        self._journal.keep_frame(compared, posed.frame.name, posed.frame.time_ns)
         for seen in self._objects.news():
             self._journal.keep_detections(seen)
 

@@ -33,12 +33,25 @@ def request_of(
 ) -> str:
     """What is asked for: the same command over the same files by the same version of the program gives the same.
 
-    `settings` is the mission's record, `more` what else the result depends on: records, arrays and plain values.
+    `settings` is the mission's record, `more` what else the result depends on: records, arrays and plain values. Of a
+    live flight: the same command, see `live_request`.
     """
+    if isinstance(setup.source, LiveSource):
+        return live_request(setup.source, settings, area, detector, *more)
     files = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in _files(setup)]
     return content_sha256(
         sorvolo.__version__, software(), setup.source.fingerprint, files, setup.source.camera, setup.source.telemetry,
         settings, area, None if detector is None else detector.info, more,
+    )
+
+
+def live_request(
+    source: LiveSource, settings: Any, area: Area | None, detector: Detects | None, *more: Any
+) -> str:
+    """What is asked for of a live flight, which is known before the flight is: the same for the same address."""
+    return content_sha256(
+        sorvolo.__version__, software(), source.inputs, source.kind, source.size_px, settings, area,
+        None if detector is None else detector.info, more,
     )
 
 

@@ -2,6 +2,7 @@
 
 import threading
 import time
+import warnings
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -12,12 +13,13 @@ from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.capture.video import VideoSource
 from sorvolo.capture.video_spans import SparseReading
-from sorvolo.errors import SettingsError
+from sorvolo.errors import SettingsError, SorvoloWarning
 from sorvolo.missions.flight.base_map import open_base
 from sorvolo.missions.flight.control import open_control
 from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.disk import check_room
 from sorvolo.missions.flight.glimpses import refuse_without_texture
+from sorvolo.missions.flight.live_journal import SourceNotes
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.reading import read_ahead
 from sorvolo.missions.flight.request import AlreadyDone, already_done, request_of
@@ -32,7 +34,7 @@ from sorvolo.missions.flight.setup import (
     repeated,
 )
 from sorvolo.missions.map.coverage import FlightCoverage
-from sorvolo.missions.map.journal import Earlier, MapJournal, Step, begun_journal
+from sorvolo.missions.map.journal import Earlier, MapJournal, Step, begun_journal, go_on_live
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.missions.map.thesis_run import ThesisRun
@@ -74,19 +76,22 @@ def map_flights(
     with opened as sources, Archive.open(site, write=True) as archive:
         ground = _known_ground(control, base, sources, settings)
         known = []
+        asked = replace(settings, live_s=0.0, memory_mb=None), wanted, looks
         for source in sources:
+            samples = go_on_live(source, archive, asked, live.same_flight_s, anew=again)
             setup = prepare(
                 source, settings, archive.site() if archive.has_site else None, telemetry_named=telemetry is not None,
                 ground_m=known_ground_m(archive), known_ground=ground, founds_site=founds_site(archive, source.name),
             )
-            request = request_of(setup, replace(settings, live_s=0.0, memory_mb=None), wanted, looks)
+            request = request_of(setup, *asked)
             mapped = already_done(archive, setup, request)
             if mapped and not again:
                 known.append(mapped)
                 continue
             coverage = FlightCoverage(setup, archive, wanted, refly, settings.live_s)
             yield from _map_one(
-                setup, archive, settings, wanted, looks, request, coverage, anew=again and mapped is None
+                setup, archive, settings, wanted, looks, request, coverage, anew=again and mapped is None,
+                samples=samples,
             )
         return tuple(known)
 
@@ -112,14 +117,14 @@ def _known_ground(
 
 def _map_one(
     setup: FlightSetup, archive: Archive, settings: MapSettings, area: Area | None, detector: Detects | None,
-    request: str, coverage: FlightCoverage, *, anew: bool,
+    request: str, coverage: FlightCoverage, *, anew: bool, samples: int,
 ) -> Generator[MosaicUpdate]:
     started_s, source = time.monotonic(), setup.source
     refuse_without_texture(source)
     check_room(setup, archive.folder, archive.site().m_per_px if archive.has_site else settings.m_per_px)
     setup = replace(setup, notices=(*setup.notices, *repeated(archive, source.name, "mapped")))
     finder = None if detector is None else ObjectFinder(detector, source.camera.camera, settings.classes)
-    with _begun(setup, archive, settings, finder, request, coverage, anew=anew) as run:
+    with _begun(setup, archive, settings, finder, request, coverage, anew=anew, samples=samples) as run:
 
         def update(frame: Step | LostFrame | Frame, ended: tuple[Status, str, int], read: int) -> MosaicUpdate:
             view = None if isinstance(frame, LostFrame) else run.view(frame.index, frame.time_ns)
@@ -150,14 +155,20 @@ def _map_one(
 
 def _begun(
     setup: FlightSetup, archive: Archive, settings: MapSettings, finder: ObjectFinder | None, request: str,
-    coverage: FlightCoverage, *, anew: bool,
+    coverage: FlightCoverage, *, anew: bool, samples: int,
 ) -> FlightRun:
-    """The run of one flight; a recorded one notes how far it is, and goes on where a killed one was."""
+    """The run of one flight, which notes how far it is, and goes on where a killed one was.
+
+    `samples` of a live flight's telemetry are noted already.
+    """
+    file, source = begun_journal(setup, archive, request, anew=anew), setup.source
     if settings.method == "thesis":
-        return ThesisRun(setup, archive, settings, finder, request)
-    journal = None
-    if not isinstance(setup.source, LiveSource):
-        journal = MapJournal(begun_journal(setup, archive, request, anew=anew))
+        if file.is_begun:
+            text = f"{source.name}: a run was stopped, and begins anew: --method thesis goes on from nothing"
+            warnings.warn(text, SorvoloWarning, stacklevel=2)
+            file = begun_journal(setup, archive, request, anew=True)
+        return ThesisRun(setup, archive, settings, finder, MapJournal(file), request)
+    journal = MapJournal(file, SourceNotes(file, source, samples) if isinstance(source, LiveSource) else None)
     return PlanarRun(setup, archive, settings, finder=finder, journal=journal, request=request, coverage=coverage)
 
 

@@ -5,11 +5,14 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import sorvolo
+from sorvolo.capture.source import LiveSource, Source
 from sorvolo.errors import SorvoloError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
+from sorvolo.missions.flight.live_journal import BEGUN, SAMPLES, SourceNotes, go_on
 from sorvolo.missions.flight.map_objects import FrameDetections
+from sorvolo.missions.flight.request import live_request
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.planar import Registered
 from sorvolo.mosaic.selection import SelectionMemory
@@ -84,13 +87,20 @@ class Earlier:
 
 
 class MapJournal:
-    """A mapping's steps and detections, in a journal of the site."""
+    """A mapping's steps and detections, in a journal of the site; `notes` are those of a live source."""
 
-    def __init__(self, journal: RunJournal) -> None:
+    def __init__(self, journal: RunJournal, notes: SourceNotes | None = None) -> None:
         self.file = journal
+        self._notes = notes
+
+    def keep_source(self) -> None:
+        """Note what a live source has brought besides frames; nothing of a recorded one."""
+        if self._notes is not None:
+            self._notes.keep()
 
     def keep(self, step: Step) -> None:
         """Note a frame. Raises StoreError when the disk is full."""
+        self.keep_source()
         values: dict[str, Any] = {
             "index": step.index, "name": step.name, "time_ns": step.time_ns, "reason": step.reason,
             "searched": step.is_searched,
@@ -117,6 +127,8 @@ class MapJournal:
     def earlier(self) -> Iterator[Step | FrameDetections]:
         """What a killed run did, in order; it ends where an entry is not as one was written."""
         for entry in self.file.entries():
+            if entry.kind in (BEGUN, SAMPLES):
+                continue
             try:
                 read = _step(entry) if entry.kind == "step" else detections_in(entry)
             except (KeyError, TypeError, ValueError, SorvoloError):
@@ -133,9 +145,29 @@ def begun_journal(setup: FlightSetup, archive: Archive, request: str, *, anew: b
 
 def run_key(setup: FlightSetup, archive: Archive, request: str) -> str:
     """What is asked for, and of which site: the same only where the very same work is to be done."""
+    if isinstance(setup.source, LiveSource):
+        return live_key(archive, request)
     site = archive.site() if archive.has_site else None
     versions = [(each.id, each.run_id, each.flight_id) for each in archive.versions() if each.complete]
     return content_sha256(request, setup.plan, setup.frame.origin, site, versions)
+
+
+def live_key(archive: Archive, request: str) -> str:
+    """The same of a live flight, before anything is known of it."""
+    return content_sha256(request, [(each.id, each.run_id) for each in archive.versions() if each.complete])
+
+
+def go_on_live(
+    source: Source, archive: Archive, asked: tuple[Any, ...], most_gap_s: float, *, anew: bool
+) -> int:
+    """Have a live source go on with the flight of a run that was killed, if one was `asked` for the same (what follows
+    the source in `live_request`); how many samples of its telemetry that run had noted."""
+    if anew or not isinstance(source, LiveSource):
+        return 0
+    request = live_request(source, *asked)
+    journal = archive.stopped_run(live_key(archive, request), sorvolo.__version__)
+    so_far = None if journal is None else go_on(source, journal, most_gap_s)
+    return 0 if so_far is None else len(so_far.times_ns)
 
 
 def put_taken(taken: Taken, values: dict[str, Any], arrays: dict[str, Any]) -> None:

@@ -11,6 +11,7 @@ from sorvolo.missions.flight.map_objects import ObjectFinder, crops_of
 from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.missions.map.journal import MapJournal
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.mosaic.roi_stitching import RoiStitcher, Stitched
 from sorvolo.mosaic.stitched_map import MIRROR_Y, StitchedPlaces, mosaic_m_per_px, paint_mosaic, site_from_mosaic
@@ -28,9 +29,9 @@ class ThesisRun(FlightRun):
 
     def __init__(
         self, setup: FlightSetup, archive: Archive, settings: MapSettings, finder: ObjectFinder | None = None,
-        request: str = "",
+        journal: MapJournal | None = None, request: str = "",
     ) -> None:
-        super().__init__(setup, archive, settings, finder=finder, request=request)
+        super().__init__(setup, archive, settings, finder=finder, journal=journal, request=request)
         self._lens = Undistorter(setup.source.camera.camera)
         full = self._lens.camera
         scale = min(1.0, settings.thesis.side_px / max(full.width_px, full.height_px))

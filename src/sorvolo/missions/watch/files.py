@@ -28,6 +28,7 @@ from sorvolo.store.exports.detection_files import (
     track_placemarks,
     tracks_collection,
     write_crop,
+    written_crop,
 )
 from sorvolo.store.exports.label_files import picture_of_detections, write_coco, write_yolo
 from sorvolo.store.exports.placemarks import gpx_bytes, kml_bytes
@@ -101,6 +102,25 @@ class WatchFiles:
             if sighting is not None:
                 self._keep_crop(sighting, crop_around(seen.frame.image, sighting.box_px))
         self._queue.put(seen)
+
+    def recall(self, seen: SeenFrame, size_px: tuple[int, int]) -> None:
+        """Write the lines of a frame of this height and width that an earlier process searched, whose picture is not
+        there any more; its crops, pictures and labels are as that process left them."""
+        self._segments |= dict.fromkeys(seen.track_ids, seen.segment)
+        self._lines.append(_rows(seen, self._site))
+        if self._outputs.labels and seen.time_ns >= self._label_due_ns:
+            self._label_due_ns = seen.time_ns + _LABELS_EVERY_NS
+            name = self._label_name(seen)
+            if (self.folder / LABELS / "images" / name).is_file():
+                self._labelled.append(self._label_of(seen, name, size_px))
+                self._classes = seen.detections.classes
+
+    def recall_crops(self, tracks: Iterable[Track]) -> None:
+        """Take the crops of tracks that an earlier process wrote."""
+        for track in tracks:
+            if (name := written_crop(self.folder, track.id)) is not None:
+                self.crop_names[track.id] = name
+                self._best[track.id] = track.best
 
     def crop_of(self, track: Track) -> str | None:
         """Write the crop of the track's best view if that is new; its file's name within the folder."""
@@ -182,12 +202,18 @@ class WatchFiles:
         images = self.folder / LABELS / "images"
         with writing(images):
             images.mkdir(parents=True, exist_ok=True)
-        name = f"{self._site.name}_{_file_name(seen.frame)}.jpg"
+        name = self._label_name(seen)
         atomic_write_bytes(images / name, jpeg_from_image(seen.frame.image), durable=False)
-        height, width = seen.frame.image.shape[:2]
-        picture = picture_of_detections(f"images/{name}", width, height, self._site.name, seen.detections)
-        self._labelled.append((picture, seen.detections.scores))
+        self._labelled.append(self._label_of(seen, name, seen.frame.image.shape[:2]))
         self._classes = seen.detections.classes
+
+    def _label_name(self, seen: SeenFrame) -> str:
+        return f"{self._site.name}_{_file_name(seen.frame)}.jpg"
+
+    def _label_of(self, seen: SeenFrame, name: str, size_px: tuple[int, int]) -> tuple[LabelledPicture, Floats]:
+        height, width = size_px
+        picture = picture_of_detections(f"images/{name}", width, height, self._site.name, seen.detections)
+        return picture, seen.detections.scores
 
     def _write_labels(self) -> None:
         if not self._labelled:

@@ -12,18 +12,19 @@ from sorvolo.capture.source import LiveSource, Source, open_sources
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.live_journal import SourceNotes
 from sorvolo.missions.flight.reading import read_ahead
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
 from sorvolo.missions.watch.cot_sender import check_host, cot_place
 from sorvolo.missions.watch.ground import over_heights
-from sorvolo.missions.watch.journal import WatchJournal, begun_journal
+from sorvolo.missions.watch.journal import StoppedWatch, WatchJournal, WatchOrder
 from sorvolo.missions.watch.places import places_of
 from sorvolo.missions.watch.run import WatchRun, WatchUpdate
 from sorvolo.missions.watch.settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
 from sorvolo.mosaic.selection import every
 from sorvolo.store.exports.cursor_on_target import COT_TYPES
-from sorvolo.store.exports.detection_files import claim_folder
+from sorvolo.store.exports.detection_files import claim_folder, keep_annotated
 from sorvolo.survey.flight import Frame, LostFrame
 
 _AHEAD = 4  # decoded frames that wait for the detector
@@ -59,13 +60,20 @@ def watch(
         for each in sources:
             if until.is_set():
                 return
-            folder = outputs.folder or Path(f"{each.name}-watch")
-            if len(sources) > 1 and outputs.folder is not None:
-                folder = outputs.folder / each.name
+            order = WatchOrder(settings, outputs, finder)
+            goes_on = order.go_on_live(each, live.same_flight_s) if isinstance(each, LiveSource) else None
+            folder = _folder_of(each, outputs, is_only=len(sources) == 1) if goes_on is None else goes_on.folder
             yield from _watch_one(
-                each, finder, settings, replace(outputs, folder=folder), folder, until,
+                each, WatchOrder(settings, replace(outputs, folder=folder), finder), folder, goes_on, until,
                 telemetry_named=telemetry is not None,
             )
+
+
+def _folder_of(source: Source, outputs: WatchOutputs, *, is_only: bool) -> Path:
+    """Where a watch's files go: each of several sources has a folder of its own."""
+    if outputs.folder is None:
+        return Path(f"{source.name}-watch")
+    return outputs.folder if is_only else outputs.folder / source.name
 
 
 def _checked_detector(detector: Detects | None, settings: WatchSettings, outputs: WatchOutputs) -> Detects:
@@ -86,9 +94,10 @@ def _demand_known_classes(detector: Detects, settings: WatchSettings, outputs: W
 
 
 def _watch_one(
-    source: Source, detector: Detects, settings: WatchSettings, outputs: WatchOutputs, folder: Path,
-    until: threading.Event, *, telemetry_named: bool,
+    source: Source, order: WatchOrder, folder: Path, goes_on: StoppedWatch | None, until: threading.Event, *,
+    telemetry_named: bool,
 ) -> Generator[WatchUpdate]:
+    settings, outputs, detector = order.settings, order.outputs, order.detector
     mapping = MapSettings(offset_s=settings.offset_s, ground_elevation_m=settings.ground_elevation_m)
 
     def prepared(mapping: MapSettings) -> FlightSetup:
@@ -100,15 +109,14 @@ def _watch_one(
         setup, ground = prepared(mapping), None
     least = settings.least_score if settings.least_score is not None else min(detector.info.thresholds.values())
     places = places_of(setup, least, ground)
-    journal = begun_journal(setup, settings, outputs, detector, folder)
-    claim_folder(
-        folder, source.name, source.fingerprint, replaces=not isinstance(source, LiveSource),
-        goes_on=journal.is_begun,
-    )
-    with closing(journal), WatchRun(setup, places, detector, settings, outputs, folder, WatchJournal(journal)) as run:
+    journal = _begun(source, order, setup, folder, goes_on)
+    with closing(journal.file), WatchRun(setup, places, detector, settings, outputs, folder, journal) as run:
+        for searched in journal.frames() if goes_on is not None else ():
+            yield run.recall(searched)
         ended = _STOPPED
         try:
-            ended = yield from _search(run, source, settings, until)
+            first = 0 if goes_on is None else goes_on.next_index
+            ended = yield from _search(run, source, settings, until, first)
         except KeyboardInterrupt:
             pass  # the usual way to end a live watch: what was found is written below
         except Exception as error:
@@ -122,11 +130,26 @@ def _watch_one(
             raise InputError(f"no frame of {source.name} could be searched: {reason}; see `sorvolo inspect`")
 
 
+def _begun(
+    source: Source, order: WatchOrder, setup: FlightSetup, folder: Path, goes_on: StoppedWatch | None
+) -> WatchJournal:
+    """The journal of a watch, whose folder is claimed: as a killed watch left it where that goes on, else empty."""
+    file = order.journal(setup, folder)
+    if not isinstance(source, LiveSource):
+        claim_folder(folder, source.name, source.fingerprint, goes_on=file.is_begun)
+        return WatchJournal(file)
+    if goes_on is not None:
+        keep_annotated(folder)
+    claim_folder(folder, source.name, source.fingerprint, replaces=False, goes_on=goes_on is not None)
+    return WatchJournal(file, SourceNotes(file, source, 0 if goes_on is None else goes_on.samples))
+
+
 def _search(
-    run: WatchRun, source: Source, settings: WatchSettings, until: threading.Event
+    run: WatchRun, source: Source, settings: WatchSettings, until: threading.Event, first: int
 ) -> Generator[WatchUpdate, None, str]:
-    """Search the wanted frames, yielding an update for each; why it ended, in words."""
-    asked = _Asked(_wanted(source, settings))
+    """Search the wanted frames from index `first` on, yielding an update for each; why it ended, in words."""
+    wanted = _wanted(source, settings)
+    asked = _Asked(lambda index, time_ns: index >= first and wanted(index, time_ns))
     with closing(_arrivals(source, asked)) as arrivals:
         for arrived_s, each in arrivals:
             if isinstance(each, Frame):

@@ -2,32 +2,42 @@
 
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import sorvolo
+from sorvolo.capture.source import LiveSource
 from sorvolo.errors import SorvoloError, SorvoloWarning
 from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.live_journal import BEGUN, SAMPLES, SourceNotes, go_on
 from sorvolo.missions.flight.replay import Replay
-from sorvolo.missions.flight.request import request_of
+from sorvolo.missions.flight.request import live_request, request_of
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.store.exports.detection_files import JOURNAL
 from sorvolo.store.site.journal import Entry, RunJournal, content_sha256
 from sorvolo.store.site.journal_records import RecordPacker, unpacked
 from sorvolo.survey.objects import Detections
+from sorvolo.tracking.following import Located
 
 _SENT, _FRAME = "sent", "frame"
 
 
 @dataclass(frozen=True, eq=False)
 class SearchedFrame:
-    """What was detected in a frame: in all of it, and by each look at an enlarged part that showed its scale."""
+    """What was detected in a frame: in all of it, and by each look at an enlarged part that showed its scale.
+
+    Of a live stream, which nobody can read again, also where that lies (`located`), and the frame's height and width.
+    """
 
     index: int
+    name: str
+    time_ns: int
     found: Detections
     looks: tuple[Detections, ...]
+    located: Located | None
+    size_px: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -39,17 +49,35 @@ class Sent:
 
 
 class WatchJournal:
-    """A watch's frames and what was sent, in a journal of its folder; `sent` is what a killed watch had sent."""
+    """A watch's frames and what was sent, in a journal of its folder; `sent` is what a killed watch had sent.
 
-    def __init__(self, journal: RunJournal) -> None:
+    `notes` are those of a live source.
+    """
+
+    def __init__(self, journal: RunJournal, notes: SourceNotes | None = None) -> None:
         self.file = journal
+        self._notes = notes
         self.sent = frozenset(each for each in self._read() if isinstance(each, Sent))
-        self._frames = Replay(_frame(each) for each in journal.taken() if each.kind == _FRAME)
+        self._replay = Replay(self.frames())
+
+    @property
+    def is_live(self) -> bool:
+        """Whether it is of a live source, whose frames nobody can read again."""
+        return self._notes is not None
+
+    def frames(self) -> Iterator[SearchedFrame]:
+        """The frames that a killed watch searched, in order."""
+        return (_frame(each) for each in self.file.taken() if each.kind == _FRAME)
 
     def keep_frame(self, frame: SearchedFrame) -> None:
         """Note a searched frame. Raises StoreError when the disk is full."""
+        if self._notes is not None:
+            self._notes.keep()
         packer = RecordPacker()
-        self.file.append(Entry(_FRAME, {"frame": packer.packed(frame)}, packer.arrays))
+        values = {
+            "index": frame.index, "name": frame.name, "time_ns": frame.time_ns, "frame": packer.packed(frame),
+        }
+        self.file.append(Entry(_FRAME, values, packer.arrays))
 
     def keep_sent(self, receiver: str, track_id: int) -> None:
         """Note what a receiver has got; from any thread. Raises StoreError when the disk is full."""
@@ -57,11 +85,13 @@ class WatchJournal:
 
     def next_frame(self, index: int) -> SearchedFrame | None:
         """The next frame that a killed watch searched, if it is the one of this index."""
-        return self._frames.take(index)
+        return None if self.is_live else self._replay.take(index)
 
     def _read(self) -> Iterator[SearchedFrame | Sent]:
         """What a killed watch noted, in order; it ends where an entry is not as one was written."""
         for entry in self.file.entries():
+            if entry.kind in (BEGUN, SAMPLES):
+                continue
             try:
                 read = _sent(entry) if entry.kind == _SENT else _frame(entry)
             except (KeyError, TypeError, ValueError, IndexError, SorvoloError):
@@ -69,21 +99,56 @@ class WatchJournal:
             yield read
 
 
-def begun_journal(
-    setup: FlightSetup, settings: WatchSettings, outputs: WatchOutputs, detector: Detects, folder: Path
-) -> RunJournal:
-    """The journal of a watch in its folder, with what a killed one left that did the very same work.
+@dataclass(frozen=True)
+class StoppedWatch:
+    """A live watch that was killed and goes on: its folder, how many samples of telemetry it had noted, and the index
+    of the first frame that it had not searched."""
 
-    Warns where there is one of another watch, which is of no use.
-    """
-    heights = Path(settings.height_model)
-    stamp = (heights.stat().st_size, heights.stat().st_mtime_ns) if settings.height_model else ()
-    key = content_sha256(request_of(setup, settings, None, detector, outputs, stamp))
-    journal = RunJournal(folder / JOURNAL, key, 0, sorvolo.__version__)
-    if why_not := journal.why_not:
-        text = f"{folder}: a watch that was stopped cannot go on, since {why_not}; it begins anew"
-        warnings.warn(text, SorvoloWarning, stacklevel=2)
-    return journal
+    folder: Path
+    samples: int
+    next_index: int
+
+
+@dataclass(frozen=True, eq=False)
+class WatchOrder:
+    """What is asked for of a watch, beside its source."""
+
+    settings: WatchSettings
+    outputs: WatchOutputs
+    detector: Detects
+
+    def journal(self, setup: FlightSetup, folder: Path) -> RunJournal:
+        """The journal of a watch in its folder, with what a killed one left that did the very same work.
+
+        Warns where there is one of another watch, which is of no use.
+        """
+        journal = self._at(folder, request_of(setup, self.settings, None, self.detector, *self._more))
+        if why_not := journal.why_not:
+            text = f"{folder}: a watch that was stopped cannot go on, since {why_not}"
+            warnings.warn(text, SorvoloWarning, stacklevel=2)
+        return journal
+
+    def go_on_live(self, source: LiveSource, most_gap_s: float) -> StoppedWatch | None:
+        """Have a live source go on with the flight of a watch that was killed; None where no such watch was asked for
+        the same."""
+        request = live_request(source, self.settings, None, self.detector, *self._more)
+        named = self.outputs.folder
+        found = sorted(each.parent for each in Path().glob(f"*-watch/{JOURNAL}"))
+        for folder in found if named is None else [named]:
+            journal = self._at(folder, request)
+            so_far = go_on(source, journal, most_gap_s) if journal.is_begun else None
+            if so_far is not None:
+                return StoppedWatch(folder, len(so_far.times_ns), so_far.next_index)
+        return None
+
+    @property
+    def _more(self) -> tuple[Any, ...]:
+        heights = Path(self.settings.height_model)
+        stamp = (heights.stat().st_size, heights.stat().st_mtime_ns) if self.settings.height_model else ()
+        return replace(self.outputs, folder=None), stamp
+
+    def _at(self, folder: Path, request: str) -> RunJournal:
+        return RunJournal(folder / JOURNAL, content_sha256(request), 0, sorvolo.__version__)
 
 
 def _frame(entry: Entry) -> SearchedFrame:

@@ -13,7 +13,7 @@ from sorvolo.survey.flight import CameraPrior, Frame, Notice, Site
 from sorvolo.survey.mosaic import FrameView
 from sorvolo.survey.objects import Detections, Track
 from sorvolo.survey.wording import counted
-from sorvolo.tracking.following import GroundFollower, PictureFollower, Taken, watched_prior
+from sorvolo.tracking.following import GroundFollower, Located, PictureFollower, Taken, watched_prior
 from sorvolo.tracking.locate import IMPOSSIBLE_SIZE, GroundHeight
 from sorvolo.tracking.tracker import TrackerSettings
 
@@ -43,6 +43,9 @@ class Places(Protocol):
 
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
         """Place a frame's detections and give them to their tracks."""
+
+    def recall(self, located: Located, found: Detections, size_px: tuple[int, int]) -> Taken:
+        """Give detections to their tracks that an earlier process placed in a frame of this height and width."""
 
     def tracks(self) -> Sequence[Track]:
         """All tracks as they are known now."""
@@ -105,6 +108,10 @@ class GroundPlaces:
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
         """Place a frame's detections on the ground and give them to their tracks."""
         return self._follower.take(frame, time_ns, found, self._prior(frame))
+
+    def recall(self, located: Located, found: Detections, size_px: tuple[int, int]) -> Taken:
+        """See `Places.recall`."""
+        return self._follower.recall(located)
 
     def tracks(self) -> Sequence[Track]:
         """All tracks as they are known now."""
@@ -189,6 +196,10 @@ class ImagePlaces:
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
         """Take the camera's motion out of a frame's detections and give them to their tracks."""
         return self._follower.take(frame, time_ns, found)
+
+    def recall(self, located: Located, found: Detections, size_px: tuple[int, int]) -> Taken:
+        """See `Places.recall`."""
+        return self._follower.recall(located, found, size_px)
 
     def tracks(self) -> Sequence[Track]:
         """All tracks as they are known now."""

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -111,14 +111,11 @@ class WatchRun:
     ) -> None:
         self._stack.close()
 
-    def _found(self, frame: Frame) -> tuple[Detections, bool]:
-        """What is detected in a frame, which is noted; and whether a watch that was killed had detected it."""
+    def _found(self, frame: Frame) -> tuple[SearchedFrame, bool]:
+        """What is detected in a frame, and whether a watch that was killed had detected it."""
         earlier = self._journal.next_frame(frame.index)
         with self.log.stage("detect"):
-            searched = self._searched(frame, earlier)
-        if earlier is None:
-            self._journal.keep_frame(searched)
-        return searched.found, earlier is not None
+            return self._searched(frame, earlier), earlier is not None
 
     def _searched(self, frame: Frame, earlier: SearchedFrame | None) -> SearchedFrame:
         """What the detector finds in a frame; where nothing places the flight, at the scale that its scene shows.
@@ -145,7 +142,8 @@ class WatchRun:
         ) if earlier is None else earlier.found
         if magnifier is not None:
             magnifier.see(found, frame.image)
-        return SearchedFrame(frame.index, found, tuple(looks))
+        size_px = frame.image.shape[0], frame.image.shape[1]
+        return SearchedFrame(frame.index, frame.name, frame.time_ns, found, tuple(looks), None, size_px)
 
     def lose(self, lost: LostFrame) -> None:
         """A frame that cannot be used."""
@@ -154,21 +152,38 @@ class WatchRun:
 
     def add(self, frame: Frame, arrived_s: float) -> WatchUpdate:
         """Search one frame, whose turn came at `arrived_s` of the monotonic clock, and take in what it shows."""
-        log = self.log
-        log.read = frame.index + 1
+        self.log.read = frame.index + 1
         time_ns = self._utc_ns(frame)
-        found, is_resumed = self._found(frame)
-        with log.stage("track"):
-            taken = self._places.take(frame, time_ns, found)
+        searched, is_resumed = self._found(frame)
+        with self.log.stage("track"):
+            taken = self._places.take(frame, time_ns, searched.found)
+        if not is_resumed:
+            self._journal.keep_frame(replace(searched, located=taken.located if self._journal.is_live else None))
+        return self._update(frame, time_ns, searched, taken, arrived_s, is_resumed=is_resumed)
+
+    def recall(self, searched: SearchedFrame) -> WatchUpdate:
+        """Take in a frame of a live source that a watch that was killed had searched, as far as its picture is not
+        needed."""
+        assert searched.located is not None  # of a live source they are noted
+        self.log.read = searched.index + 1
+        taken = self._places.recall(searched.located, searched.found, searched.size_px)
+        frame = Frame.unseen(searched.index, searched.name, searched.time_ns)
+        return self._update(frame, searched.located.time_ns, searched, taken, time.monotonic(), is_resumed=True)
+
+    def _update(
+        self, frame: Frame, time_ns: int, searched: SearchedFrame, taken: Taken, arrived_s: float, *, is_resumed: bool
+    ) -> WatchUpdate:
+        """Hand over what a frame brought."""
+        log, found, size_px = self.log, searched.found, searched.size_px
         sighted = [each for each in taken.sightings if each is not None]
         tracks = self._tracks_after(taken)
         log.searched(time_ns, found, 0 if self._places.site.is_local else len(sighted))
         with log.stage("hand over"):
-            self._files.add(SeenFrame(
+            self._write(SeenFrame(
                 frame, time_ns, found, taken.sightings, taken.track_ids,
                 frozenset(each.id for each in tracks.confirmed),
                 f"frame {frame.name}, counted so far: {counted_list(tracks.counts)}", taken.segment,
-            ))
+            ), size_px, tracks.seen)
             self._hand_over(taken, tracks, is_resumed=is_resumed)
         latency_s = time.monotonic() - arrived_s
         if not is_resumed:
@@ -177,7 +192,7 @@ class WatchRun:
         return WatchUpdate(
             frame.name, time_ns, found, sighted, tracks.new, tracks.seen, tracks.counts,
             latency_s, log.read, log.detected, source.frame_count, log.seconds, self._folder,
-            self._places.site, taken.segment, (frame.image.shape[1], frame.image.shape[0]),
+            self._places.site, taken.segment, size_px[::-1],
             frame.time_ns - source.start_ns, self._places.view(frame), is_resumed,
         )
 
@@ -185,6 +200,14 @@ class WatchRun:
         confirmed = [track for track in self._places.tracks() if track.confirmed]
         seen = [track for track in confirmed if track.id in set(taken.track_ids)]
         return _Tracks(confirmed, seen, [each for each in confirmed if each.id in taken.new_ids])
+
+    def _write(self, written: SeenFrame, size_px: tuple[int, int], seen: Sequence[Track]) -> None:
+        """Write a frame's part of the files; of one whose picture is not there any more, what does without it."""
+        if written.frame.image.size:
+            self._files.add(written)
+        else:
+            self._files.recall(written, size_px)
+            self._files.recall_crops(seen)
 
     def _hand_over(self, taken: Taken, tracks: "_Tracks", *, is_resumed: bool) -> None:
         """Crops, reports and withdrawals of one frame, and the files that show all tracks so far."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import Floats, ImageRGB, TimesNs
-from sorvolo.store.atomic import atomic_path, atomic_write_bytes, remove_leftovers, writing
+from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_path, atomic_write_bytes, remove_leftovers, writing
 from sorvolo.store.exports.placemarks import Placemark
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import (
@@ -213,6 +213,20 @@ def write_crop(folder: Path, track_id: int, crop: ImageRGB) -> str:
         (folder / CROPS).mkdir(exist_ok=True)
     atomic_write_bytes(folder / name, jpeg_from_image(crop), durable=False)
     return name
+
+
+def written_crop(folder: Path, track_id: int) -> str | None:
+    """The file name of a track's crop that is there already, within the folder; None where there is none."""
+    name = f"{CROPS}/{track_id}.jpg"
+    return name if (folder / name).is_file() else None
+
+
+def keep_annotated(folder: Path) -> None:
+    """Keep the annotated video of a watch that was killed beside the one that is about to begin."""
+    cut_off = folder / f"{TEMPORARY_PREFIX}{ANNOTATED_VIDEO}"
+    if cut_off.is_file():
+        numbers = (folder / f"annotated-{number}.mp4" for number in range(1, 10_000))
+        cut_off.rename(next(each for each in numbers if not each.exists()))
 
 
 def _mark_of(folder: Path) -> dict[str, Any] | None:

@@ -295,11 +295,21 @@ class Archive:
         remove_unused(self._files)
         return journal
 
+    def stopped_run(self, key: str, program: str) -> RunJournal | None:
+        """What a killed run of this `key` left, of whatever flight; None where there is none. See `journal`."""
+        with self._files.catalogue.reading() as connection:
+            newest = records.newest_version(connection)
+        for flight_id in stopped_flights(self._files):
+            journal = RunJournal(self._files.journal_path(flight_id), key, newest, program)
+            if journal.is_begun:
+                return journal
+        return None
+
     def _forget_stopped(self, kept: Path | None, *, but: str) -> None:
         """Forget the runs that were stopped, all but `kept`, with a warning for those of other flights than `but`."""
         for each in stopped_flights(self._files):
             if each != but:
-                _warn(f"a run of {each} was stopped before it was complete; it will begin anew, for the map changes")
+                _warn(f"a run of {each} was stopped before it was complete, and cannot go on: the map changes now")
         forget_journals(self._files, kept)
 
     def begin_flight(
