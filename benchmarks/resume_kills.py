@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +30,10 @@ from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.presets import preset
 from sorvolo.simulation.settings import SimulationSettings
 
-EFFORT = ("seconds", "cpu_s", "registration_cpu_s_per_keyframe", "peak_memory_mb", "reading")
+EFFORT = (
+    "seconds", "cpu_s", "registration_cpu_s_per_keyframe", "peak_memory_mb", "reading", "latency_s",
+    "frames_per_second",
+)
 """Of report.json: what a run took."""
 TIMED = {"report.html", "changes.html"}
 """Pages that show it."""
@@ -114,8 +118,8 @@ class Trial:
         return [*command, "--out", str(place), *shared, "--save", "pictures", "--fps", "2", "--alert-command", told]
 
 
-def rounds(options: argparse.Namespace, folder: Path) -> dict[str, object]:
-    """The undisturbed run, then the killed ones."""
+def rounds(options: argparse.Namespace, folder: Path) -> Iterator[dict[str, object]]:
+    """The result so far, after each killed run."""
     trial = Trial(options, folder)
     whole = trial.begin("undisturbed")
     whole_s, _ = trial.run(whole)
@@ -135,12 +139,12 @@ def rounds(options: argparse.Namespace, folder: Path) -> dict[str, object]:
             "alerts_lost": len(announced - trial.alerts()), "alerts_twice": len(trial.alerts() - announced),
         })
         print(number + 1, rows[-1], flush=True)
-    return {
-        "mission": options.mission, "seed": options.seed, "width_px": options.width, "model": options.model,
-        "undisturbed_s": round(whole_s, 2), "alerts": announced.total(), "kills": len(rows),
-        "same": sum(bool(each["same"]) for each in rows),
-        "resumed": sum(bool(each["frames_taken_over"]) for each in rows), "rounds": rows,
-    }
+        yield {
+            "mission": options.mission, "seed": options.seed, "width_px": options.width, "model": options.model,
+            "undisturbed_s": round(whole_s, 2), "alerts": announced.total(), "kills": len(rows),
+            "same": sum(bool(each["same"]) for each in rows),
+            "resumed": sum(bool(each["frames_taken_over"]) for each in rows), "rounds": rows,
+        }
 
 
 def main() -> None:
@@ -153,10 +157,10 @@ def main() -> None:
     parser.add_argument("--model", default="none")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        result = rounds(options, Path(folder))
     out = options.out or Path(__file__).parent / "results" / f"resume_kills_{options.mission}.json"
-    out.write_text(json.dumps({"machine": machine(), "commit": commit(), **result}, indent=1) + "\n")
+    with tempfile.TemporaryDirectory() as folder:
+        for result in rounds(options, Path(folder)):
+            out.write_text(json.dumps({"machine": machine(), "commit": commit(), **result}, indent=1) + "\n")
     print(f"{result['same']} of {result['kills']} with the same bytes, {result['resumed']} went on; {out}")
 
 

@@ -112,18 +112,6 @@ def test_it_goes_on_where_it_was(whole: tuple[Path, Path], flown: Path, tmp_path
     assert not list(site.rglob("run.journal"))
 
 
-def test_a_journal_that_is_cut_costs_only_what_is_cut_off(
-    whole: tuple[Path, Path], flown: Path, tmp_path: Path, worked: list[str]
-) -> None:
-    site = copy(whole[1], tmp_path)
-    journal = site / "flights" / "flight2" / "run.journal"
-    journal.write_bytes(journal.read_bytes()[: journal.stat().st_size // 2])
-    updates = compared(flown, site)
-    assert 0 < sum(each.is_resumed for each in updates) < _KILLED_AT
-    assert worked.count("compare_with_map") == sum(not each.is_resumed for each in updates)
-    assert content(site) == content(whole[0])
-
-
 def test_other_settings_begin_anew_and_say_so(whole: tuple[Path, Path], flown: Path, tmp_path: Path) -> None:
     site = copy(whole[1], tmp_path)
     with pytest.warns(SorvoloWarning, match="flight2: a run that was stopped cannot go on, since .* other settings"):

@@ -87,15 +87,25 @@ def reports(site: Path) -> list[dict[str, Any]]:
     return [json.loads(each.read_text()) for each in sorted((site / "flights").glob("*/report.json"))]
 
 
-def test_a_followed_file_goes_on(flight: FilmedFlight, followed: Path, tmp_path: Path) -> None:
-    source = f"follow:{followed}"
-    whole = mapped(source, tmp_path / "whole" / "site", _FILE, camera=flight.camera)
-    mapped(source, tmp_path / "killed" / "site", _FILE, killed_at=5, camera=flight.camera)
-    resumed = mapped(source, tmp_path / "killed" / "site", _FILE, camera=flight.camera)
-    assert [each.is_resumed for each in resumed] == [number < 5 for number in range(len(whole))]
+@pytest.fixture(scope="module")
+def whole(
+    flight: FilmedFlight, followed: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, list[MosaicUpdate]]:
+    """The file's map, and how it was made."""
+    site = tmp_path_factory.mktemp("whole") / "site"
+    return site, mapped(f"follow:{followed}", site, _FILE, camera=flight.camera)
+
+
+def test_a_followed_file_goes_on(
+    flight: FilmedFlight, followed: Path, whole: tuple[Path, list[MosaicUpdate]], tmp_path: Path
+) -> None:
+    source, site = f"follow:{followed}", tmp_path / "site"
+    mapped(source, site, _FILE, killed_at=5, camera=flight.camera)
+    resumed = mapped(source, site, _FILE, camera=flight.camera)
+    assert [each.is_resumed for each in resumed] == [number < 5 for number in range(len(whole[1]))]
     for name in ("mosaic.tif", "flights/film/frames.geojson"):
-        assert (tmp_path / "killed" / "site" / name).read_bytes() == (tmp_path / "whole" / "site" / name).read_bytes()
-    (report,) = reports(tmp_path / "killed" / "site")
+        assert (site / name).read_bytes() == (whole[0] / name).read_bytes()
+    (report,) = reports(site)
     assert report["georeferenced"] and "segments" not in [each["code"] for each in report["notices"]]
 
 
@@ -120,10 +130,10 @@ def test_a_stream_that_returns_is_a_second_segment(flight: FilmedFlight, tmp_pat
 
 
 def test_a_comparison_of_a_stream_goes_on(
-    flight: FilmedFlight, followed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    flight: FilmedFlight, followed: Path, whole: tuple[Path, list[MosaicUpdate]], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    site, later = tmp_path / "site", tmp_path / "later.ts"
-    mapped(f"follow:{followed}", site, _FILE, camera=flight.camera)
+    site, later = Path(shutil.copytree(whole[0], tmp_path / "site")), tmp_path / "later.ts"
     shutil.copy(followed, later)
     later.with_name("later.ts.ended").touch()
     monkeypatch.setattr(LiveStream, "is_reread", False)  # as a stream, whose frames nobody can read again
@@ -166,7 +176,7 @@ def test_a_watch_of_a_growing_file_goes_on(
 ) -> None:
     monkeypatch.setattr(LiveStream, "is_reread", False)  # as where the newest frame wins
     path, folder, alerts = tmp_path / "film.ts", tmp_path / "watch", tmp_path / "sent"
-    write_film(path, flight, 24, metadata=metadata)
+    write_film(path, flight, 20, metadata=metadata)
     detector = Following(filmed)
     told = f"{sys.executable} -c \"open('{alerts}', 'a').write('{{id}} ')\""
     outputs = WatchOutputs(folder=folder, save="pictures", labels=("coco",), alert_command=told)

@@ -154,6 +154,7 @@ def map_command(
 
     A live source is an address (rtsp://, rtmp://, udp://, tcp://), webcam:0, or follow:PATH for a video or a folder of
     photos that is still being written. Ctrl-C ends a live flight and finishes its map; a second Ctrl-C discards it.
+    After a crash or a power cut, give the same command again: it goes on where it was (not with --method thesis).
 
     Example: sorvolo map DJI_0042.MP4 --site field
 
