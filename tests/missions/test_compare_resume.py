@@ -131,3 +131,15 @@ def test_another_flight_tells_whose_run_it_ends(whole: tuple[Path, Path], flown:
         )
         next(updates)
         updates.close()
+
+
+def test_method_thesis_begins_anew_and_says_so(flown: Path, tmp_path: Path) -> None:
+    settings = MapSettings(method="thesis", model="none")
+    updates = map_flights([flown / "flight1"], tmp_path / "site", settings, camera=flown / "camera.xml")
+    next(updates)
+    shutil.copytree(tmp_path / "site", tmp_path / "amid")
+    updates.close()
+    with pytest.warns(SorvoloWarning, match="flight1: a run was stopped, and begins anew: --method thesis"):
+        again = map_flights([flown / "flight1"], tmp_path / "amid", settings, camera=flown / "camera.xml")
+        assert not next(again).is_resumed
+        again.close()

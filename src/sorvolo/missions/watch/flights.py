@@ -44,8 +44,8 @@ def watch(
     latency stays bounded, and the others are counted. Objects are placed on the ground where telemetry allows it, else
     followed in the picture.
 
-    A watch of a recorded flight that was killed goes on where it was when the same is asked for again: what was found
-    is not searched for again, and alerts that were sent are not sent again.
+    A watch that was killed goes on where it was when the same is asked for again, with a live stream within
+    `live.same_flight_s`: what was found is not searched for again, and alerts that were sent are not sent again.
 
     Set `until`, close the generator, or press Ctrl-C, to end early: all that was found until then is written. Raises
     InputError, SettingsError or StoreError with what to do.
