@@ -3,7 +3,10 @@
 import importlib.util
 import json
 import os
+import threading
 import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson, CotAuthority, CotCertificate
+from sorvolo.cli.places_of_sites import show_copy
 from sorvolo.cli.watch import Cot
 from sorvolo.errors import InputError, SettingsError
 
@@ -21,7 +25,9 @@ if TYPE_CHECKING:
 
 _NEEDED = ("fastapi", "uvicorn", "websockets", "titiler.core", "prometheus_client", "paho.mqtt")
 
-Root = Annotated[Path, typer.Argument(help="Folder that holds the sites; a site folder itself will do.")]
+Root = Annotated[
+    str, typer.Argument(help="Folder that holds the sites, or s3://BUCKET/PREFIX; a site itself will do.")
+]
 Host = Annotated[
     str, typer.Option(help="Address to listen at; others than this machine's own need TLS and tokens.")
 ]
@@ -86,6 +92,8 @@ def serve(
     Example: sorvolo serve maps --host 0.0.0.0 --tls-cert cert.pem --tls-key key.pem
 
     Example: sorvolo serve maps --mqtt mqtt://192.168.1.5 --cot udp://239.2.3.1:6969
+
+    Example: sorvolo serve s3://survey-archive
     """
     demand_extra()
     from sorvolo.missions.watch.cot_sender import CotTls
@@ -93,23 +101,40 @@ def serve(
     from sorvolo.station.server import run_station
     from sorvolo.station.settings import StationLimits, StationSettings
 
-    _demand_folder(root)
-    settings = StationSettings(
-        root, host, port, tls_cert, tls_key, insecure_lan, tuple(name or ()), tuple(stream_from or ()), free_floor,
-        upload_most, public_url, base_map, StationLimits(most_missions=most_missions, stop_within_s=stop_within),
-    )
     receivers = OutwardSettings(
         tuple(webhook or ()), webhook_secret, mqtt, _mqtt_password(mqtt_password_file) if mqtt else "", mqtt_ca, cot,
         CotTls(cot_ca, cot_cert),
     )
-    console = Console(stderr=True)
+    with _served_folder(root) as folder:
+        settings = StationSettings(
+            folder, host, port, tls_cert, tls_key, insecure_lan, tuple(name or ()), tuple(stream_from or ()),
+            free_floor, upload_most, public_url, base_map,
+            StationLimits(most_missions=most_missions, stop_within_s=stop_within),
+        )
+        run_station(settings, lambda: _announce(settings, opens=open_page), receivers, logs_json=log_json)
 
-    def announce() -> None:
-        _announce(settings, console)
-        if open_page:
-            webbrowser.open(settings.address)
 
-    run_station(settings, announce, receivers, logs_json=log_json)
+@contextmanager
+def _served_folder(root: str) -> Iterator[Path]:
+    """The folder of the sites; those of a store are kept in step with it meanwhile."""
+    from sorvolo.missions.site.copy import folder_of
+    from sorvolo.station.store_root import StoreRoot
+
+    folder = folder_of(root)
+    if folder is not None:
+        _demand_folder(folder)
+        yield folder
+        return
+    sites, over = StoreRoot(root), threading.Event()
+    for name, fault in show_copy(sites.step(), "fetching, file").items():
+        typer.echo(f"warning: {name}: {fault}", err=True)
+    keeping = threading.Thread(target=sites.keep, args=(over,), name="store", daemon=True)
+    keeping.start()
+    try:
+        yield sites.folder
+    finally:
+        over.set()
+        keeping.join()
 
 
 def token(
@@ -127,10 +152,9 @@ def token(
     from sorvolo.station.state import StationState
     from sorvolo.station.tokens import list_tokens, make_token, revoke_token
 
-    _demand_folder(root)
     if revoke and not name:
         raise SettingsError("--revoke: of which token? give its name; without a name, tokens are listed")
-    state = StationState.open(root / STATE_FOLDER)
+    state = StationState.open(_folder_of(root) / STATE_FOLDER)
     try:
         if revoke:
             revoke_token(state, name)
@@ -145,11 +169,26 @@ def token(
         state.close()
 
 
-def _announce(settings: "StationSettings", console: Console) -> None:
+def _folder_of(root: str) -> Path:
+    """Where the station of these sites keeps its own files."""
+    from sorvolo.missions.site.copy import folder_of
+    from sorvolo.station.store_root import StoreRoot
+
+    folder = folder_of(root)
+    if folder is None:
+        return StoreRoot(root).folder
+    _demand_folder(folder)
+    return folder
+
+
+def _announce(settings: "StationSettings", *, opens: bool) -> None:
+    console = Console(stderr=True)
     where = settings.address if not settings.public_url else f"{settings.public_url} (proxy to {settings.address})"
     console.print(f"station at {where}", soft_wrap=True, highlight=False, markup=False)
     if not settings.is_loopback and settings.tls_cert is None:
         console.print("[yellow]warning[/yellow]  without TLS: who listens in this network can read tokens and maps")
+    if opens:
+        webbrowser.open(settings.address)
 
 
 def _show_tokens(rows: list[tuple[str, str, str, str | None]], *, as_json: bool) -> None:

@@ -1,6 +1,7 @@
 """An object store as one end of a copy: objects named by their content, and one manifest that is replaced at once."""
 
 import hashlib
+import io
 import json
 import secrets
 import threading
@@ -35,6 +36,7 @@ from sorvolo.store.site.names import checked_sha256
 MANIFEST = "sorvolo-site.json"
 _FORMAT = 1
 _MOST_MANIFEST_BYTES = 256_000_000  # a million pictures
+_MOST_TILE_BYTES = 16_000_000  # 512 x 512 pixels take a megabyte
 SHOWN = ("mosaic.tif", "preview.png")
 """The newest map, which has plain names as well, for GIS and browsers."""
 
@@ -170,6 +172,10 @@ class BucketEnd:
         if not file.sha256 or (file.size == 0 and tile_of(file.path)):
             raise FileNotFoundError(2, "no such object", f"{self.name}/{file.path}")
         return closing(self._objects.opened(key_of(file), file.size))
+
+    def tile(self, path: str) -> BinaryIO:
+        """A tile's bytes, as they are there. Raises FileNotFoundError for none."""
+        return io.BytesIO(self._objects.read(path, _MOST_TILE_BYTES)[0])
 
     def fetch(self, file: SiteFile, key: str, path: Path) -> None:
         """Write an object to a path. Raises StoreError when it is gone, or not what its name states."""

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Generator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Self
+from typing import BinaryIO, Self
 
 from sorvolo.errors import StoreError
 from sorvolo.store.atomic import atomic_write_bytes
@@ -18,6 +18,7 @@ from sorvolo.store.copies.objects import Objects, open_objects
 from sorvolo.store.copies.state import CatalogueState, DamagedError, SiteFile, SiteState, tile_of
 from sorvolo.store.copies.transfer import CopyUpdate, copy
 from sorvolo.store.site.catalogue_place import is_site
+from sorvolo.store.site.files import lock_folder
 from sorvolo.store.site.origin import ORIGIN, TILE_SIZES, UNSENT, cache_folder
 
 
@@ -51,6 +52,12 @@ class WorkingCopy:
     def is_unsent(self) -> bool:
         """Whether the folder may hold what the store has not."""
         return (self.folder / UNSENT).is_file()
+
+    def is_ahead(self) -> bool:
+        """Whether the folder's catalogue holds anything else than what it was made of, by anybody's work."""
+        known = known_manifest(self.folder)
+        held = _WorkingFolder(self.folder).find_held() if is_site(self.folder) else None
+        return held is not None and (known is None or held.digest != known.held.digest)
 
     def begin_writing(self) -> None:
         """Note, before the site is written to, that it is to be sent."""
@@ -98,11 +105,18 @@ class WorkingCopy:
         return end.written is not None and end.written.id != before
 
     def set_aside(self) -> Path:
-        """Keep the folder, which another writer's work has overtaken, under another name; where it lies now."""
+        """Keep the folder, which another writer's work has overtaken, under another name; where it lies now.
+
+        Raises BusyError while another process writes it.
+        """
         moment = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         kept = self.folder.with_name(f"{self.folder.name}-kept-{moment}")
-        (self.folder / UNSENT).unlink(missing_ok=True)
-        os.rename(self.folder, kept)
+        lock = lock_folder(self.folder)
+        try:
+            (self.folder / UNSENT).unlink(missing_ok=True)
+            os.rename(self.folder, kept)
+        finally:
+            os.close(lock)
         return kept
 
     def _note(self, end: BucketEnd) -> None:
@@ -120,40 +134,50 @@ class StoreOrigin:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._end: BucketEnd | None = None
+        self._noted: tuple[int, int] = 0, 0
         self._files: Mapping[str, SiteFile] = {}
         self._sizes: Mapping[str, int] | None = None
-        self._opening = threading.Lock()
+        self._lock = threading.Lock()
 
     def fetch(self, path: str) -> bool:
         """Put the file of this path into the folder, checked; whether the store has one. Raises StoreError."""
-        end = self._opened()
+        end, files = self._opened()
         sha256 = tile_of(path)
-        file = SiteFile(path, self.tile_sizes().get(sha256, 0), sha256) if sha256 else self._files.get(path)
-        if file is None or (sha256 and not file.size):
+        try:
+            if sha256:
+                self._put(end, SiteFile(path, 0, sha256), end.tile(path))
+            elif path in files:
+                with end.opened(files[path]) as stream:
+                    self._put(end, files[path], stream)
+        except FileNotFoundError:
             return False
-        with end.opened(file) as stream:
-            try:
-                FolderEnd(self._folder).put(file, stream)
-            except FileNotFoundError:
-                return False
-            except DamagedError as error:
-                raise StoreError(f"{path} is damaged in the store, at {end.name}; restore it from a copy") from error
-        return True
+        return bool(sha256) or path in files
 
     def tile_sizes(self) -> Mapping[str, int]:
         """The bytes of each tile in the store, by its SHA-256."""
-        with self._opening:
+        self._opened()
+        with self._lock:
             if self._sizes is None:
                 self._sizes = _read_sizes(self._folder / TILE_SIZES)
             return self._sizes
 
-    def _opened(self) -> BucketEnd:
-        with self._opening:
+    def _put(self, end: BucketEnd, file: SiteFile, stream: BinaryIO) -> None:
+        try:
+            FolderEnd(self._folder).put(file, stream)
+        except DamagedError as error:
+            raise StoreError(f"{file.path} is damaged in the store, at {end.name}; restore it from a copy") from error
+
+    def _opened(self) -> tuple[BucketEnd, Mapping[str, SiteFile]]:
+        """The store, and the files that it has as of now: the working copy may have been brought up to date."""
+        about = (self._folder / ORIGIN).stat()
+        with self._lock:
             if self._end is None:
                 self._end = BucketEnd(open_objects(_address_of(self._folder)))
+            if self._noted != (about.st_mtime_ns, about.st_ino):
                 known = known_manifest(self._folder)
-                self._files = {} if known is None else known.files
-            return self._end
+                self._files, self._sizes = {} if known is None else known.files, None
+                self._noted = about.st_mtime_ns, about.st_ino
+            return self._end, self._files
 
 
 class _WorkingFolder(FolderEnd):
