@@ -12,8 +12,9 @@ from batch_flights import another, content
 
 from sorvolo.cli.main import main
 from sorvolo.cluster.batch import BatchSettings, run_batch
-from sorvolo.cluster.orders import FlightWish
-from sorvolo.cluster.ray_executor import _demand_fit, _demand_same, _probe_of, ray_executor
+from sorvolo.cluster.cost import Cost
+from sorvolo.cluster.orders import FlightWish, Order
+from sorvolo.cluster.ray_executor import _demand_fit, _demand_same, _probe_of, _why_not, ray_executor
 from sorvolo.cluster.table import LOCK, State
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.flight.settings import MapSettings
@@ -69,6 +70,12 @@ def test_a_machine_that_dies_loses_nothing(cluster: object, flown: Path, tmp_pat
         for _ in map_flights([tmp_path / "in" / name], wanted, MapSettings(model="none"), camera=flown / "camera.xml"):
             pass
         assert content(root / name) == content(wanted)
+    # what a machine lacks is no crash of a flight: it would end every one
+    order = Order(str(tmp_path / "elsewhere"), str(root / "x"), settings.wish)
+    with ray_executor("ray", None, 60.0, root) as executor:
+        executor.start(("map", "x"), order, Cost(1.0, 100.0))
+        with pytest.raises(StoreError, match=r"^the machine \S+ does not have .*elsewhere"):
+            executor.next_ended()
 
 
 @pytest.mark.parametrize(
@@ -100,6 +107,21 @@ def test_what_listens_but_is_no_cluster_is_named(tmp_path: Path, capsys: pytest.
         address = f"ray://127.0.0.1:{other.getsockname()[1]}"
         assert main(["batch", str(tmp_path / "1.mp4"), "--root", str(tmp_path / "maps"), "--executor", address]) == 1
     assert f"what listens at {address[6:]} is no Ray cluster" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (
+            RuntimeError("Version mismatch: The cluster was started with:\n    Ray: 2.59.0\n    Python: 3.11.7"),
+            "another version of Ray or Python than this machine (Ray 2.60",
+        ),
+        (ConnectionError("ray client connection timeout"), "a cluster with a token (set RAY_AUTH_MODE=token"),
+        (RuntimeError("Invalid authentication token"), "the cluster wants another token"),
+    ],
+)
+def test_what_ray_says_of_a_cluster_that_takes_no_batch_is_put_in_words(error: Exception, words: str) -> None:
+    assert words in _why_not("ray://10.0.0.1:10001", error)
 
 
 def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
