@@ -62,11 +62,11 @@ class PostgresServer:
         self.stop()
         shutil.rmtree(self.folder)
 
-    def sql(self, *statements: str) -> list[tuple[object, ...]]:
+    def sql(self, *statements: str, database: str = "postgres") -> list[tuple[object, ...]]:
         """Run statements, each in a transaction of its own; the rows of the last one."""
         import psycopg  # an extra, as the server is
 
-        with psycopg.connect(self.url, autocommit=True) as connection:
+        with psycopg.connect(self.url.replace("/postgres", f"/{database}"), autocommit=True) as connection:
             for each in statements:
                 cursor = connection.execute(each)
             return cursor.fetchall() if cursor.description else []

@@ -23,7 +23,6 @@ from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.site import schema
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.change_records import StoredChange, stored_changes
-from sorvolo.store.site.sqlite_database import SqliteDatabase
 from sorvolo.survey.findings import Change, ChangeKind, Verdict
 
 
@@ -376,7 +375,7 @@ def test_a_site_of_the_first_format_is_read_as_it_is_and_upgraded_to_be_written(
 
 def test_an_upgrade_that_fails_leaves_the_first_format(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     older_format(folder)
-    monkeypatch.setattr(SqliteDatabase, "set_format", "no function")  # the last step of the upgrade fails
+    monkeypatch.setattr(schema, "set_format", "no function")  # the last step of the upgrade fails
     with pytest.raises(TypeError), Archive.open(folder, write=True):
         pass
     connection = sqlite3.connect(folder / "site.db")

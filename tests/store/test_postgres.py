@@ -317,12 +317,6 @@ def migrate(connection: Connection) -> None:
     upgrade(connection, 0)
 
 
-def make_all(connection: Connection) -> None:
-    schema.metadata.create_all(connection)
-    if connection.dialect.name == "postgresql":
-        schema.postgres_metadata.create_all(connection)
-
-
 @pytest.mark.parametrize("place", ["sqlite", "postgresql"])
 def test_migrations_from_nothing_end_with_today_s_tables(
     place: str, tmp_path: Path, request: pytest.FixtureRequest
@@ -335,7 +329,7 @@ def test_migrations_from_nothing_end_with_today_s_tables(
         for each in names:
             server.sql(f"DROP SCHEMA IF EXISTS {each} CASCADE", f"CREATE SCHEMA {each}")
         urls = [str(parsed_url(server.url)) + f"?options=-csearch_path={each}" for each in names]
-    for url, make in zip(urls, (migrate, make_all)):
+    for url, make in zip(urls, (migrate, schema.make_tables)):
         engine = create_engine(url)
         with engine.begin() as connection:
             make(connection)

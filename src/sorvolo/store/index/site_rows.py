@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.catalogue import FlightEntry
+from sorvolo.store.site.catalogue import FlightEntry, StoredKeyframe
 from sorvolo.survey.flight import Site
 
 
@@ -29,18 +29,40 @@ class PlacedRows:
 
 
 @dataclass(frozen=True, eq=False)
+class FrameRows:
+    """Frames that were placed: outlines (N, 4, 2) in degrees, longitude first; times (N,) ns; whether kept (N,)."""
+
+    names: tuple[str, ...] = ()
+    outlines: Floats = field(default_factory=lambda: np.zeros((0, 4, 2)))
+    times_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    is_kept: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+
+    @property
+    def place(self) -> BaseGeometry | None:
+        """All that they show; None without frames."""
+        return shapely.union_all(shapely.make_valid(shapely.polygons(self.outlines))) if len(self.names) else None
+
+
+@dataclass(frozen=True, eq=False)
 class FlightRows:
-    """One complete flight; `state` changes when it enters the site again, `place` is all that it shows, if any."""
+    """One complete flight; `state` changes when it enters the site again."""
 
     flight: str
     state: str
     kind: str
-    first_ns: int
-    last_ns: int
-    place: BaseGeometry | None
-    frames: PlacedRows = field(default_factory=PlacedRows)
+    frames: FrameRows = field(default_factory=FrameRows)
     objects: PlacedRows = field(default_factory=PlacedRows)
     changes: PlacedRows = field(default_factory=PlacedRows)
+
+    @property
+    def first_ns(self) -> int:
+        """The time of the first frame, UTC; from 1970 on where no clock has a date, 0 without frames."""
+        return int(self.frames.times_ns.min()) if self.frames.names else 0
+
+    @property
+    def last_ns(self) -> int:
+        """The time of the last frame, as `first_ns`."""
+        return int(self.frames.times_ns.max()) if self.frames.names else 0
 
 
 @dataclass(frozen=True)
@@ -75,13 +97,9 @@ def flight_rows(archive: Archive, wanted: Collection[str]) -> Iterator[FlightRow
     for each in _complete(archive):
         if each.id not in wanted:
             continue
-        frames = _frames(archive, each.id, site)
-        times_ns = [int(row["time_ns"]) for row in frames.columns] or [0]
-        kind = "compare" if versions[each.id].id in compared else "map"
-        place = shapely.union_all(frames.places).simplify(0) if frames.places else None
         yield FlightRows(
-            each.id, _state_of(each), kind, min(times_ns), max(times_ns), place, frames,
-            _objects(archive, each.id, site), _changes(archive, each.id, site),
+            each.id, _state_of(each), "compare" if versions[each.id].id in compared else "map",
+            _frames(archive, each.id, site), _objects(archive, each.id, site), _changes(archive, each.id, site),
         )
 
 
@@ -93,36 +111,36 @@ def _state_of(flight: FlightEntry) -> str:
     return f"{flight.started_utc} {flight.finished_utc} {flight.fingerprint}"
 
 
-def _frames(archive: Archive, flight: str, site: Site) -> PlacedRows:
+def _frames(archive: Archive, flight: str, site: Site) -> FrameRows:
     """What the flight's frames show, by its frames.geojson; of the key frames alone where somebody took that away."""
     keyframes = archive.keyframes(flight)
     kept = {each.name for each in keyframes}
-    places, columns = [], []
-    for each in archive.frames(flight):
-        try:
-            place, values = shapely.Polygon(each["geometry"]["coordinates"][0]), each["properties"]
-            name, time_ns = str(values["frame"]), _nanoseconds(values["time"])
-            sigma_m = None if values.get("sigma_m") is None else float(values["sigma_m"])
-        except (TypeError, ValueError, KeyError, IndexError, shapely.errors.ShapelyError):
-            continue  # a frame that was not placed has no geometry
-        if _is_usable(place):
-            places.append(place)
-            columns.append({"name": name, "time_ns": time_ns, "is_kept": name in kept, "sigma_m": sigma_m})
-    if places:
-        return PlacedRows(places, columns)
-    for keyframe in keyframes:
-        try:
-            outline_m = apply_homography(keyframe.site_from_image, keyframe.camera.corners_px)
-        except GeometryError:
-            continue
-        place = _polygon(outline_m, site)
-        if _is_usable(place):
-            places.append(place)
-            columns.append({
-                "name": keyframe.name, "time_ns": keyframe.time_ns, "is_kept": True,
-                "sigma_m": _known(keyframe.sigma_m),
-            })
-    return PlacedRows(places, columns)
+    rows = [row for each in archive.frames(flight) if (row := _written(each, kept)) is not None]
+    rows = rows or [row for each in keyframes if (row := _shown(each, site)) is not None]
+    if not rows:
+        return FrameRows()
+    names, outlines, times_ns, is_kept = zip(*rows, strict=True)
+    return FrameRows(names, np.array(outlines), np.array(times_ns, np.int64), np.array(is_kept, np.bool_))
+
+
+_Row = tuple[str, Floats, int, bool]  # a frame's name, outline (4, 2) in degrees, time in ns, whether it was kept
+
+
+def _written(feature: Any, kept: Collection[str]) -> _Row | None:
+    """A frame as the file has it; None for one that was not placed, or that somebody broke."""
+    try:
+        outline = np.array(feature["geometry"]["coordinates"][0], np.float64)[:4, :2]
+        name, time_ns = str(feature["properties"]["frame"]), _nanoseconds(feature["properties"]["time"])
+    except (TypeError, ValueError, KeyError, IndexError):
+        return None
+    return (name, outline, time_ns, name in kept) if _is_usable(outline) else None
+
+
+def _shown(keyframe: StoredKeyframe, site: Site) -> _Row | None:
+    """A key frame as the catalogue has it."""
+    outline_m = apply_homography(keyframe.site_from_image, keyframe.camera.corners_px)
+    outline = np.column_stack(longitude_latitude(outline_m, site))
+    return (keyframe.name, outline, int(keyframe.time_ns), True) if _is_usable(outline) else None
 
 
 def _objects(archive: Archive, flight: str, site: Site) -> PlacedRows:
@@ -164,10 +182,9 @@ def _polygon(outline_m: Floats, site: Site) -> BaseGeometry:
     return shapely.Polygon(corners) if len(corners) > 2 else shapely.MultiPoint(corners).envelope.buffer(1e-8)
 
 
-def _is_usable(place: BaseGeometry) -> bool:
-    """Neither empty nor reaching to the horizon, as a frame that looks far ahead may."""
-    west, south, east, north = place.bounds if not place.is_empty else (np.nan,) * 4
-    return bool(east - west < 1 and north - south < 1 and place.is_valid)
+def _is_usable(outline: Floats) -> bool:
+    """Four corners, none of them as far away as the horizon, to which a frame that looks ahead may reach."""
+    return outline.shape == (4, 2) and bool(np.isfinite(outline).all() and (np.ptp(outline, axis=0) < 1).all())
 
 
 def _nanoseconds(text: str) -> int:

@@ -100,14 +100,15 @@ def _flight_items(
     common = {"sorvolo:site": name, "sorvolo:flight": rows.flight, "sorvolo:version": version.id}
     folder = f"flights/{rows.flight}/"
     is_dated = rows.first_ns >= _DAY_NS
-    if rows.place is not None:
+    place = rows.frames.place
+    if place is not None:
         yield StacItem(
-            f"{name}/{rows.flight}", name, rows.flight, rows.place,
+            f"{name}/{rows.flight}", name, rows.flight, place,
             rows.first_ns if is_dated else _moment_ns(version), rows.first_ns if is_dated else None,
             rows.last_ns if is_dated else None, version.created_utc, None,
             {
                 **common, "sorvolo:kind": "flight", "sorvolo:mission": rows.kind,
-                "sorvolo:frames": len(rows.frames.places),
+                "sorvolo:frames": len(rows.frames.names),
             },
             _assets(_FLIGHT_FILES, folder, address_of),
         )

@@ -173,7 +173,7 @@ class Catalogue:
 
             with self.changing() as connection:
                 upgrade(connection, version)
-                self._database.set_format(connection, SCHEMA_VERSION)
+                schema.set_format(connection, SCHEMA_VERSION)
 
 
 @contextmanager

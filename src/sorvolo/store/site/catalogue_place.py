@@ -13,8 +13,8 @@ from sorvolo.errors import SettingsError, StoreError
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.plain import json_bytes
 from sorvolo.store.nofollow import read_below
-from sorvolo.store.site.database import Database
-from sorvolo.store.site.sqlite_database import SqliteDatabase
+from sorvolo.store.site.database import Database, Layout
+from sorvolo.store.site.sqlite_database import CATALOGUE_LAYOUT, SqliteDatabase
 
 CATALOGUE = "site.db"
 POINTER = "site-catalogue.json"
@@ -58,20 +58,30 @@ def create_database(folder: Path) -> None:
 
 
 def choose_catalogue(folder: Path, words: str) -> None:
-    """Let this process, and those it starts, make new catalogues there: "sqlite" or a URL without a password.
+    """Let the catalogue of a new site lie there: "sqlite" or a URL without a password. Trusts it as `trust` does.
 
     Raises SettingsError for anything else, and for a site whose catalogue lies elsewhere.
+    """
+    url = parsed_url(words)
+    file = catalogue_file(folder)
+    if file is not None and file.name != (CATALOGUE if url is None else POINTER):
+        lies = "in its folder" if file.name == CATALOGUE else "in PostgreSQL"
+        raise SettingsError(f"the catalogue of {folder} lies {lies} already; --catalogue is for a new site")
+    trust(words)
+
+
+def trust(words: str) -> None:
+    """Let this process, and those it starts, connect there, and make new catalogues there; "" changes nothing.
+
+    Raises SettingsError for what is no address, and for one with a password.
     """
     url = parsed_url(words)
     if url is not None and url.password:
         raise SettingsError(
             "--catalogue: leave the password out, others can read a command; put it into ~/.pgpass or PGPASSWORD"
         )
-    file = catalogue_file(folder)
-    if file is not None and file.name != (CATALOGUE if url is None else POINTER):
-        lies = "in its folder" if file.name == CATALOGUE else "in PostgreSQL"
-        raise SettingsError(f"the catalogue of {folder} lies {lies} already; --catalogue is for a new site")
-    os.environ[VARIABLE] = " ".join([words, os.environ.get(VARIABLE, "")])
+    if words:
+        os.environ[VARIABLE] = " ".join([words, os.environ.get(VARIABLE, "")])
 
 
 def parsed_url(words: str) -> URL | None:
@@ -97,13 +107,13 @@ def trusted_urls() -> list[URL]:
     return [each for each in found if each is not None]
 
 
-def create_pointed(folder: Path, pointer: str, url: URL, name: str) -> None:
+def create_pointed(folder: Path, pointer: str, url: URL, name: str, layout: Layout = CATALOGUE_LAYOUT) -> None:
     """Make a schema of a new name, then the folder's pointer to it: a kill in between leaves an empty schema."""
     from sorvolo.store.site.postgres_database import PostgresDatabase, shown_url
 
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower())[:40].strip("_")
     schema = f"{plain}_{secrets.token_hex(6)}"
-    database = PostgresDatabase(url, schema, write=True)
+    database = PostgresDatabase(url, schema, write=True, layout=layout)
     try:
         database.create()
     finally:
@@ -111,12 +121,14 @@ def create_pointed(folder: Path, pointer: str, url: URL, name: str) -> None:
     atomic_write_bytes(folder / pointer, json_bytes({"url": shown_url(url), "schema": schema}))
 
 
-def pointed_database(folder: Path, pointer: str, *, write: bool) -> Database:
+def pointed_database(
+    folder: Path, pointer: str, *, write: bool, layout: Layout = CATALOGUE_LAYOUT
+) -> Database:
     """The database that a folder's pointer names. Raises StoreError for a broken pointer, or a server nobody trusts."""
     from sorvolo.store.site.postgres_database import PostgresDatabase
 
     url, schema = _read_pointer(folder, pointer)
-    return PostgresDatabase(_trusted(url, folder), schema, write=write)
+    return PostgresDatabase(_trusted(url, folder), schema, write=write, layout=layout)
 
 
 def _read_pointer(folder: Path, pointer: str) -> tuple[URL, str]:

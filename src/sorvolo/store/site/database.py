@@ -1,7 +1,9 @@
 """Database: what a catalogue asks of the database that it lies in; the faults that both kinds share."""
 
 import itertools
+from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from typing import Protocol
 
 from sqlalchemy import Connection
@@ -10,6 +12,20 @@ from sorvolo.errors import StoreError
 
 numbers = itertools.count()
 """One for each catalogue opened, so that no two have a change mark in common."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a database of ours holds: its mark in a file's header, how its tables are made in a transaction.
+
+    `beside` is a schema of PostgreSQL's in which types are looked for as well; "" for none. `page_bytes` is the size
+    of a file's pages: larger ones for larger rows.
+    """
+
+    application_id: int
+    make: Callable[[Connection], None]
+    beside: str = ""
+    page_bytes: int = 4096
 
 
 class ConnectionLostError(StoreError):
@@ -28,9 +44,6 @@ class Database(Protocol):
 
     def check(self) -> None:
         """Raise StoreError where this is no catalogue, or a damaged one; for a writer, take the right to write."""
-
-    def set_format(self, connection: Connection, number: int) -> None:
-        """Note the format that the tables have now, inside the caller's transaction."""
 
     def reading(self) -> AbstractContextManager[Connection]:
         """A transaction that sees one state of the catalogue. Raises StoreError for faults of the database."""

@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, func, insert, select, text, update
+from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, func, select, text, update
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.pool import QueuePool
 
 from sorvolo.errors import StoreError
 from sorvolo.store.site import schema
-from sorvolo.store.site.database import ConnectionLostError, damaged, numbers
+from sorvolo.store.site.database import ConnectionLostError, Layout, damaged, numbers
+from sorvolo.store.site.sqlite_database import CATALOGUE_LAYOUT
 
 OLDEST_SERVER = 15
 _PATIENCE_S = 20.0
@@ -37,11 +38,11 @@ class PostgresDatabase:
     meanwhile. Readers' transactions see one state, and cannot write. Threads may share it.
     """
 
-    def __init__(self, url: URL, name: str, *, write: bool) -> None:
+    def __init__(self, url: URL, name: str, *, write: bool, layout: Layout = CATALOGUE_LAYOUT) -> None:
         """`url` may have a password; `name` is the schema's, checked: letters, digits and underscores."""
-        self._url, self._name, self._write = url, name, write
-        self._readers = _open_engine(url, name, write=False)
-        self._writers = _open_engine(url, name, write=True)
+        self._url, self._name, self._write, self._layout = url, name, write, layout
+        self._readers = _open_engine(url, name, layout.beside, write=False)
+        self._writers = _open_engine(url, name, layout.beside, write=True)
         self._writer: Connection | None = None
         self._writes = -1  # how many transactions had written when this writer last looked
         self._mutex = threading.RLock()
@@ -57,12 +58,7 @@ class PostgresDatabase:
         with self._naming_faults(), self._writers.begin() as connection:
             self._check_server(connection)
             connection.execute(text(f"CREATE SCHEMA {self._name}"))
-            schema.metadata.create_all(connection)
-            schema.postgres_metadata.create_all(connection)
-            connection.execute(insert(schema.numbers), [
-                {"name": name, "last": 0} for name in (*schema.NUMBERED, schema.WRITES)
-            ])
-            self.set_format(connection, schema.SCHEMA_VERSION)
+            self._layout.make(connection)
 
     def check(self) -> None:
         """Raise StoreError where server or schema is none of ours; a writer takes the lock, or StoreError."""
@@ -71,18 +67,12 @@ class PostgresDatabase:
             known = text("SELECT 1 FROM pg_namespace WHERE nspname = :name")
             if connection.execute(known, {"name": self._name}).first() is None:
                 raise StoreError(
-                    f"{shown_url(self._url)} has no schema {self._name}, which holds this site's catalogue; restore it "
+                    f"{shown_url(self._url)} has no schema {self._name}, which this folder points to; restore it "
                     "there, or name the right database in SORVOLO_CATALOGUE. Nothing was changed"
                 )
         if self._write:
             with self._mutex, self._naming_faults():
                 self._ready_writer()
-
-    def set_format(self, connection: Connection, number: int) -> None:
-        """Note the format in Alembic's own table."""
-        from sorvolo.store.site.migrations.upgrade import stamp  # only where tables are made: Alembic loads slowly
-
-        stamp(connection, number)
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
@@ -231,11 +221,12 @@ def shown_url(url: URL) -> str:
     return f"postgresql://{host}{port}/{url.database or ''}"
 
 
-def _open_engine(url: URL, name: str, *, write: bool) -> Engine:
+def _open_engine(url: URL, name: str, beside: str, *, write: bool) -> Engine:
     own: dict[str, Any] = {key: value for key, value in _WAITS.items() if key not in url.query}
     mode = "off" if write else "on"
+    path = f"{name},{beside}" if beside else name
     asked = url.query.get("options", "")
-    own["options"] = f"{asked} -csearch_path={name} -cdefault_transaction_read_only={mode}".strip()
+    own["options"] = f"{asked} -csearch_path={path} -cdefault_transaction_read_only={mode}".strip()
     own.setdefault("application_name", "sorvolo")
     pool: dict[str, Any] = {"poolclass": NullPool} if write else {"poolclass": QueuePool, "pool_pre_ping": True}
     try:

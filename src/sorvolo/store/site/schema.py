@@ -1,5 +1,7 @@
 """The tables of the catalogue, the same in SQLite and in PostgreSQL, and the formats that are read."""
 
+from collections.abc import Sequence
+
 from sqlalchemy import (
     JSON,
     BigInteger,
@@ -13,6 +15,7 @@ from sqlalchemy import (
     LargeBinary,
     MetaData,
     Table,
+    insert,
 )
 from sqlalchemy import String as AnyString
 
@@ -157,6 +160,30 @@ numbers = Table(
 )
 NUMBERED = ("runs", "versions")
 WRITES = "writes"
+
+
+def make_tables(connection: Connection) -> None:
+    """The tables of the newest format, inside the caller's transaction."""
+    metadata.create_all(connection)
+    if connection.dialect.name != "sqlite":
+        make_numbers(connection, NUMBERED)
+    set_format(connection, SCHEMA_VERSION)
+
+
+def make_numbers(connection: Connection, names: Sequence[str]) -> None:
+    """The table that PostgreSQL needs beside: these numbers, and the count of writes."""
+    numbers.create(connection)
+    connection.execute(insert(numbers), [{"name": name, "last": 0} for name in (*names, WRITES)])
+
+
+def set_format(connection: Connection, number: int) -> None:
+    """Note the format in SQLite's header or in Alembic's own table, inside the caller's transaction."""
+    if connection.dialect.name == "sqlite":
+        connection.exec_driver_sql(f"PRAGMA user_version = {number:d}")
+        return
+    from sorvolo.store.site.migrations.upgrade import stamp  # only where tables are made: Alembic loads slowly
+
+    stamp(connection, number)
 
 
 def format_of(connection: Connection) -> int:

@@ -14,16 +14,16 @@ from sqlalchemy.pool import PoolProxiedConnection, QueuePool
 from sorvolo.errors import StoreError
 from sorvolo.store.atomic import atomic_path
 from sorvolo.store.site import schema
-from sorvolo.store.site.database import damaged, numbers
+from sorvolo.store.site.database import Layout, damaged, numbers
 
-APPLICATION_ID = 0x536F7256  # "SorV", in the file's header
+CATALOGUE_LAYOUT = Layout(0x536F7256, schema.make_tables)  # "SorV"
 
 
 class SqliteDatabase:
     """The file; a reader's connections cannot write. Threads may share it."""
 
-    def __init__(self, path: Path, *, write: bool) -> None:
-        self._path, self._write = path, write
+    def __init__(self, path: Path, *, write: bool, layout: Layout = CATALOGUE_LAYOUT) -> None:
+        self._path, self._write, self._layout = path, write, layout
         self._made: Engine | None = None
         self._number = next(numbers)
         self._watching: PoolProxiedConnection | None = None
@@ -44,22 +44,18 @@ class SqliteDatabase:
         """Put an empty catalogue into its place, whole from its first moment."""
         try:
             with atomic_path(self._path) as temporary:
-                _create_tables(temporary)
+                _create_tables(temporary, self._layout)
         except (sqlite3.Error, DBAPIError) as error:
             raise _fault(self._path, error) from error
 
     def check(self) -> None:
         """Raise StoreError where the file is no catalogue; to write, also where it is damaged."""
         with self.reading() as connection:
-            if connection.exec_driver_sql("PRAGMA application_id").scalar_one() != APPLICATION_ID:
+            if connection.exec_driver_sql("PRAGMA application_id").scalar_one() != self._layout.application_id:
                 raise StoreError(f"{self._path} is not a Sorvolo catalogue; choose another site folder")
             fault = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one() if self._write else "ok"
             if fault != "ok":
                 raise damaged(self.place, fault)
-
-    def set_format(self, connection: Connection, number: int) -> None:
-        """Note the format in the file's header."""
-        connection.exec_driver_sql(f"PRAGMA user_version = {number:d}")
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
@@ -110,14 +106,15 @@ class SqliteDatabase:
             self._made.dispose()
 
 
-def _create_tables(path: Path) -> None:
+def _create_tables(path: Path, layout: Layout) -> None:
     connection = sqlite3.connect(path)
+    connection.execute(f"PRAGMA page_size = {layout.page_bytes:d}")
     connection.execute("PRAGMA journal_mode = WAL")
-    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-    connection.execute(f"PRAGMA user_version = {schema.SCHEMA_VERSION}")
+    connection.execute(f"PRAGMA application_id = {layout.application_id}")
     connection.close()
     engine = _open_engine(path, write=True)
-    schema.metadata.create_all(engine)
+    with engine.begin() as made:
+        layout.make(made)
     engine.dispose()
 
 

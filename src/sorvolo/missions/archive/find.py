@@ -1,0 +1,54 @@
+"""The memory of a place over a whole archive: which flights of which sites saw it, and what they found there."""
+
+from datetime import UTC, date, datetime, time
+from pathlib import Path
+
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.store.index.archive_index import ArchiveIndex
+from sorvolo.store.index.finding import EARLIEST_NS, LATEST_NS, FoundFlight, Place
+
+_MICROSECOND_NS = 1000
+
+
+def find_place(
+    root: Path, at: str, *, first: str = "", last: str = "", classes: tuple[str, ...] = (), within_m: float = 2.0
+) -> list[FoundFlight]:
+    """The flights that saw the place `at`, "LATITUDE, LONGITUDE", in order of time, by the archive's index.
+
+    `first` and `last` are dates or times (ISO 8601, UTC unless they name a zone), a date meaning its whole day; "" is
+    no bound. With `classes` only flights that found one of them within `within_m`. Raises SettingsError for what
+    cannot be asked, StoreError where there is no index.
+    """
+    if not root.is_dir():
+        raise InputError(f"{root}: no folder; give the one that the site folders lie in")
+    latitude_deg, longitude_deg = _degrees(at)
+    place = Place(
+        latitude_deg, longitude_deg, within_m,
+        _nanoseconds(first, time.min) if first else EARLIEST_NS, _nanoseconds(last, time.max) if last else LATEST_NS,
+        frozenset(classes),
+    )
+    with ArchiveIndex.open(root, write=False) as index:
+        return index.find(place)
+
+
+def _degrees(text: str) -> tuple[float, float]:
+    try:
+        latitude_deg, longitude_deg = (float(each) for each in text.split(","))
+    except ValueError as error:
+        raise SettingsError(f"--at {text!r}: give latitude and longitude in degrees, such as 46.5,13.25") from error
+    return latitude_deg, longitude_deg
+
+
+def _nanoseconds(text: str, of_day: time) -> int:
+    """A moment, ns since 1970; a date stands for its first or last one."""
+    try:
+        moment = datetime.combine(date.fromisoformat(text), of_day, UTC)
+    except ValueError:
+        try:
+            moment = datetime.fromisoformat(text)
+        except ValueError as error:
+            raise SettingsError(f"{text!r} is no date; give 2026-05-31, or 2026-05-31T12:00") from error
+    moment = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
+    nanoseconds = ((since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds) * _MICROSECOND_NS
+    return min(max(nanoseconds, EARLIEST_NS), LATEST_NS)

@@ -1,0 +1,98 @@
+"""The archive index brought up to date: only sites and flights that changed since are read."""
+
+import os
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from sorvolo.errors import InputError, StoreError
+from sorvolo.store.index.archive_index import ArchiveIndex, IndexedSite
+from sorvolo.store.index.site_rows import flight_rows, site_state
+from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue_place import is_site
+
+
+@dataclass(frozen=True)
+class IndexUpdate:
+    """One site after it was looked at: what came and went, or why it could not be read (what is known of it stays)."""
+
+    site: str
+    sites_done: int
+    sites: int
+    added: int = 0
+    removed: int = 0
+    fault: str = ""
+
+
+@dataclass
+class IndexOutcome:
+    """What an index holds after an update. `faults` are sites that could not be read, and why."""
+
+    sites: int = 0
+    changed: int = 0
+    added: int = 0
+    removed: int = 0
+    gone: list[str] = field(default_factory=list)
+    faults: dict[str, str] = field(default_factory=dict)
+    holds: dict[str, int] = field(default_factory=dict)
+
+
+def index_archive(root: Path, address: str = "") -> Generator[IndexUpdate, None, IndexOutcome]:
+    """Bring the index of all sites below a folder up to date, yielding each site; a killed update goes on again.
+
+    A new index lies at `address`, a PostgreSQL URL, else in the folder. A flight mapped again replaces itself. Raises
+    InputError for no folder, StoreError or SettingsError where the index cannot be written.
+    """
+    if not root.is_dir():
+        raise InputError(f"{root}: no folder; give the one that the site folders lie in")
+    outcome = IndexOutcome()
+    with ArchiveIndex.open(root, write=True, address=address) as index:
+        known = index.sites()
+        paths = sorted(sites_below(root))
+        outcome.sites = len(paths)
+        for done, path in enumerate(paths, start=1):
+            update = _update_site(root, path, index, known.get(path), done, len(paths))
+            _count(outcome, update)
+            yield update
+        outcome.gone = sorted(known.keys() - set(paths))
+        index.drop_sites(outcome.gone)
+        if outcome.changed or outcome.gone:
+            index.tidy()
+        outcome.holds = index.counts()
+    return outcome
+
+
+def sites_below(root: Path) -> Iterator[str]:
+    """The folders of sites, as paths below the root with slashes; "." where the root is one. Links are not followed."""
+    for folder, folders, _ in os.walk(root):
+        path = Path(folder)
+        if is_site(path):
+            folders.clear()
+            yield path.relative_to(root).as_posix()
+        folders[:] = [each for each in folders if not each.startswith(".")]
+
+
+def _update_site(
+    root: Path, path: str, index: ArchiveIndex, known: IndexedSite | None, done: int, count: int
+) -> IndexUpdate:
+    before = known.flights if known is not None else {}
+    try:
+        with Archive.open(root / path, write=False) as archive:
+            state = site_state(archive)
+            if known is not None and known.state == state.state:
+                return IndexUpdate(path, done, count)
+            new = {flight for flight, each in state.flights.items() if before.get(flight) != each}
+            rows = list(flight_rows(archive, new))
+    except StoreError as error:
+        return IndexUpdate(path, done, count, fault=str(error))
+    gone = before.keys() & new | before.keys() - state.flights.keys()
+    index.put_site(path, state, gone, rows)
+    return IndexUpdate(path, done, count, len(new), len(gone - new))
+
+
+def _count(outcome: IndexOutcome, update: IndexUpdate) -> None:
+    outcome.added += update.added
+    outcome.removed += update.removed
+    outcome.changed += bool(update.added or update.removed)
+    if update.fault:
+        outcome.faults[update.site] = update.fault

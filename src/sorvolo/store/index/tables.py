@@ -1,0 +1,149 @@
+"""The tables of the archive index, with places as geometries: R-trees in SQLite, PostGIS in PostgreSQL."""
+
+from typing import Any
+
+from sqlalchemy import (
+    Boolean,
+    Column,
+    ColumnElement,
+    Connection,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    Table,
+    func,
+    text,
+)
+from sqlalchemy.types import UserDefinedType
+
+from sorvolo.errors import StoreError
+from sorvolo.store.site.database import Layout
+from sorvolo.store.site.schema import Nanoseconds, String, make_numbers, numbers
+
+FORMAT = 1
+"""Another format is made anew: everything in the index comes from the sites."""
+
+_APPLICATION_ID = 0x536F7249  # "SorI"
+_WGS84 = 4326
+
+
+class _PostgisGeometry(UserDefinedType[bytes]):
+    """A geometry of PostGIS, as well-known binary on our side."""
+
+    cache_ok = True
+
+    def get_col_spec(self, **_: Any) -> str:
+        return f"geometry(Geometry,{_WGS84})"
+
+    def bind_expression(self, bindvalue: Any) -> ColumnElement[bytes]:
+        return func.ST_GeomFromWKB(bindvalue, _WGS84, type_=self)
+
+    def column_expression(self, colexpr: Any) -> ColumnElement[bytes]:
+        return func.ST_AsBinary(colexpr, type_=LargeBinary)
+
+
+Geometry = LargeBinary().with_variant(_PostgisGeometry(), "postgresql")
+"""Degrees of WGS84, longitude first, as well-known binary; longitudes run on beyond 180 near the antimeridian."""
+
+metadata = MetaData()
+sites = Table(
+    "sites", metadata,
+    Column("id", Integer, primary_key=True, autoincrement=False),
+    Column("path", String, nullable=False, unique=True),  # of its folder, below the archive's
+    Column("name", String, nullable=False),
+    Column("is_local", Boolean, nullable=False),  # without a place on Earth: it has no flights here
+    Column("state", String, nullable=False),  # a hash of what the site held when it was read
+)
+flights = Table(
+    "flights", metadata,
+    Column("id", Integer, primary_key=True, autoincrement=False),
+    Column("site_id", ForeignKey("sites.id", ondelete="CASCADE"), nullable=False),
+    Column("flight", String, nullable=False),
+    Column("state", String, nullable=False),  # which run of it was read
+    Column("kind", String, nullable=False),  # map | compare
+    Column("first_ns", Nanoseconds, nullable=False),  # UTC; from 1970 on where no clock has a date
+    Column("last_ns", Nanoseconds, nullable=False),
+    Column("frames", Integer, nullable=False),  # that were placed; one row each would be slow to ask
+    Column("frame_names", String, nullable=False),  # a line each, in the order of their outlines, as below
+    Column("frame_times", LargeBinary, nullable=False),  # ns as little-endian integers of 64 bits
+    Column("frame_kept", LargeBinary, nullable=False),  # a byte each: 1 where the site has its picture
+    Column("outlines", Geometry, nullable=False),  # a collection of what each shows, polygons of four corners
+    Column("place", Geometry),  # all that they show; NULL without any
+)
+objects = Table(
+    "objects", metadata,
+    Column("id", Integer, primary_key=True, autoincrement=False),
+    Column("flight_id", ForeignKey("flights.id", ondelete="CASCADE"), nullable=False),
+    Column("object_id", String, nullable=False),
+    Column("label", String, nullable=False),
+    Column("score", Float, nullable=False),
+    Column("first_ns", Nanoseconds, nullable=False),
+    Column("last_ns", Nanoseconds, nullable=False),
+    Column("sigma_m", Float),  # NULL where unknown
+    Column("place", Geometry, nullable=False),
+)
+changes = Table(
+    "changes", metadata,
+    Column("id", Integer, primary_key=True, autoincrement=False),
+    Column("flight_id", ForeignKey("flights.id", ondelete="CASCADE"), nullable=False),
+    Column("change_id", String, nullable=False),
+    Column("kind", String, nullable=False),
+    Column("label", String, nullable=False),  # what it is; its kind where that is not known
+    Column("score", Float, nullable=False),
+    Column("first_ns", Nanoseconds, nullable=False),
+    Column("last_ns", Nanoseconds, nullable=False),
+    Column("verdict", String, nullable=False),  # "": nobody reviewed it
+    Column("place", Geometry, nullable=False),
+)
+PLACED = (flights, objects, changes)
+"""The tables with a place; in SQLite each has an R-tree `<name>_places` with the boxes of its rows."""
+
+Index("flights_by_site", flights.c.site_id)
+for _table in (objects, changes):
+    Index(f"{_table.name}_by_flight", _table.c.flight_id)
+
+
+def make_index(connection: Connection) -> None:
+    """The empty tables, inside the caller's transaction. Raises StoreError for a PostgreSQL without PostGIS."""
+    if connection.dialect.name != "sqlite":
+        _demand_postgis(connection)
+        make_numbers(connection, ["format"])
+        connection.execute(numbers.update().where(numbers.c.name == "format").values(last=FORMAT))
+    metadata.create_all(connection)
+    if connection.dialect.name != "sqlite":  # as they are: unpacking them would take longer than to read them
+        connection.execute(text("ALTER TABLE flights ALTER COLUMN outlines SET STORAGE EXTERNAL"))
+    for table in PLACED:
+        if connection.dialect.name != "sqlite":
+            connection.execute(text(f"CREATE INDEX {table.name}_by_place ON {table.name} USING gist (place)"))
+            continue
+        connection.execute(
+            text(f"CREATE VIRTUAL TABLE {table.name}_places USING rtree(id, west, east, south, north)")
+        )
+    if connection.dialect.name == "sqlite":
+        connection.exec_driver_sql(f"PRAGMA user_version = {FORMAT:d}")
+
+
+def index_format(connection: Connection) -> int:
+    """The format of an index."""
+    if connection.dialect.name == "sqlite":
+        return int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
+    return int(connection.execute(numbers.select().where(numbers.c.name == "format")).one().last)
+
+
+LAYOUT = Layout(_APPLICATION_ID, make_index, beside="public", page_bytes=16_384)
+
+
+def _demand_postgis(connection: Connection) -> None:
+    place = connection.execute(text(
+        "SELECT nspname FROM pg_extension JOIN pg_namespace ON pg_namespace.oid = extnamespace "
+        "WHERE extname = 'postgis'"
+    )).scalar()
+    if place != "public":
+        found = "no PostGIS" if place is None else f"PostGIS in the schema {place}"
+        raise StoreError(
+            f"the database has {found}; the archive index needs it in the schema public: install it (Debian: "
+            "postgresql-15-postgis-3) and have an administrator run CREATE EXTENSION postgis SCHEMA public there"
+        )
