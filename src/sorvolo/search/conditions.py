@@ -27,6 +27,8 @@ class LookSettings:
     plants: float = 0.6  # ... in this share of what is around
     rough: float = 0.2  # rms of lightness over its mean within 1.25 m: crowns are rough, lawns are not
     crown_m: float = 1.5  # over which a crown must be so
+    gap_m: float = 6.0  # a gap among crowns that is no wider is forest: smooth or dark crowns, and their shade ...
+    stand_m: float = 2.5  # ... where the crowns themselves are so wide: shrubs on a lawn and rims of things are none
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +104,18 @@ def look_at(
     is_rough = cv2.blur(texture, (wide, wide)) > settings.rough
     return FrameLook(
         camera, site_from_camera, blur_px, camera.width_px / size[0], lightness, texture,
-        np.asarray(is_plant & is_rough, bool),
+        _closed(is_plant & is_rough, settings, max(m_per_px, look_m)),
     )
+
+
+def _closed(crowns: Mask, settings: LookSettings, m_per_px: float) -> Mask:
+    """The crowns (H, W) with the narrow gaps between them, where they are those of a stand of trees."""
+    gap_px, stand_px = (max(3, round(each / m_per_px)) for each in (settings.gap_m, settings.stand_m))
+    gap, stand = (cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (each, each)) for each in (gap_px, stand_px))
+    # beyond the picture the forest may go on: what lies at its edge is judged by what the picture shows
+    wide = cv2.copyMakeBorder(crowns.astype(np.uint8), gap_px, gap_px, gap_px, gap_px, cv2.BORDER_REFLECT)
+    closed = cv2.morphologyEx(cv2.morphologyEx(wide, cv2.MORPH_OPEN, stand), cv2.MORPH_CLOSE, gap)
+    return np.asarray(crowns | (closed[gap_px:-gap_px, gap_px:-gap_px] > 0), bool)
 
 
 def gather(looks: Sequence[FrameLook], places_m: PointsM | Sequence[Floats], reach_m: float) -> Conditions:
