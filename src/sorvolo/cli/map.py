@@ -152,9 +152,8 @@ def map_command(
 ) -> None:
     """Make a geo-referenced map of one or more flights, or extend the map in the site folder.
 
-    A live source is an address (rtsp://, rtmp://, udp://, tcp://), webcam:0, or follow:PATH for a video or a folder of
-    photos that is still being written. Ctrl-C ends a live flight and finishes its map; a second Ctrl-C discards it.
-    After a crash or a power cut, give the same command again: it goes on where it was (not with --method thesis).
+    Live sources: rtsp://, rtmp://, udp://, tcp://, webcam:0, follow:PATH (a video or folder that is being written). Ctrl-C
+    finishes a live flight's map, a second one discards it. After a crash, the same command goes on where it was.
 
     Example: sorvolo map DJI_0042.MP4 --site field
 
