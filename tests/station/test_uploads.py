@@ -24,7 +24,7 @@ from sorvolo.station.app import station_app
 from sorvolo.station.check_upload import Refusal, look
 from sorvolo.station.problems import Problem
 from sorvolo.station.runs import Run
-from sorvolo.station.settings import StationSettings
+from sorvolo.station.settings import StationLimits, StationSettings
 from sorvolo.station.uploads import Child
 
 HEADERS = {"Tus-Resumable": "1.0.0"}
@@ -145,6 +145,17 @@ def test_what_tus_can_do_and_what_is_not_taken(client: TestClient) -> None:
                         ).status_code == 415
     assert client.head("/api/uploads/../../x").status_code in (404, 405)
     assert client.get("/api/uploads/" + "0" * 24).status_code == 404
+
+
+def test_so_many_uploads_are_kept_and_no_more(root: Path) -> None:
+    """As many as the station's limits state; deleting one makes room."""
+    settings = StationSettings(root, limits=StationLimits(most_uploads=1))
+    with TestClient(station_app(settings), base_url="http://127.0.0.1:8750") as client:
+        address = begin(client, "a.srt", 5).headers["location"]
+        answer = begin(client, "b.srt", 5)
+        assert answer.status_code == 409 and "1 uploads" in answer.json()["detail"]
+        client.delete(address)
+        assert begin(client, "b.srt", 5).status_code == 201
 
 
 def test_the_floor_of_free_space_holds(root: Path) -> None:

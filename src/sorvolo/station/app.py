@@ -73,10 +73,12 @@ class Station:
     def open(cls, settings: StationSettings) -> "Station":
         """Open the station's own files. Raises StoreError where they cannot be used."""
         state, shelf = StationState.open(settings.state_folder), SiteShelf(settings.root)
-        events, tiles = EventLog(state), WebTiles(shelf)
+        events, tiles = EventLog(state, settings.limits.most_events), WebTiles(shelf)
         uploads = Uploads(settings, events)
         reviews = Reviews(state, shelf, events)
-        limits = IngestLimits(free_bytes=round(settings.free_floor_gb * 1e9))
+        limits = IngestLimits(
+            streams=settings.limits.most_streams, free_bytes=round(settings.free_floor_gb * 1e9)
+        )
         ingest = Ingest(settings.root / STREAMS_FOLDER, limits, announcing(events))
         inputs = Inputs(settings, uploads, ingest.newest)
         return cls(

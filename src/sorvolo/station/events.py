@@ -13,7 +13,6 @@ from typing import Any
 from sorvolo.station.state import StationState, compact_json, utc_now
 
 _IN_MEMORY = 4000
-_MOST_KEPT = 200_000
 _AT_ONCE = 500
 LOST = "events.lost"
 """What a page gets that asks for events that are no longer kept: it has to load the site anew."""
@@ -32,8 +31,8 @@ class NewEvent:
 class EventLog:
     """All events of a station. `append` adds some, each with the next number; threads may share it."""
 
-    def __init__(self, state: StationState) -> None:
-        self._state = state
+    def __init__(self, state: StationState, most_kept: int = 200_000) -> None:
+        self._state, self._most_kept = state, most_kept
         self._lock = threading.Lock()
         rows = state.rows("SELECT * FROM events ORDER BY seq DESC LIMIT ?", (_IN_MEMORY,))
         self._recent: deque[dict[str, Any]] = deque((_event(row) for row in reversed(rows)), maxlen=_IN_MEMORY)
@@ -70,7 +69,7 @@ class EventLog:
                     })
                 yield connection
                 if made and made[-1]["seq"] % 1000 < len(made):
-                    connection.execute("DELETE FROM events WHERE seq <= ?", (made[-1]["seq"] - _MOST_KEPT,))
+                    connection.execute("DELETE FROM events WHERE seq <= ?", (made[-1]["seq"] - self._most_kept,))
             self._recent.extend(made)
             self._last = made[-1]["seq"] if made else self._last
             waiting = list(self._waiting)

@@ -21,11 +21,17 @@ class StationLimits:
     most_connections: int = 1000  # of all clients; a browser opens six and a few live ones
     most_live_per_address: int = 64  # event and video channels: a crew behind one router is one address
     most_missions: int = 4
+    most_streams: int = 16  # of drones that send at the same time
+    most_uploads: int = 1000  # that are kept
+    most_events: int = 200_000  # that are kept: who asks for older ones loads the site anew
     stop_within_s: float = 30.0  # a mission that was stopped is killed then
     finish_within_s: float = 3600.0  # a live flight that was stopped is finished first
 
     def __post_init__(self) -> None:
-        counts = (self.most_connections, self.most_live_per_address, self.most_missions)
+        counts = (
+            self.most_connections, self.most_live_per_address, self.most_missions, self.most_streams,
+            self.most_uploads, self.most_events,
+        )
         if min(counts) < 1 or min(self.stop_within_s, self.finish_within_s) <= 0:
             raise SettingsError("limits of a station are counts from 1 and seconds above 0")
 

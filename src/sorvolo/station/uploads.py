@@ -32,7 +32,6 @@ TEXT_ENDINGS = (".srt", ".csv", ".gpx", ".txt", ".nmea", ".log", ".xml", ".yaml"
 
 _ARCHIVE_ENDINGS = (".zip",)
 _MOST_TEXT_BYTES = 256_000_000
-_MOST_UPLOADS = 1000
 _PART, _INFO, _FILES = "part", "info.json", "files"
 _CHECK_WITHIN_S = 1800.0
 _LOOK_EVERY_BYTES = 64_000_000  # written between two looks at the free space
@@ -96,8 +95,9 @@ class Uploads:
         if not 0 < length <= self.most_bytes or (made.kind == "text" and length > _MOST_TEXT_BYTES):
             raise Problem(413, f"{length} bytes: 1 to {self.most_bytes} are taken, of text {_MOST_TEXT_BYTES}")
         self.demand_room(length)
-        if len(self.all()) >= _MOST_UPLOADS:
-            raise Problem(409, f"there are {_MOST_UPLOADS} uploads already; delete those that are not needed any more")
+        most = self._settings.limits.most_uploads
+        if len(self.all()) >= most:
+            raise Problem(409, f"there are {most} uploads already; delete those that are not needed any more")
         folder = self._folder / made.id
         with writing(folder):
             folder.mkdir(parents=True)
