@@ -90,7 +90,7 @@ def write_map(path: Path, place: Path, m_per_px: float, shift_m: float, seed: in
         rgb = source.read([1, 2, 3], out_shape=(3, height, width), resampling=rasterio.enums.Resampling.average)
         transform = Affine(m_per_px, 0, source.transform.c + shift_m, 0, -m_per_px, source.transform.f)
         if seed is not None:
-            height, width = min(height, 150), min(width, 150)  # large enough to be searched at every scale that fits
+            height, width = min(height, 80), min(width, 80)  # large enough to be searched at several scales
             rgb = np.random.default_rng(seed).integers(0, 255, (3, height, width), np.uint8)
         profile = {"driver": "GTiff", "count": 3, "dtype": "uint8", "width": width, "height": height}
         with rasterio.open(path, "w", crs=source.crs, transform=transform, **profile) as sink:

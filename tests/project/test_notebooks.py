@@ -41,5 +41,5 @@ def test_notebook_runs(
         assert len(variables["changes"]) > 0  # type: ignore[arg-type]
         assert (Path(str(variables["folder"])) / "changes.png").stat().st_size > 10_000
     else:
-        assert "24 pictures" not in printed and "16 pictures" in printed and "model.onnx" in printed
+        assert "12 pictures" not in printed and "8 pictures" in printed and "model.onnx" in printed
         assert "objects on an empty picture" in printed
