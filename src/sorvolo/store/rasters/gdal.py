@@ -14,7 +14,7 @@ from sorvolo.errors import InputError, SettingsError
 # a small cache keeps memory flat; no directory listing keeps GDAL from opening neighbours of a user's file; a curl name
 # that nothing has keeps /vsicurl/ and its kin from fetching anything
 _ENVIRONMENT = {
-    "GDAL_CACHEMAX": 128, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO",
+    "GDAL_CACHEMAX": 64, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO",
     "CPL_VSIL_CURL_ALLOWED_FILENAME": "/none", "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": ".none",
     "GDAL_HTTP_MAX_RETRY": 0, "GDAL_HTTP_CONNECTTIMEOUT": 1,
 }
