@@ -53,13 +53,17 @@ def main() -> None:
     parser.add_argument("--size", default="640x360")
     parser.add_argument("--output", type=Path, default=RESULTS)
     parser.add_argument("--child", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--make", help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.make:
+        make_stream(Path(options.make), options.size, options.seconds + FIRST_S)
+        return
     if options.child:
         watch_one(*options.child, options.rate)
         return
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as scratch:
-        stream = transport_stream(Path(scratch), options.size, options.seconds + FIRST_S)
+        stream = transport_stream(Path(scratch), options)
         for count in options.streams:
             rows.append(watched(stream, count, Path(scratch) / f"of{count}", options))
             keeping = [row["streams"] for row in rows if row["share"] >= KEEPS_UP]
@@ -72,8 +76,15 @@ def main() -> None:
     show(rows)
 
 
-def transport_stream(folder: Path, size: str, seconds: float) -> bytes:
-    """A simulated flight as MPEG-TS with a key frame each second, as a drone sends it."""
+def transport_stream(folder: Path, options: Any) -> bytes:
+    """A flight's stream, simulated by a process of its own: a child's peak memory counts what its parent had."""
+    command = [sys.executable, __file__, "--size", options.size, "--seconds", str(options.seconds)]
+    subprocess.run([*command, "--make", str(folder)], check=True)
+    return (folder / "flight.ts").read_bytes()
+
+
+def make_stream(folder: Path, size: str, seconds: float) -> None:
+    """Write a simulated flight as MPEG-TS with a key frame each second, as a drone sends it: flight.ts."""
     width, height = map(int, size.split("x"))
     settings = SimulationSettings(
         seed=3, flights=1, scene=SceneSettings(people=6, cars=4, small_objects=3),
@@ -90,7 +101,6 @@ def transport_stream(folder: Path, size: str, seconds: float) -> bytes:
         for frame in video.decode(video=0):
             sent.mux(stream.encode(frame))
         sent.mux(stream.encode())
-    return place.read_bytes()
 
 
 def watched(stream: bytes, count: int, folder: Path, options: Any) -> dict[str, Any]:
