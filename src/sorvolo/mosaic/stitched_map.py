@@ -60,11 +60,12 @@ class StitchedPlaces:
     """Places a flight's frames by the anchored mosaic, one after another: a frame that was not stitched lies as the one
     before, moved to its own fix. Only `place` changes it.
 
-    `full` is the frames' camera, `small` the undistorted one at the size at which they were stitched.
+    `full` is the frames' camera, `small` the undistorted one at the size at which they were stitched. Without
+    `has_fixes` the first frame's place is the site's own origin, which no frame departs from.
     """
 
-    def __init__(self, full: Camera, small: Camera, site_from_mosaic: Matrix3) -> None:
-        self._camera, self._site_from_mosaic = full, site_from_mosaic
+    def __init__(self, full: Camera, small: Camera, site_from_mosaic: Matrix3, *, has_fixes: bool = True) -> None:
+        self._camera, self._site_from_mosaic, self._has_fixes = full, site_from_mosaic, has_fixes
         self._corners: PointsPx = full.undistort_points(full.corners_px) if full.is_distorted else full.corners_px
         scale = np.diag([small.width_px / full.width_px, small.height_px / full.height_px, 1.0])
         scale[:2, 2] = 0.5 * np.diag(scale)[:2] - 0.5  # pixel centres stay on pixel centres
@@ -83,7 +84,7 @@ class StitchedPlaces:
         outline_m = apply_homography(site_from_image @ self._small_from_full, self._corners)
         centre_m = apply_homography(site_from_image, self._barycentre[None])[0]
         gps = np.full(3, np.nan)
-        if posed.prior.knows_place:
+        if self._has_fixes and posed.prior.knows_place:
             gps[:2] = centre_m - posed.prior.position_m[:2]
         sigma_m = float(np.hypot(*posed.prior.position_sigma_m[:2])) if stitched is None else float("nan")
         return PlacedFrame(

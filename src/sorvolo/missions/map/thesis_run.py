@@ -108,7 +108,7 @@ class ThesisRun(FlightRun):
 
     def _placed(self, anchored: Matrix3) -> list[PlacedFrame]:
         camera = self._setup.source.camera.camera
-        places = StitchedPlaces(camera, self._camera, anchored)
+        places = StitchedPlaces(camera, self._camera, anchored, has_fixes=self._setup.track is not None)
         result = []
         for ending in self._log.endings.values():
             time_ns = self._setup.utc_ns(ending.time_ns)
