@@ -8,7 +8,8 @@ loaded machine has slower caches: processor time grows by some tens of per cent)
 difference of their units is the unit cost; what remains of the short run is the start (imports, models). A unit is a
 photo, and of a video a key frame (map), a view (compare) or a searched frame (watch); decoding is a row of its own and
 taken off the others. Bytes and files are what the site, or the watch's folder, has more. One thread of OpenMP. Inputs
-are simulated: 1080p video at 10 frames a second from 30 m, photos of `--megapixels` from 40 m with 70 % overlap.
+are simulated: 1080p video at 10 frames a second from 30 m, photos of `--megapixels` from 40 m with 70 % overlap; or
+the photos are real ones, `--photos DIR`, of which a quarter and a half are mapped and watched, not compared.
 `--flights` keeps them. Written to results/unit_costs.json; `--only` measures those rows anew and keeps the others.
 """
 
@@ -80,12 +81,18 @@ PHOTO_JOBS = (
 )
 
 
+REAL_JOBS = (
+    VIDEO_JOBS[1], Job("watch", ("watch", "{flight1}", "--out", "{out}"), "{out}"),
+)
+
+
 def main() -> None:
     """Simulate, run, account, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="*", help="rows such as 'video: watch'")
     parser.add_argument("--megapixels", type=float, default=12.0)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--photos", type=Path, help="a folder of real photos instead of simulated ones")
     parser.add_argument("--flights", type=Path, help="where the simulated flights are, or are to be kept")
     parser.add_argument("--output", type=Path, default=RESULTS)
     parser.add_argument("--simulate", nargs=3, help=argparse.SUPPRESS)
@@ -97,8 +104,9 @@ def main() -> None:
     known = json.loads(options.output.read_text()) if options.only and options.output.is_file() else {"rows": {}}
     rows = known["rows"]
     photos = f"photo, {options.megapixels:g} MP"
+    photo_jobs = PHOTO_JOBS if options.photos is None else REAL_JOBS
     with tempfile.TemporaryDirectory() as scratch:
-        for kind, jobs in (("video", VIDEO_JOBS), (photos, PHOTO_JOBS)):
+        for kind, jobs in (("video", VIDEO_JOBS), (photos, photo_jobs)):
             wanted = [job for job in jobs if options.only is None or f"{kind}: {job.name}" in options.only]
             if not wanted:
                 continue
@@ -125,6 +133,8 @@ def simulated(place: Path, kind: str, size: int, options: Any) -> Path:
     A process of its own makes it: the peak memory of a child counts what its parent had when it began it.
     """
     folder = place / f"{kind}{size}"
+    if options.photos is not None and kind != "video":
+        return copied(folder / "flight1" / "photos", options.photos, size).parents[1]
     if not folder.is_dir():
         place.mkdir(parents=True, exist_ok=True)
         subprocess.run(
@@ -132,6 +142,15 @@ def simulated(place: Path, kind: str, size: int, options: Any) -> Path:
              "--simulate", str(folder), kind, str(size)],
             check=True,
         )
+    return folder
+
+
+def copied(folder: Path, photos: Path, size: int) -> Path:
+    """A folder with copies of the first quarter (size 0) or half (1) of a flight's photos."""
+    found = sorted(path for path in photos.iterdir() if path.suffix.lower() in (".jpg", ".jpeg"))
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in found[: max(2, len(found) // (4 if size == 0 else 2))]:
+        shutil.copy(path, folder / path.name)
     return folder
 
 
@@ -175,7 +194,8 @@ def run(job: Job, simulation: Path, work: Path) -> dict[str, Any]:
         **{f"flight{number}": str(pictures(simulation, number)) for number in (1, 2)},
         "site": str(work / "site"), "mapped": str(work / "mapped"), "out": str(work / "out"),
     }
-    camera = ("--camera", str(simulation / "camera.xml"))
+    stated = simulation / "camera.xml"
+    camera = ("--camera", str(stated)) if stated.is_file() else ()
     if any("{mapped}" in each for each in job.arguments):
         kept = simulation / "mapped"
         if not kept.is_dir():
@@ -213,6 +233,9 @@ def pictures(simulation: Path, number: int) -> Path:
 
 def frames_of(simulation: Path, number: int) -> int:
     """How many frames or photos a flight has."""
+    photos = simulation / f"flight{number}" / "photos"
+    if photos.is_dir():
+        return sum(path.suffix.lower() in (".jpg", ".jpeg") for path in photos.iterdir())
     features = json.loads((simulation / "truth" / "frames.geojson").read_text())["features"]
     return sum(each["properties"]["flight"] == f"flight{number}" for each in features)
 
