@@ -4,6 +4,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import fake_flights
@@ -17,6 +18,7 @@ from sorvolo.errors import StoreError
 from sorvolo.store.copies.bucket import MANIFEST, BucketEnd
 from sorvolo.store.copies.folder import FolderEnd
 from sorvolo.store.copies.objects import Objects, open_objects
+from sorvolo.store.copies.tidying import prune
 from sorvolo.store.copies.transfer import CopyOutcome, SiteEnd, copy, verify
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Verdict
@@ -193,6 +195,43 @@ def test_damage_in_the_store_is_found_and_named(memory: Objects, site: Path, tmp
     expected = {tiles[0]: "damaged", tiles[1]: "missing"}
     assert verified(FolderEnd(site), BucketEnd(memory)).faults == expected
     assert copied(BucketEnd(memory), FolderEnd(tmp_path / "back")).faults == expected
+
+
+def test_what_no_state_names_is_removed_and_all_else_stays(memory: Objects, site: Path, tmp_path: Path) -> None:
+    copied(FolderEnd(site), BucketEnd(memory))
+    before = set(memory.sizes(""))
+    map_again(site, "flight-1", 120)
+    copied(FolderEnd(site), BucketEnd(memory))
+    stored = memory.sizes("")
+    assert prune(memory, 3600.0).objects == 0  # too young
+    counted = prune(memory, -1.0, only_count=True)
+    assert memory.sizes("") == stored
+    pruned = prune(memory, -1.0)
+    assert pruned == counted and pruned.objects == len(stored) - len(memory.sizes("")) > 0
+    assert before - set(memory.sizes(""))
+    assert not verified(FolderEnd(site), BucketEnd(memory)).faults
+    assert prune(memory, -1.0).objects == 0
+
+
+def test_no_writer_relies_on_what_is_being_removed(memory: Objects, site: Path) -> None:
+    copied(FolderEnd(site), BucketEnd(memory))
+    map_again(site, "flight-2", 120)
+
+    class Pruned(BucketEnd):
+        def _swap(self, manifest) -> None:  # type: ignore[no-untyped-def]
+            prune(memory, -1.0)
+            super()._swap(manifest)
+
+    with pytest.raises(StoreError, match="another writer"):
+        copied(FolderEnd(site), Pruned(memory))
+    manifest, etag = BucketEnd(memory).find_manifest()
+    assert manifest is not None
+    memory.swap(MANIFEST, replace(manifest, tidying="2026-11-23T05:00:00+00:00").data(), etag)  # a prune was killed
+    with pytest.raises(StoreError, match=r"being tidied since 2026-11-23.*sorvolo site prune memory://site"):
+        copied(FolderEnd(site), BucketEnd(memory))
+    prune(memory, -1.0)
+    copied(FolderEnd(site), BucketEnd(memory))
+    assert not verified(FolderEnd(site), BucketEnd(memory)).faults
 
 
 @pytest.mark.parametrize("path", [

@@ -8,6 +8,7 @@ import typer
 
 from sorvolo.cli.options import AsJson
 from sorvolo.cli.places_of_sites import show_copy
+from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
     from sorvolo.store.copies.transfer import CopyOutcome
@@ -49,6 +50,32 @@ def copy_command(
         _print(outcome, target, verified=verify)
     if outcome.faults:
         raise typer.Exit(1)
+
+
+@site_app.command("prune")
+def prune_command(
+    place: Annotated[str, typer.Argument(help="The site in a store: s3://BUCKET/NAME.")],
+    keep_days: Annotated[float, typer.Option(min=0.0, help="Keep what was stored less than so many days ago.")] = 7.0,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Remove nothing: count.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Remove what a site in a store does not name any more: former maps, pictures of flights that were mapped again.
+
+    Versions of the map, and all that the site names, stay.
+
+    Example: sorvolo site prune s3://survey-archive/field --dry-run
+    """
+    from sorvolo.missions.site.copy import prune_site
+
+    pruned = prune_site(place, keep_days, only_count=dry_run)
+    if as_json:
+        typer.echo(json.dumps({"place": place, "dry_run": dry_run, **asdict(pruned)}, indent=1))
+    else:
+        done = "would remove" if dry_run else "removed"
+        typer.echo(
+            f"{place}: {done} {counted(pruned.objects, 'object')} ({pruned.bytes / 1e6:,.1f} MB); "
+            f"{pruned.kept_bytes / 1e6:,.1f} MB stay"
+        )
 
 
 def _print(outcome: "CopyOutcome", target: str, *, verified: bool) -> None:

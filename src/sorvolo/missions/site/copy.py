@@ -10,6 +10,7 @@ from sorvolo.errors import SettingsError, SorvoloWarning, StoreError
 from sorvolo.store.copies.bucket import BucketEnd
 from sorvolo.store.copies.folder import FolderEnd
 from sorvolo.store.copies.objects import open_objects
+from sorvolo.store.copies.tidying import Pruned, prune
 from sorvolo.store.copies.transfer import CopyOutcome, CopyUpdate, SiteEnd, copy, verify
 
 _MAY_BE_SHORT = 1.05  # times the need: other programs write to the disk as well
@@ -33,6 +34,16 @@ def verify_copy(source: str, target: str) -> Generator[CopyUpdate, None, CopyOut
     ends = _ends(source, target)
     with tempfile.TemporaryDirectory(prefix="sorvolo-") as scratch:
         return (yield from verify(*ends, Path(scratch)))
+
+
+def prune_site(address: str, keep_days: float, *, only_count: bool = False) -> Pruned:
+    """Remove what a site in an object store does not name any more and was stored so many days ago.
+
+    Raises SettingsError for a folder, which keeps nothing like it, StoreError as stores do.
+    """
+    if folder_of(address) is not None:
+        raise SettingsError(f"{address} is a folder, which needs no tidying; give s3://BUCKET/NAME")
+    return prune(open_objects(address), keep_days * 86_400, only_count=only_count)
 
 
 def _ends(source: str, target: str) -> tuple[SiteEnd, SiteEnd]:

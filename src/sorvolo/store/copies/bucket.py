@@ -47,7 +47,8 @@ _MOST_SUFFIX = 10
 class Manifest:
     """What a bucket's site consists of: the content of `sorvolo-site.json`. Tiles are those that the catalogue names.
 
-    `id` is another one each time it is written.
+    `id` is another one each time the site is. `tidying` is since when objects that it does not name are being removed
+    ("": they are not), `tidied` another text after each time that they were.
     """
 
     id: str
@@ -56,6 +57,8 @@ class Manifest:
     held: CatalogueState
     catalogue: tuple[int, str]  # bytes, SHA-256
     files: Mapping[str, SiteFile]
+    tidying: str = ""
+    tidied: str = ""
 
     def data(self) -> bytes:
         """As JSON."""
@@ -65,7 +68,7 @@ class Manifest:
             "written_utc": self.written_utc,
             "site": {"identity": held.identity, "name": held.name}, "digest": held.digest,
             "versions": sorted(map(list, held.versions)), "reviews": dict(held.reviews),
-            "catalogue": list(self.catalogue),
+            "catalogue": list(self.catalogue), "tidying": self.tidying, "tidied": self.tidied,
             "files": {path: [each.size, each.sha256] for path, each in sorted(self.files.items())},
         }).encode()
 
@@ -92,7 +95,10 @@ class Manifest:
             )
             size, sha256 = row["catalogue"]
             catalogue = _size(size), checked_sha256(sha256)
-            return cls(str(row["id"]), int(row["generation"]), str(row["written_utc"]), held, catalogue, files)
+            return cls(
+                str(row["id"]), int(row["generation"]), str(row["written_utc"]), held, catalogue, files,
+                str(row["tidying"]), str(row["tidied"]),
+            )
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise StoreError(
                 f"{where}/{MANIFEST} is damaged, or no Sorvolo wrote it; restore it from a copy of the site"
@@ -150,7 +156,7 @@ class BucketEnd:
         """The site as a manifest describes it. Raises StoreError for a catalogue that is not the one it names."""
         path = scratch / CATALOGUE
         size, sha256 = manifest.catalogue
-        self.fetch(SiteFile(_catalogue_key(sha256), size, sha256), _catalogue_key(sha256), path)
+        self.fetch(SiteFile(catalogue_key(sha256), size, sha256), catalogue_key(sha256), path)
         with closing(Catalogue.at(path, write=True)) as catalogue:
             held = find_state(catalogue)
             tiles, keyframes, _ = named_files(catalogue)
@@ -206,6 +212,11 @@ class BucketEnd:
         else:
             if self._base not in (None, manifest.id):
                 raise self._conflict()
+            if manifest.tidying:
+                raise StoreError(
+                    f"the site at {self.name} is being tidied since {manifest.tidying}; run the same command again "
+                    f"later, or end what was stopped: sorvolo site prune {self.name}"
+                )
             refuse_other(self.name, manifest.held.identity, new.held)
             if self._base is None:
                 refuse_loss(self.name, missing_from(manifest.held, manifest.files, new))
@@ -255,9 +266,9 @@ class BucketEnd:
     def _store_catalogue(self, path: Path) -> tuple[int, str]:
         """Store the catalogue under its content's name; its bytes and SHA-256."""
         sha256, size = hashlib.sha256(path.read_bytes()).hexdigest(), path.stat().st_size
-        if self._round.stored.get(_catalogue_key(sha256)) != size:
+        if self._round.stored.get(catalogue_key(sha256)) != size:
             with path.open("rb") as stream:
-                self._objects.write(_catalogue_key(sha256), stream)
+                self._objects.write(catalogue_key(sha256), stream)
         return size, sha256
 
     def free_bytes(self) -> int | None:
@@ -361,7 +372,8 @@ def key_of(file: SiteFile) -> str:
     return f"files/{file.sha256[:2]}/{file.sha256}{ending}"
 
 
-def _catalogue_key(sha256: str) -> str:
+def catalogue_key(sha256: str) -> str:
+    """The key of a catalogue."""
     return f"catalogues/{sha256}.db"
 
 

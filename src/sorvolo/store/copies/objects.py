@@ -10,7 +10,7 @@ from configparser import ConfigParser
 from configparser import Error as ConfigError
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 from urllib.parse import urlsplit
@@ -130,12 +130,19 @@ class Objects:
 
     def sizes(self, prefix: str) -> dict[str, int]:
         """The size of every object whose key begins with this folder ("" for all)."""
+        return {key: size for key, (size, _) in self.listing(prefix).items()}
+
+    def listing(self, prefix: str) -> dict[str, tuple[int, float]]:
+        """The same, with how long ago each object was stored, s."""
         import obstore
 
-        def listed() -> dict[str, int]:
+        def listed() -> dict[str, tuple[int, float]]:
+            found = [each for batch in obstore.list(self._store, prefix or None) for each in batch]
+            newest = max((each["last_modified"] for each in found), default=None)
+            now = max(newest, datetime.now(UTC)) if newest else None
             return {
-                each["path"]: each["size"]
-                for batch in obstore.list(self._store, prefix or None) for each in batch
+                each["path"]: (each["size"], (now - each["last_modified"]).total_seconds() if now else 0.0)
+                for each in found
             }
 
         return self._tried(listed, "list")
