@@ -202,8 +202,8 @@ def test_what_no_state_names_is_removed_and_all_else_stays(memory: Objects, site
     before = set(memory.sizes(""))
     map_again(site, "flight-1", 120)
     copied(FolderEnd(site), BucketEnd(memory))
-    stored = memory.sizes("")
     assert prune(memory, 3600.0).objects == 0  # too young
+    stored = memory.sizes("")
     counted = prune(memory, -1.0, only_count=True)
     assert memory.sizes("") == stored
     pruned = prune(memory, -1.0)
