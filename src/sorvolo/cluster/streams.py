@@ -67,8 +67,8 @@ def run_streams(
     """Map, or compare, each stream until it ends or `until` is set; then its flight is finished like any other's.
 
     A process that dies is started again, after a second and ever longer: it goes on with the flight as another segment
-    where the stream is back in time (`LiveSettings.same_flight_s`), else with a flight of its own. One that dies `most_tries` times in a row within a
-    minute of its start is set aside; the others go on. Raises as `run_batch`.
+    where the stream is back in time (`LiveSettings.same_flight_s`), else with a flight of its own. One that dies
+    `most_tries` times in a row within a minute of its start is set aside; the others go on. Raises as `run_batch`.
     """
     if settings.wish.mission is Mission.SEARCH:
         raise SettingsError("--mission search measures flights that are over: give map or compare for live streams")
