@@ -350,6 +350,22 @@ def copied(source: Path, target: Path, scratch: Path) -> None:
         pass
 
 
+def test_a_site_of_today_moves_into_the_database(
+    postgres: PostgresServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Archive.open(tmp_path / "old", write=True) as archive:
+        archive.create_site(SITE)
+        map_flight(archive, "a", 20, count=2, compared=True)
+    monkeypatch.setenv(VARIABLE, "")  # put back afterwards: --catalogue sets it
+    words = ["site", "copy", str(tmp_path / "old"), str(tmp_path / "new"), "--catalogue", postgres.url]
+    assert main(words) == 0 and main(words) == 0, capsys.readouterr().err
+    assert (tmp_path / "new" / POINTER).is_file() and not (tmp_path / "new" / "site.db").exists()
+    with Archive.open(tmp_path / "old", write=False) as old, Archive.open(tmp_path / "new", write=True) as new:
+        assert new.flights() == old.flights() and len(new.changes()) == len(old.changes()) == 2
+        assert map_flight(new, "b", 60, count=1) == 2
+    assert main(["site", "copy", str(tmp_path / "old"), "s3://bucket/new", "--catalogue", postgres.url]) == 1
+
+
 def test_a_copy_s_catalogue_is_a_file_and_may_be_copied_back(site: Path, tmp_path: Path) -> None:
     with Archive.open(site, write=True) as archive:
         map_flight(archive, "b", 60, count=1, compared=True)

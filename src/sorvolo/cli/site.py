@@ -28,6 +28,9 @@ def copy_command(
     source: Annotated[str, typer.Argument(help="Folder of the map, or s3://BUCKET/NAME.")],
     target: Annotated[str, typer.Argument(help="A new or empty folder or s3:// place, or that of an earlier copy.")],
     verify: Annotated[bool, typer.Option("--verify", help="Copy nothing: compare the copy with the map.")] = False,
+    catalogue: Annotated[
+        str, typer.Option(help="Where a new copy's catalogue lies: postgresql://USER@HOST/DATABASE; else in the copy.")
+    ] = "",
     as_json: AsJson = False,
 ) -> None:
     """Copy a map with all its versions, flights, pictures and findings; a stopped copy goes on where it was.
@@ -41,7 +44,7 @@ def copy_command(
     """
     from sorvolo.missions.site.copy import copy_site, verify_copy
 
-    work = verify_copy(source, target) if verify else copy_site(source, target)
+    work = verify_copy(source, target) if verify else copy_site(source, target, catalogue)
     outcome = show_copy(work, "comparing, file" if verify else "copying, file")
     if as_json:
         row = asdict(outcome) | {"faults": dict(outcome.faults), "is_whole": not outcome.faults}

@@ -12,12 +12,15 @@ from sorvolo.store.copies.folder import FolderEnd
 from sorvolo.store.copies.objects import open_objects
 from sorvolo.store.copies.tidying import Pruned, prune
 from sorvolo.store.copies.transfer import CopyOutcome, CopyUpdate, SiteEnd, copy, verify
+from sorvolo.store.site.catalogue_place import choose_catalogue
 
 _MAY_BE_SHORT = 1.05  # times the need: other programs write to the disk as well
 
 
-def copy_site(source: str, target: str) -> Generator[CopyUpdate, None, CopyOutcome]:
+def copy_site(source: str, target: str, catalogue: str = "") -> Generator[CopyUpdate, None, CopyOutcome]:
     """Copy the site at one address to another, yielding how far it is; a copy that was stopped goes on.
+
+    The catalogue of a new copy in a folder lies there, whatever the site's does, or at the address `catalogue`.
 
     An address is a folder, `file://` with one, or `s3://BUCKET/NAME`. Each file is checked by its SHA-256 while it is
     written. The copy is the site as of its last complete flight, even while another is being mapped into it. Raises
@@ -25,6 +28,8 @@ def copy_site(source: str, target: str) -> Generator[CopyUpdate, None, CopyOutco
     source lacks, where the disk is too full, where a store refuses or cannot be reached.
     """
     ends = _ends(source, target)
+    if catalogue:
+        ends = ends[0], _with_catalogue(target, catalogue)
     with tempfile.TemporaryDirectory(prefix="sorvolo-") as scratch:
         return (yield from copy(*ends, Path(scratch), room=lambda need, free: _check_room(target, need, free)))
 
@@ -53,6 +58,15 @@ def _ends(source: str, target: str) -> tuple[SiteEnd, SiteEnd]:
         if one.is_relative_to(other) or other.is_relative_to(one):
             raise SettingsError(f"{target} and {source} are the same folder, or lie in each other; choose another one")
     return ends
+
+
+def _with_catalogue(target: str, catalogue: str) -> FolderEnd:
+    """The folder of a copy whose catalogue lies elsewhere."""
+    folder = folder_of(target)
+    if folder is None:
+        raise SettingsError(f"{target} keeps its catalogue with its tiles; --catalogue is for folders")
+    choose_catalogue(folder, catalogue)
+    return FolderEnd(folder, in_database=True)
 
 
 def open_end(address: str) -> SiteEnd:

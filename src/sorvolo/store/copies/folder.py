@@ -38,7 +38,7 @@ from sorvolo.store.copies.state import (
 from sorvolo.store.nofollow import open_below, refuse_links
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site.catalogue import Catalogue
-from sorvolo.store.site.catalogue_place import CATALOGUE, POINTER, is_site
+from sorvolo.store.site.catalogue_place import CATALOGUE, POINTER, create_database, is_site
 from sorvolo.store.site.files import (
     COPYING,
     JOURNAL,
@@ -61,8 +61,9 @@ _OF_THE_FOLDER = frozenset({
 class FolderEnd:
     """A folder that a site is copied from or to."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, *, in_database: bool = False) -> None:
+        """`in_database`: a new copy's catalogue lies where the environment has new ones, else in the folder."""
+        self.folder, self._in_database = folder, in_database
 
     @property
     def name(self) -> str:
@@ -176,6 +177,8 @@ class FolderEnd:
     def conclude(self, state: SiteState) -> None:
         """Make the folder this state of the site: its catalogue comes last, then what the state has not is removed."""
         catalogue = self.folder / CATALOGUE
+        if self._in_database and not is_site(self.folder):
+            create_database(self.folder)
         if catalogue.is_file():
             _overwrite_catalogue(catalogue, state.catalogue)
         elif is_site(self.folder):
