@@ -24,7 +24,7 @@ ASSUMPTIONS: dict[str, tuple[float, str]] = {
     "compared_hz": (5, "views compared a second of each stream (the default)"),
     "mapped_hz": (1, "key frames a second of each stream: 70 % overlap at 40 m and 10 m/s"),
     "archive_tb": (1_000, "of photos: one petabyte"),
-    "photo_mb": (5, "of a photo of 12 megapixels"),
+    "photo_mb": (3.5, "of a photo of 9 megapixels"),
     "photos_per_flight": (400, "of a survey"),
     "years": (5, "that the archive is kept"),
     "machine_cores": (64, "of a server, as fast as the core that was measured"),
