@@ -1,12 +1,13 @@
 """All sites of an archive as one table that is searched without a server."""
 
 import os
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote
 
 from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.missions.archive.index import sites_below
 from sorvolo.missions.site.working_copy import fetch_site
 from sorvolo.store.copies.bucket import sites_at
 from sorvolo.store.copies.objects import open_objects
@@ -14,7 +15,6 @@ from sorvolo.store.copies.working import store_address
 from sorvolo.store.exports.stac_geoparquet import StacItem, demand_pyarrow, item_table
 from sorvolo.store.index.stac_items import PROPERTIES, site_items
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.catalogue_place import is_site
 
 
 @dataclass
@@ -49,7 +49,7 @@ def export_archive(root: str, out: Path) -> Generator[ExportUpdate, None, Export
         raise SettingsError(f"{out.name}: the table is written as .parquet; end the file's name so")
     if not out.resolve().parent.is_dir():
         raise InputError(f"no folder {out.resolve().parent} to write {out.name} to; make it first")
-    names = sites_at(open_objects(root)) if root.startswith("s3://") else sorted(sites_below(Path(root)))
+    names = _sites(root)
     outcome = ExportOutcome(sites=len(names))
     with item_table(out, PROPERTIES) as table:
         for done, name in enumerate(names, start=1):
@@ -61,6 +61,15 @@ def export_archive(root: str, out: Path) -> Generator[ExportUpdate, None, Export
             yield ExportUpdate(name, done, len(names))
         outcome.rows = table.rows
     return outcome
+
+
+def _sites(root: str) -> list[str]:
+    """The sites of an archive by name."""
+    if root.startswith("s3://"):
+        return sites_at(open_objects(root))
+    if not Path(root).is_dir():
+        raise InputError(f"no such folder: {root}; give the folder that the site folders lie in")
+    return sorted(sites_below(Path(root)))
 
 
 def _site(root: str, name: str, out: Path, outcome: ExportOutcome) -> Generator[ExportUpdate, None, list[StacItem]]:
@@ -99,14 +108,3 @@ def _addresses(root: str, folder: Path, out: Path) -> Callable[[str], str]:
         return quote(Path(below, path).as_posix()) if (folder / path).is_file() else ""
 
     return address
-
-
-def sites_below(root: Path) -> Iterator[str]:
-    """The folders of sites, as paths below the root with slashes; "." where the root is one. Links are not followed."""
-    if not root.is_dir():
-        raise InputError(f"no such folder: {root}; give the folder that the site folders lie in")
-    for folder, folders, _ in os.walk(root):
-        if is_site(Path(folder)):
-            folders.clear()
-            yield Path(folder).relative_to(root).as_posix()
-        folders[:] = [each for each in folders if not each.startswith(".")]
