@@ -58,7 +58,7 @@ def test_the_thesiss_heights_come_out_of_the_command():
 
 
 def test_no_flight_is_planned_above_the_laws_limit():
-    mavic = ("--camera", "Mavic 2 Pro", "--model", "none")  # the packaged detector asks for less than 120 m
+    mavic = ("--camera", "Mavic 2 Pro", "--model", "none")  # no detector bounds it
     answers = json.loads(run(*mavic, "--task", "detection", "--json").output)
     assert answers["maximum_heights_m"]["detection"] == pytest.approx(1715.65, abs=0.01)
     assert (answers["height_m"], answers["bounded_by"]) == (120.0, "ceiling")
