@@ -393,9 +393,9 @@ def test_the_first_flight_cannot_be_compared_with_its_own_map(flown, site):
 
 
 def elsewhere(tmp_path: Path, metres_east: float) -> Iterator[Path]:
-    moved = replace(_PAIR, flights=1, scene=replace(
-        _PAIR.scene, origin=Geodetic(41.8923127, 12.6035418 + metres_east / 83_000, 83.3)
-    ), seed=77)
+    """A short flight over other ground, so far east of the site's."""
+    scene = replace(_PAIR.scene, origin=Geodetic(41.8923127, 12.6035418 + metres_east / 83_000, 83.3))
+    moved = replace(_PAIR, flights=1, scene=scene, path=replace(_PAIR.path, length_m=12, strips=1), seed=77)
     for _ in simulate_site(tmp_path / "elsewhere", moved):
         pass
     yield tmp_path / "elsewhere"
