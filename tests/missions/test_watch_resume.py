@@ -61,7 +61,8 @@ def video(request: pytest.FixtureRequest, flown: Path, tmp_path: Path) -> Path:
 
 
 def watched(
-    video: Path, folder: Path, detector: TruthDetector, alerts: Path, then: Callable[[int], None] = lambda _: None,
+    video: Path, folder: Path, detector: TruthDetector, alerts: Path,
+    then: Callable[[list[WatchUpdate]], None] = lambda _: None,
     settings: WatchSettings = WatchSettings(),  # noqa: B008
 ) -> list[WatchUpdate]:
     """Watch a flight, with alerts to a program that writes their ids to a file."""
@@ -70,7 +71,7 @@ def watched(
     updates = []
     for each in watch(video, settings, outputs, camera="aov=70", detector=detector):
         updates.append(each)
-        then(len(updates))
+        then(updates)
     return updates
 
 
@@ -98,10 +99,10 @@ def test_it_goes_on_and_tells_nobody_twice(video: Path, detector: TruthDetector,
     whole, amid, alerts = tmp_path / "whole", tmp_path / "amid", tmp_path / "sent"
     reported: list[int] = []
 
-    def killed(count: int) -> None:
-        if count == _KILLED_AT:
-            reported.extend(ids(alerts, 1))
-            time.sleep(0.3)  # what was sent is noted after it
+    def killed(updates: list[WatchUpdate]) -> None:
+        if len(updates) == _KILLED_AT:
+            reported.extend(ids(alerts, sum(len(each.new) for each in updates)))
+            time.sleep(0.5)  # what was sent is noted after it
             shutil.copytree(whole, amid)
 
     updates = watched(video, whole, detector, alerts, killed)
@@ -123,8 +124,8 @@ def test_an_alert_that_was_not_sent_is_sent(flown: Path, detector: TruthDetector
     video, folder, amid = flown / "flight1" / "flight1.mp4", tmp_path / "watch", tmp_path / "amid"
     (tmp_path / "none").mkdir()  # no file can be written there: each alert fails
 
-    def killed(count: int) -> None:
-        if count == _KILLED_AT:
+    def killed(updates: list[WatchUpdate]) -> None:
+        if len(updates) == _KILLED_AT:
             time.sleep(1.0)
             shutil.copytree(folder, amid)
 

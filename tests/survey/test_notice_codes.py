@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import sorvolo
+from sorvolo.missions.watch.notifier import RECEIVERS
 from sorvolo.store.datasets.parsed import FINDINGS
 
 _DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -12,8 +13,7 @@ _DOCS = Path(__file__).resolve().parents[2] / "docs"
 def _codes() -> set[str]:
     source = "\n".join(path.read_text() for path in Path(sorvolo.__file__).parent.rglob("*.py"))
     reported = set(re.findall(r'\b[Nn]otice\(\s*"(\w+)"', source)) | set(re.findall(r'\.notices\("(\w+)"\)', source))
-    outboxes = re.findall(r'Outbox\([^\n]*code="(\w+)"', source)
-    return reported | {f"{name}_{end}" for name in outboxes for end in ("failed", "dropped")} | set(FINDINGS)
+    return reported | {f"{name}_{end}" for name in RECEIVERS for end in ("failed", "dropped")} | set(FINDINGS)
 
 
 def test_every_code_is_documented() -> None:

@@ -182,7 +182,7 @@ def small_gray(image: ImageRGB) -> ImageGray:
     """A gray copy whose longer side has 256 px."""
     scale = _SMALL_PX / max(image.shape[:2])
     size = (max(16, round(image.shape[1] * scale)), max(16, round(image.shape[0] * scale)))
-    return cv2.resize(gray_from_rgb(image), size, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
+    return gray_from_rgb(cv2.resize(image, size, interpolation=cv2.INTER_AREA))  # type: ignore[arg-type]
 
 
 def has_texture(image: ImageRGB, settings: SelectionSettings) -> bool:

@@ -123,7 +123,11 @@ def _candidates(
             yield fitted
     if effort is Effort.CHEAP:
         return
-    fitted = _fit(*_sift_pair(new, old, prediction, settings, cache), prediction, settings)
+    shared = _shared_sift(new, old, prediction, settings, cache)
+    fitted = _fit(*shared, prediction, settings) if shared is not None else None
+    if fitted is not None:
+        yield fitted
+    fitted = _fit(cache.sift(new), cache.sift(old), prediction, settings)  # the prediction may have been wrong
     if fitted is not None:
         yield fitted
     if prediction is not None:
@@ -147,17 +151,18 @@ def _fit(
     return _Fit(found[0], new_px[agree], old_px[agree], is_sub_pixel=new.kind == "sift" and agree.mean() > 0.25)
 
 
-def _sift_pair(
+def _shared_sift(
     new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache
-) -> tuple[Features, Features]:
-    """SIFT features of both; where they are known to share little, of that part alone: the rest is most of the cost."""
-    if prediction is not None and prediction.is_tight and not (cache.has_sift(new) and cache.has_sift(old)):
-        in_new = _shared_box(new.gray, old.gray, prediction.new_from_old, prediction.search_px)
-        old_from_new: Matrix3 = np.linalg.inv(prediction.new_from_old).astype(np.float64)
-        in_old = _shared_box(old.gray, new.gray, old_from_new, prediction.search_px)
-        if _share(in_new, new.gray) + _share(in_old, old.gray) < 2 * settings.most_shared:
-            return _sift_in(new, in_new, settings), _sift_in(old, in_old, settings)
-    return cache.sift(new), cache.sift(old)
+) -> tuple[Features, Features] | None:
+    """SIFT features of what two pictures share, where that is little and known: the rest is most of the cost."""
+    if prediction is None or not prediction.is_tight or (cache.has_sift(new) and cache.has_sift(old)):
+        return None
+    in_new = _shared_box(new.gray, old.gray, prediction.new_from_old, prediction.search_px)
+    old_from_new: Matrix3 = np.linalg.inv(prediction.new_from_old).astype(np.float64)
+    in_old = _shared_box(old.gray, new.gray, old_from_new, prediction.search_px)
+    if _share(in_new, new.gray) + _share(in_old, old.gray) >= 2 * settings.most_shared:
+        return None
+    return _sift_in(new, in_new, settings), _sift_in(old, in_old, settings)
 
 
 def _shared_box(image: ImageGray, other: ImageGray, image_from_other: Matrix3, margin_px: float) -> tuple[slice, slice]:

@@ -13,13 +13,18 @@ def read_ahead(frames: Iterator[Frame | LostFrame], most: int) -> Generator[Fram
 
     What the reading raises is raised here.
     """
-    waiting: queue.Queue[Frame | LostFrame | BaseException | None] = queue.Queue(most)
+    # queue.Queue's lock may stay held where Ctrl-C meets its Python code, and the reading would wait for ever
+    waiting: queue.SimpleQueue[Frame | LostFrame | BaseException | None] = queue.SimpleQueue()
+    free: queue.SimpleQueue[None] = queue.SimpleQueue()
+    for _ in range(most):
+        free.put(None)
     is_over = threading.Event()
 
     def put(item: Frame | LostFrame | BaseException | None) -> None:
         while not is_over.is_set():
-            with suppress(queue.Full):
-                waiting.put(item, timeout=0.2)
+            with suppress(queue.Empty):
+                free.get(timeout=0.2)
+                waiting.put(item)
                 return
 
     def read() -> None:
@@ -36,6 +41,7 @@ def read_ahead(frames: Iterator[Frame | LostFrame], most: int) -> Generator[Fram
     thread.start()
     try:
         while (item := waiting.get()) is not None:
+            free.put(None)
             if isinstance(item, BaseException):
                 raise item
             yield item

@@ -14,7 +14,7 @@ from sorvolo.store.exports.detection_files import track_properties
 from sorvolo.survey.flight import Notice, Site
 from sorvolo.survey.objects import Track
 
-_COT, _COMMAND, _URL = "cot", "alert_command", "alert_url"
+_COT, _COMMAND, _URL = RECEIVERS = ("cot", "alert_command", "alert_url")
 
 
 class Notifier:
