@@ -71,11 +71,15 @@ def section_of(model: str) -> str:
     return found[1]
 
 
-def test_lock_names_each_package_once() -> None:
+def test_locks_that_are_installed_together_agree() -> None:
     """Two versions of one package cannot be installed, and a fresh clone would end there."""
-    lines = [line for line in (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines() if "==" in line]
-    names = [line.partition("==")[0].lower().replace("_", "-") for line in lines]
-    assert sorted(names) == sorted(set(names))
+    versions: dict[str, set[str]] = {}
+    for lock in ("requirements.lock", "requirements-training.lock", "requirements-notebooks.lock"):
+        for line in (ROOT / lock).read_text(encoding="utf-8").splitlines():
+            name, _, version = line.partition("==")
+            if version:
+                versions.setdefault(name.lower().replace("_", "-"), set()).add(version)
+    assert not {name: each for name, each in versions.items() if len(each) > 1}
 
 
 def test_build_lock_holds_what_the_build_requires() -> None:
