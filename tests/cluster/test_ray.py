@@ -1,11 +1,14 @@
 """A batch on a Ray cluster of two machines, one of which dies: nothing lost, the maps of an undisturbed run."""
 
 import os
+import signal
 import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from batch_flights import another, content
@@ -19,6 +22,7 @@ from sorvolo.cluster.table import LOCK, State
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
+from sorvolo.store.site.files import LOCK as SITE_LOCK
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'sorvolo[fleet]'")
 
@@ -38,19 +42,48 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
     made.shutdown()
 
 
+def _kill_a_machine_at_work(cluster: Any, root: Path) -> None:
+    """Wait for a flight with a journal, hold its process, have its machine die, and let go of the process."""
+    while True:
+        time.sleep(0.02)
+        for node in list(cluster.worker_nodes):
+            for pid in _descendants(node.all_processes["raylet"][0].process.pid):
+                if any(list(site.glob("flights/*/run.journal")) for site in _written_sites(pid, root)):
+                    os.kill(pid, signal.SIGSTOP)
+                    cluster.remove_node(node, allow_graceful=False)
+                    os.kill(pid, signal.SIGCONT)
+                    return
+
+
+def _descendants(pid: int) -> set[int]:
+    """The processes that a process started, and those that they started."""
+    parents = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):  # it has ended
+            parents[int(path.parent.name)] = int(path.read_text().rpartition(")")[2].split()[1])
+    found = {pid}
+    while more := {child for child, parent in parents.items() if parent in found} - found:
+        found |= more
+    return found - {pid}
+
+
+def _written_sites(pid: int, root: Path) -> set[Path]:
+    """The sites below `root` whose lock a process has open."""
+    sites = set()
+    for link in Path(f"/proc/{pid}/fd").glob("*"):
+        with suppress(OSError):
+            opened = Path(os.readlink(link))
+            if opened.name == SITE_LOCK and root in opened.parents:
+                sites.add(opened.parent)
+    return sites
+
+
 def test_a_machine_that_dies_loses_nothing(cluster: object, flown: Path, tmp_path: Path) -> None:
     for name in ("one", "two"):
         another(flown, tmp_path / "in" / name)
     root = tmp_path / "maps"
 
-    def kill_a_machine() -> None:
-        end_s = time.monotonic() + 60
-        while time.monotonic() < end_s and not list(root.glob("*/flights/*/run.journal")):
-            time.sleep(0.02)
-        nodes = cluster.worker_nodes  # type: ignore[attr-defined]
-        cluster.remove_node(next(iter(nodes)), allow_graceful=False)  # type: ignore[attr-defined]
-
-    killer = threading.Thread(target=kill_a_machine)
+    killer = threading.Thread(target=_kill_a_machine_at_work, args=(cluster, root), daemon=True)
     killer.start()
     settings = BatchSettings(FlightWish(camera=str(flown / "camera.xml"), model="none"))
     running = run_batch(
@@ -62,7 +95,6 @@ def test_a_machine_that_dies_loses_nothing(cluster: object, flown: Path, tmp_pat
         except StopIteration as end:
             report = end.value
             break
-    killer.join()
     assert [row.state for row in report.rows] == [State.DONE, State.DONE]
     assert (report.tries, report.crashes) == (3, 1)
     for name in ("one", "two"):

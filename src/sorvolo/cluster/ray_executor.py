@@ -8,6 +8,7 @@ import importlib.util
 import os
 import secrets
 import socket
+import time
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -25,7 +26,7 @@ from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes
 
 Key = tuple[str, str]
 _SCHEME = "ray://"
-_REACH_S, _PROBE_S, _LOOK_S, _CANCEL_S = 8.0, 90.0, 2.0, 10.0
+_REACH_S, _PROBE_S, _AGAIN_S, _LOOK_S, _CANCEL_S = 8.0, 90.0, 0.5, 2.0, 10.0
 _CACHE_SHARE = 0.25
 _LEAST_CACHE_MB = 64.0
 
@@ -295,26 +296,11 @@ def _demand_listening(name: str, address: str) -> None:
 
 def _check_machines(root: Path) -> None:
     """Have each machine read what is written here, and answer beside it. Raises SettingsError, StoreError."""
-    import ray
-    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
     name, word = f"{TEMPORARY_PREFIX}{secrets.token_hex(6)}-probe", secrets.token_hex(16)
     path = root.resolve() / name
     atomic_write_bytes(path, word.encode())
-    answers = []
     try:
-        probe: Any = ray.remote(_probe_of(str(path), word))
-        asked = [
-            probe.options(
-                num_cpus=0, max_retries=0,
-                scheduling_strategy=NodeAffinitySchedulingStrategy(each["NodeID"], soft=False),
-            ).remote()
-            for each in _working(ray)
-        ]
-        try:
-            answers = ray.get(asked, timeout=_PROBE_S)
-        except ray.exceptions.RayError as error:
-            raise SettingsError(f"a machine of the cluster does not run tasks: {_first_line(error)}") from error
+        answers = _answers_of_machines(str(path), word)
         for host, version, sees in answers:
             _demand_same(host, version)
             if not sees or not (root / f"{name}-{host}").is_file():
@@ -325,6 +311,50 @@ def _check_machines(root: Path) -> None:
             left.unlink(missing_ok=True)
     if not answers:
         raise SettingsError("the cluster has no machine with a core")
+
+
+def _answers_of_machines(path: str, word: str) -> list[tuple[str, str, bool]]:
+    """What the probe finds on each machine that stays. Raises SettingsError where one runs no tasks.
+
+    A machine that has just joined, or just died, is known to some of Ray's processes and not yet to others: a probe
+    that could not be placed is placed again while the machine is there.
+    """
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    probe: Any = ray.remote(_probe_of(path, word))
+    end_s, answers = time.monotonic() + _PROBE_S, []
+    waiting = {each["NodeID"] for each in _working(ray)}
+    while waiting:
+        asked = {
+            node: probe.options(
+                num_cpus=0, max_retries=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)
+            ).remote()
+            for node in waiting
+        }
+        for node, task in asked.items():
+            try:
+                answers.append(ray.get(task, timeout=max(0.0, end_s - time.monotonic())))
+                waiting.remove(node)
+            except _passing(ray) as error:
+                if time.monotonic() > end_s:
+                    raise _no_tasks(error) from error
+            except ray.exceptions.RayError as error:
+                raise _no_tasks(error) from error
+        if waiting:
+            time.sleep(_AGAIN_S)
+            waiting &= {each["NodeID"] for each in _working(ray)}
+    return answers
+
+
+def _passing(ray: Any) -> tuple[type[Exception], ...]:
+    """What Ray raises where a machine was not known yet, or is no longer there."""
+    errors = ray.exceptions
+    return (errors.TaskUnschedulableError, errors.WorkerCrashedError, errors.NodeDiedError)
+
+
+def _no_tasks(error: Exception) -> SettingsError:
+    return SettingsError(f"a machine of the cluster does not run tasks: {_first_line(error)}")
 
 
 def _working(ray: Any) -> list[dict[str, Any]]:
