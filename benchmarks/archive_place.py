@@ -25,7 +25,7 @@ import provenance
 from sorvolo.store.index.archive_index import ArchiveIndex
 from sorvolo.store.index.finding import Place
 from sorvolo.store.index.site_rows import FlightRows, FrameRows, PlacedRows, SiteState
-from sorvolo.store.site.catalogue_place import VARIABLE
+from sorvolo.store.site.catalogue_place import Catalogues
 
 RESULTS = Path(__file__).parent / "results" / "archive_place.json"
 _SITES = 150
@@ -139,14 +139,15 @@ def measure(index: ArchiveIndex, counts: list[int], seed: int) -> tuple[dict[str
 
 def run(address: str, counts: list[int], seed: int) -> tuple[dict[str, Any], list[object]]:
     """One database filled and asked."""
+    catalogues = Catalogues().choosing(address)
     with tempfile.TemporaryDirectory() as folder:
-        with ArchiveIndex.open(Path(folder), write=True, address=address) as index:
+        with ArchiveIndex.open(Path(folder), write=True, address=address, catalogues=catalogues) as index:
             begun = time.perf_counter()
             fill(index, counts, seed)
             filled_s = time.perf_counter() - begun
             holds = index.counts()
         print(f"filled in {filled_s:.0f} s, asking", file=sys.stderr, flush=True)
-        with ArchiveIndex.open(Path(folder), write=False) as index:
+        with ArchiveIndex.open(Path(folder), write=False, catalogues=catalogues) as index:
             measured, found = measure(index, counts, seed)
         size = sum(each.stat().st_size for each in Path(folder).iterdir())
     figures = {"holds": holds, "filled_s": round(filled_s, 1), **measured}
@@ -168,7 +169,6 @@ def main() -> None:
     }
     result["sqlite"], found = run("", counts, seed)
     if chosen.postgres:
-        os.environ[VARIABLE] = f"sqlite {chosen.postgres}"
         result["postgis"], again = run(chosen.postgres, counts, seed)
         result["same_answers"] = again == found
     chosen.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

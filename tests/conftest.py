@@ -28,12 +28,6 @@ settings.load_profile("every time the same" if "CI" in os.environ else "anywhere
 os.environ.pop("SORVOLO_CATALOGUE", None)  # where the tester's own catalogues lie
 
 
-@pytest.fixture(autouse=True)
-def _own_catalogues(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`--catalogue` lets the rest of its process make catalogues there, which must not reach the next test."""
-    monkeypatch.setenv("SORVOLO_CATALOGUE", "")
-
-
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[PostgresServer]:
     """A PostgreSQL server for the tests of this process."""

@@ -68,7 +68,7 @@ def test_the_same_rows_in_either(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     in_file = fly(flown, tmp_path / "a" / "site", capsys)
-    monkeypatch.setenv(VARIABLE, "")
+    monkeypatch.setenv(VARIABLE, f"sqlite {postgres.url}")  # `compare` needs to trust what `map` was given
     on_server = fly(flown, tmp_path / "b" / "site", capsys, "--catalogue", postgres.url)
     one, other = tmp_path / "a" / "site", tmp_path / "b" / "site"
     assert (one / "site.db").is_file() and is_site(other) and not (other / "site.db").exists()

@@ -20,7 +20,14 @@ from sorvolo.store.copies.folder import FolderEnd
 from sorvolo.store.copies.transfer import copy
 from sorvolo.store.site import postgres_database, schema
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.catalogue_place import POINTER, VARIABLE, choose_catalogue, parsed_url
+from sorvolo.store.site.catalogue_place import (
+    CATALOGUE,
+    POINTER,
+    VARIABLE,
+    Catalogues,
+    chosen_catalogues,
+    parsed_url,
+)
 from sorvolo.store.site.database import ConnectionLostError
 from sorvolo.store.site.journal import Entry
 from sorvolo.store.site.migrations.upgrade import upgrade
@@ -94,15 +101,27 @@ def test_a_site_keeps_its_catalogue_where_it_is(
     site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, postgres: PostgresServer
 ) -> None:
     with pytest.raises(SettingsError, match="lies in PostgreSQL already"):
-        choose_catalogue(site, "sqlite")
+        chosen_catalogues(site, "sqlite")
     with pytest.raises(SettingsError, match="leave the password out"):
-        choose_catalogue(tmp_path / "new", f"postgresql://me:{PASSWORD}@host/db")
+        chosen_catalogues(tmp_path / "new", f"postgresql://me:{PASSWORD}@host/db")
     monkeypatch.setenv(VARIABLE, "sqlite")
     with Archive.open(tmp_path / "file", write=True):
         pass
     monkeypatch.setenv(VARIABLE, postgres.url)
     with Archive.open(tmp_path / "file", write=True), pytest.raises(SettingsError, match="in its folder already"):
-        choose_catalogue(tmp_path / "file", postgres.url)
+        chosen_catalogues(tmp_path / "file", postgres.url)
+
+
+def test_what_one_command_chooses_holds_for_no_other(postgres: PostgresServer, tmp_path: Path) -> None:
+    chosen = Catalogues.of_environment().choosing(postgres.url)
+    for name, catalogues, file in (("chosen", chosen, POINTER), ("plain", None, CATALOGUE)):
+        with Archive.open(tmp_path / name, write=True, catalogues=catalogues):
+            pass
+        assert (tmp_path / name / file).is_file()
+    with Archive.open(tmp_path / "chosen", write=False, catalogues=chosen) as archive:
+        assert not archive.has_site
+    with pytest.raises(StoreError, match=f"set {VARIABLE}="):
+        Archive.open(tmp_path / "chosen", write=False)
 
 
 def test_a_lost_schema_costs_no_file(site: Path, postgres: PostgresServer) -> None:
@@ -356,10 +375,12 @@ def test_a_site_of_today_moves_into_the_database(
     with Archive.open(tmp_path / "old", write=True) as archive:
         archive.create_site(SITE)
         map_flight(archive, "a", 20, count=2, compared=True)
-    monkeypatch.setenv(VARIABLE, "")  # put back afterwards: --catalogue sets it
     words = ["site", "copy", str(tmp_path / "old"), str(tmp_path / "new"), "--catalogue", postgres.url]
     assert main(words) == 0 and main(words) == 0, capsys.readouterr().err
     assert (tmp_path / "new" / POINTER).is_file() and not (tmp_path / "new" / "site.db").exists()
+    with pytest.raises(StoreError, match=f"set {VARIABLE}="):  # --catalogue was for that command alone
+        Archive.open(tmp_path / "new", write=False)
+    monkeypatch.setenv(VARIABLE, postgres.url)
     with Archive.open(tmp_path / "old", write=False) as old, Archive.open(tmp_path / "new", write=True) as new:
         assert new.flights() == old.flights() and len(new.changes()) == len(old.changes()) == 2
         assert map_flight(new, "b", 60, count=1) == 2

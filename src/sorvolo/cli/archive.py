@@ -50,9 +50,7 @@ def index_command(
     Example: sorvolo archive index /srv/flights
     """
     from sorvolo.missions.archive.index import index_archive
-    from sorvolo.store.site.catalogue_place import trust
 
-    trust(catalogue)
     outcome = _shown(index_archive(root, catalogue))
     if as_json:
         typer.echo(json.dumps({"root": str(root), **asdict(outcome)}, indent=1))

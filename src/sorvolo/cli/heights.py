@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -14,6 +14,9 @@ from sorvolo.cli.options import AsJson
 from sorvolo.cli.places_of_sites import SiteArgument, opened_site
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.shown import read_json, show_path
+
+if TYPE_CHECKING:
+    from sorvolo.store.site.catalogue_place import Catalogues
 
 
 def heights(
@@ -42,7 +45,8 @@ def heights(
 
 
 def make_and_read(
-    site: Path, flight: str = "", cell_m: float | None = None, *, has_orthophoto: bool = True
+    site: Path, flight: str = "", cell_m: float | None = None, *, has_orthophoto: bool = True,
+    catalogues: "Catalogues | None" = None,
 ) -> Mapping[str, Any]:
     """Make a flight's heights with progress on stderr; their report."""
     from sorvolo.missions.heights.run import HeightSettings, make_heights
@@ -52,7 +56,8 @@ def make_and_read(
     with ProgressReport(Console(stderr=True)) as progress:
         progress.show("heights")
         for update in make_heights(
-            site, HeightSettings(cell_m=cell_m, has_orthophoto=has_orthophoto), flight=flight or None
+            site, HeightSettings(cell_m=cell_m, has_orthophoto=has_orthophoto), flight=flight or None,
+            catalogues=catalogues,
         ):
             flight_id = update.flight_id
             progress.show(f"heights: {update.stage}, percent", round(100 * update.share), 100)

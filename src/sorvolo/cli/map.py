@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.flight.request import AlreadyDone
     from sorvolo.missions.flight.settings import MapSettings
+    from sorvolo.store.site.catalogue_place import Catalogues
     from sorvolo.survey.mosaic import MosaicUpdate
 
 _MOST_REASONS = 6
@@ -173,13 +174,13 @@ def map_command(
         control_sigma_m=gcp_accuracy, checks=names(check), memory_mb=memory, classes=names(classes),
     )
     with opened_site(site, writes=True) as place:
-        place_catalogue(place.folder, catalogue)
+        catalogues = _catalogues(site, place.folder, catalogue)
         reports = map_and_read_reports(
             inputs, place.folder, settings, telemetry=telemetry, camera=camera or None, area=area,
             live=LiveSettings(keeps_all=True, give_up_s=give_up), control=gcp, base=base, again=again, sent=place.sent,
-            refly=refly or (),
+            refly=refly or (), catalogues=catalogues,
         )
-        _print(reports, place.folder, with_heights=heights, as_json=as_json)
+        _print(reports, place.folder, catalogues, with_heights=heights, as_json=as_json)
     _exit_by(reports)
 
 
@@ -189,19 +190,22 @@ def _exit_by(reports: Sequence[Mapping[str, Any]]) -> None:
         raise typer.Exit(TO_CHECK)
 
 
-def place_catalogue(site: Path, address: str) -> None:
-    """Let a new site's catalogue lie at this address; "" leaves it to the environment. Raises SettingsError."""
-    from sorvolo.store.site.catalogue_place import choose_catalogue
+def _catalogues(site: str, folder: Path, address: str) -> "Catalogues":
+    """Where a new site's catalogue goes: to this address; "" leaves it to the environment. Raises SettingsError."""
+    from sorvolo.missions.site.copy import folder_of
+    from sorvolo.store.site.catalogue_place import chosen_catalogues
 
-    if address:
-        choose_catalogue(site, address)
+    in_store = folder_of(site) is None  # there it lies with the tiles
+    return chosen_catalogues(folder, address or ("sqlite" if in_store else ""))
 
 
-def _print(reports: Sequence[Mapping[str, Any]], site: Path, *, with_heights: bool, as_json: bool) -> None:
+def _print(
+    reports: Sequence[Mapping[str, Any]], site: Path, catalogues: "Catalogues", *, with_heights: bool, as_json: bool
+) -> None:
     """Print what became of the flights; with heights, make and print them, too."""
     if not as_json:
         show_reports(reports, site, Console())
-    heights = [make_and_read(site, each["flight"]) for each in reports] if with_heights else []
+    heights = [make_and_read(site, each["flight"], catalogues=catalogues) for each in reports if with_heights]
     if as_json:
         plain = [{key: value for key, value in each.items() if key != "track"} for each in reports]
         files = {path.name.replace(".", "_"): str(path) for path in _map_files(site).values()}
@@ -215,22 +219,22 @@ def map_and_read_reports(
     inputs: Sequence[Path | str], site: Path, settings: "MapSettings", *, telemetry: Path | str | None = None,
     camera: str | None = None, area: Path | None = None,
     live: "LiveSettings | None" = None, control: Path | None = None, base: Path | None = None, again: bool = False,
-    sent: Passing = not_sent, refly: Sequence[Path] = (),
+    sent: Passing = not_sent, refly: Sequence[Path] = (), catalogues: "Catalogues | None" = None,
 ) -> list[dict[str, Any]]:
     """Map with progress on stderr; the reports of the flights, in order, and of those that were mapped already.
 
-    `sent` sees the mission's updates and may send what a flight added.
+    `sent` sees the mission's updates and may send what a flight added. `catalogues`: as `map_flights`.
     """
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.map.flights import map_flights
     from sorvolo.store.site.archive import Archive
 
-    before = newest_version(site)
+    before = newest_version(site, catalogues)
     with ended_by_signal(inputs) as until:
         mapping = sent(map_flights(
             inputs, site, settings, telemetry=telemetry, camera=camera, area=area,
             live=live or LiveSettings(keeps_all=True), until=until, control=control, base=base, again=again,
-            refly=refly,
+            refly=refly, catalogues=catalogues,
         ))
         known: list[AlreadyDone] = []
 
@@ -241,7 +245,7 @@ def map_and_read_reports(
         with closing(mapping):
             show_progress(noted(), Console(stderr=True))
     show_done(known, "mapped")
-    with Archive.open(site, write=False) as archive:
+    with Archive.open(site, write=False, catalogues=catalogues) as archive:
         mapped = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
         mapped += [each.flight for each in known]
         return [read_json(archive.flight_folder(flight_id) / "report.json") for flight_id in mapped]

@@ -80,10 +80,7 @@ class OpenedSite:
 def opened_site(site: str, *, writes: bool = False) -> Iterator[OpenedSite]:
     """The site's folder. One in a store is brought up to date before, and what was added is sent at the end."""
     from sorvolo.missions.site.working_copy import fetch_site, send_site
-    from sorvolo.store.site.catalogue_place import trust
 
-    if "://" in site:
-        trust("sqlite")  # the catalogue of a new one goes to the store with its tiles
     folder = show_copy(fetch_site(site, writes=writes), "fetching, file")
     try:
         yield OpenedSite(folder, site)

@@ -13,6 +13,7 @@ from sorvolo.errors import StoreError
 
 if TYPE_CHECKING:
     from sorvolo.missions.flight.request import AlreadyDone
+    from sorvolo.store.site.catalogue_place import Catalogues
     from sorvolo.survey.flight import Site
 
 
@@ -38,14 +39,14 @@ def read_json(path: Path) -> dict[str, Any]:
         raise StoreError(f"{path} cannot be read ({error}); run the command on this flight again") from error
 
 
-def newest_version(site: Path) -> int:
+def newest_version(site: Path, catalogues: "Catalogues | None" = None) -> int:
     """The id of the site's newest version; 0 where there is no site yet."""
     from sorvolo.store.site.archive import Archive
     from sorvolo.store.site.catalogue_place import is_site
 
     if not is_site(site):
         return 0
-    with Archive.open(site, write=False) as archive:
+    with Archive.open(site, write=False, catalogues=catalogues) as archive:
         return max((each.id for each in archive.versions() if each.complete), default=0)
 
 

@@ -9,7 +9,7 @@ from sorvolo.errors import InputError, StoreError
 from sorvolo.store.index.archive_index import ArchiveIndex, IndexedSite
 from sorvolo.store.index.site_rows import flight_rows, site_state
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.catalogue_place import is_site
+from sorvolo.store.site.catalogue_place import Catalogues, is_site
 
 
 @dataclass(frozen=True)
@@ -43,15 +43,16 @@ def index_archive(root: Path, address: str = "") -> Generator[IndexUpdate, None,
     A new index lies at `address`, a PostgreSQL URL, else in the folder. A flight mapped again replaces itself. Raises
     InputError for no folder, StoreError or SettingsError where the index cannot be written.
     """
+    catalogues = Catalogues.of_environment().choosing(address)
     if not root.is_dir():
         raise InputError(f"{root}: no folder; give the one that the site folders lie in")
     outcome = IndexOutcome()
-    with ArchiveIndex.open(root, write=True, address=address) as index:
+    with ArchiveIndex.open(root, write=True, address=address, catalogues=catalogues) as index:
         known = index.sites()
         paths = sorted(sites_below(root))
         outcome.sites = len(paths)
         for done, path in enumerate(paths, start=1):
-            update = _update_site(root, path, index, known.get(path), done, len(paths))
+            update = _update_site(root, path, index, known.get(path), catalogues, done, len(paths))
             _count(outcome, update)
             yield update
         outcome.gone = sorted(known.keys() - set(paths))
@@ -73,11 +74,11 @@ def sites_below(root: Path) -> Iterator[str]:
 
 
 def _update_site(
-    root: Path, path: str, index: ArchiveIndex, known: IndexedSite | None, done: int, count: int
+    root: Path, path: str, index: ArchiveIndex, known: IndexedSite | None, catalogues: Catalogues, done: int, count: int
 ) -> IndexUpdate:
     before = known.flights if known is not None else {}
     try:
-        with Archive.open(root / path, write=False) as archive:
+        with Archive.open(root / path, write=False, catalogues=catalogues) as archive:
             state = site_state(archive)
             if known is not None and known.state == state.state:
                 return IndexUpdate(path, done, count)

@@ -18,7 +18,7 @@ from sorvolo.missions.flight.control import FlightControl
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.mosaic.selection import FramePlan, live_plan, untimed_plan, video_plan
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.catalogue_place import is_site
+from sorvolo.store.site.catalogue_place import Catalogues, is_site
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import CameraPrior, Frame, Notice, PosedFrame, Site
 from sorvolo.survey.mosaic import FrameView
@@ -246,11 +246,11 @@ def _planned(source: Source, settings: MapSettings, telemetry: FlightTelemetry) 
     )
 
 
-def known_flights(site: Path) -> dict[str, str]:
+def known_flights(site: Path, catalogues: Catalogues | None = None) -> dict[str, str]:
     """The fingerprint of each flight that the site folder has, by name; none where there is no site yet."""
     if not is_site(site):
         return {}
-    with Archive.open(site, write=False) as archive:
+    with Archive.open(site, write=False, catalogues=catalogues) as archive:
         return {each.id: each.fingerprint for each in archive.flights()}
 
 

@@ -25,6 +25,7 @@ from sorvolo.store.images import png_from_rgba
 from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.store.rasters.heights import write_height_cog
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue_place import Catalogues
 from sorvolo.store.site.files import HeightFile
 from sorvolo.store.tile_folder import TileFolder
 from sorvolo.survey.flight import Site
@@ -57,15 +58,16 @@ class HeightsUpdate:
 
 
 def make_heights(
-    site: Path, settings: HeightSettings = HeightSettings(), *, flight: str | None = None
+    site: Path, settings: HeightSettings = HeightSettings(), *, flight: str | None = None,
+    catalogues: Catalogues | None = None,
 ) -> Generator[HeightsUpdate]:
     """Make the heights of one mapped flight (None: the newest) as files in its folder, yielding progress.
 
-    Raises InputError for a flight that has no heights to give (no GPS, too few photos that overlap), StoreError for a
-    folder that is no site.
+    `catalogues` has the site's; None: that of the environment. Raises InputError for a flight that has no heights to
+    give (no GPS, too few photos that overlap), StoreError for a folder that is no site.
     """
-    Archive.open(site, write=False).close()  # to write would make a folder that is not there
-    with Archive.open(site, write=True) as archive:
+    Archive.open(site, write=False, catalogues=catalogues).close()  # to write would make a folder that is not there
+    with Archive.open(site, write=True, catalogues=catalogues) as archive:
         flight_id = flight or newest_flight(archive)
         keyframes = [each for each in archive.keyframes(flight_id) if each.site_from_camera is not None]
         started_s = time.monotonic()

@@ -41,6 +41,7 @@ from sorvolo.missions.map.thesis_run import ThesisRun
 from sorvolo.mosaic.control import ControlSettings
 from sorvolo.mosaic.selection import SelectionSettings, every, select_keyframes, shows_all_between
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue_place import Catalogues
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
 from sorvolo.survey.mosaic import MosaicUpdate, Status
@@ -53,7 +54,7 @@ def map_flights(
     telemetry: Path | str | None = None, camera: Path | str | None = None, area: Path | None = None,
     detector: Detects | None = None, live: LiveSettings = LiveSettings(keeps_all=True),  # noqa: B008 (frozen)
     until: threading.Event | None = None, control: Path | None = None,
-    base: Path | None = None, again: bool = False, refly: Sequence[Path] = (),
+    base: Path | None = None, again: bool = False, refly: Sequence[Path] = (), catalogues: Catalogues | None = None,
 ) -> Generator[MosaicUpdate, None, tuple[AlreadyDone, ...]]:
     """Map one or more flights into the site folder, yielding an update for each selected frame.
 
@@ -66,14 +67,15 @@ def map_flights(
     Nothing of a flight is part of the site until its last update was yielded.
     A run that was killed goes on where it was when the same is asked for again. A flight that the site has already, by
     the same files, settings and version of the program, is left out and returned, unless `again` is given.
+    `catalogues` is where a new site's catalogue goes; None: where the environment has it.
     `refly` are files for waypoints over ground that the pictures leave out, kept up to date while the flight goes on.
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being mapped is left out, those before it are in.
     """
     wanted = None if area is None else read_area(area)
     looks = open_detector(settings.model) if detector is None else detector
-    opened = opened_sources(inputs, telemetry, camera, known_flights(site), live=live, until=until)
-    with opened as sources, Archive.open(site, write=True) as archive:
+    opened = opened_sources(inputs, telemetry, camera, known_flights(site, catalogues), live=live, until=until)
+    with opened as sources, Archive.open(site, write=True, catalogues=catalogues) as archive:
         ground = _known_ground(control, base, sources, settings)
         known = []
         asked = replace(settings, live_s=0.0, memory_mb=None), wanted, looks

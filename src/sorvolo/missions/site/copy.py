@@ -12,7 +12,7 @@ from sorvolo.store.copies.folder import FolderEnd
 from sorvolo.store.copies.objects import open_objects
 from sorvolo.store.copies.tidying import Pruned, prune
 from sorvolo.store.copies.transfer import CopyOutcome, CopyUpdate, SiteEnd, copy, verify
-from sorvolo.store.site.catalogue_place import choose_catalogue
+from sorvolo.store.site.catalogue_place import Catalogues, chosen_catalogues
 
 _MAY_BE_SHORT = 1.05  # times the need: other programs write to the disk as well
 
@@ -27,9 +27,7 @@ def copy_site(source: str, target: str, catalogue: str = "") -> Generator[CopyUp
     SettingsError or StoreError with what to do: where there is no site, where the target holds another one or what the
     source lacks, where the disk is too full, where a store refuses or cannot be reached.
     """
-    ends = _ends(source, target)
-    if catalogue:
-        ends = ends[0], _with_catalogue(target, catalogue)
+    ends = _ends(source, target, catalogue)
     with tempfile.TemporaryDirectory(prefix="sorvolo-") as scratch:
         return (yield from copy(*ends, Path(scratch), room=lambda need, free: _check_room(target, need, free)))
 
@@ -51,8 +49,9 @@ def prune_site(address: str, keep_days: float, *, only_count: bool = False) -> P
     return prune(open_objects(address), keep_days * 86_400, only_count=only_count)
 
 
-def _ends(source: str, target: str) -> tuple[SiteEnd, SiteEnd]:
-    ends = open_end(source), open_end(target)
+def _ends(source: str, target: str, catalogue: str = "") -> tuple[SiteEnd, SiteEnd]:
+    catalogues = _catalogues(target, catalogue) if catalogue else None
+    ends = open_end(source, catalogues), open_end(target, catalogues)
     if isinstance(ends[0], FolderEnd) and isinstance(ends[1], FolderEnd):
         one, other = ends[0].folder.resolve(), ends[1].folder.resolve()
         if one.is_relative_to(other) or other.is_relative_to(one):
@@ -60,19 +59,18 @@ def _ends(source: str, target: str) -> tuple[SiteEnd, SiteEnd]:
     return ends
 
 
-def _with_catalogue(target: str, catalogue: str) -> FolderEnd:
-    """The folder of a copy whose catalogue lies elsewhere."""
+def _catalogues(target: str, catalogue: str) -> Catalogues:
+    """Those with the catalogue of a new copy at an address."""
     folder = folder_of(target)
     if folder is None:
         raise SettingsError(f"{target} keeps its catalogue with its tiles; --catalogue is for folders")
-    choose_catalogue(folder, catalogue)
-    return FolderEnd(folder, in_database=True)
+    return chosen_catalogues(folder, catalogue)
 
 
-def open_end(address: str) -> SiteEnd:
+def open_end(address: str, catalogues: Catalogues | None = None) -> SiteEnd:
     """The place that an address names. Raises SettingsError for one that names none."""
     folder = folder_of(address)
-    return BucketEnd(open_objects(address)) if folder is None else FolderEnd(folder)
+    return BucketEnd(open_objects(address)) if folder is None else FolderEnd(folder, catalogues)
 
 
 def folder_of(address: str) -> Path | None:

@@ -38,7 +38,7 @@ from sorvolo.store.copies.state import (
 from sorvolo.store.nofollow import open_below, refuse_links
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site.catalogue import Catalogue
-from sorvolo.store.site.catalogue_place import CATALOGUE, POINTER, create_database, is_site
+from sorvolo.store.site.catalogue_place import CATALOGUE, POINTER, Catalogues, create_database, is_site
 from sorvolo.store.site.files import (
     COPYING,
     JOURNAL,
@@ -61,9 +61,9 @@ _OF_THE_FOLDER = frozenset({
 class FolderEnd:
     """A folder that a site is copied from or to."""
 
-    def __init__(self, folder: Path, *, in_database: bool = False) -> None:
-        """`in_database`: a new copy's catalogue lies where the environment has new ones, else in the folder."""
-        self.folder, self._in_database = folder, in_database
+    def __init__(self, folder: Path, catalogues: Catalogues | None = None) -> None:
+        """A new copy's catalogue goes where `catalogues` has it; None: a file in the folder."""
+        self.folder, self._catalogues = folder, catalogues
 
     @property
     def name(self) -> str:
@@ -81,7 +81,7 @@ class FolderEnd:
         Raises StoreError for no site, one without a map, or one that is a copy that is not finished.
         """
         refuse_unfinished(self.folder)
-        files = SiteFiles.open(self.folder, write=False)
+        files = SiteFiles.open(self.folder, write=False, catalogues=self._catalogues)
         try:
             path = scratch / CATALOGUE
             _copy_catalogue(files.catalogue, path)
@@ -177,12 +177,12 @@ class FolderEnd:
     def conclude(self, state: SiteState) -> None:
         """Make the folder this state of the site: its catalogue comes last, then what the state has not is removed."""
         catalogue = self.folder / CATALOGUE
-        if self._in_database and not is_site(self.folder):
-            create_database(self.folder)
+        if self._catalogues is not None and not is_site(self.folder):
+            create_database(self.folder, self._catalogues)
         if catalogue.is_file():
             _overwrite_catalogue(catalogue, state.catalogue)
         elif is_site(self.folder):
-            _overwrite_rows(self.folder, state.catalogue)
+            _overwrite_rows(self.folder, state.catalogue, self._catalogues)
         else:
             with atomic_path(catalogue) as temporary, writing(temporary):
                 shutil.copyfile(state.catalogue, temporary)
@@ -201,7 +201,7 @@ class FolderEnd:
     def _held(self, scratch: Path) -> tuple[CatalogueState | None, Mapping[str, SiteFile]]:
         """What the folder's catalogue holds (None: no map), unfinished runs apart, and its files."""
         path = scratch / f"held-{CATALOGUE}"
-        with closing(Catalogue.open(self.folder, write=False)) as catalogue:
+        with closing(Catalogue.open(self.folder, write=False, catalogues=self._catalogues)) as catalogue:
             _copy_catalogue(catalogue, path)
         with closing(Catalogue.at(path, write=True)) as copied:
             with copied.changing() as connection:
@@ -280,10 +280,10 @@ def _overwrite_catalogue(path: Path, new: Path) -> None:
         raise StoreError(f"cannot write {path} ({error}); free some space and run the copy again") from error
 
 
-def _overwrite_rows(folder: Path, new: Path) -> None:
+def _overwrite_rows(folder: Path, new: Path, catalogues: Catalogues | None) -> None:
     """The same where the catalogue lies in a database."""
     with (
-        closing(Catalogue.open(folder, write=True)) as target, target.changing() as written,
+        closing(Catalogue.open(folder, write=True, catalogues=catalogues)) as target, target.changing() as written,
         closing(Catalogue.at(new, write=False)) as source, source.reading() as read,
     ):
         copy_rows(read, written)

@@ -26,7 +26,7 @@ from sorvolo.errors import SettingsError, StoreError
 from sorvolo.store.index import tables
 from sorvolo.store.index.finding import FoundFlight, Place, find
 from sorvolo.store.index.site_rows import FlightRows, SiteState
-from sorvolo.store.site.catalogue_place import create_pointed, parsed_url, pointed_database
+from sorvolo.store.site.catalogue_place import Catalogues, create_pointed, parsed_url, pointed_database
 from sorvolo.store.site.database import Database
 from sorvolo.store.site.sqlite_database import SqliteDatabase
 
@@ -65,11 +65,14 @@ class ArchiveIndex:
             )
 
     @classmethod
-    def open(cls, root: Path, *, write: bool, address: str = "") -> Self:
+    def open(
+        cls, root: Path, *, write: bool, address: str = "", catalogues: Catalogues | None = None
+    ) -> Self:
         """The index of a folder of sites. Writing makes one where there is none: at `address`, else in the folder.
 
-        `address` is a PostgreSQL URL; "" is a file of SQLite's, or the index that is there. Raises StoreError where
-        there is none to read, SettingsError for an address when the index lies elsewhere.
+        `address` is a PostgreSQL URL; "" is a file of SQLite's, or the index that is there. One that lies elsewhere is
+        looked for among `catalogues`; None: those of the environment. Raises StoreError where there is none to read,
+        SettingsError for an address when the index lies elsewhere.
         """
         if not has_index(root):
             if not write:
@@ -84,7 +87,7 @@ class ArchiveIndex:
             )
         if is_file:
             return cls(SqliteDatabase(root / INDEX, write=write, layout=tables.LAYOUT))
-        return cls(pointed_database(root, POINTER, write=write, layout=tables.LAYOUT))
+        return cls(pointed_database(root, POINTER, write=write, layout=tables.LAYOUT, catalogues=catalogues))
 
     def close(self) -> None:
         """Let go of the database."""

@@ -15,6 +15,7 @@ from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
 from sorvolo.store.site.catalogue import FlightEntry, StoredKeyframe, TileDifference, VersionEntry
+from sorvolo.store.site.catalogue_place import Catalogues
 from sorvolo.store.site.change_records import StoredChange, StoredReview
 from sorvolo.store.site.files import HeightFile, SiteFiles
 from sorvolo.store.site.flight_writer import FlightWriter
@@ -43,14 +44,15 @@ class Archive:
         self._writer: FlightWriter | None = None
 
     @classmethod
-    def open(cls, folder: Path, *, write: bool) -> Self:
+    def open(cls, folder: Path, *, write: bool, catalogues: Catalogues | None = None) -> Self:
         """Open a site folder, to read it (while another process writes it, too) or as its only writer.
 
-        Writing creates the folder, removes what a killed run left and repairs derived files. Raises
+        Writing creates the folder, removes what a killed run left and repairs derived files. A new catalogue goes, and
+        one that lies elsewhere is looked for, where `catalogues` has it; None: where the environment has it. Raises
         StoreError when the folder is no site, is being written by another process, cannot be written, is
         damaged, holds a link, or has another format version; then nothing in it was changed.
         """
-        files = SiteFiles.open(Path(folder), write=write)
+        files = SiteFiles.open(Path(folder), write=write, catalogues=catalogues)
         try:
             if write:
                 forget_unfinished(files)

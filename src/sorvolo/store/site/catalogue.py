@@ -30,7 +30,7 @@ from sorvolo.geometry.grid import TileIndex
 from sorvolo.geometry.pose import Pose
 from sorvolo.store.rasters.geotiff import COMPRESSIONS
 from sorvolo.store.site import schema
-from sorvolo.store.site.catalogue_place import open_database
+from sorvolo.store.site.catalogue_place import Catalogues, open_database
 from sorvolo.store.site.database import Database
 from sorvolo.store.site.names import checked_crs, checked_image_path
 from sorvolo.store.site.schema import SCHEMA_VERSION
@@ -146,9 +146,9 @@ class Catalogue:
             raise
 
     @classmethod
-    def open(cls, folder: Path, *, write: bool) -> Self:
+    def open(cls, folder: Path, *, write: bool, catalogues: Catalogues | None = None) -> Self:
         """The catalogue of a site folder, wherever it lies. Raises as the constructor."""
-        return cls(open_database(folder, write=write), folder, write=write)
+        return cls(open_database(folder, write=write, catalogues=catalogues), folder, write=write)
 
     @classmethod
     def at(cls, path: Path, *, write: bool) -> Self:

@@ -4,7 +4,9 @@ import json
 import os
 import re
 import secrets
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 from sqlalchemy import URL, make_url
 from sqlalchemy.exc import ArgumentError
@@ -23,12 +25,50 @@ POINTER = "site-catalogue.json"
 VARIABLE = "SORVOLO_CATALOGUE"
 """The environment's databases, separated by spaces, the first the one for new sites ("sqlite": their folders).
 
-They are the only servers that a site folder can have us connect to.
+With those of `--catalogue` they are the only servers that a site folder can have us connect to. Read here alone, and
+never written: what a command chooses is passed on as `Catalogues`.
 """
 
 _SCHEMES = ("postgresql", "postgres", "postgresql+psycopg")
 _NAME = re.compile(r"[a-z_][a-z0-9_]{0,62}")
 _MOST_BYTES = 100_000
+
+
+@dataclass(frozen=True)
+class Catalogues:
+    """Which databases this user's sites may lie in, and where the catalogue of a new site goes."""
+
+    trusted: tuple[URL, ...] = ()  # PostgreSQL databases
+    new: URL | None = None  # None: a file in the site's folder
+
+    @classmethod
+    def of_environment(cls) -> Self:
+        """As the user has set `SORVOLO_CATALOGUE`. Raises SettingsError for what is no address."""
+        found = [parsed_url(each) for each in os.environ.get(VARIABLE, "").split()]
+        return cls(tuple(each for each in found if each is not None), next(iter(found), None))
+
+    def choosing(self, words: str) -> "Catalogues":
+        """The same with new catalogues at an address, "sqlite" or a URL, which is trusted; "" changes nothing.
+
+        Raises SettingsError for what is no address, and for one with a password.
+        """
+        if not words:
+            return self
+        url = parsed_url(words)
+        if url is None:
+            return Catalogues(self.trusted)
+        if url.password:
+            raise SettingsError(
+                "--catalogue: leave the password out, others can read a command; put it into ~/.pgpass or PGPASSWORD"
+            )
+        return Catalogues((url, *self.trusted), url)
+
+    def find_trusted(self, url: URL) -> URL | None:
+        """The trusted URL of the same database; the only one where the server has moved; None for a stranger's."""
+        from sorvolo.store.site.postgres_database import shown_url
+
+        same = [each for each in self.trusted if shown_url(each) == shown_url(url)]
+        return next(iter(same or (self.trusted if len(self.trusted) == 1 else ())), None)
 
 
 def catalogue_file(folder: Path) -> Path | None:
@@ -41,47 +81,33 @@ def is_site(folder: Path) -> bool:
     return catalogue_file(folder) is not None
 
 
-def open_database(folder: Path, *, write: bool) -> Database:
-    """The database of a site. Raises StoreError where the pointer is broken or names a server that nobody trusts."""
+def open_database(folder: Path, *, write: bool, catalogues: Catalogues | None = None) -> Database:
+    """The database of a site. Raises StoreError where the pointer is broken or names a server that is not trusted."""
     if (folder / CATALOGUE).exists() or not (folder / POINTER).exists():
         return SqliteDatabase(folder / CATALOGUE, write=write)
-    return pointed_database(folder, POINTER, write=write)
+    return pointed_database(folder, POINTER, write=write, catalogues=catalogues)
 
 
-def create_database(folder: Path) -> None:
-    """Make the catalogue of a new site where the environment wants it: in the folder, or in PostgreSQL."""
-    url = parsed_url(next(iter(os.environ.get(VARIABLE, "").split()), ""))
+def create_database(folder: Path, catalogues: Catalogues | None = None) -> None:
+    """Make the catalogue of a new site where new ones go: in the folder, or in PostgreSQL."""
+    url = (catalogues or Catalogues.of_environment()).new
     if url is None:
         SqliteDatabase(folder / CATALOGUE, write=True).create()
     else:
         create_pointed(folder, POINTER, url, f"sorvolo_{folder.resolve().name}")
 
 
-def choose_catalogue(folder: Path, words: str) -> None:
-    """Let the catalogue of a new site lie there: "sqlite" or a URL without a password. Trusts it as `trust` does.
+def chosen_catalogues(folder: Path, words: str) -> Catalogues:
+    """Those of the environment, with a new site's catalogue at an address that its user chose; "" is no choice.
 
-    Raises SettingsError for anything else, and for a site whose catalogue lies elsewhere.
+    Raises SettingsError as `Catalogues.choosing`, and for a site whose catalogue lies elsewhere already.
     """
-    url = parsed_url(words)
+    chosen = Catalogues.of_environment().choosing(words)
     file = catalogue_file(folder)
-    if file is not None and file.name != (CATALOGUE if url is None else POINTER):
+    if words and file is not None and file.name != (CATALOGUE if chosen.new is None else POINTER):
         lies = "in its folder" if file.name == CATALOGUE else "in PostgreSQL"
         raise SettingsError(f"the catalogue of {folder} lies {lies} already; --catalogue is for a new site")
-    trust(words)
-
-
-def trust(words: str) -> None:
-    """Let this process, and those it starts, connect there, and make new catalogues there; "" changes nothing.
-
-    Raises SettingsError for what is no address, and for one with a password.
-    """
-    url = parsed_url(words)
-    if url is not None and url.password:
-        raise SettingsError(
-            "--catalogue: leave the password out, others can read a command; put it into ~/.pgpass or PGPASSWORD"
-        )
-    if words:
-        os.environ[VARIABLE] = " ".join([words, os.environ.get(VARIABLE, "")])
+    return chosen
 
 
 def parsed_url(words: str) -> URL | None:
@@ -101,12 +127,6 @@ def parsed_url(words: str) -> URL | None:
     return url.set(drivername="postgresql+psycopg")
 
 
-def trusted_urls() -> list[URL]:
-    """The PostgreSQL databases of the environment."""
-    found = [parsed_url(each) for each in os.environ.get(VARIABLE, "").split()]
-    return [each for each in found if each is not None]
-
-
 def create_pointed(folder: Path, pointer: str, url: URL, name: str, layout: Layout = CATALOGUE_LAYOUT) -> None:
     """Make a schema of a new name, then the folder's pointer to it: a kill in between leaves an empty schema."""
     from sorvolo.store.site.postgres_database import PostgresDatabase, shown_url
@@ -122,13 +142,23 @@ def create_pointed(folder: Path, pointer: str, url: URL, name: str, layout: Layo
 
 
 def pointed_database(
-    folder: Path, pointer: str, *, write: bool, layout: Layout = CATALOGUE_LAYOUT
+    folder: Path, pointer: str, *, write: bool, layout: Layout = CATALOGUE_LAYOUT, catalogues: Catalogues | None = None
 ) -> Database:
-    """The database that a folder's pointer names. Raises StoreError for a broken pointer, or a server nobody trusts."""
-    from sorvolo.store.site.postgres_database import PostgresDatabase
+    """The database that a folder's pointer names, if it is one of `catalogues` (None: of the environment).
 
-    url, schema = _read_pointer(folder, pointer)
-    return PostgresDatabase(_trusted(url, folder), schema, write=write, layout=layout)
+    A folder that a stranger made must not have us connect, with the user's password, wherever it likes: raises
+    StoreError for a server that is not trusted, as for a broken pointer.
+    """
+    from sorvolo.store.site.postgres_database import PostgresDatabase, shown_url
+
+    named, schema = _read_pointer(folder, pointer)
+    url = (catalogues or Catalogues.of_environment()).find_trusted(named)
+    if url is None:
+        raise StoreError(
+            f"the catalogue of {folder} lies in PostgreSQL, at {shown_url(named)}; if you trust that server, set "
+            f"{VARIABLE}={shown_url(named)} (with USER@ before the host where your name there is another)"
+        )
+    return PostgresDatabase(url, schema, write=write, layout=layout)
 
 
 def _read_pointer(folder: Path, pointer: str) -> tuple[URL, str]:
@@ -142,20 +172,3 @@ def _read_pointer(folder: Path, pointer: str) -> tuple[URL, str]:
             f"{folder / pointer} does not name a catalogue (schema and url were needed); restore it from a copy"
         ) from error
     return url, schema
-
-
-def _trusted(url: URL, folder: Path) -> URL:
-    """The environment's URL of the same database; its only one where the server has moved.
-
-    A folder that a stranger made must not have us connect, with the user's password, wherever it likes.
-    """
-    from sorvolo.store.site.postgres_database import shown_url
-
-    urls = trusted_urls()
-    same = [each for each in urls if shown_url(each) == shown_url(url)]
-    if same or len(urls) == 1:
-        return (same or urls)[0]
-    raise StoreError(
-        f"the catalogue of {folder} lies in PostgreSQL, at {shown_url(url)}; if you trust that server, set "
-        f"{VARIABLE}={shown_url(url)} (with USER@ before the host where your name there is another)"
-    )

@@ -18,7 +18,7 @@ from sorvolo.store.images import image_from_jpeg
 from sorvolo.store.nofollow import read_below, refuse_links
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site.catalogue import Catalogue, VersionEntry
-from sorvolo.store.site.catalogue_place import CATALOGUE, POINTER, create_database, is_site
+from sorvolo.store.site.catalogue_place import CATALOGUE, POINTER, Catalogues, create_database, is_site
 from sorvolo.store.site.names import checked_document, checked_image_path, checked_name
 from sorvolo.store.site.origin import ORIGIN, TILE_SIZES, UNSENT, find_origin
 from sorvolo.store.site.tiles import TileBlobs, TileView
@@ -67,21 +67,21 @@ class SiteFiles:
         self._lock = lock
 
     @classmethod
-    def open(cls, folder: Path, *, write: bool) -> Self:
+    def open(cls, folder: Path, *, write: bool, catalogues: Catalogues | None = None) -> Self:
         """Open a site folder. Raises StoreError as `Archive.open` does; to write, the folder is made and locked."""
         if not write:
             if not is_site(folder):
                 raise StoreError(f"no site at {folder}; make one with: sorvolo map INPUT --site {folder}")
             _refuse_traps(folder, skipped=frozenset({"tiles", "keyframes"}))  # those are read link by link
-            return cls(folder, Catalogue.open(folder, write=False), None)
+            return cls(folder, Catalogue.open(folder, write=False, catalogues=catalogues), None)
         refuse_unfinished(folder)
         _make_folder(folder)
         lock = lock_folder(folder)
         try:
             _refuse_traps(folder)
             if not _has_catalogue(folder):
-                create_database(folder)
-            return cls(folder, Catalogue.open(folder, write=True), lock)
+                create_database(folder, catalogues)
+            return cls(folder, Catalogue.open(folder, write=True, catalogues=catalogues), lock)
         except BaseException:
             os.close(lock)
             raise
