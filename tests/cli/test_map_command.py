@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from small_flights import simulate_into
 from sorvolo.cli import main as cli
 from sorvolo.cli.demo import _is_simulated
 from sorvolo.cli.progress import words_of
-from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.presets import preset
 from sorvolo.simulation.settings import SimulationSettings
 from sorvolo.store.site.archive import Archive
@@ -35,8 +35,7 @@ def _settings() -> SimulationSettings:
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     folder = tmp_path_factory.mktemp("map") / "simulated"
-    for _ in simulate_site(folder, _settings()):
-        pass
+    simulate_into(folder, _settings())
     yield folder
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from batch_flights import another, content
 
+from ended_work import ended
 from sorvolo.cluster.batch import BatchReport, BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.local_executor import LocalExecutor
@@ -58,12 +59,7 @@ def run(places: list[Path], root: Path, camera: Path, signals: dict[str, list[si
         with Disturbed(table.lock, signals) as made:
             yield made
 
-    running = run_batch(places, root, BatchSettings(FlightWish(camera=str(camera), model="none")), executor)
-    while True:
-        try:
-            next(running)
-        except StopIteration as end:
-            return end.value
+    return ended(run_batch(places, root, BatchSettings(FlightWish(camera=str(camera), model="none")), executor))
 
 
 @pytest.fixture(scope="module")

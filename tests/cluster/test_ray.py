@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from batch_flights import another, content
 
+from ended_work import ended
 from sorvolo.cli.main import main
 from sorvolo.cluster.batch import BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
@@ -86,15 +87,9 @@ def test_a_machine_that_dies_loses_nothing(cluster: object, flown: Path, tmp_pat
     killer = threading.Thread(target=_kill_a_machine_at_work, args=(cluster, root), daemon=True)
     killer.start()
     settings = BatchSettings(FlightWish(camera=str(flown / "camera.xml"), model="none"))
-    running = run_batch(
+    report = ended(run_batch(
         [tmp_path / "in"], root, settings, lambda table: ray_executor("ray", None, 60.0, table.root)
-    )
-    while True:
-        try:
-            next(running)
-        except StopIteration as end:
-            report = end.value
-            break
+    ))
     assert [row.state for row in report.rows] == [State.DONE, State.DONE]
     assert (report.tries, report.crashes) == (3, 1)
     for name in ("one", "two"):

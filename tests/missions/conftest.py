@@ -6,23 +6,13 @@ from pathlib import Path
 
 import av
 import pytest
+from truth_detector import TruthDetector
 
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.settings import (
-    ImagingSettings,
-    OutputSettings,
-    PathSettings,
-    SceneSettings,
-    SensorSettings,
-    SimulationSettings,
-)
+from small_flights import simulate_into, small_flight
+from sorvolo.simulation.settings import OutputSettings
 
-_SMALL = SimulationSettings(
-    seed=31, flights=1,
-    scene=SceneSettings(people=1, cars=1, small_objects=2, has_scenery=False),
-    path=PathSettings(height_m=20, speed_m_s=5, length_m=30, strips=2, strip_spacing_m=6),
-    imaging=ImagingSettings(width_px=480, height_px=270, fps=6),
-    sensor=SensorSettings(noise_m=(0.05, 0.05, 0.05)),
+_SMALL = small_flight(
+    31, length_m=30, spacing_m=6, size_px=(480, 270), fps=6, people=1, cars=1, small_objects=2
 )
 
 
@@ -30,18 +20,14 @@ _SMALL = SimulationSettings(
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A video of two strips with telemetry in every format, `camera.xml` and the truth."""
     folder = tmp_path_factory.mktemp("flights") / "filmed"
-    for _ in simulate_site(folder, replace(_SMALL, output=OutputSettings(telemetry="all"))):
-        pass
-    return folder
+    return simulate_into(folder, replace(_SMALL, output=OutputSettings(telemetry="all")))
 
 
 @pytest.fixture(scope="session")
 def photographed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same flight as geo-tagged photos with the gimbal's angles, and the truth."""
     folder = tmp_path_factory.mktemp("flights") / "photographed"
-    for _ in simulate_site(folder, replace(_SMALL, output=OutputSettings(photos=True))):
-        pass
-    return folder
+    return simulate_into(folder, replace(_SMALL, output=OutputSettings(photos=True)))
 
 
 @pytest.fixture(scope="session")
@@ -49,9 +35,7 @@ def lagging(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same photos, each with the fix of 0.4 s before: 2 m behind."""
     folder = tmp_path_factory.mktemp("flights") / "lagging"
     sensor = replace(_SMALL.sensor, clock_offset_s=0.4)
-    for _ in simulate_site(folder, replace(_SMALL, sensor=sensor, output=OutputSettings(photos=True))):
-        pass
-    return folder
+    return simulate_into(folder, replace(_SMALL, sensor=sensor, output=OutputSettings(photos=True)))
 
 
 @pytest.fixture(scope="session")
@@ -59,9 +43,7 @@ def oblique(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same video by a camera that looks 45 degrees down, with telemetry in every format."""
     folder = tmp_path_factory.mktemp("flights") / "oblique"
     motion = replace(_SMALL.motion, camera_pitch_deg=-45.0)
-    for _ in simulate_site(folder, replace(_SMALL, motion=motion, output=OutputSettings(telemetry="all"))):
-        pass
-    return folder
+    return simulate_into(folder, replace(_SMALL, motion=motion, output=OutputSettings(telemetry="all")))
 
 
 @pytest.fixture(scope="session")
@@ -79,3 +61,9 @@ def keyed(filmed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             target.mux(stream.encode(frame))
         target.mux(stream.encode())
     return folder / "flight1.mp4"
+
+
+@pytest.fixture(scope="module")
+def detector(flown: Path) -> TruthDetector:
+    """A detector that knows the truth of the module's own flight, `flown`."""
+    return TruthDetector(flown)

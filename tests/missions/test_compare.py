@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from small_flights import simulate_into, small_flight
 from sorvolo.capture.calibration import camera_from_option, guess_camera
 from sorvolo.capture.source import opened_sources
 from sorvolo.change.pair.thesis_options import thesis_options
@@ -31,31 +32,20 @@ from sorvolo.missions.flight.setup import _check_place, prepare
 from sorvolo.missions.heights.flight_views import run_of
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.map.known_keyframes import KnownKeyframes
-from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.mosaic.selection import every
-from sorvolo.simulation.settings import (
-    ImagingSettings,
-    LaterSettings,
-    OutputSettings,
-    PathSettings,
-    SceneSettings,
-    SensorSettings,
-    SimulationSettings,
-)
+from sorvolo.simulation.settings import LaterSettings, OutputSettings
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.findings import CompareUpdate, Verdict, ViewStatus
 from sorvolo.survey.flight import Frame, PosedFrame
 from sorvolo.survey.mosaic import Status
 
-_PAIR = SimulationSettings(
-    seed=41, flights=2,
-    scene=SceneSettings(people=0, cars=1, small_objects=3, has_scenery=False),
-    path=PathSettings(height_m=18, speed_m_s=5, length_m=36, strips=2, strip_spacing_m=7),
-    imaging=ImagingSettings(width_px=640, height_px=360, fps=5),
-    sensor=SensorSettings(noise_m=(0.2, 0.2, 0.2)),
-    later=LaterSettings(people=0, cars=1, small_objects=3, removed=2, moved=0),
-    output=OutputSettings(truth_step=2),
+_PAIR = replace(
+    small_flight(
+        41, height_m=18, length_m=36, spacing_m=7, size_px=(640, 360), noise_m=0.2, cars=1, small_objects=3,
+        output=OutputSettings(truth_step=2),
+    ),
+    flights=2, later=LaterSettings(people=0, cars=1, small_objects=3, removed=2, moved=0),
 )
 
 _MAP, _COMPARE = MapSettings(model="none"), CompareSettings(model="none")
@@ -65,9 +55,7 @@ _MAP, _COMPARE = MapSettings(model="none"), CompareSettings(model="none")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two flights over one site, the second finding other objects and other light; with the truth."""
     folder = tmp_path_factory.mktemp("pair") / "flown"
-    for _ in simulate_site(folder, _PAIR):
-        pass
-    return folder
+    return simulate_into(folder, _PAIR)
 
 
 @pytest.fixture(scope="module")
@@ -396,8 +384,7 @@ def elsewhere(tmp_path: Path, metres_east: float) -> Iterator[Path]:
     """A short flight over other ground, so far east of the site's."""
     scene = replace(_PAIR.scene, origin=Geodetic(41.8923127, 12.6035418 + metres_east / 83_000, 83.3))
     moved = replace(_PAIR, flights=1, scene=scene, path=replace(_PAIR.path, length_m=12, strips=1), seed=77)
-    for _ in simulate_site(tmp_path / "elsewhere", moved):
-        pass
+    simulate_into(tmp_path / "elsewhere", moved)
     yield tmp_path / "elsewhere"
 
 
@@ -545,8 +532,7 @@ def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(com
 def test_a_flight_in_the_dark_is_reported_to_show_less_and_paints_no_black_ground(site, tmp_path, brightness, printed):
     weather = replace(_PAIR.later.weather, brightness=brightness)
     dark = replace(_PAIR, later=replace(_PAIR.later, weather=weather))
-    for _ in simulate_site(tmp_path / "dark", dark):
-        pass
+    simulate_into(tmp_path / "dark", dark)
     shutil.copytree(site, tmp_path / "thesis")
     compare(tmp_path / "dark", site)
     (warning,) = (each for each in report(site)["warnings"] if "times as bright as the map" in each)

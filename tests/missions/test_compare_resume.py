@@ -3,36 +3,26 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from test_map_resume import Seeing, content
 
+from small_flights import simulate_into, small_flight
 from sorvolo.change.views import ViewMaker
 from sorvolo.errors import SorvoloWarning
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.mosaic.planar import PlanarMapper
-from sorvolo.simulation.settings import (
-    ImagingSettings,
-    LaterSettings,
-    PathSettings,
-    SceneSettings,
-    SensorSettings,
-    SimulationSettings,
-)
+from sorvolo.simulation.settings import LaterSettings
 from sorvolo.survey.findings import CompareUpdate
 
-_PAIR = SimulationSettings(
-    seed=43, flights=2,
-    scene=SceneSettings(people=0, cars=1, small_objects=3, has_scenery=False),
-    path=PathSettings(height_m=14, speed_m_s=4, length_m=18, strips=1),
-    imaging=ImagingSettings(width_px=320, height_px=180, fps=5),
-    sensor=SensorSettings(noise_m=(0.05, 0.05, 0.05)),
-    later=LaterSettings(people=0, cars=1, small_objects=3, removed=2, moved=0),
+_PAIR = replace(
+    small_flight(43, height_m=14, speed_m_s=4, length_m=18, cars=1, small_objects=3),
+    flights=2, later=LaterSettings(people=0, cars=1, small_objects=3, removed=2, moved=0),
 )
 _SETTINGS = CompareSettings(model="none", writes_masks=True)
 _KILLED_AT = 15  # frames
@@ -55,9 +45,7 @@ def compared(
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two flights along one strip, the second finding other objects."""
     folder = tmp_path_factory.mktemp("pair") / "flown"
-    for _ in simulate_site(folder, _PAIR):
-        pass
-    return folder
+    return simulate_into(folder, _PAIR)
 
 
 @pytest.fixture(scope="module")

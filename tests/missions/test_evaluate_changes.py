@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from small_flights import simulate_into
 from sorvolo.change.metrics import compared_ground
 from sorvolo.cli.evaluate import evaluate_app
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.evaluate.changes import evaluate_changes
 from sorvolo.missions.evaluate.frame_rows import time_ns_of
-from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.settings import (
     ImagingSettings,
     LaterSettings,
@@ -41,9 +41,7 @@ SHIFT_DEG = 4e-6  # the map lies 0.44 m north of the truth
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("changes") / "simulated"
-    for _ in simulate_site(folder, SETTINGS):
-        pass
-    return folder
+    return simulate_into(folder, SETTINGS)
 
 
 def shifted(geometry: dict, north_deg: float, east_deg: float = 0.0) -> dict:
@@ -279,8 +277,7 @@ def test_a_report_that_is_none_is_refused(site, simulated, tmp_path):
     write(other / "flights/flight2/changes.geojson", [])
     with pytest.raises(StoreError):
         evaluate_changes(other, simulated)
-    for _ in simulate_site(tmp_path / "single", replace(SETTINGS, flights=1)):
-        pass
+    simulate_into(tmp_path / "single", replace(SETTINGS, flights=1))
     with pytest.raises(InputError, match="second flight"):
         evaluate_changes(site, tmp_path / "single")
 

@@ -9,6 +9,7 @@ import pytest
 import rasterio
 
 from real_data import real_data
+from small_flights import simulate_into
 from sorvolo.cli.main import main
 from sorvolo.errors import GeometryError, InputError, SettingsError, StoreError
 from sorvolo.missions.compare.flights import _without_heights
@@ -17,7 +18,6 @@ from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.heights.measure import heights_stamp, measure_profile, measure_volume, write_contours
 from sorvolo.missions.heights.run import HeightSettings, make_heights
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.settings import (
     ImagingSettings,
     OutputSettings,
@@ -41,8 +41,7 @@ _SURVEY = SimulationSettings(
 def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A site with one small photo survey."""
     folder = tmp_path_factory.mktemp("heights")
-    for _ in simulate_site(folder / "made", _SURVEY):
-        pass
+    simulate_into(folder / "made", _SURVEY)
     photos = folder / "made" / "flight1" / "photos"
     assert main(["map", str(photos), "--site", str(folder / "site"), "--model", "none", "--heights", "--json"]) == 0
     made = list((folder / "site").glob("flights/*/heights.tif"))
@@ -88,8 +87,7 @@ def test_heights_name_what_is_missing(mapped: Path, tmp_path: Path) -> None:
 
 def test_a_flight_without_gps_has_no_heights(tmp_path: Path) -> None:
     silent = replace(_SURVEY, seed=13, output=replace(_SURVEY.output, telemetry="none"))
-    for _ in simulate_site(tmp_path / "made", silent):
-        pass
+    simulate_into(tmp_path / "made", silent)
     list(map_flights([tmp_path / "made" / "flight1" / "photos"], tmp_path / "site", MapSettings(model="none")))
     with pytest.raises(InputError, match="no GPS"):
         list(make_heights(tmp_path / "site"))

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from real_data import real_data
+from small_flights import simulate_into
 from sorvolo.cli import main as cli
 from sorvolo.errors import SettingsError
-from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.path import fly
 from sorvolo.simulation.presets import preset
 from sorvolo.simulation.settings import MotionSettings, PathSettings
@@ -27,8 +27,7 @@ def test_a_small_survey_is_mapped_whole_and_in_one_piece(tmp_path: Path) -> None
         wing, seed=7, scene=replace(wing.scene, people=0, cars=0, small_objects=0),
         path=replace(wing.path, length_m=110, strips=2), imaging=replace(wing.imaging, width_px=640, height_px=480),
     )
-    for _ in simulate_site(tmp_path / "flown", small):
-        pass
+    simulate_into(tmp_path / "flown", small)
     photos = tmp_path / "flown" / "flight1" / "photos"
     site, camera = tmp_path / "site", str(tmp_path / "flown" / "camera.xml")
     assert cli.main(["map", str(photos), "--site", str(site), "--model", "none", "--camera", camera]) == 0

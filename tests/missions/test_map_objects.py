@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from truth_detector import TruthDetector
 
+from small_flights import simulate_into, small_flight
 from sorvolo.change.classes import object_at, seen_at
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
@@ -20,15 +21,7 @@ from sorvolo.missions.evaluate.objects import evaluate_objects
 from sorvolo.missions.flight.map_objects import open_detector
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.settings import (
-    ImagingSettings,
-    OutputSettings,
-    PathSettings,
-    SceneSettings,
-    SensorSettings,
-    SimulationSettings,
-)
+from sorvolo.simulation.settings import OutputSettings
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 from sorvolo.survey.map_objects import MapObject
@@ -53,16 +46,14 @@ class Knowing(TruthDetector):
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two flights over a site with people, cars and small objects; boxes of every frame."""
     folder = tmp_path_factory.mktemp("objects") / "simulated"
-    settings = SimulationSettings(
-        seed=5, flights=2,
-        scene=SceneSettings(people=3, cars=3, small_objects=3, has_scenery=False),
-        path=PathSettings(height_m=20, speed_m_s=6, length_m=24, strips=2, strip_spacing_m=6),
-        imaging=ImagingSettings(width_px=480, height_px=270, fps=6),
-        sensor=SensorSettings(noise_m=(0.2, 0.2, 0.2)), output=OutputSettings(truth_step=1),
+    settings = replace(
+        small_flight(
+            5, speed_m_s=6, length_m=24, spacing_m=6, size_px=(480, 270), fps=6, noise_m=0.2,
+            people=3, cars=3, small_objects=3, output=OutputSettings(truth_step=1),
+        ),
+        flights=2,
     )
-    for _ in simulate_site(folder, settings):
-        pass
-    return folder
+    return simulate_into(folder, settings)
 
 
 @pytest.fixture(scope="module")

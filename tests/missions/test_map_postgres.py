@@ -9,8 +9,8 @@ import pytest
 from sqlalchemy import select
 
 from postgres_server import PostgresServer
+from small_flights import simulate_into
 from sorvolo.cli.main import main
-from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.presets import preset
 from sorvolo.store.site import schema
 from sorvolo.store.site.archive import Archive
@@ -29,9 +29,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
         path=replace(demo.path, length_m=16, strips=1),
         imaging=replace(demo.imaging, width_px=480, height_px=270, fps=4),
     )
-    for _ in simulate_site(folder, settings):
-        pass
-    return folder
+    return simulate_into(folder, settings)
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:

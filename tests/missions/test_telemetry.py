@@ -3,6 +3,7 @@
 import csv
 import json
 import socket
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -11,22 +12,15 @@ import av
 import numpy as np
 import pytest
 
+from small_flights import simulate_into, small_flight
 from sorvolo.capture.live.klv_telemetry import read_klv_file
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.missions.telemetry.doctor import CotReceiver, correct_telemetry
 from sorvolo.missions.watch.cot_sender import CotPlace
-from sorvolo.simulation.settings import (
-    ImagingSettings,
-    OutputSettings,
-    PathSettings,
-    SceneSettings,
-    SensorSettings,
-    SimulationSettings,
-)
+from sorvolo.simulation.settings import OutputSettings
 
 COMPASS_DEG, CLOCK_S, HEIGHT_M = 7.0, 0.4, 6.0
 
@@ -35,15 +29,11 @@ COMPASS_DEG, CLOCK_S, HEIGHT_M = 7.0, 0.4, 6.0
 def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A filmed flight whose log turns the compass by 7 degrees, lags by 0.4 s, and is 6 m too high."""
     folder = tmp_path_factory.mktemp("faulty") / "flight"
-    settings = SimulationSettings(
-        seed=77, flights=1, scene=SceneSettings(people=0, cars=0, small_objects=0, has_scenery=False),
-        path=PathSettings(height_m=30, speed_m_s=5, length_m=40, strips=2, strip_spacing_m=9),
-        imaging=ImagingSettings(width_px=480, height_px=360, fps=6),
-        sensor=SensorSettings(noise_m=(0.05, 0.05, 0.05), clock_offset_s=CLOCK_S),
-        output=OutputSettings(telemetry="csv"),
+    settings = small_flight(
+        77, height_m=30, length_m=40, spacing_m=9, size_px=(480, 360), fps=6, output=OutputSettings(telemetry="csv")
     )
-    for _ in simulate_site(folder, settings):
-        pass
+    settings = replace(settings, sensor=replace(settings.sensor, clock_offset_s=CLOCK_S))
+    simulate_into(folder, settings)
     _made_wrong(next((folder / "flight1").glob("*.csv")))
     return folder
 

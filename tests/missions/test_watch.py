@@ -18,46 +18,31 @@ import rasterio
 from rasterio.transform import Affine
 from truth_detector import TruthDetector
 
+from small_flights import simulate_into, small_flight
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.missions.watch.flights import watch
 from sorvolo.missions.watch.run import WatchUpdate
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
-from sorvolo.simulation.settings import (
-    ImagingSettings,
-    OutputSettings,
-    PathSettings,
-    SceneSettings,
-    SensorSettings,
-    SimulationSettings,
-)
+from sorvolo.simulation.settings import OutputSettings, SensorSettings
 from sorvolo.store.datasets import read_dataset
 from sorvolo.survey.objects import CLASSES, Detections, no_detections
 
-_FLOWN = SimulationSettings(
-    seed=77, flights=1,
-    scene=SceneSettings(people=3, cars=2, small_objects=0, has_scenery=False),
-    path=PathSettings(height_m=25, speed_m_s=6, length_m=40, strips=2, strip_spacing_m=8),
-    imaging=ImagingSettings(width_px=480, height_px=270, fps=5),
+_FLOWN = replace(
+    small_flight(
+        77, height_m=25, speed_m_s=6, length_m=40, spacing_m=8, size_px=(480, 270), people=3, cars=2,
+        output=OutputSettings(telemetry="all", truth_step=1),
+    ),
     sensor=SensorSettings(noise_m=(0.4, 0.4, 0.2)),
-    output=OutputSettings(telemetry="all", truth_step=1),
 )
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("watch") / "flown"
-    for _ in simulate_site(folder, _FLOWN):
-        pass
-    return folder
-
-
-@pytest.fixture(scope="module")
-def detector(flown: Path) -> TruthDetector:
-    return TruthDetector(flown)
+    return simulate_into(folder, _FLOWN)
 
 
 def _video(flown: Path) -> Path:

@@ -10,32 +10,20 @@ from pathlib import Path
 import pytest
 from truth_detector import TruthDetector
 
+from small_flights import simulate_into, small_flight
 from sorvolo.cli.main import main
 from sorvolo.errors import SorvoloWarning
-from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.missions.watch.flights import watch
 from sorvolo.missions.watch.run import WatchUpdate
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
-from sorvolo.simulation.settings import (
-    ImagingSettings,
-    OutputSettings,
-    PathSettings,
-    SceneSettings,
-    SensorSettings,
-    SimulationSettings,
-)
+from sorvolo.simulation.settings import OutputSettings
 
 _EFFORT = ("seconds", "latency_s", "frames_per_second", "peak_memory_mb")
 _KILLED_AT = 12  # frames
 
 
-_FLOWN = SimulationSettings(
-    seed=78, flights=1,
-    scene=SceneSettings(people=4, cars=3, small_objects=0, has_scenery=False),
-    path=PathSettings(height_m=20, speed_m_s=5, length_m=24, strips=2, strip_spacing_m=7),
-    imaging=ImagingSettings(width_px=320, height_px=180, fps=5),
-    sensor=SensorSettings(noise_m=(0.1, 0.1, 0.1)),
-    output=OutputSettings(telemetry="all", truth_step=1),
+_FLOWN = small_flight(
+    78, length_m=24, spacing_m=7, noise_m=0.1, people=4, cars=3, output=OutputSettings(telemetry="all", truth_step=1)
 )
 
 
@@ -43,14 +31,7 @@ _FLOWN = SimulationSettings(
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small flight over people and cars."""
     folder = tmp_path_factory.mktemp("watch") / "flown"
-    for _ in simulate_site(folder, _FLOWN):
-        pass
-    return folder
-
-
-@pytest.fixture(scope="module")
-def detector(flown: Path) -> TruthDetector:
-    return TruthDetector(flown)
+    return simulate_into(folder, _FLOWN)
 
 
 @pytest.fixture(params=["on the ground", "in the picture"])

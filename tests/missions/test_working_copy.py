@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from fake_bucket import BUCKET, served_bucket
 
+from ended_work import ended
 from sorvolo.cli.main import main
 from sorvolo.errors import SorvoloWarning, StoreError
 from sorvolo.missions.site.copy import copy_site
@@ -38,14 +39,6 @@ def machine(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cal
 
     become("one")
     return become
-
-
-def ended(work):  # type: ignore[no-untyped-def]
-    while True:
-        try:
-            next(work)
-        except StopIteration as end:
-            return end.value
 
 
 def fetched(address: str, *, writes: bool = False) -> Path:

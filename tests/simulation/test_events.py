@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from small_flights import simulate_into
 from sorvolo.errors import SettingsError
-from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.events import JOINED_GAP_M, event_features, true_events
 from sorvolo.simulation.flight import has_changed, simulate_flights
 from sorvolo.simulation.presets import preset
@@ -122,8 +122,7 @@ def test_a_later_flight_may_have_its_own_camera_height_and_heading(tmp_path):
         rays = second.camera.rays_from_pixels(second.camera.corners_px) @ pose.rotation.T
         ground = pose.translation_m[:2] - rays[:, :2] / rays[:, 2:] * pose.translation_m[2]
         assert (ground > corners[0]).all() and (ground < corners[1]).all()
-    for _ in simulate_site(tmp_path / "site", settings):
-        pass
+    simulate_into(tmp_path / "site", settings)
     assert "480" in (tmp_path / "site/flight2/camera.xml").read_text()
     assert "320" in (tmp_path / "site/camera.xml").read_text()
     events = json.loads((tmp_path / "site/truth/flight2/events.geojson").read_text())

@@ -16,15 +16,8 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
+from small_flights import simulate_into, small_flight
 from sorvolo.errors import StoreError
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.settings import (
-    ImagingSettings,
-    PathSettings,
-    SceneSettings,
-    SensorSettings,
-    SimulationSettings,
-)
 from sorvolo.station import runs as runs_module
 from sorvolo.station.app import station_app
 from sorvolo.station.orders import InputWish, Order, RunWish
@@ -32,23 +25,14 @@ from sorvolo.station.runs import Run, Runs
 from sorvolo.station.settings import StationLimits, StationSettings
 from sorvolo.station.state import utc_now
 
-FLIGHT = SimulationSettings(
-    seed=5, flights=1,
-    scene=SceneSettings(people=0, cars=1, small_objects=0, has_scenery=False),
-    path=PathSettings(height_m=20, speed_m_s=5, length_m=12, strips=1),
-    imaging=ImagingSettings(width_px=320, height_px=180, fps=4),
-    sensor=SensorSettings(noise_m=(0.05, 0.05, 0.05)),
-)
+FLIGHT = small_flight(5, length_m=12, fps=4, cars=1)
 HOST = "http://127.0.0.1:8750"
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A video of one short strip with telemetry beside it."""
-    folder = tmp_path_factory.mktemp("flown") / "flight"
-    for _ in simulate_site(folder, FLIGHT):
-        pass
-    return folder
+    return simulate_into(tmp_path_factory.mktemp("flown") / "flight", FLIGHT)
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import pytest
 from fake_bucket import BUCKET, served_bucket
 from starlette.testclient import TestClient
 
+from ended_work import ended
 from sorvolo.missions.site.copy import copy_site
 from sorvolo.station.app import station_app
 from sorvolo.station.settings import StationSettings
@@ -28,14 +29,6 @@ def bucket(made_site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     with served_bucket() as endpoint:
         ended(copy_site(str(made_site), f"{ADDRESS}/field"))
         yield endpoint
-
-
-def ended(work):  # type: ignore[no-untyped-def]
-    while True:
-        try:
-            next(work)
-        except StopIteration as end:
-            return end.value
 
 
 def reviewed(site: Path, verdict: Verdict) -> str:

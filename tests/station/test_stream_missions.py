@@ -14,8 +14,8 @@ import uvicorn
 from test_runs import FLIGHT
 from websockets.asyncio.client import connect
 
+from small_flights import simulate_into
 from sorvolo.capture.live.reconnect import LiveSettings
-from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.station.app import station_app
 from sorvolo.station.client import StreamClient, StreamSettings, stream_url
 from sorvolo.station.footage import open_footage
@@ -67,8 +67,7 @@ class Station:
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("flown")
-    for _ in simulate_site(folder, FLIGHT):
-        pass
+    simulate_into(folder, FLIGHT)
     return folder / "flight1" / "flight1.mp4"
 
 

@@ -1,5 +1,6 @@
 """Small made-up sites and flights for the store's tests; as a program, it kills itself at random moments."""
 
+import hashlib
 import os
 import random
 import signal
@@ -193,6 +194,23 @@ def _expect_whole(folder: Path, when: str) -> None:
     _, ending = os.waitpid(_forked(check_whole, folder), 0)
     if ending:
         sys.exit(f"{when}: the site is not whole")
+
+
+def mapped_site(folder: Path, flights: int = 1, colour: int = 50) -> Path:
+    """A new site with some flights of two frames each, compared, of plain colours."""
+    with Archive.open(folder, write=True) as archive:
+        archive.create_site(SITE)
+        for number in range(flights):
+            map_flight(archive, f"flight-{number}", colour + number, count=2, compared=True)
+    return folder
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """SHA-256 of each file of a site but the catalogue's, by path."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in folder.rglob("*") if path.is_file() and not path.name.startswith("site.")
+    }
 
 
 if __name__ == "__main__":

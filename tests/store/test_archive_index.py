@@ -12,6 +12,7 @@ from fake_changes import fake_change
 from fake_flights import LOCAL_SITE, SITE, frame, image, map_flight, tile
 from test_objects_store import search, thing
 
+from ended_work import ended
 from postgres_server import PostgresServer
 from sorvolo.cli.main import main
 from sorvolo.errors import SettingsError, StoreError
@@ -78,12 +79,7 @@ def postgis(postgres: PostgresServer) -> str:
 
 
 def indexed(root: Path, address: str = "") -> IndexOutcome:
-    work = index_archive(root, address)
-    while True:
-        try:
-            next(work)
-        except StopIteration as end:
-            return end.value
+    return ended(index_archive(root, address))
 
 
 def at(east_m: float, north_m: float, site=SITE) -> str:

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 import rasterio
 from fake_bucket import BUCKET, served_bucket
-from test_copies import _ended, hashes, made
+from fake_flights import hashes, mapped_site
 
+from ended_work import ended
 from sorvolo.errors import StoreError
 from sorvolo.store.copies.bucket import MANIFEST, BucketEnd
 from sorvolo.store.copies.folder import FolderEnd
@@ -30,16 +31,6 @@ def bucket() -> Iterator[str]:
         yield endpoint
 
 
-@pytest.fixture(scope="module")
-def two_flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made(tmp_path_factory.mktemp("buckets") / "site", 2)
-
-
-@pytest.fixture
-def site(two_flights: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(two_flights, tmp_path / "site"))
-
-
 @pytest.fixture
 def memory() -> Objects:
     store = pytest.importorskip("obstore.store", reason="object stores need obstore: pip install 'sorvolo[s3]'")
@@ -48,12 +39,12 @@ def memory() -> Objects:
 
 def copied(source: SiteEnd, target: SiteEnd) -> CopyOutcome:
     with tempfile.TemporaryDirectory() as scratch:
-        return _ended(copy(source, target, Path(scratch)))
+        return ended(copy(source, target, Path(scratch)))
 
 
 def verified(source: SiteEnd, target: SiteEnd) -> CopyOutcome:
     with tempfile.TemporaryDirectory() as scratch:
-        return _ended(verify(source, target, Path(scratch)))
+        return ended(verify(source, target, Path(scratch)))
 
 
 def map_again(site: Path, flight: str, colour: int) -> None:
@@ -179,7 +170,7 @@ def test_other_objects_and_other_sites_are_not_overwritten(memory: Objects, site
     memory.remove(["holiday.jpg"])
     copied(FolderEnd(site), BucketEnd(memory))
     with pytest.raises(StoreError, match="holds another site"):
-        copied(FolderEnd(made(tmp_path / "another")), BucketEnd(memory))
+        copied(FolderEnd(mapped_site(tmp_path / "another")), BucketEnd(memory))
     with pytest.raises(StoreError, match="no site at memory://site"):
         copied(BucketEnd(Objects(obstore.store.MemoryStore(), "memory://site")), FolderEnd(tmp_path / "back"))
 

@@ -1,7 +1,6 @@
 """A site copied to another folder: whole, whatever is killed or written meanwhile, and never over what it lacks."""
 
 import contextlib
-import hashlib
 import os
 import random
 import shutil
@@ -14,7 +13,9 @@ from typing import BinaryIO
 
 import fake_flights
 import pytest
+from fake_flights import hashes, mapped_site
 
+from ended_work import ended
 from sorvolo.errors import StoreError
 from sorvolo.store.copies.folder import FolderEnd
 from sorvolo.store.copies.state import SiteFile, SiteState
@@ -25,45 +26,11 @@ from sorvolo.survey.findings import Verdict
 
 
 def copied(source: Path, target: Path) -> CopyOutcome:
-    return _ended(copy(FolderEnd(source), FolderEnd(target), Path(tempfile.mkdtemp(dir=target.parent))))
+    return ended(copy(FolderEnd(source), FolderEnd(target), Path(tempfile.mkdtemp(dir=target.parent))))
 
 
 def verified(source: Path, target: Path) -> CopyOutcome:
-    return _ended(verify(FolderEnd(source), FolderEnd(target), Path(tempfile.mkdtemp(dir=target.parent))))
-
-
-def _ended(work) -> CopyOutcome:
-    while True:
-        try:
-            next(work)
-        except StopIteration as end:
-            return end.value
-
-
-def hashes(folder: Path) -> dict[str, str]:
-    """SHA-256 of each file of a site but the catalogue's, by path."""
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in folder.rglob("*") if path.is_file() and not path.name.startswith("site.")
-    }
-
-
-def made(folder: Path, flights: int = 1, colour: int = 50) -> Path:
-    with Archive.open(folder, write=True) as archive:
-        archive.create_site(fake_flights.SITE)
-        for number in range(flights):
-            fake_flights.map_flight(archive, f"flight-{number}", colour + number, count=2, compared=True)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def two_flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made(tmp_path_factory.mktemp("copies") / "site", 2)
-
-
-@pytest.fixture
-def site(two_flights: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(two_flights, tmp_path / "site"))
+    return ended(verify(FolderEnd(source), FolderEnd(target), Path(tempfile.mkdtemp(dir=target.parent))))
 
 
 def test_a_copy_has_every_file_of_the_site_and_can_be_worked_in(two_flights: Path, tmp_path: Path) -> None:
@@ -136,12 +103,12 @@ def test_a_copy_is_of_one_piece_though_flights_are_mapped_into_the_site_meanwhil
     source, target = _MappedInto(site, 2), tmp_path / "copy"
     scratch = tmp_path / "scratch"
     scratch.mkdir()
-    outcome = _ended(copy(source, FolderEnd(target), scratch, threads=1))
+    outcome = ended(copy(source, FolderEnd(target), scratch, threads=1))
     assert source.left == 0 and outcome.newest == 4 and not outcome.faults
     assert hashes(target) == hashes(site)
     fake_flights.check_whole(target)
     with pytest.raises(StoreError, match="changes faster than it can be copied"):
-        _ended(copy(_MappedInto(site, 100), FolderEnd(tmp_path / "other"), scratch, threads=1, most_rounds=2))
+        ended(copy(_MappedInto(site, 100), FolderEnd(tmp_path / "other"), scratch, threads=1, most_rounds=2))
     assert not (tmp_path / "other/site.db").exists()
 
 
@@ -182,7 +149,7 @@ def test_a_target_with_anything_else_is_refused(site: Path, tmp_path: Path) -> N
     with pytest.raises(StoreError, match=r"holds no site \(there is 'thesis.txt'\)"):
         copied(site, foreign)
     assert list(foreign.iterdir()) == [foreign / "thesis.txt"]
-    other = made(tmp_path / "other")
+    other = mapped_site(tmp_path / "other")
     before = hashes(other)
     with pytest.raises(StoreError, match="holds another site"):
         copied(site, other)

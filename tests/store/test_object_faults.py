@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 from fake_bucket import BUCKET, KEY, SECRET, environment, served_bucket
+from fake_flights import hashes, mapped_site
 from test_buckets import copied
-from test_copies import hashes, made
 
 from sorvolo.cli.main import main
 from sorvolo.errors import SettingsError, StoreError
@@ -24,8 +24,8 @@ _QUICK = ObjectSettings(connect_s=1.0, request_s=1.0, retries=1, retry_s=2.0, tr
 
 
 @pytest.fixture(scope="module")
-def two_flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made(tmp_path_factory.mktemp("faults") / "site", 1)
+def one_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return mapped_site(tmp_path_factory.mktemp("faults") / "site", 1)
 
 
 @pytest.fixture(autouse=True)
@@ -153,28 +153,28 @@ class _Failing(Objects):
         return super().part(key, start, length)
 
 
-def test_a_copy_that_loses_its_store_goes_on(two_flights: Path, tmp_path: Path) -> None:
+def test_a_copy_that_loses_its_store_goes_on(one_flight: Path, tmp_path: Path) -> None:
     from obstore.store import MemoryStore
 
     store, target = MemoryStore(), tmp_path / "back"
     whole = Objects(store, "memory://site")
     with pytest.raises(StoreError, match="was cut"):
-        copied(FolderEnd(two_flights), BucketEnd(_Failing(store, "memory://site")))
+        copied(FolderEnd(one_flight), BucketEnd(_Failing(store, "memory://site")))
     stored = len(whole.sizes(""))
     assert stored == 5 and not BucketEnd(whole).has_site
-    assert copied(FolderEnd(two_flights), BucketEnd(whole)).newest == 1
+    assert copied(FolderEnd(one_flight), BucketEnd(whole)).newest == 1
     with pytest.raises(StoreError, match="was cut"):
         copied(BucketEnd(_Failing(store, "memory://site")), FolderEnd(target))
     assert not (target / "site.db").exists()
     copied(BucketEnd(whole), FolderEnd(target))
-    assert hashes(target) == hashes(two_flights)
+    assert hashes(target) == hashes(one_flight)
 
 
 def test_a_full_disk_is_announced_before_the_download(
-    two_flights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    one_flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with served_bucket():
-        assert main(["site", "copy", str(two_flights), f"s3://{BUCKET}/full"]) == 0
+        assert main(["site", "copy", str(one_flight), f"s3://{BUCKET}/full"]) == 0
         usage = shutil.disk_usage(tmp_path)
         monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
         assert main(["site", "copy", f"s3://{BUCKET}/full", str(tmp_path / "back")]) == 1

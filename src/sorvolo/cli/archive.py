@@ -1,7 +1,7 @@
 """`sorvolo archive`: all sites of a folder indexed, the flights that saw a place, and a table of them all."""
 
 import json
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,11 +14,10 @@ from rich.table import Table
 
 from sorvolo.cli.archive_table import export_command
 from sorvolo.cli.options import AsJson, names
-from sorvolo.cli.progress import ProgressReport
+from sorvolo.cli.progress import shown_work
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
-    from sorvolo.missions.archive.index import IndexOutcome, IndexUpdate
     from sorvolo.store.index.finding import FoundFlight, FoundThing
 
 archive_app = typer.Typer(no_args_is_help=True)
@@ -51,7 +50,10 @@ def index_command(
     """
     from sorvolo.missions.archive.index import index_archive
 
-    outcome = _shown(index_archive(root, catalogue))
+    outcome = shown_work(
+        index_archive(root, catalogue),
+        lambda progress, update: progress.show("reading sites", update.sites_done, update.sites, update.site),
+    )
     if as_json:
         typer.echo(json.dumps({"root": str(root), **asdict(outcome)}, indent=1))
     else:
@@ -94,17 +96,6 @@ def find_command(
         typer.echo(json.dumps({"root": str(root), "at": at, "flights": plain_json(found)}, indent=1))
     else:
         _show(found, Console())
-
-
-def _shown(work: "Generator[IndexUpdate, None, IndexOutcome]") -> "IndexOutcome":
-    """Do the work with progress on stderr."""
-    with ProgressReport(Console(stderr=True)) as progress:
-        while True:
-            try:
-                update = next(work)
-            except StopIteration as end:
-                return end.value
-            progress.show("reading sites", update.sites_done, update.sites, update.site)
 
 
 def _show(found: Sequence["FoundFlight"], console: Console) -> None:

@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from sorvolo.cli.options import AsJson
-from sorvolo.cli.progress import ProgressReport
+from sorvolo.cli.progress import shown_work
 from sorvolo.survey.wording import counted_list
 
 
@@ -27,15 +26,10 @@ def export_command(
     """
     from sorvolo.missions.archive.export import export_archive
 
-    work = export_archive(root, out)
-    with ProgressReport(Console(stderr=True)) as progress:
-        while True:
-            try:
-                update = next(work)
-            except StopIteration as end:
-                outcome = end.value
-                break
-            progress.show("reading sites", update.done, update.sites or None, update.site)
+    outcome = shown_work(
+        export_archive(root, out),
+        lambda progress, update: progress.show("reading sites", update.done, update.sites or None, update.site),
+    )
     if as_json:
         typer.echo(json.dumps({"root": root, "file": str(out), **asdict(outcome)}, indent=1))
     else:

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Protocol, TypeVar
 
 import typer
-from rich.console import Console
 
-from sorvolo.cli.progress import ProgressReport
+from sorvolo.cli.progress import ProgressReport, shown_work
 from sorvolo.errors import SorvoloError
 
 if TYPE_CHECKING:
@@ -97,11 +96,9 @@ def opened_site(site: str, *, writes: bool = False) -> Iterator[OpenedSite]:
 
 def show_copy(work: "Generator[CopyUpdate, None, T]", task: str) -> T:
     """Do the work with progress on stderr."""
-    with ProgressReport(Console(stderr=True)) as progress:
-        while True:
-            try:
-                update = next(work)
-            except StopIteration as end:
-                return end.value
-            words = f"{update.done_bytes / 1e6:,.0f} of {update.bytes / 1e6:,.0f} MB"
-            progress.show(task, update.done, update.files, words)
+
+    def show(progress: ProgressReport, update: "CopyUpdate") -> None:
+        words = f"{update.done_bytes / 1e6:,.0f} of {update.bytes / 1e6:,.0f} MB"
+        progress.show(task, update.done, update.files, words)
+
+    return shown_work(work, show)

@@ -1,9 +1,9 @@
 """How far a command is: a bar on a terminal, a line every ten seconds elsewhere, as in a log file."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Generator, Iterable
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Self, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from sorvolo.survey.mosaic import MosaicUpdate
 
 _LINE_EVERY_S = 10.0
+
+T = TypeVar("T")
+U = TypeVar("U")
 
 
 class ProgressReport:
@@ -60,6 +63,17 @@ class ProgressReport:
             line = f"{task}{so_far}{', ' + words if words else ''}"
             self.console.print(line, highlight=False, markup=False, soft_wrap=True)
         self._task = task
+
+
+def shown_work(work: Generator[U, None, T], show: Callable[[ProgressReport, U], None]) -> T:
+    """Do all of the work, showing each update on stderr; what the work returns."""
+    with ProgressReport(Console(stderr=True)) as progress:
+        while True:
+            try:
+                update = next(work)
+            except StopIteration as end:
+                return end.value
+            show(progress, update)
 
 
 class Resumed:
