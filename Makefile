@@ -64,13 +64,15 @@ $(WRITING)/.ready: requirements-docs.lock
 	$(WRITING)/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-docs.lock
 	touch $@
 
+# The locks name all that is needed, so nothing is resolved; bytecode is made of what is used.
+PIP := pip install --quiet --disable-pip-version-check --no-deps --no-compile
+
 $(READY): requirements.lock pyproject.toml setup.py $(wildcard src/sorvolo/kernels/*.?pp)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -e .
+	$(BIN)/python -m $(PIP) -r requirements.lock
+	$(BIN)/python -m $(PIP) -e .
 	touch $@
 
 $(TRAINS): $(READY) requirements-training.lock requirements-notebooks.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock -r requirements-training.lock \
-	  -r requirements-notebooks.lock
+	$(BIN)/python -m $(PIP) -r requirements-training.lock -r requirements-notebooks.lock
 	touch $@

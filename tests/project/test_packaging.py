@@ -5,9 +5,12 @@ import re
 import subprocess
 import tomllib
 from fnmatch import fnmatch
+from importlib import metadata
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -80,6 +83,28 @@ def test_locks_that_are_installed_together_agree() -> None:
             if version:
                 versions.setdefault(name.lower().replace("_", "-"), set()).add(version)
     assert not {name: each for name, each in versions.items() if len(each) > 1}
+
+
+def test_the_locks_hold_all_that_their_packages_require() -> None:
+    """The environment is installed from them without their dependencies."""
+    locked = {}
+    for lock in ("requirements.lock", "requirements-training.lock", "requirements-notebooks.lock"):
+        for line in (ROOT / lock).read_text(encoding="utf-8").splitlines():
+            if "==" in line and not line.startswith("#"):
+                name, _, version = line.partition("==")
+                locked[canonicalize_name(name)] = version
+    missing = []
+    for name in locked:
+        try:
+            required = [Requirement(each) for each in metadata.requires(name) or ()]
+        except metadata.PackageNotFoundError:  # an extra that is not installed here
+            continue
+        for each in required:
+            if each.marker is None or each.marker.evaluate({"extra": ""}):
+                found = locked.get(canonicalize_name(each.name))
+                if found is None or not each.specifier.contains(found, prereleases=True):
+                    missing.append(f"{name}: {each}, locked: {found}")
+    assert len(locked) > 100 and not missing
 
 
 def test_build_lock_holds_what_the_build_requires() -> None:
