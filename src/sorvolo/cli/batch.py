@@ -175,7 +175,7 @@ def _executor_of(
         raise SettingsError(f"--workers {workers}: at least 1 is needed")
     if name == "local":
         count = workers or default_workers()
-        return lambda table: LocalExecutor(count, settings.stall_s, table.lock)
+        return lambda table: LocalExecutor(count, settings.stall_s, table.lock, settings.costs)
     if name == "ray" or name.startswith("ray://"):
         from sorvolo.cluster.ray_executor import ray_executor
 

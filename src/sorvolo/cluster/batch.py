@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Protocol, TypeGuard
 
 import sorvolo
-from sorvolo.cluster.cost import Cost, cost_of
+from sorvolo.cluster.cost import Cost, CostSettings, cost_of
 from sorvolo.cluster.orders import Ending, FlightWish, Order, Outcome, Scouted
 from sorvolo.cluster.scout import FoundFlight, Unreadable, find_flights, scout
 from sorvolo.cluster.sites import Placed, SiteBy, existing_site, existing_sites, sites_of
@@ -23,6 +23,14 @@ Key = tuple[str, str]
 
 
 @dataclass(frozen=True)
+class RestartSettings:
+    """When the process of a live stream that died is started again."""
+
+    settled_s: float = 60.0  # one that lived so long did not die of its beginning: its tries are counted anew
+    longest_wait_s: float = 60.0  # before the next start; the waits are 1 s, 2 s, 4 s and so on
+
+
+@dataclass(frozen=True)
 class BatchSettings:
     """How a batch goes about its flights."""
 
@@ -31,6 +39,9 @@ class BatchSettings:
     most_tries: int = 3  # that end the process of a flight's worker; then it is set aside
     stall_s: float = 300.0  # without an answer or any work: the worker is ended
     retries: bool = False  # flights that were set aside before are tried again
+    near_m: float = 50.0  # from a site's ground: a drone sees no less than half of that beside its track
+    costs: CostSettings = CostSettings()  # noqa: RUF009 (frozen)
+    restarts: RestartSettings = RestartSettings()
 
     def __post_init__(self) -> None:
         if self.most_tries < 1:
@@ -169,13 +180,13 @@ class _Run:
         if not free:
             return None
         row = max(free, key=lambda queue: sum(_frames(each) for each in queue))[0]
-        return row if self._executor.has_room(cost_of(row, self._table)) else None
+        return row if self._executor.has_room(cost_of(row, self._table, self._settings.costs)) else None
 
     def _start(self, row: Row) -> None:
         self._waiting[row.site].remove(row)
         if not self._waiting[row.site]:
             del self._waiting[row.site]
-        cost = cost_of(row, self._table)
+        cost = cost_of(row, self._table, self._settings.costs)
         self._keep(replace(row, state=State.RUNNING, tries=row.tries + 1, words=""))
         self.tries += 1
         order = Order(
@@ -310,7 +321,7 @@ def _with_sites(rows: Sequence[Row], table: BatchTable, settings: BatchSettings)
     known |= {row.scouted.fingerprint: row.site for row in table if row.scouted is not None and row.site}
     grounds = {name: site.ground for name, site in there.items() if site.ground is not None}
     names = [each.name for each in table.root.iterdir()]
-    sites = sites_of(_placed(rows), settings.site_by, known, grounds, names)
+    sites = sites_of(_placed(rows), settings.site_by, known, grounds, names, settings.near_m)
     return [_at_site(row, sites, table) for row in rows]
 
 

@@ -6,8 +6,14 @@ from statistics import median
 
 from sorvolo.cluster.table import Row, State
 
-_UNKNOWN_MB = 1000.0  # before any flight was measured
-_RESERVE = 1.2
+
+@dataclass(frozen=True)
+class CostSettings:
+    """What a try is given, and what of a machine all tries may have together."""
+
+    unknown_mb: float = 1000.0  # before any flight was measured; 4,000 frames of 1080p peak at 634 MB
+    reserve: float = 1.2  # times the largest flight so far
+    machine_share: float = 0.8  # of a machine's memory: the rest is for the system, the batch and the files' cache
 
 
 @dataclass(frozen=True)
@@ -18,7 +24,7 @@ class Cost:
     memory_mb: float
 
 
-def cost_of(row: Row, rows: Iterable[Row]) -> Cost:
+def cost_of(row: Row, rows: Iterable[Row], settings: CostSettings = CostSettings()) -> Cost:
     """The memory of the largest flight of the same mission so far and a fifth more, the cores of the median one.
 
     After each crash of this flight it is given twice the memory: want of it may have been the reason.
@@ -27,6 +33,6 @@ def cost_of(row: Row, rows: Iterable[Row]) -> Cost:
         each for each in rows
         if each.mission == row.mission and each.state in (State.DONE, State.DOUBTFUL) and each.peak_memory_mb > 0
     ]
-    memory_mb = _RESERVE * max((each.peak_memory_mb for each in ended), default=_UNKNOWN_MB / _RESERVE)
+    memory_mb = settings.reserve * max((each.peak_memory_mb for each in ended), default=0.0) or settings.unknown_mb
     cpus = median([each.cpu_s / each.seconds for each in ended if each.seconds > 0] or [1.0])
     return Cost(max(1.0, round(cpus)), memory_mb * 2**row.crashes)

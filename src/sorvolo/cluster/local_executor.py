@@ -6,14 +6,12 @@ import threading
 from collections.abc import Mapping
 from typing import Self
 
-from sorvolo.cluster.cost import Cost
+from sorvolo.cluster.cost import Cost, CostSettings
 from sorvolo.cluster.orders import Ending, Order
 from sorvolo.cluster.process import WorkerProcess, run_order
-from sorvolo.missions.flight.memory import available_bytes, memory_budget_bytes
+from sorvolo.missions.flight.memory import MemorySettings, available_bytes, memory_budget_bytes
 
 Key = tuple[str, str]
-_SHARE = 0.8  # of the machine's memory, for all workers together
-_LEAST_CACHE_MB = 64.0
 
 
 class LocalExecutor:
@@ -22,8 +20,8 @@ class LocalExecutor:
     `lock` is the batch's, which the processes keep until they are gone.
     """
 
-    def __init__(self, workers: int, stall_s: float, lock: int) -> None:
-        self.workers = workers
+    def __init__(self, workers: int, stall_s: float, lock: int, costs: CostSettings = CostSettings()) -> None:  # noqa: B008
+        self.workers, self._share = workers, costs.machine_share
         self._stall_s, self._lock = stall_s, lock
         self._running: dict[Key, tuple[WorkerProcess, Cost]] = {}
         self._ended: queue.SimpleQueue[tuple[Key, Ending]] = queue.SimpleQueue()
@@ -47,12 +45,13 @@ class LocalExecutor:
         if not self._running:
             return True
         taken_mb = sum(each.memory_mb for _, each in self._running.values())
-        return len(self._running) < self.workers and (taken_mb + cost.memory_mb) * 1e6 <= _SHARE * available_bytes()
+        most_mb = self._share * available_bytes() / 1e6
+        return len(self._running) < self.workers and taken_mb + cost.memory_mb <= most_mb
 
     @property
     def cache_mb(self) -> float:
         """Memory for what a worker could also read again: the machine's share of it, divided among the workers."""
-        return max(_LEAST_CACHE_MB, memory_budget_bytes(None) / 1e6 / self.workers)
+        return max(MemorySettings().least_mb, memory_budget_bytes(None) / 1e6 / self.workers)
 
     def start(self, key: Key, order: Order, cost: Cost) -> None:
         """Begin a try."""

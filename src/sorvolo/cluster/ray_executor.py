@@ -22,13 +22,12 @@ from sorvolo.cluster.orders import Ending, Order, Outcome
 from sorvolo.cluster.process import WorkerProcess, run_order
 from sorvolo.cluster.table import LOCK
 from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.missions.flight.memory import MemorySettings
 from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes
 
 Key = tuple[str, str]
 _SCHEME = "ray://"
 _REACH_S, _PROBE_S, _AGAIN_S, _LOOK_S, _CANCEL_S = 8.0, 90.0, 0.5, 2.0, 10.0
-_CACHE_SHARE = 0.25
-_LEAST_CACHE_MB = 64.0
 
 
 @contextmanager
@@ -80,7 +79,8 @@ class RayExecutor:
         """Memory that a try may take for what it could also read again: of the smallest machine, a core's share."""
         with self._cluster():
             shares = [each["memory"] / each["CPU"] for each in self._machines()]
-        return max(_LEAST_CACHE_MB, _CACHE_SHARE * min(shares) / 1e6)
+        memory = MemorySettings()
+        return max(memory.least_mb, memory.share * min(shares) / 1e6)
 
     def has_room(self, cost: Cost) -> bool:
         """Whether one more try may begin."""

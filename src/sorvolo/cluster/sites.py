@@ -15,7 +15,6 @@ from sorvolo.store.site.catalogue_place import is_site
 Box = tuple[float, float, float, float]
 """South, west, north and east of ground, degrees."""
 
-_NEAR_M = 50.0  # a drone sees that much ground beside its track, or no less than half of it
 _M_PER_DEG = 111_320.0
 
 
@@ -36,14 +35,14 @@ class Placed:
 
 def sites_of(
     flights: Sequence[Placed], by: SiteBy, known: Mapping[str, str], ground: Mapping[str, Box],
-    taken: Sequence[str] = (),
+    taken: Sequence[str] = (), near_m: float = 50.0,
 ) -> dict[str, str]:
     """The site of each flight, by the flight's fingerprint.
 
     `known` are the sites of flights that have one, by fingerprint: they keep it. `ground` is where sites are that
     exist. `taken` are further names that no new site may have. By place, a flight in order of time joins the first site
-    whose ground lies within 50 m of its fixes, and the site's ground then reaches as far as the flight's; one that has
-    no fixes, or lies near no site, founds a site named after it.
+    whose ground lies within `near_m` of its fixes, and the site's ground then reaches as far as the flight's; one that
+    has no fixes, or lies near no site, founds a site named after it.
     """
     found = dict(known)
     grounds = dict(ground)
@@ -53,7 +52,7 @@ def sites_of(
             _extend(grounds, site, each.scouted.box)
     for each in sorted((each for each in flights if each.scouted.fingerprint not in found), key=_moment):
         box = each.scouted.box
-        near = _near(box, grounds) if by is SiteBy.PLACE and box is not None else ""
+        near = _near(box, grounds, near_m) if by is SiteBy.PLACE and box is not None else ""
         site = near or _new_name(each.path, used)
         used.add(site)
         _extend(grounds, site, box)
@@ -61,9 +60,9 @@ def sites_of(
     return found
 
 
-def _near(box: Box, grounds: Mapping[str, Box]) -> str:
+def _near(box: Box, grounds: Mapping[str, Box], near_m: float) -> str:
     """The first site by name whose ground lies near; "" for none."""
-    return next((name for name, other in sorted(grounds.items()) if _are_near(box, other)), "")
+    return next((name for name, other in sorted(grounds.items()) if _are_near(box, other, near_m)), "")
 
 
 def _moment(flight: Placed) -> tuple[int, str]:
@@ -109,9 +108,9 @@ def _ground(archive: Archive) -> Box | None:
     return float(latitudes.min()), float(longitudes.min()), float(latitudes.max()), float(longitudes.max())
 
 
-def _are_near(one: Box, other: Box) -> bool:
-    """Whether two boxes lie within `_NEAR_M` of each other, along each axis."""
-    north = _NEAR_M / _M_PER_DEG
+def _are_near(one: Box, other: Box, near_m: float) -> bool:
+    """Whether two boxes lie within `near_m` of each other, along each axis."""
+    north = near_m / _M_PER_DEG
     east = north / max(0.01, math.cos(math.radians(one[0])))
     return (
         one[0] - north <= other[2] and other[0] - north <= one[2]

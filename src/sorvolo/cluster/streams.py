@@ -18,8 +18,6 @@ from sorvolo.cluster.table import BatchTable, Row, State
 from sorvolo.errors import SettingsError
 
 _LOOK_S = 0.5
-_SETTLED_S = 60.0  # after which a process that dies is no longer taken to die of its beginning
-_LONGEST_WAIT_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -119,7 +117,7 @@ class _Streams:
             self._due_s.clear()
         for key in [key for key, due_s in self._due_s.items() if due_s <= time.monotonic()]:
             row = self.rows[key]
-            cost = cost_of(replace(row, crashes=0), self._table)
+            cost = cost_of(replace(row, crashes=0), self._table, self._settings.costs)
             if not self._executor.has_room(cost):
                 return
             del self._due_s[key]
@@ -135,11 +133,12 @@ class _Streams:
         if ending.outcome is not Outcome.CRASHED:
             return self._keep(row.after(ending, State(ending.outcome.value), ending.words))
         self.crashes += 1
-        row = replace(row, crashes=1 if ending.seconds > _SETTLED_S else row.crashes + 1)
+        row = replace(row, crashes=1 if ending.seconds > self._settings.restarts.settled_s else row.crashes + 1)
         if row.crashes >= self._settings.most_tries:
             words = f"set aside after {row.crashes} tries: {ending.words}"
             return self._keep(row.after(ending, State.SET_ASIDE, words))
-        self._due_s[key] = time.monotonic() + min(_LONGEST_WAIT_S, 2.0 ** (row.crashes - 1))
+        wait_s = min(self._settings.restarts.longest_wait_s, 2.0 ** (row.crashes - 1))
+        self._due_s[key] = time.monotonic() + wait_s
         return self._keep(row.after(ending, State.WAITING, ending.words))
 
     def _keep(self, row: Row) -> Row:

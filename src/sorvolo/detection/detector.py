@@ -15,7 +15,7 @@ from sorvolo.detection.models import find_model, thermal_model
 from sorvolo.detection.session import Seen, Session
 from sorvolo.detection.suppression import SeenTile, merge_tiles
 from sorvolo.detection.tiling import Tiles, plan_tiles
-from sorvolo.detection.turning import QUARTERS, agreed, turned, turned_back
+from sorvolo.detection.turning import LookSettings, agreed, turned, turned_back
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.survey.flight import Notice
@@ -192,11 +192,11 @@ class Detector:
 
 def _seen_turned(rgb: ImageRGB, whole: Callable[[ImageRGB], Seen]) -> Seen:
     """What the looks at a picture from straight above agree on."""
-    looks = []
-    for quarters in QUARTERS:
+    looks, settings = [], LookSettings()
+    for quarters in settings.quarters:
         seen = whole(turned(rgb, quarters))
         looks.append(Seen(turned_back(seen.boxes_px, quarters, (rgb.shape[0], rgb.shape[1])), seen.scores, seen.labels))
-    return agreed(looks)
+    return agreed(looks, settings)
 
 
 def _thresholds(info: ModelInfo, from_above: bool) -> Mapping[str, float]:

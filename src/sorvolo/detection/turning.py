@@ -1,27 +1,32 @@
 """Pictures from straight above looked at several times, each time turned: what the looks agree on."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from sorvolo.detection.session import Seen
-from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Matrix3
+from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Matrix3, Rows
 from sorvolo.geometry.box_overlap import iou_matrix
 
-QUARTERS = (0, 1)
-"""Quarter turns of the looks. From straight above nothing is upright, but networks that learnt from photos know people
-upright: a second look a quarter turned finds others, and few mistakes look alike in both."""
 
-LEAST_DOWN = 0.8
-"""Of the optical axis: pictures from 37 degrees off straight down or less are from above."""
+@dataclass(frozen=True)
+class LookSettings:
+    """How pictures from above are looked at. The thresholds on models' cards (`turned`) hold for these values.
 
-_SAME_IOU = 0.5
-_UNSEEN = 0.02  # the score of what a look does not show: models report nothing below it
+    From straight above nothing is upright, but networks that learnt from photos know people upright: a second look a
+    quarter turned finds others, and few mistakes look alike in both.
+    """
+
+    quarters: tuple[int, ...] = (0, 1)  # quarter turns, one for each look
+    least_down: float = 0.8  # of the optical axis: 37 degrees off straight down or less is from above
+    same_iou: float = 0.5  # boxes of one class that overlap more are one object, as COCO counts them
+    unseen: float = 0.02  # the score of what a look does not show: models report nothing below it
 
 
-def is_from_above(site_from_camera: Matrix3) -> bool:
+def is_from_above(site_from_camera: Matrix3, settings: LookSettings = LookSettings()) -> bool:
     """Whether a camera of this rotation (3, 3) looks about straight down."""
-    return -float(site_from_camera[2, 2]) >= LEAST_DOWN
+    return -float(site_from_camera[2, 2]) >= settings.least_down
 
 
 def turned(picture: ImageRGB, quarters: int) -> ImageRGB:
@@ -41,7 +46,7 @@ def turned_back(boxes_px: BoxesPx, quarters: int, size_px: tuple[int, int]) -> B
     return np.column_stack(columns).astype(np.float32).reshape(-1, 4)
 
 
-def agreed(looks: Sequence[Seen]) -> Seen:
+def agreed(looks: Sequence[Seen], settings: LookSettings = LookSettings()) -> Seen:
     """What several looks at one picture saw, each object once, best first.
 
     Boxes of a class that overlap are one object, at most one of each look. Its score is the mean over all looks, so
@@ -55,16 +60,9 @@ def agreed(looks: Sequence[Seen]) -> Seen:
     for label in np.unique(labels).tolist():
         rows = np.flatnonzero(labels == label)
         rows = rows[np.argsort(-scores[rows], kind="stable")]
-        overlap = iou_matrix(boxes[rows], boxes[rows])
-        is_free = np.ones(len(rows), bool)
-        for first in range(len(rows)):
-            if not is_free[first]:
-                continue
-            alike = np.flatnonzero(is_free & (overlap[first] > _SAME_IOU))
-            is_free[alike] = False
-            is_free[first] = False
-            members = rows[np.union1d(alike, [first])]
-            best = np.full(len(looks), _UNSEEN)
+        for alike in _alike(boxes[rows], settings.same_iou):
+            members = rows[alike]
+            best = np.full(len(looks), settings.unseen)
             np.maximum.at(best, of_look[members], scores[members])
             kept.append((np.average(boxes[members], axis=0, weights=scores[members]), float(best.mean()), label))
     order = sorted(range(len(kept)), key=lambda k: -kept[k][1])
@@ -72,3 +70,14 @@ def agreed(looks: Sequence[Seen]) -> Seen:
         np.array([kept[k][0] for k in order], np.float32).reshape(-1, 4), np.array([kept[k][1] for k in order]),
         np.array([kept[k][2] for k in order], np.int64),
     )
+
+
+def _alike(boxes_px: Floats, same_iou: float) -> Iterator[Rows]:
+    """Indices of boxes (N, 4), best first, that overlap the best one that is left."""
+    overlap = iou_matrix(boxes_px, boxes_px)
+    is_free = np.ones(len(boxes_px), bool)
+    for first in range(len(boxes_px)):
+        if is_free[first]:
+            alike = np.union1d(np.flatnonzero(is_free & (overlap[first] > same_iou)), [first])
+            is_free[alike] = False
+            yield alike

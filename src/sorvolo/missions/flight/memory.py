@@ -1,25 +1,36 @@
 """How much memory a mission may take for what it could also read again."""
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 from sorvolo.errors import SettingsError
 
-_SHARE, _ENOUGH_BYTES = 0.25, 512_000_000  # of the machine, where nobody chose; more saves no time
-_LEAST_MB = 64
 _CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 
-def memory_budget_bytes(memory_mb: float | None) -> int:
+@dataclass(frozen=True)
+class MemorySettings:
+    """What a mission takes where nobody chose, and how it is divided."""
+
+    share: float = 0.25  # of the machine's memory, or of the container's limit
+    enough_mb: float = 512.0  # more saves no time (decision 0033)
+    least_mb: float = 64.0  # with less, a picture of 12 megapixels and the tiles below it do not fit
+    tiles_mb: int = 64  # at most, for tiles, and
+    images_mb: int = 256  # for pictures: more gains nothing
+    pictures: int = 6  # as many of the flight's as are wanted at once, those beside each other in two strips
+
+
+def memory_budget_bytes(memory_mb: float | None, settings: MemorySettings = MemorySettings()) -> int:
     """The budget in bytes: the given one (MB), else 512 MB, or a quarter of the machine's memory or of the
     container's limit where that is less.
 
     Raises SettingsError when it is too small to work with.
     """
     if memory_mb is None:
-        return min(_ENOUGH_BYTES, int(_SHARE * available_bytes()))
-    if not memory_mb >= _LEAST_MB:
-        raise SettingsError(f"--memory must be at least {_LEAST_MB} MB, got {memory_mb:g}")
+        return int(min(1e6 * settings.enough_mb, settings.share * available_bytes()))
+    if not memory_mb >= settings.least_mb:
+        raise SettingsError(f"--memory must be at least {settings.least_mb:g} MB, got {memory_mb:g}")
     return int(memory_mb * 1e6)
 
 

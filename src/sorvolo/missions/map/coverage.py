@@ -8,7 +8,8 @@ from typing import Any
 
 from sorvolo.errors import GeometryError
 from sorvolo.missions.flight.setup import FlightSetup
-from sorvolo.missions.plan_flight import fly_again
+from sorvolo.missions.map.painting import PaintSettings
+from sorvolo.missions.plan_flight import ReflySettings, fly_again
 from sorvolo.mosaic.seen_ground import PictureOnGround, coverage_figures, seen_ground
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.coverage_files import COVERAGE, holes_lonlat, seen_geojson
@@ -16,10 +17,6 @@ from sorvolo.store.exports.plain import features_name, geojson_bytes
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.area import Area
 from sorvolo.survey.coverage import SeenGround
-
-_REST = 4  # times as long as it took: it must not hold up the flight
-_MOST_HOLES = 60
-_BESIDE = 0.2  # of the height: how far the passes over a hole reach into what was seen
 
 
 class FlightCoverage:
@@ -31,8 +28,10 @@ class FlightCoverage:
     """
 
     def __init__(
-        self, setup: FlightSetup, archive: Archive, area: Area | None, refly: Sequence[Path], live_s: float
+        self, setup: FlightSetup, archive: Archive, area: Area | None, refly: Sequence[Path], live_s: float,
+        settings: ReflySettings = ReflySettings(), pace: PaintSettings = PaintSettings(),  # noqa: B008 (frozen)
     ) -> None:
+        self._settings, self._rest = settings, pace.rest
         self._setup, self._archive, self._refly, self._live_s = setup, archive, tuple(refly), live_s
         is_known = area is not None and setup.telemetry is not None
         self._area_m = area.polygons_m(setup.frame) if area is not None and is_known else ()
@@ -48,7 +47,7 @@ class FlightCoverage:
         ground = seen_ground(placed, self._area_m)
         atomic_write_bytes(self._archive.live_coverage_path, self._geojson(ground), durable=False)
         self._plan(ground, placed)
-        self._again_s = time.monotonic() + max(self._live_s, _REST * (time.monotonic() - started_s))
+        self._again_s = time.monotonic() + max(self._live_s, self._rest * (time.monotonic() - started_s))
 
     def conclude(self, placed: Sequence[PictureOnGround]) -> tuple[Mapping[str, bytes], dict[str, Any]]:
         """What all of the flight saw: a file for the flight's folder by its name, and its figures for the report."""
@@ -62,7 +61,7 @@ class FlightCoverage:
 
     def _plan(self, ground: Sequence[SeenGround], placed: Sequence[PictureOnGround]) -> tuple[Path, ...]:
         """Write the waypoints over the holes; the files, none where there are no holes or no place on Earth."""
-        holes = [each for each in ground if not each.views][:_MOST_HOLES]
+        holes = [each for each in ground if not each.views][:self._settings.most_holes]
         site = self._archive.site()
         if not self._refly or site.is_local:
             return ()
@@ -73,8 +72,9 @@ class FlightCoverage:
         camera = self._setup.source.camera.camera
         height_m = median(each.m_per_px for each in placed) * camera.fx_px
         try:
-            area = Area(holes_lonlat(holes, site, _BESIDE * height_m), f"holes of {self._setup.source.name}")
-            fly_again(area, camera, height_m, self._refly)
+            rings = holes_lonlat(holes, site, self._settings.beside * height_m)
+            area = Area(rings, f"holes of {self._setup.source.name}")
+            fly_again(area, camera, height_m, self._refly, settings=self._settings)
         except GeometryError:
             return ()  # too small or too odd to be flown over; they stay in the file of the coverage
         self._is_planned = True

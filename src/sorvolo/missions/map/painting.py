@@ -23,12 +23,17 @@ from sorvolo.store.exports.map_pictures import write_live_preview
 from sorvolo.store.images import ImageCache
 from sorvolo.store.site.archive import Archive, FlightWriter
 
-_PAINT_EVERY = 8  # keyframes painted together: tiles that several touch are rendered once; not where somebody waits
-_PAINT_AT_ONCE = 24  # at most, the newest first: a solve may move a hundred
-_PAINT_LIVE = 3  # of those moved, beside the newest, while somebody waits for that
-_PAINT_REST = 4  # times as long as a painting took: showing a map that still moves must not hold up the flight
-_COARSE_MAP = 0.77  # times the pictures' own pixels: a coarser map does not need every pixel of them
-_CACHE_BYTES = 128 * 1024 * 1024  # of earlier flights' pictures
+
+@dataclass(frozen=True)
+class PaintSettings:
+    """How much of a map is painted while it grows; what is painted in the end does not depend on it."""
+
+    every: int = 8  # keyframes painted together: tiles that several touch are rendered once; not where somebody waits
+    at_once: int = 24  # at most, the newest first: a solve may move a hundred
+    live: int = 3  # of those moved, beside the newest, while somebody waits for that
+    rest: float = 4.0  # times as long as a painting took: showing a map that still moves must not hold up the flight
+    coarse_map: float = 0.77  # times the pictures' own pixels: a coarser map does not need every pixel of them
+    cache_bytes: int = 128 * 1024 * 1024  # of earlier flights' pictures; a quarter of it of the flight's own, small
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,20 +58,21 @@ class FlightPainter:
     def __init__(
         self, writer: FlightWriter, archive: Archive, mapper: PlanarMapper, lens: Undistorter, known: KnownKeyframes,
         native_m_per_px: float, log: FlightLog, live_s: float,
-        *, is_live: bool,
+        *, is_live: bool, settings: PaintSettings = PaintSettings(),
     ) -> None:
+        self._settings = settings
         self._writer, self._archive, self._mapper, self._known, self._log = writer, archive, mapper, known, log
-        self._live_s, self._paint_every = live_s, _PAINT_EVERY if live_s >= 1 else 1
+        self._live_s, self._paint_every = live_s, settings.every if live_s >= 1 else 1
         self._is_live = is_live
         self.shown_s = 0.0
         """When readers could see the newest key frame of a live flight, by the monotonic clock."""
         self.images: dict[int, str] = {}
         """Where each frame's picture is stored, by frame index: what `FlightWriter.commit` wants."""
         self.exposure = Exposure({}, {}, 0.0)
-        self._known_images = ImageCache(lambda each: archive.image(known[each].stored), _CACHE_BYTES)
+        self._known_images = ImageCache(lambda each: archive.image(known[each].stored), settings.cache_bytes)
         self._stored: Camera = lens.camera
         shrink = native_m_per_px / archive.site_grid().grid.m_per_px
-        if shrink < _COARSE_MAP:
+        if shrink < settings.coarse_map:
             full = lens.camera
             self._stored = full.resized(max(16, round(full.width_px * shrink)), max(16, round(full.height_px * shrink)))
         self._valid: Mask | None = lens.valid(self._stored.width_px, self._stored.height_px)
@@ -75,7 +81,9 @@ class FlightPainter:
             step, coarse_grid(archive.site_grid(), step),
             self._stored.resized(-(-self._stored.width_px // step), -(-self._stored.height_px // step)),
         )
-        self._live_images = ImageCache(lambda each: writer.small_image(each - known.count, step), _CACHE_BYTES // 4)
+        self._live_images = ImageCache(
+            lambda each: writer.small_image(each - known.count, step), settings.cache_bytes // 4
+        )
         self._live_canvas = Canvas(
             self._live.site_grid.grid, CoarseTiles(writer.tiles, archive.site_grid().grid, step),
             self._live_images.get, keeps_known_ground=True,
@@ -116,8 +124,9 @@ class FlightPainter:
             return painted
         self._painted_at = len(self._frames)
         self._adapt()
-        painted += self._paint_small(sorted(self._dirty)[-(_PAINT_LIVE if self._is_live else _PAINT_AT_ONCE):])
-        self._paint_again_s = time.monotonic() + _PAINT_REST * (time.monotonic() - started_s)
+        most = self._settings.live if self._is_live else self._settings.at_once
+        painted += self._paint_small(sorted(self._dirty)[-most:])
+        self._paint_again_s = time.monotonic() + self._settings.rest * (time.monotonic() - started_s)
         self._flush()
         return painted
 
@@ -162,7 +171,7 @@ class FlightPainter:
         with self._log.stage(Stage.STORE):
             self._writer.flush()
             write_live_preview(self._writer.tiles, self._archive.live_preview_path)
-        self._show_again_s = time.monotonic() + max(self._live_s, _PAINT_REST * (time.monotonic() - started_s))
+        self._show_again_s = time.monotonic() + max(self._live_s, self._settings.rest * (time.monotonic() - started_s))
 
     def _new_canvas(self) -> Canvas:
         site_grid = self._archive.site_grid()

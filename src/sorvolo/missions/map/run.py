@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.map_objects import FrameDetections, ObjectFinder, search_summary, why_not_searched
-from sorvolo.missions.flight.memory import memory_budget_bytes
+from sorvolo.missions.flight.memory import MemorySettings, memory_budget_bytes
 from sorvolo.missions.flight.request import REQUEST
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, new_site
@@ -18,9 +18,6 @@ from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
 from sorvolo.survey.map_objects import ObjectSearch
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
-
-_MOST_TILES_MB, _MOST_IMAGES_MB = 64, 256  # more gains nothing
-_PICTURES_AROUND = 6
 
 
 class FlightRun(ABC):
@@ -169,7 +166,8 @@ class FlightRun(ABC):
         """For the pictures that lie around a place, which are painted one after the other."""
         camera = self._setup.source.camera.camera
         picture_mb = 3 * camera.width_px * camera.height_px // 1_000_000
-        return min(_MOST_IMAGES_MB, max(_MOST_TILES_MB, _PICTURES_AROUND * picture_mb))
+        most = MemorySettings()
+        return min(most.images_mb, max(most.tiles_mb, most.pictures * picture_mb))
 
     def _make_site(self, m_per_px: float, ground_up_m: float) -> None:
         """Make the site if there is none; see `new_site`."""
@@ -185,7 +183,7 @@ class FlightRun(ABC):
             memory_mb = int(memory_budget_bytes(self._settings.memory_mb) / 1e6)
             journal = None if self._journal is None else self._journal.file
             self._writer = self._archive.begin_flight(
-                source.name, source.fingerprint, settings, tiles_mb=min(_MOST_TILES_MB, memory_mb // 8),
+                source.name, source.fingerprint, settings, tiles_mb=min(MemorySettings().tiles_mb, memory_mb // 8),
                 images_mb=min(self._images_mb(), memory_mb // 2), journal=journal,
             )
             self._began_writer = True

@@ -6,15 +6,11 @@ from pathlib import Path
 
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.geometry.arrays import Floats
-from sorvolo.missions.plan_flight import fly_again
+from sorvolo.missions.plan_flight import ReflySettings, fly_again
 from sorvolo.missions.search.report import Searched, is_coarse, needed_m_per_px
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.store.exports.pod_files import CellGrid, Region, swollen_polygons
 from sorvolo.survey.area import Area
-
-_LEAST_M2 = 20.0  # of a hole that is flown again
-_MOST_HOLES = 60
-_LOWEST_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -36,15 +32,16 @@ def write_refly(
 
     It is flown as high as the first flights, lower where their pictures were too coarse for the detector.
     """
-    large = [each for each in again if each.area_m2 >= _LEAST_M2][:_MOST_HOLES]
+    pace = ReflySettings()
+    large = [each for each in again if each.area_m2 >= pace.least_m2][:pace.most_holes]
     if not large:
         return None
     area = Area(tuple(_rings(large, grid)), "holes of the search")
     camera, height_m = searched.camera, searched.height_m
     if is_coarse(searched, settings, info):
         needed = needed_m_per_px(searched.labels[0], info)
-        height_m = max(_LOWEST_M, min(height_m, 0.9 * needed * camera.fx_px))
-    plan = fly_again(area, camera, height_m, files, dji_drone=dji_drone)
+        height_m = max(pace.lowest_m, min(height_m, 0.9 * needed * camera.fx_px))
+    plan = fly_again(area, camera, height_m, files, dji_drone=dji_drone, settings=pace)
     return Refly(
         len(large), sum(each.area_m2 for each in large), plan.height_m, plan.duration_s, tuple(map(str, files))
     )
