@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import prepare
 from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.map.painting import FlightPainter, PaintSettings
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.site.history import site_history
 from sorvolo.store.exports.plain import features_path
@@ -406,10 +408,10 @@ def test_the_map_does_not_depend_on_when_it_was_shown_while_it_grew(
 ) -> None:
     film = tmp_path / "film.mp4"
     shutil.copy(_film(filmed), film)  # without telemetry, whose offsets would move every frame at last
-    monkeypatch.setattr("sorvolo.missions.map.painting._PAINT_REST", 0)
     maps = []
     for paint_every in (1, 1000):  # keyframes
-        monkeypatch.setattr("sorvolo.missions.map.painting._PAINT_EVERY", paint_every)
+        painter = partial(FlightPainter, settings=PaintSettings(every=paint_every, rest=0))
+        monkeypatch.setattr("sorvolo.missions.map.planar_run.FlightPainter", painter)
         run_map(tmp_path / f"every {paint_every}", film, "--camera", filmed / "camera.xml")
         maps.append((tmp_path / f"every {paint_every}" / "mosaic.tif").read_bytes())
     assert maps[0] == maps[1]
