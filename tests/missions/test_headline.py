@@ -14,8 +14,10 @@ from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.missions.flight.headline import MapQuality, map_headline
+from sorvolo.missions.flight.warnings import _angle_warnings
 from sorvolo.mosaic.consistency import Consistency
 from sorvolo.mosaic.flight_figures import flight_figures
+from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.store.exports.flight_files import video_writer
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
@@ -118,3 +120,12 @@ def test_a_video_from_one_place_ends_with_a_warning_and_its_own_exit_code(
     assert "no map:" in capsys.readouterr().out
     report = json.loads((tmp_path / "site/flights/hover/report.json").read_text())
     assert report["headline"]["quality"] == "one-view"
+
+
+@pytest.mark.parametrize(("has_angles", "words"), [
+    (True, "the stated angles of 2 frames of 8 contradict"), (False, "no angles are stated, so the camera was taken"),
+])
+def test_angles_that_nobody_stated_are_not_called_stated(has_angles: bool, words: str) -> None:
+    report = GraphReport(1.0, 0.1, 0.0, 0.0, 8, 0, 0.0, 0.4, angles_contradicted=2)
+    (warning,) = _angle_warnings([placed(10.0 * k) for k in range(8)], report, has_angles=has_angles)
+    assert warning.startswith(words)

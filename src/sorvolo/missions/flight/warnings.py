@@ -24,7 +24,8 @@ def flight_warnings(
     """The warnings of a flight's report."""
     return [
         *agreement.faults, *agreement.steps, *_frame_warnings(placed), *doubts(placed, figures), *agreement.remarks,
-        *_angle_warnings(placed, graph), *_camera_warnings(figures, setup), *_clock_warnings(setup, log),
+        *_angle_warnings(placed, graph, has_angles=_has_angles(setup)), *_camera_warnings(figures, setup),
+        *_clock_warnings(setup, log),
     ]
 
 
@@ -52,13 +53,20 @@ def doubts(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
     return warnings
 
 
-def _angle_warnings(placed: Sequence[PlacedFrame], graph: GraphReport | None) -> list[str]:
-    """Where the pictures contradict the stated angles of the camera or the aircraft."""
+def _has_angles(setup: FlightSetup) -> bool:
+    """Whether telemetry states where the camera or the aircraft looked; else it is taken to have looked down."""
+    return setup.track is not None and setup.track.attitude != "none"
+
+
+def _angle_warnings(placed: Sequence[PlacedFrame], graph: GraphReport | None, *, has_angles: bool) -> list[str]:
+    """Where the pictures contradict the stated angles of the camera or the aircraft, or the view straight down."""
     warnings = []
     if graph is not None and graph.angles_contradicted > _MANY * len(placed):
+        frames = f"{counted(graph.angles_contradicted, 'frame')} of {len(placed)}"
         warnings.append(
-            f"the stated angles of {counted(graph.angles_contradicted, 'frame')} of {len(placed)} contradict the "
-            "pictures by 15 deg or more and were not used"
+            f"the stated angles of {frames} contradict the pictures by 15 deg or more and were not used" if has_angles
+            else "no angles are stated, so the camera was taken to look straight down; by the pictures it looked 15 "
+            f"deg or more to the side in {frames}"
         )
     if graph is not None and max(graph.turned_deg[0], abs(graph.turned_deg[1])) > _TURNED_DEG:
         tilt_deg, heading_deg = graph.turned_deg
@@ -71,8 +79,7 @@ def _angle_warnings(placed: Sequence[PlacedFrame], graph: GraphReport | None) ->
 
 def _camera_warnings(figures: FlightFigures, setup: FlightSetup) -> list[str]:
     warnings = []
-    has_angles = setup.track is not None and setup.track.attitude != "none"
-    if not has_angles and figures.tilt_deg > OBLIQUE_DEG:  # measured from the pictures' perspective
+    if not _has_angles(setup) and figures.tilt_deg > OBLIQUE_DEG:  # measured from the pictures' perspective
         lack = "there is no telemetry" if setup.track is None else "telemetry has no camera angles"
         warnings.append(
             f"the camera looks {figures.tilt_deg:.0f} deg away from straight down and {lack}: "
