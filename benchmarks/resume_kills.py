@@ -132,7 +132,7 @@ def rounds(options: argparse.Namespace, folder: Path) -> Iterator[dict[str, obje
         again_s, printed = trial.run(place)
         found = content(place)
         differing = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
-        resumed = re.search(r"going on after (\d+) frame", printed)
+        resumed = re.search(r"continuing after (\d+) frame", printed)
         rows.append({
             "kill_s": round(kill_s, 2), "again_s": round(again_s, 2), "same": not differing,
             "frames_taken_over": int(resumed[1]) if resumed else 0, "differing": differing[:10],

@@ -119,7 +119,7 @@ def test_a_killed_batch_leaves_no_worker_and_the_same_command_goes_on(flown: Pat
     end_s = time.monotonic() + 60
     while not journal.exists() and first.poll() is None and time.monotonic() < end_s:
         time.sleep(0.02)
-    with pytest.raises(StoreError, match=f"another batch works in .*: process {first.pid} on "):
+    with pytest.raises(StoreError, match=f"another batch is running in .*: process {first.pid} on "):
         BatchTable.open(tmp_path / "maps")
     first.kill()
     first.wait()

@@ -117,7 +117,7 @@ def test_a_flight_that_can_be_read_now_has_one_row(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"notes\n", "line 1 is no row of a batch"), (b'{"a": 1}\n', "is no table of sorvolo batch"),
+        (b"notes\n", "line 1 is no row of a batch"), (b'{"a": 1}\n', "is not a table of sorvolo batch"),
         (b'{"made_by": "sorvolo batch", "format": 2}\n', "has format 2, this version reads 1"),
         (b'{"made_by": "sorvolo batch", "format": 1}\n{"source": 1}\n{}\n', "line 2 is no row of a batch"),
     ],
@@ -135,7 +135,7 @@ def test_roots_that_cannot_be_used(tmp_path: Path) -> None:
         BatchTable.open(tmp_path / "site")
     with pytest.raises(StoreError, match="is a file, a folder was needed"):
         BatchTable.open(tmp_path / "file")
-    with BatchTable.open(tmp_path / "maps"), pytest.raises(StoreError, match=r"another batch works in .*: process"):
+    with BatchTable.open(tmp_path / "maps"), pytest.raises(StoreError, match=r"another batch is running .*: process"):
         BatchTable.open(tmp_path / "maps")
 
 

@@ -133,7 +133,7 @@ def test_what_listens_but_is_no_cluster_is_named(tmp_path: Path, capsys: pytest.
         (tmp_path / "1.mp4").write_text("no video")
         address = f"ray://127.0.0.1:{other.getsockname()[1]}"
         assert main(["batch", str(tmp_path / "1.mp4"), "--root", str(tmp_path / "maps"), "--executor", address]) == 1
-    assert f"what listens at {address[6:]} is no Ray cluster" in capsys.readouterr().err
+    assert f"{address[6:]} is not a Ray cluster" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_what_listens_but_is_no_cluster_is_named(tmp_path: Path, capsys: pytest.
             "another version of Ray or Python than this machine (Ray 2.60",
         ),
         (ConnectionError("ray client connection timeout"), "a cluster with a token (set RAY_AUTH_MODE=token"),
-        (RuntimeError("Invalid authentication token"), "the cluster wants another token"),
+        (RuntimeError("Invalid authentication token"), "the cluster needs another token"),
     ],
 )
 def test_what_ray_says_of_a_cluster_that_takes_no_batch_is_put_in_words(error: Exception, words: str) -> None:

@@ -102,7 +102,7 @@ def test_it_goes_on_where_it_was(whole: tuple[Path, Path], flown: Path, tmp_path
 
 def test_other_settings_begin_anew_and_say_so(whole: tuple[Path, Path], flown: Path, tmp_path: Path) -> None:
     site = copy(whole[1], tmp_path)
-    with pytest.warns(SorvoloWarning, match="flight2: a run that was stopped cannot go on, since .* other settings"):
+    with pytest.warns(SorvoloWarning, match="flight2: a run that was stopped cannot continue: .* other settings"):
         updates = compare_flights(
             [flown / "flight2"], site, CompareSettings(model="none", votes=2), camera=flown / "camera.xml"
         )
@@ -113,7 +113,7 @@ def test_other_settings_begin_anew_and_say_so(whole: tuple[Path, Path], flown: P
 
 def test_another_flight_tells_whose_run_it_ends(whole: tuple[Path, Path], flown: Path, tmp_path: Path) -> None:
     site = copy(whole[1], tmp_path)
-    with pytest.warns(SorvoloWarning, match="a run of flight2 was stopped before it was complete, and cannot go on"):
+    with pytest.warns(SorvoloWarning, match="a run of flight2 was stopped before it was complete, and cannot continue"):
         updates = map_flights(
             [flown / "flight1"], site, MapSettings(model="none"), camera=flown / "camera.xml", again=True
         )
@@ -127,7 +127,7 @@ def test_method_thesis_begins_anew_and_says_so(flown: Path, tmp_path: Path) -> N
     next(updates)
     shutil.copytree(tmp_path / "site", tmp_path / "amid")
     updates.close()
-    with pytest.warns(SorvoloWarning, match="flight1: a run was stopped, and begins anew: --method thesis"):
+    with pytest.warns(SorvoloWarning, match="flight1: a stopped run begins again from the start: --method thesis"):
         again = map_flights([flown / "flight1"], tmp_path / "amid", settings, camera=flown / "camera.xml")
         assert not next(again).is_resumed
         again.close()

@@ -126,7 +126,7 @@ def test_other_settings_begin_anew_and_say_so(flown: Path, detector: TruthDetect
     shutil.copytree(folder, tmp_path / "amid")
     updates.close()
     assert not (folder / "run.journal").exists()
-    with pytest.warns(SorvoloWarning, match="a watch that was stopped cannot go on, since it was of other settings"):
+    with pytest.warns(SorvoloWarning, match="a watch that was stopped cannot continue: it was of other settings"):
         again = watch(
             video, WatchSettings(frames_per_second=2), WatchOutputs(folder=tmp_path / "amid"), camera="aov=70",
             detector=detector,
@@ -150,5 +150,5 @@ def test_what_was_printed_is_not_printed_again(
     shutil.move(tmp_path / "amid", folder)
     assert main(command) == 0
     printed = capsys.readouterr().err
-    assert new and f"going on after {_KILLED_AT} frames of a run that was stopped" in printed
+    assert new and f"continuing after {_KILLED_AT} frames of a stopped run" in printed
     assert not any(f" {each}  at " in printed for each in new)

@@ -200,7 +200,7 @@ def test_across_the_antimeridian(tmp_path: Path, address: str) -> None:
 
 @pytest.mark.parametrize(("words", "match"), [
     ({"at": "north pole"}, "latitude and longitude"), ({"at": "91,0"}, "no place"), ({"at": "nan,0"}, "no place"),
-    ({"at": "1,2", "first": "soon"}, "no date"), ({"at": "1,2", "within_m": 0}, "more than 0"),
+    ({"at": "1,2", "first": "soon"}, "is not a date"), ({"at": "1,2", "within_m": 0}, "more than 0"),
     ({"at": "1,2", "first": "2026-02-01", "last": "2026-01-01"}, "in order"),
 ])
 def test_what_cannot_be_asked_is_named(tmp_path: Path, words: dict, match: str) -> None:

@@ -218,7 +218,7 @@ def test_no_writer_relies_on_what_is_being_removed(memory: Objects, site: Path) 
     manifest, etag = BucketEnd(memory).find_manifest()
     assert manifest is not None
     memory.swap(MANIFEST, replace(manifest, tidying="2026-11-23T05:00:00+00:00").data(), etag)  # a prune was killed
-    with pytest.raises(StoreError, match=r"being tidied since 2026-11-23.*sorvolo site prune memory://site"):
+    with pytest.raises(StoreError, match=r"has been pruned since 2026-11-23.*sorvolo site prune memory://site"):
         copied(FolderEnd(site), BucketEnd(memory))
     prune(memory, -1.0)
     copied(FolderEnd(site), BucketEnd(memory))

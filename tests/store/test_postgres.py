@@ -195,7 +195,7 @@ def test_a_server_that_is_gone_ends_a_flight_as_a_kill_does(
         journal = archive.journal("b", "key")
         journal.append(Entry("frame", {}))
         with (
-            pytest.raises(ConnectionLostError, match=r"run the same command again.*goes on where it was"),
+            pytest.raises(ConnectionLostError, match=r"run the same command again.*continues where it was"),
             archive.begin_flight("b", "", {}, journal=journal) as writer,
         ):
             writer.save_image(0, image(0))

@@ -89,9 +89,9 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(data: Path, tmp_path: P
     assert reports[0]["losses"] == reports[1]["losses"] and len(reports[0]["losses"]) == 6
     assert reports[0]["held_out"] == reports[1]["held_out"]
 
-    with pytest.raises(SettingsError, match="already holds a run; --resume goes on with it"):
+    with pytest.raises(SettingsError, match="already holds a run; --resume continues it"):
         next(_train(data, tmp_path / "stopped", settings))
-    with pytest.raises(SettingsError, match=r"cannot go on with other settings: .*seed was 1, is 2"):
+    with pytest.raises(SettingsError, match=r"cannot continue with other settings: .*seed was 1, is 2"):
         list(_train(data, tmp_path / "stopped", _settings(rpn="standard", seed=2), resume=True))
 
 
@@ -141,7 +141,7 @@ def test_other_labels_are_other_data(tmp_path: Path) -> None:
         if update.step == 1:
             run.close()  # type: ignore[attr-defined]
     (place / "labels" / "flight0_0000.txt").write_text("0 0.5 0.5 0.2 0.2")
-    with pytest.raises(SettingsError, match="cannot go on with other settings: data was"):
+    with pytest.raises(SettingsError, match="cannot continue with other settings: data was"):
         list(_train(place, tmp_path / "out", _settings(), resume=True))
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 archive_app = typer.Typer(no_args_is_help=True)
 
-Root = Annotated[Path, typer.Argument(help="The folder that the site folders lie in.")]
+Root = Annotated[Path, typer.Argument(help="The folder that holds the site folders.")]
 
 
 @archive_app.callback()
@@ -42,9 +42,9 @@ def index_command(
     ] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Make the index of an archive, or bring it up to date: only what changed since is read.
+    """Make the index of an archive, or update it: only what has changed is read.
 
-    The exit code is 1 if a site could not be read; what was known of it stays.
+    The exit code is 1 if a site could not be read; its earlier entries stay.
 
     Example: sorvolo archive index /srv/flights
     """
@@ -79,7 +79,7 @@ def find_command(
     classes: Annotated[
         str, typer.Option("--class", help="Only flights that found one of these there, such as car,appeared.")
     ] = "",
-    within: Annotated[float, typer.Option(help="What was found so near counts as there, m.")] = 2.0,
+    within: Annotated[float, typer.Option(help="How near a finding must be to count as there, m.")] = 2.0,
     as_json: AsJson = False,
 ) -> None:
     """List the flights that saw a place, in order of time, and what they found there.
@@ -102,7 +102,7 @@ def _show(found: Sequence["FoundFlight"], console: Console) -> None:
     from sorvolo.store.exports.plain import time_words
 
     if not found:
-        console.print("no flight saw this place (then)")
+        console.print("no flight saw this place at that time")
         return
     table = Table(box=SIMPLE_HEAD, padding=0)
     for name in ("flown", "site", "flight", "by", "frames", "best frame", "found there"):

@@ -13,7 +13,7 @@ from sorvolo.survey.wording import counted_list
 
 
 def export_command(
-    root: Annotated[str, typer.Argument(help="The folder that the site folders lie in, or s3://BUCKET/PREFIX.")],
+    root: Annotated[str, typer.Argument(help="The folder that holds the site folders, or s3://BUCKET/PREFIX.")],
     out: Annotated[Path, typer.Option(help="The file to write: NAME.parquet.")],
     as_json: AsJson = False,
 ) -> None:

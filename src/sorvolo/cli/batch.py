@@ -93,9 +93,9 @@ def batch(
     retry: Retry = False,
     as_json: AsJson = False,
 ) -> None:
-    """Map, compare or search many flights. Stopped or killed at any moment, the same command goes on.
+    """Map, compare or search many flights. After a stop or a kill, the same command continues.
 
-    A flight whose process dies is tried again; one that cannot be used, or that ends its process each time, is named.
+    A flight whose process dies is tried again; one that cannot be used, or that crashes every time, is listed.
     Live sources are mapped side by side until they end; Ctrl-C ends them and finishes their maps.
 
     ROOT/batch.jsonl holds what became of each. Ends with exit code 1 where a flight failed or was set aside, with 3
@@ -113,7 +113,7 @@ def batch(
     from sorvolo.cluster.orders import FlightWish, Mission
     from sorvolo.cluster.sites import SiteBy
 
-    context.obj.stop_words = f"stopped; the same command goes on: {root} holds what was done"
+    context.obj.stop_words = f"stopped; run the same command to continue: {root} holds what is done"
     by = site_by or (SiteByName.PLACE if mission is MissionName.COMPARE else SiteByName.FLIGHT)
     wish = FlightWish(Mission(mission.value), _absolute(camera), _absolute(model), gsd, give_up)
     settings = BatchSettings(wish, SiteBy(by.value), tries, stall, retry)
@@ -158,7 +158,7 @@ def _check_live(live: Sequence[str], places: Sequence[str], workers: int | None)
     if live and len(live) < len(places):
         raise SettingsError("give folders of flights or live sources, not both: they are two batches with two roots")
     if live and workers is not None and workers < len(live):
-        raise SettingsError(f"--workers {workers}: {len(live)} live sources need as many at once")
+        raise SettingsError(f"--workers {workers}: {len(live)} live sources need a worker each")
 
 
 def _absolute(name: str) -> str:
@@ -251,6 +251,6 @@ def _show(report: "BatchReport", places: Sequence[Path], root: Path, console: Co
     if len(rows) > _MOST_ROWS:
         console.print(f"and {len(rows) - _MOST_ROWS:,} more", highlight=False)
     console.print(
-        f"tries: {report.tries}, of which {report.crashes} ended their process; {report.seconds:.1f} s", highlight=False
+        f"tries: {report.tries}, of which {report.crashes} crashed; {report.seconds:.1f} s", highlight=False
     )
     show_path("table", root / TABLE, console)

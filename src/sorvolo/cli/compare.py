@@ -120,7 +120,7 @@ def compare(
     """Find what appeared, disappeared, was replaced or moves since the map was made, and update the map.
 
     Live sources are those of `sorvolo map`. Ctrl-C ends a live flight and keeps its changes; a second Ctrl-C discards
-    them. After a crash or a power cut, give the same command again: it goes on where it was.
+    them. After a crash or a power cut, run the same command again: it continues where it was.
 
     Example: sorvolo compare DJI_0057.MP4 --site field
 

@@ -154,7 +154,7 @@ def map_command(
     """Make a geo-referenced map of one or more flights, or extend the map in the site folder.
 
     Live sources: rtsp://, rtmp://, udp://, tcp://, webcam:0, follow:PATH (a video or folder that is being written).
-    Ctrl-C finishes a live flight's map, a second one discards it. After a crash, the same command goes on where it was.
+    Ctrl-C finishes a live flight's map, a second one discards it. After a crash, the same command continues.
 
     Example: sorvolo map DJI_0042.MP4 --site field
 

@@ -88,7 +88,7 @@ class Resumed:
         if is_resumed:
             self._count = count
         elif self._count:
-            words = f"going on after {counted(self._count, 'frame')} of a run that was stopped"
+            words = f"continuing after {counted(self._count, 'frame')} of a stopped run"
             self._console.print(words, highlight=False)
             self._count = 0
 

@@ -27,7 +27,7 @@ Dataset = Annotated[Path | None, typer.Argument(help="The UMCD dataset's folder,
 OutFolder = Annotated[Path, typer.Option(help="Folder for tables, figures, maps and models.")]
 Simulated = Annotated[bool, typer.Option("--simulated", help="Simulate a dataset in the same layout instead.")]
 Quick = Annotated[bool, typer.Option("--quick", help="Only a try: one short path, small pictures.")]
-VideoCount = Annotated[int | None, typer.Option(help="At most so many videos of each environment and part.")]
+VideoCount = Annotated[int | None, typer.Option(help="At most this many videos of each environment and part.")]
 PathLength = Annotated[float, typer.Option(help="With --simulated: length of each path, m; 0: as in Tables 2.1, 2.3.")]
 PictureSize = Annotated[str, typer.Option(help="With --simulated: picture size, such as 1280x720.")]
 ViewRate = Annotated[float, typer.Option(help="Frames compared per second of video.")]
@@ -57,10 +57,10 @@ def reproduce(
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Do the experiments of the thesis's chapter 4: Tables 4.1, 4.3 to 4.6 and the figures, beside the printed ones.
+    """Repeat the thesis's experiments of chapter 4: Tables 4.1, 4.3 to 4.6 and the figures, beside the printed ones.
 
-    The same command goes on where it was stopped. Rows that cannot be made are named with the reason, and the exit code
-    is 3.
+    The same command continues where it was stopped. Rows that cannot be made are listed with the reason, and the exit
+    code is 3.
 
     Example: sorvolo reproduce UMCD --out chapter4
 

@@ -44,9 +44,9 @@ Missions = Annotated[int, typer.Option(help="Missions that may run at the same t
 StopWithin = Annotated[float, typer.Option(help="Seconds after which a mission that was stopped is killed.")]
 StreamFrom = Annotated[
     list[str] | None,
-    typer.Option(help="Network that streams may be called from, such as 192.168.1.0/24. Can be repeated."),
+    typer.Option(help="Network whose cameras the station may connect to, such as 192.168.1.0/24. Can be repeated."),
 ]
-FreeFloor = Annotated[float, typer.Option(help="Disk space to leave free, GB: below it nothing new is taken in.")]
+FreeFloor = Annotated[float, typer.Option(help="Disk space to leave free, GB; with less, nothing new is accepted.")]
 UploadMost = Annotated[float, typer.Option(help="Largest upload, GB.")]
 Opens = Annotated[bool, typer.Option("--open", help="Open the page in a browser.")]
 Webhooks = Annotated[
@@ -71,7 +71,7 @@ LogJson = Annotated[bool, typer.Option("--log-json", help="Log each request and 
 TokenName = Annotated[str, typer.Argument(help="Who it is for, such as a person's name.", show_default="list tokens")]
 TokenRole = Annotated[str, typer.Option(help="view, review (also judge), or operate (also run missions).")]
 Days = Annotated[float | None, typer.Option(help="Days until it expires.", show_default="never")]
-Revoke = Annotated[bool, typer.Option("--revoke", help="Make the token of this name void.")]
+Revoke = Annotated[bool, typer.Option("--revoke", help="Revoke the token of this name.")]
 
 
 def serve(
@@ -85,7 +85,7 @@ def serve(
 ) -> None:
     """Serve a folder of sites to browsers: the map while it grows, changes, objects, and what to do with them.
 
-    Only this machine reaches it unless --host states otherwise. Ctrl-C ends it; running missions go on.
+    Only this computer can reach it unless --host is given. Ctrl-C ends it; running missions continue.
 
     Example: sorvolo serve demo-site --open
 

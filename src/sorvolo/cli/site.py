@@ -33,7 +33,7 @@ def copy_command(
     ] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Copy a map with all its versions, flights, pictures and findings; a stopped copy goes on where it was.
+    """Copy a map with all its versions, flights, pictures and findings; an interrupted copy continues.
 
     Every file is checked by its SHA-256. While a flight is being mapped, the copy is the map as of the last complete
     flight. The exit code is 1 if a file is missing, damaged or, with --verify, different.
@@ -62,7 +62,7 @@ def prune_command(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Remove nothing: count.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Remove what a site in a store does not name any more: former maps, pictures of flights that were mapped again.
+    """Remove what a site in a store no longer uses: earlier maps, pictures of flights that were mapped again.
 
     Versions of the map, and all that the site names, stay.
 
@@ -77,7 +77,7 @@ def prune_command(
         done = "would remove" if dry_run else "removed"
         typer.echo(
             f"{place}: {done} {counted(pruned.objects, 'object')} ({pruned.bytes / 1e6:,.1f} MB); "
-            f"{pruned.kept_bytes / 1e6:,.1f} MB stay"
+            f"{pruned.kept_bytes / 1e6:,.1f} MB remain"
         )
 
 
@@ -89,7 +89,7 @@ def _print(outcome: "CopyOutcome", target: str, *, verified: bool) -> None:
     )
     if outcome.left_out:
         names = ", ".join(outcome.left_out[:_MOST_FAULTS])
-        typer.echo(f"left out, not of the map: {names}{', ...' if len(outcome.left_out) > _MOST_FAULTS else ''}")
+        typer.echo(f"not copied, not part of the map: {names}{', ...' if len(outcome.left_out) > _MOST_FAULTS else ''}")
     for path, fault in list(outcome.faults.items())[:_MOST_FAULTS]:
         typer.echo(f"{path}: {fault}", err=True)
     if len(outcome.faults) > _MOST_FAULTS:

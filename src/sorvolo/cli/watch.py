@@ -119,7 +119,7 @@ def watch_command(
 
     Ends with the source or with Ctrl-C. Either way all results are written, and the exit code is 0, whether anything
     was found or not. detections.jsonl grows while the watch runs. After a crash or a power cut, give the same command
-    again: it goes on where it was, and sends no alert twice.
+    again: it continues where it was, and sends no alert twice.
 
     Example: sorvolo watch DJI_0042.MP4 --classes person
 

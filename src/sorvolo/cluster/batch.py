@@ -1,4 +1,4 @@
-"""A mission over many flights: each is one retried task; a table holds what became of it, whatever is killed when."""
+"""A mission over many flights: each is one retried task; a table keeps its result through any kill."""
 
 import hashlib
 import time
@@ -32,7 +32,7 @@ class RestartSettings:
 
 @dataclass(frozen=True)
 class BatchSettings:
-    """How a batch goes about its flights."""
+    """How a batch treats its flights."""
 
     wish: FlightWish = FlightWish()  # noqa: RUF009 (frozen)
     site_by: SiteBy = SiteBy.FLIGHT
@@ -68,13 +68,13 @@ class Executor(Protocol):
         """Memory that a try may take for what it could also read again."""
 
     def has_room(self, cost: Cost) -> bool:
-        """Whether one more try may begin."""
+        """Whether another try may start."""
 
     def start(self, key: Key, order: Order, cost: Cost) -> None:
-        """Begin a try."""
+        """Start a try."""
 
     def finish(self, key: Key) -> None:
-        """Have a live flight end, and be finished."""
+        """End a live flight, and have its map finished."""
 
     def next_ended(self, timeout_s: float | None = None) -> tuple[Key, Ending] | None:
         """Wait until a try has ended; None where none did for so long. Raises SorvoloError if the executor is gone."""
@@ -82,19 +82,19 @@ class Executor(Protocol):
 
 @dataclass(frozen=True)
 class BatchUpdate:
-    """What happened: the flight that it happened to, how many of how many are through, which ones run (their names)."""
+    """One event of a batch: its flight, how many of how many are finished, and the names of those that run."""
 
     task: str
     done: int
     total: int
     row: Row | None = None
-    is_known: bool = False  # it was through before this batch
+    is_known: bool = False  # it was finished before this batch
     running: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class BatchReport:
-    """All flights of a batch with what became of them; those in `known` were through before it began."""
+    """All flights of a batch and their results; those in `known` were finished before it began."""
 
     rows: tuple[Row, ...]
     known: frozenset[Key]
@@ -103,7 +103,7 @@ class BatchReport:
     crashes: int
 
     def counts(self) -> dict[str, int]:
-        """How many flights ended how; "known" are those that were done before."""
+        """How many flights ended in each state; "known" are those that were finished before."""
         found = Counter(
             "known" if row.key in self.known and row.state is State.DONE else row.state.value for row in self.rows
         )

@@ -41,7 +41,7 @@ class LocalExecutor:
         return self._running
 
     def has_room(self, cost: Cost) -> bool:
-        """Whether one more may begin."""
+        """Whether another try may start."""
         if not self._running:
             return True
         taken_mb = sum(each.memory_mb for _, each in self._running.values())
@@ -54,13 +54,13 @@ class LocalExecutor:
         return max(MemorySettings().least_mb, memory_budget_bytes(None) / 1e6 / self.workers)
 
     def start(self, key: Key, order: Order, cost: Cost) -> None:
-        """Begin a try."""
+        """Start a try."""
         worker = WorkerProcess(order, [self._lock])
         self._running[key] = (worker, cost)
         threading.Thread(target=self._wait, args=(key, worker), daemon=True, name=f"flight {key[1][:8]}").start()
 
     def finish(self, key: Key) -> None:
-        """Have a live flight end, and be finished."""
+        """End a live flight, and have its map finished."""
         self._running[key][0].finish()
 
     def next_ended(self, timeout_s: float | None = None) -> tuple[Key, Ending] | None:

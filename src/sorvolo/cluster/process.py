@@ -52,7 +52,7 @@ class WorkerProcess:
         self._process.kill()
 
     def finish(self) -> None:
-        """Have it end a live flight, and finish that."""
+        """Have it end a live flight and finish its map."""
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(FINISH)
@@ -102,13 +102,13 @@ class WorkerProcess:
             answer = last[1]
             return Ending(Outcome(answer["outcome"]), str(answer["words"]), str(answer.get("flight", "")))
         if self._stalled_s:
-            words = f"its process did nothing for {self._stalled_s:.0f} s and was ended"
+            words = f"its process hung for {self._stalled_s:.0f} s and was killed"
         elif code == -signal.SIGKILL:
-            words = "its process was killed, perhaps for want of memory"
+            words = "its process was killed, perhaps because memory ran out"
         elif code < 0:
             words = f"its process ended by signal {-code} ({signal.Signals(-code).name})"
         else:
-            words = f"its process ended with code {code} and no answer"
+            words = f"its process exited with code {code} and no answer"
         tail = self._tail()
         return Ending(Outcome.CRASHED, f"{words}: {tail}" if tail else words)
 

@@ -1,7 +1,7 @@
 """Flights of a batch on a Ray cluster whose machines share a disk; the only place that knows Ray.
 
-Ray places tasks and notices machines that die. Tries, their count, and what was done are the batch's own: Ray is told
-to try nothing again.
+Ray places tasks and notices machines that die. The batch itself counts tries and keeps results: Ray's own retries are
+off.
 """
 
 import importlib.util
@@ -83,7 +83,7 @@ class RayExecutor:
         return max(memory.least_mb, memory.share * min(shares) / 1e6)
 
     def has_room(self, cost: Cost) -> bool:
-        """Whether one more try may begin."""
+        """Whether another try may start."""
         if self._workers is not None:
             return len(self._running) < self._workers
         with self._cluster():
@@ -108,7 +108,7 @@ class RayExecutor:
             self._running[key] = self._ray.remote(_try).options(max_retries=0, name=name, **asked).remote(*given)
 
     def finish(self, key: Key) -> None:
-        """Have a live flight end, and be finished."""
+        """End a live flight, and have its map finished."""
         with self._cluster():
             self._actors[key].finish.remote()
 
@@ -172,7 +172,7 @@ class RayExecutor:
 
 
 class _LiveTry:
-    """On a machine of the cluster: a try at a live flight, which can be told to end. Ray calls both in threads."""
+    """On a machine of the cluster: a try at a live flight, which `finish` ends. Ray calls both in threads."""
 
     def __init__(self) -> None:
         self._worker: WorkerProcess | None = None
@@ -239,7 +239,7 @@ def _connect(name: str, workers: int | None) -> None:
             ray.init(address="local", num_cpus=workers, include_dashboard=False, **options)
     except ray.exceptions.AuthenticationError as error:
         raise SettingsError(
-            f"--executor {name}: the cluster wants another token; set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH to "
+            f"--executor {name}: the cluster needs another token; set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH to "
             "the file of the token that it was started with"
         ) from error
     except (ConnectionError, RuntimeError, ValueError) as error:
@@ -254,10 +254,10 @@ def _why_not(name: str, error: Exception) -> str:
         both = " ".join(str(error).split())[:300]
         return f"the cluster has another version of Ray or Python than this machine (Ray {ray.__version__}): {both}"
     if "oken" in str(error) or "nauthenticated" in str(error):
-        return f"the cluster wants another token: {words}; set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH"
+        return f"the cluster needs another token: {words}; set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH"
     if name.startswith(_SCHEME):
         return (
-            f"what listens there takes no Ray client ({words}): a cluster with a token (set RAY_AUTH_MODE=token and "
+            f"what listens there accepts no Ray client ({words}): a cluster with a token (set RAY_AUTH_MODE=token and "
             "RAY_AUTH_TOKEN_PATH), or no Ray"
         )
     return f"no Ray cluster answers: {words}"
@@ -276,7 +276,7 @@ def _demand_reachable(name: str) -> None:
         with grpc.insecure_channel(address) as channel:  # it may be something else that listens there
             grpc.channel_ready_future(channel).result(timeout=_REACH_S)
     except grpc.FutureTimeoutError:
-        raise SettingsError(f"--executor {name}: what listens at {address} is no Ray cluster") from None
+        raise SettingsError(f"--executor {name}: {address} is not a Ray cluster") from None
 
 
 def _demand_listening(name: str, address: str) -> None:

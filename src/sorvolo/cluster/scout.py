@@ -1,4 +1,4 @@
-"""What lies in the folders of a batch: which files are flights, and what is known of each before it is mapped."""
+"""The contents of a batch's folders: which files are flights, and what is known of each before it is mapped."""
 
 import hashlib
 import os
@@ -31,7 +31,7 @@ class FoundFlight:
 
 @dataclass(frozen=True)
 class Unreadable:
-    """A flight that cannot be looked into, and why; `crashed` if it ended its process as often as it was tried."""
+    """A flight that cannot be read, and why; `crashed` if every try crashed its process."""
 
     words: str
     crashed: bool = False
@@ -95,7 +95,7 @@ def scout(
     paths: Sequence[Path], camera: str, most_tries: int, held: Sequence[int] = (),
     seen: Callable[[int], None] = lambda _: None,
 ) -> list[Scouted | Unreadable]:
-    """Look into each flight, in a process apart: a file that breaks a decoder breaks no batch.
+    """Inspect each flight in a separate process: a file that crashes a decoder does not crash the batch.
 
     One that ends the process `most_tries` times is unreadable. `seen` is called with how many were looked into.
     """

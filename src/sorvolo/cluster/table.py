@@ -1,4 +1,4 @@
-"""What became of each flight of a batch: a table that outlives every kill, and the lock of its folder.
+"""The result of each flight of a batch: a table that survives every kill, and the lock of its folder.
 
 `batch.jsonl` holds a row for each change, the newest of a flight last; it is written anew, without the older ones, when
 a batch begins. `docs/formats.md` has its fields.
@@ -169,7 +169,7 @@ def _locked(root: Path) -> int:
             if _is_alive(holder) or time.monotonic() > end_s:
                 os.close(lock)
                 who = holder or "its name is not known"
-                raise StoreError(f"another batch works in {root}: {who}; wait until it ends, or stop it") from None
+                raise StoreError(f"another batch is running in {root}: {who}; wait until it ends, or stop it") from None
             time.sleep(0.1)
     os.ftruncate(lock, 0)
     os.pwrite(lock, f"process {os.getpid()} on {socket.gethostname()}, since {utc_now()}".encode(), 0)
@@ -181,7 +181,7 @@ def _holder(lock: int) -> str:
 
 
 def _is_alive(holder: str) -> bool:
-    """Whether the process that a lock names is there; on another machine it is taken to be."""
+    """Whether the process that a lock names exists; on another machine it is assumed to."""
     words = holder.split()
     if len(words) < 4 or not words[1].isdecimal() or words[3].rstrip(",") != socket.gethostname():
         return bool(holder)
@@ -221,7 +221,7 @@ def _read(path: Path) -> dict[tuple[str, str], Row]:
 
 def _demand_format(path: Path, head: Any) -> None:
     if not isinstance(head, dict) or head.get("made_by") != "sorvolo batch":
-        raise StoreError(f"{path} is no table of sorvolo batch; move it away, or choose another --root")
+        raise StoreError(f"{path} is not a table of sorvolo batch; move it away, or choose another --root")
     if head.get("format") != _FORMAT:
         raise StoreError(
             f"{path} has format {head.get('format')}, this version reads {_FORMAT}; use the version that wrote it"

@@ -227,7 +227,7 @@ def _is_flight(source: str, site: Path, flight: str) -> bool:
 
 
 def _wait_for_site(site: Path) -> None:
-    """Wait a while for a site whose writer is just ending."""
+    """Wait for a site whose writer is about to end."""
     from sorvolo.store.site.files import LOCK
 
     end_s = time.monotonic() + _SITE_BUSY_S

@@ -190,7 +190,7 @@ def _cover_findings(source: Source, frames: FrameFacts, facts: TelemetryFacts) -
     beyond_s = float(source.telemetry.video_time_ns.max(initial=0)) / _SECOND_NS - frames.duration_s
     if source.kind == "video" and beyond_s > max(5.0, 0.2 * frames.duration_s):
         return [Finding(
-            Level.WARNING, f"the telemetry goes on for {beyond_s:.0f} s after the video's end",
+            Level.WARNING, f"the telemetry continues for {beyond_s:.0f} s after the video's end",
             "check that it belongs to this video, and that the video is whole",
         )]
     if share > 0.98 or facts.format == "exif":

@@ -18,7 +18,7 @@ class SeenSettings:
 
     cells_across: int = 24  # of a picture's shorter side on the ground
     most_cells: int = 1500  # along a side of the whole flight: then they are larger
-    steps: tuple[int, ...] = (1, 2, 3, 5)  # numbers of pictures that are told apart: heights need 3, better 5
+    steps: tuple[int, ...] = (1, 2, 3, 5)  # numbers of pictures that are distinguished: heights need 3, better 5
     bridged: float = 1.0  # of a picture's shorter side: gaps between strips up to this wide are amid what was seen
     least_hole: float = 0.05  # of a picture's area: notches at its corners are smaller
 

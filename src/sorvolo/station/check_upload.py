@@ -108,7 +108,7 @@ def _demand_room(part: Path, wanted_bytes: int) -> None:
     if wanted_bytes > free_bytes:
         raise Refusal(
             f"unpacked it needs {wanted_bytes / 1e9:.1f} GB with what stays free, {free_bytes / 1e9:.1f} GB are there; "
-            "delete uploads or flights that are not needed any more, and upload it again"
+            "delete uploads or flights that you no longer need, and upload it again"
         )
 
 

@@ -84,7 +84,7 @@ def video_routes(shelf: SiteShelf, collections: SiteCollections, videos: FlightV
 def _demanded(archive: Archive, flight: str, videos: FlightVideos) -> Path:
     path = videos.find(archive, flight)
     if path is None:
-        raise Problem(404, f"the video of {flight[:80]!r} is not below the station's folder any more, or was none")
+        raise Problem(404, f"the video of {flight[:80]!r} is no longer below the station's folder, or there was none")
     return path
 
 

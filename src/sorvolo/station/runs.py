@@ -273,7 +273,7 @@ class Runs:
         last = _tail(folder / LOG_FILE)
         words = "its process ended without a word"
         if code is not None and code < 0:
-            words = f"its process was killed (signal {-code}), perhaps for want of memory"
+            words = f"its process was killed (signal {-code}), perhaps because memory ran out"
         run = replace(
             run, state=LOST if code is None else FAILED, ended_at=utc_now(), exit_code=code,
             error=f"{words}; the site is as it was before{': ' + last if last else ''}",
@@ -303,7 +303,7 @@ class Runs:
         if free_gb < self._settings.free_floor_gb:
             raise Problem(
                 507, f"{free_gb:.1f} GB are free, {self._settings.free_floor_gb:.1f} GB have to stay free; delete "
-                     "uploads or flights that are not needed any more"
+                     "uploads or flights that you no longer need"
             )
 
     def _order(self, wish: RunWish, run_id: str, site: Path, folder: Path) -> Order:

@@ -97,7 +97,7 @@ class Uploads:
         self.demand_room(length)
         most = self._settings.limits.most_uploads
         if len(self.all()) >= most:
-            raise Problem(409, f"there are {most} uploads already; delete those that are not needed any more")
+            raise Problem(409, f"there are {most} uploads already; delete those that you no longer need")
         folder = self._folder / made.id
         with writing(folder):
             folder.mkdir(parents=True)
@@ -178,7 +178,7 @@ class Uploads:
         if free - more_bytes < self._settings.free_floor_gb * 1e9:
             raise Problem(
                 507, f"{free / 1e9:.1f} GB are free, of which {self._settings.free_floor_gb:.1f} GB stay free; delete "
-                     "uploads or flights that are not needed any more"
+                     "uploads or flights that you no longer need"
             )
 
     def close(self) -> None:

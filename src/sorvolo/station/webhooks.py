@@ -50,7 +50,7 @@ def webhook(url: str, secret: str = "") -> Send:
 
 
 def webhook_name(url: str) -> str:
-    """The address without what may be secret in it: only its host, and a mark that tells two of one host apart.
+    """The address without what may be secret in it: only its host, and a mark that distinguishes two of one host.
 
     The paths of many receivers (Slack, Discord, Teams) are what lets a program post there.
     """

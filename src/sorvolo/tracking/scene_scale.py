@@ -16,7 +16,7 @@ _CAR, _PERSON = "car", "person"
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """Which boxes tell the scale, and how well."""
+    """Which boxes show the scale, and how well."""
 
     least_score: float = 0.5
     least_boxes: int = 8  # of a class; fewer may be mistakes, or all of one odd kind

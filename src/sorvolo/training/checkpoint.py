@@ -74,7 +74,7 @@ def restore(learner: Learner, checkpoint: Checkpoint, settings: Mapping[str, Any
     ]
     if differing:
         raise SettingsError(
-            f"a run cannot go on with other settings: {'; '.join(differing)}. Give the earlier ones, or another --out"
+            f"a run cannot continue with other settings: {'; '.join(differing)}; give the earlier ones, or a new --out"
         )
     try:
         learner.load_state(checkpoint.state)

@@ -46,7 +46,7 @@ def export_archive(root: str, out: Path) -> Generator[ExportUpdate, None, Export
     """
     demand_pyarrow()
     if out.suffix.lower() != ".parquet":
-        raise SettingsError(f"{out.name}: the table is written as .parquet; end the file's name so")
+        raise SettingsError(f"{out.name}: the table is written as .parquet; give a file name with that ending")
     if not out.resolve().parent.is_dir():
         raise InputError(f"no folder {out.resolve().parent} to write {out.name} to; make it first")
     names = _sites(root)
@@ -68,7 +68,7 @@ def _sites(root: str) -> list[str]:
     if root.startswith("s3://"):
         return sites_at(open_objects(root))
     if not Path(root).is_dir():
-        raise InputError(f"no such folder: {root}; give the folder that the site folders lie in")
+        raise InputError(f"no such folder: {root}; give the folder that holds the site folders")
     return sorted(sites_below(Path(root)))
 
 

@@ -20,7 +20,7 @@ def find_place(
     cannot be asked, StoreError where there is no index.
     """
     if not root.is_dir():
-        raise InputError(f"{root}: no folder; give the one that the site folders lie in")
+        raise InputError(f"{root} is not a folder; give the one that holds the site folders")
     latitude_deg, longitude_deg = _degrees(at)
     place = Place(
         latitude_deg, longitude_deg, within_m,
@@ -47,7 +47,7 @@ def _nanoseconds(text: str, of_day: time) -> int:
         try:
             moment = datetime.fromisoformat(text)
         except ValueError as error:
-            raise SettingsError(f"{text!r} is no date; give 2026-05-31, or 2026-05-31T12:00") from error
+            raise SettingsError(f"{text!r} is not a date; give 2026-05-31, or 2026-05-31T12:00") from error
     moment = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
     since = moment - datetime(1970, 1, 1, tzinfo=UTC)
     nanoseconds = ((since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds) * _MICROSECOND_NS

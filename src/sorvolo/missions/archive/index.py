@@ -45,7 +45,7 @@ def index_archive(root: Path, address: str = "") -> Generator[IndexUpdate, None,
     """
     catalogues = Catalogues.of_environment().choosing(address)
     if not root.is_dir():
-        raise InputError(f"{root}: no folder; give the one that the site folders lie in")
+        raise InputError(f"{root} is not a folder; give the one that holds the site folders")
     outcome = IndexOutcome()
     with ArchiveIndex.open(root, write=True, address=address, catalogues=catalogues) as index:
         known = index.sites()

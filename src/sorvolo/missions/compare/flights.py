@@ -46,7 +46,7 @@ def compare_flights(
     carries the changes that its frame announced. `steps` is a folder for the intermediate pictures of method thesis
     (its Figure 3.14). The flights' findings and the new version of the map are part of the site when a flight's last
     update was yielded.
-    A run that was killed goes on where it was when the same is asked for again.
+    A run that was killed continues when the same is asked for again.
     A flight that was compared already, as it is asked for, is left out and returned, unless `again` is given.
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being compared is left out, those before it are in.

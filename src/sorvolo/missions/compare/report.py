@@ -38,7 +38,7 @@ class ViewCounts:
             self._reasons[reason] += 1
 
     def take(self, outcome: ViewOutcome, outline_m: PointsM | None) -> None:
-        """Count a frame's comparison; `outline_m` (4, 2) is the ground under it, None where nobody knows."""
+        """Count a frame's comparison; `outline_m` (4, 2) is the ground under it, None where unknown."""
         self.end(outcome.status, outcome.reason)
         if outcome.site_from_image is not None:
             self._residuals_px.append(outcome.residual_px)

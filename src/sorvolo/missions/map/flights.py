@@ -65,7 +65,7 @@ def map_flights(
     (gcp_list.txt), `base` a GeoTIFF or a site folder whose map shows its ground, to which it is tied. A live
     flight is read, by the settings `live`, until it ends or `until` is set; then its map is finished like any other's.
     Nothing of a flight is part of the site until its last update was yielded.
-    A run that was killed goes on where it was when the same is asked for again. A flight that the site has already, by
+    A run that was killed continues when the same is asked for again. A flight that the site has already, by
     the same files, settings and version of the program, is left out and returned, unless `again` is given.
     `catalogues` is where a new site's catalogue goes; None: where the environment has it.
     `refly` are files for waypoints over ground that the pictures leave out, kept up to date while the flight goes on.
@@ -166,7 +166,7 @@ def _begun(
     file, source = begun_journal(setup, archive, request, anew=anew), setup.source
     if settings.method == "thesis":
         if file.is_begun:
-            text = f"{source.name}: a run was stopped, and begins anew: --method thesis goes on from nothing"
+            text = f"{source.name}: a stopped run begins again from the start: --method thesis cannot continue one"
             warnings.warn(text, SorvoloWarning, stacklevel=2)
             file = begun_journal(setup, archive, request, anew=True)
         return ThesisRun(setup, archive, settings, finder, MapJournal(file), request)

@@ -41,7 +41,7 @@ def compare_video(
     """A row of Tables 4.3 to 4.5, and pictures of Figures 4.4 and 4.5: the map beside the frame, as JPEGs.
 
     The map stays as it is: a copy in `scratch` is compared with. Raises InputError and StoreError as `compare_flights`,
-    InputError where nothing tells which frames show a change.
+    InputError where nothing states which frames show a change.
     """
     _demand_truth(truth)
     method, written = COMPARISONS[title]

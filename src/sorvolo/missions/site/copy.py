@@ -18,7 +18,7 @@ _MAY_BE_SHORT = 1.05  # times the need: other programs write to the disk as well
 
 
 def copy_site(source: str, target: str, catalogue: str = "") -> Generator[CopyUpdate, None, CopyOutcome]:
-    """Copy the site at one address to another, yielding how far it is; a copy that was stopped goes on.
+    """Copy the site at one address to another, yielding progress; an interrupted copy continues.
 
     The catalogue of a new copy in a folder lies there, whatever the site's does, or at the address `catalogue`.
 
@@ -40,7 +40,7 @@ def verify_copy(source: str, target: str) -> Generator[CopyUpdate, None, CopyOut
 
 
 def prune_site(address: str, keep_days: float, *, only_count: bool = False) -> Pruned:
-    """Remove what a site in an object store does not name any more and was stored so many days ago.
+    """Remove what a site in an object store no longer names and was stored more than `keep_days` days ago.
 
     Raises SettingsError for a folder, which keeps nothing like it, StoreError as stores do.
     """

@@ -107,7 +107,7 @@ def export_version(site: Path, at: str | None, path: Path, *, compress: str = "d
 def _check_target(path: Path) -> None:
     """Raises SettingsError or InputError where no map can be written to the path."""
     if path.suffix.lower() not in _ENDINGS:
-        raise SettingsError(f"{path.name}: the map is written as .tif, .png or .kmz; end the file's name so")
+        raise SettingsError(f"{path.name}: the map is written as .tif, .png or .kmz; give a name with such an ending")
     if not path.resolve().parent.is_dir():
         raise InputError(f"no folder {path.resolve().parent} to write {path.name} to; make it first")
     if path.is_dir():

@@ -153,7 +153,7 @@ def _claimed(out: Path, resume: bool) -> Iterator[None]:
     if resume and not held:
         raise SettingsError(f"{out} holds no {CHECKPOINT} to go on from; leave --resume out to start there")
     if held and not resume:
-        raise SettingsError(f"{out} already holds a run; --resume goes on with it, another --out starts anew")
+        raise SettingsError(f"{out} already holds a run; --resume continues it, another --out starts a new one")
     made = [each for each in (out, *out.parents) if not each.exists()]
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)

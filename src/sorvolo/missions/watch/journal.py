@@ -124,7 +124,7 @@ class WatchOrder:
         """
         journal = self._at(folder, request_of(setup, self.settings, None, self.detector, *self._more))
         if why_not := journal.why_not:
-            text = f"{folder}: a watch that was stopped cannot go on, since {why_not}"
+            text = f"{folder}: a watch that was stopped cannot continue: {why_not}"
             warnings.warn(text, SorvoloWarning, stacklevel=2)
         return journal
 

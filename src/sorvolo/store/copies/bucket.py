@@ -214,8 +214,8 @@ class BucketEnd:
                 raise self._conflict()
             if manifest.tidying:
                 raise StoreError(
-                    f"the site at {self.name} is being tidied since {manifest.tidying}; run the same command again "
-                    f"later, or end what was stopped: sorvolo site prune {self.name}"
+                    f"the site at {self.name} has been pruned since {manifest.tidying}; run the same command again "
+                    f"later, or finish a prune that was stopped: sorvolo site prune {self.name}"
                 )
             refuse_other(self.name, manifest.held.identity, new.held)
             if self._base is None:
@@ -223,7 +223,7 @@ class BucketEnd:
         self._round.stored = self._objects.sizes("")
 
     def lacks(self, state: SiteState) -> list[SiteFile]:
-        """The files whose bytes are not there, as far as their names or sizes tell; the others are noted."""
+        """The files whose bytes are not there, judged by names and sizes; the others are noted."""
         known = self._round.manifest.files if self._round.manifest is not None else {}
         lacking = []
         for file in state.files.values():

@@ -1,4 +1,4 @@
-"""What a site in an object store does not name any more is removed, without harm to who reads or writes meanwhile."""
+"""What a site in an object store no longer names is removed, without harm to concurrent readers and writers."""
 
 import secrets
 import tempfile

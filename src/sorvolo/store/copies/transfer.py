@@ -59,13 +59,13 @@ class SiteEnd(Protocol):
         ...
 
     def free_bytes(self) -> int | None:
-        """Room for files; None where nobody knows."""
+        """Room for files; None where unknown."""
         ...
 
 
 @dataclass(frozen=True)
 class CopyUpdate:
-    """How far it is: files and bytes that are done, of those that are to be copied or compared."""
+    """Progress: files and bytes done, of those to be copied or compared."""
 
     done: int
     files: int
@@ -104,12 +104,12 @@ def copy(
     source: SiteEnd, target: SiteEnd, scratch: Path, *, threads: int = 4, most_rounds: int = 20,
     room: Callable[[int, int | None], None] = lambda needed, free: None,
 ) -> Generator[CopyUpdate, None, CopyOutcome]:
-    """Make `target` what `source` is at one moment, however often that one changes meanwhile.
+    """Make `target` a copy of `source` as of one moment, even if the source changes meanwhile.
 
-    What is there already is not copied again, so that a stopped copy goes on. `scratch` is a folder for catalogues.
-    `room` gets the bytes that are needed and those that are free, before each round, and may raise. Files that the
-    source has lost or that are damaged there are left out and named in the outcome. Raises StoreError as the ends do,
-    and when the source did not stand still for one of `most_rounds` rounds.
+    What is there already is not copied again, so that an interrupted copy continues. `scratch` is a folder for
+    catalogues. `room` gets the bytes that are needed and those that are free, before each round, and may raise. Files
+    that the source has lost or that are damaged there are left out and named in the outcome. Raises StoreError as the
+    ends do, and when the source changed during each of `most_rounds` rounds.
     """
     counts = _Counts()
     with target.being_filled():
@@ -119,7 +119,7 @@ def copy(
             lacking = [each for each in target.lacks(state) if each.path not in counts.faults]
             room(sum(each.size for each in lacking), target.free_bytes())
             gone = yield from _move(source, target, lacking, counts, threads)
-            for path in gone & counts.gone:  # twice: it is not only that another process replaces it
+            for path in gone & counts.gone:  # gone in two rounds: another process is not just replacing it
                 counts.faults[path] = "missing"
             counts.gone = gone
             if not gone - counts.faults.keys() and source.is_still(state, scratch):

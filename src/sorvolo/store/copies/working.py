@@ -197,7 +197,7 @@ class _WorkingFolder(FolderEnd):
 
 
 def known_manifest(folder: Path) -> Manifest | None:
-    """What a working copy was made of; None where nobody knows."""
+    """What a working copy was made of; None where unknown."""
     try:
         note = json.loads((folder / ORIGIN).read_bytes())
     except (FileNotFoundError, ValueError):

@@ -67,7 +67,7 @@ class FlightRows:
 
 @dataclass(frozen=True)
 class SiteState:
-    """What a site holds, told cheaply: `state` is another one after each flight and each review.
+    """What a site holds, in brief: `state` changes with each flight and each review.
 
     `flights` are the states of its complete flights, `verdicts` those on its changes, by id; a local site has neither.
     """

@@ -292,7 +292,7 @@ class Archive:
             newest = records.newest_version(connection)
         journal = RunJournal(path, key, newest, program)
         if not anew and (why_not := journal.why_not):
-            _warn(f"{flight_id}: a run that was stopped cannot go on, since {why_not}; it begins anew")
+            _warn(f"{flight_id}: a run that was stopped cannot continue: {why_not}; it starts again")
         self._forget_stopped(path if journal.is_begun and not anew else None, but=flight_id)
         remove_unused(self._files)
         return journal
@@ -311,7 +311,7 @@ class Archive:
         """Forget the runs that were stopped, all but `kept`, with a warning for those of other flights than `but`."""
         for each in stopped_flights(self._files):
             if each != but:
-                _warn(f"a run of {each} was stopped before it was complete, and cannot go on: the map changes now")
+                _warn(f"a run of {each} was stopped before it was complete, and cannot continue: the map changes now")
         forget_journals(self._files, kept)
 
     def begin_flight(

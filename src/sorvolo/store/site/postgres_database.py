@@ -210,7 +210,7 @@ class PostgresDatabase:
             return StoreError(f"{shown_url(self._url)}: {fault}; make the database, or correct SORVOLO_CATALOGUE")
         return ConnectionLostError(
             f"no connection to {self.place} ({fault}); what was stored is safe: run the same command again when the "
-            "server is there, it goes on where it was"
+            "server is there, it continues where it was"
         )
 
 
