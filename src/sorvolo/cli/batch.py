@@ -22,7 +22,8 @@ from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
-    from sorvolo.cluster.batch import BatchReport, BatchSettings, BatchUpdate, Executor
+    from sorvolo.cluster.batch import BatchReport, BatchSettings, BatchUpdate
+    from sorvolo.cluster.executor import Executor
     from sorvolo.cluster.table import BatchTable, Row
 
 _FAILED = 1
@@ -73,6 +74,10 @@ Model = Annotated[
 ]
 Tries = Annotated[int, typer.Option(help="Set a flight aside when it ended its process so many times.")]
 Stall = Annotated[float, typer.Option(help="End a process that neither answers nor computes for so many seconds.")]
+Blocks = Annotated[
+    int,
+    typer.Option(help="Divide each flight of photos into so many blocks of ground, joined to one map."),
+]
 Retry = Annotated[bool, typer.Option("--retry", help="Also try flights again that were set aside.")]
 
 
@@ -91,6 +96,7 @@ def batch(
     tries: Tries = 3,
     stall: Stall = 300.0,
     retry: Retry = False,
+    blocks: Blocks = 1,
     as_json: AsJson = False,
 ) -> None:
     """Map, compare or search many flights. After a stop or a kill, the same command continues.
@@ -108,6 +114,8 @@ def batch(
     Example: sorvolo batch north=rtsp://192.168.1.10/live south=udp://:5000 --root maps
 
     Example: sorvolo batch /mnt/shared/flights --root /mnt/shared/maps --executor ray://head:10001
+
+    Example: sorvolo batch /mnt/shared/valley --root /mnt/shared/maps --blocks 16 --executor ray://head:10001
     """
     from sorvolo.cluster.batch import BatchSettings
     from sorvolo.cluster.orders import FlightWish, Mission
@@ -116,7 +124,7 @@ def batch(
     context.obj.stop_words = f"stopped; run the same command to continue: {root} holds what is done"
     by = site_by or (SiteByName.PLACE if mission is MissionName.COMPARE else SiteByName.FLIGHT)
     wish = FlightWish(Mission(mission.value), _absolute(camera), _absolute(model), gsd, give_up)
-    settings = BatchSettings(wish, SiteBy(by.value), tries, stall, retry)
+    settings = BatchSettings(wish, SiteBy(by.value), tries, stall, retry, blocks)
     report = _run(places, root, settings, executor, workers)
     if as_json:
         typer.echo(json.dumps(_plain(report, root), indent=1))
@@ -137,7 +145,7 @@ def _run(
     from sorvolo.cluster.streams import is_stream, run_streams, streams_of
 
     live = [each for each in places if is_stream(each)]
-    _check_live(live, places, workers)
+    _check_live(live, places, workers, settings.blocks)
     if live:  # one that waits for its drone does nothing, and gives up by itself
         settings = replace(settings, stall_s=settings.stall_s + settings.wish.give_up_s)
     most = len(live) if live and workers is None else workers
@@ -153,10 +161,12 @@ def _run(
             return _show_progress(running, Console(stderr=True))
 
 
-def _check_live(live: Sequence[str], places: Sequence[str], workers: int | None) -> None:
+def _check_live(live: Sequence[str], places: Sequence[str], workers: int | None, blocks: int) -> None:
     """Raise SettingsError for live sources beside folders, and for fewer workers than live sources."""
     if live and len(live) < len(places):
         raise SettingsError("give folders of flights or live sources, not both: they are two batches with two roots")
+    if live and blocks > 1:
+        raise SettingsError("--blocks divides folders of photos; live sources are mapped whole")
     if live and workers is not None and workers < len(live):
         raise SettingsError(f"--workers {workers}: {len(live)} live sources need a worker each")
 

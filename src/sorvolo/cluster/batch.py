@@ -4,14 +4,15 @@ import hashlib
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence, Set
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TypeGuard
+from typing import TYPE_CHECKING, TypeGuard
 
 import sorvolo
 from sorvolo.cluster.cost import Cost, CostSettings, cost_of
-from sorvolo.cluster.orders import Ending, FlightWish, Order, Outcome, Scouted
+from sorvolo.cluster.executor import Executor, Key
+from sorvolo.cluster.orders import Ending, FlightWish, Mission, Order, Outcome, Scouted
 from sorvolo.cluster.scout import FoundFlight, Unreadable, find_flights, scout
 from sorvolo.cluster.sites import Placed, SiteBy, existing_site, existing_sites, sites_of
 from sorvolo.cluster.table import FINAL, BatchTable, Row, State
@@ -19,7 +20,8 @@ from sorvolo.detection.models import find_model
 from sorvolo.errors import SettingsError
 from sorvolo.missions.flight.software import software
 
-Key = tuple[str, str]
+if TYPE_CHECKING:
+    from sorvolo.cluster.divided import Progress
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,7 @@ class BatchSettings:
     most_tries: int = 3  # that end the process of a flight's worker; then it is set aside
     stall_s: float = 300.0  # without an answer or any work: the worker is ended
     retries: bool = False  # flights that were set aside before are tried again
+    blocks: int = 1  # into which each flight is divided
     near_m: float = 50.0  # from a site's ground: a drone sees no less than half of that beside its track
     costs: CostSettings = CostSettings()  # noqa: RUF009 (frozen)
     restarts: RestartSettings = RestartSettings()
@@ -46,6 +49,10 @@ class BatchSettings:
     def __post_init__(self) -> None:
         if self.most_tries < 1:
             raise SettingsError(f"--tries {self.most_tries}: at least 1 is needed")
+        if self.blocks < 1:
+            raise SettingsError(f"--blocks {self.blocks}: at least 1 is needed")
+        if self.blocks > 1 and self.wish.mission is not Mission.MAP:
+            raise SettingsError(f"--blocks divides flights to be mapped; --mission {self.wish.mission} takes none")
         if not self.stall_s > 0:
             raise SettingsError(f"--stall {self.stall_s:g}: more than 0 seconds are needed")
         if self.wish.m_per_px is not None:
@@ -54,30 +61,6 @@ class BatchSettings:
             MapSettings(m_per_px=self.wish.m_per_px)  # states what is out of range
         if self.wish.model not in ("none", "default"):
             find_model(self.wish.model)
-
-
-class Executor(Protocol):
-    """Where tries at flights run."""
-
-    @property
-    def running(self) -> Mapping[Key, object]:
-        """What runs, by key."""
-
-    @property
-    def cache_mb(self) -> float:
-        """Memory that a try may take for what it could also read again."""
-
-    def has_room(self, cost: Cost) -> bool:
-        """Whether another try may start."""
-
-    def start(self, key: Key, order: Order, cost: Cost) -> None:
-        """Start a try."""
-
-    def finish(self, key: Key) -> None:
-        """End a live flight, and have its map finished."""
-
-    def next_ended(self, timeout_s: float | None = None) -> tuple[Key, Ending] | None:
-        """Wait until a try has ended; None where none did for so long. Raises SorvoloError if the executor is gone."""
 
 
 @dataclass(frozen=True)
@@ -156,13 +139,16 @@ class _Run:
     def update(self, row: Row | None = None, *, is_known: bool = False) -> BatchUpdate:
         """How far the batch is."""
         done = sum(each.state not in (State.WAITING, State.RUNNING) for each in self.rows.values())
-        running = tuple(_name(self.rows[key]) for key in self._executor.running)
+        running = tuple(_name(each) for each in self.rows.values() if each.state is State.RUNNING)
         return BatchUpdate("flights", done, len(self.rows), row, is_known, running)
 
     def through(self) -> Generator[BatchUpdate]:
         """Try each flight until it is through. Closed on the way, those that run are marked as waiting again."""
         try:
             while self._waiting or self._executor.running:
+                if self._settings.blocks > 1:
+                    yield from self._divided(self._take(max(self._waiting.values(), key=_all_frames)[0]))
+                    continue
                 while (row := self._next()) is not None:
                     self._start(row)
                     yield self.update()
@@ -170,8 +156,8 @@ class _Run:
                     key, ending = ended
                     yield self.update(self._end(self.rows[key], ending))
         finally:
-            for key in list(self._executor.running):
-                self._keep(replace(self.rows[key], state=State.WAITING, words="the batch was stopped"))
+            for row in [each for each in self.rows.values() if each.state is State.RUNNING]:
+                self._keep(replace(row, state=State.WAITING, words="the batch was stopped"))
 
     def _next(self) -> Row | None:
         """The flight to begin: of a site that nobody writes, and of these the one with most frames before it."""
@@ -179,20 +165,54 @@ class _Run:
         free = [queue for site, queue in self._waiting.items() if site not in busy]
         if not free:
             return None
-        row = max(free, key=lambda queue: sum(_frames(each) for each in queue))[0]
+        row = max(free, key=_all_frames)[0]
         return row if self._executor.has_room(cost_of(row, self._table, self._settings.costs)) else None
 
-    def _start(self, row: Row) -> None:
+    def _divided(self, row: Row) -> Generator[BatchUpdate]:
+        """One flight in blocks, with all workers: another is begun when it is through."""
+        from sorvolo.cluster.divided import SetAside, map_divided  # which takes long to import
+
+        def cost(crashes: int) -> Cost:
+            return cost_of(replace(row, crashes=crashes), self._table, self._settings.costs)
+
+        running = map_divided(
+            row.key, self._order(row), self._settings.blocks, self._executor, cost, self._settings.most_tries
+        )
+        try:
+            ending = yield from self._shown(running)
+        except SetAside as error:
+            row = replace(row, crashes=self._settings.most_tries - 1)
+            ending = Ending(Outcome.CRASHED, str(error))
+        yield self.update(self._end(row, ending))
+
+    def _shown(self, running: "Generator[Progress, None, Ending]") -> Generator[BatchUpdate, None, Ending]:
+        """What becomes of a flight in blocks, as updates of the batch."""
+        with closing(running):
+            while True:
+                try:
+                    task, done, total = next(running)
+                except StopIteration as end:
+                    ending: Ending = end.value
+                    return ending
+                yield replace(self.update(), task=task, done=done, total=total)
+
+    def _take(self, row: Row) -> Row:
+        """The row, no longer waiting."""
         self._waiting[row.site].remove(row)
         if not self._waiting[row.site]:
             del self._waiting[row.site]
-        cost = cost_of(row, self._table, self._settings.costs)
-        self._keep(replace(row, state=State.RUNNING, tries=row.tries + 1, words=""))
         self.tries += 1
-        order = Order(
+        return self._keep(replace(row, state=State.RUNNING, tries=row.tries + 1, words=""))
+
+    def _order(self, row: Row) -> Order:
+        return Order(
             row.source, str((self._table.root / row.site).resolve()), self._settings.wish, self._executor.cache_mb
         )
-        self._executor.start(row.key, order, cost)
+
+    def _start(self, row: Row) -> None:
+        cost = cost_of(row, self._table, self._settings.costs)
+        row = self._take(row)
+        self._executor.start(row.key, self._order(row), cost)
 
     def _end(self, row: Row, ending: Ending) -> Row:
         if ending.outcome is not Outcome.CRASHED:
@@ -341,6 +361,10 @@ def _moment(row: Row) -> tuple[int, str]:
 
 def _frames(row: Row) -> int:
     return row.scouted.frames if row.scouted is not None else 0
+
+
+def _all_frames(rows: Sequence[Row]) -> int:
+    return sum(_frames(each) for each in rows)
 
 
 def _name(row: Row) -> str:

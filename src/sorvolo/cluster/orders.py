@@ -42,14 +42,34 @@ class FlightWish:
     give_up_s: float = 30.0
 
 
+class PartKind(StrEnum):
+    """What a part of a flight in blocks is."""
+
+    BLOCK = "block"  # some of its photos, registered
+    TILES = "tiles"  # some of its map's tiles, painted
+
+
+@dataclass(frozen=True)
+class Part:
+    """One of `count` parts of a flight, by its number from 0; its files lie in `folder`. `key` is what is asked for."""
+
+    kind: PartKind
+    number: int
+    count: int
+    folder: str
+    key: str = ""
+
+
 @dataclass(frozen=True)
 class Order:
-    """One try at one flight: the file, folder or address, the site's folder, and how much its caches may take, MB."""
+    """One try at one flight, or at a `part` of one: the file, folder or address, the site's folder, and how much its
+    caches may take, MB."""
 
     source: str
     site: str
     wish: FlightWish
     memory_mb: float | None = None
+    part: Part | None = None
 
     def line(self) -> bytes:
         """The order as it goes to the worker."""
@@ -59,7 +79,10 @@ class Order:
     def of(cls, plain: Mapping[str, Any]) -> Self:
         """The order that a worker received."""
         wish = dict(plain["wish"])
-        return cls(**{**plain, "wish": FlightWish(**{**wish, "mission": Mission(wish["mission"])})})
+        part = plain.get("part")
+        if part is not None:
+            part = Part(**{**part, "kind": PartKind(part["kind"])})
+        return cls(**{**plain, "wish": FlightWish(**{**wish, "mission": Mission(wish["mission"])}), "part": part})
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from sorvolo.capture.live.addresses import is_live_address, live_address, shown_address
 from sorvolo.capture.source import safe_name
-from sorvolo.cluster.batch import BatchReport, BatchSettings, BatchUpdate, Executor, Key
+from sorvolo.cluster.batch import BatchReport, BatchSettings, BatchUpdate
 from sorvolo.cluster.cost import cost_of
+from sorvolo.cluster.executor import Executor, Key
 from sorvolo.cluster.orders import Ending, Mission, Order, Outcome, Scouted
 from sorvolo.cluster.table import BatchTable, Row, State
 from sorvolo.errors import SettingsError

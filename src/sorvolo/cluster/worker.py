@@ -19,7 +19,7 @@ from typing import Any, BinaryIO
 
 from sorvolo.capture.live.addresses import is_live_address, without_secret
 from sorvolo.capture.live.reconnect import LiveSettings
-from sorvolo.cluster.orders import FINISH, Mission, Order, Outcome, Scouted, answer_line
+from sorvolo.cluster.orders import FINISH, Mission, Order, Outcome, Part, PartKind, Scouted, answer_line
 from sorvolo.errors import SorvoloError
 
 _ALIVE_EVERY_S = 0.5
@@ -60,14 +60,41 @@ def main() -> int:
         return 0
     order = Order.of(content["order"])
     try:
-        _wait_for_site(Path(order.site))
-        flight, words, is_good = _MISSIONS[order.wish.mission](order, answers.alive, until)
+        flight, words, is_good = _done(order, answers.alive, until)
     except SorvoloError as error:
         answers.add("ended", {"outcome": Outcome.FAILED, "words": without_secret(str(error), order.source)})
         return 0
     outcome = Outcome.DONE if is_good else Outcome.DOUBTFUL
     answers.add("ended", {"outcome": outcome, "words": words, "flight": flight})
     return 0
+
+
+def _done(order: Order, alive: Callable[..., None], until: threading.Event) -> tuple[str, str, bool]:
+    """Do the order: the flight's name in the site, words about it, and whether its result is one to use."""
+    if order.part is not None:
+        _PARTS[order.part.kind](order, order.part, alive)
+        return "", "", True
+    _wait_for_site(Path(order.site))
+    return _MISSIONS[order.wish.mission](order, alive, until)
+
+
+def _block(order: Order, part: Part, alive: Callable[..., None]) -> None:
+    """Register the photos of a block."""
+    from sorvolo.missions.flight.settings import MapSettings
+    from sorvolo.missions.map.blocks import Division, map_block
+
+    wish = order.wish
+    settings = MapSettings(m_per_px=wish.m_per_px, model=wish.model, memory_mb=order.memory_mb)
+    division = Division(Path(part.folder), part.key, part.count)
+    map_block(Path(order.source), wish.camera or None, settings, division, part.number, alive)
+
+
+def _tiles(order: Order, part: Part, alive: Callable[..., None]) -> None:
+    """Paint a share of the map's tiles."""
+    from sorvolo.missions.flight.memory import memory_budget_bytes
+    from sorvolo.missions.map.tile_shares import paint_share
+
+    paint_share(Path(part.folder), part.number, part.count, memory_budget_bytes(order.memory_mb), alive)
 
 
 def _follow_input(until: threading.Event) -> None:
@@ -112,6 +139,7 @@ def _map(order: Order, alive: Callable[..., None], until: threading.Event) -> tu
     """Map the flight: its name in the site, the headline, and whether it is a map to use."""
     from sorvolo.missions.flight.settings import MapSettings
     from sorvolo.missions.map.flights import map_flights
+    from sorvolo.missions.site.headlines import headline_of
 
     site, wish = Path(order.site), order.wish
     settings = MapSettings(m_per_px=wish.m_per_px, model=wish.model, memory_mb=order.memory_mb)
@@ -119,7 +147,7 @@ def _map(order: Order, alive: Callable[..., None], until: threading.Event) -> tu
         [order.source], site, settings, camera=wish.camera or None, live=_live(order), until=until
     )
     flight = _run(updates, site, alive)
-    return flight, *_headline(site, flight, "headline", "map")
+    return flight, *headline_of(site, flight)
 
 
 def _compare(order: Order, alive: Callable[..., None], until: threading.Event) -> tuple[str, str, bool]:
@@ -163,6 +191,7 @@ def _search(order: Order, alive: Callable[..., None], until: threading.Event) ->
     return flight, str(head.get("text", "")), bool(head.get("complete"))
 
 
+_PARTS = {PartKind.BLOCK: _block, PartKind.TILES: _tiles}
 _MISSIONS = {Mission.MAP: _map, Mission.COMPARE: _compare, Mission.SEARCH: _search}
 
 
@@ -184,15 +213,6 @@ def _run(updates: Generator[Any, None, Any], site: Path, alive: Callable[..., No
         return str(known[0].flight)
     with Archive.open(site, write=False) as archive:
         return next(each.flight_id for each in archive.versions() if each.complete and each.id > before)
-
-
-def _headline(site: Path, flight: str, name: str, good: str) -> tuple[str, bool]:
-    """The first line of a flight's report, and whether its result is one to use."""
-    from sorvolo.store.site.archive import Archive
-
-    with Archive.open(site, write=False) as archive:
-        head = archive.report(flight).get(name) or {}
-    return str(head.get("text", "")), head.get("quality") == good
 
 
 def _newest(site: Path) -> int:

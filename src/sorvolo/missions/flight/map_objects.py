@@ -107,9 +107,9 @@ class ObjectFinder:
         self._waiting.append(self._thread.submit(self._look, posed.frame, m_per_px, from_above))
         self._take(_AHEAD)
 
-    def news(self) -> list[FrameDetections]:
-        """What was found since this was asked last, in the frames' order."""
-        self._take(_AHEAD)
+    def news(self, *, waits: bool = False) -> list[FrameDetections]:
+        """What was found since this was asked last, in the frames' order; `waits`: in all frames so far."""
+        self._take(0 if waits else _AHEAD)
         news, self._news = self._news, []
         return news
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
 
 from sorvolo.capture.live.stream import LiveStream
@@ -21,8 +22,9 @@ from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.map.coverage import FlightCoverage
 from sorvolo.missions.map.journal import MapJournal, Step, StoredPicture, Taken
 from sorvolo.missions.map.known_keyframes import KnownKeyframes
-from sorvolo.missions.map.painting import FlightPainter, site_from_image
+from sorvolo.missions.map.painting import FlightPainter, KeptPicture, site_from_image
 from sorvolo.missions.map.run import FlightRun
+from sorvolo.missions.map.tile_shares import PaintsElsewhere
 from sorvolo.mosaic.base_ties import BaseReport, FoundFrame, tie_to_base
 from sorvolo.mosaic.exposure import Exposure
 from sorvolo.mosaic.graph_settings import PoseGraphSettings
@@ -44,7 +46,8 @@ from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 _WAIT_FOR_HEIGHT = 12  # keyframes held back until the height above ground is seen in them
 _OFFSET_ROUNDS = 3
 _LOCAL_M_PER_PX = 1.0
-_HORIZON = "the camera looks at the horizon"
+HORIZON = "the camera looks at the horizon"
+"""Why a frame is rejected that shows more than the ground."""
 
 
 class PlanarRun(FlightRun):
@@ -53,10 +56,10 @@ class PlanarRun(FlightRun):
     def __init__(
         self, setup: FlightSetup, archive: Archive, settings: MapSettings, writer: FlightWriter | None = None,
         finder: ObjectFinder | None = None, journal: MapJournal | None = None, request: str = "",
-        coverage: FlightCoverage | None = None,
+        coverage: FlightCoverage | None = None, elsewhere: PaintsElsewhere | None = None,
     ) -> None:
         super().__init__(setup, archive, settings, writer, finder, journal, request)
-        self._coverage = coverage
+        self._coverage, self._elsewhere = coverage, elsewhere
         model = setup.source.camera
         self._lens = Undistorter(model.camera)
         self._known = KnownKeyframes.of(archive, setup.source.name)
@@ -70,7 +73,7 @@ class PlanarRun(FlightRun):
             keyframes=Keyframes(self._spill, memory_budget_bytes(settings.memory_mb) // 4),
         )
         self._times_ns: dict[int, int] = {}  # of the flight's keyframes that have a place
-        self._held: dict[int, ImageRGB | bytes] = {}  # JPEG where all of the flight waits for its place
+        self._held: dict[int, ImageRGB | bytes | KeptPicture] = {}  # JPEG where all of the flight waits for its place
         self._painter: FlightPainter | None = None
         self._offset: OffsetEstimate | None = None
         self._control: ControlReport | None = None
@@ -103,7 +106,7 @@ class PlanarRun(FlightRun):
         """Place one frame; what became of it and how many tiles were painted meanwhile."""
         frame, self._taken = posed.frame, None
         if sees_horizon(self._setup.source.camera.camera, posed.prior):
-            return self.lose(frame.index, frame.name, frame.time_ns, _HORIZON)
+            return self.lose(frame.index, frame.name, frame.time_ns, HORIZON)
         with self._log.stage(Stage.UNDISTORT):
             image = self._lens.undistort(frame.image)
         with self._log.stage(Stage.REGISTER):
@@ -135,6 +138,12 @@ class PlanarRun(FlightRun):
         if self._painter is None or not self._painter.take_over(registered.keyframe.id, picture):
             return None
         return *self._take(step, registered, None), 0
+
+    def join(self, step: Step, picture: Path) -> tuple[Status, str]:
+        """Take a frame as a block of the flight took it, and its stored picture from this file."""
+        assert step.taken is not None and isinstance(step.taken.picture, StoredPicture)
+        registered = self._mapper.joined(step.taken.registered)
+        return self._take(step, registered, KeptPicture(picture, step.taken.picture))
 
     def view(self, index: int, time_ns: int) -> FrameView | None:
         """See `FlightRun.view`."""
@@ -214,7 +223,7 @@ class PlanarRun(FlightRun):
         return Exposure({}, {}, 0.0) if self._painter is None else self._painter.exposure
 
     def _take(
-        self, frame: Frame | Step, registered: Registered, picture: ImageRGB | bytes | None
+        self, frame: Frame | Step, registered: Registered, picture: ImageRGB | bytes | KeptPicture | None
     ) -> tuple[Status, str]:
         """Place a registered frame and keep its picture, if it has not been kept before; what became of it."""
         with self._log.stage(Stage.REGISTER):
@@ -231,7 +240,7 @@ class PlanarRun(FlightRun):
             self._painter.mark(outcome.moved | {keyframe_id})
         return outcome.status, outcome.reason
 
-    def _keep(self, keyframe_id: int, picture: ImageRGB | bytes) -> None:
+    def _keep(self, keyframe_id: int, picture: ImageRGB | bytes | KeptPicture) -> None:
         if self._painter is not None:
             self._painter.save(keyframe_id, image_from_jpeg(picture, "") if isinstance(picture, bytes) else picture)
             return
@@ -249,7 +258,7 @@ class PlanarRun(FlightRun):
             writer = self.begin()
             self._painter = FlightPainter(
                 writer, self._archive, self._mapper, self._lens, self._known, self._native_m_per_px(), self._log,
-                self._settings.live_s, is_live=isinstance(self._setup.source, LiveSource),
+                self._settings.live_s, is_live=isinstance(self._setup.source, LiveSource), elsewhere=self._elsewhere,
             )
             for keyframe_id, held in self._held.items():
                 image = image_from_jpeg(held, "") if isinstance(held, bytes) else held
@@ -285,6 +294,8 @@ class PlanarRun(FlightRun):
         held = self._held.get(keyframe_id)
         if held is None:
             return self.begin().image(keyframe_id - self._known.count)
+        if isinstance(held, KeptPicture):
+            return held.image()
         return image_from_jpeg(held, "") if isinstance(held, bytes) else held
 
     def _find_offset(self) -> OffsetEstimate | None:
@@ -324,7 +335,7 @@ class PlanarRun(FlightRun):
             pose = self._mapper.pose(keyframe_id)
             outline_m = footprint(camera, pose)
             if not is_on_ground(outline_m):
-                result.append(self._rejected(ending, _HORIZON, camera))
+                result.append(self._rejected(ending, HORIZON, camera))
                 continue
             status, reason = self._mapper.ending(keyframe_id)
             self._log.end(ending.index, ending.name, ending.time_ns, status, reason)

@@ -37,7 +37,10 @@ class TileBlobs:
 
     def save(self, rgba: ImageRGBA) -> str:
         """Write a tile unless its very bytes are there already, and return the SHA-256 of its PNG."""
-        data = png_from_rgba(rgba)
+        return self.keep(png_from_rgba(rgba))
+
+    def keep(self, data: bytes) -> str:
+        """The same for a tile that is encoded already."""
         sha256 = hashlib.sha256(data).hexdigest()
         path = self._path(sha256)
         if not path.exists():
@@ -57,11 +60,7 @@ class TileBlobs:
             if sha256 in self._read:
                 self._read.move_to_end(sha256)
                 return self._read[sha256]
-        path = self._path(sha256)
-        data = self._bytes(f"{self._folder.name}/{path.parent.name}/{path.name}")
-        if hashlib.sha256(data).hexdigest() != sha256:
-            raise StoreError(f"the tile {path} is damaged; restore it from a copy of the site, or map again")
-        tile = rgba_from_png(data, str(path))
+        tile = rgba_from_png(self.encoded(sha256), str(self._path(sha256)))
         tile.setflags(write=False)
         with self._reading:
             self._forget(sha256)
@@ -70,6 +69,14 @@ class TileBlobs:
             while self._read_bytes > self.cache_bytes:
                 self._forget(next(iter(self._read)))
         return tile
+
+    def encoded(self, sha256: str) -> bytes:
+        """A tile's PNG; raises as `load` does."""
+        path = self._path(sha256)
+        data = self._bytes(f"{self._folder.name}/{path.parent.name}/{path.name}")
+        if hashlib.sha256(data).hexdigest() != sha256:
+            raise StoreError(f"the tile {path} is damaged; restore it from a copy of the site, or map again")
+        return data
 
     def _bytes(self, name: str) -> bytes:
         try:
@@ -209,14 +216,23 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
         self._changed.add(index)
         self._keep(index, frozen(rgba, np.uint8))
 
+    def adopt(self, index: TileIndex, data: bytes) -> None:
+        """Replace a tile by one that another process painted and encoded, as `TileBlobs` keeps them."""
+        self._let_go(index)
+        self._replace_hash(index, self._blobs.keep(data))
+        self._changed.add(index)
+
     def __delitem__(self, index: TileIndex) -> None:
         if index not in self:
             raise KeyError(index)
+        self._let_go(index)
+        self._replace_hash(index, None)
+        self._changed.add(index)
+
+    def _let_go(self, index: TileIndex) -> None:
         dropped = self._loaded.pop(index, None)
         self._bytes -= 0 if dropped is None else dropped.nbytes
         self._unsaved.discard(index)
-        self._replace_hash(index, None)
-        self._changed.add(index)
 
     def __iter__(self) -> Iterator[TileIndex]:
         return iter(self._hashes.keys() | self._unsaved)

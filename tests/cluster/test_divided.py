@@ -1,0 +1,145 @@
+"""A flight mapped in blocks gives the map that it gives when it is mapped whole; what cannot be divided is named."""
+
+import os
+import shutil
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+
+from ended_work import ended
+from small_flights import simulate_into, small_flight
+from sorvolo.cluster.batch import BatchReport, BatchSettings, run_batch
+from sorvolo.cluster.cost import Cost
+from sorvolo.cluster.local_executor import LocalExecutor
+from sorvolo.cluster.orders import FlightWish, Mission, Order, PartKind
+from sorvolo.cluster.table import BatchTable, State
+from sorvolo.errors import SettingsError
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.map.joining import plan_blocks
+from sorvolo.simulation.settings import OutputSettings
+from sorvolo.store.site.archive import Archive
+
+
+class Flown(NamedTuple):
+    """A flight of three strips: its photos, its camera, and the site that they make when they are mapped whole."""
+
+    photos: Path
+    camera: Path
+    whole: Path
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    folder = tmp_path_factory.mktemp("strips")
+    settings = small_flight(7, length_m=26, spacing_m=7, fps=1, output=OutputSettings(photos=True))
+    simulate_into(folder / "flown", replace(settings, path=replace(settings.path, strips=3)))
+    photos, camera = folder / "flown" / "flight1" / "photos", folder / "flown" / "camera.xml"
+    (photos / "0099.jpg").write_bytes(b"no picture")
+    ended(map_flights([photos], folder / "whole", MapSettings(model="none"), camera=camera))
+    return Flown(photos, camera, folder / "whole")
+
+
+class Disturbed(LocalExecutor):
+    """A local executor that ends the process of the second block."""
+
+    def start(self, key: tuple[str, str], order: Order, cost: Cost) -> None:
+        super().start(key, order, cost)
+        if order.part is not None and (order.part.kind, order.part.number) == (PartKind.BLOCK, 1):
+            os.kill(self._running[key][0].pid, signal.SIGSEGV)
+
+
+class Noting(LocalExecutor):
+    """A local executor that keeps what it was asked to do."""
+
+    orders: ClassVar[list[Order]] = []
+
+    def start(self, key: tuple[str, str], order: Order, cost: Cost) -> None:
+        self.orders.append(order)
+        super().start(key, order, cost)
+
+
+def run(flight: Flown, root: Path, blocks: int, by: type[LocalExecutor], most_tries: int = 3) -> BatchReport:
+    @contextmanager
+    def executor(table: BatchTable) -> Iterator[LocalExecutor]:
+        with by(2, 300.0, table.lock) as made:
+            yield made
+
+    wish = FlightWish(camera=str(flight.camera), model="none")
+    settings = BatchSettings(wish, most_tries=most_tries, retries=True, blocks=blocks)
+    return ended(run_batch([flight.photos], root, settings, executor))
+
+
+@pytest.fixture(scope="module")
+def divided(flight: Flown, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BatchReport, BatchReport]:
+    """The root of a batch in two blocks, one of which crashed: what came of that, and of the same command again."""
+    root = tmp_path_factory.mktemp("divided") / "maps"
+    return root, run(flight, root, 2, Disturbed, most_tries=1), run(flight, root, 2, Noting)
+
+
+def test_a_block_that_ends_its_process_each_time_sets_the_flight_aside(
+    divided: tuple[Path, BatchReport, BatchReport]
+) -> None:
+    (row,) = divided[1].rows
+    assert row.state is State.SET_ASIDE
+    assert "block 2 of 2: its process ended by signal 11 (SIGSEGV)" in row.words
+
+
+def test_the_map_in_blocks_is_that_of_one_machine(
+    divided: tuple[Path, BatchReport, BatchReport], flight: Flown
+) -> None:
+    root, _, again = divided
+    (row,) = again.rows
+    assert (row.state, row.site, row.flight) == (State.DONE, "photos", "photos")
+    with Archive.open(flight.whole, write=False) as whole, Archive.open(root / "photos", write=False) as joined:
+        assert replace(joined.site(), name="whole") == whole.site()
+        assert joined.report("photos")["notices"] == whole.report("photos")["notices"]  # the photo that is none, too
+        frames = {each.index: each for each in joined.keyframes()}
+        assert frames.keys() == {each.index for each in whole.keyframes()} and len(frames) > 15
+        for each in whole.keyframes():
+            corners_px = each.camera.corners_px
+            away_m = apply_homography(frames[each.index].site_from_image, corners_px) - apply_homography(
+                each.site_from_image, corners_px
+            )
+            assert np.linalg.norm(away_m, axis=1).max() < 0.1 * whole.site().m_per_px
+        ours, theirs = joined.tiles(), whole.tiles()
+        assert set(ours) == set(theirs)
+        for tile in theirs:
+            assert np.abs(ours[tile].astype(int) - theirs[tile]).mean() < 0.1  # of 255, over all pixels
+    parts = {(each.part.kind, each.part.number) for each in Noting.orders if each.part is not None}
+    assert parts == {(PartKind.BLOCK, 1), (PartKind.TILES, 0), (PartKind.TILES, 1)}  # the block that was whole stayed
+    assert sorted(path.name for path in root.iterdir()) == ["batch.jsonl", "batch.lock", "photos"]
+
+
+def test_a_flight_in_blocks_is_known_afterwards(
+    divided: tuple[Path, BatchReport, BatchReport], flight: Flown
+) -> None:
+    report = run(flight, divided[0], 3, Noting)
+    assert (report.tries, report.counts()) == (0, {"known": 1})
+
+
+def test_what_cannot_be_divided_is_named(flight: Flown, tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="--blocks divides flights to be mapped; --mission compare"):
+        BatchSettings(FlightWish(Mission.COMPARE), blocks=2)
+    with pytest.raises(SettingsError, match="--blocks 0: at least 1"):
+        BatchSettings(blocks=0)
+    settings, other = MapSettings(model="none"), tmp_path / "other"
+    shutil.copytree(flight.photos, other)
+    first = min(other.iterdir())
+    first.write_bytes(first.read_bytes() + b"another")
+    with pytest.raises(SettingsError, match=r"the site whole shows photos already: .* leave --blocks out"):
+        plan_blocks(other, flight.whole, settings, flight.camera, 2, tmp_path / "blocks")
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for number in range(2):
+        cv2.imwrite(str(bare / f"{number}.jpg"), np.full((180, 320, 3), number, np.uint8))
+    with pytest.raises(SettingsError, match="the photos of bare have no GPS, by which they would be divided"):
+        plan_blocks(bare, tmp_path / "site", settings, flight.camera, 2, tmp_path / "blocks")
