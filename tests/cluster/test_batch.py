@@ -70,6 +70,8 @@ def batched(flown: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
         another(flown, folder / "in" / name)
     another(flown, folder / "in" / "sub" / "killed")  # the same bytes: the same flight
     (folder / "in" / "broken.mp4").write_text("no video")
+    (folder / "in" / "single").mkdir()
+    (folder / "in" / "single" / "DJI_7.JPG").write_bytes(b"one photo")
     signals = {"killed": [signal.SIGKILL, signal.SIGSTOP], "poisoned": [signal.SIGSEGV] * 3}
     return folder, run([folder / "in"], folder / "maps", flown / "camera.xml", signals)
 
@@ -79,7 +81,9 @@ def test_each_flight_is_through_once_or_named(batched: tuple[Path, BatchReport])
     rows = {Path(row.source).relative_to(folder / "in").as_posix(): row for row in report.rows}
     assert {name: row.state for name, row in rows.items()} == {
         "broken.mp4": State.FAILED, "killed": State.DONE, "sub/killed": State.DUPLICATE, "poisoned": State.SET_ASIDE,
+        "single": State.SKIPPED,
     }
+    assert rows["single"].words == "a single photo (DJI_7.JPG): a flight needs 2 or more"
     assert "broken.mp4" in rows["broken.mp4"].words
     assert rows["sub/killed"].words == f"the same flight as {folder / 'in' / 'killed'}"
     assert rows["poisoned"].words.startswith("set aside after 3 tries: its process ended by signal 11 (SIGSEGV)")
@@ -105,7 +109,7 @@ def test_again_nothing_is_done_twice(batched: tuple[Path, BatchReport], flown: P
     again = run([folder / "in"], folder / "maps", flown / "camera.xml", {})
     assert again.tries == 0
     assert [row.state for row in again.rows] == [row.state for row in first.rows]
-    assert again.counts() == {"known": 1, "duplicate": 1, "failed": 1, "set aside": 1}
+    assert again.counts() == {"known": 1, "duplicate": 1, "skipped": 1, "failed": 1, "set aside": 1}
 
 
 def test_a_killed_batch_leaves_no_worker_and_the_same_command_goes_on(flown: Path, tmp_path: Path) -> None:

@@ -31,7 +31,9 @@ def test_flights_are_videos_and_folders_of_photos_however_deep(tmp_path: Path) -
     )
     (tmp_path / "e").symlink_to(tmp_path / "a")
     found = find_flights([tmp_path, tmp_path / "b"], tmp_path / "maps")
-    assert [each.path.relative_to(tmp_path).as_posix() for each in found] == ["a/DJI_1.MP4", "b/deep"]
+    flights = [each.path.relative_to(tmp_path).as_posix() for each in found if not each.why_not]
+    assert flights == ["a/DJI_1.MP4", "b/deep"]
+    assert [each.path.name for each in found if each.why_not] == ["c"]
 
 
 def test_a_flights_stamp_changes_with_its_files_and_its_telemetry(tmp_path: Path) -> None:
@@ -43,7 +45,9 @@ def test_a_flights_stamp_changes_with_its_files_and_its_telemetry(tmp_path: Path
 
 
 def test_folders_without_flights_are_an_error(tmp_path: Path) -> None:
-    _touch(tmp_path / "in" / "notes.txt")
+    _touch(tmp_path / "in" / "notes.txt", tmp_path / "one" / "alone.jpg")
+    with pytest.raises(InputError, match=r"no flights among 1 file in .*: videos, or folders with two or more photos"):
+        find_flights([tmp_path / "one"], tmp_path / "maps")
     with pytest.raises(InputError, match=r"no flights among 1 file in .*: videos, or folders with two or more photos"):
         find_flights([tmp_path / "in"], tmp_path / "maps")
     with pytest.raises(InputError, match=r"no such folder: .*gone"):

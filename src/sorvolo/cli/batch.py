@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _FAILED = 1
 _MOST_ROWS = 40
-_COLOURS = {"done": "green", "known": "green", "doubtful": "yellow", "duplicate": "blue"}
+_COLOURS = {"done": "green", "known": "green", "doubtful": "yellow", "duplicate": "blue", "skipped": "blue"}
 
 
 class MissionName(StrEnum):

@@ -239,7 +239,7 @@ def _listed(
     seen = {(row.source, row.stamp): row.scouted for row in table if row.scouted is not None}
     new = [
         each.path for each in found
-        if (str(each.path), each.stamp) not in seen and not _is_set_aside(table, each, settings)
+        if not each.why_not and (str(each.path), each.stamp) not in seen and not _is_set_aside(table, each, settings)
     ]
     yield BatchUpdate("looking into flights", 0, len(new))
     answers = dict(zip(new, scout(new, settings.wish.camera, settings.most_tries, [table.lock])))
@@ -257,6 +257,8 @@ def _row_of(
     scouted = answer if isinstance(answer, Scouted) else None
     wish = settings.wish
     fresh = Row(str(found.path), wish.mission.value, found.stamp, _request(found, wish), scouted)
+    if found.why_not:
+        return table.put(replace(fresh, scouted=None, state=State.SKIPPED, words=found.why_not))
     if isinstance(answer, Unreadable):
         state = State.SET_ASIDE if answer.crashed else State.FAILED
         return table.put(replace(fresh, state=state, words=answer.words))

@@ -23,10 +23,14 @@ _STALL_S = 120.0
 
 @dataclass(frozen=True)
 class FoundFlight:
-    """A video, or a folder of photos; `stamp` changes with the names, sizes and times of its files."""
+    """A video, or a folder of photos; `stamp` changes with the names, sizes and times of its files.
+
+    `why_not` is why it is no flight after all, though somebody may take it for one; "" for a flight.
+    """
 
     path: Path
     stamp: str
+    why_not: str = ""
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ class Unreadable:
 
 
 def find_flights(places: Sequence[Path], root: Path) -> list[FoundFlight]:
-    """Every video and every folder of two or more photos in these folders and below, by path.
+    """Every video and every folder of photos in these folders and below, by path; one with a single photo is no flight.
 
     Hidden folders, links to folders, site folders and `root`, where maps are made, are passed over. A place may also be
     a video. Raises InputError for a place that is not there, or when there is no flight at all.
@@ -55,7 +59,7 @@ def find_flights(places: Sequence[Path], root: Path) -> list[FoundFlight]:
             files += len(names)
             for each in _flights_of(folder, names):
                 found[each.path] = each
-    if not found:
+    if all(each.why_not for each in found.values()):
         raise InputError(
             f"no flights among {counted(files, 'file')} in {', '.join(map(str, places))}: videos, or folders with two "
             "or more photos, were needed"
@@ -78,8 +82,9 @@ def _flights_of(folder: Path, names: Sequence[str]) -> Iterator[FoundFlight]:
     beside = sorted({*paths} - {*videos, *photos})
     for path in videos:
         yield FoundFlight(path, _stamp([path, *beside]))  # its telemetry may be among these
-    if len(photos) >= _LEAST_PHOTOS:
-        yield FoundFlight(folder, _stamp(photos))
+    if photos:
+        few = f"a single photo ({photos[0].name}): a flight needs {_LEAST_PHOTOS} or more"
+        yield FoundFlight(folder, _stamp(photos), few if len(photos) < _LEAST_PHOTOS else "")
 
 
 def _ending_in(endings: frozenset[str], paths: Sequence[Path]) -> list[Path]:

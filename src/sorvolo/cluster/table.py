@@ -34,6 +34,7 @@ class State(StrEnum):
     DONE = "done"
     DOUBTFUL = "doubtful"  # used, but its result is to be checked before use
     DUPLICATE = "duplicate"  # the same flight as another, under another name
+    SKIPPED = "skipped"  # no flight, though it may be taken for one
     FAILED = "failed"  # it cannot be used as it is
     SET_ASIDE = "set aside"  # it ended its process each time
 
