@@ -1,5 +1,7 @@
 """The memory of a place: who saw it, when, what was found there; pictures cut from key frames and from videos."""
 
+import shutil
+import time
 from pathlib import Path
 
 import av
@@ -61,3 +63,34 @@ def test_the_frame_of_a_number_is_that_frame(tmp_path: Path) -> None:
         assert abs(float(frame_of(str(path), number).mean()) - 12 * number) < 4, number
     with pytest.raises(ValueError, match="no frame"):
         frame_of(str(path), 400)
+
+
+def test_all_sites_are_asked_at_once(client: TestClient, root: Path) -> None:
+    """By an index that the station makes and keeps: a flight that came since is found, a site that went is not."""
+    shutil.copytree(root / "field", root / "more" / "field")
+    place = {"lon": 0.0, "lat": 0.0}
+    for each in client.get("/api/sites/field/collections/frames/items").json()["features"][:1]:
+        place["lon"], place["lat"] = np.mean(each["geometry"]["coordinates"][0][:-1], axis=0)
+    rows = client.get("/api/place", params=place).json()
+    assert {(each["site"], each["flight"]) for each in rows} == {
+        (site, flight) for site in ("field", "more:field") for flight in ("a", "b")
+    }
+    assert all(each["frames"] and each["best_frame"] for each in rows)
+    with Archive.open(root / "field", write=True) as archive, archive.begin_flight("c", "c", {}) as writer:
+        writer.commit([frame(0)], {0: writer.save_image(0, image(0))}, {}, "")
+    shutil.rmtree(root / "more" / "field")
+    time.sleep(1.1)  # the station looks for sites once a second
+    rows = client.get("/api/place", params=place).json()
+    assert {(each["site"], each["flight"]) for each in rows} == {("field", flight) for flight in "abc"}
+    assert client.get("/api/place", params={"lon": 170, "lat": 80}).json() == []
+
+
+def test_an_index_of_no_use_is_named_and_one_site_does_without(client: TestClient, root: Path) -> None:
+    frames = client.get("/api/sites/field/collections/frames/items").json()["features"]
+    place = dict(zip(("lon", "lat"), np.mean(frames[0]["geometry"]["coordinates"][0][:-1], axis=0), strict=True))
+    with_index = client.get("/api/sites/field/place", params=place).json()
+    (root / "archive-index.db").write_bytes(b"nothing of ours")
+    answer = client.get("/api/place", params=place)
+    assert answer.status_code == 503
+    assert "archive-index.db" in answer.json()["title"] + answer.json()["detail"]
+    assert client.get("/api/sites/field/place", params=place).json() == with_index != []

@@ -29,6 +29,7 @@ from sorvolo.station.map_watch import MapWatch
 from sorvolo.station.metrics import StationMetrics, memory_bytes, metrics_routes
 from sorvolo.station.outward import Outward, OutwardSettings
 from sorvolo.station.place import place_routes
+from sorvolo.station.place_index import PlaceIndex
 from sorvolo.station.problems import PROBLEM_ANSWERS, Problem, answer_problems
 from sorvolo.station.reviews import Reviews, review_routes
 from sorvolo.station.run_routes import run_routes
@@ -68,6 +69,7 @@ class Station:
     runs: Runs
     map_watch: MapWatch
     videos: FlightVideos
+    place_index: PlaceIndex
 
     @classmethod
     def open(cls, settings: StationSettings) -> "Station":
@@ -84,7 +86,7 @@ class Station:
         return cls(
             settings, state, shelf, tiles, events, SiteCollections(shelf), reviews, ingest, uploads, inputs,
             Runs(settings, state, shelf, events, inputs, ingest.show_boxes), MapWatch(shelf, tiles, reviews, events),
-            FlightVideos(inputs),
+            FlightVideos(inputs), PlaceIndex(shelf),
         )
 
     def close(self) -> None:
@@ -92,6 +94,7 @@ class Station:
         self.map_watch.close()
         self.runs.close()
         self.uploads.close()
+        self.place_index.close()
         self.shelf.close()
         self.state.close()
 
@@ -128,7 +131,7 @@ def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardS
         feature_routes(station.collections, station.reviews), review_routes(station.reviews, station.shelf),
         crop_routes(station.shelf), stream_routes(station.ingest), metrics_routes(metrics),
         upload_routes(station.uploads, station.runs), run_routes(station.runs, station.inputs),
-        place_routes(station.shelf, station.collections, station.reviews, station.videos),
+        place_routes(station.shelf, station.collections, station.reviews, station.videos, station.place_index),
         video_routes(station.shelf, station.collections, station.videos),
         drawing_routes(Drawings(settings, station.shelf, station.events)),
         export_routes(station.shelf, station.collections),

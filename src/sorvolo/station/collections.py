@@ -39,6 +39,7 @@ SEARCH_FOLDER = "search"
 _POD_FILE = f"{SEARCH_FOLDER}/pod.geojson"
 _LIVE_COVERAGE = LIVE_COVERAGE.removesuffix(".geojson")
 _MOST_BYTES = 256_000_000
+_MOST_FLIGHTS = 400  # whose frames are kept by flight: of some ten kilobytes to a megabyte each
 
 Feature = dict[str, Any]
 
@@ -88,7 +89,27 @@ class SiteCollections:
     def __init__(self, shelf: SiteShelf) -> None:
         self._shelf = shelf
         self._kept: dict[tuple[str, str], _Kept] = {}
+        self._flights: dict[tuple[str, str, str], tuple[int, Collection]] = {}  # frames with their file's time
         self._lock = threading.Lock()
+
+    def frames_of(self, site_id: str, flights: Sequence[str]) -> list[Collection]:
+        """What `get` has of the frames of each of these flights, without reading those of others."""
+        archive = self._shelf.open(site_id)
+        site, created_utc = archive.site(), archive.created_utc
+        return [self._frames_of(site_id, created_utc, archive, site, each) for each in flights]
+
+    def _frames_of(self, site_id: str, created_utc: str, archive: Archive, site: Site, flight: str) -> Collection:
+        mark = _modified(archive, f"flights/{flight}/{features_name('frames', is_local=site.is_local)}")
+        key = (site_id, created_utc, flight)
+        with self._lock:
+            known = self._flights.pop(key, None)
+        if known is None or known[0] != mark:
+            known = mark, Collection.of(_frames_of(archive, site, flight))
+        with self._lock:
+            self._flights[key] = known
+            while len(self._flights) > _MOST_FLIGHTS:
+                del self._flights[next(iter(self._flights))]
+        return known[1]
 
     def get(self, site_id: str, name: str) -> Collection:
         """A collection of a site. Raises Problem (404)."""
@@ -116,17 +137,22 @@ def on_earth(site: Site) -> Site:
 
 
 def _frames(archive: Archive) -> list[Feature]:
-    site, features = archive.site(), []
-    for flight in _flights(archive):
-        for each in _features_of(archive, f"flights/{flight}", "frames"):
-            values = dict(each.get("properties") or {})
-            values |= {"flight": flight, "datetime": values.get("time")}
-            geometry = _lonlat(each.get("geometry"), site)
-            if site.is_local:
-                values |= _camera_on_earth(values, site)
-            features.append({
-                "type": "Feature", "id": f"{flight}:{values.get('frame')}", "geometry": geometry, "properties": values,
-            })
+    site = archive.site()
+    return [each for flight in _flights(archive) for each in _frames_of(archive, site, flight)]
+
+
+def _frames_of(archive: Archive, site: Site, flight: str) -> list[Feature]:
+    """The frames of one flight."""
+    features = []
+    for each in _features_of(archive, f"flights/{flight}", "frames", local=site.is_local):
+        values = dict(each.get("properties") or {})
+        values |= {"flight": flight, "datetime": values.get("time")}
+        geometry = _lonlat(each.get("geometry"), site)
+        if site.is_local:
+            values |= _camera_on_earth(values, site)
+        features.append({
+            "type": "Feature", "id": f"{flight}:{values.get('frame')}", "geometry": geometry, "properties": values,
+        })
     return features
 
 

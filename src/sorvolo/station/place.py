@@ -10,13 +10,18 @@ import numpy as np
 from fastapi import APIRouter, Depends, Query
 from shapely import Point
 
+from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.station.collections import Collection, Feature, SiteCollections
 from sorvolo.station.flight_videos import FlightVideos
+from sorvolo.station.place_index import PlaceIndex
+from sorvolo.station.problems import Problem
 from sorvolo.station.reviews import Review, Reviews
 from sorvolo.station.security import needs
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.tokens import Role
+from sorvolo.store.exports.plain import utc_text
+from sorvolo.store.index.finding import FoundFlight, Place
 from sorvolo.store.site.archive import Archive
 
 _NEAR_M = 1.5  # from the tapped place to what was found there
@@ -25,12 +30,27 @@ _DAY_S = 86_400.0
 
 
 def place_routes(
-    shelf: SiteShelf, collections: SiteCollections, reviews: Reviews, videos: FlightVideos
+    shelf: SiteShelf, collections: SiteCollections, reviews: Reviews, videos: FlightVideos, index: PlaceIndex
 ) -> APIRouter:
     """What is remembered of a place."""
-    router = APIRouter(prefix="/api/sites/{site}", tags=["memory"], dependencies=[Depends(needs(Role.VIEW))])
+    router = APIRouter(prefix="/api", tags=["memory"], dependencies=[Depends(needs(Role.VIEW))])
 
     @router.get("/place")
+    def place_of_all(
+        lon: float = Query(ge=-360, le=360), lat: float = Query(ge=-90, le=90),
+        within_m: float = Query(_NEAR_M, gt=0, le=10_000),
+    ) -> list[dict[str, Any]]:
+        """Every flight of every site that saw the place or found something within reach of it, in order of time.
+
+        Sites without GPS have no place on Earth, and are left out. 503 where the index of the sites cannot be used.
+        """
+        try:
+            found = index.of_all(Place(lat, lon, within_m))
+        except StoreError as error:
+            raise Problem(503, str(error)) from error
+        return [_flight_row(site_id, each, reviews) for site_id, each in found]
+
+    @router.get("/sites/{site}/place")
     def place(
         site: str, lon: float = Query(ge=-360, le=360), lat: float = Query(ge=-90, le=90),
         most_per_flight: int = Query(12, ge=1, le=200),
@@ -40,15 +60,17 @@ def place_routes(
         `crop_url` is a picture of the ground around it, north up; null where nothing was kept to cut it from.
         """
         archive = shelf.open(site)
-        frames = collections.get(site, "frames")
-        found = _near(site, Point(lon, lat), collections, reviews)
+        known = index.of_site(site, Place(lat, lon, _NEAR_M))
+        if known is None:
+            views = _views(collections.get(site, "frames"), lon, lat)
+            found = _near(site, Point(lon, lat), collections, reviews)
+        else:
+            those = collections.frames_of(site, [each.flight for each in known if each.frames])
+            views = [view for frames in those for view in _views(frames, lon, lat)]
+            found = {each.flight: _things(site, each, reviews) for each in known}
         place_m = archive.site().frame.ground_from_lonlat([(lon, lat)])[0] if archive.has_site else np.zeros(2)
-        seen = frames.within([lon, lat, lon, lat])
-        kept = {(each.flight_id, each.index) for each in archive.keyframes()}
-        chosen = [
-            each for flight in dict.fromkeys(frames.features[each]["properties"]["flight"] for each in seen)
-            for each in _best(frames, seen, flight, Point(lon, lat), kept)[:most_per_flight]
-        ]
+        kept = {(each.flight_id, each.index) for flight in views for each in archive.keyframes(flight.flight)}
+        chosen = [each for flight in views for each in _best(flight, Point(lon, lat), kept)[:most_per_flight]]
         flights = dict.fromkeys(str(each["properties"]["flight"]) for each in chosen)
         films = {flight: _film(archive, flight, videos) for flight in flights}
         base = f"/api/sites/{quote(site, safe=':')}"
@@ -56,6 +78,30 @@ def place_routes(
         return sorted(rows, key=lambda each: (str(each["time"]), each["frame_id"]))
 
     return router
+
+
+def _flight_row(site_id: str, found: FoundFlight, reviews: Reviews) -> dict[str, Any]:
+    """A flight that saw the place, of any site."""
+    things = _things(site_id, found, reviews)
+    return {
+        "site": site_id, "site_name": found.site_name, "flight": found.flight, "frames": found.frames,
+        "first_time": utc_text(found.first_ns), "last_time": utc_text(found.last_ns),
+        "best_frame": found.best_frame or None, "place_url": f"/api/sites/{quote(site_id, safe=':')}/place",
+        **_found_here(things),
+    }
+
+
+def _things(site_id: str, found: FoundFlight, reviews: Reviews) -> list[dict[str, Any]]:
+    """What a flight found at the place, by the index, with the verdicts on it."""
+    said = {kind: reviews.current(site_id, kind) for kind in {each.type for each in found.things}}
+    return [
+        {
+            "type": each.type, "id": each.id, "class": each.label, "kind": each.kind or None, "score": each.score,
+            "first_seen": utc_text(each.first_ns), "last_seen": utc_text(each.last_ns),
+            "review": _review(said[each.type].get(each.id)),
+        }
+        for each in found.things
+    ]
 
 
 def _near(
@@ -87,17 +133,32 @@ def _review(review: Review | None) -> dict[str, Any] | None:
     return {"verdict": review.verdict, "note": review.note, "who": review.who, "at": review.at}
 
 
-def _best(
-    frames: Collection, seen: Sequence[int], flight: str, place: Point, kept: set[tuple[str, int]]
-) -> list[Feature]:
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """The frames of a flight that see a place, by number."""
+
+    flight: str
+    frames: Collection
+    seen: Sequence[int]
+
+
+def _views(frames: Collection, longitude: float, latitude: float) -> list[_Views]:
+    """The frames that see a place, by flight."""
+    seen: dict[str, list[int]] = {}
+    for each in frames.within([longitude, latitude, longitude, latitude]):
+        seen.setdefault(str(frames.features[each]["properties"]["flight"]), []).append(each)
+    return [_Views(flight, frames, numbers) for flight, numbers in seen.items()]
+
+
+def _best(views: _Views, place: Point, kept: set[tuple[str, int]]) -> list[Feature]:
     """The frames of a flight that see a place, best first: those whose picture was kept, and farthest from its edge."""
+    frames = views.frames
 
     def rank(number: int) -> tuple[bool, float]:
-        is_kept = (flight, frames.features[number]["properties"].get("frame")) in kept
+        is_kept = (views.flight, frames.features[number]["properties"].get("frame")) in kept
         return not is_kept, -float(frames.shapes[number].boundary.distance(place))
 
-    own = [each for each in seen if frames.features[each]["properties"]["flight"] == flight]
-    return [frames.features[each] for each in sorted(own, key=rank)]
+    return [frames.features[each] for each in sorted(views.seen, key=rank)]
 
 
 @dataclass(frozen=True)

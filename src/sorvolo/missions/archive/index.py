@@ -73,22 +73,31 @@ def sites_below(root: Path) -> Iterator[str]:
         folders[:] = [each for each in folders if not each.startswith(".")]
 
 
+def update_site(index: ArchiveIndex, path: str, known: IndexedSite | None, archive: Archive) -> tuple[int, int]:
+    """Bring what the index has of one open site up to date: how many of its flights came, and how many went.
+
+    `path` is the site's, `known` what the index knows of it. Raises StoreError for a site that cannot be read.
+    """
+    before = known.flights if known is not None else {}
+    state = site_state(archive)
+    if known is not None and known.state == state.state:
+        return 0, 0
+    new = {flight for flight, each in state.flights.items() if before.get(flight) != each}
+    rows = list(flight_rows(archive, new))
+    gone = before.keys() & new | before.keys() - state.flights.keys()
+    index.put_site(path, state, gone, rows)
+    return len(new), len(gone - new)
+
+
 def _update_site(
     root: Path, path: str, index: ArchiveIndex, known: IndexedSite | None, catalogues: Catalogues, done: int, count: int
 ) -> IndexUpdate:
-    before = known.flights if known is not None else {}
     try:
         with Archive.open(root / path, write=False, catalogues=catalogues) as archive:
-            state = site_state(archive)
-            if known is not None and known.state == state.state:
-                return IndexUpdate(path, done, count)
-            new = {flight for flight, each in state.flights.items() if before.get(flight) != each}
-            rows = list(flight_rows(archive, new))
+            added, removed = update_site(index, path, known, archive)
     except StoreError as error:
         return IndexUpdate(path, done, count, fault=str(error))
-    gone = before.keys() & new | before.keys() - state.flights.keys()
-    index.put_site(path, state, gone, rows)
-    return IndexUpdate(path, done, count, len(new), len(gone - new))
+    return IndexUpdate(path, done, count, added, removed)
 
 
 def _count(outcome: IndexOutcome, update: IndexUpdate) -> None:
