@@ -108,9 +108,9 @@ def _found_share(model, pictures):
 
 @pytest.fixture(scope="module")
 def trained():
-    training = JointTraining(tiny(), JointSettings(steps=220, batch=4, rate=5e-3, averaging=0.9, warm_steps=10), 1)
-    stream = fours(squares(220 * 4, 1))
-    losses = [training.learn(each).loss for each in islice(stream, 220)]
+    training = JointTraining(tiny(), JointSettings(steps=120, batch=4, rate=5e-3, averaging=0.9, warm_steps=10), 1)
+    stream = fours(squares(120 * 4, 1))
+    losses = [training.learn(each).loss for each in islice(stream, 120)]
     return training, losses
 
 

@@ -50,7 +50,7 @@ def test_the_process_counts_as_before_when_a_training_has_ended(data: Path, tmp_
 
 def test_the_command_learns_and_writes_a_model_that_runs(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "my-model"
-    options = ["--weights", "none", "--steps", "40", "--batch", "2", "--side", "64", "--val", "0.25", "--device", "cpu"]
+    options = ["--weights", "none", "--steps", "24", "--batch", "2", "--side", "64", "--val", "0.25", "--device", "cpu"]
     assert main(["train", str(data), "--out", str(out), *options, "--json"]) == 0
 
     report = json.loads((out / "training.json").read_text())
