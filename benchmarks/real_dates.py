@@ -271,12 +271,14 @@ def found_among(
     """Events, the outlines (N, 2) in the site's metres by id, against the polygons."""
     reported = drawn_events(rings_m, frame, map_from_true, size_px)
     everywhere = np.any([np.zeros(drawn_shape(size_px), bool), *(mask for _, mask in reported)], axis=0)
+    cells = [np.nonzero(mask) for _, mask in reported]
+    sizes = [len(rows) for rows, _ in cells]
     hits, covered, touching = {}, {}, set()
     for name, each in truth["changes"].items():
         mask = drawn(np.array(each["px"], float), size_px)
-        overlaps, sizes = np.array([[(mask & other).sum(), other.sum()] for _, other in reported]).reshape(-1, 2).T
+        overlaps = [int(np.count_nonzero(mask[other])) for other in cells]
         touching |= set(np.flatnonzero(overlaps).tolist())
-        hits[name] = is_hit(each["kind"], int(mask.sum()), overlaps.tolist(), sizes.tolist())
+        hits[name] = is_hit(each["kind"], int(mask.sum()), overlaps, sizes)
         if each["kind"] == "area":
             covered[name] = round(float((mask & everywhere).sum() / mask.sum()), 2)
     quiet = np.any([drawn(np.array(ring, float), size_px) for ring in truth["unchanged"].values()], axis=0)

@@ -326,3 +326,21 @@ def test_a_view_without_any_known_ground_is_harmless():
     blind = replace(view, valid=np.zeros_like(view.valid), changed=np.zeros_like(view.changed))
     evidence, reported = collect([blind])
     assert reported == [] and evidence.conclude() == ()
+
+
+def seldom(thing: Thing, others: int) -> list:
+    """Two photos of a thing, then one of each of so many others."""
+    places = [(0.0, 0.0), (4.0, 0.0), *((100.0 + 40 * number, 0.0) for number in range(others))]
+    return [
+        view_of(number, 2 * number, (*place, CAMERA_HEIGHT_M), [thing if number < 2 else Thing(*place)])
+        for number, place in enumerate(places)
+    ]
+
+
+def test_a_thing_that_two_early_photos_show_is_not_forgotten_for_many_uncertain_ones_after_it():
+    few = replace(EvidenceSettings().gathering.candidates, most_seeds=3)
+    views = seldom(Thing(2, 0), 6)
+    for settings_, ids in ((few, ["f-1"]), (replace(few, most_seeds_px=0), [])):
+        gathering = replace(EvidenceSettings().gathering, candidates=settings_)
+        evidence, reported = collect(views, gathering=gathering)
+        assert not reported and [each.id for each in evidence.conclude()] == ids

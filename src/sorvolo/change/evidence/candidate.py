@@ -25,7 +25,8 @@ class CandidateSettings:
     seen: float = 0.5  # a view that sees less is not asked
     all_seen: float = 0.99  # a view that sees more knows its place
     most_places: int = 64  # of views, for the spread of its place
-    most_seeds: int = 256  # uncertain candidates; the oldest go first
+    most_seeds: int = 256  # uncertain candidates that are kept in any case ...
+    most_seeds_px: int = 8_000_000  # ... and more while their pictures have no more pixels (110 MB); the oldest go first
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,10 +217,17 @@ class Seeds:
             seed.pictures.show(view, *window.box_m(self._cell_m), self._m_per_px)
             self._ask(seed, kept_view)
             self._seeds.append(seed)
-        del self._seeds[:-self._settings.most_seeds]
+        self._forget()
 
     def _ask(self, seed: Candidate, kept_view: KeptView) -> None:
         seed.ask(kept_view, self._grid.read(seed.cells).changed > 0, self._cell_m)
+
+    def _forget(self) -> None:
+        """Let the oldest go where there are too many: a large site has hundreds that only its first photos show."""
+        settings = self._settings
+        sizes = [each.pictures.size_px for each in self._seeds]
+        while len(sizes) > settings.most_seeds and sum(sizes) > settings.most_seeds_px:
+            del sizes[0], self._seeds[0]
 
     def _new(self, laid: LaidView, weak: Mask) -> list[CellWindow]:
         """The windows of large enough `weak` pieces, the surest first."""

@@ -48,6 +48,11 @@ class Pictures:
         self._yes: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
         self._asked: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
 
+    @property
+    def size_px(self) -> int:
+        """Pixels of a picture."""
+        return 0 if self._window is None else self._window.width_px * self._window.height_px
+
     def gain(self, low_m: Floats, high_m: Floats, view: ComparedView) -> float:
         """How much better, as a factor, the view shows a box of ground; infinite if the pictures have to grow."""
         if self._window is None or self._best is None or not self._window.holds(low_m, high_m):
