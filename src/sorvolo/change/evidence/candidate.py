@@ -26,7 +26,7 @@ class CandidateSettings:
     all_seen: float = 0.99  # a view that sees more knows its place
     most_places: int = 64  # of views, for the spread of its place
     most_seeds: int = 256  # uncertain candidates that are kept in any case ...
-    most_seeds_px: int = 8_000_000  # ... and more while their pictures have no more pixels (110 MB); the oldest go first
+    most_seeds_px: int = 8_000_000  # ... and while their pictures have no more pixels (110 MB); the oldest go first
 
 
 @dataclass(frozen=True, eq=False)
