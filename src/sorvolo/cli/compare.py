@@ -299,18 +299,18 @@ def _show_coverage(coverage: Mapping[str, Any], console: Console, *, is_local: b
     for name, area in gaps.items():
         console.print(f"  not compared: {area_text(area, is_local=is_local)}, {GAP_WORDS[Gap(name)]}", highlight=False)
     if not is_local:
-        console.print(f"things drawn into these views: {_size_words(coverage)}", highlight=False)
+        console.print(f"test objects drawn into these views: {_size_words(coverage)}", highlight=False)
 
 
 def _size_words(coverage: Mapping[str, Any]) -> str:
     """How small a thing is found in four of five pictures."""
     plain, faint, large = coverage["smallest_m"], coverage["faint_m"], coverage["large_found"]
     if large is None:
-        return "none: how small a thing would be found is unknown"
+        return "none: the smallest size that would be found is unknown"
     if plain is None:
-        return f"even of the largest only {large:.0%} are found"
-    faint_words = "faint ones are not found" if faint is None else f"faint ones from {faint:g} m on"
-    return f"on half of the ground, those that stand out are found from {plain:g} m on; {faint_words}"
+        return f"only {large:.0%} of even the largest are found"
+    faint_words = "faint ones are not found" if faint is None else f"faint ones from {faint:g} m"
+    return f"on half of the ground, distinct ones are found from {plain:g} m; {faint_words}"
 
 
 def _show_changes(features: Sequence[Any], console: Console, form: PlaceFormat, *, is_local: bool) -> None:

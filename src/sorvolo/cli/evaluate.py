@@ -217,7 +217,7 @@ def _show(measured: "MosaicEvaluation") -> None:
     deviation = measured.deviation
     if deviation.frames:
         console.print(
-            f"deviation from {counted(deviation.frames, 'frame')} of its (thesis 4.1.1): mean {deviation.mean:.1%}, "
+            f"deviation from the frames ({deviation.frames} of them, thesis 4.1.1): mean {deviation.mean:.1%}, "
             f"median {deviation.median:.1%}, worst {deviation.worst:.1%}"
         )
     if measured.reference is not None:

@@ -14,8 +14,8 @@ class Gap(StrEnum):
     DARK = "dark"  # too dark on either date
     LEANING = "leaning"  # earlier pictures contradict the map there: crowns and walls that lean
     BLURRED = "blurred"  # its views are blurred
-    ONE_VIEW = "one-view"  # one view alone shows it, which announces nothing
-    INSENSITIVE = "insensitive"  # things that were drawn there were not found
+    ONE_VIEW = "one-view"  # seen in one view only, too few to announce a change
+    INSENSITIVE = "insensitive"  # test objects that were drawn there were not found
 
 
 GAP_WORDS = {
@@ -24,8 +24,8 @@ GAP_WORDS = {
     Gap.DARK: "black shadow or night on one of the dates",
     Gap.LEANING: "crowns or walls lean there: earlier pictures contradict the map",
     Gap.BLURRED: "its views are blurred",
-    Gap.ONE_VIEW: "one view alone shows it, which announces nothing",
-    Gap.INSENSITIVE: "things drawn into its views were not found",
+    Gap.ONE_VIEW: "seen in one view only, too few to announce a change",
+    Gap.INSENSITIVE: "test objects drawn into its views were not found",
 }
 """Each reason in words."""
 

@@ -276,9 +276,7 @@ def _times(table: _Table, counters: Mapping[str, Floats]) -> tuple[TimesNs, Time
             *notice("no_time", int((times_ns == NO_TIME_NS).sum()), "{} rows dropped: no readable time"),
         ]
     known = counter_ns != NO_TIME_NS
-    notices = notice(
-        "no_date", rows, "the table has no date: the video dates its {} rows, else they count from 1970-01-01"
-    )
+    notices = notice("no_date", rows, "the table has no date: its {} rows take the video's if it has one, else 1970")
     if known.any():
         relative_ns = np.where(known, counter_ns - counter_ns[increasing(counter_ns)][0], NO_TIME_NS)
         notices += notice("no_time", int((~known).sum()), "{} rows dropped: no readable time")
