@@ -182,8 +182,10 @@ def test_what_was_not_sent_and_is_overtaken_is_kept(
 
 
 def test_commands_take_a_place_in_a_store(
-    machine: Callable[[str], None], photographed: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    machine: Callable[[str], None], photographed: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     address = f"s3://{BUCKET}/commands"
     photos = sorted(photographed.rglob("*.jpg"))[:4]
     flights = []
@@ -200,6 +202,20 @@ def test_commands_take_a_place_in_a_store(
     assert [each["flight"] for each in json.loads(capsys.readouterr().out)["versions"]] == ["one"]
     assert main(["history", address, "--at", "1", "--export", str(tmp_path / "first.tif")]) == 0
     assert (tmp_path / "first.tif").stat().st_size > 1000
+    capsys.readouterr()
+    assert main(["evaluate", "mosaic", address, "--json"]) == 0
+    assert [each["flight"] for each in json.loads(capsys.readouterr().out)["flights"]] == ["one"]
+    assert main(["telemetry", address, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["folder"] == "commands-telemetry/commands"
+    assert (tmp_path / "commands-telemetry" / "commands" / "geo.txt").is_file()
+    for command, fault in (
+        (["measure", "contours", address, "--out", "contours.geojson"], "flight one of .* has no heights"),
+        (["search", address, "--model", "default", "--flight", "nine"], "nine"),
+        (["evaluate", "objects", address, "--truth", "x"], "x: no truth/frames.geojson in it"),
+        (["evaluate", "changes", address, "--truth", "x"], "no such folder: x"),
+    ):
+        assert main(command) == 1
+        assert re.search(fault, capsys.readouterr().err)
     assert main(["compare", *flights[1:], "--site", address, "--model", "none", "--json"]) in (0, 3)
     manifest = BucketEnd(open_objects(address)).manifest()
     assert manifest.generation == 3 and manifest.held.newest == 3  # sent after each flight

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from sorvolo.cli.evaluate_detector import detector
+from sorvolo.cli.places_of_sites import SiteArgument, opened_site
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def evaluate() -> None:
 
 @evaluate_app.command()
 def mosaic(
-    site: Annotated[Path, typer.Argument(help="Folder of the map that `sorvolo map` made.")],
+    site: SiteArgument,
     truth: Annotated[Path | None, typer.Option(help="Folder that `sorvolo simulate` made.")] = None,
     reference: Annotated[Path | None, typer.Option(help="A reference map: a GeoTIFF of the same ground.")] = None,
     positions: Annotated[
@@ -48,7 +49,8 @@ def mosaic(
     from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
     from sorvolo.store.exports.plain import plain_json
 
-    measured = evaluate_mosaic(site, truth=truth, reference=reference, positions=positions)
+    with opened_site(site) as place:
+        measured = evaluate_mosaic(place.folder, truth=truth, reference=reference, positions=positions)
     if as_json:
         typer.echo(json.dumps(plain_json(measured), indent=1))
     else:
@@ -57,7 +59,9 @@ def mosaic(
 
 @evaluate_app.command()
 def changes(
-    found: Annotated[Path, typer.Argument(help="Folder of a map that was compared, or a folder of masks.")],
+    found: Annotated[
+        str, typer.Argument(help="Folder of a map that was compared, or s3://BUCKET/NAME; or a folder of masks.")
+    ],
     truth: Annotated[Path, typer.Option(help="Folder that `sorvolo simulate` made, or a folder of masks.")],
     flight: Annotated[str | None, typer.Option(help="Only this compared flight.")] = None,
     least_px: Annotated[
@@ -74,7 +78,8 @@ def changes(
     from sorvolo.missions.evaluate.changes import as_json as measures_as_json
     from sorvolo.missions.evaluate.changes import evaluate_changes
 
-    measured = evaluate_changes(found, truth, flight=flight, least_px=least_px)
+    with opened_site(found) as place:
+        measured = evaluate_changes(place.folder, truth, flight=flight, least_px=least_px)
     if as_json:
         typer.echo(json.dumps(measures_as_json(measured), indent=1))
         return
@@ -85,7 +90,7 @@ def changes(
 
 @evaluate_app.command()
 def objects(
-    site: Annotated[Path, typer.Argument(help="Folder of the map.")],
+    site: SiteArgument,
     truth: Annotated[Path, typer.Option(help="Folder that `sorvolo simulate` made.")],
     flight: Annotated[str | None, typer.Option(help="Only this flight.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
@@ -97,7 +102,8 @@ def objects(
     from sorvolo.missions.evaluate.objects import evaluate_objects
     from sorvolo.store.exports.plain import plain_json
 
-    measured = evaluate_objects(site, truth, flight=flight)
+    with opened_site(site) as place:
+        measured = evaluate_objects(place.folder, truth, flight=flight)
     if as_json:
         typer.echo(json.dumps(plain_json(measured), indent=1))
         return

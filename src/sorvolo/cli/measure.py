@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson
+from sorvolo.cli.places_of_sites import opened_site
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
 
 measure_app = typer.Typer(no_args_is_help=True)
 
-_Site = Annotated[Path, typer.Argument(help="Folder of the map; its flights need heights: sorvolo heights.")]
+_Site = Annotated[
+    str, typer.Argument(help="Folder of the map, or s3://BUCKET/NAME; its flights need heights: sorvolo heights.")
+]
 _Flight = Annotated[str, typer.Option(help="Which flight. Without it: that of the newest map.")]
 
 
@@ -49,7 +52,8 @@ def volume(
     from sorvolo.missions.heights.measure import measure_volume
     from sorvolo.store.exports.plain import plain_json
 
-    found = measure_volume(site, area, flight=flight, since=since)
+    with opened_site(site) as place:
+        found = measure_volume(place.folder, area, flight=flight, since=since)
     if as_json:
         typer.echo(json.dumps({**plain_json(found), "net_m3": found.volume.net_m3}, indent=1))
     else:
@@ -69,7 +73,8 @@ def profile(
     """
     from sorvolo.missions.heights.measure import measure_profile
 
-    rows = measure_profile(site, at, flight=flight, step_m=step)
+    with opened_site(site) as place:
+        rows = list(measure_profile(place.folder, at, flight=flight, step_m=step))
     writer = csv.writer(sys.stdout, lineterminator="\n")
     writer.writerow(["way_m", "latitude_deg", "longitude_deg", "surface_m", "sigma_m", "ground_m"])
     for row in rows:
@@ -94,7 +99,8 @@ def contours(
     """
     from sorvolo.missions.heights.measure import write_contours
 
-    count = write_contours(site, out, interval, flight=flight, of_surface=surface)
+    with opened_site(site) as place:
+        count = write_contours(place.folder, out, interval, flight=flight, of_surface=surface)
     typer.echo(f"{out}: {counted(count, 'line')}")
 
 

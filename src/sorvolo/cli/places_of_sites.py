@@ -49,6 +49,12 @@ class OpenedSite:
     folder: Path
     address: str
 
+    def results(self, ending: str) -> Path:
+        """Where results go: beside the site's folder; for a site in a store, into the current folder."""
+        if "://" in self.address and not self.address.startswith("file:"):
+            return Path(f"{self.address.rstrip('/').rpartition('/')[2]}-{ending}")
+        return self.folder.with_name(f"{self.folder.resolve().name}-{ending}")
+
     def sent(self, updates: Generator[U, None, T], /) -> Generator[U, None, T]:
         """The updates of a mission; after each of its flights but the last what it added is sent to the store."""
         before_s = 0.0

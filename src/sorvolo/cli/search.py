@@ -1,10 +1,10 @@
 """`sorvolo search`: what a flight's search would have found, measured, and where it could not see."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -12,18 +12,25 @@ from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson, Camera, names
+from sorvolo.cli.places_of_sites import opened_site
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.shown import show_notices_and_warnings, show_path
 from sorvolo.errors import SettingsError
+
+if TYPE_CHECKING:
+    from sorvolo.missions.search.flights import SearchOutputs
+    from sorvolo.missions.search.settings import SearchSettings
 
 _HOLES = 3  # exit code of a search that could not see all of its area
 
 
 Inputs = Annotated[
     list[str],
-    typer.Argument(help="The folder of a map; or flights (videos, folders of photos) to map into --site first."),
+    typer.Argument(
+        help="The folder of a map, or s3://BUCKET/NAME; or flights (videos, folders of photos) to map into --site."
+    ),
 ]
-SiteFolder = Annotated[Path | None, typer.Option(help="Folder of the map that flights go into.")]
+SiteFolder = Annotated[str, typer.Option(help="Folder of the map that flights go into, or s3://BUCKET/NAME.")]
 Flights = Annotated[
     list[str] | None, typer.Option(help="Flight to measure. Can be repeated. Without it: all of the map's.")
 ]
@@ -52,7 +59,7 @@ Seed = Annotated[int, typer.Option(help="Other plants at other places.")]
 
 def search_command(
     inputs: Inputs,
-    site: SiteFolder = None,
+    site: SiteFolder = "",
     flight: Flights = None,
     area: SearchedArea = None,
     poa: Segments = None,
@@ -79,23 +86,21 @@ def search_command(
 
     Example: sorvolo search DJI_0042.MP4 --site field --poa segments.geojson
     """
-    from sorvolo.missions.search.flights import SearchOutputs, search_site
+    from sorvolo.cli.map import map_and_read_reports
+    from sorvolo.missions.flight.settings import MapSettings
+    from sorvolo.missions.search.flights import SearchOutputs
     from sorvolo.missions.search.settings import SearchSettings
 
     settings = SearchSettings(plants, names(classes), model, enough, through_crowns, _sun(sun), seed)
-    folder = _mapped(inputs, site, camera, model)
-    outputs = SearchOutputs(
-        out or folder.with_name(f"{folder.resolve().name}-search"), area, poa, tuple(flight or ()),
-        tuple(refly or ()), dji_drone,
-    )
-    report: Mapping[str, Any] = {}
-    with ProgressReport(Console(stderr=True)) as progress, closing(search_site(folder, settings, outputs)) as measuring:
-        for each in measuring:
-            if isinstance(each, dict):
-                report = each
-            else:
-                words = f"{each.found} of {each.planted} found" if each.planted else ""
-                progress.show(f"searching planted pictures of {each.flight},", each.done, each.total, words)
+    with opened_site(site or _map_of(inputs), writes=bool(site)) as place:
+        if site:
+            map_and_read_reports(
+                list(inputs), place.folder, MapSettings(model=model), camera=camera or None, sent=place.sent
+            )
+        outputs = SearchOutputs(
+            out or place.results("search"), area, poa, tuple(flight or ()), tuple(refly or ()), dji_drone
+        )
+        report = _measured(place.folder, settings, outputs)
     if as_json:
         typer.echo(json.dumps({"folder": str(outputs.folder), **report}, indent=1))
     else:
@@ -104,17 +109,26 @@ def search_command(
         raise typer.Exit(_HOLES)
 
 
-def _mapped(inputs: list[str], site: Path | None, camera: str, model: str) -> Path:
-    """The site's folder; where flights were given, they are mapped into it first."""
-    from sorvolo.cli.map import map_and_read_reports
-    from sorvolo.missions.flight.settings import MapSettings
+def _map_of(inputs: Sequence[str]) -> str:
+    """The only input, where it is a map. Raises SettingsError for anything else."""
+    if len(inputs) > 1 or not ("://" in inputs[0] or Path(inputs[0]).is_dir()):
+        raise SettingsError("give the folder of a map, or flights and --site FOLDER to map them into")
+    return inputs[0]
 
-    if site is None:
-        if len(inputs) > 1 or not Path(inputs[0]).is_dir():
-            raise SettingsError("give the folder of a map, or flights and --site FOLDER to map them into")
-        return Path(inputs[0])
-    map_and_read_reports(list(inputs), site, MapSettings(model=model), camera=camera or None)
-    return site
+
+def _measured(site: Path, settings: "SearchSettings", outputs: "SearchOutputs") -> Mapping[str, Any]:
+    """The report of a measured search, with progress on stderr."""
+    from sorvolo.missions.search.flights import search_site
+
+    report: Mapping[str, Any] = {}
+    with ProgressReport(Console(stderr=True)) as progress, closing(search_site(site, settings, outputs)) as measuring:
+        for each in measuring:
+            if isinstance(each, dict):
+                report = each
+            else:
+                words = f"{each.found} of {each.planted} found" if each.planted else ""
+                progress.show(f"searching planted pictures of {each.flight},", each.done, each.total, words)
+    return report
 
 
 def _sun(text: str) -> tuple[float, float] | None:

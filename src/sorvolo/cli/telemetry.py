@@ -10,10 +10,13 @@ from rich.console import Console
 from rich.markup import escape
 
 from sorvolo.cli.options import AsJson, Camera, CotAuthority, CotCertificate
+from sorvolo.cli.places_of_sites import OpenedSite, opened_site
 from sorvolo.cli.shown import show_path
 from sorvolo.errors import SettingsError
 
-_Site = Annotated[Path | None, typer.Option(help="Folder of the map that the flight is in, or is mapped into first.")]
+_Site = Annotated[
+    str, typer.Option(help="Folder of the map that the flight is in or is mapped into first, or s3://BUCKET/NAME.")
+]
 _Flight = Annotated[str, typer.Option(help="Flight of the map.", show_default="its only one")]
 _Log = Annotated[str, typer.Option(help="The flight's log if it is not beside the video.")]
 _Cot = Annotated[
@@ -23,8 +26,11 @@ _Out = Annotated[Path | None, typer.Option(help="Folder for results.", show_defa
 
 
 def telemetry_command(
-    source: Annotated[Path, typer.Argument(help="A flight (video, folder of photos), with --site; or a map's folder.")],
-    site: _Site = None,
+    source: Annotated[
+        str,
+        typer.Argument(help="A flight (video, folder of photos), with --site; or a map's folder, or s3://BUCKET/NAME."),
+    ],
+    site: _Site = "",
     flight: _Flight = "",
     telemetry: _Log = "",
     camera: Camera = "",
@@ -47,21 +53,21 @@ def telemetry_command(
     from sorvolo.missions.watch.cot_sender import CotTls, check_host, cot_place
     from sorvolo.store.site.catalogue_place import is_site
 
-    from_site = is_site(source)
-    if from_site == (site is not None):
+    from_site = "://" in source or is_site(Path(source))
+    if from_site == bool(site):
         raise SettingsError("give a flight and --site FOLDER, or the folder of a map alone")
     receiver = CotReceiver(cot_place(cot), CotTls(cot_ca, cot_cert)) if cot else None
     if receiver is not None:  # before minutes of work
         check_host(receiver.place)
         receiver.tls.context()
-    folder = source if site is None else site
-    if site is not None:
-        _map_if_new(source, site, telemetry, camera)
-    target = out or folder.with_name(f"{folder.resolve().name}-telemetry") / (flight or source.stem)
-    report = correct_telemetry(
-        folder, target, flight=flight, source=None if from_site else source, telemetry=telemetry or None,
-        camera=camera or None, cot=receiver,
-    )
+    with opened_site(site or source, writes=bool(site)) as place:
+        if site:
+            _map_if_new(Path(source), place, telemetry, camera)
+        target = out or place.results("telemetry") / (flight or Path(source.rstrip("/")).stem)
+        report = correct_telemetry(
+            place.folder, target, flight=flight, source=None if from_site else Path(source),
+            telemetry=telemetry or None, camera=camera or None, cot=receiver,
+        )
     if as_json:
         typer.echo(json.dumps({"folder": str(target), **report}, indent=1))
     else:
@@ -80,16 +86,17 @@ def _show(report: Mapping[str, Any], target: Path, console: Console) -> None:
         show_path("written", target / name, console)
 
 
-def _map_if_new(source: Path, site: Path, telemetry: str, camera: str) -> None:
+def _map_if_new(source: Path, place: OpenedSite, telemetry: str, camera: str) -> None:
     """Map the flight where the site does not have it yet."""
     from sorvolo.capture.source import opened_sources
     from sorvolo.cli.map import map_and_read_reports
     from sorvolo.missions.flight.settings import MapSettings
     from sorvolo.missions.flight.setup import known_flights
 
-    with opened_sources([source], telemetry or None, camera or None, known_flights(site)) as sources:
-        is_known = sources[0].name in known_flights(site)
+    with opened_sources([source], telemetry or None, camera or None, known_flights(place.folder)) as sources:
+        is_known = sources[0].name in known_flights(place.folder)
     if not is_known:
         map_and_read_reports(
-            [source], site, MapSettings(model="none"), telemetry=telemetry or None, camera=camera or None
+            [source], place.folder, MapSettings(model="none"), telemetry=telemetry or None, camera=camera or None,
+            sent=place.sent,
         )
