@@ -97,7 +97,7 @@ def check_export(model: FasterRCNN, exported: bytes, pictures: Sequence[ImageRGB
     for picture in pictures:
         height, width = (side // model.stride * model.stride for side in picture.shape[:2])
         planes = np.ascontiguousarray(picture[:height, :width].transpose(2, 0, 1))[None]
-        found, others = _seen(model, planes), _shaken(model, planes)
+        found, *others = _seen_and_shaken(model, planes)
         other_boxes, other_scores, other_labels = session.run(None, {"image": planes})
         for box, score, label in zip(*found):
             if not all(_holds(other, box, score, label) for other in others):
@@ -119,14 +119,9 @@ def check_export(model: FasterRCNN, exported: bytes, pictures: Sequence[ImageRGB
     return ExportCheck(worst_px, worst_score, alone, count, undecided)
 
 
-def _seen(model: FasterRCNN, planes: NDArray[np.uint8]) -> _Found:
-    with torch.no_grad():
-        boxes, scores, labels = model(torch.from_numpy(planes))
-    return boxes.numpy(), scores.numpy(), labels.numpy()
-
-
-def _shaken(model: FasterRCNN, planes: NDArray[np.uint8]) -> list[_Found]:
-    """The model's answers when the scores of anchors and regions change by what a rounding may.
+@torch.no_grad()
+def _seen_and_shaken(model: FasterRCNN, planes: NDArray[np.uint8]) -> list[_Found]:
+    """The model's answer, and those when the scores of anchors and regions change by what a rounding may.
 
     Where many are equal, as after a few steps of training, it is that which decides whose regions are looked at and
     whose boxes stay.
@@ -136,15 +131,16 @@ def _shaken(model: FasterRCNN, planes: NDArray[np.uint8]) -> list[_Found]:
     def shaken(scores: Tensor) -> Tensor:
         return scores + _ROUNDING * torch.randn(scores.shape, generator=random)
 
-    hooks = [
-        model.proposals.register_forward_hook(lambda _, __, out: replace(out, scores=shaken(out.scores))),
-        model.head.register_forward_hook(lambda _, __, out: (shaken(out[0]), out[1])),
-    ]
+    levels = model.features(torch.from_numpy(planes))
+    proposed, size_px = model.proposals(levels), (planes.shape[2], planes.shape[3])
+    found = [model.detect(levels, proposed, size_px)]
+    hook = model.head.register_forward_hook(lambda _, __, out: (shaken(out[0]), out[1]))
     try:
-        return [_seen(model, planes) for _ in range(_SHAKES)]
+        for _ in range(_SHAKES):
+            found.append(model.detect(levels, replace(proposed, scores=shaken(proposed.scores)), size_px))
     finally:
-        for hook in hooks:
-            hook.remove()
+        hook.remove()
+    return [(boxes.numpy(), scores.numpy(), labels.numpy()) for boxes, scores, labels in found]
 
 
 def _holds(found: _Found, box: Floats, score: float, label: int) -> bool:

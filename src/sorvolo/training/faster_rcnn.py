@@ -45,9 +45,13 @@ class FasterRCNN(nn.Module):
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """One picture (1, 3, H, W), RGB 0 to 255: boxes (K, 4) px, scores (K,), labels (K,), best first."""
-        size_px = (images.shape[2], images.shape[3])
         levels = self.features(images)
-        proposed: Proposed = self.proposals(levels)
+        return self.detect(levels, self.proposals(levels), (images.shape[2], images.shape[3]))
+
+    def detect(
+        self, levels: list[Tensor], proposed: Proposed, size_px: tuple[int, int]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What `forward` gives for a picture of that height and width, by its features and what is proposed in it."""
         reach = self.reach
         regions, _ = propose(proposed, 0, size_px, before=reach.before, after=reach.regions)
         scores, offsets = self.classify(levels, regions, torch.zeros_like(regions[:, 0], dtype=torch.int64))
