@@ -248,9 +248,9 @@ def test_a_damaged_picture_is_left_out_for_all_models_and_named(toy, coco, tmp_p
     earlier = str(tmp_path / "whole" / FOUND)
     assert main([*command, "--compare", earlier, "--out", str(tmp_path / "cut")]) == 0
     printed = capsys.readouterr().out.replace("\n", "")
-    assert f"note: 1 pictures cannot be read and were left out: {folder / '1.png'}" in printed
+    assert f"note: 1 picture left out that cannot be read: {folder / '1.png'}" in printed
     numbers = json.loads((tmp_path / "cut" / NUMBERS).read_text())
-    assert numbers["sets"][0]["pictures"] == 3 and "1 pictures cannot be read" in numbers["notices"]
+    assert numbers["sets"][0]["pictures"] == 3 and "1 picture left out that cannot be read" in numbers["notices"]
     assert numbers["comparisons"][0]["arms"][0]["mean"] == numbers["comparisons"][0]["arms"][1]["mean"]
     assert read_found(tmp_path / "cut" / FOUND).sets["coco"].files == ("0.png", "2.png", "3.png")
     # what was measured without it can be compared without it

@@ -152,7 +152,7 @@ def test_damaged_pictures_are_passed_over_and_reported(tmp_path: Path) -> None:
     options = DataOptions(val="0")
     list(train_detector([place], tmp_path / "out", _settings(steps=2), options, device="cpu"))
     report = json.loads((tmp_path / "out" / "training.json").read_text())
-    assert any(f"1 pictures cannot be read and were passed over (first: {path}" in each for each in report["notices"])
+    assert any(f"1 picture left out that cannot be read (first: {path}" in each for each in report["notices"])
     assert any("nothing was held out" in each for each in report["notices"])
     assert report["held_out"] is None and report["model"]["thresholds"] == {"car": 0.5}
 

@@ -95,6 +95,6 @@ def _print(outcome: "CopyOutcome", target: str, *, verified: bool) -> None:
     if len(outcome.faults) > _MOST_FAULTS:
         typer.echo(f"and {len(outcome.faults) - _MOST_FAULTS:,} more (--json lists all)", err=True)
     if not outcome.faults:
-        typer.echo("every file of the copy is the map's" if verified else "the copy is whole")
+        typer.echo("every file matches" if verified else "the copy is complete")
     elif not verified:
         typer.echo("the rest was copied; restore these files of the map from another copy, or map again", err=True)

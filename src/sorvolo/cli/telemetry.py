@@ -13,6 +13,7 @@ from sorvolo.cli.options import AsJson, Camera, CotAuthority, CotCertificate
 from sorvolo.cli.places_of_sites import OpenedSite, opened_site
 from sorvolo.cli.shown import show_path
 from sorvolo.errors import SettingsError
+from sorvolo.survey.wording import counted
 
 _Site = Annotated[
     str, typer.Option(help="Folder of the map that the flight is in or is mapped into first, or s3://BUCKET/NAME.")
@@ -75,7 +76,8 @@ def telemetry_command(
 
 
 def _show(report: Mapping[str, Any], target: Path, console: Console) -> None:
-    console.print(f"Telemetry of {escape(report['flight'])}, {report['frames']} frames", style="bold", highlight=False)
+    words = f"Telemetry of {escape(report['flight'])}, {counted(report['frames'], 'frame')}"
+    console.print(words, style="bold", highlight=False)
     for sentence in report["sentences"]:
         console.print(f"  {sentence}", highlight=False, soft_wrap=True)
     for warning in report["warnings"]:

@@ -25,6 +25,7 @@ from sorvolo.store.pages.detector import detector_page
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections, no_detections
+from sorvolo.survey.wording import counted
 
 LEAST_SCORE = 0.02
 """Candidates from this score on are measured: average precision needs the doubtful ones too."""
@@ -288,7 +289,7 @@ def _damage_notices(damaged: Mapping[str, str]) -> tuple[str, ...]:
     if not damaged:
         return ()
     some = "; ".join(f"{path}: {reason}" for path, reason in list(damaged.items())[:_NAMED])
-    return (f"{len(damaged)} pictures cannot be read and were left out: {some}",)
+    return (f"{counted(len(damaged), 'picture')} left out that cannot be read: {some}",)
 
 
 def _arm_name(place: str) -> str:

@@ -17,6 +17,7 @@ from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.plain import json_bytes, plain_json
 from sorvolo.store.exports.reproduction_sheets import reproduction_sheets
 from sorvolo.store.pages.reproduction import reproduction_page
+from sorvolo.survey.wording import counted
 
 NUMBERS, PAGE, MARKDOWN = "reproduction.json", "reproduction.html", "reproduction.md"
 
@@ -72,8 +73,8 @@ def _size_words(rows: Sequence[Row], size: SimulatedSize | None) -> str:
     frames = sum(each["frames"] for each in mosaics.values())
     compared = _compared(rows)
     words = (
-        f"{len(mosaics)} videos mapped ({frames:,} frames), {len(compared)} compared "
-        f"({sum(each['views'] for each in compared.values()):,} views)."
+        f"{counted(len(mosaics), 'video')} mapped ({counted(frames, 'frame')}), {len(compared)} compared "
+        f"({counted(sum(each['views'] for each in compared.values()), 'view')})."
     )
     if size is None:
         return words

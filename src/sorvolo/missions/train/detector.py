@@ -23,6 +23,7 @@ from sorvolo.missions.train.start import class_notices, load_start
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
 from sorvolo.store.exports.plain import json_bytes, plain_json
 from sorvolo.store.pages.training import training_page
+from sorvolo.survey.wording import counted
 from sorvolo.training.checkpoint import (
     checkpoint_bytes,
     load_weights_bytes,
@@ -328,7 +329,7 @@ def _closing_notices(run: _Run, agreement: ExportCheck, check: Check | None) -> 
         )
     if run.reader.damaged:
         count, (path, reason) = len(run.reader.damaged), next(iter(run.reader.damaged.items()))
-        notices.append(f"{count} pictures cannot be read and were passed over (first: {path}: {reason})")
+        notices.append(f"{counted(count, 'picture')} left out that cannot be read (first: {path}: {reason})")
     if not run.sets.held_out:
         notices.append("nothing was held out: how good the model is, and from which score to report, is not known")
     if not agreement.is_good:

@@ -19,6 +19,7 @@ from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.store.exports.plain import utc_text
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.objects import Detections, Track
+from sorvolo.survey.wording import counted
 
 # notices of sources about frames that cannot be used: left out where the reasons are reported
 _OF_LOST_FRAMES = ("unreadable_photo", "corrupt_photo", "duplicate_photo", "other_size", "other_shape")
@@ -133,7 +134,7 @@ def source_notices(source: Source, log: WatchLog) -> tuple[Notice, ...]:
     """The notices of the source and its telemetry, and one about unusable frames."""
     lost = sum(log.lost.values())
     reasons = "; ".join(f"{count} x {reason}" for reason, count in log.lost.most_common(5))
-    unusable = (Notice("lost_frames", lost, f"{lost} frames could not be used: {reasons}"),) if lost else ()
+    unusable = (Notice("lost_frames", lost, f"{counted(lost, 'frame')} could not be used: {reasons}"),) if lost else ()
     others = [each for each in source.notices() if not (lost and each.code in _OF_LOST_FRAMES)]
     return (*source.telemetry.notices, *others, *unusable)
 
