@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -14,6 +14,10 @@ from sorvolo.cli.places_of_sites import OpenedSite, opened_site
 from sorvolo.cli.shown import show_path
 from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
+
+if TYPE_CHECKING:
+    from sorvolo.missions.telemetry.doctor import CotReceiver
+    from sorvolo.missions.watch.cot_sender import CotTls
 
 _Site = Annotated[
     str, typer.Option(help="Folder of the map that the flight is in or is mapped into first, or s3://BUCKET/NAME.")
@@ -50,17 +54,14 @@ def telemetry_command(
 
     Example: sorvolo telemetry field --flight DJI_0042
     """
-    from sorvolo.missions.telemetry.doctor import CotReceiver, correct_telemetry
-    from sorvolo.missions.watch.cot_sender import CotTls, check_host, cot_place
+    from sorvolo.missions.telemetry.doctor import correct_telemetry
+    from sorvolo.missions.watch.cot_sender import CotTls
     from sorvolo.store.site.catalogue_place import is_site
 
     from_site = "://" in source or is_site(Path(source))
     if from_site == bool(site):
         raise SettingsError("give a flight and --site FOLDER, or the folder of a map alone")
-    receiver = CotReceiver(cot_place(cot), CotTls(cot_ca, cot_cert)) if cot else None
-    if receiver is not None:  # before minutes of work
-        check_host(receiver.place)
-        receiver.tls.context()
+    receiver = _receiver(cot, CotTls(cot_ca, cot_cert)) if cot else None
     with opened_site(site or source, writes=bool(site)) as place:
         if site:
             _map_if_new(Path(source), place, telemetry, camera)
@@ -73,6 +74,17 @@ def telemetry_command(
         typer.echo(json.dumps({"folder": str(target), **report}, indent=1))
     else:
         _show(report, target, Console())
+
+
+def _receiver(address: str, tls: "CotTls") -> "CotReceiver":
+    """Who gets the track; checked before minutes of work."""
+    from sorvolo.missions.telemetry.doctor import CotReceiver
+    from sorvolo.missions.watch.cot_sender import check_host, cot_place
+
+    receiver = CotReceiver(cot_place(address), tls)
+    check_host(receiver.place)
+    receiver.tls.context()
+    return receiver
 
 
 def _show(report: Mapping[str, Any], target: Path, console: Console) -> None:

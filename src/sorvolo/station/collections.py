@@ -80,6 +80,14 @@ class _Kept:
     collection: Collection
 
 
+@dataclass(frozen=True, eq=False)
+class FlightFrames:
+    """One flight's frames, and of which the picture was kept, by number."""
+
+    frames: Collection
+    kept: frozenset[int]
+
+
 class SiteCollections:
     """The collections of all sites, made when asked for and kept until their content changes. Threads may share it.
 
@@ -89,22 +97,23 @@ class SiteCollections:
     def __init__(self, shelf: SiteShelf) -> None:
         self._shelf = shelf
         self._kept: dict[tuple[str, str], _Kept] = {}
-        self._flights: dict[tuple[str, str, str], tuple[int, Collection]] = {}  # frames with their file's time
+        self._flights: dict[tuple[str, str, str], tuple[int, FlightFrames]] = {}  # frames with their file's time
         self._lock = threading.Lock()
 
-    def frames_of(self, site_id: str, flights: Sequence[str]) -> list[Collection]:
+    def frames_of(self, site_id: str, flights: Sequence[str]) -> list[FlightFrames]:
         """What `get` has of the frames of each of these flights, without reading those of others."""
         archive = self._shelf.open(site_id)
         site, created_utc = archive.site(), archive.created_utc
         return [self._frames_of(site_id, created_utc, archive, site, each) for each in flights]
 
-    def _frames_of(self, site_id: str, created_utc: str, archive: Archive, site: Site, flight: str) -> Collection:
+    def _frames_of(self, site_id: str, created_utc: str, archive: Archive, site: Site, flight: str) -> FlightFrames:
         mark = _modified(archive, f"flights/{flight}/{features_name('frames', is_local=site.is_local)}")
         key = (site_id, created_utc, flight)
         with self._lock:
             known = self._flights.pop(key, None)
         if known is None or known[0] != mark:
-            known = mark, Collection.of(_frames_of(archive, site, flight))
+            kept = frozenset(each.index for each in archive.keyframes(flight))
+            known = mark, FlightFrames(Collection.of(_frames_of(archive, site, flight)), kept)
         with self._lock:
             self._flights[key] = known
             while len(self._flights) > _MOST_FLIGHTS:

@@ -4,7 +4,7 @@ import json
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +38,22 @@ class FlightVideos:
 
     def find(self, archive: Archive, flight: str) -> Path | None:
         """The flight's video; None where it was no video, is gone, or two inputs have its name."""
-        if flight not in {each.id for each in archive.flights()}:
-            return None
-        names = archive.report(flight).get("inputs")
-        if not isinstance(names, list) or len(names) != 1:
-            return None
-        found = [path for path in self._inputs.videos() if path.name == names[0]]
-        return found[0] if len(found) == 1 else None
+        return self.of(archive, [flight]).get(flight)
+
+    def of(self, archive: Archive, flights: Iterable[str]) -> dict[str, Path]:
+        """The videos of these flights, of those that `find` would find."""
+        paths: dict[str, list[Path]] = {}
+        for path in self._inputs.videos():
+            paths.setdefault(path.name, []).append(path)
+        if not paths:
+            return {}
+        known, found = {each.id for each in archive.flights()}, {}
+        for flight in known.intersection(flights):
+            names = archive.report(flight).get("inputs")
+            named = paths.get(str(names[0]), []) if isinstance(names, list) and len(names) == 1 else []
+            if len(named) == 1:
+                found[flight] = named[0]
+        return found
 
 
 def video_routes(shelf: SiteShelf, collections: SiteCollections, videos: FlightVideos) -> APIRouter:

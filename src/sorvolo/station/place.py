@@ -1,6 +1,6 @@
 """The memory of a place: every flight and second that saw it, in order, with pictures and what was found there."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -63,16 +63,19 @@ def place_routes(
         known = index.of_site(site, Place(lat, lon, _NEAR_M))
         if known is None:
             views = _views(collections.get(site, "frames"), lon, lat)
+            kept = {(each.flight_id, each.index) for view in views for each in archive.keyframes(view.flight)}
             found = _near(site, Point(lon, lat), collections, reviews)
         else:
-            those = collections.frames_of(site, [each.flight for each in known if each.frames])
-            views = [view for frames in those for view in _views(frames, lon, lat)]
+            seeing = [each.flight for each in known if each.frames]
+            those = dict(zip(seeing, collections.frames_of(site, seeing), strict=True))
+            views = [view for each in those.values() for view in _views(each.frames, lon, lat)]
+            kept = {(flight, number) for flight, each in those.items() for number in each.kept}
             found = {each.flight: _things(site, each, reviews) for each in known}
         place_m = archive.site().frame.ground_from_lonlat([(lon, lat)])[0] if archive.has_site else np.zeros(2)
-        kept = {(each.flight_id, each.index) for flight in views for each in archive.keyframes(flight.flight)}
         chosen = [each for flight in views for each in _best(flight, Point(lon, lat), kept)[:most_per_flight]]
-        flights = dict.fromkeys(str(each["properties"]["flight"]) for each in chosen)
-        films = {flight: _film(archive, flight, videos) for flight in flights}
+        flights = [each.flight for each in views]
+        there = videos.of(archive, flights)
+        films = {flight: _Film(flight in there, _began(archive, flight, there)) for flight in flights}
         base = f"/api/sites/{quote(site, safe=':')}"
         rows = [_row(base, each, place_m, kept, films[each["properties"]["flight"]], found) for each in chosen]
         return sorted(rows, key=lambda each: (str(each["time"]), each["frame_id"]))
@@ -169,9 +172,8 @@ class _Film:
     began: Any
 
 
-def _film(archive: Archive, flight: str, videos: FlightVideos) -> _Film:
-    is_there = videos.find(archive, flight) is not None
-    return _Film(is_there, archive.report(flight).get("flown") if is_there else None)
+def _began(archive: Archive, flight: str, there: Container[str]) -> Any:
+    return archive.report(flight).get("flown") if flight in there else None
 
 
 def _row(
