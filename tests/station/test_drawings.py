@@ -1,6 +1,15 @@
 """Drawings that all pages of a site share: kept, numbered, never overwritten unseen."""
 
+import json
+import os
+import shutil
+import time
+from pathlib import Path
+
+from fake_flights import SITE
 from starlette.testclient import TestClient
+
+from sorvolo.store.site.archive import Archive
 
 URL = "/api/sites/field/drawings"
 
@@ -36,3 +45,27 @@ def test_what_is_no_drawing_is_refused(client: TestClient) -> None:
     for wrong in (far, zone("x", purpose="bomb"), zone("y", more="z"), zone("n" * 81)):
         assert client.put(URL, json={"revision": 0, "features": [wrong]}).status_code == 422
     assert client.get("/api/sites/nowhere/drawings").status_code == 404
+
+
+def test_a_new_site_has_none_of_a_deleted_one_of_its_name(client: TestClient, root: Path, made_site: Path) -> None:
+    client.put(URL, json={"revision": 0, "features": [zone("old")]})
+    shutil.rmtree(root / "field")
+    time.sleep(0.01)
+    with Archive.open(root / "field", write=True) as archive:
+        archive.create_site(SITE)
+    assert client.get(URL).json() == {"type": "FeatureCollection", "revision": 0, "features": []}
+    assert client.put(URL, json={"revision": 0, "features": [zone("new")]}).json()["revision"] == 1
+    shutil.rmtree(root / "field")
+    shutil.copytree(made_site, root / "field")  # the first site is back, and what was drawn since is not of it
+    assert client.get(URL).json()["features"] == []
+
+
+def test_drawings_of_an_earlier_station_stay_with_the_site_that_was_there(client: TestClient, root: Path) -> None:
+    client.put(URL, json={"revision": 0, "features": [zone("a")]})
+    (path,) = (root / "station" / "drawings").iterdir()
+    kept = json.loads(path.read_bytes())
+    del kept["made_utc"]
+    path.write_text(json.dumps(kept))
+    assert [each["id"] for each in client.get(URL).json()["features"]] == ["a"]
+    os.utime(path, (1_000_000_000, 1_000_000_000))  # before the site was made: of one that had its name
+    assert client.get(URL).json()["features"] == []

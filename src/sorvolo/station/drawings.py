@@ -3,6 +3,7 @@
 import hashlib
 import json
 import threading
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -71,26 +72,38 @@ class Drawings:
 
     def get(self, site_id: str) -> dict[str, Any]:
         """The drawings of a site with their revision. Raises Problem (404)."""
-        self._shelf.folder(site_id)
-        try:
-            kept = json.loads(self._path(site_id).read_bytes())
-        except (FileNotFoundError, ValueError):
-            kept = {}
+        kept = self._kept(site_id, self._shelf.open(site_id).created_utc)
         return {"type": "FeatureCollection", "revision": kept.get("revision", 0), "features": kept.get("features", [])}
 
     def put(self, site_id: str, wish: DrawingsWish) -> dict[str, Any]:
         """Keep a site's drawings. Raises Problem (404; 409 where somebody drew meanwhile), StoreError."""
         with self._lock:
-            now = self.get(site_id)["revision"]
+            made_utc = self._shelf.open(site_id).created_utc
+            now = self._kept(site_id, made_utc).get("revision", 0)
             if wish.revision != now:
                 raise Problem(409, "somebody drew meanwhile; load the drawings again and add yours", revision=now)
             kept = {"revision": now + 1, "features": [each.model_dump() for each in wish.features]}
             path = self._path(site_id)
             with writing(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
-            atomic_write_bytes(path, compact_json(kept).encode())
+            atomic_write_bytes(path, compact_json({**kept, "made_utc": made_utc}).encode())
         self._events.append(NewEvent("drawings.changed", {"revision": kept["revision"]}, site_id))
         return {"type": "FeatureCollection", **kept}
+
+    def _kept(self, site_id: str, made_utc: str) -> dict[str, Any]:
+        """What is kept for the site that was made then; nothing of a deleted one that had its name.
+
+        Files of earlier stations do not name the site's time: they are of one that was there when they were written.
+        """
+        path = self._path(site_id)
+        try:
+            kept: dict[str, Any] = json.loads(path.read_bytes())
+            at_utc = datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat()
+        except (FileNotFoundError, ValueError):
+            return {}
+        of_utc = kept.get("made_utc")
+        is_ours = at_utc >= made_utc if of_utc is None else of_utc in ("", made_utc)  # "": before its first map
+        return kept if is_ours else {}
 
     def _path(self, site_id: str) -> Path:
         return self._folder / f"{hashlib.sha256(site_id.encode()).hexdigest()[:32]}.json"
