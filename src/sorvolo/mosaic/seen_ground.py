@@ -14,7 +14,7 @@ from sorvolo.survey.coverage import SeenGround
 
 @dataclass(frozen=True)
 class SeenSettings:
-    """How finely ground is counted, and what counts as a hole."""
+    """The cells in which ground is counted, and what counts as a hole."""
 
     cells_across: int = 24  # of a picture's shorter side on the ground
     most_cells: int = 1500  # along a side of the whole flight: then they are larger
@@ -57,7 +57,7 @@ def seen_ground(
 
 
 def coverage_figures(ground: Sequence[SeenGround]) -> dict[str, float | int | None]:
-    """What a report has of it: areas seen, seen by one picture alone, of the holes and their number; the resolution
+    """The figures of a report: areas seen, seen in one picture only, of the holes, and their number; the resolution
     that half of the ground has or a finer one."""
     seen, holes = [each for each in ground if each.views], [each for each in ground if not each.views]
     total_m2, coarser_m2, middle = sum(each.area_m2 for each in seen), 0.0, None

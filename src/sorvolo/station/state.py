@@ -87,7 +87,7 @@ class StationState:
 
     @contextmanager
     def changing(self) -> Iterator[sqlite3.Connection]:
-        """A transaction that happens whole, on the disk, or not at all. Raises StoreError on a full disk."""
+        """A transaction, durable when it ends. Raises StoreError on a full disk."""
         with self._lock:
             try:
                 self._connection.execute("BEGIN IMMEDIATE")

@@ -1,4 +1,4 @@
-"""What a comparison has found out about each frame so far, in its journal: a killed run goes on after the last one."""
+"""What a comparison knows of each frame so far, in its journal: a killed run continues after the last one."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from sorvolo.survey.flight import CameraPrior
 
 @dataclass(frozen=True, eq=False)
 class KeptFrame:
-    """A frame that nobody can read again; `jpeg` is its undistorted picture at the size at which it was compared."""
+    """A frame that cannot be read again; `jpeg` is its undistorted picture at the size at which it was compared."""
 
     name: str
     time_ns: int
@@ -57,7 +57,7 @@ class CompareJournal(MapJournal):
         self._frames = Replay(iter(()) if keeps_pictures else self._taken())
 
     def kept_frames(self) -> Iterator[ComparedFrame]:
-        """The frames that a killed run compared and nobody can read again."""
+        """The frames that a killed run compared and that cannot be read again."""
         return (each for each in self._taken() if each.kept is not None)
 
     def keep_frame(self, frame: ComparedFrame, name: str, time_ns: int) -> None:

@@ -39,7 +39,7 @@ class FlightCoverage:
         self._is_planned = False
 
     def show(self, pictures: Callable[[], Sequence[PictureOnGround]]) -> None:
-        """Write what was seen by now, now and then."""
+        """Write from time to time what was seen so far."""
         started_s = time.monotonic()
         if started_s < self._again_s or not self._archive.has_site:
             return

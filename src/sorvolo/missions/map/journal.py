@@ -1,4 +1,4 @@
-"""What a mapping has done with each frame so far, in its journal: a killed run goes on after the last one."""
+"""What a mapping has done with each frame so far, in its journal: a killed run continues after the last one."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
@@ -137,14 +137,14 @@ class MapJournal:
 
 
 def begun_journal(setup: FlightSetup, archive: Archive, request: str, *, anew: bool) -> RunJournal:
-    """The journal of a run, with what a killed one left that did the very same work; `anew` discards that."""
+    """The journal of a run, with what a killed run of the same work left; `anew` discards that."""
     return archive.journal(
         setup.source.name, run_key(setup, archive, request), sorvolo.__version__, anew=anew
     )
 
 
 def run_key(setup: FlightSetup, archive: Archive, request: str) -> str:
-    """What is asked for, and of which site: the same only where the very same work is to be done."""
+    """What is asked for, and of which site: the same only for the same work."""
     if isinstance(setup.source, LiveSource):
         return live_key(archive, request)
     site = archive.site() if archive.has_site else None

@@ -1,4 +1,4 @@
-"""What a watch has detected, and whom it has notified of what, in its journal: a killed watch goes on where it was."""
+"""A watch's detections and sent notices, in its journal: a killed watch continues where it was."""
 
 import warnings
 from collections.abc import Iterator
@@ -42,7 +42,7 @@ class SearchedFrame:
 
 @dataclass(frozen=True)
 class Sent:
-    """A receiver has the message about a track. `receiver` is the one's code in notices."""
+    """A receiver got the message about a track. `receiver` is its code in notices."""
 
     receiver: str
     track_id: int
@@ -62,7 +62,7 @@ class WatchJournal:
 
     @property
     def is_live(self) -> bool:
-        """Whether it is of a live source, whose frames nobody can read again."""
+        """Whether it is of a live source, whose frames cannot be read again."""
         return self._notes is not None
 
     def frames(self) -> Iterator[SearchedFrame]:
@@ -118,7 +118,7 @@ class WatchOrder:
     detector: Detects
 
     def journal(self, setup: FlightSetup, folder: Path) -> RunJournal:
-        """The journal of a watch in its folder, with what a killed one left that did the very same work.
+        """The journal of a watch in its folder, with what a killed watch of the same work left.
 
         Warns where there is one of another watch, which is of no use.
         """

@@ -1,4 +1,4 @@
-"""An object store as one end of a copy: objects named by their content, and one manifest that is replaced at once."""
+"""An object store as one end of a copy: objects named by their content, and a manifest that is replaced atomically."""
 
 import hashlib
 import io
@@ -74,7 +74,7 @@ class Manifest:
 
     @classmethod
     def parsed(cls, data: bytes, where: str) -> Self:
-        """Raises StoreError for what no Sorvolo wrote, or a later one."""
+        """Raises StoreError for what Sorvolo did not write, or a later version wrote."""
         try:
             row = json.loads(data)
             if row["format"] != "sorvolo site":
@@ -134,7 +134,7 @@ class BucketEnd:
         return self.find_manifest()[0] is not None
 
     def find_manifest(self) -> tuple[Manifest | None, str]:
-        """What is there, and its ETag; None and "" where no site is."""
+        """The manifest and its ETag; None and "" where there is no site."""
         try:
             data, etag = self._objects.read(MANIFEST, _MOST_MANIFEST_BYTES)
         except FileNotFoundError:
@@ -142,14 +142,14 @@ class BucketEnd:
         return Manifest.parsed(data, self.name), etag
 
     def manifest(self) -> Manifest:
-        """What is there. Raises StoreError where no site is."""
+        """The manifest. Raises StoreError where there is no site."""
         found, _ = self.find_manifest()
         if found is None:
             raise StoreError(f"no site at {self.name}; put one there: sorvolo site copy FOLDER {self.name}")
         return found
 
     def state(self, scratch: Path) -> SiteState:
-        """The site as of now; its catalogue comes to lie in `scratch`."""
+        """The site as of now, its catalogue in a file in `scratch`."""
         return self.state_of(self.manifest(), scratch)
 
     def state_of(self, manifest: Manifest, scratch: Path) -> SiteState:
@@ -170,7 +170,7 @@ class BucketEnd:
         return SiteState(held, path, files)
 
     def is_still(self, state: SiteState, scratch: Path) -> bool:
-        """Whether the site is as it was."""
+        """Whether the site is unchanged."""
         return self.shown is not None and self.manifest().id == self.shown.id
 
     def opened(self, file: SiteFile) -> AbstractContextManager[BinaryIO]:
@@ -180,11 +180,11 @@ class BucketEnd:
         return closing(self._objects.opened(key_of(file), file.size))
 
     def tile(self, path: str) -> BinaryIO:
-        """A tile's bytes, as they are there. Raises FileNotFoundError for none."""
+        """A tile's bytes. Raises FileNotFoundError for none."""
         return io.BytesIO(self._objects.read(path, _MOST_TILE_BYTES)[0])
 
     def fetch(self, file: SiteFile, key: str, path: Path) -> None:
-        """Write an object to a path. Raises StoreError when it is gone, or not what its name states."""
+        """Write an object to a path. Raises StoreError when it is gone, or its hash does not match its name."""
         digest = hashlib.sha256()
         try:
             with closing(self._objects.opened(key, file.size)) as stream, open(path, "wb") as target:
@@ -197,11 +197,11 @@ class BucketEnd:
             raise StoreError(f"{self.name}/{key} is damaged; restore it from a copy of the site")
 
     def being_filled(self) -> AbstractContextManager[None]:
-        """Nothing is held meanwhile: `conclude` finds out whether another writer was faster."""
+        """No lock is held: `conclude` detects another writer."""
         return nullcontext()
 
     def accept(self, new: SiteState, scratch: Path) -> None:
-        """Find out what is there. Raises StoreError where the new state would lose anything of it."""
+        """Read what the store holds. Raises StoreError where the new state would lose any of it."""
         self._round = _Round()
         manifest, self._round.etag = self.find_manifest()
         self._round.manifest = manifest
@@ -249,7 +249,7 @@ class BucketEnd:
         self._round.files[file.path] = named
 
     def conclude(self, state: SiteState) -> None:
-        """Make all that was put the site, unless another writer was faster: then StoreError, and his work stays."""
+        """Make everything that was put the site. Raises StoreError where another writer was faster."""
         former, stored = self._round.manifest, self._round.stored
         here = {path: replace(each, stamp=0) for path, each in self._round.files.items() if path in state.files}
         self.tile_bytes = {tile_of(path): stored.get(path, each.size) for path, each in here.items() if tile_of(path)}
@@ -272,11 +272,11 @@ class BucketEnd:
         return size, sha256
 
     def free_bytes(self) -> int | None:
-        """Nobody knows."""
+        """Unknown."""
         return None
 
     def _swap(self, manifest: Manifest) -> None:
-        """Replace the manifest by this one, if it still is the one that was there."""
+        """Replace the manifest by this one if it has not changed since it was read."""
         try:
             self._objects.swap(MANIFEST, manifest.data(), self._round.etag)
         except (ConflictError, StoreError) as error:
@@ -289,7 +289,7 @@ class BucketEnd:
             raise
 
     def _show(self, manifest: Manifest) -> None:
-        """Give the newest map plain names as well; of two writers, the later one's stay."""
+        """Store the newest map under plain names as well; of two writers, the later one wins."""
         former = self._round.manifest
         shown = {} if former is None else {name: former.files.get(name) for name in SHOWN}
         done = ""
@@ -344,7 +344,7 @@ class _Round:
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def claim(self, key: str) -> bool:
-        """Whether the caller is the first to write this object: files with the same bytes share one."""
+        """Whether the caller is the first to write this object: files with the same bytes share one object."""
         with self.lock:
             is_first = key not in self.claimed
             self.claimed.add(key)
@@ -364,7 +364,7 @@ def _is_same_picture(file: SiteFile, former: SiteFile) -> bool:
 
 
 def key_of(file: SiteFile) -> str:
-    """The key of a file's bytes: a tile's path, else its SHA-256 with the ending that programs go by."""
+    """The key of a file's bytes: a tile's path, else its SHA-256 with the file's ending, which programs need."""
     if tile_of(file.path):
         return file.path
     suffix = Path(file.path).suffix.lower()

@@ -98,7 +98,7 @@ class FolderEnd:
         return SiteState(held, path, listed, left_out)
 
     def is_still(self, state: SiteState, scratch: Path) -> bool:
-        """Whether the site is as it was: what is copied since then belongs together."""
+        """Whether the site is as it was: everything copied since then is consistent."""
         with scratch_folder(scratch) as apart:
             now = self.state(apart)
         return now.held == state.held and now.files == state.files
@@ -111,7 +111,7 @@ class FolderEnd:
 
     @contextmanager
     def being_filled(self) -> Iterator[None]:
-        """Hold the right to write into the folder, which is made; StoreError for one with anything but a site."""
+        """Make the folder and lock it for writing. Raises StoreError where it holds anything but a site."""
         with writing(self.folder):
             try:
                 self.folder.mkdir(parents=True, exist_ok=True)
@@ -175,7 +175,7 @@ class FolderEnd:
                 os.utime(temporary, ns=(file.stamp, file.stamp))
 
     def conclude(self, state: SiteState) -> None:
-        """Make the folder this state of the site: its catalogue comes last, then what the state has not is removed."""
+        """Make the folder this state of the site: the catalogue last; then remove files that are not in the state."""
         catalogue = self.folder / CATALOGUE
         if self._catalogues is not None and not is_site(self.folder):
             create_database(self.folder, self._catalogues)
@@ -194,7 +194,7 @@ class FolderEnd:
         sync_file(self.folder)
 
     def free_bytes(self) -> int | None:
-        """Room on the disk."""
+        """Free disk space, bytes."""
         there = next(each for each in (self.folder.absolute(), *self.folder.absolute().parents) if each.exists())
         return shutil.disk_usage(there).free
 
@@ -239,7 +239,7 @@ def refuse_other(name: str, identity: str, held: CatalogueState) -> None:
 
 
 def refuse_loss(name: str, lost: str) -> None:
-    """Raise StoreError where anything would be lost by a copy."""
+    """Raise StoreError where a copy would lose anything."""
     if lost:
         raise StoreError(
             f"{name} holds what the source of the copy lacks: {lost}. Nothing was copied; copy in the other direction "
@@ -255,7 +255,7 @@ def _identity_of(note: Path) -> str:
 
 
 def _copy_catalogue(catalogue: Catalogue, path: Path) -> None:
-    """One state of an open catalogue as a file of its own, even while others write it."""
+    """A consistent copy of an open catalogue in a file, even while others write it."""
     with writing(path), catalogue.reading() as connection:
         driver = connection.connection.driver_connection
         if not isinstance(driver, sqlite3.Connection):
@@ -271,7 +271,7 @@ def _copy_catalogue(catalogue: Catalogue, path: Path) -> None:
 
 
 def _overwrite_catalogue(path: Path, new: Path) -> None:
-    """Replace what a catalogue holds, in one transaction: those who read it see the old state or the new one."""
+    """Replace what a catalogue holds, in one transaction: readers see the old state or the new one."""
     try:
         with closing(sqlite3.connect(new)) as source, closing(sqlite3.connect(path, timeout=30)) as target:
             source.backup(target)
@@ -281,7 +281,7 @@ def _overwrite_catalogue(path: Path, new: Path) -> None:
 
 
 def _overwrite_rows(folder: Path, new: Path, catalogues: Catalogues | None) -> None:
-    """The same where the catalogue lies in a database."""
+    """The same for a catalogue in a PostgreSQL database."""
     with (
         closing(Catalogue.open(folder, write=True, catalogues=catalogues)) as target, target.changing() as written,
         closing(Catalogue.at(new, write=False)) as source, source.reading() as read,
@@ -314,7 +314,7 @@ def _listed(
 
 
 def _is_foreign(path: str) -> bool:
-    """Whether the file is none that Sorvolo puts into a site folder."""
+    """Whether the file does not belong to a site."""
     return not (path in _OF_THE_FOLDER or is_site_path(path) or tile_of(path) or _is_passing(path))
 
 
@@ -327,7 +327,7 @@ def _file(folder: Path, path: str, sha256: str) -> SiteFile | None:
 
 
 def _is_passing(path: str) -> bool:
-    """Whether the file is one that only lies there for a while."""
+    """Whether the file is temporary."""
     parts = path.split("/")
     passing = (LIVE_PREVIEW, LIVE_COVERAGE, JOURNAL)
     return any(each.startswith(TEMPORARY_PREFIX) for each in parts) or parts[-1] in passing
@@ -340,7 +340,7 @@ def _foreign(folder: Path) -> Iterator[str]:
 
 
 def _remove_empty(folder: Path) -> None:
-    """Remove folders that hold nothing any more."""
+    """Remove empty folders."""
     for root, _, _ in os.walk(folder, topdown=False):
         if not any(os.scandir(root)):
             os.rmdir(root)

@@ -1,4 +1,4 @@
-"""An object store (S3, or what speaks its language) as bytes by key: retried within limits, its refusals in words."""
+"""An S3-compatible object store as bytes by key: requests are retried within limits, refusals are explained."""
 
 import importlib.util
 import io
@@ -57,7 +57,7 @@ T = TypeVar("T")
 
 
 class ConflictError(Exception):
-    """What was to be replaced is not what it was."""
+    """The object to be replaced has changed."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class Objects:
         return self._tried(listed, "list")
 
     def first(self) -> list[str]:
-        """Some keys, fewer than a thousand; none where nothing is stored."""
+        """A first page of keys, fewer than a thousand; none where nothing is stored."""
         import obstore
 
         def some() -> list[str]:
@@ -174,7 +174,7 @@ class Objects:
         return True
 
     def copy(self, key: str, to: str) -> None:
-        """Give an object a second key, in the store itself."""
+        """Copy an object to a second key, within the store."""
         import obstore
 
         self._tried(lambda: obstore.copy(self._store, key, to), "copy")
@@ -186,7 +186,7 @@ class Objects:
         self._tried(lambda: obstore.delete(self._store, list(keys)), "delete")
 
     def _tried(self, work: Callable[[], T], action: str) -> T:
-        """What the work returns, begun again where a connection was cut."""
+        """What the work returns; it is repeated where a connection breaks."""
         for count in range(1, self._settings.tries):
             try:
                 with self._in_words(action):
@@ -212,7 +212,7 @@ class Objects:
 
 
 class _CutError(StoreError):
-    """No answer came, or only a part of one."""
+    """There was no answer, or only part of one."""
 
 
 class _Parts(io.RawIOBase):
@@ -331,7 +331,7 @@ def _section(path: Path, *names: str) -> dict[str, str]:
 
 
 def _words_of(text: str) -> str:
-    """What a person can do about a library's error, which may hold keys and is not repeated."""
+    """Advice for a library's error. The error itself may hold keys and is not repeated."""
     code, status = _CODE.search(text), _STATUS.search(text)
     if code and code[1] in _WORDS:
         return f"{_WORDS[code[1]]} ({code[1]})"

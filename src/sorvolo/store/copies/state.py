@@ -1,4 +1,4 @@
-"""What a site consists of at one moment, as a copy takes it: its catalogue, its files, and what it has over another."""
+"""What a copy takes of a site at one moment: its catalogue and files; and what it has that another lacks."""
 
 import hashlib
 import json
@@ -49,7 +49,7 @@ class SiteFile:
 
 @dataclass(frozen=True)
 class CatalogueState:
-    """What a catalogue holds, as far as a copy must not lose it.
+    """What a catalogue holds that a copy must not lose.
 
     `identity` names the site wherever its copies lie; `digest` all that the catalogue holds, whoever wrote it where.
     `versions` are the complete versions of the map (id, run, when made), `reviews` when each change was judged.
@@ -71,7 +71,7 @@ class CatalogueState:
 class SiteState:
     """A site as it is at one moment: a catalogue without unfinished runs in a file of its own, and its files by path.
 
-    `left_out` are files in the site's folder that are none of the site's.
+    `left_out` are files in the site's folder that do not belong to the site.
     """
 
     held: CatalogueState
@@ -133,7 +133,7 @@ def is_site_path(path: str) -> bool:
 
 
 def checked_path(path: object) -> str:
-    """The path of a site's file that somebody else wrote down; raises StoreError for one that could lie elsewhere."""
+    """A path from an untrusted list, checked; raises StoreError for one outside the site."""
     if isinstance(path, str) and (is_site_path(path) or tile_of(path)):
         return path
     raise StoreError(
@@ -166,7 +166,7 @@ def refuse_damaged(file: SiteFile, sha256: str) -> None:
 
 
 def is_left_out(path: str, keyframes: set[str], owed: set[tuple[str, str]]) -> bool:
-    """Whether a copy leaves a file below `flights` out on purpose: what only a run that is not finished needs."""
+    """Whether a copy leaves a file below `flights` out on purpose: what only an unfinished run needs."""
     parts = path.split("/")
     if parts[0] != "flights" or len(parts) < 3:
         return False
@@ -178,7 +178,7 @@ def is_left_out(path: str, keyframes: set[str], owed: set[tuple[str, str]]) -> b
 
 
 def _digest(connection: Connection) -> str:
-    """One number for all that the catalogue holds, without how far derived files are written."""
+    """A hash of everything in the catalogue except the progress of derived files."""
     digest = hashlib.sha256()
     for table in schema.metadata.sorted_tables:
         if table is schema.leftovers:

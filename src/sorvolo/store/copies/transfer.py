@@ -27,11 +27,11 @@ class SiteEnd(Protocol):
         ...
 
     def state(self, scratch: Path) -> SiteState:
-        """The site as of now; its catalogue comes to lie in `scratch`."""
+        """The site as of now, its catalogue in a file in `scratch`."""
         ...
 
     def is_still(self, state: SiteState, scratch: Path) -> bool:
-        """Whether the site is as it was."""
+        """Whether the site is unchanged."""
         ...
 
     def opened(self, file: SiteFile) -> AbstractContextManager[BinaryIO]:
@@ -55,7 +55,7 @@ class SiteEnd(Protocol):
         ...
 
     def conclude(self, state: SiteState) -> None:
-        """Make all that was put the site, at once."""
+        """Make everything that was put the site, atomically."""
         ...
 
     def free_bytes(self) -> int | None:
@@ -78,7 +78,7 @@ class CopyOutcome:
     """What became of a copy, or of a comparison: `faults` has each file that is missing, damaged or different, and how.
 
     `copied` and `copied_bytes` count what was written (or compared), `files` and `bytes` what the site has; `newest` is
-    the newest version of its map. `left_out` are files in the source's folder that are none of the site's.
+    the newest version of its map. `left_out` are files in the source's folder that do not belong to the site.
     """
 
     files: int

@@ -1,4 +1,4 @@
-"""ArchiveIndex: one database over all sites of a folder, kept beside them; everything in it can be made anew."""
+"""ArchiveIndex: one database over all sites of a folder, kept beside them; it can be rebuilt from them."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -45,10 +45,10 @@ class IndexedSite:
 
 
 class ArchiveIndex:
-    """The open index; a context manager. Sites are named by the paths of their folders below the archive's."""
+    """The open index; a context manager. Sites are identified by their folders' paths below the archive's."""
 
     def __init__(self, database: Database) -> None:
-        """Raises StoreError for a database that is none of ours or out of reach."""
+        """Raises StoreError for a database that is not an index or cannot be reached."""
         self._database = database
         try:
             database.check()
@@ -110,9 +110,9 @@ class ArchiveIndex:
             return {row.path: IndexedSite(row.id, row.state, flights.get(row.id, {})) for row in known}
 
     def put_site(self, path: str, state: SiteState, gone: Collection[str], new: Iterable[FlightRows]) -> None:
-        """Bring a site up to date, whole or not at all: flights that are `gone` leave, then `new` ones come.
+        """Update a site in one transaction: remove the flights in `gone`, then add `new` ones.
 
-        A flight among both is replaced. Verdicts follow.
+        A flight in both is replaced. Verdicts are updated.
         """
         with self._database.changing() as connection:
             site_id = connection.execute(select(tables.sites.c.id).where(tables.sites.c.path == path)).scalar()
@@ -130,7 +130,7 @@ class ArchiveIndex:
             _set_verdicts(connection, site_id, state.verdicts)
 
     def drop_sites(self, paths: Collection[str]) -> None:
-        """Forget sites that are there no more."""
+        """Remove sites that no longer exist."""
         with self._database.changing() as connection:
             for path in paths:
                 site = select(tables.sites.c.id).where(tables.sites.c.path == path).scalar_subquery()
@@ -148,7 +148,7 @@ class ArchiveIndex:
             return {**held, "frames": int(frames or 0)}
 
     def tidy(self) -> None:
-        """Let the database look at what came, so that it finds its way; after many flights."""
+        """Update the database's query statistics; call it after many flights."""
         with self._database.changing() as connection:
             connection.execute(text("ANALYZE"))
 
@@ -214,7 +214,7 @@ def _add_boxes(connection: Connection, kept: Table, places: Mapping[int, BaseGeo
 
 
 def _drop_flights(connection: Connection, which: ColumnElement[bool]) -> None:
-    """Delete flights with all that is theirs; R-trees follow no foreign keys."""
+    """Delete flights with their objects and changes; R-trees have no foreign keys."""
     flights = select(tables.flights.c.id).where(which)
     if connection.dialect.name == "sqlite":
         for each in tables.PLACED:
@@ -229,7 +229,7 @@ def _next_id(connection: Connection, kept: Table) -> int:
 
 
 def _set_verdicts(connection: Connection, site_id: int, verdicts: Mapping[str, str]) -> None:
-    """Verdicts come and go without a flight."""
+    """Set the verdicts: they change without a new flight."""
     own = select(tables.flights.c.id).where(tables.flights.c.site_id == site_id)
     kept = tables.changes
     known = connection.execute(

@@ -66,7 +66,7 @@ class FoundThing:
 
 @dataclass(frozen=True)
 class FoundFlight:
-    """A flight that saw the place, or found something near it: in how many frames, when, and in which one best.
+    """A flight that saw the place, or found something near it: in how many frames, when, and which frame shows it best.
 
     The best frame is one whose picture was kept, if any, and of those the one with the place farthest from its edge.
     """
@@ -98,7 +98,7 @@ def find(connection: Connection, place: Place) -> list[FoundFlight]:
 def _seen(
     connection: Connection, place: Place, longitude_deg: float, things: Mapping[int, Sequence[FoundThing]]
 ) -> list[tuple[int, FoundFlight]]:
-    """The flights of which a frame shows the place, by their numbers in the index."""
+    """The flights with a frame that shows the place, by their numbers in the index."""
     c = tables.flights.c
     columns = (c.id, *_ABOUT, c.frames, c.frame_names, c.frame_times, c.frame_kept, c.outlines)
     query = _near(connection, tables.flights, columns, longitude_deg, place.latitude_deg, np.zeros(2))
@@ -184,7 +184,7 @@ def _things(connection: Connection, place: Place) -> dict[int, list[FoundThing]]
 def _meeting(
     connection: Connection, kept: Table, columns: Sequence[Any], place: Place, reach_deg: Floats
 ) -> tuple[list[Row[Any]], Floats]:
-    """The rows whose box comes so near (2,), and how far from each the place lies, m."""
+    """The rows whose box is within `reach_deg` (2,), and the distance of the place from each, m."""
     rows: list[Row[Any]] = []
     distances_m = []
     for longitude in _turns(place.longitude_deg, float(reach_deg[0])):
@@ -212,7 +212,7 @@ def _near(
 
 
 def _then(query: Select[Any], place: Place, first: Any, last: Any) -> Select[Any]:
-    """Of these only what reaches into the span of time."""
+    """Only the rows within the span of time."""
     return query.where(last >= place.first_ns, first <= place.last_ns)
 
 

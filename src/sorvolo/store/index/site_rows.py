@@ -39,7 +39,7 @@ class FrameRows:
 
     @property
     def place(self) -> BaseGeometry | None:
-        """All that they show; None without frames."""
+        """All ground that they show; None without frames."""
         return shapely.union_all(shapely.make_valid(shapely.polygons(self.outlines))) if len(self.names) else None
 
 
@@ -112,7 +112,7 @@ def _state_of(flight: FlightEntry) -> str:
 
 
 def _frames(archive: Archive, flight: str, site: Site) -> FrameRows:
-    """What the flight's frames show, by its frames.geojson; of the key frames alone where somebody took that away."""
+    """What the flight's frames show, by its frames.geojson; by the key frames alone where that is missing."""
     keyframes = archive.keyframes(flight)
     kept = {each.name for each in keyframes}
     rows = [row for each in archive.frames(flight) if (row := _written(each, kept)) is not None]
@@ -127,7 +127,7 @@ _Row = tuple[str, Floats, int, bool]  # a frame's name, outline (4, 2) in degree
 
 
 def _written(feature: Any, kept: Collection[str]) -> _Row | None:
-    """A frame as the file has it; None for one that was not placed, or that somebody broke."""
+    """A frame as the file has it; None for one that was not placed or is damaged."""
     try:
         outline = np.array(feature["geometry"]["coordinates"][0], np.float64)[:4, :2]
         name, time_ns = str(feature["properties"]["frame"]), _nanoseconds(feature["properties"]["time"])

@@ -24,7 +24,7 @@ from sorvolo.store.site.database import Layout
 from sorvolo.store.site.schema import Nanoseconds, String, make_numbers, numbers
 
 FORMAT = 1
-"""Another format is made anew: everything in the index comes from the sites."""
+"""An index of another format is rebuilt: everything in it comes from the sites."""
 
 _APPLICATION_ID = 0x536F7249  # "SorI"
 _WGS84 = 4326

@@ -1,4 +1,4 @@
-"""Database: what a catalogue asks of the database that it lies in; the faults that both kinds share."""
+"""Database: what a catalogue needs of its database; the faults that both kinds share."""
 
 import itertools
 from collections.abc import Callable
@@ -29,7 +29,7 @@ class Layout:
 
 
 class ConnectionLostError(StoreError):
-    """The database went away in the middle of something: what was not committed is undone, the rest stands."""
+    """The connection to the database was lost: what was not committed is rolled back, the rest is kept."""
 
 
 class Database(Protocol):
@@ -49,23 +49,23 @@ class Database(Protocol):
         """A transaction that sees one state of the catalogue. Raises StoreError for faults of the database."""
 
     def changing(self) -> AbstractContextManager[Connection]:
-        """A transaction that happens whole, on the disk, or not at all. Raises StoreError as `reading`."""
+        """A transaction, durable when it ends. Raises StoreError as `reading`."""
 
     def fold_log(self) -> None:
         """Give back the space that a write-ahead log takes, where it lies beside the site."""
 
     def change_mark(self) -> tuple[int, int]:
-        """Another one after each transaction of others that changed the catalogue; no two that were opened share one.
+        """A mark that changes with each transaction of others; no two open catalogues share one.
 
         What is read after it is at least as new. Raises StoreError.
         """
 
     def close(self) -> None:
-        """Close every connection, and let go of the right to write."""
+        """Close every connection and release the lock."""
 
 
 def damaged(place: str, fault: object) -> StoreError:
-    """The error for a catalogue that cannot be what Sorvolo wrote."""
+    """The error for a damaged catalogue."""
     return StoreError(
         f"{place} is damaged or not a Sorvolo catalogue ({fault}); nothing was changed: "
         "restore it from a copy, or map into a new folder"

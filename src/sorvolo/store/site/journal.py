@@ -1,4 +1,4 @@
-"""A run's journal: what it knows of each frame so far, appended as it comes, to go on from after a kill."""
+"""A run's journal: what it knows of each frame so far, appended as it comes, so that a killed run can continue."""
 
 import hashlib
 import json
@@ -37,7 +37,7 @@ class Entry:
 
 
 class RunJournal:
-    """The journal of one run at `path`. `append` adds an entry, from any thread; `entries` are those that are whole.
+    """The journal of one run at `path`. `append` adds an entry, from any thread; `entries` are the complete ones.
 
     `key` says of what run it is, `after` over which version of the map (0: none), `program` by which version of
     Sorvolo. A file with others, or a damaged one,
@@ -55,7 +55,7 @@ class RunJournal:
 
     @property
     def is_begun(self) -> bool:
-        """Whether an earlier process began the file for this very run."""
+        """Whether an earlier process began the file for this same run."""
         if not self._path.is_file():
             return False
         with open(self._path, "rb", opener=_no_link) as file:
@@ -63,7 +63,7 @@ class RunJournal:
 
     @property
     def why_not(self) -> str:
-        """Why what an earlier process left is of no use, in words; "" where it is, or where there is nothing."""
+        """Why what an earlier process left cannot be used; "" where it can, or where there is nothing."""
         if not self._path.is_file():
             return ""
         with open(self._path, "rb", opener=_no_link) as file:
@@ -116,7 +116,7 @@ class RunJournal:
             self._file = None
 
     def remove(self) -> None:
-        """The run is over: nothing is left to go on from."""
+        """The run is over: remove the journal."""
         with self._lock:
             self._is_over = True
             self.close()
@@ -137,7 +137,7 @@ class RunJournal:
 
 
 def content_sha256(*values: Any) -> str:
-    """One number for records, arrays and plain values, the same whenever all of them are.
+    """A hash of records, arrays and plain values: equal for equal values.
 
     Raises TypeError for anything else, such as an open file.
     """
@@ -171,7 +171,7 @@ def _parts(value: Any) -> Sequence[Any]:
 
 
 def is_journal_after(path: Path, version: int) -> bool:
-    """Whether the file is the journal of a run over this version of the map: another one's is of no use any more."""
+    """Whether the file is the journal of a run over this version of the map: any other can no longer be used."""
     with open(path, "rb", opener=_no_link) as file:
         return _read_run(file).get("after") == version
 

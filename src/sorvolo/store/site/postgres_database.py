@@ -1,4 +1,4 @@
-"""A catalogue in PostgreSQL: one schema for each site. The one place that knows PostgreSQL's ways."""
+"""A catalogue in PostgreSQL: one schema for each site. The only place that knows PostgreSQL."""
 
 import hashlib
 import threading
@@ -61,7 +61,7 @@ class PostgresDatabase:
             self._layout.make(connection)
 
     def check(self) -> None:
-        """Raise StoreError where server or schema is none of ours; a writer takes the lock, or StoreError."""
+        """Raise StoreError where server or schema does not fit; a writer takes the lock, or raises StoreError."""
         with self.reading() as connection:
             self._check_server(connection)
             known = text("SELECT 1 FROM pg_namespace WHERE nspname = :name")
@@ -82,7 +82,7 @@ class PostgresDatabase:
 
     @contextmanager
     def changing(self) -> Iterator[Connection]:
-        """A transaction that happens whole, on the server's disk, or not at all; for the one writer."""
+        """A transaction, durable when it ends; for the one writer."""
         with self._mutex, self._naming_faults():
             connection = self._ready_writer()
             with connection.begin():
@@ -92,7 +92,7 @@ class PostgresDatabase:
             self._writes += 1
 
     def fold_log(self) -> None:
-        """Nothing: the server's log lies on the server."""
+        """Nothing: the server keeps its own log."""
 
     def change_mark(self) -> tuple[int, int]:
         """As of `Database`: how many transactions have written."""
@@ -130,7 +130,7 @@ class PostgresDatabase:
             time.sleep(_LOOK_AGAIN_S)
 
     def _ready_writer(self) -> Connection:
-        """The connection that holds the lock; made anew, and locked, where the server closed it between two uses."""
+        """The connection that holds the lock; reopened, and locked, if the server closed it between two uses."""
         if self._writer is not None:
             try:
                 with self._writer.begin():
@@ -181,7 +181,7 @@ class PostgresDatabase:
             raise self._fault(error) from error
 
     def _fault(self, error: DBAPIError) -> StoreError:
-        """What to do about a fault of PostgreSQL's. Its words never hold the password."""
+        """What to do about a fault of PostgreSQL's. The text never holds the password."""
         state = _state(error)
         lines = str(error.orig).strip().splitlines() or [type(error.orig).__name__]
         fault = lines[0]
@@ -243,7 +243,7 @@ def _writes(connection: Connection) -> int:
 
 
 def _state(error: DBAPIError) -> str:
-    """PostgreSQL's five letters for what went wrong; "" where no server answered."""
+    """PostgreSQL's five-character error code; "" where no server answered."""
     return getattr(error.orig, "sqlstate", None) or ""
 
 

@@ -1,4 +1,4 @@
-"""One catalogue's rows put into another, whatever databases the two lie in."""
+"""One catalogue's rows copied into another, whatever databases hold them."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""A catalogue in SQLite: the file `site.db` of the site folder. The one place that knows SQLite's ways."""
+"""A catalogue in SQLite: the file `site.db` of the site folder. The only place that knows SQLite."""
 
 import os
 import sqlite3
@@ -67,7 +67,7 @@ class SqliteDatabase:
             raise _fault(self._path, error) from error
 
     def changing(self) -> AbstractContextManager[Connection]:
-        """A transaction that happens whole, on the disk, or not at all."""
+        """A transaction, durable when it ends."""
         return self.reading()
 
     def fold_log(self) -> None:

@@ -1,4 +1,4 @@
-"""A site kept whole: derived files that are owed are written, what nothing refers to any more is removed."""
+"""Upkeep of a site: missing derived files are written, files that nothing refers to are removed."""
 
 import shutil
 from pathlib import Path
@@ -21,7 +21,7 @@ from sorvolo.store.site.journal import is_journal_after
 
 
 def repair(files: SiteFiles) -> None:
-    """Write the derived files that a killed process still owed, and those of the map that were deleted.
+    """Write the derived files that a killed process had not yet written, and those of the map that were deleted.
 
     Raises StoreError on a full disk; what the catalogue holds stays true.
     """
@@ -46,7 +46,7 @@ def _newest(files: SiteFiles) -> VersionEntry | None:
 
 
 def forget_unfinished(files: SiteFiles) -> None:
-    """Drop runs that never committed, then every file that nothing refers to any more.
+    """Drop runs that never committed, then every file that nothing refers to.
 
     The journal of a run that was killed stays, and its pictures, as long as the map is the one that it began over.
     """
@@ -76,7 +76,7 @@ def remove_unused(files: SiteFiles) -> None:
 
 
 def forget_journals(files: SiteFiles, kept: Path | None = None) -> None:
-    """Delete the journals of runs that were killed, all but `kept`, which goes on: the site becomes another one."""
+    """Delete the journals of runs that were killed, all but `kept`, which continues: the site changes."""
     for flight in files.flight_folders():
         if flight / JOURNAL != kept:
             (flight / JOURNAL).unlink(missing_ok=True)
