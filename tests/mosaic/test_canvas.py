@@ -102,6 +102,24 @@ def test_tiles_meet_without_seams(scene, reference, side):
     assert np.abs(small.astype(int) - reference).max() <= 2
 
 
+def test_each_tile_is_stored_once(scene, reference):
+    """Where much is painted at once: tiles are compressed when memory runs out."""
+    class Counted(dict):
+        stored = 0
+
+        def __setitem__(self, index, tile):
+            self.stored += 1
+            super().__setitem__(index, tile)
+
+    frames, images = scene
+    for side, window_px in ((128, 256), (256, 300), (64, 200)):
+        tiles = Counted()
+        settings = CanvasSettings(window_px=window_px)
+        Canvas(Grid((0.0, 0.0), 0.05, side), tiles, images.__getitem__, settings).paint(frames)
+        assert len(tiles) == tiles.stored > 9
+        assert np.abs(whole(tiles, side).astype(int) - reference).max() <= 2
+
+
 def test_frames_one_by_one_in_any_order_paint_the_same(scene, reference):
     frames, images = scene
     tiles: dict = {}

@@ -43,7 +43,10 @@ def test_what_is_painted_coarsely_lies_where_the_fine_picture_does():
     image, fine, coarse = picture(), {}, {}
     painted(SITE_GRID, fine, image)
     small = cv2.resize(image, (160, 120), interpolation=cv2.INTER_AREA)
-    painted(coarse_grid(SITE_GRID, STEP), CoarseTiles(coarse, SITE_GRID.grid, STEP), small)
+    view = CoarseTiles(coarse, SITE_GRID.grid, STEP)
+    painted(coarse_grid(SITE_GRID, STEP), view, small)
+    assert not coarse
+    view.save()
     assert fine.keys() == coarse.keys()
     one, other = joined(fine, 256), joined(coarse, 256)
     both = cv2.erode((one[..., 3] & other[..., 3]), np.ones((33, 33), np.uint8)) > 0
@@ -67,13 +70,37 @@ def test_known_ground_stays_and_the_rest_comes_back_as_it_was_put():
     new[..., 3] = 255
     view[2, 3] = new
     view[5, 5] = new
+    view.save()
     assert np.array_equal(tiles[2, 3][:100, :130], known[:100, :130])
+    view.release()
     assert np.array_equal(view[2, 3][25:], new[25:])
     assert np.array_equal(view[5, 5], new)
     view[5, 5] = new[::-1]
     assert np.array_equal(view[5, 5], new[::-1])
     del view[5, 5]
-    assert set(view) == {(2, 3)}
+    assert set(view) == set(tiles) == {(2, 3)}
+    view[7, 7] = new
+    del view[7, 7]
+    view.save()
+    assert set(tiles) == {(2, 3)}
+
+
+def test_few_tiles_in_memory_show_the_same_as_many():
+    rng = np.random.default_rng(5)
+    shown = {}
+    for most_bytes in (1, 1 << 30):
+        tiles: dict = {}
+        view, known = CoarseTiles(tiles, SITE_GRID.grid, STEP, most_bytes), {}
+        for number in range(60):
+            index = (number * 7 % 5, 0)
+            known[index] = rng.integers(0, 256, (64, 64, 4), np.uint8)
+            view[index] = known[index]
+            if number % 9 == 0:
+                view.save()
+        assert all(np.array_equal(view[index], each) for index, each in known.items())
+        view.save()
+        shown[most_bytes] = {index: each[::STEP, ::STEP] for index, each in tiles.items()}
+        assert all(np.array_equal(shown[most_bytes][index], each) for index, each in known.items())
 
 
 @pytest.mark.parametrize(("longest_px", "step"), [(320, 1), (640, 1), (1024, 2), (1920, 4), (4000, 8), (8000, 8)])

@@ -9,6 +9,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.mosaic.selection import (
     Selected,
     SelectionSettings,
+    SmallCopies,
     StretchSelection,
     every,
     has_texture,
@@ -50,6 +51,19 @@ def chosen(frames, settings=None, *, keep_all=False, inside=EVERYWHERE):
 
 def places(selected) -> np.ndarray:
     return np.array([each.posed.prior.position_m[0] for each in selected if not each.reason])
+
+
+def test_small_copies_are_made_once_and_forgotten(monkeypatch):
+    made = []
+    monkeypatch.setattr("sorvolo.mosaic.selection.small_gray", lambda image: made.append(1) or small_gray(image))
+    copies, frames = SmallCopies(), [posed(k, 16 * k) for k in range(40)]
+    for each in frames:
+        assert np.array_equal(copies.of(each.frame), small_gray(each.frame.image))
+        assert copies.of(each.frame) is copies.of(each.frame)
+    assert len(made) == 40
+    with_copies = select_keyframes(frames, SelectionSettings(), keep_all=False, inside=EVERYWHERE, small=copies)
+    assert np.array_equal(places(with_copies), places(chosen(frames)))
+    assert len(copies._kept) < 40
 
 
 @pytest.mark.parametrize("overlap", [0.6, 0.7, 0.85])

@@ -17,14 +17,16 @@ from sorvolo.geometry.geodesy import Geodetic, Projection
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.store.exports.frame_files import frames_geojson
 from sorvolo.store.exports.map_pictures import (
+    LivePreview,
     picture,
     pictures,
+    small_map_of,
     write_kmz,
-    write_live_preview,
     write_preview,
     write_small_maps,
 )
 from sorvolo.store.exports.plain import geojson_bytes, plain_json, utc_text
+from sorvolo.store.images import shrink, unweighted, weighted
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 
@@ -176,25 +178,61 @@ def test_previews_are_png_with_a_transparent_background(tmp_path: Path) -> None:
     image = cv2.imread(str(tmp_path / "preview.png"), cv2.IMREAD_UNCHANGED)
     assert image.shape == (256, 384, 4)
     assert (image[200, 60, 3], image[60, 60, 3]) == (0, 255)
-    write_live_preview({}, tmp_path / "live.png")
-    assert not (tmp_path / "live.png").exists()
-    write_live_preview({(0, 0): tile(9)}, tmp_path / "live.png")
-    assert cv2.imread(str(tmp_path / "live.png"))[0, 0].tolist() == [0, 0, 9]
 
 
-def test_small_maps_are_written_from_one_reading_of_the_tiles(tmp_path: Path) -> None:
-    class Counted(dict):
-        reads = 0
+class Counted(dict):
+    """Tiles that count how often one is read."""
 
-        def __getitem__(self, index: tuple[int, int]) -> np.ndarray:
-            Counted.reads += 1
-            return super().__getitem__(index)
+    reads = 0
 
+    def __getitem__(self, index: tuple[int, int]) -> np.ndarray:
+        self.reads += 1
+        return super().__getitem__(index)
+
+
+def test_the_growing_map_is_shown_small_by_the_tiles_that_changed(tmp_path: Path) -> None:
+    preview, path = LivePreview(512), tmp_path / "live.png"
+    preview.write({}, (), path)
+    assert not path.exists()
+    tiles = Counted({(0, 0): tile(9)})
+    preview.write(tiles, [(0, 0)], path)
+    assert cv2.imread(str(path))[0, 0].tolist() == [0, 0, 9]
+    tiles |= {(column, 0): tile(20 + column) for column in range(1, 5)}
+    preview.write(tiles, [], path)
+    assert tiles.reads == 5
+    tiles[0, 0] = tile(70)
+    del tiles[2, 0]
+    preview.write(tiles, [(0, 0), (2, 0)], path)
+    assert tiles.reads == 6
+    assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., [2, 1, 0, 3]], picture(tiles, 1024).rgba)
+
+
+def test_a_picture_knows_how_much_ground_the_map_shows() -> None:
+    half = np.zeros((512, 512, 4), np.uint8)
+    half[100:, 3:203] = (200, 150, 100, 255)
+    assert picture({(0, 0): half, (7, 3): half}, 64).shown_m2(0.5) == 2 * 412 * 200 * 0.25
+
+
+@pytest.mark.parametrize("size", [64, 128, 256])
+def test_a_picture_is_made_smaller_by_the_mean_of_what_is_seen(size: int) -> None:
+    rng = np.random.default_rng(size)
+    rgba = rng.integers(0, 256, (512, 512, 4), dtype=np.uint8)
+    rgba[..., 3] = 255 * (np.add.outer(np.arange(512), np.arange(512)) % 700 < 400)
+    wanted = unweighted(cv2.resize(weighted(rgba), (size, size), interpolation=cv2.INTER_AREA))
+    small = shrink(rgba, size, size)
+    seen = small[..., 3] > 0
+    assert np.abs(small.astype(int) - wanted)[seen].max() <= 1  # halves are rounded up or to even
+    assert np.array_equal(seen, wanted[..., 3] > 0)
+
+
+def test_small_maps_are_written_of_tiles_as_they_pass_by(tmp_path: Path) -> None:
     tiles, site_grid = marked_tiles((-700, 2300)), SiteGrid.at(ORIGIN, 0.2, "EPSG:32633")
     write_preview(tiles, tmp_path / "preview.png")
     write_kmz(tiles, site_grid, "two fields", tmp_path / "two.kmz")
-    write_small_maps(Counted(tiles), site_grid, "two fields", tmp_path / "small.png", tmp_path / "small.kmz")
-    assert Counted.reads <= len(tiles) + 1
+    small = small_map_of(tiles, 512)
+    for index in reversed(sorted(tiles)):
+        small.take(index, tiles[index])
+    write_small_maps(small, site_grid, "two fields", tmp_path / "small.png", tmp_path / "small.kmz")
     assert (tmp_path / "small.kmz").read_bytes() == (tmp_path / "two.kmz").read_bytes()
     one, two = (cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED) for name in ("preview.png", "small.png"))
     assert np.abs(np.array(one.shape) - two.shape).max() <= 1 and max(two.shape) <= 2048

@@ -75,6 +75,15 @@ def test_it_is_a_cloud_optimized_geotiff(tmp_path: Path, site_grid: SiteGrid) ->
     assert is_valid, (errors, warnings)
 
 
+def test_each_tile_is_read_once_and_passes_by(tmp_path: Path, site_grid: SiteGrid) -> None:
+    tiles = {(column, row): tile(10 + column, 300) for column in range(3) for row in range(2)}
+    passed: list[tuple[tuple[int, int], int]] = []
+    write_cog(
+        tiles, site_grid, tmp_path / "mosaic.tif", pass_by=lambda index, one: passed.append((index, int(one.sum())))
+    )
+    assert sorted(passed) == [(index, int(tiles[index].sum())) for index in sorted(tiles)]
+
+
 def test_overviews_do_not_darken_the_rim_of_what_is_seen(tmp_path: Path, site_grid: SiteGrid) -> None:
     half = np.zeros((512, 512, 4), np.uint8)
     half[:, :255] = (200, 200, 200, 255)  # an odd edge: overview pixels mix seen and unseen

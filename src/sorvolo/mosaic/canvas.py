@@ -232,9 +232,8 @@ class Canvas:
         if self._within is not None:
             cells = cv2.bitwise_and(cells, self._cells_within(self._within, low, cells.shape))
         left, top, width, height = cv2.boundingRect(cells)
-        across, down = (max(1, -(-side * CELL_PX // self._settings.window_px)) for side in (width, height))
-        xs = np.linspace(left, left + width, across + 1).astype(int)
-        ys = np.linspace(top, top + height, down + 1).astype(int)
+        xs = self._cuts(int(low[0]) + left, width) - low[0]
+        ys = self._cuts(int(low[1]) + top, height) - low[1]
         rows, columns = list(pairwise(ys.tolist())), list(pairwise(xs.tolist()))
         for column, row in _neighbours_first(len(columns), len(rows)):
             (x0, x1), (y0, y1) = columns[column], rows[row]
@@ -254,6 +253,18 @@ class Canvas:
         for column, row in tiles:
             _paste(result, np.ones((side, side), np.uint8), column * side - int(low[0]), row * side - int(low[1]))
         return result
+
+    def _cuts(self, first: int, count: int) -> NDArray[np.int64]:
+        """Where `count` cells from the `first` on are cut into windows.
+
+        What is too large for one is cut at borders of tiles: then each tile is painted, and stored, once.
+        """
+        tile_px, most_px = self._grid.tile_px, self._settings.window_px
+        if count * CELL_PX <= most_px:
+            return np.array([first, first + count])
+        whole_px = most_px // tile_px * tile_px if tile_px % ALIGN_PX == 0 else 0
+        step = (whole_px or most_px) // CELL_PX
+        return np.array([first, *range((first // step + 1) * step, first + count, step), first + count])
 
     def _render(self, x0: int, y0: int, x1: int, y1: int) -> ImageRGBA:
         """The picture of an aligned window of grid pixels, ends exclusive."""

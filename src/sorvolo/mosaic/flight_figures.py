@@ -1,13 +1,12 @@
 """A flight's placed frames summed up in the figures that its report has."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageRGBA
-from sorvolo.geometry.grid import TileIndex
+from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.summary import median_of_known, percentile_of_known, rms_of_known
 from sorvolo.survey.mosaic import PlacedFrame, Status
@@ -73,11 +72,6 @@ def stated_height_m(placed: Sequence[PlacedFrame], altitude_offset_m: float) -> 
         if each.site_from_camera is not None
     ])
     return float("nan") if stated is None else stated
-
-
-def shown_m2(tiles: Mapping[TileIndex, ImageRGBA], m_per_px: float) -> float:
-    """The ground that a map's tiles show."""
-    return float(sum(int(np.count_nonzero(tile[..., 3])) for tile in tiles.values()) * m_per_px**2)
 
 
 def _reach_m(seen: Sequence[PlacedFrame]) -> float:

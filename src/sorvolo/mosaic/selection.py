@@ -1,5 +1,6 @@
 """Which frames become keyframes: enough overlap by eq. 3.17, sharp enough, inside the area of interest."""
 
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -10,13 +11,14 @@ from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import ImageGray, ImageRGB, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.registration.features import gray_from_rgb, normalise_contrast, sharpness
-from sorvolo.survey.flight import LostFrame, PosedFrame
+from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
 
 _SMALL_PX = 256
 _UNTIMED_STEP_S = 0.2  # candidates of a video without telemetry, or live: five a second, the pictures decide
 _LIVE_SPEED_M_S = 5.0  # at least: a flight that has just begun does not show yet how fast it will be
 _USUAL = 25  # frames that show how sharp the flight's usually are
 _SPARSE_SHARE = 2 / 3  # of the way between keyframes that frames which are looked at may lie apart
+_COPIES_KEPT = 16  # more than wait between the decoder and the selection
 _COARSE_PX = 64  # at which a sensor's noise averages out and ground still shows itself
 
 
@@ -118,21 +120,23 @@ def evenly(count: int, most: int) -> list[int]:
 def select_keyframes(
     frames: Iterable[PosedFrame | LostFrame], settings: SelectionSettings, *, keep_all: bool,
     inside: Callable[[PosedFrame], bool], memory: SelectionMemory = SelectionMemory(),
+    small: "SmallCopies | None" = None,
 ) -> Iterator[Selected | LostFrame]:
     """The frames that the map needs, in order; lost ones pass through.
 
     `inside` is True for frames in the area of interest (UAV_path, eq. 3.1); the others are dropped. `keep_all`: photos,
     each of which was meant. The shift since the last keyframe is measured in the pictures by phase correlation of
     small copies, so it needs no telemetry; where that fails (a turn, water) each candidate is taken. `memory` is that
-    of the last frame selected, to go on after it.
+    of the last frame selected, to go on after it; `small` has copies of the frames that were looked at before.
     """
+    small = SmallCopies() if small is None else small
     for each in frames:
         if isinstance(each, LostFrame):
             yield each
             continue
         if not inside(each):
             continue
-        gray = small_gray(each.frame.image)
+        gray = small.of(each.frame)
         clarity = sharpness(gray)
         typical = float(np.median(memory.usual)) if memory.usual else clarity
         texture = normalise_contrast(gray)
@@ -146,16 +150,37 @@ def select_keyframes(
         yield Selected(each, reason, memory)
 
 
-def shows_all_between(before: ImageRGB, after: ImageRGB, settings: SelectionSettings) -> bool:
-    """Whether no frame between these two is needed to keep the overlap: they lie near each other, and the later one is
-    as sharp as the earlier.
+def shows_all_between(old: ImageGray, new: ImageGray, settings: SelectionSettings) -> bool:
+    """Whether no frame between these two, `small_gray`, is needed to keep the overlap: they lie near each other, and
+    the later one is as sharp as the earlier.
 
     Keyframes chosen among frames so near overlap by `least_overlap` at least, with the usual settings.
     """
-    old, new = small_gray(before), small_gray(after)
     if sharpness(new) < settings.blurred * sharpness(old):
         return False
     return 1 - _overlap(normalise_contrast(old), normalise_contrast(new)) <= _SPARSE_SHARE * (1 - settings.overlap)
+
+
+class SmallCopies:
+    """`small_gray` of a flight's frames, made once for the frames looked at last; only `of` changes it. Threads may
+    share it."""
+
+    def __init__(self) -> None:
+        self._kept: dict[int, ImageGray] = {}
+        self._keeping = threading.Lock()
+
+    def of(self, frame: Frame) -> ImageGray:
+        """The small copy of a frame."""
+        with self._keeping:
+            kept = self._kept.get(frame.index)
+        if kept is not None:
+            return kept
+        made = small_gray(frame.image)
+        with self._keeping:
+            self._kept[frame.index] = made
+            while len(self._kept) > _COPIES_KEPT:
+                self._kept.pop(next(iter(self._kept)))
+        return made
 
 
 class StretchSelection:

@@ -37,7 +37,7 @@ from sorvolo.missions.heights.measure import flight_with_heights, read_field
 from sorvolo.missions.map.journal import Taken
 from sorvolo.store.exports.change_files import write_pictures
 from sorvolo.store.exports.coverage_files import COVERAGE, coverage_geojson
-from sorvolo.store.exports.map_pictures import picture
+from sorvolo.store.exports.map_pictures import Picture, picture
 from sorvolo.store.exports.plain import features_name, geojson_bytes
 from sorvolo.store.images import ImageCache, array_from_bytes, image_from_jpeg, jpeg_from_image
 from sorvolo.store.pages.flight import report_page
@@ -211,11 +211,11 @@ class CompareRun:
         with self._log.stage(Stage.DETECT):
             search, changes = self._objects.conclude(placed, changes)
         with self._log.stage(Stage.REPORT):
-            shown = picture(self._writer.tiles, 800).rgba  # a day without change should cost little
+            shown = picture(self._writer.tiles, 800)  # a day without change should cost little
         ground = self._counts.ground.parts()
-        report = self._report(changes, suppressed, shown_as_well, placed, notices, started_s, ground)
+        report = self._report(changes, suppressed, shown_as_well, placed, shown, notices, started_s, ground)
         report["objects"] = self._objects.summary(search)
-        page = report_page(report, shown, crops_of(search), self._archive.site())
+        page = report_page(report, shown.rgba, crops_of(search), self._archive.site())
         site = self._archive.site()
         documents = {features_name(COVERAGE, is_local=site.is_local): geojson_bytes(coverage_geojson(ground, site))}
         self._writer.commit(
@@ -288,11 +288,11 @@ class CompareRun:
 
     def _report(
         self, changes: Sequence[Change], suppressed: int, shown_as_well: int, placed: Sequence[PlacedFrame],
-        notices: Sequence[Notice], started_s: float, ground: Sequence[CoveredGround],
+        shown: Picture, notices: Sequence[Notice], started_s: float, ground: Sequence[CoveredGround],
     ) -> dict[str, Any]:
         result = FlightResult(placed, self._setup.source.camera.camera, makes_map=False)
         report = build_report(
-            self._setup, self._settings.mapping, self._log, result, self._archive.site(), self._writer.tiles,
+            self._setup, self._settings.mapping, self._log, result, self._archive.site(), shown,
             [*notices, *self._objects.notices], time.monotonic() - started_s,
         )
         warnings = comparison_warnings(self._counts, self._views.brightness, self._views.times_coarser)

@@ -16,8 +16,9 @@ class MemorySettings:
     share: float = 0.25  # of the machine's memory, or of the container's limit
     enough_mb: float = 512.0  # more saves no time (decision 0033)
     least_mb: float = 64.0  # with less, a picture of 12 megapixels and the tiles below it do not fit
-    tiles_mb: int = 64  # at most, for tiles, and
-    images_mb: int = 256  # for pictures: more gains nothing
+    tiles_mb: int = 24  # at most, for tiles: each is painted once
+    least_images_mb: int = 64  # at most for pictures that are small, and
+    images_mb: int = 256  # for large ones: more gains nothing
     pictures: int = 6  # as many of the flight's as are wanted at once, those beside each other in two strips
 
 

@@ -2,16 +2,14 @@
 
 import resource
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import sorvolo
 from sorvolo.capture.sync import OffsetEstimate
 from sorvolo.capture.video import VideoSource
-from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.grid import TileIndex
 from sorvolo.missions.flight.headline import map_headline
 from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.settings import MapSettings
@@ -24,12 +22,12 @@ from sorvolo.mosaic.flight_figures import (
     FlightFigures,
     delay_figures,
     flight_figures,
-    shown_m2,
     stated_height_m,
     track_row,
 )
 from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.store.exports.control_files import control_summary
+from sorvolo.store.exports.map_pictures import Picture
 from sorvolo.store.exports.plain import utc_text
 from sorvolo.survey.control import ControlReport
 from sorvolo.survey.flight import CameraModel, Notice, Site
@@ -54,11 +52,12 @@ class FlightResult:
 
 def build_report(
     setup: FlightSetup, settings: MapSettings, log: FlightLog, result: FlightResult, site: Site,
-    tiles: Mapping[TileIndex, ImageRGBA], notices: Sequence[Notice], seconds: float,
+    shown: Picture, notices: Sequence[Notice], seconds: float,
 ) -> dict[str, Any]:
     """report.json of one flight; its keys are specified in docs/formats.md. Numbers that are not known are None.
 
-    `notices` are those of the source and of what worked on its frames; telemetry's and the setup's are added.
+    `shown` is the map made small, whatever its size. `notices` are those of the source and of what worked on its
+    frames; telemetry's and the setup's are added.
     """
     source, placed, graph = setup.source, result.placed, result.graph
     figures = flight_figures(placed, result.camera.fx_px)
@@ -87,7 +86,7 @@ def build_report(
         "ground_sampling_distance_m": site.m_per_px,
         "native_ground_sampling_distance_m": figures.native_m_per_px,
         "height_above_ground_m": figures.height_m,
-        "area_m2": shown_m2(tiles, site.m_per_px),
+        "area_m2": shown.shown_m2(site.m_per_px),
         "delay_s": delay_figures(log.delays_s),
         **_effort(log, seconds, max(1, len(placed))),
         "notices": [asdict(each) for each in (*source.telemetry.notices, *setup.notices, *notices)],

@@ -39,7 +39,7 @@ from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.missions.map.thesis_run import ThesisRun
 from sorvolo.mosaic.control import ControlSettings
-from sorvolo.mosaic.selection import SelectionSettings, every, select_keyframes, shows_all_between
+from sorvolo.mosaic.selection import SelectionSettings, SmallCopies, every, select_keyframes, shows_all_between
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import Catalogues
 from sorvolo.survey.area import Area
@@ -146,7 +146,7 @@ def _map_one(
         selected = select_keyframes(
             reader.posed(run), selection,
             keep_all=source.kind == "photos" or (settings.method == "thesis" and setup.track is not None),
-            inside=setup.inside(area), memory=before.memory,
+            inside=setup.inside(area), memory=before.memory, small=reader.small,
         )
         for each in selected:
             ended = run.take(each)
@@ -184,6 +184,7 @@ class _Reader:
     def __init__(self, setup: FlightSetup, before: Earlier, selection: SelectionSettings | None) -> None:
         self._setup, self._before, self._selection = setup, before, selection
         self._is_candidate = every(setup.plan.step_s)
+        self.small = SmallCopies()
         self.read = 0
 
     def posed(self, run: FlightRun) -> Iterator[PosedFrame | LostFrame]:
@@ -225,4 +226,4 @@ class _Reader:
 
     def _is_enough(self, before: Frame, after: Frame) -> bool:
         assert self._selection is not None
-        return shows_all_between(before.image, after.image, self._selection)
+        return shows_all_between(self.small.of(before), self.small.of(after), self._selection)

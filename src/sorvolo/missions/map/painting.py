@@ -9,7 +9,7 @@ from pathlib import Path
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import ImageRGB, Mask, Matrix3
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.grid import SiteGrid
+from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.map.journal import StoredPicture
@@ -23,7 +23,7 @@ from sorvolo.mosaic.placing import canvas_frame
 from sorvolo.mosaic.planar import PlanarMapper
 from sorvolo.registration.lens import Undistorter
 from sorvolo.registration.sizes import at_size
-from sorvolo.store.exports.map_pictures import write_live_preview
+from sorvolo.store.exports.map_pictures import LivePreview
 from sorvolo.store.images import ImageCache, image_from_jpeg
 from sorvolo.store.site.archive import Archive, FlightWriter
 
@@ -111,10 +111,11 @@ class FlightPainter:
         self._live_images = ImageCache(
             lambda each: writer.small_image(each - known.count, step), settings.cache_bytes // 4
         )
+        self._live_tiles = CoarseTiles(writer.tiles, archive.site_grid().grid, step)
         self._live_canvas = Canvas(
-            self._live.site_grid.grid, CoarseTiles(writer.tiles, archive.site_grid().grid, step),
-            self._live_images.get, keeps_known_ground=True,
+            self._live.site_grid.grid, self._live_tiles, self._live_images.get, keeps_known_ground=True
         )
+        self._preview, self._unshown = LivePreview(self._live.site_grid.grid.tile_px), set[TileIndex]()
         self._frames: set[int] = set()
         self._dirty: set[int] = set()
         self._painted_at = 0
@@ -170,8 +171,11 @@ class FlightPainter:
         """
         self.exposure = self._mapper.exposure()
         self._straighten()
-        if self._painted_at:
+        self._live_images.clear()
+        self._live_tiles.release()
+        if self._painted_at or self._is_live:
             self._writer.take_back_tiles()
+        self._writer.release_memory()
         at = _Fineness(1, self._archive.site_grid(), self._stored)
         with self._log.stage(Stage.PAINT):
             if self._elsewhere is None:
@@ -186,6 +190,7 @@ class FlightPainter:
         """Paint the newest key frame and let readers see it."""
         painted = self._paint_small([newest])
         with self._log.stage(Stage.STORE):
+            self._live_tiles.save()
             self._writer.flush()
         self.shown_s = time.monotonic()
         return painted
@@ -198,7 +203,8 @@ class FlightPainter:
         with self._log.stage(Stage.PAINT):
             painted = self._paint(self._live_canvas, keyframe_ids, self._live)
         self._dirty.difference_update(keyframe_ids)
-        return painted
+        self._unshown |= painted
+        return len(painted)
 
     def _flush(self) -> None:
         """Let readers see what was painted, and the whole map small; the larger the map, the less often."""
@@ -206,8 +212,10 @@ class FlightPainter:
         if started_s < self._show_again_s:
             return
         with self._log.stage(Stage.STORE):
+            self._live_tiles.save()
             self._writer.flush()
-            write_live_preview(self._writer.tiles, self._archive.live_preview_path)
+            self._preview.write(self._live_tiles, self._unshown, self._archive.live_preview_path)
+            self._unshown.clear()
         self._show_again_s = time.monotonic() + max(self._live_s, self._settings.rest * (time.monotonic() - started_s))
 
     def _new_canvas(self) -> Canvas:
@@ -236,14 +244,13 @@ class FlightPainter:
             self.images[index] = self._writer.save_image(index, lens.undistort(self._writer.image(index)))
         self._valid = lens.valid(self._stored.width_px, self._stored.height_px)
 
-    def _paint(self, canvas: Canvas, keyframe_ids: Collection[int], at: "_Fineness") -> int:
-        """Paint keyframes where they stand; how many tiles were painted."""
+    def _paint(self, canvas: Canvas, keyframe_ids: Collection[int], at: "_Fineness") -> frozenset[TileIndex]:
+        """Paint keyframes where they stand; the tiles that this changed."""
         painted = {each: self._canvas_frame(each, at) for each in sorted(keyframe_ids)}
-        tiles = canvas.paint(
+        return canvas.paint(
             [frame for frame in painted.values() if frame is not None],
             forget=[each for each, frame in painted.items() if frame is None],
         )
-        return len(tiles)
 
     def _plan(self, at: "_Fineness") -> PaintPlan:
         frames = [frame for each in sorted(self._frames) if (frame := self._canvas_frame(each, at)) is not None]

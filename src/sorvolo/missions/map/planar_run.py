@@ -193,18 +193,18 @@ class PlanarRun(FlightRun):
         writer = self.begin()
         search = self._search(placed)
         with self._log.stage(Stage.REPORT):
-            shown = picture(writer.tiles, 1600).rgba
+            shown = picture(writer.tiles, 1600)
         result = FlightResult(
             placed, self._refined(self._setup.source.camera.camera), self._offset, self._mapper.report(),
             self._exposure.spread, control=self._control, base=self._base,
             pieces=[[each - self._known.count for each in ids] for ids in self._mapper.pieces()],
         )
         report = build_report(
-            self._setup, self._settings, self._log, result, self._archive.site(), writer.tiles,
+            self._setup, self._settings, self._log, result, self._archive.site(), shown,
             [*notices, *self._detector_notices], time.monotonic() - started_s,
         )
         report["objects"] = self._search_summary(search)
-        page = report_page(report, shown, crops_of(search), self._archive.site())
+        page = report_page(report, shown.rgba, crops_of(search), self._archive.site())
         documents = {} if self._control is None else dict(control_documents(self._control))
         if self._coverage is not None:
             files, report["seen"] = self._coverage.conclude(self.pictures_on_ground())

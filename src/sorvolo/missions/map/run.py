@@ -167,7 +167,7 @@ class FlightRun(ABC):
         camera = self._setup.source.camera.camera
         picture_mb = 3 * camera.width_px * camera.height_px // 1_000_000
         most = MemorySettings()
-        return min(most.images_mb, max(most.tiles_mb, most.pictures * picture_mb))
+        return min(most.images_mb, max(most.least_images_mb, most.pictures * picture_mb))
 
     def _make_site(self, m_per_px: float, ground_up_m: float) -> None:
         """Make the site if there is none; see `new_site`."""

@@ -78,14 +78,14 @@ class ThesisRun(FlightRun):
             paint_mosaic(rgba, corner_px, anchored, self._archive.site_grid(), writer.tiles)
         with self._log.stage(Stage.REPORT):
             placed = self._placed(anchored)
-            shown = picture(writer.tiles, 1600).rgba
+            shown = picture(writer.tiles, 1600)
         search = self._search(placed)
         report = build_report(
             self._setup, self._settings, self._log, FlightResult(placed, self._setup.source.camera.camera), site,
-            writer.tiles, [*notices, *self._detector_notices], time.monotonic() - started_s,
+            shown, [*notices, *self._detector_notices], time.monotonic() - started_s,
         )
         report["objects"] = self._search_summary(search)
-        page = report_page(report, shown, crops_of(search), self._archive.site())
+        page = report_page(report, shown.rgba, crops_of(search), self._archive.site())
         writer.commit(placed, paths, report, page, crs=self._settings.crs, search=search)
 
     # ---- inside -----------------------------------------------------------------------------------------------

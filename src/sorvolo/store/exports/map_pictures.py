@@ -27,12 +27,93 @@ _KMZ_PIECE_PX = 1024  # viewers on phones refuse textures much larger
 class Picture:
     """The map made small: `rgba` (H, W, 4), each pixel `step_px` grid pixels wide.
 
-    The outer corner of its pixel (0, 0) is at `corner_px` on the grid.
+    The outer corner of its pixel (0, 0) is at `corner_px` on the grid; `shown_px` grid pixels show ground.
     """
 
     rgba: ImageRGBA
     corner_px: tuple[float, float]
     step_px: int
+    shown_px: int = 0
+
+    def shown_m2(self, m_per_px: float) -> float:
+        """The ground that the map shows, its pixels being so wide."""
+        return float(self.shown_px * m_per_px**2)
+
+
+class SmallMap:
+    """A map made small while its tiles pass by, in any order; only `take` and `take_from` change it.
+
+    The tiles are `tile_px` wide and lie at `indexes`. The map is halved until no side exceeds `max_px`, and memory
+    depends on that alone.
+    """
+
+    def __init__(self, indexes: Collection[TileIndex], tile_px: int, max_px: int) -> None:
+        columns, rows = np.array(sorted(indexes)).T
+        self._left, self._top = int(columns.min()), int(rows.min())
+        width, height = int(columns.max()) - self._left + 1, int(rows.max()) - self._top + 1
+        self._tile_px, self._step = tile_px, _thinning(max(width, height), tile_px, max_px)
+        self._side = tile_px // self._step
+        self._canvas: ImageRGBA = np.zeros((height * self._side, width * self._side, 4), np.uint8)
+        self._shown_px: dict[TileIndex, int] = {}
+
+    @property
+    def side_px(self) -> int:
+        """How wide a tile is drawn."""
+        return self._side
+
+    @property
+    def taken(self) -> int:
+        """How many tiles have passed by."""
+        return len(self._shown_px)
+
+    def take(self, index: TileIndex, tile: ImageRGBA) -> None:
+        """Draw a tile, (tile_px, tile_px, 4), or what `shrink` made of it."""
+        self._part(index)[:] = shrink(tile, self._side, self._side)
+        self._shown_px[index] = int(np.count_nonzero(tile[..., 3]))
+
+    def take_from(self, other: "SmallMap", index: TileIndex) -> None:
+        """Draw a tile that another map of the same tiles shows alike."""
+        self._part(index)[:] = other._part(index)
+        self._shown_px[index] = other._shown_px[index]
+
+    def picture(self, *beside: "SmallMap") -> Picture:
+        """What was drawn, cropped to what is seen in it or in any of the maps `beside` it, of the same tiles."""
+        seen = np.any([each._canvas[..., 3] > 0 for each in (self, *beside)], axis=0)
+        (y0, y1), (x0, x1) = (np.flatnonzero(seen.any(axis=axis))[[0, -1]] + [0, 1] for axis in (1, 0))
+        corner_px = tuple(
+            float(tile * self._tile_px + int(first) * self._step - 0.5)
+            for tile, first in ((self._left, x0), (self._top, y0))
+        )
+        rgba = np.ascontiguousarray(self._canvas[y0:y1, x0:x1])
+        return Picture(rgba, (corner_px[0], corner_px[1]), self._step, sum(self._shown_px.values()))
+
+    def _part(self, index: TileIndex) -> ImageRGBA:
+        x, y = (index[0] - self._left) * self._side, (index[1] - self._top) * self._side
+        return self._canvas[y:y + self._side, x:x + self._side]
+
+
+class LivePreview:
+    """A small PNG of the map while it grows, for which only tiles that changed are read; only `write` changes it."""
+
+    def __init__(self, tile_px: int) -> None:
+        self._tile_px = tile_px
+        self._shrunk: dict[TileIndex, ImageRGBA] = {}
+        self._side = tile_px
+
+    def write(self, tiles: Mapping[TileIndex, ImageRGBA], changed: Collection[TileIndex], path: Path) -> None:
+        """Write the map, of whose tiles `changed` are others than when it was written last; nothing without tiles."""
+        if not tiles:
+            return
+        small = SmallMap(list(tiles), self._tile_px, LIVE_PREVIEW_PX)
+        if small.side_px != self._side:
+            kept = {} if small.side_px > self._side else self._shrunk
+            self._side = small.side_px
+            self._shrunk = {index: shrink(each, self._side, self._side) for index, each in kept.items()}
+        for index in tiles:
+            if index not in self._shrunk or index in changed:
+                self._shrunk[index] = shrink(tiles[index], self._side, self._side)
+            small.take(index, self._shrunk[index])
+        atomic_write_bytes(path, png_from_rgba(small.picture().rgba), durable=False)
 
 
 def picture(tiles: Mapping[TileIndex, ImageRGBA], max_px: int) -> Picture:
@@ -52,25 +133,15 @@ def pictures(
     """
     indexes = sorted(set().union(*maps))
     tile_px = next(tiles[index].shape[0] for index in indexes[:1] for tiles in maps if index in tiles)
-    columns, rows = np.array(indexes).T
-    left, top = int(columns.min()), int(rows.min())
-    width, height = int(columns.max()) - left + 1, int(rows.max()) - top + 1
-    step = _thinning(max(width, height), tile_px, max_px)
-    small_px = tile_px // step
-    canvases = [np.zeros((height * small_px, width * small_px, 4), np.uint8) for _ in maps]
-    seen = np.zeros((height * small_px, width * small_px), bool)
-    for canvas, tiles in zip(canvases, maps):
-        known = alike if canvas is not canvases[0] else ()
-        for column, row in sorted(tiles):
-            y, x = (row - top) * small_px, (column - left) * small_px
-            part = np.s_[y:y + small_px, x:x + small_px]
-            canvas[part] = (
-                canvases[0][part] if (column, row) in known else shrink(tiles[column, row], small_px, small_px)
-            )
-        seen |= canvas[..., 3] > 0
-    (y0, y1), (x0, x1) = (np.flatnonzero(seen.any(axis=axis))[[0, -1]] + [0, 1] for axis in (1, 0))
-    corner_px = (left * tile_px + int(x0) * step - 0.5, top * tile_px + int(y0) * step - 0.5)
-    return [Picture(np.ascontiguousarray(canvas[y0:y1, x0:x1]), corner_px, step) for canvas in canvases]
+    small = [SmallMap(indexes, tile_px, max_px) for _ in maps]
+    for each, tiles in zip(small, maps):
+        known = alike if each is not small[0] else ()
+        for index in sorted(tiles):
+            if index in known:
+                each.take_from(small[0], index)
+            else:
+                each.take(index, tiles[index])
+    return [each.picture(*small) for each in small]
 
 
 def _thinning(tiles: int, tile_px: int, max_px: int) -> int:
@@ -86,23 +157,20 @@ def write_preview(tiles: Mapping[TileIndex, ImageRGBA], path: Path, max_px: int 
     atomic_write_bytes(path, png_from_rgba(picture(tiles, max_px).rgba))
 
 
-def write_small_maps(
-    tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, name: str, preview: Path, kmz: Path
-) -> None:
-    """Write what `write_preview` and `write_kmz` do, the tiles being read once for both."""
-    shown = picture(tiles, _KMZ_PX)
-    small = shown.rgba
-    while max(small.shape[:2]) > PREVIEW_PX:
-        small = shrink(small, -(-small.shape[1] // 2), -(-small.shape[0] // 2))
-    atomic_write_bytes(preview, png_from_rgba(small))
-    _write_kmz(shown, site_grid, name, kmz)
+def small_map_of(tiles: Collection[TileIndex], tile_px: int) -> SmallMap:
+    """The map as large as `write_small_maps` wants it, to be drawn from these tiles."""
+    return SmallMap(tiles, tile_px, _KMZ_PX)
 
 
-def write_live_preview(tiles: Mapping[TileIndex, ImageRGBA], path: Path) -> None:
-    """Write a small PNG of the map while it grows; nothing when there are no tiles yet."""
-    if tiles:
-        data = png_from_rgba(picture(tiles, LIVE_PREVIEW_PX).rgba)
-        atomic_write_bytes(path, data, durable=False)
+def write_small_maps(small: SmallMap, site_grid: SiteGrid, name: str, preview: Path, kmz: Path | None) -> None:
+    """Write what `write_preview` and, unless that is None, `write_kmz` do, of a `small_map_of` all tiles."""
+    shown = small.picture()
+    rgba = shown.rgba
+    while max(rgba.shape[:2]) > PREVIEW_PX:
+        rgba = shrink(rgba, -(-rgba.shape[1] // 2), -(-rgba.shape[0] // 2))
+    atomic_write_bytes(preview, png_from_rgba(rgba))
+    if kmz is not None:
+        _write_kmz(shown, site_grid, name, kmz)
 
 
 def write_kmz(tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, name: str, path: Path) -> None:

@@ -5,13 +5,14 @@ starts at that pixel's outer corner.
 """
 
 import shutil
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import escape
 from zlib import crc32
 
+import cv2
 import numpy as np
 import rasterio
 import rasterio.shutil
@@ -34,7 +35,9 @@ _BLOCK_PX = 512
 _VERIFIED_BLOCKS = 64
 # zstd is the fastest to write and to read once; deflate is what every reader of the final file understands; its
 # level 6 takes 1.7 times as long as 1, all steps together, for files 4 % smaller
-_SCRATCH = {"driver": "GTiff", "tiled": True, "compress": "zstd", "zstd_level": 1, "sparse_ok": True}
+_SCRATCH = {
+    "driver": "GTiff", "tiled": True, "compress": "zstd", "zstd_level": 1, "sparse_ok": True, "interleave": "band",
+}
 _COG = {
     "driver": "COG", "blocksize": _BLOCK_PX, "compress": "DEFLATE", "level": 1, "predictor": "YES",
     "overviews": "FORCE_USE_EXISTING", "bigtiff": "IF_SAFER", "num_threads": "ALL_CPUS",
@@ -62,14 +65,14 @@ class Raster:
 
 def write_cog(
     tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, path: Path, *, crs: str | None = None,
-    compress: str = "deflate",
+    compress: str = "deflate", pass_by: Callable[[TileIndex, ImageRGBA], None] = lambda _index, _tile: None,
 ) -> None:
     """Write the map as a Cloud Optimized GeoTIFF with alpha and overviews, in place of what was at `path`.
 
-    Tiles are read one at a time. `crs` reprojects (bilinear); the site's own CRS is the default, a local site
-    has none. `compress` is one of COMPRESSIONS; JPEG has three bands and a mask. The file is read back before it takes
-    its place. Raises SettingsError for an unknown `crs` or `compress`, and StoreError for an empty map, a full disk, or
-    a file that reads back differently.
+    Tiles are read one at a time, and each is shown to `pass_by`. `crs` reprojects (bilinear); the site's own CRS is the
+    default, a local site has none. `compress` is one of COMPRESSIONS; JPEG has three bands and a mask. The file is read
+    back before it takes its place. Raises SettingsError for an unknown `crs` or `compress`, and StoreError for an empty
+    map, a full disk, or a file that reads back differently.
     """
     if not tiles:
         raise StoreError("the map has no tiles; there is nothing to write as GeoTIFF")
@@ -87,7 +90,7 @@ def write_cog(
         _naming_faults(path),
     ):
         plain = scratch / "plain.tif"
-        _write_plain(tiles, grid, plain)
+        _write_plain(tiles, grid, plain, pass_by)
         if target is not None:
             plain = _warped(plain, target)
         filled = None if target is not None else _filled_blocks(tiles, grid)
@@ -117,7 +120,9 @@ def read_raster(path: Path, max_px: int) -> Raster:
         raise InputError(f"{path} is no readable GeoTIFF ({error}); export it as GeoTIFF again") from error
 
 
-def _write_plain(tiles: Mapping[TileIndex, ImageRGBA], grid: Grid, path: Path) -> None:
+def _write_plain(
+    tiles: Mapping[TileIndex, ImageRGBA], grid: Grid, path: Path, pass_by: Callable[[TileIndex, ImageRGBA], None]
+) -> None:
     columns, rows = np.array(sorted(tiles)).T
     left, top = columns.min() * grid.tile_px, rows.min() * grid.tile_px
     width, height = (columns.max() + 1) * grid.tile_px - left, (rows.max() + 1) * grid.tile_px - top
@@ -135,7 +140,8 @@ def _write_plain(tiles: Mapping[TileIndex, ImageRGBA], grid: Grid, path: Path) -
             x0, y0, _, _ = grid.tile_window(index)
             window = Window(x0 - left, y0 - top, grid.tile_px, grid.tile_px)
             tile = tiles[index]
-            sink.write(np.moveaxis(tile, 2, 0), window=window)
+            sink.write(_bands(tile), window=window)
+            pass_by(index, tile)
             if index in verified:
                 verified[index] = crc32(tile.tobytes())
     # GDAL can lose blocks on a full disk and still close without a word
@@ -145,6 +151,11 @@ def _write_plain(tiles: Mapping[TileIndex, ImageRGBA], grid: Grid, path: Path) -
             read = source.read(window=Window(x0 - left, y0 - top, grid.tile_px, grid.tile_px))
             if crc32(np.moveaxis(read, 0, 2).tobytes()) != written:
                 raise StoreError(_differs(path))
+
+
+def _bands(rgba: ImageRGBA) -> NDArray[np.uint8]:
+    """(4, H, W) the colours one after the other, as the scratch file has them."""
+    return np.stack(cv2.split(rgba))
 
 
 def _warped(plain: Path, target: CRS) -> Path:
@@ -240,7 +251,7 @@ def _halved(larger: Path, path: Path, filled: set[TileIndex] | None) -> Path | N
                     continue  # unwritten blocks stay sparse
                 odd = (0, rgba.shape[0] % 2), (0, rgba.shape[1] % 2), (0, 0)
                 halved = shrink(np.pad(rgba, odd, mode="edge"), small.width, small.height)
-                sink.write(np.moveaxis(halved, 2, 0), window=small)
+                sink.write(_bands(halved), window=small)
     return path
 
 

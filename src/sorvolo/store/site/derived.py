@@ -3,14 +3,15 @@
 import os
 import shutil
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from sorvolo.geometry.arrays import ImageRGBA
+from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.atomic import atomic_write_bytes, sync_file, temporary_beside, writing
 from sorvolo.store.exports.change_files import change_placemarks, changes_geojson, crop_names
-from sorvolo.store.exports.map_pictures import Picture, pictures, write_preview, write_small_maps
+from sorvolo.store.exports.map_pictures import Picture, pictures, small_map_of, write_small_maps
 from sorvolo.store.exports.object_files import CROPS, OBJECTS, object_placemarks, objects_geojson
 from sorvolo.store.exports.placemarks import Placemark, gpx_bytes, kml_bytes
 from sorvolo.store.exports.plain import features_name, features_path, geojson_bytes
@@ -34,16 +35,25 @@ def write_map_files(files: SiteFiles, version: VersionEntry) -> None:
         for path in (files.preview_path, files.mosaic_path, files.kmz_path):
             path.unlink(missing_ok=True)
         return
-    with ThreadPoolExecutor(1, thread_name_prefix="geotiff") as other:  # takes as long as all else together
-        geotiff = other.submit(
-            write_cog, tiles, files.site_grid(), files.mosaic_path, crs=version.export_crs or None,
-            compress=version.compress,
+    site = files.site()
+    small = small_map_of(tiles, files.site_grid().grid.tile_px)
+    waiting: list[Future[None]] = []
+    with ThreadPoolExecutor(1, thread_name_prefix="previews") as other:
+
+        def pass_by(index: TileIndex, tile: ImageRGBA) -> None:
+            small.take(index, tile)
+            if small.taken == len(tiles):  # while GDAL makes its file
+                kmz = None if site.is_local else files.kmz_path
+                waiting.append(other.submit(
+                    write_small_maps, small, files.site_grid(), site.name, files.preview_path, kmz
+                ))
+
+        write_cog(
+            tiles, files.site_grid(), files.mosaic_path, crs=version.export_crs or None, compress=version.compress,
+            pass_by=pass_by,
         )
-        if files.site().is_local:
-            write_preview(tiles, files.preview_path)
-        else:
-            write_small_maps(tiles, files.site_grid(), files.site().name, files.preview_path, files.kmz_path)
-        geotiff.result()
+    for each in waiting:
+        each.result()
 
 
 def map_is_there(files: SiteFiles) -> bool:

@@ -17,6 +17,7 @@ from sorvolo.store.exports.change_files import BOXES_FILE, boxes_json, crop_file
 from sorvolo.store.exports.frame_files import frames_geojson
 from sorvolo.store.exports.object_files import CROPS, object_crops
 from sorvolo.store.exports.plain import features_name, geojson_bytes, json_bytes
+from sorvolo.store.freed_memory import give_back
 from sorvolo.store.images import ImageCache, jpeg_from_image
 from sorvolo.store.nofollow import read_below
 from sorvolo.store.rasters.geotiff import parse_crs
@@ -168,6 +169,13 @@ class FlightWriter:
         """Make `tiles` what they were before the flight; readers see it with the next `flush`."""
         self._growing.take_back()
 
+    def release_memory(self) -> None:
+        """Drop tiles and pictures that can be read again: before a stage that needs others."""
+        self._growing.release()
+        self._files.blobs.release()
+        self._cache.clear()
+        give_back()
+
     def flush(self) -> None:
         """Let readers see the map as it is now."""
         changed = self._growing.save()
@@ -228,8 +236,7 @@ class FlightWriter:
             if search is not None:
                 object_records.add_search(connection, self._run_id, search)
         self._is_open = False
-        self._growing.release()
-        self._cache.clear()
+        self.release_memory()
         forget_journals(self._files)
         repair(self._files)
         remove_unused(self._files)

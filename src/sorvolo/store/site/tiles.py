@@ -105,6 +105,12 @@ class TileBlobs:
                 self._forget(sha256)
         self._unsynced.difference_update(hashes)
 
+    def release(self) -> None:
+        """Drop the tiles read last from memory."""
+        with self._reading:
+            self._read.clear()
+            self._read_bytes = 0
+
     def stored(self) -> set[str]:
         """The SHA-256 of every blob in the folder."""
         return {path.stem for path in self._folder.glob("??/*.png") if is_sha256(path.stem)}
