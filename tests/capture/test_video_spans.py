@@ -1,7 +1,9 @@
 """Videos read by the key frames of their streams: the same frames, fewer decoded; in full where a stream is odd."""
 
 import random
+from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from test_video import all_frames, open_video, write_video
 
 from sorvolo.capture.video import VideoSource
 from sorvolo.capture.video_spans import SparseReading
+from sorvolo.capture.video_stream import stamp_of
 from sorvolo.survey.flight import Frame
 
 # `write_video` gives 25 frames a second, and a key frame of the stream each ten
@@ -124,3 +127,12 @@ def test_damage_is_counted_as_it_is_in_a_full_reading(tmp_path: Path) -> None:
     assert "damaged" in source.reading.whole_because or "stamps" in source.reading.whole_because
     assert source.notices() == full.notices() and full.notices()
     assert found[-1].time_ns > 2.2e9 and (np.diff([each.index for each in found]) > 0).all()
+
+
+def test_a_stamp_is_the_nearest_nanosecond() -> None:
+    chance = random.Random(4)
+    for _ in range(2000):
+        base = Fraction(chance.choice([1, 7, 1001]), chance.choice([24, 12_800, 30_000, 90_000, 1 << 40, 2 * 10**9]))
+        pts = chance.randint(-(10**7), 10**9)
+        assert stamp_of(SimpleNamespace(pts=pts, time_base=base)) == round(pts * base * 10**9)  # type: ignore[arg-type]
+    assert stamp_of(SimpleNamespace(pts=None, time_base=Fraction(1, 25))) is None  # type: ignore[arg-type]

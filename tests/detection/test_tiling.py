@@ -85,15 +85,22 @@ class TestPlan:
         places = np.array(plan.places_px)
         assert places.min() == 0 and places[:, 2].max() == size[1] and places[:, 3].max() == size[0]
         sides = (places[:, 2:] - places[:, :2]) * plan.scale
+        assert sides.prod(axis=1).max() <= MOST_WHOLE_PX
         if len(places) == 1:
-            assert sides.prod() <= MOST_WHOLE_PX
             return
-        assert sides.max() <= 1280
+        assert sides.max() <= 1.5 * math.sqrt(MOST_WHOLE_PX)
         longest = 200 / plan.scale if math.isnan(m_per_px) else 4.75 / m_per_px
         for low, high in ((0, 2), (1, 3)):
             spans = sorted({(span[low], span[high]) for span in plan.places_px})
             for (_, end), (start, _) in pairwise(spans):
                 assert end - start >= min(longest, 0.5 * sides[0, low] / plan.scale) - 3
+
+    def test_little_is_shown_twice(self) -> None:
+        """Of a photo of 4000 x 2250 px from 40 m, whose tiles overlap by 5.5 m, a third (two thirds with tiles of 1280
+        px); of a 4K frame less."""
+        for size, m_per_px, most in (((2250, 4000), 0.017, 1.4), ((2160, 3840), 0.02, 1.3), ((1500, 2000), 0.03, 1.15)):
+            places = np.array(plan_tiles(size, _INFO, ("person", "car"), m_per_px=m_per_px).places_px)
+            assert (places[:, 2:] - places[:, :2]).prod(axis=1).sum() < most * size[0] * size[1]
 
     def test_whole_means_whole_unless_memory_forbids(self) -> None:
         assert plan_tiles((2160, 3840), _INFO, CLASSES, tiles=None, m_per_px=0.3).places_px == ((0, 0, 3840, 2160),)

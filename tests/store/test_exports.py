@@ -115,6 +115,13 @@ def test_times_are_utc_and_lose_nothing(time_ns: int, text: str) -> None:
     assert utc_text(time_ns) == text
 
 
+def test_a_feature_is_a_line_whatever_its_values_are() -> None:
+    values = ([1.5, "\u00e9"], [1.5, "\u00e9"]), (float("nan"), None), (np.float32(0.5), 0.5), (Status.VISION, "vision")
+    for plain, written in values:
+        lines = geojson_bytes({"name": "x", "features": [{"a": plain}, {"b": 1}]}).decode().splitlines()
+        assert [json.loads(line.rstrip(",")) for line in lines[1:-1]] == [{"a": written}, {"b": 1}]
+
+
 def test_plain_json_says_what_json_can() -> None:
     @dataclass(frozen=True)
     class Settings:

@@ -21,7 +21,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.survey.flight import TELEMETRY_COLUMNS, CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry
 
-_LOOK_AHEAD = 2
+_LOOK_AHEAD = 1
 _STEP_NS = 1_000_000  # between photos of the same second
 _UNTIMED_STEP_NS = 1_000_000_000
 _QUARTER_TURN = 6  # EXIF's number for clockwise
@@ -80,9 +80,9 @@ class PhotoSource:
         return (*self._notices, *found)
 
     def frames(self, wanted: Callable[[int, int], bool]) -> Iterator[Frame | LostFrame]:
-        """Decode the wanted photos in order, up to two ahead of the consumer in a thread of their own.
+        """Decode the wanted photos in order, one ahead of the consumer in a thread of its own: they are large.
 
-        `wanted(index, time_ns)` is asked before a photo is decoded, hence up to two photos ahead as well.
+        `wanted(index, time_ns)` is asked before a photo is decoded, hence one photo ahead as well.
         """
         pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photos")
         pending: deque[Future[Frame | LostFrame]] = deque()

@@ -189,6 +189,7 @@ def _packets(
 ) -> "Iterator[_Packet]":
     """All packets of an even stream, the first being a key frame's. Raises UnevenStreamError for any other."""
     key_pts: int | None = None
+    unit_s = float(stream.time_base or 1)
     try:
         for packet in container.demux(stream):
             if packet.size == 0:
@@ -197,7 +198,7 @@ def _packets(
             key_pts = packet.pts if packet.is_keyframe else key_pts
             if key_pts is None:
                 raise UnevenStreamError("the video does not begin with a key frame")
-            if (_pts(packet) - key_pts) * float(stream.time_base or 1) > longest_s:
+            if (_pts(packet) - key_pts) * unit_s > longest_s:
                 raise UnevenStreamError(f"key frames of the stream lie more than {longest_s:g} s apart")
             yield packet
     except (av.FFmpegError, IndexError) as error:

@@ -24,7 +24,6 @@ MOST_AT_ONCE_PX = 8_400_000
 TASK = Task.RECOGNITION
 """What a person must at least be shown for (Johnson's criteria): 6 px over the critical dimension."""
 
-_SIDE_PX = 1280  # of a tile as the network sees it
 _MOST_LARGER = 3.0  # magnified further, a picture is only blurred more
 _THERMAL_PX = 2.0  # times as many pixels as by day must a person have: thermal optics blur, and clothes hide limbs
 _THERMAL_LARGER = 1.5  # where the ground's sampling distance is not known: thermal sensors have few pixels
@@ -85,11 +84,11 @@ def plan_tiles(
     """The tiles of a picture of (height, width) `size_px`.
 
     `tiles` "auto": the scale comes from `m_per_px`; where that is unknown (NaN), it is 1, or 1.5 for a `thermal` frame
-    that is small. A picture that is still small is one tile; else tiles of about 1280 px as the model sees them. A
-    number: tiles of so many of the picture's pixels a side, not scaled. None: the picture as it is. Tiles overlap by
-    the longest object that is wanted, as far as its size is known, at most by half. A model of one input size,
-    `fixed_px`, gets tiles of that size from "auto". Raises SettingsError for a tile size or a sampling distance that
-    cannot be.
+    that is small. A picture that is still small is one tile; else it is cut into tiles of at most that size, which show
+    the fewest pixels twice. A number: tiles of so many of the picture's pixels a side, not scaled. None: the picture as
+    it is. Tiles overlap by the longest object that is wanted, as far as its size is known, at most by half. A model of
+    one input size, `fixed_px`, gets tiles of that size from "auto". Raises SettingsError for a tile size or a sampling
+    distance that cannot be.
     """
     height, width = size_px
     if m_per_px <= 0 or math.isinf(m_per_px):
@@ -116,13 +115,32 @@ def _auto_plan(
     size_px: tuple[int, int], info: ModelInfo, wanted: Sequence[str], m_per_px: float, scale: float,
     fixed_px: tuple[int, int] | None,
 ) -> TilePlan:
-    """One tile where the picture at this scale is small enough for that, else tiles of the model's usual size."""
+    """One tile where the picture at this scale is small enough for that, else tiles that are."""
     height, width = size_px
-    if fixed_px is None and height * width * scale**2 <= MOST_WHOLE_PX:
+    overlap_px, step = _overlap_px(info, wanted, m_per_px, scale), info.stride / scale
+    if fixed_px is not None:
+        sides = fixed_px[0] / scale, fixed_px[1] / scale
+        return TilePlan(scale, _places(size_px, sides, overlap_px, step))
+    if height * width * scale**2 <= MOST_WHOLE_PX:
         return TilePlan(scale, ((0, 0, width, height),))
-    side_px = fixed_px or (_SIDE_PX, _SIDE_PX)
-    sides = side_px[0] / scale, side_px[1] / scale
-    return TilePlan(scale, _places(size_px, sides, _overlap_px(info, wanted, m_per_px, scale), info.stride / scale))
+    return TilePlan(scale, _places(size_px, _cheapest_sides(size_px, overlap_px, step, scale), overlap_px, step))
+
+
+def _cheapest_sides(
+    size_px: tuple[int, int], overlap_px: float, step: float, scale: float
+) -> tuple[float, float]:
+    """(height, width) of the tiles of at most MOST_WHOLE_PX, as the model sees them, that show least in all.
+
+    Largest tiles are at most about twice as long one way: what lies near a border is seen less well.
+    """
+    most = MOST_WHOLE_PX / (scale * step) ** 2  # in steps
+    best = (math.inf, (math.sqrt(most) * step, math.sqrt(most) * step))
+    for height in range(math.ceil(math.sqrt(most / 2)), math.ceil(math.sqrt(most * 2))):
+        sides = min(height * step, size_px[0]), min(math.floor(most / height) * step, size_px[1])
+        places = np.array(_places(size_px, sides, overlap_px, step))
+        shown_px = float(np.prod(places[:, 2:] - places[:, :2], axis=1).sum())
+        best = min(best, (shown_px, sides))
+    return best[1]
 
 
 def _places(

@@ -15,6 +15,7 @@ from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.memory import MemorySettings
 from sorvolo.registration.sizes import at_most
 from sorvolo.store.exports.detection_files import crop_around
 from sorvolo.store.exports.plain import plain_json
@@ -105,7 +106,8 @@ class ObjectFinder:
         m_per_px = float(height_m) / self._camera.fx_px if knows_height else None
         from_above = is_from_above(posed.prior.rotation)
         self._waiting.append(self._thread.submit(self._look, posed.frame, m_per_px, from_above))
-        self._take(_AHEAD)
+        most_bytes = 1e6 * MemorySettings().waiting_mb
+        self._take(min(_AHEAD, max(1, int(most_bytes // posed.frame.image.nbytes))))
 
     def news(self, *, waits: bool = False) -> list[FrameDetections]:
         """What was found since this was asked last, in the frames' order; `waits`: in all frames so far."""

@@ -19,6 +19,7 @@ class MemorySettings:
     tiles_mb: int = 24  # at most, for tiles: each is painted once
     least_images_mb: int = 64  # at most for pictures that are small, and
     images_mb: int = 256  # for large ones: more gains nothing
+    waiting_mb: int = 64  # for frames that wait for the detector, though one may always
     pictures: int = 6  # as many of the flight's as are wanted at once, those beside each other in two strips
 
 

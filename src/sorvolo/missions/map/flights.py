@@ -204,9 +204,9 @@ class _Reader:
                 run.look(posed)
 
     def _frames(self) -> Generator[Frame | LostFrame]:
-        """Those of a recorded flight are decoded while those before them are placed."""
+        """Those of a recorded flight are decoded while those before them are placed: photos by their source."""
         source = self._setup.source
-        if isinstance(source, LiveSource):
+        if isinstance(source, LiveSource) or source.kind == "photos":
             yield from source.frames(self._is_wanted)
             return
         if isinstance(source, VideoSource) and self._selection is not None:

@@ -54,12 +54,16 @@ def json_bytes(value: Any) -> bytes:
 def geojson_bytes(collection: Mapping[str, Any]) -> bytes:
     """A FeatureCollection as UTF-8 JSON text, one feature a line."""
     head = {key: value for key, value in collection.items() if key != "features"}
-    opening = json.dumps(plain_json(head), ensure_ascii=False, allow_nan=False)[:-1]
-    features = [
-        json.dumps(plain_json(feature), ensure_ascii=False, allow_nan=False)
-        for feature in collection["features"]
-    ]
-    return (opening + ', "features": [\n' + ",\n".join(features) + "\n]}\n").encode()
+    features = ",\n".join(_line(feature) for feature in collection["features"])
+    return (_line(head)[:-1] + ', "features": [\n' + features + "\n]}\n").encode()
+
+
+def _line(value: Any) -> str:
+    """JSON without line breaks; most values are plain already, and outlines of ten thousand corners among them."""
+    try:
+        return json.dumps(value, ensure_ascii=False, allow_nan=False)
+    except (TypeError, ValueError):  # records, arrays; NaN
+        return json.dumps(plain_json(value), ensure_ascii=False, allow_nan=False)
 
 
 def feature_collection(
