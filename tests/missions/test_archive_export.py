@@ -149,7 +149,7 @@ def test_an_archive_in_a_bucket(maps: Path, tmp_path: Path, monkeypatch: pytest.
 def test_bad_input_is_named(maps: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for root, out, words in (
         (tmp_path / "nowhere", tmp_path / "a.parquet", "no such folder"),
-        (maps, tmp_path / "a.csv", "end the file's name so"),
+        (maps, tmp_path / "a.csv", "give a file name with that ending"),
         (maps, tmp_path / "no/a.parquet", "make it first"),
     ):
         assert main(["archive", "export", str(root), "--out", str(out)]) == 1

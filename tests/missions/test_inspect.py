@@ -160,7 +160,7 @@ def test_a_log_without_a_date_is_shown_without_one(tmp_path: Path) -> None:
     app.command()(inspect)
     shown = " ".join(CliRunner().invoke(app, [str(video)]).output.split())
     assert "1970-01-01 00:00" not in shown and "without a date" in shown
-    assert "the video dates its 5 rows" in shown
+    assert "its 5 rows take the video's" in shown
 
 
 def test_too_few_frames_a_second_for_the_speed(tmp_path: Path) -> None:
