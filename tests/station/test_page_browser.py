@@ -22,6 +22,7 @@ from playwright.sync_api import expect
 from pyproj import Geod
 from stream_flights import write_track, write_video
 from test_stream_messages import units
+from watch_runs import watch_run
 from websockets.sync.client import connect
 
 from sorvolo.geometry.coordinates import Coordinates, place_text
@@ -208,6 +209,8 @@ def test_a_flight_is_followed_live(served: Served, opened: Watched) -> None:
     with page.expect_request(re.compile("/tiles/live-abc123/")):
         around = [lon - 1e-3, lat - 1e-3, lon + 1e-3, lat + 1e-3]
         announce(served, "map.tiles", {"revision": "abc123", "bounds": around})
+    with page.expect_request(re.compile("/collections/coverage/items")):
+        announce(served, "coverage.changed", {})
     hostile = "<img src=x onerror=window.pwned=1>"
     announce(served, "object.found", {"feature": {
         "type": "Feature", "id": "o1", "geometry": {"type": "Point", "coordinates": [lon + 5e-5, lat - 5e-5]},
@@ -550,6 +553,21 @@ def test_everybody_can_use_it(browser: Any, served: Served) -> None:
     found["settings"] = serious(watched.page)
     assert {name: each for name, each in found.items() if each} == {}
     context.close()
+
+
+def test_what_a_watch_found_is_judged_with_the_keyboard(opened: Watched, served: Served) -> None:
+    results, page = watch_run(served.station, "run-7"), opened.page
+    try:
+        announce(served, "site.changed", {"versions": 2})
+        page.locator("[data-panel=review]").click()
+        page.get_by_role("button", name="Objects (2)").click()
+        page.locator(".strip button[data-id='run-7:1']").click()
+        page.keyboard.press("c")
+        page.locator(".strip button.confirmed[data-id='run-7:1']").wait_for()
+        (given,) = served.ask("/api/sites/field/reviews?kind=finding")
+        assert (given["id"], given["verdict"]) == ("run-7:1", "confirmed")
+    finally:
+        (results / "tracks.geojson").unlink()
 
 
 def serious(page: Any, rules: list[str] | None = None) -> list[str]:

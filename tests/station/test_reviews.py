@@ -9,6 +9,7 @@ from typing import Any
 
 from fake_flights import SITE, map_flight
 from starlette.testclient import TestClient
+from watch_runs import PICTURE, watch_run
 
 from sorvolo.missions.site.review import list_changes, review_changes
 from sorvolo.station.app import station_app
@@ -168,3 +169,34 @@ def test_unknown_things_and_impossible_verdicts(client: TestClient) -> None:
     assert verdict(client, "b-1", "confirmed", -1).status_code == 422
     assert client.post("/api/sites/nowhere/reviews", json={
         "kind": "object", "id": "x", "verdict": "confirmed", "revision": 0}).status_code == 404
+
+
+def test_what_a_watch_found_is_reviewed_as_changes_are(client: TestClient) -> None:
+    watch_run(client.app.state.station, "run-1")
+    items = "/api/sites/field/collections/findings/items"
+    person, car = client.get(items).json()["features"]
+    assert (person["id"], person["properties"]["class"], "path" in person["properties"]) == ("run-1:1", "person", False)
+    assert client.get(person["properties"]["crops"][0]).content == PICTURE
+    assert car["properties"]["crops"] == []
+    wish = {"kind": "finding", "id": "run-1:1", "verdict": "confirmed", "note": "a hiker", "revision": 0}
+    assert client.post(REVIEWS, json=wish).json()["revision"] == 1
+    assert client.post(REVIEWS, json={**wish, "verdict": "rejected"}).status_code == 409
+    assert client.post(REVIEWS, json={**wish, "id": "run-1:9"}).status_code == 404
+    assert [each["id"] for each in client.get(f"{items}?review=confirmed").json()["features"]] == ["run-1:1"]
+    given = client.get(f"{REVIEWS}?kind=finding").json()
+    assert [(each["id"], each["verdict"], each["note"]) for each in given] == [("run-1:1", "confirmed", "a hiker")]
+    assert [each["id"] for each in client.get(REVIEWS).json()] == ["run-1:1"]
+
+
+def test_a_watch_needs_no_site_and_others_see_nothing_of_it(client: TestClient) -> None:
+    results = watch_run(client.app.state.station, "run-2", site="nowhere-yet")
+    items = "/api/sites/nowhere-yet/collections/findings/items"
+    assert len(client.get(items).json()["features"]) == 2
+    wish = {"kind": "finding", "id": "run-2:2", "verdict": "rejected", "revision": 0}
+    assert client.post("/api/sites/nowhere-yet/reviews", json=wish).status_code == 201
+    assert client.get(items).json()["features"][1]["properties"]["review"] == "rejected"
+    assert client.get("/api/sites/field/collections/findings/items").json()["features"] == []
+    assert client.get("/api/sites/field/crops/finding/run-2:1/0.jpg").status_code == 404
+    assert client.get("/api/sites/nothing/collections/findings/items").status_code == 404
+    (results / "tracks.geojson").write_text("broken")
+    assert client.get("/api/sites/field/collections/findings/items").json()["features"] == []

@@ -34,7 +34,7 @@ def test_a_client_finds_its_way_from_the_landing_page(client: TestClient) -> Non
         links["conformance"]).json()["conformsTo"]
     found = client.get(links["data"]).json()["collections"]
     assert {each["id"]: each["count"] for each in found} == {
-        "frames": 8, "objects": 0, "changes": 4, "coverage": 0, "pod": 0, "track": 2,
+        "frames": 8, "objects": 0, "changes": 4, "findings": 0, "coverage": 0, "pod": 0, "track": 2,
     }
     west, south, east, north = found[0]["extent"]["spatial"]["bbox"][0]
     assert west < 13.25 < east and south < 46.5 < north
@@ -147,3 +147,14 @@ def browsers_can_ask(client: TestClient) -> bool:
     asking.start()
     asking.join(5)
     return answer == [200]
+
+
+def test_a_coverage_that_grows_is_announced(client: TestClient, root: Path) -> None:
+    """So that a page shows the holes of the flight in the air without being asked."""
+    station = client.app.state.station
+    before = station.events.last
+    for text in ('{"features": []}', '{"features": [] }'):
+        (root / "field" / "live-coverage.geojson").write_text(text)
+        time.sleep(0.5)  # the station looks five times a second
+    announced = [each for each in station.events.after(before) if each["type"] == "coverage.changed"]
+    assert [each["site"] for each in announced] == ["field", "field"]

@@ -21,6 +21,7 @@ from sorvolo.station.event_routes import event_routes
 from sorvolo.station.events import EventLog
 from sorvolo.station.exports import export_routes
 from sorvolo.station.features import feature_routes, landing_links
+from sorvolo.station.findings import Findings
 from sorvolo.station.flight_videos import FlightVideos, video_routes
 from sorvolo.station.ingest import Ingest, IngestLimits
 from sorvolo.station.inputs import Inputs
@@ -35,7 +36,7 @@ from sorvolo.station.reviews import Reviews, review_routes
 from sorvolo.station.run_routes import run_routes
 from sorvolo.station.runs import Runs
 from sorvolo.station.security import COOKIE, Doorkeeper, holder_in, needs
-from sorvolo.station.settings import STREAMS_FOLDER, StationSettings
+from sorvolo.station.settings import RUNS_FOLDER, STREAMS_FOLDER, StationSettings
 from sorvolo.station.sites import SiteShelf, readable, site_detail
 from sorvolo.station.stac import stac_routes
 from sorvolo.station.state import StationState
@@ -70,6 +71,7 @@ class Station:
     map_watch: MapWatch
     videos: FlightVideos
     place_index: PlaceIndex
+    findings: Findings
 
     @classmethod
     def open(cls, settings: StationSettings) -> "Station":
@@ -77,16 +79,17 @@ class Station:
         state, shelf = StationState.open(settings.state_folder), SiteShelf(settings.root)
         events, tiles = EventLog(state, settings.limits.most_events), WebTiles(shelf)
         uploads = Uploads(settings, events)
-        reviews = Reviews(state, shelf, events)
+        findings = Findings(state, settings.state_folder / RUNS_FOLDER)
+        reviews = Reviews(state, shelf, events, findings)
         limits = IngestLimits(
             streams=settings.limits.most_streams, free_bytes=round(settings.free_floor_gb * 1e9)
         )
         ingest = Ingest(settings.root / STREAMS_FOLDER, limits, announcing(events))
         inputs = Inputs(settings, uploads, ingest.newest)
         return cls(
-            settings, state, shelf, tiles, events, SiteCollections(shelf), reviews, ingest, uploads, inputs,
+            settings, state, shelf, tiles, events, SiteCollections(shelf, findings), reviews, ingest, uploads, inputs,
             Runs(settings, state, shelf, events, inputs, ingest.show_boxes), MapWatch(shelf, tiles, reviews, events),
-            FlightVideos(inputs), PlaceIndex(shelf),
+            FlightVideos(inputs), PlaceIndex(shelf), findings,
         )
 
     def close(self) -> None:
@@ -129,7 +132,7 @@ def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardS
     for router in (
         _about_routes(station), _site_routes(station), event_routes(station.events),
         feature_routes(station.collections, station.reviews), review_routes(station.reviews, station.shelf),
-        crop_routes(station.shelf), stream_routes(station.ingest), metrics_routes(metrics),
+        crop_routes(station.shelf, station.findings), stream_routes(station.ingest), metrics_routes(metrics),
         upload_routes(station.uploads, station.runs), run_routes(station.runs, station.inputs),
         place_routes(station.shelf, station.collections, station.reviews, station.videos, station.place_index),
         video_routes(station.shelf, station.collections, station.videos),

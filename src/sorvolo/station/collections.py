@@ -12,6 +12,7 @@ from shapely.errors import ShapelyError
 from shapely.geometry import shape
 from shapely.geometry.base import BaseGeometry
 
+from sorvolo.station.findings import Findings
 from sorvolo.station.problems import Problem
 from sorvolo.station.sites import SiteShelf
 from sorvolo.store.exports.change_files import changes_geojson
@@ -29,10 +30,12 @@ TITLES: Mapping[str, str] = {
     "frames": "Frames: what of the ground each shows, and how it was placed",
     "objects": "People, cars and small objects, each once, by the newest look at each place",
     "changes": "Changes between flights",
+    "findings": "What watches found: people, cars and small objects on no map",
     "coverage": "Ground that flights saw, and its holes; ground compared, and the rest with its reason",
     "pod": "Probability of detection of the latest measured search",
     "track": "The drone's way, one line a flight",
 }
+FINDINGS = "findings"
 SEARCH_FOLDER = "search"
 """The folder of a site in which the station keeps its latest measured search."""
 
@@ -94,8 +97,8 @@ class SiteCollections:
     A flight that is being mapped changes the site's catalogue twice a second, and none of its collections.
     """
 
-    def __init__(self, shelf: SiteShelf) -> None:
-        self._shelf = shelf
+    def __init__(self, shelf: SiteShelf, findings: Findings) -> None:
+        self._shelf, self._findings = shelf, findings
         self._kept: dict[tuple[str, str], _Kept] = {}
         self._flights: dict[tuple[str, str, str], tuple[int, FlightFrames]] = {}  # frames with their file's time
         self._lock = threading.Lock()
@@ -122,8 +125,13 @@ class SiteCollections:
 
     def get(self, site_id: str, name: str) -> Collection:
         """A collection of a site. Raises Problem (404)."""
+        if name == FINDINGS:
+            found = self._findings.of_site(site_id)
+            if not found:
+                self._shelf.folder(site_id)  # raises where there is no such site
+            return Collection.of(found)
         if name not in _MAKERS:
-            raise Problem(404, f"no collection {name[:40]!r}; there are {', '.join(_MAKERS)}")
+            raise Problem(404, f"no collection {name[:40]!r}; there are {', '.join(TITLES)}")
         archive = self._shelf.open(site_id)
         mark = (archive.change_mark(), _modified(archive, _POD_FILE), _modified(archive, LIVE_COVERAGE))
         with self._lock:

@@ -6,6 +6,7 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Depends, Response
 
 from sorvolo.geometry.arrays import ImageRGB, PointsM
+from sorvolo.station.findings import Findings
 from sorvolo.station.problems import Problem
 from sorvolo.station.security import needs
 from sorvolo.station.sites import SiteShelf
@@ -30,7 +31,7 @@ class JpegResponse(Response):
     media_type = "image/jpeg"
 
 
-def crop_routes(shelf: SiteShelf) -> APIRouter:
+def crop_routes(shelf: SiteShelf, findings: Findings) -> APIRouter:
     """Pictures by the id of what they show; never by a path."""
     cutting = CapacityLimiter(_AT_ONCE)
     router = APIRouter(prefix="/api/sites/{site}/crops", tags=["crops"], dependencies=[Depends(needs(Role.VIEW))])
@@ -55,6 +56,13 @@ def crop_routes(shelf: SiteShelf) -> APIRouter:
             raise Problem(404, "no such picture: 0 is the best one, of an object that the site has")
         data = _read(archive, f"flights/{found.flight_id}/{CROPS}/{crop_name(found.thing.id)}")
         return JpegResponse(data, headers={"cache-control": _KEPT})
+
+    @router.get("/finding/{finding_id}/{n}.jpg", response_class=JpegResponse)
+    def of_finding(site: str, finding_id: str, n: int) -> Response:
+        """What a watch found, as its best frame shows it."""
+        if n != 0:
+            raise Problem(404, "no such picture: 0 is the best one")
+        return JpegResponse(findings.crop(site, finding_id), headers={"cache-control": "private, no-cache"})
 
     @router.get("/frame/{flight}/{index}/{east_mm}/{north_mm}.jpg", response_class=JpegResponse)
     async def of_frame(site: str, flight: str, index: int, east_mm: int, north_mm: int) -> Response:

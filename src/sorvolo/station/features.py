@@ -19,7 +19,7 @@ _CONFORMS = [
 ]
 _GEOJSON = "application/geo+json"
 _MOST = 10_000
-_REVIEWED = {"objects": "object", "changes": "change"}
+_REVIEWED = {"objects": "object", "changes": "change", "findings": "finding"}
 Limit = Query(1000, ge=1, le=_MOST, description="Features at most.")
 Offset = Query(0, ge=0, le=10**9)
 
@@ -180,10 +180,15 @@ def _reviewed(features: Sequence[Feature], name: str, site: str, reviews: Review
         values = {
             **each["properties"], "review": review and review.verdict, "revision": review.revision if review else 0,
             "note": review and review.note, "reviewer": review and review.who, "reviewed_at": review and review.at,
-            "crops": crop_addresses(site, kind, str(each["id"])),
+            "crops": _crops(site, kind, each),
         }
         result.append({**each, "properties": values})
     return result
+
+
+def _crops(site: str, kind: str, feature: Feature) -> list[str]:
+    has_none = kind == "finding" and not feature["properties"].get("crop")  # not every watch keeps pictures
+    return [] if has_none else crop_addresses(site, kind, str(feature["id"]))
 
 
 def crop_addresses(site: str, kind: str, feature_id: str) -> list[str]:

@@ -33,6 +33,7 @@ class MapWatch:
     def __init__(self, shelf: SiteShelf, tiles: WebTiles, reviews: Reviews, events: EventLog) -> None:
         self._shelf, self._tiles, self._reviews, self._events = shelf, tiles, reviews, events
         self._seen: dict[str, _Seen] = {}
+        self._covered: dict[str, int] = {}  # when the coverage of the flight in the air was written, by site
         self._settled_s = 0.0
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="maps", daemon=True)
@@ -64,6 +65,7 @@ class MapWatch:
 
     def _look_at(self, site_id: str) -> None:
         archive = self._shelf.open(site_id)
+        self._look_at_coverage(site_id, archive)
         mark, before = archive.change_mark(), self._seen.get(site_id)
         if before is not None and before.mark == mark:
             return
@@ -87,6 +89,16 @@ class MapWatch:
             return False
         announced = self._events.newest("map.tiles", site_id)
         return announced is None or announced["data"]["revision"] != state.revision
+
+    def _look_at_coverage(self, site_id: str, archive: Archive) -> None:
+        """Announce that the coverage of the flight in the air is another one; when it ends, the site has changed."""
+        try:
+            written_ns = archive.live_coverage_path.stat().st_mtime_ns
+        except OSError:
+            written_ns = 0
+        if written_ns and written_ns != self._covered.get(site_id):
+            self._events.append(NewEvent("coverage.changed", {}, site_id))
+        self._covered[site_id] = written_ns
 
     def _announce(self, site_id: str, archive: Archive, state: Pyramid | None, before: Pyramid | None) -> None:
         """The tiles that changed; all of them where nobody knows what was before."""

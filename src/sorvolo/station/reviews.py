@@ -1,4 +1,4 @@
-"""Verdicts on objects and changes: each kept with who gave it and when; none is lost to another's."""
+"""Verdicts on objects, changes and findings: each kept with who gave it and when; none is lost to another's."""
 
 import sqlite3
 import threading
@@ -12,6 +12,7 @@ from pydantic import BaseModel, Field
 from sorvolo.errors import SorvoloError, StoreError
 from sorvolo.missions.site.review import review_changes, withdraw_reviews
 from sorvolo.station.events import EventLog, NewEvent
+from sorvolo.station.findings import Findings
 from sorvolo.station.problems import Problem
 from sorvolo.station.security import needs
 from sorvolo.station.sites import SiteShelf
@@ -20,13 +21,14 @@ from sorvolo.station.tokens import Holder, Role
 from sorvolo.survey.findings import Verdict
 
 NO_VERDICT = "none"
+_OF_WATCHES = "watches"  # in place of when the site was made
 _ELSEWHERE = "sorvolo review"  # who gave a verdict by the command line
 
 
 class ReviewWish(BaseModel):
-    """A verdict on an object or a change; `revision` is that of the verdict it was made upon, 0 for none."""
+    """A verdict on an object, a change or a finding; `revision` is that of the verdict it was made upon, 0 for none."""
 
-    kind: Literal["object", "change"]
+    kind: Literal["object", "change", "finding"]
     id: str = Field(min_length=1, max_length=400)
     verdict: Literal["confirmed", "rejected", "none"]
     note: str = Field("", max_length=2000)
@@ -53,8 +55,8 @@ class Reviews:
     done (`settle`).
     """
 
-    def __init__(self, state: StationState, shelf: SiteShelf, events: EventLog) -> None:
-        self._state, self._shelf, self._events = state, shelf, events
+    def __init__(self, state: StationState, shelf: SiteShelf, events: EventLog, findings: Findings) -> None:
+        self._state, self._shelf, self._events, self._findings = state, shelf, events, findings
         self._settling = threading.Lock()
         self._unsettled: set[str] = set()
         self._known: set[tuple[str, str]] = set()
@@ -63,7 +65,7 @@ class Reviews:
         """The newest verdict on each thing of a kind, by id; those given by the command line included."""
         rows = self._state.rows(
             "SELECT kind, id, MAX(revision) AS revision, verdict, note, who, at FROM reviews "
-            "WHERE site = ? AND made_utc = ? AND kind = ? GROUP BY id", (*self._key(site_id), kind),
+            "WHERE site = ? AND made_utc = ? AND kind = ? GROUP BY id", (*self._key(site_id, kind), kind),
         )
         found = {row["id"]: Review(**dict(row)) for row in rows}
         if kind == "change":
@@ -74,8 +76,9 @@ class Reviews:
         """All verdicts of a site, newest first; of one thing."""
         rows = self._state.rows(
             "SELECT kind, id, revision, verdict, note, who, at FROM reviews "
-            "WHERE site = ? AND made_utc = ? AND (? = '' OR kind = ?) AND (? = '' OR id = ?) "
-            "ORDER BY number DESC LIMIT 5000", (*self._key(site_id), kind, kind, thing_id, thing_id),
+            "WHERE site = ? AND made_utc IN (?, ?) AND (? = '' OR kind = ?) AND (? = '' OR id = ?) "
+            "ORDER BY number DESC LIMIT 5000",
+            (*self._key(site_id, kind), _OF_WATCHES, kind, kind, thing_id, thing_id),
         )
         return [Review(**dict(row)) for row in rows]
 
@@ -87,7 +90,7 @@ class Reviews:
         if wish.revision != revision:
             raise self._conflict(wish, now)
         made = Review(wish.kind, wish.id, revision + 1, wish.verdict, wish.note, who, utc_now())
-        event, key = NewEvent("review.changed", asdict(made), site_id), self._key(site_id)
+        event, key = NewEvent("review.changed", asdict(made), site_id), self._key(site_id, wish.kind)
         try:
             with self._events.appending([event]) as connection:
                 if now is not None and now.who == _ELSEWHERE:
@@ -129,11 +132,14 @@ class Reviews:
             except (Problem, SorvoloError):  # gone meanwhile, or damaged
                 self._unsettled.discard(site_id)
 
-    def _key(self, site_id: str) -> tuple[str, str]:
+    def _key(self, site_id: str, kind: str) -> tuple[str, str]:
         """Which site a verdict is of: a new site may have the name, and the ids, of one that was deleted.
 
+        Findings have the ids of their runs, which no others have, and a watch needs no site.
         Verdicts of a station of format 1 become those of the site that was there when they were given.
         """
+        if kind == "finding":
+            return site_id, _OF_WATCHES
         made_utc = self._shelf.open(site_id).created_utc
         if made_utc and (site_id, made_utc) not in self._known:
             with self._state.changing() as connection:
@@ -161,11 +167,16 @@ class Reviews:
         return found
 
     def _demand_thing(self, site_id: str, kind: str, thing_id: str) -> None:
-        archive = self._shelf.open(site_id)
-        changes, objects = archive.changes(), archive.objects()
-        ids = [each.id for each in changes] if kind == "change" else [each.thing.id for each in objects]
-        if thing_id not in ids:
+        if thing_id not in self._ids(site_id, kind):
             raise Problem(404, f"the site has no {kind} {thing_id[:80]!r}; load the list again")
+
+    def _ids(self, site_id: str, kind: str) -> list[str]:
+        if kind == "finding":
+            return [str(each["id"]) for each in self._findings.of_site(site_id)]
+        archive = self._shelf.open(site_id)
+        if kind == "change":
+            return [each.id for each in archive.changes()]
+        return [each.thing.id for each in archive.objects()]
 
     @staticmethod
     def _conflict(wish: ReviewWish, now: Review | None) -> Problem:
@@ -182,14 +193,14 @@ def review_routes(reviews: Reviews, shelf: SiteShelf) -> APIRouter:
 
     @router.get("", dependencies=[Depends(needs(Role.VIEW))])
     def history(
-        site: str, kind: Literal["", "object", "change"] = "", id: str = Query("", max_length=400),
+        site: str, kind: Literal["", "object", "change", "finding"] = "", id: str = Query("", max_length=400),
     ) -> list[dict[str, Any]]:
         """Every verdict of the site with who gave it and when, newest first."""
         return [asdict(each) for each in reviews.history(site, kind, id)]
 
     @router.post("", status_code=201)
     def give(site: str, wish: ReviewWish, holder: Holder = Depends(needs(Role.REVIEW))) -> dict[str, Any]:  # noqa: B008
-        """Confirm or reject an object or a change, or take a verdict back. 409 where another one came first."""
+        """Confirm or reject an object, a change or a finding, or take a verdict back. 409 where another came first."""
         return asdict(reviews.give(site, wish, holder.name))
 
     return router

@@ -33,7 +33,7 @@ from sorvolo.station.orders import (
     RunWish,
 )
 from sorvolo.station.problems import Problem
-from sorvolo.station.settings import StationSettings
+from sorvolo.station.settings import RUNS_FOLDER, StationSettings
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.state import StationState, compact_json, utc_after, utc_now
 from sorvolo.store.atomic import writing
@@ -80,7 +80,7 @@ class Runs:
     ) -> None:
         self._show_boxes = show_boxes
         self._settings, self._state, self._shelf, self._events, self._inputs = settings, state, shelf, events, inputs
-        self._folder = settings.state_folder / "runs"
+        self._folder = settings.state_folder / RUNS_FOLDER
         self._lock = threading.RLock()
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._lingering_s: dict[str, float] = {}  # ended by their own journal, their processes not yet: since when

@@ -27,6 +27,7 @@ class Live {
       this.ends.push(() => screen.station.events.removeEventListener(type, mine));
     };
     on("map.tiles", (data) => screen.view?.ready.then(() => this.refresh(data)));
+    on("coverage.changed", () => this.coverSoon());
     on("frame.placed", (data, event) => this.placed(data, event));
     on("run.started", (data, event) => this.started(data, event));
     on("run.progress", (data, event) => this.progressed(data, event));
@@ -46,6 +47,18 @@ class Live {
       this.screen.view.go(bounds);
     }
     if (!this.screen.opened?.versions) this.screen.view.refresh(revision, bounds);
+  }
+
+  /** Load the holes of the flight in the air anew, once at a time. */
+  async coverSoon() {
+    if (this.covering) { this.coversAgain = true; return; }
+    this.covering = true;
+    try {
+      do {
+        this.coversAgain = false;
+        await this.screen.data.load(["coverage"]);
+      } while (this.coversAgain && !this.screen.closed);
+    } catch { /* the connection's own sign shows it; the next change loads it */ } finally { this.covering = false; }
   }
 
   started(_, event) {

@@ -33,9 +33,8 @@ class Review {
     this.refresh();
   }
 
-  /** What can be judged: a watch's objects stand on no map. */
   shown(what = this.what) {
-    return this.screen.data.shown(what).filter((each) => !each.properties.watched);
+    return this.screen.data.shown(what);
   }
 
   list() {

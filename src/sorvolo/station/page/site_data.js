@@ -21,8 +21,9 @@ export class SiteData extends EventTarget {
   async load(names = NAMES) {
     await Promise.all(names.map(async (name) => {
       const kept = await features(this.id, name);
+      if (name === "objects") kept.push(...await features(this.id, "findings"));
       const watched = this.all[name].filter((each) => each.properties.watched && !kept.some(({ id }) => id === each.id));
-      this.all[name] = [...kept, ...watched]; // what a watch found is on no map, and would be gone
+      this.all[name] = [...kept, ...watched]; // what a running watch has just found is not in its file yet
     }));
     this.changed(names);
   }

@@ -1,4 +1,4 @@
-// A person's verdict on an object or change: confirm, reject, note; another's verdict meanwhile is shown, not overwritten.
+// A person's verdict on an object, a change or what a watch found: confirm, reject, note; another's verdict meanwhile is shown, not overwritten.
 
 import { post, siteUrl } from "./api.js";
 import { button, el, fill, message } from "./dom.js";
@@ -8,7 +8,7 @@ import * as words from "./words.js";
 /** Send a verdict; gives whether it was taken. */
 export async function judge(screen, feature, verdict, note = null) {
   const values = feature.properties;
-  const kind = isChange(feature) ? "change" : "object";
+  const kind = isChange(feature) ? "change" : values.watched ? "finding" : "object";
   try {
     const made = await post(siteUrl(screen.data.id, "reviews"),
       { kind, id: feature.id, verdict, note: note ?? values.note ?? "", revision: values.revision ?? 0 });
@@ -40,7 +40,6 @@ export function verdictLine(feature) {
 
 /** Buttons and a note for a feature. */
 export function verdictForm(screen, feature, { keys = false } = {}) {
-  if (feature.properties.watched) return el("p", { class: "note" }, "Reported by a watch. Verdicts are given on what a map or a comparison holds.");
   const may = screen.station.status.role !== "view";
   const line = el("div", {}, verdictLine(feature));
   if (!may) return el("div", {}, line, el("p", { class: "note" }, "Your token may look, not review."));
