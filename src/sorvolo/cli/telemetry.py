@@ -65,11 +65,19 @@ def telemetry_command(
     with opened_site(site or source, writes=bool(site)) as place:
         if site:
             _map_if_new(Path(source), place, telemetry, camera)
-        target = out or place.results("telemetry") / (flight or Path(source.rstrip("/")).stem)
+        target = out or _results(place, flight, source)
         report = correct_telemetry(
             place.folder, target, flight=flight, source=None if from_site else Path(source),
             telemetry=telemetry or None, camera=camera or None, cot=receiver,
         )
+    _print(report, target, as_json=as_json)
+
+
+def _results(place: OpenedSite, flight: str, source: str) -> Path:
+    return place.results("telemetry") / (flight or Path(source.rstrip("/")).stem)
+
+
+def _print(report: Mapping[str, Any], target: Path, *, as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps({"folder": str(target), **report}, indent=1))
     else:
