@@ -12,6 +12,7 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,20 @@ from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes
 
 Key = tuple[str, str]
 _SCHEME = "ray://"
-_REACH_S, _PROBE_S, _AGAIN_S, _LOOK_S, _CANCEL_S = 8.0, 90.0, 0.5, 2.0, 10.0
+
+
+@dataclass(frozen=True)
+class WaitSettings:
+    """How long a cluster's answers are waited for, s. Chosen, not measured, for machines in one network."""
+
+    reach_s: float = 8.0  # a connection to the head, which takes milliseconds
+    probe_s: float = 90.0  # the first task on every machine: Ray starts a process for it before
+    again_s: float = 0.5  # between two questions which machines are there
+    ending_s: float = 2.0  # in one wait for a try to end, between which Ctrl-C is noticed
+    cancel_s: float = 10.0  # tasks that are cancelled
+
+
+_WAITS = WaitSettings()
 
 
 @contextmanager
@@ -117,7 +131,8 @@ class RayExecutor:
         ended: list[Any] = []
         with self._cluster():
             while not ended:
-                ended, _ = self._ray.wait(list(self._running.values()), num_returns=1, timeout=timeout_s or _LOOK_S)
+                wait_s = timeout_s or _WAITS.ending_s
+                ended, _ = self._ray.wait(list(self._running.values()), num_returns=1, timeout=wait_s)
                 if not ended and timeout_s is not None:
                     return None
             key = next(each for each, task in self._running.items() if task == ended[0])
@@ -135,7 +150,7 @@ class RayExecutor:
             for key, task in self._running.items():
                 if key not in self._actors:
                     self._ray.cancel(task, force=True)
-            self._ray.wait(list(self._running.values()), num_returns=len(self._running), timeout=_CANCEL_S)
+            self._ray.wait(list(self._running.values()), num_returns=len(self._running), timeout=_WAITS.cancel_s)
 
     def _ending(self, task: Any) -> Ending:
         try:
@@ -274,7 +289,7 @@ def _demand_reachable(name: str) -> None:
     _demand_listening(name, address)
     try:
         with grpc.insecure_channel(address) as channel:  # it may be something else that listens there
-            grpc.channel_ready_future(channel).result(timeout=_REACH_S)
+            grpc.channel_ready_future(channel).result(timeout=_WAITS.reach_s)
     except grpc.FutureTimeoutError:
         raise SettingsError(f"--executor {name}: {address} is not a Ray cluster") from None
 
@@ -283,7 +298,7 @@ def _demand_listening(name: str, address: str) -> None:
     """Raise SettingsError where nothing listens at HOST:PORT."""
     host, _, port = address.rpartition(":")
     try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=_REACH_S).close()
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_WAITS.reach_s).close()
     except (OSError, OverflowError, ValueError) as error:
         how = (
             f"start one on that machine: ray start --head --ray-client-server-port {port}" if name.startswith(_SCHEME)
@@ -323,7 +338,7 @@ def _answers_of_machines(path: str, word: str) -> list[tuple[str, str, bool]]:
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     probe: Any = ray.remote(_probe_of(path, word))
-    end_s, answers = time.monotonic() + _PROBE_S, []
+    end_s, answers = time.monotonic() + _WAITS.probe_s, []
     waiting = {each["NodeID"] for each in _working(ray)}
     while waiting:
         asked = {
@@ -342,7 +357,7 @@ def _answers_of_machines(path: str, word: str) -> list[tuple[str, str, bool]]:
             except ray.exceptions.RayError as error:
                 raise _no_tasks(error) from error
         if waiting:
-            time.sleep(_AGAIN_S)
+            time.sleep(_WAITS.again_s)
             waiting &= {each["NodeID"] for each in _working(ray)}
     return answers
 
