@@ -10,6 +10,7 @@ from sorvolo.geometry.arrays import ImageRGB, Mask, Matrix3
 from sorvolo.survey.findings import ComparedView
 
 _BLACK_LEVEL = 8.0  # grey levels added before logarithms: below it a camera shows noise, not light
+_OCTAVES = np.log2(np.arange(256, dtype=np.float32) + np.float32(_BLACK_LEVEL))  # of each grey level
 _SKY = np.array([0.7, -0.7], np.float32)  # blue and red over green, by which light from the sky differs from the sun's
 
 Signs = NDArray[np.float32]
@@ -66,7 +67,7 @@ def area_signs(
     valid = view.valid if leans is None else view.valid & ~leans
     known = np.asarray(cv2.resize(valid.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255)
     before, after = (_octaves(image, size) for image in (view.reference, view.image))
-    levels = [each.mean(axis=2) for each in (before, after)]
+    levels = [_level(each) for each in (before, after)]
     likeness, detail, _ = _structure(levels[0], levels[1], settings)
     surface = _colour(after)
     brighter = _centred(_blurred(levels[1] - levels[0], settings.colour_px), known)
@@ -84,7 +85,7 @@ def leaning(
     height, width = seen.shape
     scale = min(1.0, settings.side_px / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    before, after = (_octaves(image, size).mean(axis=2) for image in (reference, picture))
+    before, after = (_level(_octaves(image, size)) for image in (reference, picture))
     likeness, _, rough = _structure(before, after, settings)
     found = (likeness < settings.leans) & (rough > settings.rough)
     window = np.ones((settings.window_px, settings.window_px), np.uint8)
@@ -144,4 +145,9 @@ def _colour(octaves: Signs) -> Signs:
 
 def _octaves(image: NDArray[np.uint8], size: tuple[int, int]) -> Signs:
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(np.log2(small.astype(np.float32) + _BLACK_LEVEL), np.float32)
+    return np.asarray(cv2.LUT(small, _OCTAVES), np.float32)
+
+
+def _level(octaves: Signs) -> Signs:
+    """(h, w) the mean of the three colours; a sum of planes is five times as fast as NumPy's along a short axis."""
+    return np.asarray((octaves[..., 0] + octaves[..., 1] + octaves[..., 2]) / np.float32(3), np.float32)
