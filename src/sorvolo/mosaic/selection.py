@@ -14,10 +14,6 @@ from sorvolo.registration.features import gray_from_rgb, normalise_contrast, sha
 from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
 
 _SMALL_PX = 256
-_UNTIMED_STEP_S = 0.2  # candidates of a video without telemetry, or live: five a second, the pictures decide
-_LIVE_SPEED_M_S = 5.0  # at least: a flight that has just begun does not show yet how fast it will be
-_USUAL = 25  # frames that show how sharp the flight's usually are
-_SPARSE_SHARE = 2 / 3  # of the way between keyframes that frames which are looked at may lie apart
 _COPIES_KEPT = 16  # more than wait between the decoder and the selection
 _COARSE_PX = 64  # at which a sensor's noise averages out and ground still shows itself
 
@@ -31,10 +27,20 @@ class SelectionSettings:
     blurred: float = 0.6  # of the usual sharpness: wait for a better one
     useless: float = 0.35  # of the usual sharpness: reject
     bare_levels: float = 0.6  # of gray, spread at 64 px: one gray 0, with noise 0.5, the barest real field 2.2
+    usual: int = 25  # frames that show how sharp the flight's usually are
+    sparse_share: float = 2 / 3  # of the way between keyframes that decoded frames may lie apart (decision 0033)
 
     def __post_init__(self) -> None:
         if not 0 < self.least_overlap <= self.overlap < 1:
             raise SettingsError(f"overlap must lie between {self.least_overlap} and 1, got {self.overlap}")
+
+
+@dataclass(frozen=True)
+class CandidateSettings:
+    """Which frames are looked at where telemetry does not show how fast the flight is."""
+
+    step_s: float = 0.2  # five a second: the pictures decide
+    live_speed_m_s: float = 5.0  # at least, of a live flight that has just begun: a drone's usual speed over a survey
 
 
 @dataclass(frozen=True)
@@ -74,16 +80,21 @@ def interval_s(camera: Camera, height_m: float, speed_m_s: float, overlap: float
     return float(np.clip(length_m * (1 - overlap) / max(speed_m_s, 0.1), 0.02, 10.0))
 
 
-def untimed_plan(*, is_video: bool, expected: int) -> FramePlan:
+def untimed_plan(
+    *, is_video: bool, expected: int, settings: CandidateSettings = CandidateSettings()
+) -> FramePlan:
     """The plan of a flight of unknown speed: a video's pictures are asked five times a second, photos are all taken."""
-    step_s = _UNTIMED_STEP_S if is_video else 0.0
+    step_s = settings.step_s if is_video else 0.0
     return FramePlan(step_s, 0.0, expected)
 
 
-def live_plan(camera: Camera, height_m: float, speed_m_s: float, overlap: float, *, by_pictures: bool) -> FramePlan:
+def live_plan(
+    camera: Camera, height_m: float, speed_m_s: float, overlap: float, *, by_pictures: bool,
+    settings: CandidateSettings = CandidateSettings(),
+) -> FramePlan:
     """The plan of a video that has just begun and does not show yet how fast it will be."""
-    keyframe_s = interval_s(camera, height_m, max(speed_m_s, _LIVE_SPEED_M_S), overlap)
-    step_s = _UNTIMED_STEP_S if by_pictures else min(keyframe_s, 2.0)
+    keyframe_s = interval_s(camera, height_m, max(speed_m_s, settings.live_speed_m_s), overlap)
+    step_s = settings.step_s if by_pictures else min(keyframe_s, 2.0)
     return FramePlan(step_s, 0.5 * keyframe_s if by_pictures else 0.0, 2)
 
 
@@ -141,7 +152,7 @@ def select_keyframes(
         typical = float(np.median(memory.usual)) if memory.usual else clarity
         texture = normalise_contrast(gray)
         overlap = 0.0 if memory.last is None or keep_all else _overlap(memory.last, texture)
-        memory = SelectionMemory(memory.last, (*memory.usual, clarity)[-_USUAL:], memory.count + 1)
+        memory = SelectionMemory(memory.last, (*memory.usual, clarity)[-settings.usual:], memory.count + 1)
         reason = _reason_if_selected(overlap, clarity, typical, memory.count, settings)
         if reason is None:
             continue
@@ -158,7 +169,8 @@ def shows_all_between(old: ImageGray, new: ImageGray, settings: SelectionSetting
     """
     if sharpness(new) < settings.blurred * sharpness(old):
         return False
-    return 1 - _overlap(normalise_contrast(old), normalise_contrast(new)) <= _SPARSE_SHARE * (1 - settings.overlap)
+    moved = 1 - _overlap(normalise_contrast(old), normalise_contrast(new))
+    return moved <= settings.sparse_share * (1 - settings.overlap)
 
 
 class SmallCopies:
