@@ -17,7 +17,7 @@ def another(flown: Path, folder: Path) -> Path:
 
 
 def content(site: Path) -> dict[str, bytes]:
-    """A site's files by name, less the catalogue and what tells how long it took."""
+    """A site's files by name, less the catalogue and what states how long it took."""
     found = {}
     for path in sorted(site.rglob("*")):
         if not path.is_file() or path.name.startswith("site.") or path.name in _TIMED:

@@ -1,4 +1,4 @@
-"""Live streams side by side: one whose process dies is started again, all are finished when they are told to end."""
+"""Live streams side by side: one whose process dies is started again, all are finished when they are asked to end."""
 
 import os
 import signal

@@ -178,8 +178,8 @@ def test_a_watch_of_a_growing_file_goes_on(
     path, folder, alerts = tmp_path / "film.ts", tmp_path / "watch", tmp_path / "sent"
     write_film(path, flight, 20, metadata=metadata)
     detector = Following(filmed)
-    told = f"{sys.executable} -c \"open('{alerts}', 'a').write('{{id}} ')\""
-    outputs = WatchOutputs(folder=folder, save="pictures", labels=("coco",), alert_command=told)
+    command = f"{sys.executable} -c \"open('{alerts}', 'a').write('{{id}} ')\""
+    outputs = WatchOutputs(folder=folder, save="pictures", labels=("coco",), alert_command=command)
     settings = WatchSettings(every=1)
 
     def watched() -> Generator[WatchUpdate]:

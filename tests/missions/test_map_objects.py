@@ -91,7 +91,7 @@ def test_map_finds_each_object_once(simulated: Path, mapped: Path) -> None:
 
 
 def test_report_crops_and_site_file(mapped: Path) -> None:
-    """The report tells what was found and shows it; the crops are pictures; both files hold the same objects."""
+    """The report states what was found and shows it; the crops are pictures; both files hold the same objects."""
     reported = report_of(mapped, "flight1")["objects"]
     own = json.loads((mapped / "flights/flight1/objects.geojson").read_text())["features"]
     assert reported["count"] == len(own) == sum(reported["classes"].values()) == len(reported["list"])

@@ -47,8 +47,8 @@ def watched(
     settings: WatchSettings = WatchSettings(),  # noqa: B008
 ) -> list[WatchUpdate]:
     """Watch a flight, with alerts to a program that writes their ids to a file."""
-    told = f"{sys.executable} -c \"open('{alerts}', 'a').write('{{id}} ')\""
-    outputs = WatchOutputs(folder=folder, save="pictures", labels=("coco",), alert_command=told)
+    command = f"{sys.executable} -c \"open('{alerts}', 'a').write('{{id}} ')\""
+    outputs = WatchOutputs(folder=folder, save="pictures", labels=("coco",), alert_command=command)
     updates = []
     for each in watch(video, settings, outputs, camera="aov=70", detector=detector):
         updates.append(each)

@@ -81,8 +81,8 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[_Server]:
 def _refused(words: str) -> None:
     with pytest.raises(StoreError, match=words) as caught:
         BucketEnd(open_objects(f"s3://{BUCKET}/field", _QUICK)).manifest()
-    told = f"{caught.value!r} {caught.value.__cause__!r} {caught.value.__suppress_context__}"
-    assert SECRET not in told and KEY not in told and told.endswith("True")
+    shown = f"{caught.value!r} {caught.value.__cause__!r} {caught.value.__suppress_context__}"
+    assert SECRET not in shown and KEY not in shown and shown.endswith("True")
 
 
 @pytest.mark.parametrize(("status", "code", "words"), [

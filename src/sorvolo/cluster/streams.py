@@ -92,15 +92,15 @@ class _Streams:
         self.rows = {row.key: row for row in rows}
         self._addresses = {row.key: each.address for row, each in zip(rows, streams)}
         self._due_s: dict[Key, float] = dict.fromkeys(self.rows, 0.0)  # those that wait for their start
-        self._told = False
+        self._is_finishing = False
         self.tries = self.crashes = 0
 
     def through(self) -> Generator[BatchUpdate]:
         """Run them all until each has ended."""
         while self._due_s or self._executor.running:
             yield from self._begin()
-            if self._until.is_set() and not self._told:
-                self._told = True
+            if self._until.is_set() and not self._is_finishing:
+                self._is_finishing = True
                 for key in self._executor.running:
                     self._executor.finish(key)
             if self._executor.running:

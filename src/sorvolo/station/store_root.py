@@ -58,7 +58,7 @@ class StoreRoot:
 
     def keep(self, until: threading.Event) -> None:
         """Step again and again until the event is set, and once more; what fails is logged, once for each reason."""
-        told: dict[str, str] = {}
+        reported: dict[str, str] = {}
         is_last = False
         while not is_last:
             is_last = until.wait(_EVERY_S)
@@ -67,9 +67,9 @@ class StoreRoot:
             except SorvoloError as error:
                 faults = {self._objects.name: str(error)}
             for name, fault in faults.items():
-                if told.get(name) != fault:
+                if reported.get(name) != fault:
                     _LOG.warning("%s is not in step with its store: %s", name, fault)
-            told = faults
+            reported = faults
 
     def _step_site(self, name: str, working: WorkingCopy) -> Generator[CopyUpdate, None, None]:
         with tempfile.TemporaryDirectory(prefix="sorvolo-") as scratch:
