@@ -1,13 +1,15 @@
 """A flight mapped in blocks gives the map that it gives when it is mapped whole; what cannot be divided is named."""
 
+import json
 import os
 import shutil
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -15,10 +17,11 @@ import pytest
 
 from ended_work import ended
 from small_flights import simulate_into, small_flight
+from sorvolo.cluster import worker
 from sorvolo.cluster.batch import BatchReport, BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.local_executor import LocalExecutor
-from sorvolo.cluster.orders import FlightWish, Mission, Order, PartKind
+from sorvolo.cluster.orders import Ending, FlightWish, Mission, Order, Outcome, PartKind
 from sorvolo.cluster.table import BatchTable, State
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.homography import apply_homography
@@ -57,19 +60,41 @@ class Disturbed(LocalExecutor):
             os.kill(self._running[key][0].pid, signal.SIGSEGV)
 
 
-class Noting(LocalExecutor):
-    """A local executor that keeps what it was asked to do."""
+class Here:
+    """An executor that does each order at once, in this process, as a worker would; `orders` is what it did."""
 
     orders: ClassVar[list[Order]] = []
+    cache_mb = 64.0
 
-    def start(self, key: tuple[str, str], order: Order, cost: Cost) -> None:
+    def __init__(self, _workers: int, _stall_s: float, _lock: int) -> None:
+        self.running: dict[tuple[str, str], Ending] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def has_room(self, _: Cost) -> bool:
+        return not self.running
+
+    def start(self, key: tuple[str, str], order: Order, _: Cost) -> None:
+        received = Order.of(json.loads(order.line())["order"])
+        assert received == order
+        flight, words, is_good = worker._done(received, lambda *_: None, threading.Event())
         self.orders.append(order)
-        super().start(key, order, cost)
+        self.running[key] = Ending(Outcome.DONE if is_good else Outcome.DOUBTFUL, words, flight)
+
+    def finish(self, _: tuple[str, str]) -> None:
+        raise AssertionError("nothing is live")
+
+    def next_ended(self, timeout_s: float | None = None) -> tuple[tuple[str, str], Ending] | None:
+        return self.running.popitem() if self.running else None
 
 
-def run(flight: Flown, root: Path, blocks: int, by: type[LocalExecutor], most_tries: int = 3) -> BatchReport:
+def run(flight: Flown, root: Path, blocks: int, by: type[LocalExecutor | Here], most_tries: int = 3) -> BatchReport:
     @contextmanager
-    def executor(table: BatchTable) -> Iterator[LocalExecutor]:
+    def executor(table: BatchTable) -> Iterator[LocalExecutor | Here]:
         with by(2, 300.0, table.lock) as made:
             yield made
 
@@ -82,7 +107,7 @@ def run(flight: Flown, root: Path, blocks: int, by: type[LocalExecutor], most_tr
 def divided(flight: Flown, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BatchReport, BatchReport]:
     """The root of a batch in two blocks, one of which crashed: what came of that, and of the same command again."""
     root = tmp_path_factory.mktemp("divided") / "maps"
-    return root, run(flight, root, 2, Disturbed, most_tries=1), run(flight, root, 2, Noting)
+    return root, run(flight, root, 2, Disturbed, most_tries=1), run(flight, root, 2, Here)
 
 
 def test_a_block_that_ends_its_process_each_time_sets_the_flight_aside(
@@ -114,7 +139,7 @@ def test_the_map_in_blocks_is_that_of_one_machine(
         assert set(ours) == set(theirs)
         for tile in theirs:
             assert np.abs(ours[tile].astype(int) - theirs[tile]).mean() < 0.1  # of 255, over all pixels
-    parts = {(each.part.kind, each.part.number) for each in Noting.orders if each.part is not None}
+    parts = {(each.part.kind, each.part.number) for each in Here.orders if each.part is not None}
     assert parts == {(PartKind.BLOCK, 1), (PartKind.TILES, 0), (PartKind.TILES, 1)}  # the block that was whole stayed
     assert sorted(path.name for path in root.iterdir()) == ["batch.jsonl", "batch.lock", "photos"]
 
@@ -122,7 +147,7 @@ def test_the_map_in_blocks_is_that_of_one_machine(
 def test_a_flight_in_blocks_is_known_afterwards(
     divided: tuple[Path, BatchReport, BatchReport], flight: Flown
 ) -> None:
-    report = run(flight, divided[0], 3, Noting)
+    report = run(flight, divided[0], 3, Here)
     assert (report.tries, report.counts()) == (0, {"known": 1})
 
 
