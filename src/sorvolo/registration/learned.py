@@ -16,6 +16,7 @@ _CELL_PX = 8  # the network gives one descriptor a cell of this side
 _WHOLE_PX = 32  # its input's sides are multiples of this
 _LEAST_POINT = 0.05  # of a place's probability of being a point, as published
 _LEAST_LIKENESS = 0.5  # cosine of two descriptors: less is no pair, however alone
+_ROWS = 64  # so many points at a time are compared with all others: what they make stays in the processor's cache
 _APART_PX = 5  # side of the window in which a point must be the likeliest
 
 LEARNED = "xfeat"
@@ -54,16 +55,25 @@ def match_learned(
     """
     if not len(new) or not len(old):
         return np.zeros((0, 2), np.int64)
-    likeness = new.descriptors @ old.descriptors.T
+    expected = None
     if new_from_old is not None:
         expected = np.nan_to_num(apply_homography(new_from_old, old.points_px), nan=1e9).astype(np.float32)
-        here = new.points_px.astype(np.float32)
-        far = (here[:, :1] - expected[:, 0]) ** 2 + (here[:, 1:] - expected[:, 1]) ** 2 > radius_px**2
-        likeness[far] = -1.0
-    nearest, back = likeness.argmax(axis=1), likeness.argmax(axis=0)
-    rows = np.arange(len(new))
-    mutual = (back[nearest] == rows) & (likeness[rows, nearest] > _LEAST_LIKENESS)
-    return np.column_stack([rows[mutual], nearest[mutual]]).astype(np.int64)
+    here = new.points_px.astype(np.float32)
+    ours, theirs = (np.asarray(each.descriptors, np.float32) for each in (new, old))
+    nearest, likest = np.zeros(len(new), np.int64), np.zeros(len(new), np.float32)
+    likest_back = np.full(len(old), -1.0, np.float32)
+    for start in range(0, len(new), _ROWS):
+        part = slice(start, start + _ROWS)
+        likeness = ours[part] @ theirs.T
+        if expected is not None:
+            across, down = here[part, :1] - expected[:, 0], here[part, 1:] - expected[:, 1]
+            np.copyto(likeness, -1.0, where=across * across + down * down > radius_px**2)
+        nearest[part], likest[part] = likeness.argmax(axis=1), likeness.max(axis=1)
+        np.maximum(likest_back, likeness.max(axis=0), out=likest_back)
+    rows = np.flatnonzero((likest == likest_back[nearest]) & (likest > _LEAST_LIKENESS))
+    _, first = np.unique(nearest[rows], return_index=True)  # of new ones that are as like, the first
+    rows = rows[np.sort(first)]
+    return np.column_stack([rows, nearest[rows]]).astype(np.int64)
 
 
 def _sampled(planes: Floats32, points_px: PointsPx) -> Floats32:
