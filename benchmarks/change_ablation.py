@@ -207,7 +207,7 @@ def record_all(cache: Path, real: Path | None, presets: Sequence[str] | None, se
 
 def record_dates(cache: Path, data: Path) -> None:
     """Compare the first pair of real dates, whose changes are drawn by hand; the later date has its attitude."""
-    folder, (earlier, later) = cache / "dates", real_dates.HELD_OUT[0].split("/")
+    folder, (earlier, later) = cache / "dates", real_dates.DEVELOPMENT[0].split("/")
     if (folder / "recorded.pickle").is_file():
         return
     first, size_px = real_dates.fly(data, earlier, 2)

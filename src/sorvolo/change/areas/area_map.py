@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.change.areas.ground_pictures import GroundPictures, GroundPictureSettings
+from sorvolo.change.areas.ground_sums import GroundSums
 from sorvolo.change.areas.segments import AreaSettings, GroundSigns, segments
 from sorvolo.change.areas.signs import AreaSigns, SignSettings, area_signs
-from sorvolo.change.evidence.cells import CellWindow, window_around
 from sorvolo.change.shape.outlines import mask_of, measures, outline_of
 from sorvolo.geometry.arrays import Mask, PointsM
 from sorvolo.geometry.homography import apply_homography
@@ -63,53 +63,55 @@ class AreaMap:
 
     def __init__(self, settings: AreaMapSettings = AreaMapSettings()) -> None:
         self._settings = settings
-        self._cell_m = 0.0
-        self._window = CellWindow(0, 0, 0, 0)
-        self._sums: dict[str, NDArray[np.float32]] = {name: np.zeros((0, 0), np.float32) for name in _SUMS}
+        self._ground = GroundSums(_SUMS, 0.0, settings.most_cells)
         self._times_ns: list[int] = []
         self._residuals_m: list[float] = []
         self._pictures = GroundPictures(1.0, settings.pictures)
 
     def add(self, view: ComparedView, leans: Mask | None = None) -> None:
         """Take in one view, of which earlier pictures show that some ground `leans` (h, w)."""
-        height, width = view.valid.shape
-        if not self._cell_m:
-            settings = self._settings
-            coarser = max(1.0, max(height, width) / settings.signs.side_px)
-            self._cell_m = settings.cell_px * view.m_per_px * coarser
-            self._pictures = GroundPictures(self._cell_m / settings.picture_px, settings.pictures)
-        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
-        window = window_around(apply_homography(view.site_from_image, corners), self._cell_m)
-        if not self._grow(window):
+        settings = self._settings
+        if not self._ground.cell_m:
+            coarser = max(1.0, max(view.valid.shape) / settings.signs.side_px)
+            cell_m = settings.cell_px * view.m_per_px * coarser
+            self._ground = GroundSums(_SUMS, cell_m, settings.most_cells)
+            self._pictures = GroundPictures(cell_m / settings.picture_px, settings.pictures)
+        window = self._ground.window_of(view)
+        if not self._ground.make_room(window):
             return
-        laid = self._laid(view, area_signs(view, leans, self._settings.signs), window)
-        part = window.within(self._window)
-        for name, values in laid.items():
-            self._sums[name][part] += values
+        signs = area_signs(view, leans, settings.signs)
+        planes = {
+            "agree": _differs(signs, settings.segments, settings.votes.own_units), "likeness": signs.likeness,
+            "blue": signs.colour[..., 0], "red": signs.colour[..., 1], "detail": signs.detail,
+            "blue_now": signs.surface[..., 0], "red_now": signs.surface[..., 1],
+        }
+        known = signs.known.astype(np.float32)
+        laid = self._ground.add(window, view.site_from_image @ signs.view_from_signs, planes, known)
         self._times_ns.append(view.time_ns)
         if np.isfinite(view.residual_px):
             self._residuals_m.append(view.residual_px * view.m_per_px)
         rows, columns = np.nonzero(laid["agree"])
         if len(rows):
             cells = np.column_stack([columns, rows]).astype(float)
-            self._pictures.show(view, apply_homography(window.site_from_cell(self._cell_m), cells))
+            self._pictures.show(view, apply_homography(window.site_from_cell(self._ground.cell_m), cells))
 
     def conclude(self, id_prefix: str, first_number: int) -> tuple[Change, ...]:
         """After the last view: all areas, the largest first, numbered from `first_number` on."""
-        seen, votes = self._sums["seen"], self._settings.votes
+        sums, votes = self._ground.sums, self._settings.votes
+        seen = sums["seen"]
         if not seen.size:
             return ()
         known = seen >= votes.least_views
-        mean = {name: np.asarray(values / np.maximum(seen, 1), np.float32) for name, values in self._sums.items()}
+        mean = {name: np.asarray(values / np.maximum(seen, 1), np.float32) for name, values in sums.items()}
         colour, surface = np.dstack([mean["blue"], mean["red"]]), np.dstack([mean["blue_now"], mean["red_now"]])
         signs = GroundSigns(mean["likeness"], colour, mean["detail"], surface, known)
         found = []
         for cells, units in segments(signs, self._settings.segments):
-            if np.count_nonzero(cells) * self._cell_m**2 < self._settings.segments.least_m2:
+            if np.count_nonzero(cells) * self._ground.cell_m**2 < self._settings.segments.least_m2:
                 continue
             agreement = float(mean["agree"][cells].mean())
             score = agreement * min(1.0, units / votes.sure_units)
-            views = float(self._sums["agree"][cells].mean())
+            views = float(sums["agree"][cells].mean())
             is_shown = agreement >= votes.agreeing_share and views >= votes.agreeing_views
             if is_shown and score >= votes.least_score:
                 found.append(self._record(cells, score))
@@ -119,7 +121,8 @@ class AreaMap:
     # ---- inside -----------------------------------------------------------------------------------------------
 
     def _record(self, cells: Mask, score: float) -> Change:
-        site_from_cell = self._window.site_from_cell(self._cell_m)
+        cell_m = self._ground.cell_m
+        site_from_cell = self._ground.window.site_from_cell(cell_m)
         outline_m = outline_of(cells, site_from_cell, 0.5, 1.0)
         if outline_m is None:
             raise AssertionError("an area has cells")
@@ -127,53 +130,9 @@ class AreaMap:
         residual_m = float(np.mean(self._residuals_m)) if self._residuals_m else 0.0
         return Change(
             "", ChangeKind.AREA, score, outline_m, min(self._times_ns), max(self._times_ns),
-            round(float(self._sums["agree"][cells].mean())), float(np.count_nonzero(cells)) * self._cell_m**2,
-            size.length_m, float(np.hypot(residual_m, self._cell_m / np.sqrt(12))), self._pictures.patch(outline_m),
+            round(float(self._ground.sums["agree"][cells].mean())), float(np.count_nonzero(cells)) * cell_m**2,
+            size.length_m, float(np.hypot(residual_m, cell_m / np.sqrt(12))), self._pictures.patch(outline_m),
         )
-
-    def _grow(self, window: CellWindow) -> bool:
-        """Make the raster hold a window; whether it does."""
-        old = self._window
-        new = window if 0 in old.shape else old.joined(window)
-        if new == old:
-            return True
-        spare = max(new.shape) // 4
-        new = CellWindow(
-            *(min(new.x0, old.x0 - spare if new.x0 < old.x0 else new.x0),
-              min(new.y0, old.y0 - spare if new.y0 < old.y0 else new.y0)),
-            *(max(new.x1, old.x1 + spare if new.x1 > old.x1 else new.x1),
-              max(new.y1, old.y1 + spare if new.y1 > old.y1 else new.y1)),
-        )
-        if new.shape[0] * new.shape[1] > self._settings.most_cells:
-            return False
-        part = old.within(new)
-        for name, values in self._sums.items():
-            self._sums[name] = np.zeros(new.shape, np.float32)
-            if values.size:
-                self._sums[name][part] = values
-        self._window = new
-        return True
-
-    def _laid(self, view: ComparedView, signs: AreaSigns, window: CellWindow) -> dict[str, NDArray[np.float32]]:
-        """What the view adds to the sums in a window."""
-        cell_from_signs = (
-            np.linalg.inv(window.site_from_cell(self._cell_m)) @ view.site_from_image @ signs.view_from_signs
-        )
-
-        def laid(values: NDArray[np.float32]) -> NDArray[np.float32]:
-            found = cv2.warpPerspective(
-                values, cell_from_signs, window.shape[::-1], flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
-            )
-            return np.asarray(found * seen, np.float32)
-
-        seen = np.ones(window.shape, np.float32)
-        seen = (laid(signs.known.astype(np.float32)) > 0.99).astype(np.float32)
-        differs = _differs(signs, self._settings.segments, self._settings.votes.own_units)
-        return {
-            "seen": seen, "agree": laid(differs), "likeness": laid(signs.likeness),
-            "blue": laid(signs.colour[..., 0]), "red": laid(signs.colour[..., 1]), "detail": laid(signs.detail),
-            "blue_now": laid(signs.surface[..., 0]), "red_now": laid(signs.surface[..., 1]),
-        }
 
 
 def _differs(signs: AreaSigns, settings: AreaSettings, own_units: float) -> NDArray[np.float32]:

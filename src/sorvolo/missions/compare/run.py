@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from sorvolo.change.areas.area_map import AreaMap, with_areas
+from sorvolo.change.areas.gathered_things import GatheredThings
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
 from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
 from sorvolo.change.map_update import paint_changes
@@ -96,6 +97,7 @@ class CompareRun:
         self._views = _view_maker(setup, archive, settings, base_version)
         self._evidence: EvidenceMap | None = None
         self._areas = AreaMap()
+        self._gathered = GatheredThings() if _is_coarse(setup, archive, settings) else None
         self._rejected = [
             KnownPlace(each.outline_m, each.kind) for each in archive.reviews()
             if each.verdict is Verdict.REJECTED and each.flight_id != source.name
@@ -249,6 +251,8 @@ class CompareRun:
             announced: Sequence[Change] = self._reported(self._evidence.add(view))
             if self._settings.method != "thesis":
                 self._areas.add(view, leans)
+            if self._gathered is not None:
+                self._gathered.add(view, leans)
         if announced:
             with self._log.stage(Stage.DETECT):
                 announced = self._objects.named(announced)
@@ -257,12 +261,15 @@ class CompareRun:
         return tuple(announced)
 
     def _found(self) -> Sequence[Change]:
-        """All changes of the flight, after its last view: things, and ground that changed as an area."""
+        """All changes of the flight, after its last view: things, ground that changed as an area, and what only all
+        views together show."""
         if self._evidence is None:
             return ()
         things = self._evidence.conclude()
-        areas = self._areas.conclude(self._setup.source.name, self._evidence.next_number)
-        return with_areas(things, areas)
+        name, first = self._setup.source.name, self._evidence.next_number
+        areas = self._areas.conclude(name, first)
+        found = with_areas(things, areas)
+        return found + ([] if self._gathered is None else self._gathered.conclude(name, first + len(areas), found))
 
     def _reported(self, changes: Sequence[Change]) -> list[Change]:
         return reported(changes, self._map_sigma_m, self._rejected)
@@ -312,14 +319,23 @@ class CompareRun:
         }
 
 
+def _is_coarse(
+    setup: FlightSetup, archive: Archive, settings: CompareSettings, sizes: ViewSizes = ViewSizes()
+) -> bool:
+    """Whether photos are compared with a map so coarse that its things have few pixels: then they are compared larger,
+    and by learned features as well."""
+    is_of_photos = setup.source.kind == "photos" and settings.method != "thesis"
+    return is_of_photos and archive.site_grid().grid.m_per_px > sizes.fine_m_per_px
+
+
 def _view_maker(
     setup: FlightSetup, archive: Archive, settings: CompareSettings, base_version: int, sizes: ViewSizes = ViewSizes(),
 ) -> ViewMaker:
     source, site_grid = setup.source, archive.site_grid()
     side_px = settings.side_px or (sizes.video_px if source.kind == "video" else sizes.photo_px)
     finer = 1.0
-    if source.kind == "photos" and settings.method != "thesis":
-        finer = max(1.0, min(sizes.photo_finer, site_grid.grid.m_per_px / sizes.fine_m_per_px))
+    if _is_coarse(setup, archive, settings, sizes):
+        finer = min(sizes.photo_finer, site_grid.grid.m_per_px / sizes.fine_m_per_px)
     flight = FlightCamera(source.camera.camera, setup.usual_height_m, side_px, setup.utc_ns, finer)
     reference = ReferenceMap(archive.tiles(base_version), site_grid.grid)
     if settings.method == "thesis":

@@ -1,0 +1,126 @@
+"""Things that no view shows surely and all views together do: learned differences gathered over a flight's views."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+
+from sorvolo.change.areas.ground_pictures import GroundPictures, GroundPictureSettings
+from sorvolo.change.areas.ground_sums import GroundSums
+from sorvolo.change.pair.learned_difference import LearnedSettings, learned_difference
+from sorvolo.change.shape.kinds import kind_of
+from sorvolo.change.shape.outlines import mask_of, measures, outline_of
+from sorvolo.geometry.arrays import Mask
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.survey.findings import Change, ComparedView, Shade
+
+_SUMS = ("seen", "apart", "agree", "dark")
+
+
+@dataclass(frozen=True)
+class GatherThingSettings:
+    """Which gathered ground is a thing (0035). Spreads: see `learned_difference`."""
+
+    cell_px: int = 3  # a cell's side, in pixels of the views
+    most_cells: int = 12_000_000  # of the raster, which bounds its memory (190 MB): views beyond are left out
+    least_views: int = 2
+    spreads: float = 1.2  # by which the views of a cell lie apart on the mean
+    own_spreads: float = 0.8  # from which on a view by itself agrees
+    least_cells: int = 64  # smaller things are found by their outline
+    most_of_cells: int = 2000  # larger ground is an area
+    most_dark: float = 0.7  # share of it that is darker on one date as in a shadow: it may be one
+    sure_spreads: float = 3.0  # what lies so far apart is sure
+    explained: float = 0.2  # share of it that other changes hold: it is reported with them
+    learned: LearnedSettings = field(default_factory=LearnedSettings)
+    pictures: GroundPictureSettings = field(default_factory=GroundPictureSettings)
+
+
+class GatheredThings:
+    """What a flight's views show together. Only `add` changes it."""
+
+    def __init__(self, settings: GatherThingSettings = GatherThingSettings()) -> None:
+        self._settings = settings
+        self._ground = GroundSums(_SUMS, 0.0, settings.most_cells)
+        self._pictures = GroundPictures(1.0, settings.pictures)
+        self._times_ns: list[int] = []
+        self._residuals_m: list[float] = []
+
+    def add(self, view: ComparedView, leans: Mask | None = None) -> None:
+        """Take in one view, of which earlier pictures show that some ground `leans` (h, w)."""
+        settings = self._settings
+        if not self._ground.cell_m:
+            self._ground = GroundSums(_SUMS, settings.cell_px * view.m_per_px, settings.most_cells)
+            self._pictures = GroundPictures(view.m_per_px, settings.pictures)
+        window = self._ground.window_of(view)
+        if not self._ground.make_room(window):
+            return
+        before, after = (np.ascontiguousarray(each[..., ::-1]) for each in (view.reference, view.image))
+        apart = learned_difference(before, after, view.valid, settings.learned)
+        if leans is not None:
+            apart[leans] = np.minimum(apart[leans], 0)
+        planes = {
+            "apart": apart, "agree": (apart > settings.own_spreads).astype(np.float32),
+            "dark": ((view.shade & np.uint8(Shade.LATER_DARK | Shade.EARLIER_DARK)) > 0).astype(np.float32),
+        }
+        laid = self._ground.add(window, view.site_from_image, planes, view.valid.astype(np.float32))
+        self._times_ns.append(view.time_ns)
+        if np.isfinite(view.residual_px):
+            self._residuals_m.append(view.residual_px * view.m_per_px)
+        rows, columns = np.nonzero(laid["apart"] > settings.spreads)
+        if len(rows):
+            cells = np.column_stack([columns, rows]).astype(float)
+            self._pictures.show(view, apply_homography(window.site_from_cell(self._ground.cell_m), cells))
+
+    def conclude(self, id_prefix: str, first_number: int, others: Sequence[Change]) -> list[Change]:
+        """After the last view: the things that `others` do not hold, numbered from `first_number` on."""
+        if not self._times_ns:
+            return []
+        explained = self._settings.explained
+        found = [each for each in self._things() if _explained(each, others) < explained]
+        return [replace(each, id=f"{id_prefix}-{first_number + place}") for place, each in enumerate(found)]
+
+    def _things(self) -> Iterator[Change]:
+        """Connected ground that lies apart, without an id."""
+        settings, sums = self._settings, self._ground.sums
+        seen = np.maximum(sums["seen"], 1)
+        mean = {name: sums[name] / seen for name in ("apart", "agree", "dark")}
+        differs = (sums["seen"] >= settings.least_views) & (mean["apart"] > settings.spreads)
+        opened = cv2.morphologyEx(differs.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
+        for label in range(1, count):
+            x, y, wide, high, cells = (int(each) for each in stats[label])
+            if not settings.least_cells <= cells <= settings.most_of_cells:
+                continue
+            part = np.s_[y : y + high, x : x + wide]
+            own = labels[part] == label
+            apart, agree, dark = (float(mean[name][part][own].mean()) for name in ("apart", "agree", "dark"))
+            change = self._record(own, (x, y), agree * min(1.0, apart / settings.sure_spreads))
+            if change is not None and dark <= settings.most_dark:
+                yield change
+
+    def _record(self, cells: Mask, corner: tuple[int, int], score: float) -> Change | None:
+        cell_m = self._ground.cell_m
+        cell_from_own = np.array([[1, 0, corner[0]], [0, 1, corner[1]], [0, 0, 1.0]])
+        outline_m = outline_of(cells, self._ground.window.site_from_cell(cell_m) @ cell_from_own, 0.5, 1.0)
+        if outline_m is None:
+            return None
+        patch, size = self._pictures.patch(outline_m), measures(outline_m)
+        rows, columns = np.nonzero(cells)
+        views = float(self._ground.sums["agree"][rows + corner[1], columns + corner[0]].mean())
+        residual_m = float(np.mean(self._residuals_m)) if self._residuals_m else 0.0
+        return Change(
+            "", kind_of(patch), score, outline_m, min(self._times_ns), max(self._times_ns), max(round(views), 1),
+            size.area_m2, size.length_m, float(np.hypot(residual_m, cell_m)), patch,
+        )
+
+
+def _explained(change: Change, others: Sequence[Change]) -> float:
+    """The share of a change that lies within others."""
+    shape, site_from_patch = change.patch.changed.shape, change.patch.site_from_patch
+    own, theirs = mask_of(change.outline_m, site_from_patch, shape), np.zeros(shape, bool)
+    low, high = change.outline_m.min(axis=0), change.outline_m.max(axis=0)
+    for each in others:
+        if (each.outline_m.max(axis=0) > low).all() and (each.outline_m.min(axis=0) < high).all():
+            theirs |= mask_of(each.outline_m, site_from_patch, shape)
+    return float((own & theirs).sum() / max(1, own.sum()))
