@@ -16,6 +16,7 @@ from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import Change, ComparedView, Shade
 
 _SUMS = ("seen", "apart", "agree", "dark")
+_HIGHEST = 95.0  # percentile of what lies farthest apart
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class GatherThingSettings:
     most_cells: int = 12_000_000  # of the raster, which bounds its memory (190 MB): views beyond are left out
     least_views: int = 2
     spreads: float = 1.2  # by which the views of a cell lie apart on the mean
+    of_height: float = 0.6  # its outline runs where this part of what lies farthest apart in it is left
     own_spreads: float = 0.8  # from which on a view by itself agrees
     least_cells: int = 64  # smaller things are found by their outline
     most_of_cells: int = 2000  # larger ground is an area
@@ -90,10 +92,14 @@ class GatheredThings:
         count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
         for label in range(1, count):
             x, y, wide, high, cells = (int(each) for each in stats[label])
-            if not settings.least_cells <= cells <= settings.most_of_cells:
+            if cells < settings.least_cells:
                 continue
             part = np.s_[y : y + high, x : x + wide]
             own = labels[part] == label
+            height = settings.of_height * float(np.percentile(mean["apart"][part][own], _HIGHEST))
+            own &= mean["apart"][part] > height
+            if not settings.least_cells <= np.count_nonzero(own) <= settings.most_of_cells:
+                continue
             apart, agree, dark = (float(mean[name][part][own].mean()) for name in ("apart", "agree", "dark"))
             change = self._record(own, (x, y), agree * min(1.0, apart / settings.sure_spreads))
             if change is not None and dark <= settings.most_dark:
