@@ -18,9 +18,9 @@ where they are, what the map of the earlier date is off by as a whole taken out.
 orthophoto, drawn by hand with the later one laid over the earlier beside it, 1.6 times as large, before anything was
 scored. On the second pair they are boxes mostly, and not all that changed was drawn. A thing is found when an event
 overlaps it by at least a quarter of the smaller of the two areas and is at most ten times as large. An area (over 100
-m2) is found when one event covers at least 40 % of it; the share that all events together cover is given as well. An event is false
-when at least half of it lies on ground drawn as unchanged. Events that touch neither are counted as elsewhere: not all
-that changed is drawn.
+m2) is found when one event covers at least 40 % of it; the share that all events together cover is given as well. An
+event is false when at least half of it lies on ground drawn as unchanged. Events that touch neither are counted as
+elsewhere: not all that changed is drawn.
 
 Each run is appended to results/real_dates.json: how often a pair was scored is how often it stands there.
 """
