@@ -107,14 +107,19 @@ def _known_ground(
         raise SettingsError("check points (--check) are of a control point file: give it with --gcp")
     if control is None and base is None:
         return None
-    if settings.method != "planar":
-        raise SettingsError("--gcp and --base tie maps of method planar only; leave --method out")
-    if len(sources) != 1:
-        raise SettingsError(f"--gcp and --base tie one flight, not {len(sources)}; map the flights one by one")
+    _refuse_ties(len(sources), settings)
     if control is not None:
         return open_control(control, sources[0], ControlSettings(settings.control_sigma_m, checks=settings.checks))
     assert base is not None
     return open_base(base, sources[0])
+
+
+def _refuse_ties(flights: int, settings: MapSettings) -> None:
+    """Raise SettingsError where a map cannot be tied to known ground."""
+    if settings.method != "planar":
+        raise SettingsError("--gcp and --base tie maps of method planar only; leave --method out")
+    if flights != 1:
+        raise SettingsError(f"--gcp and --base tie one flight, not {flights}; map the flights one by one")
 
 
 def _map_one(

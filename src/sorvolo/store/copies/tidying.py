@@ -2,6 +2,7 @@
 
 import secrets
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,11 +26,11 @@ class Pruned:
 
 
 def prune(objects: Objects, older_than_s: float, *, only_count: bool = False) -> Pruned:
-    """Remove the objects that the site does not name and that were stored so long ago.
+    """Remove the objects that the site does not name and that were stored more than `older_than_s` ago.
 
-    Who writes meanwhile could take such an object for stored: while it lasts the manifest says so, and writers that
-    began before find another manifest. A prune that was killed is done again. Raises StoreError where no site is, or
-    where another writer comes in between.
+    A concurrent writer could rely on such an object. So the manifest states that a prune runs, and writers that began
+    before find that the manifest has changed. A prune that was killed is repeated. Raises StoreError where there is no
+    site, or where another writer comes in between.
     """
     end = BucketEnd(objects)
     manifest, etag = end.find_manifest()
@@ -44,13 +45,16 @@ def prune(objects: Objects, older_than_s: float, *, only_count: bool = False) ->
         key: size for key, (size, age_s) in stored.items() if key not in used and age_s > older_than_s
     }
     if not only_count:
-        keys = sorted(unused)
-        for start in range(0, len(keys), _AT_ONCE):
-            objects.remove(keys[start:start + _AT_ONCE])
+        _remove(objects, sorted(unused))
         _, etag = end.find_manifest()
         _swap(objects, replace(manifest, tidying="", tidied=secrets.token_hex(8)), etag)
     total = sum(size for size, _ in stored.values())
     return Pruned(len(unused), sum(unused.values()), total - sum(unused.values()))
+
+
+def _remove(objects: Objects, keys: Sequence[str]) -> None:
+    for start in range(0, len(keys), _AT_ONCE):
+        objects.remove(keys[start:start + _AT_ONCE])
 
 
 def _used(end: BucketEnd, manifest: Manifest) -> set[str]:
