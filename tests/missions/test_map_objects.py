@@ -1,10 +1,12 @@
 """Objects through whole missions: a small simulated site mapped and compared with a detector that knows the truth."""
 
 import json
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,16 +16,19 @@ from small_flights import simulate_into, small_flight
 from sorvolo.change.classes import object_at, seen_at
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.camera import Camera
 from sorvolo.missions.compare.change_classes import ChangeClasses
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.evaluate.changes import evaluate_changes
 from sorvolo.missions.evaluate.objects import evaluate_objects
-from sorvolo.missions.flight.map_objects import open_detector
+from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.simulation.settings import OutputSettings
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Change, ChangeKind, Patch
+from sorvolo.survey.flight import CameraPrior, Frame, PosedFrame
 from sorvolo.survey.map_objects import MapObject
 from sorvolo.survey.objects import Detections, Sighting, no_detections
 
@@ -299,3 +304,30 @@ def test_small_objects_are_looked_for_where_they_are_asked_for(simulated: Path, 
         list(map_flights(
             [video], tmp_path / "none", MapSettings(classes=("bicycle",)), camera=camera, detector=detector
         ))
+
+
+@pytest.mark.parametrize(("side_px", "at_once"), [(400, 3), (3600, 1)])
+def test_large_photos_wait_for_the_detector_one_by_one(side_px: int, at_once: int) -> None:
+    """Else four photos of 100 megapixels would take a gigabyte."""
+    done, begun = [], []
+    unfinished = []
+
+    class Slow:
+        classes, notices, provider = ("person",), (), "nowhere"
+        info = SimpleNamespace(usual_classes=("person",), name="slow")
+
+        def detect(self, image: ImageRGB, **_: object) -> Detections:
+            time.sleep(0.01)
+            done.append(1)
+            return no_detections(self.classes)
+
+    finder = ObjectFinder(cast(Detects, Slow()), Camera.from_angle_of_view(640, 480, 60))
+    image = np.broadcast_to(np.uint8(0), (side_px, side_px, 3))
+    prior = CameraPrior(np.array([0, 0, 40.0]), np.ones(3), np.diag([1.0, -1, -1]), np.ones(3))
+    for index in range(8):
+        begun.append(1)
+        finder.look(PosedFrame(Frame(index, str(index), index, image), prior))
+        unfinished.append(len(begun) - len(done))
+    assert len(finder.news(waits=True)) == 8
+    finder.close()
+    assert max(unfinished) == at_once

@@ -64,3 +64,19 @@ def test_one_larger_than_the_memory_is_there_all_the_same() -> None:
     np.testing.assert_array_equal(kept.keyframe(0).gray, _keyframe(0)[0].gray)
     with pytest.raises(KeyError):
         kept.keyframe(2)
+
+
+def test_what_is_released_comes_back_from_the_shelf() -> None:
+    shelf = _Shelf()
+    kept = Keyframes(shelf)
+    for number in range(3):
+        kept.add(*_keyframe(number))
+    kept.release()
+    assert not kept._near and kept._bytes == 0
+    for number in range(3):
+        np.testing.assert_array_equal(kept.keyframe(number).gray, _keyframe(number)[0].gray)
+        np.testing.assert_array_equal(kept.thumbnail(number), _keyframe(number)[1])
+    alone = Keyframes()
+    alone.add(*_keyframe(0))
+    alone.release()
+    np.testing.assert_array_equal(alone.keyframe(0).gray, _keyframe(0)[0].gray)

@@ -33,7 +33,7 @@ class CoarseTiles(MutableMapping[TileIndex, ImageRGBA]):
     """
 
     def __init__(
-        self, tiles: MutableMapping[TileIndex, ImageRGBA], grid: Grid, step: int, most_bytes: int = 32 << 20
+        self, tiles: MutableMapping[TileIndex, ImageRGBA], grid: Grid, step: int, most_bytes: int = 16 << 20
     ) -> None:
         self._tiles, self._grid, self._step = tiles, grid, step
         self._known = KnownGround(grid, tiles)

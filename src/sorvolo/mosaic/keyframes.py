@@ -69,6 +69,11 @@ class Keyframes:
         """The small copy of the keyframe's picture, from the shelf if it has to be."""
         return self._both(keyframe_id)[1]
 
+    def release(self) -> None:
+        """Put all on the shelf: nothing is wanted of them for a while. Without a shelf they stay."""
+        while self._shelf is not None and self._near:
+            self._shelve_oldest(self._shelf)
+
     # ---- inside -----------------------------------------------------------------------------------------------
 
     def _both(self, keyframe_id: int) -> tuple[Keyframe, ImageRGB]:
@@ -88,11 +93,14 @@ class Keyframes:
         self._near[keyframe.id] = keyframe, thumbnail
         self._bytes += _size(keyframe, thumbnail)
         while self._shelf is not None and self._bytes > self._most_bytes and len(self._near) > 1:
-            keyframe_id, (oldest, small) = self._near.popitem(last=False)
-            self._bytes -= _size(oldest, small)
-            if keyframe_id not in self._shelved:
-                self._shelf.put(keyframe_id, _bytes(oldest, small))
-                self._shelved.add(keyframe_id)
+            self._shelve_oldest(self._shelf)
+
+    def _shelve_oldest(self, shelf: Shelf) -> None:
+        keyframe_id, (oldest, small) = self._near.popitem(last=False)
+        self._bytes -= _size(oldest, small)
+        if keyframe_id not in self._shelved:
+            shelf.put(keyframe_id, _bytes(oldest, small))
+            self._shelved.add(keyframe_id)
 
 
 def _size(keyframe: Keyframe, thumbnail: ImageRGB) -> int:

@@ -126,6 +126,10 @@ class PlanarMapper:
         """Place an undistorted picture, (H, W, 3), of the distortion-free `camera` (at the picture's size)."""
         return self.place(self.register(keyframe_id, camera, image, prior))
 
+    def release(self) -> None:
+        """Put what links need out of memory: no frame comes for a while."""
+        self._keyframes.release()
+
     def register(self, keyframe_id: int, camera: Camera, image: ImageRGB, prior: CameraPrior) -> Registered:
         """Tie an undistorted picture to the map as it is; `place` is what adds it."""
         keyframe = self._keyframe(keyframe_id, camera, image, prior)

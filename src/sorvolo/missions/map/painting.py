@@ -37,7 +37,7 @@ class PaintSettings:
     live: int = 3  # of those moved, beside the newest, while somebody waits for that
     rest: float = 4.0  # times as long as a painting took: showing a map that still moves must not hold up the flight
     coarse_map: float = 0.77  # times the pictures' own pixels: a coarser map does not need every pixel of them
-    cache_bytes: int = 128 * 1024 * 1024  # of earlier flights' pictures; a quarter of it of the flight's own, small
+    cache_bytes: int = 128 * 1024 * 1024  # of earlier flights' pictures; an eighth of it of the flight's own, small
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class FlightPainter:
             self._stored.resized(-(-self._stored.width_px // step), -(-self._stored.height_px // step)),
         )
         self._live_images = ImageCache(
-            lambda each: writer.small_image(each - known.count, step), settings.cache_bytes // 4
+            lambda each: writer.small_image(each - known.count, step), settings.cache_bytes // 8
         )
         self._live_tiles = CoarseTiles(writer.tiles, archive.site_grid().grid, step)
         self._live_canvas = Canvas(
@@ -173,6 +173,7 @@ class FlightPainter:
         self._straighten()
         self._live_images.clear()
         self._live_tiles.release()
+        self._mapper.release()
         if self._painted_at or self._is_live:
             self._writer.take_back_tiles()
         self._writer.release_memory()

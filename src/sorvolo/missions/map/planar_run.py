@@ -70,7 +70,7 @@ class PlanarRun(FlightRun):
                 model.focal_sigma, offset_sigma_m, joins_map=self._known.count > 0 or setup.known_ground is not None
             ),
             known=self._known.for_graph(),
-            keyframes=Keyframes(self._spill, memory_budget_bytes(settings.memory_mb) // 4),
+            keyframes=Keyframes(self._spill, memory_budget_bytes(settings.memory_mb) // 8),
         )
         self._times_ns: dict[int, int] = {}  # of the flight's keyframes that have a place
         self._held: dict[int, ImageRGB | bytes | KeptPicture] = {}  # JPEG where all of the flight waits for its place

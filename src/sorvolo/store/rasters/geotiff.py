@@ -249,8 +249,9 @@ def _halved(larger: Path, path: Path, filled: set[TileIndex] | None) -> Path | N
                 rgba = np.moveaxis(source.read(window=large.intersection(whole)), 0, 2)
                 if not rgba[..., 3].any():
                     continue  # unwritten blocks stay sparse
-                odd = (0, rgba.shape[0] % 2), (0, rgba.shape[1] % 2), (0, 0)
-                halved = shrink(np.pad(rgba, odd, mode="edge"), small.width, small.height)
+                if rgba.shape[0] % 2 or rgba.shape[1] % 2:
+                    rgba = np.pad(rgba, [(0, rgba.shape[0] % 2), (0, rgba.shape[1] % 2), (0, 0)], mode="edge")
+                halved = shrink(np.ascontiguousarray(rgba), small.width, small.height)
                 sink.write(_bands(halved), window=small)
     return path
 
