@@ -232,6 +232,13 @@ def test_a_picture_is_made_smaller_by_the_mean_of_what_is_seen(size: int) -> Non
     assert np.array_equal(seen, wanted[..., 3] > 0)
 
 
+def test_a_large_picture_is_made_smaller_part_by_part() -> None:
+    rng = np.random.default_rng(8)
+    rgba = rng.integers(0, 256, (2600, 1500, 4), dtype=np.uint8)
+    wanted = unweighted(cv2.resize(weighted(rgba), (750, 1300), interpolation=cv2.INTER_AREA))
+    assert np.array_equal(shrink(rgba, 750, 1300), wanted)
+
+
 def test_small_maps_are_written_of_tiles_as_they_pass_by(tmp_path: Path) -> None:
     tiles, site_grid = marked_tiles((-700, 2300)), SiteGrid.at(ORIGIN, 0.2, "EPSG:32633")
     write_preview(tiles, tmp_path / "preview.png")

@@ -16,6 +16,7 @@ MOST_KEYFRAME_PX = 160_000_000
 MOST_TILE_PX = 4096 * 4096
 """Of a tile or a crop."""
 
+_FLOAT_PX = 1 << 20  # of a picture, as floats at a time
 # 4:4:4 and 92: features found again on the stored keyframe sit where they sat; 4:2:0 shifts coloured edges.
 _JPEG = [
     cv2.IMWRITE_JPEG_QUALITY, 92,
@@ -125,9 +126,16 @@ def shrink(rgba: ImageRGBA, width: int, height: int) -> ImageRGBA:
     if rgba[..., 3].min() == 255:
         return np.asarray(cv2.resize(rgba, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     times = rgba.shape[0] // height
-    if rgba.shape[:2] == (height * times, width * times) and not _is_partly_seen(rgba).any():
+    if rgba.shape[:2] != (height * times, width * times):
+        return unweighted(cv2.resize(weighted(rgba), size, interpolation=cv2.INTER_AREA))
+    if not _is_partly_seen(rgba).any():
         return _shrunk_rim(rgba, times)
-    return unweighted(cv2.resize(weighted(rgba), size, interpolation=cv2.INTER_AREA))
+    rows = max(1, _FLOAT_PX // (times**2 * width))  # at a time: as floats the whole may be hundreds of megabytes
+    parts = [rgba[first * times:(first + rows) * times] for first in range(0, height, rows)]
+    return np.concatenate([
+        unweighted(cv2.resize(weighted(each), (width, len(each) // times), interpolation=cv2.INTER_AREA))
+        for each in parts
+    ])
 
 
 def _shrunk_rim(rgba: ImageRGBA, times: int) -> ImageRGBA:

@@ -167,7 +167,9 @@ def write_small_maps(small: SmallMap, site_grid: SiteGrid, name: str, preview: P
     shown = small.picture()
     rgba = shown.rgba
     while max(rgba.shape[:2]) > PREVIEW_PX:
-        rgba = shrink(rgba, -(-rgba.shape[1] // 2), -(-rgba.shape[0] // 2))
+        if rgba.shape[0] % 2 or rgba.shape[1] % 2:
+            rgba = np.pad(rgba, [(0, rgba.shape[0] % 2), (0, rgba.shape[1] % 2), (0, 0)])
+        rgba = shrink(rgba, rgba.shape[1] // 2, rgba.shape[0] // 2)
     atomic_write_bytes(preview, png_from_rgba(rgba))
     if kmz is not None:
         _write_kmz(shown, site_grid, name, kmz)
