@@ -32,7 +32,7 @@ _UNCHANGED = SimulationSettings(
     seed=53, flights=2,
     scene=SceneSettings(people=0, cars=1, small_objects=3, moving_share=0.0, has_scenery=False),
     path=PathSettings(height_m=20, speed_m_s=5, length_m=24, strips=2, strip_spacing_m=8),
-    imaging=ImagingSettings(width_px=560, height_px=420, fps=5),
+    imaging=ImagingSettings(width_px=400, height_px=300, fps=5),
     sensor=SensorSettings(noise_m=(0.3, 0.3, 0.3)),
     later=LaterSettings(people=0, cars=0, small_objects=0, removed=0, moved=0),
     output=OutputSettings(photos=True, photo_overlap=0.75),
@@ -140,7 +140,7 @@ def test_a_map_far_coarser_than_the_flight_is_warned_of(
 ) -> None:
     first = written(flights[0], tmp_path / "first")
     coarse = tmp_path / "coarse"
-    assert main(["map", str(first), "--site", str(coarse), "--model", "none", "--gsd", "0.4", *camera(first)]) == 0
+    assert main(["map", str(first), "--site", str(coarse), "--model", "none", "--gsd", "0.56", *camera(first)]) == 0
     (warning,) = warned(coarse, written(flights[1], tmp_path / "second", [0, 1, 2]))
     assert warning.startswith("the map's pixels are 9 times as large as the flight's")
 
