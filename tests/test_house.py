@@ -1,6 +1,7 @@
 """The house as ARCHITECTURE.md draws it: every file named once, and functions that a reader holds in one look."""
 
 import ast
+import gc
 import re
 from collections.abc import Iterator
 from functools import cache
@@ -49,7 +50,11 @@ def test_every_file_stands_in_the_tree_and_every_line_of_the_tree_is_a_file() ->
 
 @cache
 def _parsed(path: Path) -> ast.Module:
-    return ast.parse(path.read_text())
+    gc.disable()  # else it walks all trees so far again and again
+    try:
+        return ast.parse(path.read_text())
+    finally:
+        gc.enable()
 
 
 def _functions(path: Path) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
