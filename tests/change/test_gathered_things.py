@@ -46,11 +46,10 @@ def test_features_differ_where_a_thing_of_the_grounds_brightness_stands_and_not_
     known[:, 560:] = False
     apart = learned_difference(ground, later, known)
     assert apart.shape == known.shape and not apart[~known].any()
-    assert apart[AT].mean() > 2.0
+    assert apart[AT].mean() > 1.2
     elsewhere = known.copy()
     elsewhere[130:206, 190:280] = False
-    assert abs(float(np.median(apart[elsewhere]))) < 0.3
-    assert np.percentile(apart[elsewhere], 99) < apart[AT].mean()
+    assert np.percentile(apart[elsewhere], 99) < 0.6
 
 
 def test_where_hardly_anything_is_known_nothing_is_said(ground):

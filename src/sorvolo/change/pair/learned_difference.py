@@ -24,7 +24,8 @@ class LearnedSettings:
     """How features are compared (0035)."""
 
     reach: int = 1  # cells of a layer that a feature is looked for around: alignment is good to less than a cell
-    least_spread: float = 0.05  # of distances, in standard deviations of features: no pair is taken as quieter
+    least_middle: tuple[float, float] = (0.8, 0.55)  # of distance, in features' standard deviations, and of 1 - cosine:
+    least_spread: tuple[float, float] = (0.25, 0.17)  # two dates have these at least; no pair is taken as calmer
     least_known: int = 64  # cells of a layer; fewer tell nothing about unchanged ground
     most: float = 8.0  # spreads; beyond, more says no more
     direction: float = 2.0  # weight of the angle between features, beside 1 of their distance
@@ -39,8 +40,8 @@ def learned_difference(
     Features are those of NanoDet's backbone (`learned_difference.onnx`), each channel in units of its standard
     deviation over the pictures, compared with the nearest of those around: by their distance and by the cosine between
     them. Both are centred on the median of the `known` ground and divided by their spread there (1.48 times the median
-    deviation): the scale is what light, season, traffic and alignment do to unchanged ground in this very pair. The
-    mean over three layers; 0 where nothing is `known`.
+    deviation): the scale is what light, season, traffic and alignment do to unchanged ground in this very pair, and at
+    least what they do between two dates. The mean over three layers; 0 where nothing is `known`.
     """
     height, width = query.shape[:2]
     seen = np.ones((height, width), bool) if known is None else known
@@ -55,8 +56,10 @@ def learned_difference(
         if np.count_nonzero(held) < settings.least_known:
             return np.zeros((height, width), np.float32)
         apart = _apart(one[:, :rows, :columns], other[:, :rows, :columns], held, settings.reach)
-        for measure, weight in zip(apart, (1.0, settings.direction), strict=True):
-            spreads = np.float32(weight) * _in_spreads(measure, held, settings)
+        for row, weight in enumerate((1.0, settings.direction)):
+            spreads = np.float32(weight) * _in_spreads(
+                apart[row], held, settings.least_middle[row], settings.least_spread[row], settings.most
+            )
             larger = cv2.resize(spreads, (columns * stride, rows * stride), interpolation=cv2.INTER_LINEAR)
             total += larger[:height, :width]
     total /= np.float32(len(_LAYERS) * (1 + settings.direction))
@@ -84,11 +87,12 @@ def _padded(image: NDArray[np.uint8], stride: int) -> NDArray[np.uint8]:
     )
 
 
-def _in_spreads(measure: Floats32, held: Mask, settings: LearnedSettings) -> Floats32:
-    """A measure (rows, columns) less its median where `held`, in spreads."""
-    middle = np.median(measure[held])
-    spread = max(1.4826 * float(np.median(np.abs(measure[held] - middle))), settings.least_spread)
-    return np.asarray(np.clip((measure - middle) / np.float32(spread), -settings.most, settings.most), np.float32)
+def _in_spreads(measure: Floats32, held: Mask, least_middle: float, least_spread: float, most: float) -> Floats32:
+    """A measure (rows, columns) less its median where `held`, in spreads, at most so many."""
+    median = float(np.median(measure[held]))
+    spread = max(1.4826 * float(np.median(np.abs(measure[held] - median))), least_spread)
+    away = (measure - np.float32(max(median, least_middle))) / np.float32(spread)
+    return np.asarray(np.clip(away, -most, most), np.float32)
 
 
 def _apart(one: Floats32, other: Floats32, held: Mask, reach: int) -> tuple[Floats32, Floats32]:
