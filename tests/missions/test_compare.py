@@ -497,7 +497,7 @@ def test_ground_beside_the_map_extends_it(surveyed, tmp_path, monkeypatch):
 
     monkeypatch.setattr(ViewMaker, "placed", noted)
     monkeypatch.setattr(KnownKeyframes, "for_graph", lambda _: [])
-    compare(surveyed, tmp_path / "site")
+    compare(surveyed, tmp_path / "site", replace(_COMPARE, views_per_second=1.5))
     with Archive.open(tmp_path / "site", write=False) as archive:
         after = dict(archive.tiles())
     area = {version: sum(int(np.count_nonzero(tile[..., 3])) for tile in tiles.values())

@@ -254,8 +254,9 @@ class Aligner:
         return self._misses < self._settings.searched_misses or self._misses % 5 == 1
 
     def _by_search(self, frame: "_Frame", by_telemetry: Pose | None, *, is_inside: bool) -> Place | None:
-        """The frame placed by learned features, telemetry and its neighbours; what these leave in doubt a local fit
-        must confirm. Without telemetry's place the search begins at the last frame's."""
+        """The frame placed by learned features, telemetry and its neighbours; what these leave in doubt, or what lies
+        far from where telemetry was right so far, a local fit must confirm. Without telemetry's place the search begins
+        at the last frame's."""
         if by_telemetry is None and self._fits and not frame.prior.knows_place:
             start = self._fits[-1].pose
         elif by_telemetry is not None and is_inside:
@@ -266,7 +267,7 @@ class Aligner:
         if found is None:
             return None
         place = Place(found.fit.site_from_image, found.fit.pose, found.fit.residual_px, False, found.ratio)
-        if found.is_sure:
+        if found.is_sure and not self._search.is_odd(place.pose, frame.prior):
             return place
         local = self._local(frame, place)
         return place if local is not None and local.rest <= self._settings.confirms_rest else None
