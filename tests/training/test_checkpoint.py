@@ -90,7 +90,7 @@ def test_a_resumed_run_has_the_losses_of_one_that_was_not_stopped(
 
 def test_other_settings_are_refused_by_name() -> None:
     saved = read_checkpoint(checkpoint_bytes(_joint(), _SETTINGS, History()), "checkpoint")
-    with pytest.raises(SettingsError, match=r"seed was 3, is 4; steps was 8, is 9\. Give the earlier ones"):
+    with pytest.raises(SettingsError, match=r"seed was 3, is 4; steps was 8, is 9; give the earlier ones"):
         restore(_joint(), saved, _SETTINGS | {"seed": 4, "steps": 9})
     other = JointTraining(build("fast", ("person",), "standard", None), JointSettings(steps=8), 3)
     with pytest.raises(InputError, match="does not fit this network"):
