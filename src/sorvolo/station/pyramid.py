@@ -15,7 +15,6 @@ from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.site.tiles import TileView
 
 _MOST_LEVELS = 24
-_COARSE_LEVEL = 2  # from which a tile is made of 16 others
 
 
 Key = TypeVar("Key")
@@ -61,7 +60,7 @@ class Pyramid:
     """The tiles of one state of a map at halved resolutions. Level 0 is the map's own.
 
     Pictures are known by the hashes of what they are made of: where the map did not change, one made for an earlier
-    state is used again from `cache`. `coarse` may give tiles of higher levels without reading what they are made of.
+    state is used again from `cache`. `coarse` may give tiles of levels above 0 without reading what they are made of.
     """
 
     def __init__(
@@ -119,7 +118,7 @@ class Pyramid:
         return self._cache.get(key, lambda: self._halved(level, index))
 
     def _halved(self, level: int, index: TileIndex) -> ImageRGBA:
-        given = self._coarse(level, index) if level >= _COARSE_LEVEL else None
+        given = self._coarse(level, index)
         if given is not None:
             return given
         half = self.tile_px // 2
