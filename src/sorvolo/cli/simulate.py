@@ -26,6 +26,9 @@ Ground = Annotated[str, typer.Option(help="Ground: dirt, countryside, urban, san
 GroundResolution = Annotated[
     float | None, typer.Option(help="Ground resolution of an orthophoto without a CRS, m a pixel.")
 ]
+ReliefHeight = Annotated[
+    float | None, typer.Option("--relief", help="Hills, from the lowest to the highest ground, m. Without it: level.")
+]
 FlightCount = Annotated[int | None, typer.Option(help="Number of flights; between them things change.")]
 GpsNoise = Annotated[float | None, typer.Option(help="GPS noise of each fix and axis, m rms.")]
 GpsRate = Annotated[float | None, typer.Option(help="GPS fixes a second.", show_default="the format's own")]
@@ -54,6 +57,7 @@ def simulate(
     seed: SeedOption = None,
     ground: Ground = "",
     ground_gsd: GroundResolution = None,
+    relief: ReliefHeight = None,
     flights: FlightCount = None,
     gps_noise: GpsNoise = None,
     gps_rate: GpsRate = None,
@@ -92,16 +96,17 @@ def simulate(
         raise SettingsError("--thermal is for single pictures: give their number with --pictures as well")
     if pictures is not None:
         _refuse_options_of_flights({
-            "--preset": preset_name != "demo", "--flights": flights, "--gps-noise": gps_noise, "--gps-rate": gps_rate,
-            "--clock-offset": clock_offset, "--telemetry": telemetry, "--faults": faults or None, "--speed": speed,
-            "--length": length, "--strips": strips, "--tilt": tilt, "--fps": fps, "--size": size, "--photos": photos,
+            "--preset": preset_name != "demo", "--relief": relief, "--flights": flights, "--gps-noise": gps_noise,
+            "--gps-rate": gps_rate, "--clock-offset": clock_offset, "--telemetry": telemetry,
+            "--faults": faults or None, "--speed": speed, "--length": length, "--strips": strips, "--tilt": tilt,
+            "--fps": fps, "--size": size, "--photos": photos,
         })
         wanted = _picture_settings(pictures, seed, ground_kind, thermal, height)
         _simulate_pictures(folder, wanted, ground_file, ground_gsd, as_json)
         return
     settings = _with_options(
         preset(preset_name),
-        top={"seed": seed, "flights": flights}, scene={"ground": ground_kind or None},
+        top={"seed": seed, "flights": flights}, scene={"ground": ground_kind or None, "relief_m": relief},
         path={"height_m": height, "speed_m_s": speed, "length_m": length, "strips": strips},
         motion={"tilt_rms_deg": tilt}, imaging={"fps": fps, **_size(size)},
         sensor=_sensor_options(gps_noise, gps_rate, clock_offset, faults),

@@ -57,7 +57,8 @@ class Thing:
     """One object of the site: what it is and where it stands.
 
     `seed` draws its colours and textures; `velocity_m_s` (east, north) moves it through `east_m`,
-    `north_m`, where it is at the middle of a flight; `sway_m` is how far the wind has pushed a crown.
+    `north_m`, where it is at the middle of a flight; `sway_m` is how far the wind has pushed a crown. `up_m` is the
+    ground's height there, which what moves keeps to by `climb_m_s`, the slope there.
     """
 
     id: int
@@ -70,6 +71,8 @@ class Thing:
     seed: int
     velocity_m_s: tuple[float, float] = (0.0, 0.0)
     sway_m: tuple[float, float] = (0.0, 0.0)
+    up_m: float = 0.0
+    climb_m_s: float = 0.0
 
     @property
     def is_moving(self) -> bool:
@@ -91,7 +94,7 @@ class Thing:
         """Where it stands this long after the middle of the flight, (3,) in the site frame."""
         return np.array([
             self.east_m + self.velocity_m_s[0] * from_middle_s,
-            self.north_m + self.velocity_m_s[1] * from_middle_s, 0.0,
+            self.north_m + self.velocity_m_s[1] * from_middle_s, self.up_m + self.climb_m_s * from_middle_s,
         ])
 
     def footprint_m(self, from_middle_s: float = 0.0) -> PointsM:

@@ -10,6 +10,7 @@ from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.pose import Pose
 from sorvolo.simulation.canvas import GroundRaster
 from sorvolo.simulation.objects import Body, Thing
+from sorvolo.simulation.relief import Relief
 from sorvolo.simulation.view import View, blend, remapped, sample_patches
 from sorvolo.simulation.world import Day
 
@@ -19,7 +20,7 @@ Labels = NDArray[np.int32]
 
 def render(day: Day, view: View, site_from_camera: Pose, from_middle_s: float) -> ImageRGB:
     """The picture before the camera's own faults, this long after the middle of the flight."""
-    image = render_ground(day.ground, view)
+    image = render_ground(day.ground, view) if day.relief.is_level else render_hills(day.ground, day.relief, view)
     seen = _in_sight(day.things, view, site_from_camera, from_middle_s)
     patches = [
         day.shadows[thing.id].moved(np.eye(3), thing.place_m(from_middle_s))
@@ -50,6 +51,18 @@ def render_ground(ground: GroundRaster, view: View) -> ImageRGB:
     shift = np.array([[1, 0, -x0], [0, 1, -y0], [0, 0, 1.0]])
     where = cv2.perspectiveTransform(np.ascontiguousarray(rays).reshape(-1, 1, 2), shift @ raster_from_ray)
     return remapped(ground.rgb[y0:y1, x0:x1], where.reshape(height, width, 2), cv2.BORDER_REPLICATE)
+
+
+def render_hills(ground: GroundRaster, relief: Relief, view: View) -> ImageRGB:
+    """The bare ground laid over hills, through the view's own lens."""
+    matrix = ground.raster_from_site_matrix
+    per_m, first_px = matrix.diagonal()[:2].astype(np.float32), matrix[:2, 2].astype(np.float32)
+    where = relief.seen(view) * per_m + first_px
+    rows, columns = ground.rgb.shape[:2]
+    # only this window is handed on: remap takes no picture of more than 32767 pixels a side
+    low = np.clip(np.floor(where.min(axis=(0, 1))) - 2, 0, [columns - 2, rows - 2]).astype(int)
+    high = np.clip(np.ceil(where.max(axis=(0, 1))) + 3, low + 2, [columns, rows]).astype(int)
+    return remapped(ground.rgb[low[1]:high[1], low[0]:high[0]], where - low.astype(np.float32), cv2.BORDER_REPLICATE)
 
 
 def render_labels(

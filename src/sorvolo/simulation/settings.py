@@ -34,6 +34,7 @@ class SceneSettings:
     small_objects: int = 4
     moving_share: float = 0.5  # of people and cars, in later flights
     has_scenery: bool = True  # trees, bushes, houses
+    relief_m: float = 0.0  # of smooth hills, from the lowest to the highest ground
     origin: Geodetic = DEFAULT_ORIGIN
 
     def __post_init__(self) -> None:
@@ -43,6 +44,7 @@ class SceneSettings:
             )
         _demand("object counts", min(self.people, self.cars, self.small_objects), 0, 10000)
         _demand("moving_share", self.moving_share, 0, 1)
+        _demand("relief_m", self.relief_m, 0, 200)
 
 
 @dataclass(frozen=True)
@@ -247,6 +249,11 @@ class SimulationSettings:
     def __post_init__(self) -> None:
         _demand("seed", self.seed, 0, 2**63)
         _demand("flights", self.flights, 1, 20)
+        if self.scene.relief_m > 0.8 * self.path.height_m:
+            raise SettingsError(
+                f"hills of {self.scene.relief_m:g} m are too high for a flight at {self.path.height_m:g} m; "
+                "at most 0.8 of it"
+            )
 
     @property
     def m_per_px(self) -> float:

@@ -12,10 +12,11 @@ from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, ImageRGBA, Poin
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.level_ground import footprint
-from sorvolo.geometry.pose import gimbal_angles_from_rotation
+from sorvolo.geometry.pose import Pose, gimbal_angles_from_rotation
 from sorvolo.simulation.canvas import GroundRaster
 from sorvolo.simulation.flight import SimulatedFlight, has_changed
 from sorvolo.simulation.objects import Body, Label, Thing
+from sorvolo.simulation.relief import LEVEL, Relief
 from sorvolo.simulation.rendering import Labels, render_labels
 from sorvolo.simulation.view import View, sample_patches
 from sorvolo.simulation.world import World
@@ -56,11 +57,19 @@ def frame_features(flight: SimulatedFlight) -> list[dict[str, Any]]:
             "fix_longitude_deg": _degrees_or_null(fixes[index, 1]),
             "fix_latitude_deg": _degrees_or_null(fixes[index, 0]),
         }
-        outline = footprint(flight.camera, pose)
+        outline = _outline_m(flight, pose)
         features.append({
             "type": "Feature", "geometry": polygon_geometry(outline, flight.site), "properties": properties,
         })
     return features
+
+
+def _outline_m(flight: SimulatedFlight, pose: Pose) -> PointsM:
+    """(4, 2) the ground under the picture's outer corners; NaN beyond the horizon."""
+    if flight.world.relief.is_level:
+        return footprint(flight.camera, pose)
+    rays = flight.camera.rays_from_pixels(flight.camera.corners_px) @ pose.rotation.T
+    return flight.world.relief.met(pose.translation_m, rays)[:, :2]
 
 
 def object_features(world: World, site: LocalFrame) -> list[dict[str, Any]]:
@@ -223,12 +232,14 @@ def polygon_geometry(outline_m: PointsM, site: LocalFrame) -> dict[str, Any] | N
     }
 
 
-def surface_heights(things: Sequence[Thing], bodies: Mapping[int, Body], view: View) -> Floats32:
-    """(H, W) the height of the topmost surface above the ground at each pixel of a map view, m: 0 is bare ground.
+def surface_heights(
+    things: Sequence[Thing], bodies: Mapping[int, Body], view: View, relief: Relief = LEVEL
+) -> Floats32:
+    """(H, W) the height of the topmost surface at each pixel of a map view, m; that of level ground is 0.
 
     What looks like a leaf (crowns, silhouettes) counts where it is opaque.
     """
-    heights = np.zeros((view.camera.height_px, view.camera.width_px), np.float32)
+    heights = ground_heights(view, relief)
     for thing in things:
         for patch in bodies[thing.id].placed(thing.turn, thing.place_m(0.0), view.eye_m):
             corners = patch.corners_m
@@ -243,3 +254,12 @@ def surface_heights(things: Sequence[Thing], bodies: Mapping[int, Body], view: V
                 here = heights[y0:y1, x0:x1]
                 np.maximum(here, up, out=here, where=rgba[..., 3] > 127, casting="same_kind")
     return heights
+
+
+def ground_heights(view: View, relief: Relief) -> Floats32:
+    """(H, W) the bare ground's height at each pixel of a map view, m."""
+    if relief.is_level:
+        return np.zeros((view.camera.height_px, view.camera.width_px), np.float32)
+    rays = view.rays_in((0, 0, view.camera.width_px, view.camera.height_px))
+    east, north = rays[..., 0] - view.ray_from_site[0, 3], view.ray_from_site[1, 3] - rays[..., 1]
+    return relief.up_m(np.dstack([east, north])).astype(np.float32)

@@ -13,6 +13,7 @@ from sorvolo.simulation.canvas import Area, GroundRaster
 from sorvolo.simulation.ground import GroundKind, Layout, PaintedGround, paint_ground
 from sorvolo.simulation.noise import fractal
 from sorvolo.simulation.objects import SMALL_KINDS, Body, Label, Light, Thing, new_kind, new_size
+from sorvolo.simulation.relief import LEVEL, Relief
 from sorvolo.simulation.settings import SceneSettings, SimulationSettings, WeatherSettings
 from sorvolo.simulation.view import Patch, View, blend, map_view, sample_patches
 
@@ -22,10 +23,11 @@ _SHADOW_TINT = np.array([0.40, 0.44, 0.52], np.float32)  # what the blue sky alo
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """The site through all flights: its ground without shadows, and the things of each flight, in order."""
+    """The site through all flights: its ground without shadows, its hills, and the things of each flight, in order."""
 
     ground: GroundRaster
     days: tuple[tuple[Thing, ...], ...]
+    relief: Relief = LEVEL
 
     @property
     def things(self) -> dict[int, list[int]]:
@@ -52,6 +54,7 @@ class Day:
     light: Light
     gains: Floats
     cloud_shade: float
+    relief: Relief = LEVEL
 
 
 def needed_area(settings: SimulationSettings, waypoints_m: Floats, margin_m: float = 4.0) -> Area:
@@ -67,7 +70,7 @@ def _reach_m(settings: SimulationSettings, flight: int) -> float:
     """How far from the point below it the camera of a flight may see the ground."""
     camera = settings.imaging.camera
     height_factor = 1.0 if flight == 1 else settings.later.revisit.height_factor
-    height_m = settings.path.height_m * height_factor + 4 * settings.motion.height_rms_m
+    height_m = settings.path.height_m * height_factor + 4 * settings.motion.height_rms_m + settings.scene.relief_m
     across = 0.5 * camera.width_px / camera.fx_px, 0.5 * camera.height_px / camera.fy_px
     # barrel distortion shows more than the pinhole's angle: its rays are the truth
     corner = np.abs(camera.rays_from_pixels(camera.corners_px)[:, :2]).max(axis=0)
@@ -98,13 +101,24 @@ def build_world(
             min(0.025, 0.72 * settings.m_per_px), float(np.sqrt(width_m * height_m / _LARGEST_GROUND_PX))
         )
         painted = paint_ground(GroundKind(settings.scene.ground), area, m_per_px, rng)
+    relief = Relief.hills(
+        settings.scene.relief_m, settings.path.height_m, area, np.random.default_rng([settings.seed, 10])
+    )
     first = _furnish(
         settings.scene, painted.layout, plans_m[0], settings, np.random.default_rng([settings.seed, 2])
     )
     days = [first]
     for flight in range(2, settings.flights + 1):
         days.append(_next_day(days[0], painted.layout, plans_m[0], settings, flight))
-    return World(painted.raster, tuple(days))
+    return World(painted.raster, tuple(tuple(_on_hills(thing, relief) for thing in day) for day in days), relief)
+
+
+def _on_hills(thing: Thing, relief: Relief) -> Thing:
+    if relief.is_level:
+        return thing
+    places = np.array([thing.place_m(-1.0), thing.place_m(0.0), thing.place_m(1.0)])[:, :2]
+    before_m, here_m, after_m = relief.up_m(places)
+    return replace(thing, up_m=float(here_m), climb_m_s=float(after_m - before_m) / 2)
 
 
 def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px: float) -> Day:
@@ -127,7 +141,7 @@ def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px:
         thing.id: own_shadow(thing, bodies[thing.id], light, m_per_px) for thing in things if thing.is_moving
     }
     cloud_shade = 0.38 if weather.has_clouds else 0.0
-    return Day(ground, things, bodies, shadows, light, gains, cloud_shade)
+    return Day(ground, things, bodies, shadows, light, gains, cloud_shade, world.relief)
 
 
 def _daylight(weather: WeatherSettings, rng: np.random.Generator) -> tuple[Light, Floats]:
@@ -322,7 +336,8 @@ def _with_shadows(
     depth = np.zeros((height, width), np.uint8)
     sun_view = map_view(ground.west_m, ground.north_m, ground.m_per_px, (width, height), light.sun)
     for thing in things:
-        _cast(bodies[thing.id].placed(thing.turn, thing.place_m(0.0), sun_view.eye_m), sun_view, depth)
+        foot = np.append(thing.place_m(0.0)[:2], 0.0)  # the ground around is as high as it: its shadow begins there
+        _cast(bodies[thing.id].placed(thing.turn, foot, sun_view.eye_m), sun_view, depth)
     if not depth.any():
         return ground
     depth[:] = cv2.GaussianBlur(depth, (0, 0), max(0.6, 0.03 / ground.m_per_px[0]))  # the sun is no point
