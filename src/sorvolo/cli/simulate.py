@@ -88,8 +88,7 @@ def simulate(
     from sorvolo.simulation.presets import preset, preset_names
 
     if list_presets:
-        typer.echo("\n".join(preset_names()))
-        return
+        return typer.echo("\n".join(preset_names()))
     ground_file = _ground_file(ground)
     ground_kind = ground if ground_file is None else "orthophoto"
     if pictures is None and thermal:
@@ -97,13 +96,12 @@ def simulate(
     if pictures is not None:
         _refuse_options_of_flights({
             "--preset": preset_name != "demo", "--relief": relief, "--flights": flights, "--gps-noise": gps_noise,
-            "--gps-rate": gps_rate, "--clock-offset": clock_offset, "--telemetry": telemetry,
-            "--faults": faults or None, "--speed": speed, "--length": length, "--strips": strips, "--tilt": tilt,
-            "--fps": fps, "--size": size, "--photos": photos,
+            "--gps-rate": gps_rate, "--clock-offset": clock_offset, "--telemetry": telemetry, "--faults": faults or None,
+            "--speed": speed, "--length": length, "--strips": strips, "--tilt": tilt, "--fps": fps, "--size": size,
+            "--photos": photos,
         })
-        wanted = _picture_settings(pictures, seed, ground_kind, thermal, height)
-        _simulate_pictures(folder, wanted, ground_file, ground_gsd, as_json)
-        return
+        asked = _picture_settings(pictures, seed, ground_kind, thermal, height)
+        return _simulate_pictures(folder, asked, ground_file, ground_gsd, as_json)
     settings = _with_options(
         preset(preset_name),
         top={"seed": seed, "flights": flights}, scene={"ground": ground_kind or None, "relief_m": relief},
