@@ -96,9 +96,9 @@ def simulate(
     if pictures is not None:
         _refuse_options_of_flights({
             "--preset": preset_name != "demo", "--relief": relief, "--flights": flights, "--gps-noise": gps_noise,
-            "--gps-rate": gps_rate, "--clock-offset": clock_offset, "--telemetry": telemetry, "--faults": faults or None,
-            "--speed": speed, "--length": length, "--strips": strips, "--tilt": tilt, "--fps": fps, "--size": size,
-            "--photos": photos,
+            "--gps-rate": gps_rate, "--clock-offset": clock_offset, "--telemetry": telemetry, "--speed": speed,
+            "--faults": faults or None, "--length": length, "--strips": strips, "--tilt": tilt, "--fps": fps,
+            "--size": size, "--photos": photos,
         })
         asked = _picture_settings(pictures, seed, ground_kind, thermal, height)
         return _simulate_pictures(folder, asked, ground_file, ground_gsd, as_json)
