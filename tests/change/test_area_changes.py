@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from sorvolo.change.areas.area_map import AreaMap, AreaMapSettings, with_areas
+from sorvolo.change.areas.ground_pictures import GroundPictures, GroundPictureSettings
 from sorvolo.change.areas.segments import AreaSettings
 from sorvolo.change.areas.signs import leaning
 from sorvolo.change.shape.outlines import overlap
+from sorvolo.change.shape.patches import PatchWindow, cut
 from sorvolo.simulation.canvas import Area
 from sorvolo.simulation.ground import GroundKind, paint_ground
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
@@ -45,14 +47,19 @@ def changes_of(
         x, y = 300 * (index % 3), 220 * (index // 3)
         part = np.s_[y : y + VIEW_PX[1], x : x + VIEW_PX[0]]
         seen = light(after[part], index).astype(float) + rng.normal(0, 2.0, (*VIEW_PX[::-1], 3))
-        site_from_image = np.array([[M_PER_PX, 0, x * M_PER_PX], [0, -M_PER_PX, -y * M_PER_PX], [0, 0, 1.0]])
-        areas.add(ComparedView(
-            index, f"{index}", index * 10**9, site_from_image, np.array([x * M_PER_PX + 16, -y * M_PER_PX - 12, 40.0]),
-            np.clip(np.rint(seen), 0, 255).astype(np.uint8), before[part].copy(), np.ones(VIEW_PX[::-1], bool),
-            np.zeros(VIEW_PX[::-1], np.uint8), np.zeros((0, 4), np.int64), np.zeros(0), 0.4,
-            np.zeros(VIEW_PX[::-1], np.uint8),
-        ))
+        areas.add(view_of(before[part].copy(), np.clip(np.rint(seen), 0, 255).astype(np.uint8), index, x, y))
     return areas.conclude("b", 7)
+
+
+def view_of(before: Rgb, after: Rgb, index: int = 0, x: int = 0, y: int = 0) -> ComparedView:
+    """A view whose top left pixel is pixel (x, y) of the ground."""
+    site_from_image = np.array([[M_PER_PX, 0, x * M_PER_PX], [0, -M_PER_PX, -y * M_PER_PX], [0, 0, 1.0]])
+    return ComparedView(
+        index, f"{index}", index * 10**9, site_from_image, np.array([x * M_PER_PX + 16, -y * M_PER_PX - 12, 40.0]),
+        after, before, np.ones(VIEW_PX[::-1], bool),
+        np.zeros(VIEW_PX[::-1], np.uint8), np.zeros((0, 4), np.int64), np.zeros(0), 0.4,
+        np.zeros(VIEW_PX[::-1], np.uint8),
+    )
 
 
 def laid(ground: Rgb, other: Rgb, outline_m: np.ndarray) -> Rgb:
@@ -87,6 +94,30 @@ def test_an_area_far_larger_than_a_view_is_one_change(grass):
     road_m = np.array([[3.0, -18.0], [61.0, -26.0], [61.0, -34.0], [3.0, -26.0]])
     (found,) = changes_of(grass, laid(grass, painted(GroundKind.SAND, 2), road_m))
     assert overlap(found.outline_m, road_m)[0] > 0.8
+
+
+@pytest.mark.parametrize(("most_px", "coarser"), [(2048, 1), (200, 2)])
+def test_the_pictures_of_an_area_show_its_ground_where_it_lies(grass, most_px, coarser):
+    view = view_of(grass[:480, :640].copy(), painted(GroundKind.SAND, 2)[:480, :640].copy())
+    pictures = GroundPictures(0.1, GroundPictureSettings(side_px=32, most_patch_px=most_px))
+    west, south, east, north = 3.3, -20.7, 28.1, -2.9
+    squares_m = np.stack(np.meshgrid(np.arange(1.6, 32, 3.2), np.arange(-1.6, -24, -3.2)), axis=-1).reshape(-1, 2)
+    pictures.show(view, squares_m[3:])  # all but three in the north west
+    patch = pictures.patch(np.array([[west, south], [east, south], [east, north], [west, north]]))
+    rows, columns = patch.after.shape[:2]
+    assert patch.m_per_px == pytest.approx(0.1 * coarser) and max(rows, columns) <= most_px
+    fine = cut(view, PatchWindow(0.0, 0.0, 0.1, 320, 240))
+    x, y = patch.west_m + np.arange(columns) * patch.m_per_px, -patch.north_m + np.arange(rows) * patch.m_per_px
+    near = [  # what the view shows there; a coarser pixel is one of those it covers
+        np.ix_(np.rint(y / 0.1 + down).clip(0, 239).astype(int), np.rint(x / 0.1 + right).clip(0, 319).astype(int))
+        for down in range(coarser) for right in range(coarser)
+    ]
+    for found, wanted in ((patch.before, fine.before), (patch.after, fine.after)):
+        known = found[..., 3] > 0
+        np.testing.assert_array_equal(known, (x > 9.6 - 1e-6) | (y[:, None] > 3.2 - 1e-6))
+        assert not found[~known].any()
+        apart = [np.abs(found.astype(int) - wanted[each]).max(axis=-1) for each in near]
+        assert np.min(apart, axis=0)[known].max() <= 1
 
 
 def exposure(image: Rgb, index: int) -> Rgb:

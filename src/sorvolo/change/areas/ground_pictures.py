@@ -59,12 +59,16 @@ class GroundPictures:
             coarse *= 2
         (west, south), (east, north) = np.floor((low_m - margin_m) / coarse), np.ceil((high_m + margin_m) / coarse)
         window = PatchWindow(west * coarse, north * coarse, coarse, int(east - west), int(north - south))
-        empty = np.zeros((window.height_px, window.width_px, 4), np.uint8)
-        pictures = Cut(empty, empty, empty[..., 0])
+        size = window.height_px, window.width_px
+        whole = Cut(np.zeros((*size, 4), np.uint8), np.zeros((*size, 4), np.uint8), np.zeros(size, np.uint8))
         for key in self._around(low_m - margin_m, high_m + margin_m):
-            square, own = self._squares[key][0], self._window(key)
-            pictures = pictures.over(square.moved(window, own))
-        return patch_of(window, pictures, outline_m)
+            own = self._window(key)
+            rows, columns, part = window.part(own)
+            if part.width_px > 0 and part.height_px > 0:
+                there = Cut(whole.before[rows, columns], whole.after[rows, columns], whole.shade[rows, columns])
+                joined = there.over(self._squares[key][0].moved(part, own))
+                there.before[:], there.after[:], there.shade[:] = joined.before, joined.after, joined.shade
+        return patch_of(window, whole, outline_m)
 
     def _window(self, key: tuple[int, int]) -> PatchWindow:
         side_m = self._side_m

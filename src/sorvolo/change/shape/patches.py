@@ -12,6 +12,7 @@ from sorvolo.survey.findings import ComparedView, Patch
 
 _LEAST_MARGIN_M = 0.5
 _MARGIN_SHARE = 0.5
+_LEAST_PART = 1e-6  # of a pixel: less is a rounding error
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,19 @@ class PatchWindow:
     def size_px(self) -> tuple[int, int]:
         """Width, height."""
         return self.width_px, self.height_px
+
+    def part(self, other: "PatchWindow") -> tuple[slice, slice, "PatchWindow"]:
+        """The pixels of this window that another one touches: their rows, their columns, and the window of them alone.
+
+        It has no pixel where the two lie apart.
+        """
+        s, reach_m = self.m_per_px, other.m_per_px * np.array(other.size_px)
+        low = np.array([other.west_m - self.west_m, self.north_m - other.north_m])
+        first = np.maximum(np.floor(low / s + _LEAST_PART), 0).astype(int)
+        last = np.minimum(np.ceil((low + reach_m) / s - _LEAST_PART), self.size_px).astype(int)
+        (left, top), (width, height) = first.tolist(), np.maximum(last - first, 0).tolist()
+        part = PatchWindow(self.west_m + left * s, self.north_m - top * s, s, width, height)
+        return slice(top, top + height), slice(left, left + width), part
 
     def holds(self, low_m: PointsM, high_m: PointsM) -> bool:
         """Whether a box lies inside, with a little ground around it."""
